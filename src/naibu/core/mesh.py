@@ -1,0 +1,91 @@
+"""A finite element mesh: points, cells of one type, and the named region of every cell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from naibu.core.errors import InputError
+
+NODES_PER_CELL = {"tetra": 4, "tetra10": 10, "hexahedron": 8}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mesh:
+    """Points and cells in three dimensions.
+
+    Attributes
+    ----------
+    points : ndarray, shape (n, 3), float64
+        Node positions, mm.
+    cells : ndarray, shape (m, k), int64
+        Node numbers of every cell, in VTK order (a positively oriented cell has a positive Jacobian).
+    cell_type : str
+        ``"tetra"`` (k = 4), ``"tetra10"`` (k = 10) or ``"hexahedron"`` (k = 8).
+    regions : ndarray, shape (m,), int64
+        Index into `region_names` for every cell.
+    region_names : tuple of str
+        Name of every region, usually its material.
+    """
+
+    points: NDArray[np.float64]
+    cells: NDArray[np.int64]
+    cell_type: str
+    regions: NDArray[np.int64]
+    region_names: tuple[str, ...]
+
+    @classmethod
+    def from_arrays(
+        cls,
+        points: ArrayLike,
+        cells: ArrayLike,
+        cell_type: str,
+        *,
+        regions: ArrayLike | None = None,
+        region_names: Sequence[str] = ("body",),
+    ) -> Mesh:
+        """Check the arrays and make a mesh of them.
+
+        Raises
+        ------
+        InputError
+            Wrong shapes, an unknown cell type, node numbers out of range, NaN points, or regions without a name.
+        """
+        p = np.ascontiguousarray(points, dtype=np.float64)
+        c = np.ascontiguousarray(cells, dtype=np.int64)
+        if cell_type not in NODES_PER_CELL:
+            raise InputError(f"cell type {cell_type!r} is not known; use one of {sorted(NODES_PER_CELL)}")
+        if p.ndim != 2 or p.shape[1] != 3:
+            raise InputError(f"mesh points must have shape (n, 3), not {p.shape}")
+        if c.ndim != 2 or c.shape[1] != NODES_PER_CELL[cell_type] or len(c) == 0:
+            raise InputError(f"{cell_type} cells must have shape (m, {NODES_PER_CELL[cell_type]}) with m > 0, not {c.shape}")
+        if not np.isfinite(p).all():
+            bad = int(np.flatnonzero(~np.isfinite(p).all(axis=1))[0])
+            raise InputError(f"mesh point {bad} is {p[bad].tolist()}: every coordinate must be a finite number")
+        if c.min() < 0 or c.max() >= len(p):
+            raise InputError(f"cells name nodes {c.min()} to {c.max()}, but the mesh has nodes 0 to {len(p) - 1}")
+        r = np.zeros(len(c), dtype=np.int64) if regions is None else np.ascontiguousarray(regions, dtype=np.int64)
+        if r.shape != (len(c),):
+            raise InputError(f"regions must have one entry for each of the {len(c)} cells, not shape {r.shape}")
+        if r.min() < 0 or r.max() >= len(region_names):
+            raise InputError(f"cells use region {r.max()}, but only {len(region_names)} region names are given")
+        return cls(p, c, cell_type, r, tuple(region_names))
+
+    @property
+    def n_points(self) -> int:
+        """Number of nodes."""
+        return len(self.points)
+
+    @property
+    def n_cells(self) -> int:
+        """Number of cells."""
+        return len(self.cells)
+
+    def moved(self, displacement: NDArray[np.float64]) -> Mesh:
+        """Return the mesh with every node moved by `displacement` (n, 3), mm."""
+        if displacement.shape != self.points.shape:
+            raise InputError(f"displacement must have shape {self.points.shape}, not {displacement.shape}")
+        return replace(self, points=self.points + displacement)

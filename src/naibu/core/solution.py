@@ -1,0 +1,23 @@
+"""What a solver hands back: a value, and a status whose text tells the user what happened."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+
+class Status(Enum):
+    """How a solve ended; the value is the sentence for the user."""
+
+    CONVERGED = "Converged."
+    STEP_TOO_SMALL = (
+        "The load step became too small: Newton's method failed even for a tiny increment. The body may buckle, a corner may fold, or the "
+        "load is more than the mesh can follow. Refine the mesh near the indenter, lower the load or the Poisson ratio, or ask for more steps."
+    )
+    SINGULAR = "The linear system is singular: the body can move freely. Hold it by a fixed support, a bonded contact, or friction."
+    INTERRUPTED = "Interrupted by the user; what is returned is the best so far."
+    ITERATION_LIMIT = "The iteration limit was reached before the tolerance; the result may be used with care, or continued with more iterations."
+
+    @property
+    def ok(self) -> bool:
+        """Whether the result can be used without reserve."""
+        return self is Status.CONVERGED

@@ -1,0 +1,404 @@
+"""A measured object as a finite element model: mesh, contacts and observation of its markers, as functions of named parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from naibu.core.errors import InputError
+from naibu.core.experiment import Experiment, State
+from naibu.core.mesh import Mesh
+from naibu.core.parameters import Parameter
+from naibu.identification.placement import Placement, placement
+from naibu.mechanics.assembly import Assembler, BlockPattern, block_pattern, body_force
+from naibu.mechanics.contact import STICK, Contact, bar, plane
+from naibu.mechanics.elements import Elements, elements
+from naibu.mechanics.materials import Law, from_moduli, law_named, parameter_vector
+from naibu.mechanics.sensitivities import Direction
+from naibu.mechanics.statics import Problem
+from naibu.mechanics.supports import Friction, Prescribed, interface, rigid_contact
+from naibu.meshing.generation import box, cylinder, half_ellipsoid, hemisphere
+from naibu.meshing.interfaces import split_at_plane
+from naibu.meshing.location import interpolation_operator
+from naibu.meshing.surface import boundary_faces, faces_among, node_areas
+
+Array = NDArray[np.float64]
+ContactModel = Literal["coulomb", "stick", "springs"]
+GRAVITY = np.array([0.0, 0.0, -9810.0])  # mm/s2
+
+
+@dataclass(frozen=True, slots=True)
+class ModelSettings:
+    """What a specimen is modelled with.
+
+    Attributes
+    ----------
+    law : str
+        Hyperelastic law of every material, see `naibu.mechanics.materials.LAWS`.
+    contact : {"coulomb", "stick", "springs"}
+        What the rigid bodies do to the surface sideways: rub with a friction coefficient for each pair of materials, hold it, or hold it
+        by tangential springs.
+    joined : {"glued", "sliding"}
+        What holds separately cast blocks together.
+    element_size_mm : float
+        Edge of the hexahedra; 0 takes a tenth of the object's height.
+    normal_stiffness : float
+        Contact penalty, kPa/mm.
+    density : float
+        kg/mm3; weight is applied where an object is not pressed onto its base.
+    """
+
+    law: str = "neo_hookean"
+    contact: ContactModel = "coulomb"
+    joined: Literal["glued", "sliding"] = "glued"
+    element_size_mm: float = 0.0
+    normal_stiffness: float = 2e4
+    tangential_stiffness: float = 200.0
+    density: float = 1e-6
+
+
+def young_modulus(material: str) -> str:
+    """Name of the Young's modulus of `material`."""
+    return f"{material}: young_modulus"
+
+
+def poisson_ratio(material: str) -> str:
+    """Name of the Poisson's ratio of `material`."""
+    return f"{material}: poisson_ratio"
+
+
+def shape_parameter(material: str, name: str) -> str:
+    """Name of a dimensionless parameter of the law of `material`, such as ``c01_share``."""
+    return f"{material}: {name}"
+
+
+def friction(material: str, body: str) -> str:
+    """Name of the friction coefficient (or, for springs, the tangential stiffness) of `material` on `body`."""
+    return f"{material} on {body}: friction"
+
+
+SHAPE_NAMES: dict[str, tuple[str, ...]] = {"mooney_rivlin": ("c01_share",), "yeoh": ("c20_ratio", "c30_ratio")}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Specimen:
+    """A meshed experiment.
+
+    Attributes
+    ----------
+    experiment : Experiment
+        What was measured.
+    settings : ModelSettings
+        Law, contact, mesh size.
+    placement : Placement
+        Where the object lies in its free scan.
+    mesh : Mesh
+        In the object's frame, mm.
+    marker_ids : ndarray, shape (k,), int64
+        Trusted markers with a complete position in the free state.
+    marker_points : ndarray, shape (k, 3)
+        Their positions in the object's frame, mm.
+    observation : csr_matrix, shape (k, n)
+        Interpolates nodal displacements at the markers.
+    """
+
+    experiment: Experiment
+    settings: ModelSettings
+    placement: Placement
+    mesh: Mesh
+    marker_ids: NDArray[np.int64]
+    marker_points: Array
+    observation: sp.csr_array
+    _gradient: tuple[sp.csr_array, ...]
+    _elements: Elements
+    _pattern: BlockPattern
+    _assembler: Assembler
+    _contacts: tuple[Contact, ...]
+    _materials_of_points: tuple[NDArray[np.int64], ...]
+
+    @property
+    def law(self) -> Law:
+        """The hyperelastic law."""
+        return law_named(self.settings.law)
+
+    @property
+    def indenters(self) -> tuple[int, ...]:
+        """Indices of the contacts that move."""
+        return tuple(i for i, c in enumerate(self._contacts) if not np.array_equal(c.start, c.stop) or c.name.startswith("indenter"))
+
+    def deformation_gradient(self, displacement: Array) -> Array:
+        """Return F (k, 3, 3) at the markers, by central differences over a tenth of an element."""
+        step = _difference_step(self.settings, self.experiment)
+        forward, backward = self._gradient[:3], self._gradient[3:]
+        columns = [(f @ displacement - b @ displacement) / (2.0 * step) for f, b in zip(forward, backward, strict=True)]
+        return np.stack(columns, axis=2) + np.eye(3)
+
+    def material_parameters(self, values: Mapping[str, float]) -> Array:
+        """Return the parameters (cells, 4), kPa, of all cells."""
+        rows = np.zeros((len(self.mesh.region_names), 4))
+        for row, name in zip(rows, self.mesh.region_names, strict=True):
+            vector = from_moduli(self.law, *_moduli(name, values), _shape(self.law, name, values)).parameters
+            row[: len(vector)] = vector
+        return rows[self.mesh.regions]
+
+    def problem(self, values: Mapping[str, float], state: str) -> Problem:
+        """Return the boundary-value problem of one state.
+
+        Parameters
+        ----------
+        values : mapping
+            Physical value of every parameter of the specimen, by name.
+        state : str
+            Name of the state.
+        """
+        contacts = []
+        for i, (contact, material_of_point) in enumerate(zip(self._contacts, self._materials_of_points, strict=True)):
+            changed = self._with_friction(contact, material_of_point, values)
+            contacts.append(self._moved(changed, values, state) if i in self.indenters else changed)
+        assembler = self._assembler.with_parameters(self.material_parameters(values))
+        n = self.mesh.n_points
+        weight = np.zeros((n, 3))
+        if self.experiment.loading.kind == "side_plates":
+            weight = body_force(self._elements, np.full(self.mesh.n_cells, self.settings.density), GRAVITY)
+        return Problem(self.mesh.points, assembler, tuple(contacts), Prescribed.nothing(n), weight)
+
+    def direction(self, name: str, values: Mapping[str, float], state: str) -> list[Direction]:
+        """Return how the problem of a state depends on the physical value of a parameter; empty where it does not.
+
+        The change is the sum of the directions returned.
+        """
+        if (materials := self._material_direction(name, values)) is not None:
+            return [Direction(materials=materials)]
+        out = []
+        for i, (contact, material_of_point) in enumerate(zip(self._contacts, self._materials_of_points, strict=True)):
+            mask = np.array([name == friction(m, _body(contact)) for m in self.mesh.region_names])[material_of_point].astype(float)
+            if mask.any():
+                springs = self.settings.contact == "springs"
+                out.append(Direction(contact=i, tangential_stiffness=mask) if springs else Direction(contact=i, friction=mask))
+        for i in self.indenters:
+            path = self._path_directions(self._contacts[i], state).get(name)
+            if path is not None:
+                stop, rotation = path
+                out.append(Direction(contact=i, stop=stop, rotation=rotation))
+        return out
+
+    def _material_direction(self, name: str, values: Mapping[str, float]) -> Array | None:
+        """Derivative (cells, 4) of the cells' parameters with respect to the physical value of a material's parameter."""
+        for index, region in enumerate(self.mesh.region_names):
+            shape = _shape(self.law, region, values)
+            mu, kappa = _moduli(region, values)
+            e, nu = values[young_modulus(region)], values[poisson_ratio(region)]
+            vector: tuple[float, ...] | None = None
+            if name == young_modulus(region):
+                vector = parameter_vector(self.law, mu / e, kappa / e, shape)
+            elif name == poisson_ratio(region):
+                vector = parameter_vector(self.law, -mu / (1.0 + nu), 2.0 * kappa / (1.0 - 2.0 * nu), shape)
+            for k, shape_name in enumerate(SHAPE_NAMES.get(self.law.name, ())):
+                if name == shape_parameter(region, shape_name):
+                    one = tuple(1.0 if k == j else 0.0 for j in range(len(shape)))
+                    zero = parameter_vector(self.law, mu, 0.0, tuple(0.0 for _ in shape))
+                    vector = tuple(a - b for a, b in zip(parameter_vector(self.law, mu, 0.0, one), zero, strict=True))
+            if vector is not None:
+                out = np.zeros((self.mesh.n_cells, 4))
+                out[self.mesh.regions == index, : len(vector)] = vector
+                return out
+        return None
+
+    def _with_friction(self, contact: Contact, material_of_point: NDArray[np.int64], values: Mapping[str, float]) -> Contact:
+        from dataclasses import replace
+
+        if contact.name.startswith("joint"):
+            return contact
+        given = np.array([values.get(friction(m, _body(contact)), STICK) for m in self.mesh.region_names])[material_of_point]
+        if self.settings.contact == "springs":
+            return replace(contact, tangential_stiffness=given, friction_coefficient=np.full_like(given, STICK))
+        if self.settings.contact == "stick":
+            given = np.full_like(given, STICK)
+        return replace(contact, friction_coefficient=given)
+
+    def _moved(self, contact: Contact, values: Mapping[str, float], state: str) -> Contact:
+        """Set the end of the body's path and its tilt from the state's parameters."""
+        from dataclasses import replace
+
+        stop, rotation = contact.start.copy(), np.zeros(3)
+        for name, (rate, turn) in self._path_directions(contact, state).items():
+            reference = self._reference(contact, name, state)
+            stop = stop + rate * (values.get(name, reference) - reference)
+            rotation = rotation + turn * values.get(name, 0.0)
+        return replace(contact, stop=stop, rotation=_rotation(rotation))
+
+    def _reference(self, contact: Contact, name: str, state: str) -> float:
+        """Value of a path parameter at which the body is at its start."""
+        if name == opening(self.experiment, state):
+            size = self.experiment.shape.size_mm
+            return size[1] if self.experiment.loading.kind == "side_plates" else size[2]
+        return 0.0
+
+    def _path_directions(self, contact: Contact, state: str) -> dict[str, tuple[Array, Array]]:
+        """For every parameter that moves the body: change of the end of its path, and rotation about its reference point."""
+        zero = np.zeros(3)
+        if self.experiment.loading.kind == "side_plates":
+            side = 0.5 if contact.start[1] > 0 else -0.5
+            return {opening(self.experiment, state): (np.array([0.0, side, 0.0]), zero)}
+        out = {opening(self.experiment, state): (np.array([0.0, 0.0, 1.0]), zero)}
+        prefix = f"{self.experiment.name}/{state}"
+        out[f"{prefix}: tilt_x"] = (zero, np.array([1.0, 0.0, 0.0]))
+        out[f"{prefix}: tilt_y"] = (zero, np.array([0.0, 1.0, 0.0]))
+        if self.experiment.loading.kind == "bar":
+            lateral = np.array([1.0, 0.0, 0.0]) if self.experiment.loading.bar_axis == "y" else np.array([0.0, 1.0, 0.0])
+            out[f"{prefix}: bar_offset"] = (lateral, zero)
+        return out
+
+
+def opening(experiment: Experiment, state: str) -> str:
+    """Name of the height of the plate or bar above the base, or of the distance between side plates, in a state."""
+    kind = "width" if experiment.loading.kind == "side_plates" else "height"
+    return f"{experiment.name}/{state}: {kind}"
+
+
+def specimen(experiment: Experiment, settings: ModelSettings | None = None) -> Specimen:
+    """Mesh an experiment and prepare its contacts and observations.
+
+    Raises
+    ------
+    InputError
+        A kind of object or loading that this model does not cover, or markers that lie far outside the object.
+    """
+    chosen = settings or ModelSettings()
+    _require_supported(experiment)
+    place = placement(experiment)
+    mesh = _mesh(experiment, chosen)
+    joints: list[Contact] = []
+    for height in experiment.joined_at_mm:
+        if chosen.joined == "sliding":
+            area = node_areas(mesh, _plane_faces(mesh, height))
+            mesh, pairs = split_at_plane(mesh, height)
+            joints.append(interface(f"joint at {height:g} mm", mesh.points, pairs, area[pairs[:, 0]], friction=Friction(0.3), normal_stiffness=chosen.normal_stiffness))
+    boundary = boundary_faces(mesh)
+    bodies = _bodies(experiment, chosen, mesh, boundary.faces)
+    regions_of_points = tuple(np.repeat(mesh.regions[boundary.cells], len(c.area) // len(boundary.cells)) for c in bodies)
+    regions_of_joints = tuple(np.zeros(len(c.area), dtype=np.int64) for c in joints)
+    contacts = (*bodies, *joints)
+    discrete = elements(mesh)
+    pattern = block_pattern(mesh.n_points, discrete.connectivity, *(c.nodes for c in contacts))
+    placeholder = [from_moduli(law_named(chosen.law), 1.0, 10.0)] * len(mesh.region_names)
+    assembler = Assembler.from_materials(discrete, mesh.regions, placeholder, pattern)
+    initial = experiment.initial
+    complete = initial.trusted & np.isfinite(initial.points).all(axis=1)
+    points = place.to_object(initial.points[complete])
+    tolerance = 0.05 * experiment.height_mm
+    observation = interpolation_operator(mesh, points, tolerance_mm=tolerance)
+    step = _difference_step(chosen, experiment)
+    shifted = [interpolation_operator(mesh, points + sign * step * axis, tolerance_mm=2 * tolerance) for sign in (1.0, -1.0) for axis in np.eye(3)]
+    return Specimen(
+        experiment, chosen, place, mesh, initial.ids[complete], points, observation, tuple(shifted), discrete, pattern, assembler, contacts,
+        (*regions_of_points, *regions_of_joints),
+    )  # fmt: skip
+
+
+def _require_supported(experiment: Experiment) -> None:
+    if experiment.dimensions != 3:
+        raise InputError(f"experiment {experiment.name!r} has two-dimensional data; displacement matching needs markers in three dimensions")
+    if experiment.up_axis != "z":
+        raise InputError(f"experiment {experiment.name!r} has its height along {experiment.up_axis}; turn its axes so that z points away from the base")
+    if experiment.loading.kind == "cylinder":
+        raise InputError(f"experiment {experiment.name!r} is pressed by a cylinder; plates, bars and side plates are covered")
+
+
+def _element_size(settings: ModelSettings, experiment: Experiment) -> float:
+    return settings.element_size_mm or experiment.height_mm / 10.0
+
+
+def _difference_step(settings: ModelSettings, experiment: Experiment) -> float:
+    return 0.1 * _element_size(settings, experiment)
+
+
+def _mesh(experiment: Experiment, settings: ModelSettings) -> Mesh:
+    size = np.array(experiment.shape.size_mm)
+    edge = _element_size(settings, experiment)
+    layers = [(layer.material, layer.to_base_mm - layer.from_base_mm) for layer in experiment.layers]
+    kind = experiment.shape.kind
+    if kind == "box":
+        breaks = {}
+        if experiment.loading.kind == "bar" and experiment.loading.bar_width_mm:
+            half = experiment.loading.bar_width_mm / 2.0
+            breaks = {"x" if experiment.loading.bar_axis == "y" else "y": (-half, half)}
+        return box(size, np.maximum(np.round(size / edge), 2).astype(int), layers=layers, breaks=breaks)
+    if len(layers) > 1 and kind != "cylinder":
+        raise InputError(f"experiment {experiment.name!r}: layers are only covered in boxes and cylinders, not in a {kind}")
+    if kind == "cylinder":
+        return cylinder(size[0], size[2], edge, layers=layers)
+    mesh = half_ellipsoid(size, edge) if kind == "half_ellipsoid" else hemisphere(size[0], edge)
+    return Mesh(mesh.points, mesh.cells, mesh.cell_type, mesh.regions, (layers[0][0],))
+
+
+def _plane_faces(mesh: Mesh, height: float) -> NDArray[np.int64]:
+    """Faces of the cells below a horizontal plane that lie on it."""
+    below = mesh.points[mesh.cells][:, :, 2].max(axis=1) <= height + 1e-6
+    lower = Mesh(mesh.points, mesh.cells[below], mesh.cell_type, mesh.regions[below], mesh.region_names)
+    return faces_among(lower, np.flatnonzero(np.abs(mesh.points[:, 2] - height) < 1e-6))
+
+
+def _bodies(experiment: Experiment, settings: ModelSettings, mesh: Mesh, faces: NDArray[np.int64]) -> list[Contact]:
+    """The table and the indenters; an indenter starts where it touches the free object."""
+    stick = Friction(STICK, settings.tangential_stiffness)
+    loading, size = experiment.loading, experiment.shape.size_mm
+
+    def body(name, surface, start):  # type: ignore[no-untyped-def]
+        return rigid_contact(name, mesh.points, faces, surface, start=start, stop=start, friction=stick, normal_stiffness=settings.normal_stiffness)
+
+    bodies = [body(f"base of {loading.base_material}", plane((0.0, 0.0, 1.0)), (0.0, 0.0, 0.0))]
+    counter = loading.counter_material
+    if loading.kind == "side_plates":
+        for sign, side in ((-1.0, "low"), (1.0, "high")):
+            bodies.append(body(f"indenter ({side} side) of {counter}", plane((0.0, -sign, 0.0)), (0.0, sign * size[1] / 2.0, 0.0)))
+    elif loading.kind == "bar":
+        surface = bar(loading.bar_axis, loading.bar_width_mm or 0.0)
+        bodies.append(body(f"indenter of {counter}", surface, (0.0, 0.0, size[2])))
+    else:
+        bodies.append(body(f"indenter of {counter}", plane((0.0, 0.0, -1.0)), (0.0, 0.0, size[2])))
+    return bodies
+
+
+def _body(contact: Contact) -> str:
+    """Material of a rigid body, from its name."""
+    return contact.name.rpartition(" of ")[2]
+
+
+def _moduli(material: str, values: Mapping[str, float]) -> tuple[float, float]:
+    """Shear and bulk modulus, kPa."""
+    e, nu = values[young_modulus(material)], values[poisson_ratio(material)]
+    return e / (2.0 * (1.0 + nu)), e / (3.0 * (1.0 - 2.0 * nu))
+
+
+def _shape(law: Law, material: str, values: Mapping[str, float]) -> tuple[float, ...]:
+    return tuple(values.get(shape_parameter(material, name), 0.0) for name in SHAPE_NAMES.get(law.name, ()))
+
+
+def _rotation(vector: Array) -> Array:
+    """Rotation matrix of a rotation vector, rad (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    if angle == 0.0:
+        return np.eye(3)
+    x, y, z = vector / angle
+    k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k)
+
+
+def state_parameters(experiment: Experiment, state: State) -> list[Parameter]:
+    """Parameters of the boundary conditions of one state, with their priors: opening, tilt of a plate, offset of a bar."""
+    prefix = f"{experiment.name}/{state.name}"
+    size = experiment.shape.size_mm
+    full = size[1] if experiment.loading.kind == "side_plates" else size[2]
+    start = state.estimated_mm or state.stated_mm or 0.7 * full
+    out = [Parameter(opening(experiment, state.name), float(start), "mm", prior_sd=5.0)]
+    if experiment.loading.kind != "side_plates":
+        out += [Parameter(f"{prefix}: tilt_{axis}", 0.0, "rad", prior_sd=0.01) for axis in "xy"]
+    if experiment.loading.kind == "bar":
+        out.append(Parameter(f"{prefix}: bar_offset", 0.0, "mm", prior_sd=1.0))
+    return out

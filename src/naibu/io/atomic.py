@@ -1,0 +1,64 @@
+"""Write a file so that a reader, or a crash, never meets half of it."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+from naibu.core.errors import InputError
+
+
+def write_atomically(path: str | os.PathLike[str], data: str | bytes) -> Path:
+    """Write `data` beside `path` and rename it into place, so that `path` is either the old file or the whole new one.
+
+    Parameters
+    ----------
+    path : path-like
+        File to write; its folder is made when it is not there.
+    data : str or bytes
+        Content; text is stored as UTF-8 with its line ends unchanged.
+
+    Returns
+    -------
+    Path
+        `path`.
+
+    Raises
+    ------
+    InputError
+        The folder or the file cannot be written.
+    """
+    target = Path(path)
+    content = data.encode("utf-8") if isinstance(data, str) else data
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        handle, aside_name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
+    except OSError as error:
+        raise _not_writable(target, error) from error
+    aside = Path(aside_name)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        # mkstemp makes the file private; give it the rights an ordinary new file would have
+        aside.chmod(0o666 & ~_umask())
+        aside.replace(target)
+    except OSError as error:
+        raise _not_writable(target, error) from error
+    finally:
+        aside.unlink(missing_ok=True)
+    return target
+
+
+def _not_writable(target: Path, error: OSError) -> InputError:
+    reason = error.strerror or str(error)
+    return InputError(f"{target}: cannot be written ({reason}); choose a folder you may write to, or free some space")
+
+
+def _umask() -> int:
+    # the only way to read the mask is to set it
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -1,0 +1,264 @@
+"""What may stand in the `meta.toml` of an experiment folder, and how a mistake in it is told to the user."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+
+from naibu.core.errors import InputError
+from naibu.core.experiment import Axis
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+# one number stands for a list of one, so that the rest of the code meets lists only
+PositiveOrList = Annotated[list[Positive], BeforeValidator(lambda v: v if isinstance(v, list) else [v])]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+def _gathered(data: Any, pattern: str, into: str) -> Any:
+    """Move the keys that match `pattern` into the sub-table `into`: families of keys such as ``rows_layer_1``."""
+    if not isinstance(data, dict):
+        return data
+    family = {k: v for k, v in data.items() if re.fullmatch(pattern, k)}
+    return {k: v for k, v in data.items() if k not in family} | {into: family}
+
+
+class CoordinatesTable(_Table):
+    """``[coordinates]``: axes, resolution, and where the base lies."""
+
+    axes: str = ""
+    up_axis: Axis | None = None
+    pixel_mm: Positive | None = None
+    xy_step_mm: Positive | None = None
+    step_mm: Positive | None = None
+    z_step_mm: Positive | None = None
+    z_base_est_mm: Finite | None = None
+    xy_scale_probable: Positive = 1.0
+    printed_values: str = ""
+
+
+class ObjectTable(_Table):
+    """``[object]``: the body in its free state."""
+
+    shape: str
+    size_mm: Annotated[list[Positive], Field(min_length=3, max_length=3)]
+    size_axes: Annotated[list[Axis], Field(min_length=3, max_length=3)] | None = None
+    joined_at_mm: list[Positive] | None = None
+    material: str = "gel"
+    mass_g: Positive | None = None
+    temperature_C: Finite | None = None
+
+
+class MarkersTable(_Table):
+    """``[markers]``: what the markers are and where they were meant to be."""
+
+    kind: str = ""
+    placing: str = ""
+    numbering: str = ""
+    count: Annotated[int, Field(gt=0)] | None = None
+    nominal_spacing_mm: Positive | None = None
+    nominal_margin_mm: NotNegative | None = None
+    nominal_height_above_base_mm: list[Positive] = []
+    depth_below_top_mm: Positive | None = None
+    layer_z_mm: list[Finite] = []
+    rows_of_layers: dict[str, list[int]] = {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _rows(cls, data: Any) -> Any:
+        return _gathered(data, r"rows_layer_\d+", "rows_of_layers")
+
+
+class LayerTable(_Table):
+    """``[[layer]]``: a slab of one material."""
+
+    material: Annotated[str, Field(min_length=1)]
+    from_base_mm: Annotated[list[NotNegative], Field(min_length=2, max_length=2)]
+    markers: Annotated[list[int], Field(min_length=2, max_length=2)] | None = None
+
+
+class LoadingTable(_Table):
+    """``[loading]``: how the object is pressed, in words and, where the keys are there, in numbers."""
+
+    kind: Literal["plate", "bar", "side_plates", "cylinder"] | None = None
+    bar_width_mm: Positive | None = None
+    bar_axis: Axis | None = None
+    counter_material: str = "acrylic"
+    base_material: str = "table"
+    indenter: str = ""
+    contact: str = ""
+    height_stated_mm: PositiveOrList | None = None
+    height_est_mm: PositiveOrList | None = None
+    width_stated_mm: PositiveOrList | None = None
+    width_est_mm: PositiveOrList | None = None
+    width_initial_mm: Positive | None = None
+    surface_displacement_mm: Finite | None = None
+    deformed_after_s: NotNegative | None = None
+
+
+class ScannerTable(_Table):
+    """``[scanner]``: the instrument; kept with the experiment as it is."""
+
+    instrument: str | None = None
+    slice_area_mm: Positive | None = None
+    slice_thickness_mm: Positive | None = None
+    slice_pitch_mm: Positive | None = None
+    slices: int | None = None
+    coil_inner_diameter_mm: Positive | None = None
+    frequency_MHz: Positive | None = None
+    frame_rate_Hz: Positive | None = None
+    image_px: list[int] | None = None
+    sound_speed_m_per_s: Positive | None = None
+
+
+class GelTable(_Table):
+    """``[gel]``: what is known of the material beforehand."""
+
+    product: str = ""
+    nu_note: str = ""
+    values: dict[str, str | float] = {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _values(cls, data: Any) -> Any:
+        return _gathered(data, r"(E_\w+_Pa|hardness_\w+)", "values")
+
+
+class StateTable(_Table):
+    """``[[state]]``: one measured state; the first is the free one."""
+
+    name: Annotated[str, Field(pattern=r"^[\w.-]+$")]
+    what: str = ""
+    loaded: bool | None = None
+    file: Annotated[str, Field(min_length=1)] | None = None
+    held_out: bool = False
+    height_stated_mm: Positive | None = None
+    height_est_mm: Positive | None = None
+    width_stated_mm: Positive | None = None
+    width_est_mm: Positive | None = None
+    printed_heading: str = ""
+    seed_lines: str = ""
+    count: dict[str, int] = {}
+    residual_from_smooth_field_mm: dict[str, NotNegative] = {}
+
+
+class Meta(_Table):
+    """The whole of `meta.toml`."""
+
+    title: str
+    source: str = ""
+    dimensions: Literal[2, 3] = 3
+    units: Literal["mm"]
+    known_problems: list[str] = []
+    coordinates: CoordinatesTable = CoordinatesTable()
+    object: ObjectTable
+    markers: MarkersTable = MarkersTable()
+    layer: list[LayerTable] = []
+    loading: LoadingTable
+    scanner: ScannerTable = ScannerTable()
+    gel: GelTable = GelTable()
+    state: Annotated[list[StateTable], Field(min_length=1)]
+
+
+_TABLES: dict[str, type[_Table]] = {
+    "coordinates": CoordinatesTable,
+    "object": ObjectTable,
+    "markers": MarkersTable,
+    "layer": LayerTable,
+    "loading": LoadingTable,
+    "scanner": ScannerTable,
+    "gel": GelTable,
+    "state": StateTable,
+}
+_LISTED = ("layer", "state")
+_MENDS = {
+    "title": 'add a line such as title = "Gel cube under a plate"',
+    "units": 'naibu reads millimetres: convert the coordinates and write units = "mm"',
+    "dimensions": "write dimensions = 3, or 2 for markers seen in one plane",
+    "object": 'add a table [object] with shape = "cube" and size_mm = [60, 60, 60]',
+    "shape": 'write, for example, shape = "cube"',
+    "size_mm": "write three positive lengths along x, y, z, for example size_mm = [60, 60, 60]",
+    "size_axes": 'write each of the three axes once, for example size_axes = ["x", "y", "z"]',
+    "from_base_mm": "write the slab's lower and upper height, for example from_base_mm = [0, 30]",
+    "loading": 'add a table [loading] with kind = "plate", "bar", "side_plates" or "cylinder"',
+    "kind": 'write kind = "plate", "bar", "side_plates" or "cylinder"',
+    "bar_axis": 'write bar_axis = "x", "y" or "z"',
+    "up_axis": 'write up_axis = "x", "y" or "z"',
+    "state": 'add a [[state]] table with name = "initial" for the free state, and one for each loaded state',
+    "name": 'give every state a name of letters, digits, "_", "-" and ".", for example name = "initial"',
+}
+
+
+def load_meta(path: Path, content: bytes) -> Meta:
+    """Parse and check the bytes of `meta.toml`; `path` is only named in errors.
+
+    Raises
+    ------
+    InputError
+        The text is not UTF-8 or not TOML (the line is shown), or a key is unknown, missing or holds a value that cannot be.
+    """
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: byte {error.start} is not UTF-8 text; save the file as UTF-8") from error
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(_syntax_message(path, text, error)) from error
+    try:
+        return Meta.model_validate(data)
+    except ValidationError as error:
+        faults = [f"{path}: {_told(dict(fault))}" for fault in error.errors(include_url=False)]
+        raise InputError("\n".join(dict.fromkeys(faults))) from error
+
+
+def _syntax_message(path: Path, text: str, error: tomllib.TOMLDecodeError) -> str:
+    found = re.search(r"at line (\d+)", str(error))
+    lines = text.splitlines()
+    number = int(found[1]) if found else len(lines)
+    shown = lines[number - 1].strip() if 0 < number <= len(lines) else ""
+    return f"{path}: line {number} is not valid TOML: {shown!r} ({error}); mend this line: one key = value, text in quotes"
+
+
+def _told(fault: dict[str, Any]) -> str:
+    """One fault of the check, in words that name the field, its value and the mend."""
+    place, key = _place(fault["loc"])
+    if fault["type"] == "extra_forbidden":
+        return f"{place} is not a known key; {_known_instead(fault['loc'], key)}"
+    mend = _MENDS.get(key, "correct it in this file")
+    if fault["type"] == "missing":
+        return f"{place} is missing; {_MENDS.get(key, 'add it')}"
+    what = "must be a finite number" if fault["type"] == "finite_number" else str(fault["msg"]).replace("Input should", "must")
+    return f"{place} = {fault['input']!r}: {what[:1].lower()}{what[1:]}; {mend}"
+
+
+def _place(loc: tuple[int | str, ...]) -> tuple[str, str]:
+    """Return the place of a fault as the user sees it in the file, and the key at fault."""
+    parts = list(loc)
+    table = ""
+    if parts[0] in _TABLES and len(parts) > 1:
+        name = str(parts.pop(0))
+        table = f"[[{name}]] number {int(parts.pop(0)) + 1} " if name in _LISTED and isinstance(parts[0], int) else f"[{name}] "
+    if not parts:
+        return table.strip(), str(loc[0])
+    key = str(parts[0])
+    entry = next((f", entry {p + 1}" for p in parts[1:] if isinstance(p, int)), "")
+    return f"{table}{key}{entry}", key
+
+
+def _known_instead(loc: tuple[int | str, ...], key: str) -> str:
+    model = _TABLES[str(loc[0])] if loc[0] in _TABLES else Meta
+    known = [name for name in model.model_fields if name not in ("rows_of_layers", "values")]
+    close = difflib.get_close_matches(key, known, n=1, cutoff=0.6)
+    if close:
+        return f"did you mean {close[0]!r}?"
+    return f"remove it, or use one of {', '.join(known)}"

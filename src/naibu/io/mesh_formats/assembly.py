@@ -1,0 +1,104 @@
+"""What the readers share: blocks of cells gathered into one mesh, and polygons cut into triangles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from naibu.core.errors import InputError
+from naibu.core.mesh import NODES_PER_CELL, Mesh
+
+# Kinds without volume: files carry them beside the volume cells, as boundary or geometry.
+FLAT_KINDS = frozenset(
+    {"vertex", "poly_vertex", "line", "poly_line", "triangle", "triangle_strip", "polygon", "pixel", "quad"}
+    | {"line3", "triangle6", "quad8", "quad9", "triangle7", "line4"}
+)
+
+
+class Block(NamedTuple):
+    """Cells of one kind in a file.
+
+    Attributes
+    ----------
+    kind : str
+        Name of the cell type.
+    cells : ndarray, shape (m, k), int64
+        Indices of points, in VTK order.
+    tags : ndarray, shape (m,), int64
+        The file's number for the region of every cell.
+    """
+
+    kind: str
+    cells: NDArray[np.int64]
+    tags: NDArray[np.int64]
+
+
+def volume_mesh(source: str, points: NDArray[np.float64], blocks: Sequence[Block], names: Mapping[int, str]) -> Mesh:
+    """Gather the volume cells of a file into one mesh; points that none of them uses are left out.
+
+    Parameters
+    ----------
+    source : str
+        Name of the file, for errors.
+    points : ndarray, shape (n, 3)
+        All points of the file.
+    blocks : sequence of Block
+        All cells of the file; those without volume are passed over.
+    names : mapping of int to str
+        Region name of each tag. A tag without one is called ``"region_<tag>"`` (``"volume_<n>"`` for the tag -n, which the Gmsh reader
+        gives to volumes in no physical group), or ``"body"`` if it is the only one.
+
+    Raises
+    ------
+    InputError
+        No volume cells, kinds that naibu has no elements for, two kinds in one file, or cells that name missing points.
+    """
+    volume = [block for block in blocks if block.kind not in FLAT_KINDS and len(block.cells)]
+    if not volume:
+        kinds = sorted({block.kind for block in blocks})
+        raise InputError(f"{source}: holds no volume cells (only {kinds or 'points'}); read a closed surface with read_surface and mesh it")
+    for block in volume:
+        if block.kind not in NODES_PER_CELL:
+            found = f"{len(block.cells)} cells of type {block.kind!r}"
+            raise InputError(f"{source}: holds {found}; naibu has elements for {sorted(NODES_PER_CELL)}: mesh it again with those")
+    if len(kinds := sorted({block.kind for block in volume})) > 1:
+        raise InputError(f"{source}: mixes volume cells of types {kinds}; naibu needs one type: convert all cells to tetrahedra")
+    cells = np.concatenate([block.cells for block in volume])
+    if cells.min() < 0 or cells.max() >= len(points):
+        raise InputError(f"{source}: cells name points {cells.min()} to {cells.max()}, but the file has points 0 to {len(points) - 1}")
+    tags, regions = np.unique(np.concatenate([block.tags for block in volume]), return_inverse=True)
+    unnamed = ["body" if len(tags) == 1 else (f"region_{tag}" if tag >= 0 else f"volume_{-tag}") for tag in tags.tolist()]
+    region_names = [names.get(tag, other) for tag, other in zip(tags.tolist(), unnamed, strict=True)]
+    used, numbered = np.unique(cells, return_inverse=True)
+    if len(used) < len(points):
+        points, cells = points[used], numbered.reshape(cells.shape)
+    return Mesh.from_arrays(points, cells, kinds[0], regions=regions.ravel(), region_names=region_names)
+
+
+def fan_triangles(corners: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Cut polygons into triangles (t, 3) that share each polygon's first corner.
+
+    Parameters
+    ----------
+    corners : ndarray, shape (sum of counts,), int64
+        Corners of all polygons, one after the other.
+    counts : ndarray, shape (f,), int64
+        Number of corners of each; those with fewer than three are left out.
+    """
+    starts = np.cumsum(counts) - counts
+    triangles = np.maximum(counts - 2, 0)
+    first = np.repeat(starts, triangles)
+    step = np.arange(int(triangles.sum())) - np.repeat(np.cumsum(triangles) - triangles, triangles)
+    return np.stack([corners[first], corners[first + step + 1], corners[first + step + 2]], axis=1).astype(np.int64)
+
+
+def numbers(source: str, what: str, text: bytes | str) -> NDArray[np.float64]:
+    """Return the numbers in a piece of text, naming the file and the piece if one is not a number."""
+    tokens = text.split()
+    try:
+        return np.array(tokens, dtype=np.float64)
+    except ValueError as error:
+        raise InputError(f"{source}: {what} holds something that is not a number ({error}); the file is damaged or cut off") from error

@@ -1,0 +1,127 @@
+"""Reading meshes and surfaces; the ending of the file name picks the format."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from naibu.core.errors import InputError
+from naibu.core.mesh import Mesh
+from naibu.io.mesh_formats import msh, obj, ply, stl, vrml, vtu
+
+_Reader = TypeVar("_Reader")
+_SurfaceArrays = tuple[NDArray[np.float64], NDArray[np.int64]]
+
+MESH_READERS: dict[str, Callable[[str, bytes], Mesh]] = {".vtu": vtu.read, ".msh": msh.read}
+SURFACE_READERS: dict[str, Callable[[str, bytes], _SurfaceArrays]] = {
+    ".stl": stl.read,
+    ".ply": ply.read,
+    ".obj": obj.read,
+    ".wrl": vrml.read,
+    ".vrml": vrml.read,
+}
+
+
+class Surface(NamedTuple):
+    """A triangulated surface.
+
+    Attributes
+    ----------
+    points : ndarray, shape (n, 3)
+        Positions, mm.
+    triangles : ndarray, shape (t, 3), int64
+        Point numbers, counterclockwise seen from outside where the file keeps to that.
+    """
+
+    points: NDArray[np.float64]
+    triangles: NDArray[np.int64]
+
+
+def read_mesh(path: str | os.PathLike[str], *, unit_mm: float = 1.0) -> Mesh:
+    """Read a volume mesh.
+
+    Parameters
+    ----------
+    path : path-like
+        VTK unstructured grid (``.vtu``: ascii, base64 or appended, plain, zlib or lzma) or Gmsh mesh (``.msh``: 4.1 ascii or binary, 2.2
+        ascii).
+    unit_mm : float
+        Length of the file's unit, mm: 1000 if the file is in metres.
+
+    Returns
+    -------
+    Mesh
+        Tetrahedra (linear or quadratic) or hexahedra. Regions are the physical volumes (Gmsh), or the cell array ``region`` or one of
+        the usual names for it (VTK). Points that no volume cell uses, and cells without volume, are left out.
+
+    Raises
+    ------
+    InputError
+        No such file, a format that is not read, a damaged or cut off file, or cell types that naibu has no elements for.
+    """
+    reader = _reader(path, MESH_READERS, SURFACE_READERS, "read_surface")
+    mesh = reader(Path(path).name, _content(path))
+    return Mesh(mesh.points * _unit(unit_mm), mesh.cells, mesh.cell_type, mesh.regions, mesh.region_names)
+
+
+def read_surface(path: str | os.PathLike[str], *, unit_mm: float = 1.0) -> Surface:
+    """Read a triangulated surface.
+
+    Parameters
+    ----------
+    path : path-like
+        ``.stl`` (ascii or binary), ``.ply`` (ascii or binary), ``.obj`` or VRML 2.0 (``.wrl``, ``.vrml``).
+    unit_mm : float
+        Length of the file's unit, mm: 1000 if the file is in metres.
+
+    Returns
+    -------
+    Surface
+        Points and triangles; polygons are cut into fans.
+
+    Raises
+    ------
+    InputError
+        No such file, a format that is not read, or a damaged or cut off file.
+    """
+    reader = _reader(path, SURFACE_READERS, MESH_READERS, "read_mesh")
+    name = Path(path).name
+    points, triangles = reader(name, _content(path))
+    if len(triangles) == 0:
+        raise InputError(f"{name}: holds no faces, only {len(points)} points; export the surface as triangles")
+    if triangles.min() < 0 or triangles.max() >= len(points):
+        bad = triangles.max() if triangles.max() >= len(points) else triangles.min()
+        raise InputError(f"{name}: a face names point {bad}, but the file has points 0 to {len(points) - 1}; write it again")
+    if not np.isfinite(points).all():
+        bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
+        raise InputError(f"{name}: point {bad} is {points[bad].tolist()}; every coordinate must be a finite number")
+    return Surface(points * _unit(unit_mm), triangles)
+
+
+def _reader(path: str | os.PathLike[str], readers: dict[str, _Reader], others: dict[str, object] | object, instead: str) -> _Reader:
+    """Return the reader for the ending of the file name."""
+    ending = Path(path).suffix.lower()
+    if ending not in readers:
+        hint = f": read it with {instead}" if isinstance(others, dict) and ending in others else f"; naibu reads {sorted(readers)} here"
+        raise InputError(f"{Path(path).name}: files ending in {ending!r} are not of the kind asked for{hint}")
+    return readers[ending]
+
+
+def _content(path: str | os.PathLike[str]) -> bytes:
+    """Return the bytes of a file."""
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+
+
+def _unit(unit_mm: float) -> float:
+    """Return the length of the file's unit, refusing what is not one."""
+    if not (np.isfinite(unit_mm) and unit_mm > 0):
+        raise InputError(f"unit_mm is {unit_mm!r}; give the length of the file's unit in mm, 1 for mm or 1000 for metres")
+    return float(unit_mm)

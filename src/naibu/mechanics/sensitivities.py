@@ -1,0 +1,156 @@
+"""Derivatives of a quasi-static solution with respect to parameters, by direct differentiation along the load path.
+
+At every converged state the residual ``r(u, a, p) = 0`` is differentiated once: one factorization of the exact tangent and one solve for
+each parameter. Friction remembers, through the anchors `a` of the contact points; their derivatives are carried from step to step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from naibu.mechanics.contact import Contact, ContactResponse
+from naibu.mechanics.statics import LoadState, Newton, Problem, SolverSettings
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Direction:
+    """A direction in the space of all that a problem depends on; unset parts are zero.
+
+    Attributes
+    ----------
+    materials : ndarray, shape (cells, 4), optional
+        Change of the cells' parameters, kPa.
+    contact : int
+        Index of the contact to which the following belong.
+    friction : ndarray, shape (p,), optional
+        Change of the friction coefficient of every contact point.
+    tangential_stiffness : ndarray, shape (p,), optional
+        Change of the tangential stiffness, kPa/mm.
+    start, stop : ndarray, shape (3,), optional
+        Change of the ends of the body's path, mm.
+    rotation : ndarray, shape (3,), optional
+        Rotation of the body about its reference point, rad.
+    """
+
+    materials: Array | None = None
+    contact: int = -1
+    friction: Array | None = None
+    tangential_stiffness: Array | None = None
+    start: Array | None = None
+    stop: Array | None = None
+    rotation: Array | None = None
+
+
+def sensitivities(problem: Problem, states: tuple[LoadState, ...], directions: list[Direction], *, newton: Newton | None = None) -> list[Array]:
+    """Return, for every state of the path, the derivatives (n, 3, k) of the displacement along the k directions.
+
+    Parameters
+    ----------
+    problem : Problem
+        The problem that was solved.
+    states : tuple of LoadState
+        Its solution path, the free state first.
+    directions : list of Direction
+        What to differentiate with respect to.
+    newton : Newton, optional
+        The solver of the path, to reuse its analysed linear solver.
+
+    Raises
+    ------
+    ConvergenceError
+        The tangent at a state is singular.
+    """
+    solver = newton or Newton(problem, SolverSettings())
+    count = len(directions)
+    out = [np.zeros((*problem.points.shape, count))]
+    moving = [_BodyDirections.gather(i, c, directions) for i, c in enumerate(problem.contacts)]
+    d_anchors = [m.at_rest(c) for m, c in zip(moving, problem.contacts, strict=True)]
+    for before, state in zip(states[:-1], states[1:], strict=True):
+        _, _, factorization, responses = solver.linearised(state.displacement, before.anchors, state.load)
+        rhs = np.zeros((*problem.points.shape, count))
+        for k, direction in enumerate(directions):
+            if direction.materials is not None:
+                rhs[:, :, k] = -problem.assembler.forces_of_parameter(state.displacement, direction.materials)
+        explicit = []
+        for c, m, response, da in zip(problem.contacts, moving, responses, d_anchors, strict=True):
+            change = m.explicit(c, response, da, state.load)
+            explicit.append(change)
+            for k in range(count):
+                rhs[:, :, k] += c.scattered(change.force[:, :, k], len(rhs))
+        rhs[problem.prescribed.held] = 0.0
+        du = factorization.solve(rhs.reshape(-1, count)).reshape(rhs.shape)
+        out.append(du)
+        d_anchors = [
+            change.anchors(c, response, np.einsum("pa,paik->pik", c.shape, du[c.nodes]))
+            for c, response, change in zip(problem.contacts, responses, explicit, strict=True)
+        ]
+    return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _BodyDirections:
+    """The parts of all directions that belong to one contact, stacked over the k directions."""
+
+    friction: Array
+    stiffness: Array
+    start: Array
+    stop: Array
+    rotation: Array
+
+    @classmethod
+    def gather(cls, index: int, contact: Contact, directions: list[Direction]) -> _BodyDirections:
+        n, count = len(contact.area), len(directions)
+        parts = cls(np.zeros((n, count)), np.zeros((n, count)), np.zeros((3, count)), np.zeros((3, count)), np.zeros((3, count)))
+        for k, d in enumerate(directions):
+            if d.contact != index:
+                continue
+            sources = ((parts.friction, d.friction), (parts.stiffness, d.tangential_stiffness), (parts.start, d.start), (parts.stop, d.stop), (parts.rotation, d.rotation))
+            for target, source in sources:
+                if source is not None:
+                    target[:, k] = source
+        return parts
+
+    def moved(self, contact: Contact, world: Array, load: float) -> Array:
+        """Change (p, 3, k) of local positions of points that stay at `world` (p, 3), relative to the body's reference point."""
+        translation = self.start + load * (self.stop - self.start)
+        turned = np.cross(self.rotation.T[None, :, :], world[:, None, :])
+        return -np.einsum("pkj,ji->pik", turned + translation.T[None, :, :], contact.rotation)
+
+    def at_rest(self, contact: Contact) -> Array:
+        """Change (p, 3, k) of the anchors at the beginning of loading."""
+        return self.moved(contact, contact.rest - contact.start, 0.0)
+
+    def explicit(self, contact: Contact, response: ContactResponse, d_anchors: Array, load: float) -> _Explicit:
+        """Change of local positions, tractions and forces while the nodes stay."""
+        local = self.moved(contact, response.local @ contact.rotation.T, load)
+        area = contact.area[:, None, None]
+        slipping = (response.slip_direction != 0.0).any(axis=1)
+        by_stiffness = np.where(slipping[:, None], 0.0, response.tangential / contact.tangential_stiffness[:, None])
+        known = np.einsum("pij,pjk->pik", response.anchor_stiffness, d_anchors) + response.slip_direction[:, :, None] * self.friction[:, None, :]
+        known -= area * by_stiffness[:, :, None] * self.stiffness[:, None, :]
+        force = known - np.einsum("pij,pjk->pik", response.stiffness, local)
+        turned = np.cross(self.rotation.T[None, :, :], (response.force @ contact.rotation.T)[:, None, :])
+        force += np.einsum("pkj,ji->pik", turned, contact.rotation)
+        return _Explicit(local, -known / area, force, self.stiffness)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Explicit:
+    """Changes (p, 3, k) at fixed nodes: local positions, friction traction but for its dependence on them, point forces."""
+
+    local: Array
+    traction: Array
+    force: Array
+    stiffness: Array
+
+    def anchors(self, contact: Contact, response: ContactResponse, d_points: Array) -> Array:
+        """Change (p, 3, k) of the next step's anchors, ``a = y - t / k_t``, when the points also move by `d_points` (p, 3, k)."""
+        local = self.local + np.einsum("pjk,ji->pik", d_points, contact.rotation)
+        traction = self.traction + np.einsum("pij,pjk->pik", response.tangential_stiffness, local)
+        k_t = contact.tangential_stiffness[:, None, None]
+        return local - traction / k_t + response.tangential[:, :, None] * self.stiffness[:, None, :] / k_t**2

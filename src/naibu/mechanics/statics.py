@@ -1,0 +1,364 @@
+"""Quasi-static equilibrium at finite strain: Newton's method with line search along an adaptive load path."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import scipy.sparse as sp
+from numba import njit
+from numpy.typing import NDArray
+
+from naibu.core.errors import ConvergenceError, InputError
+from naibu.core.solution import Status
+from naibu.mechanics.assembly import Assembler
+from naibu.mechanics.contact import Contact, ContactResponse
+from naibu.mechanics.linear_solvers import Factorization, LinearSolver, choose_solver
+from naibu.mechanics.supports import Prescribed
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class SolverSettings:
+    """How to follow the load path.
+
+    Attributes
+    ----------
+    first_step, largest_step, smallest_step : float
+        Fractions of the whole load.
+    tolerance : float
+        Newton's method ends when the residual force has fallen below this fraction of the contact and support forces.
+    max_iterations : int
+        Newton iterations of one load step before it is halved.
+    anchor_stiffness : float
+        Weak springs to the ground on every node, as a fraction of the mean diagonal of the tangent; they only keep a body that nothing
+        holds yet from drifting.
+    """
+
+    first_step: float = 0.125
+    largest_step: float = 0.25
+    smallest_step: float = 1e-3
+    tolerance: float = 1e-7
+    max_iterations: int = 14
+    anchor_stiffness: float = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """A body, what it is made of, what holds and presses it.
+
+    Attributes
+    ----------
+    points : ndarray, shape (n, 3)
+        Nodes in the free state, mm.
+    assembler : Assembler
+        Elements and materials; its pattern must hold the contacts' couplings (`block_pattern` with their nodes).
+    contacts : tuple of Contact
+        Rigid bodies and interfaces.
+    prescribed : Prescribed
+        Given displacements.
+    external_force : ndarray, shape (n, 3)
+        Dead load, mN, present from the beginning (weight).
+    """
+
+    points: Array
+    assembler: Assembler
+    contacts: tuple[Contact, ...]
+    prescribed: Prescribed
+    external_force: Array
+    _positions: tuple[NDArray[np.int32], ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        if not self._positions and self.contacts:
+            object.__setattr__(self, "_positions", tuple(self.assembler.pattern.positions(c.nodes) for c in self.contacts))
+
+    @property
+    def unsymmetric(self) -> bool:
+        """Whether Coulomb friction makes the tangent unsymmetric."""
+        return any(not c.bonded and float(c.friction_coefficient.min()) < 100.0 for c in self.contacts)
+
+    def with_changes(self, *, assembler: Assembler | None = None, contacts: tuple[Contact, ...] | None = None) -> Problem:
+        """Return the problem with other parameters or bodies (same nodes)."""
+        return replace(self, assembler=assembler or self.assembler, contacts=contacts if contacts is not None else self.contacts)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadState:
+    """Equilibrium at one fraction of the load: displacement (n, 3) mm, and the contact anchors with which the next step starts."""
+
+    load: float
+    displacement: Array
+    anchors: tuple[Array, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """Equilibrium states along the load path.
+
+    Attributes
+    ----------
+    states : tuple of LoadState
+        The free state, then every converged step; the last one is at full load if `status` is converged.
+    status : Status
+        How the solve ended.
+    reactions : dict
+        Force (3,), mN, of every rigid body on the soft one at the last state, and ``"prescribed"`` for the held nodes.
+    iterations : int
+        Newton iterations in all.
+    residual : float
+        Relative residual force of the last state.
+    penetration_mm : float
+        Deepest penetration of a rigid body at the last state.
+    linear_solver : str
+        The solver that was used.
+    """
+
+    states: tuple[LoadState, ...]
+    status: Status
+    reactions: dict[str, Array]
+    iterations: int
+    residual: float
+    penetration_mm: float
+    linear_solver: str
+
+    @property
+    def displacement(self) -> Array:
+        """Displacement (n, 3), mm, of the last state."""
+        return self.states[-1].displacement
+
+
+@dataclass(slots=True, eq=False)
+class Newton:
+    """Equilibrium iterations for one problem; keeps the analysed linear solver from step to step."""
+
+    problem: Problem
+    settings: SolverSettings
+    solver: LinearSolver | None = None
+    iterations: int = 0
+
+    def residual(self, u: Array, anchors: tuple[Array, ...], load: float) -> tuple[Array, float, float]:
+        """Return the out-of-balance force (n, 3) mN, a force scale mN, and the smallest det F."""
+        _, internal, smallest = self.problem.assembler.forces(u)
+        if not smallest > 0.0:
+            return internal, np.inf, smallest
+        contact = np.zeros_like(internal)
+        for c, a in zip(self.problem.contacts, anchors, strict=True):
+            contact += c.scattered(c.evaluate(u, a, load).force, len(u))
+        return self._balance(internal, contact)[0], self._balance(internal, contact)[1], smallest
+
+    def _balance(self, internal: Array, contact: Array) -> tuple[Array, float]:
+        r = internal - contact - self.problem.external_force
+        held = self.problem.prescribed.held
+        scale = float(np.abs(contact).sum() + np.abs(r[held]).sum() + np.abs(self.problem.external_force).sum())
+        r[held] = 0.0
+        return r, scale
+
+    def linearised(self, u: Array, anchors: tuple[Array, ...], load: float) -> tuple[Array, float, Factorization, list[ContactResponse]]:
+        """Return residual, force scale, the factorized tangent (held rows and columns replaced by the identity) and contact responses.
+
+        Raises
+        ------
+        ConvergenceError
+            An inverted element, or a singular tangent.
+        """
+        p = self.problem
+        _, internal, blocks, smallest = p.assembler.evaluate(u)
+        if not smallest > 0.0:
+            raise ConvergenceError(f"an element is inverted (det F = {smallest:.3g})")
+        contact = np.zeros_like(internal)
+        responses = []
+        for c, a, positions in zip(p.contacts, anchors, p._positions, strict=True):
+            response = c.evaluate(u, a, load)
+            contact += c.scattered(response.force, len(u))
+            c.add_stiffness(response, p.assembler.pattern, positions, blocks)
+            responses.append(response)
+        residual, scale = self._balance(internal, contact)
+        matrix = constrained(p.assembler.pattern.matrix(blocks), p.prescribed.held, self.settings.anchor_stiffness)
+        if self.solver is None:
+            self.solver = choose_solver(matrix, p.points, p.prescribed.held.ravel(), symmetric=not p.unsymmetric)
+        return residual, scale, self.solver.factorize(matrix), responses
+
+    def solve(self, u: Array, anchors: tuple[Array, ...], load: float) -> tuple[Array, float] | None:
+        """Return displacement and relative residual in equilibrium, starting from `u`; None where the iteration fails."""
+        u = np.where(self.problem.prescribed.held, load * self.problem.prescribed.values, u)
+        norms: list[float] = []
+        for _ in range(self.settings.max_iterations):
+            try:
+                residual, scale, factorization, _ = self.linearised(u, anchors, load)
+            except ConvergenceError:
+                return None
+            norm = float(np.abs(residual).sum())
+            if norm <= self.settings.tolerance * max(scale, 1e-9):
+                return u, norm / max(scale, 1e-9)
+            norms.append(norm)
+            if len(norms) > 6 and norm > 0.5 * norms[-5]:
+                return None
+            self.iterations += 1
+            step = -factorization.solve(residual.ravel()).reshape(-1, 3)
+            found = self._line_search(u, step, anchors, load, norm)
+            if found is None:
+                return None
+            u = found
+        return None
+
+    def _line_search(self, u: Array, step: Array, anchors: tuple[Array, ...], load: float, norm: float) -> Array | None:
+        """Return the first of u + step, u + step / 2, ... that inverts no element and does not raise the residual much."""
+        best: tuple[float, Array] | None = None
+        for k in range(7):
+            trial = u + 0.5**k * step
+            residual, _, smallest = self.residual(trial, anchors, load)
+            if smallest > 0.0:
+                value = float(np.abs(residual).sum())
+                if value < norm * (1.0 - 0.1 * 0.5**k):
+                    return trial
+                if best is None or value < best[0]:
+                    best = value, trial
+        # contact may have to pass through a higher residual when points change status
+        return best[1] if best is not None and best[0] < 5.0 * norm else None
+
+
+def constrained(matrix: sp.bsr_matrix, held: NDArray[np.bool_], anchor_stiffness: float = 0.0) -> sp.bsr_matrix:
+    """Return `matrix` with held rows and columns replaced by a scaled identity, and weak springs on the diagonal.
+
+    Changes the blocks of `matrix` in place.
+    """
+    _constrain(matrix.indptr, matrix.indices, matrix.data, held, anchor_stiffness)
+    return matrix
+
+
+@njit(cache=True)
+def _constrain(indptr, indices, blocks, held, anchor_stiffness):  # type: ignore[no-untyped-def]  # pragma: no cover
+    n = len(held)
+    mean = 0.0
+    for i in range(n):
+        for at in range(indptr[i], indptr[i + 1]):
+            if indices[at] == i:
+                mean += (blocks[at, 0, 0] + blocks[at, 1, 1] + blocks[at, 2, 2]) / (3.0 * n)
+    for i in range(n):
+        for at in range(indptr[i], indptr[i + 1]):
+            j = indices[at]
+            for a in range(3):
+                for b in range(3):
+                    if held[i, a] or held[j, b]:
+                        blocks[at, a, b] = mean if (i == j and a == b) else 0.0
+                    elif i == j and a == b:
+                        blocks[at, a, b] += anchor_stiffness * mean
+
+
+def solve(
+    problem: Problem,
+    *,
+    settings: SolverSettings | None = None,
+    throw: bool = True,
+    callback: Callable[[float], None] | None = None,
+    solver: LinearSolver | None = None,
+) -> Solution:
+    """Follow the load from the free state to its end.
+
+    Parameters
+    ----------
+    problem : Problem
+        Body, materials, supports.
+    settings : SolverSettings, optional
+        Steps and tolerances.
+    throw : bool
+        Whether to raise when the end is not reached, or to return what was reached with its status.
+    callback : callable, optional
+        Called with the fraction of the load after every step, for progress.
+    solver : LinearSolver, optional
+        A linear solver for the problem's pattern; chosen automatically by default.
+
+    Raises
+    ------
+    ConvergenceError
+        The end of the load was not reached (only with `throw`).
+    InputError
+        A displacement that is not finite was prescribed.
+    """
+    chosen = settings or SolverSettings()
+    if not np.isfinite(problem.external_force).all():
+        raise InputError("external forces must be finite numbers")
+    newton = Newton(problem, chosen, solver)
+    first = LoadState(0.0, np.zeros_like(problem.points), tuple(c.anchors_at_rest() for c in problem.contacts))
+    states, step, residual = [first], chosen.first_step, 0.0
+    while states[-1].load < 1.0 - 1e-12:
+        last = states[-1]
+        load = min(1.0, last.load + step)
+        found = newton.solve(_extrapolated(states, load), last.anchors, load)
+        if found is None and len(states) > 1:
+            found = newton.solve(last.displacement, last.anchors, load)
+        if found is None:
+            step *= 0.5
+            if step < chosen.smallest_step:
+                return _finish(newton, states, residual, Status.STEP_TOO_SMALL, throw)
+            continue
+        residual = found[1]
+        states.append(advanced(problem, found[0], last.anchors, load))
+        step = min(chosen.largest_step, 1.5 * step)
+        if callback is not None:
+            callback(load)
+    return _finish(newton, states, residual, Status.CONVERGED, throw)
+
+
+def follow(problem: Problem, loads: list[float], guesses: list[Array], *, settings: SolverSettings | None = None, solver: LinearSolver | None = None) -> Solution | None:
+    """Solve at given fractions of the load from good guesses of the displacement; None where Newton's method fails.
+
+    Parameters
+    ----------
+    problem : Problem
+        Body, materials, supports.
+    loads : list of float
+        Increasing fractions of the load, ending at 1; the free state is not listed.
+    guesses : list of ndarray, shape (n, 3)
+        Displacements to start from, mm, for instance those of a similar problem.
+    settings, solver
+        As for `solve`.
+    """
+    newton = Newton(problem, settings or SolverSettings(), solver)
+    states = [LoadState(0.0, np.zeros_like(problem.points), tuple(c.anchors_at_rest() for c in problem.contacts))]
+    residual = 0.0
+    for load, guess in zip(loads, guesses, strict=True):
+        found = newton.solve(guess, states[-1].anchors, load)
+        if found is None:
+            return None
+        residual = found[1]
+        states.append(advanced(problem, found[0], states[-1].anchors, load))
+    return _finish(newton, states, residual, Status.CONVERGED, True)
+
+
+def advanced(problem: Problem, u: Array, anchors: tuple[Array, ...], load: float) -> LoadState:
+    """Return the converged state `u` with the anchors for the next step."""
+    moved = tuple(c.next_anchors(c.evaluate(u, a, load)) for c, a in zip(problem.contacts, anchors, strict=True))
+    return LoadState(load, u, moved)
+
+
+def _extrapolated(states: list[LoadState], load: float) -> Array:
+    """Guess the displacement at `load` from the last two states."""
+    last = states[-1]
+    if len(states) < 2:
+        return last.displacement
+    before = states[-2]
+    return last.displacement + (load - last.load) / (last.load - before.load) * (last.displacement - before.displacement)
+
+
+def _finish(newton: Newton, states: list[LoadState], residual: float, status: Status, throw: bool) -> Solution:
+    if throw and not status.ok:
+        raise ConvergenceError(f"stopped at {100 * states[-1].load:.1f} % of the load. {status.value}")
+    problem, last = newton.problem, states[-1]
+    reactions: dict[str, Array] = {}
+    penetration = 0.0
+    contact = np.zeros_like(last.displacement)
+    anchors = states[-2].anchors if len(states) > 1 else last.anchors
+    for c, a in zip(problem.contacts, anchors, strict=True):
+        response = c.evaluate(last.displacement, a, last.load)
+        nodal = c.scattered(response.force, len(contact))
+        contact += nodal
+        reactions[c.name] = (response.force @ c.rotation.T).sum(axis=0)
+        penetration = max(penetration, float(-response.gap.min()))
+    internal = problem.assembler.forces(last.displacement)[1]
+    held = problem.prescribed.held
+    reactions["prescribed"] = np.where(held, internal - contact - problem.external_force, 0.0).sum(axis=0)
+    name = newton.solver.name if newton.solver is not None else "none"
+    return Solution(tuple(states), status, reactions, newton.iterations, residual, penetration, name)

@@ -1,0 +1,160 @@
+"""What holds and presses a body: prescribed nodes, rigid bodies in contact, interfaces between blocks, weight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from naibu.core.errors import InputError
+from naibu.mechanics.contact import STICK, Contact, RigidSurface, plane
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prescribed:
+    """Displacement components that are given; they grow in proportion to the load.
+
+    Attributes
+    ----------
+    held : ndarray, shape (n, 3), bool
+        Which components are prescribed.
+    values : ndarray, shape (n, 3)
+        Their values at full load, mm.
+    """
+
+    held: NDArray[np.bool_]
+    values: Array
+
+    @classmethod
+    def nothing(cls, n_points: int) -> Prescribed:
+        """Return a support that holds nothing."""
+        return cls(np.zeros((n_points, 3), dtype=bool), np.zeros((n_points, 3)))
+
+    def and_also(self, nodes: ArrayLike, values: ArrayLike, components: tuple[bool, bool, bool] = (True, True, True)) -> Prescribed:
+        """Return the support with the `components` of `nodes` prescribed to `values` (3,) or (len(nodes), 3), mm, as well.
+
+        Raises
+        ------
+        InputError
+            A node number outside the mesh, or a value that is not finite.
+        """
+        index = np.asarray(nodes, dtype=np.int64)
+        given = np.broadcast_to(np.asarray(values, dtype=float), (len(index), 3))
+        if len(index) and (index.min() < 0 or index.max() >= len(self.held)):
+            raise InputError(f"prescribed node {index.max()} does not exist; the mesh has nodes 0 to {len(self.held) - 1}")
+        if not np.isfinite(given).all():
+            raise InputError("prescribed displacements must be finite numbers; leave a component free instead of giving NaN")
+        held, all_values = self.held.copy(), self.values.copy()
+        for axis in np.flatnonzero(components):
+            held[index, axis] = True
+            all_values[index, axis] = given[:, axis]
+        return Prescribed(held, all_values)
+
+
+@dataclass(frozen=True, slots=True)
+class Friction:
+    """How a surface rubs on another.
+
+    Attributes
+    ----------
+    coefficient : float
+        Coulomb's coefficient; `STICK` or more never slips, 0 slips freely.
+    stiffness : float
+        Tangential stiffness before slip, kPa/mm; a soft one makes tangential springs.
+    """
+
+    coefficient: float = STICK
+    stiffness: float = 200.0
+
+    def __post_init__(self) -> None:
+        if not self.coefficient >= 0.0 or not self.stiffness > 0.0:
+            raise InputError(f"friction needs a coefficient >= 0 and a stiffness > 0 kPa/mm, not {self.coefficient:g} and {self.stiffness:g}")
+
+
+def rigid_contact(
+    name: str, points: Array, faces: NDArray[np.int64], surface: RigidSurface, *, start: ArrayLike, stop: ArrayLike,
+    friction: Friction | list[Friction], normal_stiffness: float, bonded: bool = False, rotation: Array | None = None,
+) -> Contact:  # fmt: skip
+    """Let boundary faces touch a rigid body.
+
+    Parameters
+    ----------
+    name : str
+        Name of the body, under which its reaction is returned.
+    points : ndarray, shape (n, 3)
+        Nodes of the mesh in the free state, mm.
+    faces : ndarray, shape (f, 3) or (f, 4), int64
+        Boundary faces that may touch.
+    surface : RigidSurface
+        Shape of the body.
+    start, stop : array_like, shape (3,)
+        Path of the body's reference point, mm.
+    friction : Friction or list of Friction
+        One for all faces or one for each face.
+    normal_stiffness : float
+        Penalty, kPa/mm: a pressure p lets the surface penetrate by p / normal_stiffness.
+    bonded : bool
+        Whether the body sticks to the faces for good (glue): no lift-off, no slip.
+    rotation : ndarray, shape (3, 3), optional
+        Constant orientation of the body.
+
+    Raises
+    ------
+    InputError
+        No faces, or a penalty that is not positive.
+    """
+    if len(faces) == 0:
+        raise InputError(f"{name}: no faces to touch; check the selection of the surface")
+    if not normal_stiffness > 0.0:
+        raise InputError(f"{name}: the normal stiffness must be positive, not {normal_stiffness:g} kPa/mm")
+    shape, area = face_quadrature(points, faces)
+    n_q = shape.shape[0]
+    nodes = np.repeat(faces, n_q, axis=0)
+    coefficients = np.tile(shape, (len(faces), 1))
+    pairs = [friction] * len(faces) if isinstance(friction, Friction) else friction
+    return Contact(
+        name, nodes, coefficients, np.einsum("pk,pki->pi", coefficients, points[nodes]), area.ravel(), surface,
+        np.asarray(start, dtype=float), np.asarray(stop, dtype=float), np.eye(3) if rotation is None else rotation, normal_stiffness,
+        np.repeat([f.stiffness for f in pairs], n_q), np.repeat([f.coefficient for f in pairs], n_q), bonded,
+    )  # fmt: skip
+
+
+def interface(name: str, points: Array, pairs: NDArray[np.int64], area: Array, *, friction: Friction, normal_stiffness: float, bonded: bool = False) -> Contact:
+    """Lay one block on another: pairs (k, 2) of a lower and an upper node at the same place, each standing for `area` (k,) mm2.
+
+    The blocks may separate and slide (``bonded=False``); the normal is vertical in the free state and kept, which suits interfaces that
+    stay near horizontal.
+
+    Raises
+    ------
+    InputError
+        The nodes of a pair do not coincide.
+    """
+    distance = np.linalg.norm(points[pairs[:, 1]] - points[pairs[:, 0]], axis=1)
+    if len(pairs) == 0 or distance.max() > 1e-6:
+        raise InputError(f"{name}: an interface needs pairs of coinciding nodes; split the mesh with split_at_plane")
+    k = len(pairs)
+    return Contact(
+        name, pairs, np.tile([-1.0, 1.0], (k, 1)), np.zeros((k, 3)), area, plane((0.0, 0.0, 1.0)), np.zeros(3), np.zeros(3), np.eye(3),
+        normal_stiffness, np.full(k, friction.stiffness), np.full(k, friction.coefficient), bonded,
+    )  # fmt: skip
+
+
+def face_quadrature(points: Array, faces: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Return shape values (q, k) of the quadrature points of faces, and the areas (f, q), mm2, that they stand for."""
+    corners = points[faces]
+    if faces.shape[1] == 3:
+        shape = np.full((3, 3), 1.0 / 6.0) + 0.5 * np.eye(3)
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        return shape, np.repeat(np.linalg.norm(normal, axis=1)[:, None] / 6.0, 3, axis=1)
+    g = 1.0 / np.sqrt(3.0)
+    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=float)
+    at = g * signs
+    shape = 0.25 * (1 + at[:, None, 0] * signs[None, :, 0]) * (1 + at[:, None, 1] * signs[None, :, 1])
+    d_xi = 0.25 * signs[None, :, 0] * (1 + at[:, None, 1] * signs[None, :, 1])
+    d_eta = 0.25 * signs[None, :, 1] * (1 + at[:, None, 0] * signs[None, :, 0])
+    tangents = np.einsum("qk,fki->fqi", d_xi, corners), np.einsum("qk,fki->fqi", d_eta, corners)
+    return shape, np.linalg.norm(np.cross(*tangents), axis=2)

@@ -1,0 +1,217 @@
+"""The boundary of a mesh: its faces, the area that belongs to every node, and selections by plane and by direction."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from naibu.core.errors import InputError
+from naibu.core.mesh import Mesh
+
+# Faces of a cell in VTK order, counterclockwise seen from outside; quadratic triangles list corners, then mid-edge nodes.
+CELL_FACES = {
+    "tetra": np.array([[0, 1, 3], [1, 2, 3], [2, 0, 3], [0, 2, 1]]),
+    "tetra10": np.array([[0, 1, 3, 4, 8, 7], [1, 2, 3, 5, 9, 8], [2, 0, 3, 6, 7, 9], [0, 2, 1, 6, 5, 4]]),
+    "hexahedron": np.array([[0, 4, 7, 3], [1, 2, 6, 5], [0, 1, 5, 4], [3, 7, 6, 2], [0, 3, 2, 1], [4, 5, 6, 7]]),
+}
+_SIDES = {"x-": (0, -1), "x+": (0, 1), "y-": (1, -1), "y+": (1, 1), "z-": (2, -1), "z+": (2, 1)}
+_QUAD_TURNS = (np.arange(4)[:, None] + np.arange(4)) % 4
+_GAUSS = 1 / np.sqrt(3.0)
+
+
+class Boundary(NamedTuple):
+    """Faces that belong to one cell only.
+
+    Attributes
+    ----------
+    faces : ndarray, shape (f, k), int64
+        Node numbers, counterclockwise seen from outside: k = 3 (``"tetra"``), 4 (``"hexahedron"``) or 6 (``"tetra10"``: three
+        corners, then the mid-edge nodes).
+    cells : ndarray, shape (f,), int64
+        The cell that each face belongs to.
+    """
+
+    faces: NDArray[np.int64]
+    cells: NDArray[np.int64]
+
+
+def boundary_faces(mesh: Mesh) -> Boundary:
+    """Return the outward oriented faces of the mesh that have a cell on one side only.
+
+    Raises
+    ------
+    InputError
+        A face is shared by more than two cells, so the mesh does not conform.
+    """
+    return faces_of_cells(mesh.cells, mesh.cell_type)
+
+
+def faces_of_cells(cells: NDArray[np.int64], cell_type: str) -> Boundary:
+    """Return the boundary of bare cells (m, k); see `boundary_faces`."""
+    local = CELL_FACES[cell_type]
+    faces = cells[:, local].reshape(-1, local.shape[1])
+    corners = 4 if cell_type == "hexahedron" else 3
+    keys = np.sort(faces[:, :corners], axis=1)
+    order = np.lexsort(keys.T)
+    starts = np.flatnonzero(np.concatenate([[True], (np.diff(keys[order], axis=0) != 0).any(axis=1)]))
+    counts = np.diff(np.concatenate([starts, [len(faces)]]))
+    if counts.max() > 2:
+        bad = keys[order[starts[counts.argmax()]]]
+        raise InputError(f"{counts.max()} cells share the face with nodes {bad.tolist()}; at most two can: remove the doubled cells")
+    single = np.sort(order[starts[counts == 1]])
+    return Boundary(faces[single], (single // len(local)).astype(np.int64))
+
+
+def boundary_nodes(mesh: Mesh) -> NDArray[np.int64]:
+    """Return the sorted numbers (n,) of the nodes on the boundary."""
+    return np.unique(boundary_faces(mesh).faces)
+
+
+def triangles_of_faces(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Split faces (f, 3 | 4 | 6) into triangles (t, 3) of the same orientation.
+
+    Quadrilaterals are cut by the diagonal of their lowest node, like `naibu.meshing.splitting.split_hexahedra` does, and quadratic
+    triangles into four.
+    """
+    if faces.shape[1] == 3:
+        return faces
+    if faces.shape[1] == 6:
+        return faces[:, [0, 3, 5, 3, 1, 4, 5, 4, 2, 3, 4, 5]].reshape(-1, 3)
+    turned = np.take_along_axis(faces, _QUAD_TURNS[faces.argmin(axis=1)], axis=1)
+    return turned[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+
+
+def face_normals(points: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the area vector (f, 3), mm^2, of faces (f, 3 | 4 | 6): it points outwards and its length is the area of a plane face."""
+    p = points[faces]
+    if faces.shape[1] == 4:
+        return 0.5 * np.cross(p[:, 2] - p[:, 0], p[:, 3] - p[:, 1])
+    return 0.5 * np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+
+
+def node_areas(mesh: Mesh, faces: NDArray[np.int64] | None = None) -> NDArray[np.float64]:
+    r"""Return the tributary area of every node, :math:`\int N_i \, dA`.
+
+    A uniform pressure loads node i by pressure times this area.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Mesh with n points.
+    faces : ndarray, shape (f, k), optional
+        Faces to integrate over; default: the whole boundary.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Areas, mm^2; their sum is the area of the faces. Corners of quadratic triangles (straight-sided) get none.
+    """
+    faces = boundary_faces(mesh).faces if faces is None else faces
+    if faces.shape[1] == 4:
+        shares = _quad_shares(mesh.points[faces])
+    else:
+        area = np.linalg.norm(face_normals(mesh.points, faces), axis=1)
+        weights = np.full(3, 1 / 3) if faces.shape[1] == 3 else np.repeat([0, 1 / 3], 3)
+        shares = area[:, None] * weights
+    return np.asarray(np.bincount(faces.ravel(), weights=shares.ravel(), minlength=mesh.n_points), dtype=np.float64)
+
+
+def nodes_on_plane(
+    mesh: Mesh, point_mm: ArrayLike, normal: ArrayLike, *, tolerance_mm: float | None = None
+) -> NDArray[np.int64]:
+    """Return the numbers of the nodes on a plane.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Any mesh.
+    point_mm : array_like, shape (3,)
+        A point of the plane, mm.
+    normal : array_like, shape (3,)
+        Its normal, of any length but zero.
+    tolerance_mm : float, optional
+        Largest distance from the plane; default: a millionth of the diagonal of the mesh.
+
+    Returns
+    -------
+    ndarray, shape (k,), int64
+        Sorted node numbers; empty if the plane meets no node.
+
+    Raises
+    ------
+    InputError
+        The normal is zero.
+    """
+    distance = (mesh.points - np.asarray(point_mm, dtype=np.float64)) @ _unit(normal)
+    limit = 1e-6 * float(np.linalg.norm(np.ptp(mesh.points, axis=0))) if tolerance_mm is None else tolerance_mm
+    return np.flatnonzero(np.abs(distance) <= limit).astype(np.int64)
+
+
+def side_nodes(mesh: Mesh, side: str, *, tolerance_mm: float | None = None) -> NDArray[np.int64]:
+    """Return the nodes at one end of the mesh: ``"z-"`` are those of least z, ``"x+"`` those of greatest x.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Any mesh.
+    side : {"x-", "x+", "y-", "y+", "z-", "z+"}
+        Axis and end.
+    tolerance_mm : float, optional
+        See `nodes_on_plane`.
+
+    Raises
+    ------
+    InputError
+        `side` is not one of the six names.
+    """
+    if side not in _SIDES:
+        raise InputError(f"side is {side!r}; use one of {sorted(_SIDES)}")
+    axis, sign = _SIDES[side]
+    extreme = mesh.points[(sign * mesh.points[:, axis]).argmax()]
+    return nodes_on_plane(mesh, extreme, np.eye(3)[axis], tolerance_mm=tolerance_mm)
+
+
+def faces_towards(mesh: Mesh, direction: ArrayLike, *, max_angle_deg: float = 45.0) -> NDArray[np.int64]:
+    """Return the boundary faces (f, k) whose outward normal is within `max_angle_deg` of `direction` (3,).
+
+    Raises
+    ------
+    InputError
+        The direction is zero.
+    """
+    faces = boundary_faces(mesh).faces
+    normals = face_normals(mesh.points, faces)
+    cosine = (normals @ _unit(direction)) / np.linalg.norm(normals, axis=1)
+    towards: NDArray[np.bool_] = cosine >= np.cos(np.radians(max_angle_deg)) - 1e-12
+    return faces[towards]
+
+
+def faces_among(mesh: Mesh, nodes: ArrayLike) -> NDArray[np.int64]:
+    """Return the boundary faces (f, k) all of whose nodes are in `nodes` (n,)."""
+    chosen = np.zeros(mesh.n_points, dtype=bool)
+    chosen[np.asarray(nodes, dtype=np.int64)] = True
+    faces = boundary_faces(mesh).faces
+    return faces[chosen[faces].all(axis=1)]
+
+
+def _unit(vector: ArrayLike) -> NDArray[np.float64]:
+    """Return a direction of length one."""
+    array = np.asarray(vector, dtype=np.float64)
+    length = float(np.linalg.norm(array))
+    if array.shape != (3,) or not length > 0:
+        raise InputError(f"the direction is {array.tolist()}; give three numbers that are not all zero")
+    return array / length
+
+
+def _quad_shares(p: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the integral (f, 4) of each bilinear shape function over quadrilaterals p (f, 4, 3), by 2 x 2 Gauss points."""
+    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=np.float64)
+    shares = np.zeros(p.shape[:2])
+    for r, s in signs * _GAUSS:
+        shape = (1 + r * signs[:, 0]) * (1 + s * signs[:, 1]) / 4
+        along_r = np.einsum("i,fix->fx", signs[:, 0] * (1 + s * signs[:, 1]) / 4, p)
+        along_s = np.einsum("i,fix->fx", signs[:, 1] * (1 + r * signs[:, 0]) / 4, p)
+        shares += np.linalg.norm(np.cross(along_r, along_s), axis=1)[:, None] * shape
+    return shares
