@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import os
 import sys
 from pathlib import Path
 from typing import Protocol
@@ -47,6 +48,7 @@ class LinearSolver(Protocol):
 @functools.cache
 def pardiso_library() -> ctypes.CDLL | None:
     """Return the oneMKL runtime library if its wheel is installed, else None."""
+    os.environ.setdefault("KMP_BLOCKTIME", "0")  # idle threads sleep at once instead of spinning beside Numba's
     names = ("libmkl_rt.so.3", "libmkl_rt.so.2", "libmkl_rt.so.1", "libmkl_rt.2.dylib", "mkl_rt.3.dll", "mkl_rt.2.dll")
     folders = [Path(sys.prefix) / "lib", Path(sys.prefix) / "Library" / "bin"]
     for path in (folder / name for folder in folders for name in names):

@@ -41,7 +41,7 @@ class SolverSettings:
     largest_step: float = 0.25
     smallest_step: float = 1e-3
     tolerance: float = 1e-7
-    max_iterations: int = 14
+    max_iterations: int = 25
     anchor_stiffness: float = 1e-9
 
 
@@ -193,30 +193,45 @@ class Newton:
             if norm <= self.settings.tolerance * max(scale, 1e-9):
                 return u, norm / max(scale, 1e-9)
             norms.append(norm)
-            if len(norms) > 6 and norm > 0.5 * norms[-5]:
+            if len(norms) > 8 and norm > 0.5 * norms[-7]:
                 return None
             self.iterations += 1
             step = -factorization.solve(residual.ravel()).reshape(-1, 3)
-            found = self._line_search(u, step, anchors, load, norm)
+            found = self._line_search(u, step, anchors, load, residual)
             if found is None:
                 return None
             u = found
         return None
 
-    def _line_search(self, u: Array, step: Array, anchors: tuple[Array, ...], load: float, norm: float) -> Array | None:
-        """Return the first of u + step, u + step / 2, ... that inverts no element and does not raise the residual much."""
-        best: tuple[float, Array] | None = None
-        for k in range(7):
-            trial = u + 0.5**k * step
-            residual, _, smallest = self.residual(trial, anchors, load)
-            if smallest > 0.0:
-                value = float(np.abs(residual).sum())
-                if value < norm * (1.0 - 0.1 * 0.5**k):
-                    return trial
-                if best is None or value < best[0]:
-                    best = value, trial
-        # contact may have to pass through a higher residual when points change status
-        return best[1] if best is not None and best[0] < 5.0 * norm else None
+    def _line_search(self, u: Array, step: Array, anchors: tuple[Array, ...], load: float, residual: Array) -> Array | None:
+        """Return ``u + a step`` with a in (0, 1] where the work of the residual on the step has fallen enough; None where all invert elements.
+
+        The work ``r . step`` vanishes at equilibrium along the step. Unlike the norm of r it may be trusted when points change their
+        contact status.
+        """
+        before = float(np.vdot(residual, step))
+        low, high, a = 0.0, 1.0, 1.0
+        work_low = before
+        best = None
+        for _ in range(9):
+            trial = u + a * step
+            r, _, smallest = self.residual(trial, anchors, load)
+            if not smallest > 0.0:
+                high = a
+                a = 0.5 * (low + a)
+                continue
+            work = float(np.vdot(r, step))
+            best = trial
+            if abs(work) <= 0.5 * abs(before) or (a == 1.0 and work * before > 0.0):
+                return trial
+            if work * before > 0.0:
+                low, work_low = a, work
+                a = 0.5 * (a + high)
+            else:
+                high = a
+                guess = low + (a - low) * work_low / (work_low - work)
+                a = min(max(guess, low + 0.1 * (a - low)), low + 0.9 * (a - low))
+        return best
 
 
 def constrained(matrix: sp.bsr_matrix, held: NDArray[np.bool_], anchor_stiffness: float = 0.0) -> sp.bsr_matrix:

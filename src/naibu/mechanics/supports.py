@@ -11,6 +11,7 @@ from naibu.core.errors import InputError
 from naibu.mechanics.contact import STICK, Contact, RigidSurface, plane
 
 Array = NDArray[np.float64]
+QUADRATURE_ORDER = 3  # Gauss points a side of a quadrilateral face: contact edges cross faces, so more than elasticity needs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,11 +151,10 @@ def face_quadrature(points: Array, faces: NDArray[np.int64]) -> tuple[Array, Arr
         shape = np.full((3, 3), 1.0 / 6.0) + 0.5 * np.eye(3)
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         return shape, np.repeat(np.linalg.norm(normal, axis=1)[:, None] / 6.0, 3, axis=1)
-    g = 1.0 / np.sqrt(3.0)
+    nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE_ORDER)
+    xi, eta = (a.ravel() for a in np.meshgrid(nodes, nodes, indexing="ij"))
+    weight = np.outer(weights, weights).ravel()
     signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=float)
-    at = g * signs
-    shape = 0.25 * (1 + at[:, None, 0] * signs[None, :, 0]) * (1 + at[:, None, 1] * signs[None, :, 1])
-    d_xi = 0.25 * signs[None, :, 0] * (1 + at[:, None, 1] * signs[None, :, 1])
-    d_eta = 0.25 * signs[None, :, 1] * (1 + at[:, None, 0] * signs[None, :, 0])
-    tangents = np.einsum("qk,fki->fqi", d_xi, corners), np.einsum("qk,fki->fqi", d_eta, corners)
-    return shape, np.linalg.norm(np.cross(*tangents), axis=2)
+    along, across = 1 + xi[:, None] * signs[:, 0], 1 + eta[:, None] * signs[:, 1]
+    tangents = [np.einsum("qk,fki->fqi", d, corners) for d in (0.25 * signs[:, 0] * across, 0.25 * along * signs[:, 1])]
+    return 0.25 * along * across, weight * np.linalg.norm(np.cross(*tangents), axis=2)
