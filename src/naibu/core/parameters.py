@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from naibu.core.errors import InputError
 
+MAX_POISSON_RATIO = 0.4995  # beyond it a solid is incompressible for all that displacements can tell
+
 Scale = Literal["linear", "log", "incompressibility"]
 
 
@@ -27,7 +29,8 @@ class Parameter:
     unit : str
         Unit of the physical value, empty when it has none.
     scale : {"linear", "log", "incompressibility"}
-        How the optimiser sees it: as it is, as ln(value), or, for a Poisson ratio, as ln(1 - 2 value). Every real number is then admissible.
+        How the optimiser sees it: as it is, as ln(value), or, for a Poisson ratio, as
+        ln(0.999 - 2 value), which keeps it below 0.4995. Every real number is then admissible.
     prior_sd : float
         Standard deviation of the prior on the optimiser's scale; infinite for none.
     fixed : bool
@@ -46,8 +49,8 @@ class Parameter:
             raise InputError(f"parameter {self.name!r} must be a finite number, not {self.value}")
         if self.scale == "log" and not self.value > 0.0:
             raise InputError(f"parameter {self.name!r} must be positive, not {self.value:g}")
-        if self.scale == "incompressibility" and not self.value < 0.5:
-            raise InputError(f"parameter {self.name!r} must be below 0.5, not {self.value:g}")
+        if self.scale == "incompressibility" and not self.value < MAX_POISSON_RATIO:
+            raise InputError(f"parameter {self.name!r} must be below {MAX_POISSON_RATIO}, not {self.value:g}")
         if not self.prior_sd > 0.0:
             raise InputError(f"parameter {self.name!r} needs a positive prior standard deviation, not {self.prior_sd:g}; fix it instead")
 
@@ -55,19 +58,19 @@ class Parameter:
         """Return the optimiser's value of a physical one."""
         if self.scale == "log":
             return float(np.log(value))
-        return float(np.log1p(-2.0 * value)) if self.scale == "incompressibility" else value
+        return float(np.log(2.0 * (MAX_POISSON_RATIO - value))) if self.scale == "incompressibility" else value
 
     def physical(self, inner: float) -> float:
         """Return the physical value of the optimiser's."""
         if self.scale == "log":
             return float(np.exp(inner))
-        return float(-0.5 * np.expm1(inner)) if self.scale == "incompressibility" else inner
+        return float(MAX_POISSON_RATIO - 0.5 * np.exp(inner)) if self.scale == "incompressibility" else inner
 
     def slope(self, value: float) -> float:
         """Return d physical / d inner at a physical value."""
         if self.scale == "log":
             return value
-        return value - 0.5 if self.scale == "incompressibility" else 1.0
+        return value - MAX_POISSON_RATIO if self.scale == "incompressibility" else 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

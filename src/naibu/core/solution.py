@@ -11,11 +11,14 @@ class Status(Enum):
     CONVERGED = "Converged."
     STEP_TOO_SMALL = (
         "The load step became too small: Newton's method failed even for a tiny increment. The body may buckle, a corner may fold, or the "
-        "load is more than the mesh can follow. Refine the mesh near the indenter, lower the load or the Poisson ratio, or ask for more steps."
+        "load is more than the mesh can follow. Refine the mesh near the indenter, lower the load or the Poisson ratio, or ask for "
+        "more steps."
     )
     SINGULAR = "The linear system is singular: the body can move freely. Hold it by a fixed support, a bonded contact, or friction."
     INTERRUPTED = "Interrupted by the user; what is returned is the best so far."
-    ITERATION_LIMIT = "The iteration limit was reached before the tolerance; the result may be used with care, or continued with more iterations."
+    ITERATION_LIMIT = (
+        "The iteration limit was reached before the tolerance; the result may be used with care, or continued with more iterations."
+    )
 
     @property
     def ok(self) -> bool:

@@ -7,7 +7,9 @@ of the materials' parameters includes what the nuisances cost.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,13 +18,15 @@ from numpy.typing import NDArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.parameters import ParameterSet
 from naibu.core.solution import Status
+from naibu.identification.lattice import FILLED_SD_MM
+from naibu.identification.pose import Pose, registration
 from naibu.identification.specimen import Specimen
-from naibu.mechanics.linear_solvers import LinearSolver
+from naibu.mechanics.linear_solvers import LinearSolver, use_one_thread
 from naibu.mechanics.sensitivities import sensitivities
-from naibu.mechanics.statics import Newton, Solution, SolverSettings, follow, solve
+from naibu.mechanics.statics import Newton, Solution, SolverSettings, solve
 
 Array = NDArray[np.float64]
-_PATH = SolverSettings(first_step=0.15, largest_step=0.2, tolerance=1e-6)
+_PATH = SolverSettings(tolerance=1e-6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,30 +42,28 @@ class NoiseModel:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pose:
-    """Rigid pose of the object in a loaded scan: ``x = rotation @ (X - centre) + position``."""
-
-    rotation: Array
-    centre: Array
-    position: Array
-
-    def applied(self, points: Array) -> Array:
-        """Return points (k, 3) of the object's frame in the scan's."""
-        return (points - self.centre) @ self.rotation.T + self.position
-
-    def moved(self, change: Array) -> Pose:
-        """Return the pose after a translation ``change[:3]``, mm, and a rotation vector ``change[3:]``, rad."""
-        return Pose(_rotation(change[3:]) @ self.rotation, self.centre, self.position + change[:3])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Trial:
-    """One measured state of a specimen."""
+    """One measured state of a specimen.
+
+    Attributes
+    ----------
+    specimen : Specimen
+        The meshed experiment.
+    state : str
+        Name of the state.
+    measured : ndarray, shape (k, 3)
+        Positions in the scan's frame, true mm; NaN where missing.
+    sd : ndarray, shape (3,)
+        Standard deviation of a measured coordinate of the loaded state, mm.
+    free_sd : ndarray, shape (k, 3)
+        That of the free state; larger where a coordinate was completed from the lattice.
+    """
 
     specimen: Specimen
     state: str
     measured: Array
     sd: Array
+    free_sd: Array
 
     @property
     def label(self) -> str:
@@ -89,7 +91,8 @@ class Trial:
         measured = markers.aligned(specimen.marker_ids) * specimen.placement.scale
         if np.isfinite(measured).any(axis=1).sum() < 4:
             raise InputError(f"{experiment.name}/{state} shares fewer than 4 trusted markers with the free state")
-        return cls(specimen, state, measured, noise.standard_deviation(experiment.xy_step_mm, experiment.z_step_mm))
+        sd = noise.standard_deviation(experiment.xy_step_mm, experiment.z_step_mm)
+        return cls(specimen, state, measured, sd, np.where(specimen.marker_filled, FILLED_SD_MM, sd))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,7 +138,7 @@ class MatchingSettings:
     """
 
     max_iterations: int = 25
-    tolerance: float = 1e-2
+    tolerance: float = 3e-2
     huber: float = 3.0
 
 
@@ -192,19 +195,23 @@ class Matcher:
         ConvergenceError
             A trial cannot be solved at these values.
         """
-        return [self._evaluate_one(i, values, previous[i] if previous else None, change) for i in range(len(self.trials))]
+        def one(i: int) -> TrialFit:
+            return self._evaluate_one(i, values, previous[i] if previous else None, change)
+
+        if len(self.trials) == 1:
+            return [one(0)]
+        with ThreadPoolExecutor(min(len(self.trials), os.cpu_count() or 1), initializer=use_one_thread) as pool:
+            return list(pool.map(one, range(len(self.trials))))
 
     def _evaluate_one(self, index: int, values: Mapping[str, float], previous: TrialFit | None, change: Array | None) -> TrialFit:
         trial = self.trials[index]
         specimen = trial.specimen
         problem = specimen.problem(values, trial.state)
-        solution = None
+        hints: list[tuple[float, Array]] = []
         if previous is not None and change is not None:
             states = previous.solution.states[1:]
-            guesses = [s.displacement + d @ change for s, d in zip(states, previous.path[1:], strict=True)]
-            solution = follow(problem, [s.load for s in states], guesses, settings=_PATH, solver=self._solvers.get(index))
-        if solution is None:
-            solution = solve(problem, settings=_PATH, solver=self._solvers.get(index))
+            hints = [(s.load, s.displacement + d @ change) for s, d in zip(states, previous.path[1:], strict=True)]
+        solution = solve(problem, settings=_PATH, solver=self._solvers.get(index), hints=hints)
         newton = Newton(problem, _PATH, self._solvers.get(index))
         path = self._path_derivatives(trial, values, solution, newton)
         self._solvers[index] = newton.solver
@@ -230,12 +237,12 @@ class Matcher:
         offset = values.get(trial.base_offset, 0.0)
         moved = specimen.marker_points + u + offset * gradient[:, :, 2]
         if pose is None:
-            pose = _first_pose(moved, trial.measured)
+            pose = _first_pose(specimen, moved, trial.measured)
         predicted = pose.applied(moved)
         turned = np.einsum("ij,kjl->kil", pose.rotation, gradient)
         rotated = specimen.placement.rotation.T  # noise of the free scan, turned into the object's frame
         both = np.einsum("kij,jl->kil", turned, rotated)
-        sd = np.sqrt(trial.sd**2 + np.einsum("kil,l->ki", both**2, trial.sd**2))
+        sd = np.sqrt(trial.sd**2 + np.einsum("kil,kl->ki", both**2, trial.free_sd**2))
         du = path[-1]
         n_free = du.shape[2]
         at_markers = np.stack([specimen.observation @ du[:, i, :] for i in range(3)], axis=1) if n_free else np.zeros((len(u), 3, 0))
@@ -276,8 +283,10 @@ class Matcher:
                 objective += deviation**2
         return hessian, gradient, objective, data
 
-    def run(self, callback: Callable[[int, float, Mapping[str, float]], None] | None = None) -> Match:
+    def run(self, callback: Callable[[int, float, Mapping[str, float]], None] | None = None, *, start: Mapping[str, float] | None = None) -> Match:
         """Search for the parameters; `callback(iteration, objective, values)` is called after every accepted step.
+
+        The search starts from the parameters' own values, or from those in `start`.
 
         Raises
         ------
@@ -285,16 +294,16 @@ class Matcher:
             A trial cannot be solved at the starting values.
         """
         free = self.parameters.free
-        inner = self.parameters.start()
+        inner = np.array([p.inner((start or {}).get(p.name, p.value)) for p in free])
         fits = self.evaluate(self.parameters.values(inner))
         hessian, gradient, objective, _ = self.normal_equations(fits, inner)
         history, damping, status = [objective], 1e-3, Status.ITERATION_LIMIT
         try:
             for iteration in range(self.settings.max_iterations):
                 step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian) + 1e-12), gradient)
-                step[: len(free)] = np.clip(step[: len(free)], -_limits(free), _limits(free))
+                step *= min(1.0, float(np.min(_limits(free) / np.maximum(np.abs(step[: len(free)]), 1e-300), initial=1.0)))
                 expected = float(2.0 * gradient @ step - step @ hessian @ step)
-                if expected < self.settings.tolerance:
+                if expected < self.settings.tolerance * max(1.0, 0.01 * objective):
                     status = Status.CONVERGED
                     break
                 found = self._try(inner, step, fits, objective)
@@ -349,21 +358,10 @@ def _limits(free: Sequence[object]) -> Array:
     return np.array([{"log": 0.7, "incompressibility": 1.0}.get(q.scale, 3.0) for q in free])  # type: ignore[attr-defined]
 
 
-def _first_pose(points: Array, measured: Array) -> Pose:
-    """Least-squares rigid pose (Kabsch) of points onto the completely measured ones; a turn about the vertical is found by itself."""
-    seen = np.isfinite(measured).all(axis=1)
-    centre = points[seen].mean(axis=0)
-    position = measured[seen].mean(axis=0)
-    u, _, vt = np.linalg.svd((measured[seen] - position).T @ (points[seen] - centre))
-    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return Pose(rotation, centre, position)
-
-
-def _rotation(vector: Array) -> Array:
-    """Rotation matrix of a rotation vector, rad (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    if angle == 0.0:
-        return np.eye(3)
-    x, y, z = vector / angle
-    k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k)
+def _first_pose(specimen: Specimen, points: Array, measured: Array) -> Pose:
+    """Pose that brings `points` to the `measured` ones; without data that of the free scan."""
+    if np.isfinite(measured).all(axis=1).sum() >= 4:
+        return registration(points, measured)
+    place = specimen.placement
+    centre = points.mean(axis=0)
+    return Pose(place.rotation, centre, place.rotation @ centre + place.origin)

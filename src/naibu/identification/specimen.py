@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -14,7 +14,10 @@ from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, State
 from naibu.core.mesh import Mesh
 from naibu.core.parameters import Parameter
+from naibu.identification.lattice import completed
+from naibu.identification.model_mesh import element_size, model_mesh
 from naibu.identification.placement import Placement, placement
+from naibu.identification.pose import rotation_matrix
 from naibu.mechanics.assembly import Assembler, BlockPattern, block_pattern, body_force
 from naibu.mechanics.contact import STICK, Contact, bar, plane
 from naibu.mechanics.elements import Elements, elements
@@ -22,7 +25,6 @@ from naibu.mechanics.materials import Law, from_moduli, law_named, parameter_vec
 from naibu.mechanics.sensitivities import Direction
 from naibu.mechanics.statics import Problem
 from naibu.mechanics.supports import Friction, Prescribed, interface, rigid_contact
-from naibu.meshing.generation import box, cylinder, half_ellipsoid, hemisphere
 from naibu.meshing.interfaces import split_at_plane
 from naibu.meshing.location import interpolation_operator
 from naibu.meshing.surface import boundary_faces, faces_among, node_areas
@@ -46,7 +48,7 @@ class ModelSettings:
     joined : {"glued", "sliding"}
         What holds separately cast blocks together.
     element_size_mm : float
-        Edge of the hexahedra; 0 takes a tenth of the object's height.
+        Edge of the hexahedra, smaller under a bar; 0 takes an eighth of the object's height.
     normal_stiffness : float
         Contact penalty, kPa/mm.
     density : float
@@ -57,7 +59,7 @@ class ModelSettings:
     contact: ContactModel = "coulomb"
     joined: Literal["glued", "sliding"] = "glued"
     element_size_mm: float = 0.0
-    normal_stiffness: float = 2e4
+    normal_stiffness: float = 5e3
     tangential_stiffness: float = 200.0
     density: float = 1e-6
 
@@ -82,6 +84,13 @@ def friction(material: str, body: str) -> str:
     return f"{material} on {body}: friction"
 
 
+def joint_friction(experiment: Experiment, height: float) -> str:
+    """Name of the friction coefficient between the blocks that meet at `height` above the base, mm."""
+    below = next(layer.material for layer in experiment.layers if layer.to_base_mm >= height - 1e-9)
+    above = next(layer.material for layer in experiment.layers if layer.to_base_mm > height + 1e-9)
+    return friction(*sorted((below, above), reverse=True))
+
+
 SHAPE_NAMES: dict[str, tuple[str, ...]] = {"mooney_rivlin": ("c01_share",), "yeoh": ("c20_ratio", "c30_ratio")}
 
 
@@ -100,9 +109,11 @@ class Specimen:
     mesh : Mesh
         In the object's frame, mm.
     marker_ids : ndarray, shape (k,), int64
-        Trusted markers with a complete position in the free state.
+        Trusted markers whose position in the free state is known, or known in part and completed from the lattice.
     marker_points : ndarray, shape (k, 3)
         Their positions in the object's frame, mm.
+    marker_filled : ndarray, shape (k, 3), bool
+        Which coordinates (in the scan's axes) were completed.
     observation : csr_matrix, shape (k, n)
         Interpolates nodal displacements at the markers.
     """
@@ -113,13 +124,15 @@ class Specimen:
     mesh: Mesh
     marker_ids: NDArray[np.int64]
     marker_points: Array
+    marker_filled: NDArray[np.bool_]
     observation: sp.csr_array
     _gradient: tuple[sp.csr_array, ...]
     _elements: Elements
     _pattern: BlockPattern
     _assembler: Assembler
     _contacts: tuple[Contact, ...]
-    _materials_of_points: tuple[NDArray[np.int64], ...]
+    _pairs: tuple[tuple[str, ...], ...]
+    _pair_of_points: tuple[NDArray[np.int64], ...]
 
     @property
     def law(self) -> Law:
@@ -157,8 +170,8 @@ class Specimen:
             Name of the state.
         """
         contacts = []
-        for i, (contact, material_of_point) in enumerate(zip(self._contacts, self._materials_of_points, strict=True)):
-            changed = self._with_friction(contact, material_of_point, values)
+        for i in range(len(self._contacts)):
+            changed = self._with_friction(i, values)
             contacts.append(self._moved(changed, values, state) if i in self.indenters else changed)
         assembler = self._assembler.with_parameters(self.material_parameters(values))
         n = self.mesh.n_points
@@ -175,10 +188,10 @@ class Specimen:
         if (materials := self._material_direction(name, values)) is not None:
             return [Direction(materials=materials)]
         out = []
-        for i, (contact, material_of_point) in enumerate(zip(self._contacts, self._materials_of_points, strict=True)):
-            mask = np.array([name == friction(m, _body(contact)) for m in self.mesh.region_names])[material_of_point].astype(float)
-            if mask.any():
-                springs = self.settings.contact == "springs"
+        for i, (pairs, pair_of_point) in enumerate(zip(self._pairs, self._pair_of_points, strict=True)):
+            if name in pairs:
+                mask = (pair_of_point == pairs.index(name)).astype(float)
+                springs = self._is_spring(i)
                 out.append(Direction(contact=i, tangential_stiffness=mask) if springs else Direction(contact=i, friction=mask))
         for i in self.indenters:
             path = self._path_directions(self._contacts[i], state).get(name)
@@ -209,28 +222,30 @@ class Specimen:
                 return out
         return None
 
-    def _with_friction(self, contact: Contact, material_of_point: NDArray[np.int64], values: Mapping[str, float]) -> Contact:
-        from dataclasses import replace
+    def _is_spring(self, index: int) -> bool:
+        """Whether the friction parameters of a contact are spring stiffnesses."""
+        return self.settings.contact == "springs" and not self._contacts[index].name.startswith("joint")
 
-        if contact.name.startswith("joint"):
-            return contact
-        given = np.array([values.get(friction(m, _body(contact)), STICK) for m in self.mesh.region_names])[material_of_point]
-        if self.settings.contact == "springs":
+    def _with_friction(self, index: int, values: Mapping[str, float]) -> Contact:
+        contact = self._contacts[index]
+        given = np.array([values.get(name, STICK) for name in self._pairs[index]])[self._pair_of_points[index]]
+        if self._is_spring(index):
             return replace(contact, tangential_stiffness=given, friction_coefficient=np.full_like(given, STICK))
-        if self.settings.contact == "stick":
+        if self.settings.contact == "stick" and not contact.name.startswith("joint"):
             given = np.full_like(given, STICK)
         return replace(contact, friction_coefficient=given)
 
     def _moved(self, contact: Contact, values: Mapping[str, float], state: str) -> Contact:
         """Set the end of the body's path and its tilt from the state's parameters."""
-        from dataclasses import replace
-
         stop, rotation = contact.start.copy(), np.zeros(3)
         for name, (rate, turn) in self._path_directions(contact, state).items():
             reference = self._reference(contact, name, state)
             stop = stop + rate * (values.get(name, reference) - reference)
             rotation = rotation + turn * values.get(name, 0.0)
-        return replace(contact, stop=stop, rotation=_rotation(rotation))
+        # a tilted plate starts higher, so that it touches the free object with its lowest edge
+        size = self.experiment.shape.size_mm
+        start = contact.start + [0.0, 0.0, 0.5 * (abs(rotation[0]) * size[1] + abs(rotation[1]) * size[0])]
+        return replace(contact, start=start, stop=stop, rotation=rotation_matrix(rotation))
 
     def _reference(self, contact: Contact, name: str, state: str) -> float:
         """Value of a path parameter at which the body is at its start."""
@@ -272,32 +287,36 @@ def specimen(experiment: Experiment, settings: ModelSettings | None = None) -> S
     chosen = settings or ModelSettings()
     _require_supported(experiment)
     place = placement(experiment)
-    mesh = _mesh(experiment, chosen)
+    mesh = model_mesh(experiment, chosen.element_size_mm)
     joints: list[Contact] = []
     for height in experiment.joined_at_mm:
         if chosen.joined == "sliding":
             area = node_areas(mesh, _plane_faces(mesh, height))
-            mesh, pairs = split_at_plane(mesh, height)
-            joints.append(interface(f"joint at {height:g} mm", mesh.points, pairs, area[pairs[:, 0]], friction=Friction(0.3), normal_stiffness=chosen.normal_stiffness))
+            mesh, split = split_at_plane(mesh, height)
+            joints.append(interface(f"joint at {height:g} mm", mesh.points, split, area[split[:, 0]], friction=Friction(0.3), normal_stiffness=chosen.normal_stiffness))
     boundary = boundary_faces(mesh)
     bodies = _bodies(experiment, chosen, mesh, boundary.faces)
-    regions_of_points = tuple(np.repeat(mesh.regions[boundary.cells], len(c.area) // len(boundary.cells)) for c in bodies)
-    regions_of_joints = tuple(np.zeros(len(c.area), dtype=np.int64) for c in joints)
+    pairs = [tuple(friction(m, _body(c)) for m in mesh.region_names) for c in bodies]
+    pair_of_points = [np.repeat(mesh.regions[boundary.cells], len(c.area) // len(boundary.cells)) for c in bodies]
+    pairs += [(joint_friction(experiment, float(height)),) for height in experiment.joined_at_mm[: len(joints)]]
+    pair_of_points += [np.zeros(len(c.area), dtype=np.int64) for c in joints]
     contacts = (*bodies, *joints)
     discrete = elements(mesh)
     pattern = block_pattern(mesh.n_points, discrete.connectivity, *(c.nodes for c in contacts))
     placeholder = [from_moduli(law_named(chosen.law), 1.0, 10.0)] * len(mesh.region_names)
     assembler = Assembler.from_materials(discrete, mesh.regions, placeholder, pattern)
     initial = experiment.initial
-    complete = initial.trusted & np.isfinite(initial.points).all(axis=1)
-    points = place.to_object(initial.points[complete])
+    filled, was_missing = completed(initial.ids, np.where(initial.trusted[:, None], initial.points, np.nan))
+    partly = np.isfinite(np.where(initial.trusted[:, None], initial.points, np.nan)).any(axis=1)
+    usable = partly & np.isfinite(filled).all(axis=1)
+    points = place.to_object(filled[usable])
     tolerance = 0.05 * experiment.height_mm
     observation = interpolation_operator(mesh, points, tolerance_mm=tolerance)
     step = _difference_step(chosen, experiment)
     shifted = [interpolation_operator(mesh, points + sign * step * axis, tolerance_mm=2 * tolerance) for sign in (1.0, -1.0) for axis in np.eye(3)]
     return Specimen(
-        experiment, chosen, place, mesh, initial.ids[complete], points, observation, tuple(shifted), discrete, pattern, assembler, contacts,
-        (*regions_of_points, *regions_of_joints),
+        experiment, chosen, place, mesh, initial.ids[usable], points, was_missing[usable], observation, tuple(shifted), discrete, pattern, assembler, contacts,
+        tuple(pairs), tuple(pair_of_points),
     )  # fmt: skip
 
 
@@ -310,31 +329,8 @@ def _require_supported(experiment: Experiment) -> None:
         raise InputError(f"experiment {experiment.name!r} is pressed by a cylinder; plates, bars and side plates are covered")
 
 
-def _element_size(settings: ModelSettings, experiment: Experiment) -> float:
-    return settings.element_size_mm or experiment.height_mm / 10.0
-
-
 def _difference_step(settings: ModelSettings, experiment: Experiment) -> float:
-    return 0.1 * _element_size(settings, experiment)
-
-
-def _mesh(experiment: Experiment, settings: ModelSettings) -> Mesh:
-    size = np.array(experiment.shape.size_mm)
-    edge = _element_size(settings, experiment)
-    layers = [(layer.material, layer.to_base_mm - layer.from_base_mm) for layer in experiment.layers]
-    kind = experiment.shape.kind
-    if kind == "box":
-        breaks = {}
-        if experiment.loading.kind == "bar" and experiment.loading.bar_width_mm:
-            half = experiment.loading.bar_width_mm / 2.0
-            breaks = {"x" if experiment.loading.bar_axis == "y" else "y": (-half, half)}
-        return box(size, np.maximum(np.round(size / edge), 2).astype(int), layers=layers, breaks=breaks)
-    if len(layers) > 1 and kind != "cylinder":
-        raise InputError(f"experiment {experiment.name!r}: layers are only covered in boxes and cylinders, not in a {kind}")
-    if kind == "cylinder":
-        return cylinder(size[0], size[2], edge, layers=layers)
-    mesh = half_ellipsoid(size, edge) if kind == "half_ellipsoid" else hemisphere(size[0], edge)
-    return Mesh(mesh.points, mesh.cells, mesh.cell_type, mesh.regions, (layers[0][0],))
+    return 0.1 * element_size(experiment, settings.element_size_mm)
 
 
 def _plane_faces(mesh: Mesh, height: float) -> NDArray[np.int64]:
@@ -352,7 +348,9 @@ def _bodies(experiment: Experiment, settings: ModelSettings, mesh: Mesh, faces: 
     def body(name, surface, start):  # type: ignore[no-untyped-def]
         return rigid_contact(name, mesh.points, faces, surface, start=start, stop=start, friction=stick, normal_stiffness=settings.normal_stiffness)
 
-    bodies = [body(f"base of {loading.base_material}", plane((0.0, 0.0, 1.0)), (0.0, 0.0, 0.0))]
+    # where only its weight holds the object down, it starts pressed into the table by a hair, for the contact to have a stiffness
+    ground = 1e-4 if loading.kind == "side_plates" else 0.0
+    bodies = [body(f"base of {loading.base_material}", plane((0.0, 0.0, 1.0)), (0.0, 0.0, ground))]
     counter = loading.counter_material
     if loading.kind == "side_plates":
         for sign, side in ((-1.0, "low"), (1.0, "high")):
@@ -378,16 +376,6 @@ def _moduli(material: str, values: Mapping[str, float]) -> tuple[float, float]:
 
 def _shape(law: Law, material: str, values: Mapping[str, float]) -> tuple[float, ...]:
     return tuple(values.get(shape_parameter(material, name), 0.0) for name in SHAPE_NAMES.get(law.name, ()))
-
-
-def _rotation(vector: Array) -> Array:
-    """Rotation matrix of a rotation vector, rad (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    if angle == 0.0:
-        return np.eye(3)
-    x, y, z = vector / angle
-    k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k)
 
 
 def state_parameters(experiment: Experiment, state: State) -> list[Parameter]:

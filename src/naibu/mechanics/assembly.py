@@ -13,6 +13,7 @@ from naibu.mechanics.elements import Elements
 from naibu.mechanics.materials import Material, inverse_transpose, parameter_table, stress_and_tangent
 
 _CHUNK = 64
+LARGE = 4000  # groups from which the threads' hand-over costs less than it saves
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,7 +123,8 @@ class Assembler:
         self, displacement: NDArray[np.float64], parameters: NDArray[np.float64], blocks: NDArray[np.float64]
     ) -> tuple[float, NDArray[np.float64], float]:
         force = np.zeros((self.elements.n_points, 3))
-        energy, smallest = _assemble(
+        assemble = _assemble_large if len(self.elements.connectivity) > LARGE else _assemble_small
+        energy, smallest = assemble(
             self._order, self._colour_start, self.elements.connectivity, self.elements.gradients, self.elements.weights,
             self.elements.cell_of_point, self.elements.shared_dilatation, self.law_codes, parameters,
             np.ascontiguousarray(displacement), self._positions, force, blocks,
@@ -192,7 +194,6 @@ def _colours(connectivity: NDArray[np.int64], n_points: int) -> tuple[NDArray[np
     return order, start
 
 
-@njit(cache=True, parallel=True)
 def _assemble(  # type: ignore[no-untyped-def]  # pragma: no cover
     order, colour_start, connectivity, gradients, weights, cells, shared, codes, parameters, u, positions, force, blocks
 ):
@@ -220,6 +221,11 @@ def _assemble(  # type: ignore[no-untyped-def]  # pragma: no cover
             energy += energies[chunk]
             smallest = min(smallest, determinants[chunk])
     return energy, smallest
+
+
+# Small meshes are assembled by one thread, so that several problems can be solved side by side; large ones by all.
+_assemble_small = njit(cache=True, nogil=True)(_assemble)
+_assemble_large = njit(cache=True, parallel=True)(_assemble)
 
 
 @njit(cache=True)

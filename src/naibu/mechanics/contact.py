@@ -225,7 +225,7 @@ def _gap(kind, s, y, n, h):  # type: ignore[no-untyped-def]  # pragma: no cover
     return d2 - radius
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
     kind, s, y, anchors, k_n, k_t, mu, bonded, gap, force, tangential, slip, stiffness, tangential_stiffness, anchor_stiffness
 ):
@@ -281,7 +281,7 @@ def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
                 slip[q, i] = -p * e[i] / size
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _scatter_blocks(positions, shape, stiffness, blocks):  # type: ignore[no-untyped-def]  # pragma: no cover
     n, k = shape.shape
     for q in range(n):

@@ -60,6 +60,13 @@ def pardiso_library() -> ctypes.CDLL | None:
     return None
 
 
+def use_one_thread() -> None:
+    """Let the direct solver use one thread when called from the present one; for problems solved side by side."""
+    library = pardiso_library()
+    if library is not None:
+        library.MKL_Set_Num_Threads_Local(1)
+
+
 class PardisoSolver:
     """Supernodal factorization by oneMKL PARDISO; the analysis of the pattern is kept between factorizations."""
 
@@ -112,8 +119,10 @@ class PardisoSolver:
             self._set_parameters()
             self._call(11, empty, empty, 1)
             error = self._call(22, empty, empty, 1)
-        if error != 0:
-            raise ConvergenceError(f"the linear system is singular (PARDISO error {error}): is every body held against rigid motion?")
+        perturbed = int(self._parameters[13])  # vanishing pivots, which PARDISO replaces by tiny ones without a word
+        if error != 0 or perturbed:
+            what = f"PARDISO error {error}, {perturbed} vanishing pivots"
+            raise ConvergenceError(f"the linear system is singular ({what}): is every body held against rigid motion?")
         return self
 
     def solve(self, b: Array) -> Array:
@@ -147,7 +156,7 @@ class PardisoSolver:
             self._handle[:] = 0
 
     def __del__(self) -> None:
-        if getattr(self, "_library", None) is not None and hasattr(self, "_analysed"):
+        if getattr(self, "_library", None) is not None and hasattr(self, "_analysed") and not sys.is_finalizing():
             self._release()
 
 

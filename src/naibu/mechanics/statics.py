@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.solution import Status
 from naibu.mechanics.assembly import Assembler
-from naibu.mechanics.contact import Contact, ContactResponse
+from naibu.mechanics.contact import PLANE, Contact, ContactResponse
 from naibu.mechanics.linear_solvers import Factorization, LinearSolver, choose_solver
 from naibu.mechanics.supports import Prescribed
 
@@ -37,11 +37,11 @@ class SolverSettings:
         holds yet from drifting.
     """
 
-    first_step: float = 0.125
-    largest_step: float = 0.25
+    first_step: float = 0.05
+    largest_step: float = 0.12
     smallest_step: float = 1e-3
     tolerance: float = 1e-7
-    max_iterations: int = 25
+    max_iterations: int = 16
     anchor_stiffness: float = 1e-9
 
 
@@ -77,7 +77,8 @@ class Problem:
     @property
     def unsymmetric(self) -> bool:
         """Whether Coulomb friction makes the tangent unsymmetric."""
-        return any(not c.bonded and float(c.friction_coefficient.min()) < 100.0 for c in self.contacts)
+        curved = any(c.surface.kind != PLANE for c in self.contacts)  # friction turns with the normal
+        return curved or any(not c.bonded and float(c.friction_coefficient.min()) < 100.0 for c in self.contacts)
 
     def with_changes(self, *, assembler: Assembler | None = None, contacts: tuple[Contact, ...] | None = None) -> Problem:
         """Return the problem with other parameters or bodies (same nodes)."""
@@ -151,7 +152,9 @@ class Newton:
     def _balance(self, internal: Array, contact: Array) -> tuple[Array, float]:
         r = internal - contact - self.problem.external_force
         held = self.problem.prescribed.held
-        scale = float(np.abs(contact).sum() + np.abs(r[held]).sum() + np.abs(self.problem.external_force).sum())
+        # the floor is a force that would strain the body by 1e-5: it counts where contacts open and nothing presses any more
+        floor = 1e-5 * float(self.problem.assembler.parameters[:, 0].max()) * float(np.ptp(self.problem.points, axis=0).max()) ** 2
+        scale = float(np.abs(contact).sum() + np.abs(r[held]).sum() + np.abs(self.problem.external_force).sum()) + floor
         r[held] = 0.0
         return r, scale
 
@@ -183,28 +186,27 @@ class Newton:
     def solve(self, u: Array, anchors: tuple[Array, ...], load: float) -> tuple[Array, float] | None:
         """Return displacement and relative residual in equilibrium, starting from `u`; None where the iteration fails."""
         u = np.where(self.problem.prescribed.held, load * self.problem.prescribed.values, u)
-        norms: list[float] = []
+        struggles = 0
+        extent = float(np.ptp(self.problem.points, axis=0).max())
         for _ in range(self.settings.max_iterations):
             try:
                 residual, scale, factorization, _ = self.linearised(u, anchors, load)
             except ConvergenceError:
                 return None
             norm = float(np.abs(residual).sum())
-            if norm <= self.settings.tolerance * max(scale, 1e-9):
-                return u, norm / max(scale, 1e-9)
-            norms.append(norm)
-            if len(norms) > 8 and norm > 0.5 * norms[-7]:
-                return None
+            if norm <= self.settings.tolerance * scale:
+                return u, norm / scale
             self.iterations += 1
             step = -factorization.solve(residual.ravel()).reshape(-1, 3)
             found = self._line_search(u, step, anchors, load, residual)
-            if found is None:
-                return None
-            u = found
+            struggles += found is None or found[1] < 0.15
+            if found is None or struggles > 2 or np.abs(step).max() > extent:
+                return None  # a shorter load step costs less than a long fight
+            u = found[0]
         return None
 
-    def _line_search(self, u: Array, step: Array, anchors: tuple[Array, ...], load: float, residual: Array) -> Array | None:
-        """Return ``u + a step`` with a in (0, 1] where the work of the residual on the step has fallen enough; None where all invert elements.
+    def _line_search(self, u: Array, step: Array, anchors: tuple[Array, ...], load: float, residual: Array) -> tuple[Array, float] | None:
+        """Return ``u + a step`` and a in (0, 1] where the work of the residual on the step has fallen enough; None where all invert elements.
 
         The work ``r . step`` vanishes at equilibrium along the step. Unlike the norm of r it may be trusted when points change their
         contact status.
@@ -221,9 +223,9 @@ class Newton:
                 a = 0.5 * (low + a)
                 continue
             work = float(np.vdot(r, step))
-            best = trial
+            best = trial, a
             if abs(work) <= 0.5 * abs(before) or (a == 1.0 and work * before > 0.0):
-                return trial
+                return best
             if work * before > 0.0:
                 low, work_low = a, work
                 a = 0.5 * (a + high)
@@ -269,6 +271,7 @@ def solve(
     throw: bool = True,
     callback: Callable[[float], None] | None = None,
     solver: LinearSolver | None = None,
+    hints: Sequence[tuple[float, Array]] = (),
 ) -> Solution:
     """Follow the load from the free state to its end.
 
@@ -284,6 +287,8 @@ def solve(
         Called with the fraction of the load after every step, for progress.
     solver : LinearSolver, optional
         A linear solver for the problem's pattern; chosen automatically by default.
+    hints : sequence of (load, displacement)
+        States (n, 3), mm, of a similar problem at increasing loads up to 1: the path then stops at these loads and starts from them.
 
     Raises
     ------
@@ -297,65 +302,45 @@ def solve(
         raise InputError("external forces must be finite numbers")
     newton = Newton(problem, chosen, solver)
     first = LoadState(0.0, np.zeros_like(problem.points), tuple(c.anchors_at_rest() for c in problem.contacts))
-    states, step, residual = [first], chosen.first_step, 0.0
+    states, step, residual = [first], 1.0 if hints else chosen.first_step, 0.0
     while states[-1].load < 1.0 - 1e-12:
         last = states[-1]
-        load = min(1.0, last.load + step)
-        found = newton.solve(_extrapolated(states, load), last.anchors, load)
-        if found is None and len(states) > 1:
-            found = newton.solve(last.displacement, last.anchors, load)
+        hint = next((h for h in hints if h[0] > last.load + 1e-9), None)
+        load = min(1.0 if hint is None else hint[0], last.load + step)
+        found = None
+        for guess in _guesses(states, load, hint):
+            found = newton.solve(guess, last.anchors, load)
+            if found is not None:
+                break
         if found is None:
-            step *= 0.5
+            step = 0.5 * (load - last.load)
             if step < chosen.smallest_step:
                 return _finish(newton, states, residual, Status.STEP_TOO_SMALL, throw)
             continue
         residual = found[1]
         states.append(advanced(problem, found[0], last.anchors, load))
-        step = min(chosen.largest_step, 1.5 * step)
+        step = 1.0 if hints else min(chosen.largest_step, 1.5 * step)
         if callback is not None:
             callback(load)
     return _finish(newton, states, residual, Status.CONVERGED, throw)
 
 
-def follow(problem: Problem, loads: list[float], guesses: list[Array], *, settings: SolverSettings | None = None, solver: LinearSolver | None = None) -> Solution | None:
-    """Solve at given fractions of the load from good guesses of the displacement; None where Newton's method fails.
-
-    Parameters
-    ----------
-    problem : Problem
-        Body, materials, supports.
-    loads : list of float
-        Increasing fractions of the load, ending at 1; the free state is not listed.
-    guesses : list of ndarray, shape (n, 3)
-        Displacements to start from, mm, for instance those of a similar problem.
-    settings, solver
-        As for `solve`.
-    """
-    newton = Newton(problem, settings or SolverSettings(), solver)
-    states = [LoadState(0.0, np.zeros_like(problem.points), tuple(c.anchors_at_rest() for c in problem.contacts))]
-    residual = 0.0
-    for load, guess in zip(loads, guesses, strict=True):
-        found = newton.solve(guess, states[-1].anchors, load)
-        if found is None:
-            return None
-        residual = found[1]
-        states.append(advanced(problem, found[0], states[-1].anchors, load))
-    return _finish(newton, states, residual, Status.CONVERGED, True)
+def _guesses(states: list[LoadState], load: float, hint: tuple[float, Array] | None) -> list[Array]:
+    """Displacements to start from at `load`: the hint there, the path extrapolated, the last state."""
+    last = states[-1]
+    out = [hint[1]] if hint is not None and hint[0] == load else []
+    if len(states) > 1:
+        before = states[-2]
+        out.append(last.displacement + (load - last.load) / (last.load - before.load) * (last.displacement - before.displacement))
+    if not out or (hint is None and len(states) > 1):
+        out.append(last.displacement)
+    return out
 
 
 def advanced(problem: Problem, u: Array, anchors: tuple[Array, ...], load: float) -> LoadState:
     """Return the converged state `u` with the anchors for the next step."""
     moved = tuple(c.next_anchors(c.evaluate(u, a, load)) for c, a in zip(problem.contacts, anchors, strict=True))
     return LoadState(load, u, moved)
-
-
-def _extrapolated(states: list[LoadState], load: float) -> Array:
-    """Guess the displacement at `load` from the last two states."""
-    last = states[-1]
-    if len(states) < 2:
-        return last.displacement
-    before = states[-2]
-    return last.displacement + (load - last.load) / (last.load - before.load) * (last.displacement - before.displacement)
 
 
 def _finish(newton: Newton, states: list[LoadState], residual: float, status: Status, throw: bool) -> Solution:

@@ -1,0 +1,1 @@
+"""Closed forms, virtual specimens and measures with which results are judged."""

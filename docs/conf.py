@@ -1,0 +1,66 @@
+"""Sphinx configuration; build with ``python -m sphinx -W -b html docs docs/_build/html`` after ``pip install ".[docs]"``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from sphinx.application import Sphinx
+
+import naibu
+
+sys.path.insert(0, str(Path(__file__).resolve().parent / "_ext"))
+
+project = "naibu"
+author = "The naibu developers"
+copyright = author
+release = version = naibu.__version__
+
+extensions = ["sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.viewcode", "numpydoc", "sphinx_gallery.gen_gallery", "naibu_help"]
+default_role = "py:obj"
+exclude_patterns = ["_build", "_templates", "gallery_src", "sg_execution_times.rst"]
+templates_path = ["_templates"]
+
+autosummary_generate = True
+autodoc_typehints = "none"  # types stand in the numpydoc sections
+autodoc_member_order = "bysource"
+numpydoc_show_class_members = False
+numpydoc_class_members_toctree = False
+
+sphinx_gallery_conf = {
+    "examples_dirs": "gallery_src",
+    "gallery_dirs": "gallery",
+    "filename_pattern": r"plot_",
+    "within_subsection_order": "ExampleTitleSortKey",
+    "download_all_examples": False,
+    "remove_config_comments": True,
+    "show_memory": False,
+    "min_reported_time": 5,
+    "abort_on_example_error": True,
+    "capture_repr": (),
+}
+
+toc_object_entries = False
+
+html_theme = "alabaster"
+html_static_path = ["_static"]
+html_css_files = ["naibu.css"]
+html_theme_options = {
+    "description": "Parameters of soft objects from the motion of their inside, without a force sensor.",
+    "fixed_sidebar": True,
+    "page_width": "1240px",
+    "sidebar_width": "230px",
+    "show_powered_by": False,
+}
+html_sidebars = {"**": ["about.html", "navigation.html", "searchbox.html"]}
+
+
+def only_our_own(app: Sphinx, what: str, name: str, member: object, skip: bool, options: object) -> bool | None:
+    """Leave out what a module merely imports, and fields whose docstring Python wrote: they are told under "Attributes"."""
+    foreign = what == "module" and not str(getattr(member, "__module__", "naibu")).startswith("naibu")
+    written_by_python = (getattr(member, "__doc__", "") or "").startswith("Alias for field number")
+    return True if foreign or written_by_python else None
+
+
+def setup(app: Sphinx) -> None:
+    app.connect("autodoc-skip-member", only_our_own)

@@ -1,0 +1,180 @@
+"""From experiments to a calibrated model: which parameters there are, what is known of them beforehand, and what the data say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from naibu.core.errors import InputError
+from naibu.core.experiment import Experiment
+from naibu.core.parameters import Parameter, ParameterSet
+from naibu.identification.displacement_matching import Match, Matcher, MatchingSettings, NoiseModel, Trial
+from naibu.identification.specimen import (
+    SHAPE_NAMES,
+    ModelSettings,
+    Specimen,
+    friction,
+    joint_friction,
+    poisson_ratio,
+    shape_parameter,
+    specimen,
+    state_parameters,
+    young_modulus,
+)
+
+REFERENCE_MODULUS_KPA = 200.0  # of the known region when only ratios are sought
+START_POISSON_RATIO = 0.49
+START_FRICTION = 0.2
+START_SPRING = 30.0  # kPa/mm
+
+
+@dataclass(frozen=True, slots=True)
+class Knowledge:
+    """What is known before the search.
+
+    Attributes
+    ----------
+    young_moduli : mapping of str to float
+        Materials whose Young's modulus is given, kPa; they set the scale.
+    scale_is_absolute : bool
+        Whether the moduli of the known materials are true values, or stand for 1 in a ratio.
+    """
+
+    young_moduli: Mapping[str, float] = field(default_factory=dict)
+    scale_is_absolute: bool = True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """The trials of a calibration and the match found for them."""
+
+    trials: tuple[Trial, ...]
+    match: Match
+    settings: ModelSettings
+    noise: NoiseModel
+    knowledge: Knowledge
+
+
+def calibrate(
+    experiments: Sequence[Experiment],
+    *,
+    knowledge: Knowledge | None = None,
+    states: Mapping[str, Sequence[str]] | None = None,
+    settings: ModelSettings | None = None,
+    noise: NoiseModel | None = None,
+    search: MatchingSettings | None = None,
+    start: Mapping[str, float] | None = None,
+    callback: Callable[[int, float, Mapping[str, float]], None] | None = None,
+) -> Calibration:
+    """Identify materials, friction and boundary conditions from all loaded states of some experiments jointly.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+        With three-dimensional markers.
+    knowledge : Knowledge, optional
+        Materials with known modulus; by default the first one found stands for the scale, and the others' moduli are ratios to it.
+    states : mapping, optional
+        States to use, by experiment; all measured ones by default.
+    settings : ModelSettings, optional
+        Law, contact, mesh.
+    noise : NoiseModel, optional
+        Of the measurement.
+    search : MatchingSettings, optional
+        Iterations and tolerance.
+    start : mapping, optional
+        Physical values to start from, by name; priors keep their centres.
+    callback : callable, optional
+        ``callback(iteration, objective, values)`` after every step.
+
+    Raises
+    ------
+    InputError
+        No experiment, no measured loaded state, a known material that no experiment contains, or data that cannot be used.
+    ConvergenceError
+        A trial cannot be solved at the starting values.
+    """
+    if not experiments:
+        raise InputError("no experiments are given; name at least one folder or bundled dataset")
+    chosen, measured = settings or ModelSettings(), noise or NoiseModel()
+    specimens = [specimen(e, chosen) for e in experiments]
+    used = {e.name: tuple((states or {}).get(e.name, [s.name for s in e.loaded_states])) for e in experiments}
+    trials = tuple(Trial.of(s, name, measured) for s in specimens for name in used[s.experiment.name])
+    if not trials:
+        raise InputError(f"no loaded state with measured positions in {', '.join(e.name for e in experiments)}")
+    known = knowledge or _first_material(experiments)
+    parameters = initial_parameters(specimens, used, known)
+    match = Matcher(trials, parameters, search or MatchingSettings()).run(callback, start=start)
+    return Calibration(trials, match, chosen, measured, known)
+
+
+def _first_material(experiments: Sequence[Experiment]) -> Knowledge:
+    return Knowledge({experiments[0].materials[0]: REFERENCE_MODULUS_KPA}, scale_is_absolute=False)
+
+
+def initial_parameters(specimens: Sequence[Specimen], states: Mapping[str, Sequence[str]], knowledge: Knowledge) -> ParameterSet:
+    """Return all parameters of the trials with their starting values and priors.
+
+    Raises
+    ------
+    InputError
+        A known material that no experiment contains.
+    """
+    found: dict[str, Parameter] = {}
+    materials = [m for s in specimens for m in s.experiment.materials]
+    for name in knowledge.young_moduli:
+        if name not in materials:
+            raise InputError(f"known material {name!r} is in none of the experiments; they contain {', '.join(sorted(set(materials)))}")
+    reference = float(np.mean(list(knowledge.young_moduli.values()) or [REFERENCE_MODULUS_KPA]))
+    for s in specimens:
+        for p in _material_parameters(s, knowledge, reference) + _friction_parameters(s):
+            found.setdefault(p.name, p)
+        found.setdefault(offset := f"{s.experiment.name}: base_offset", Parameter(offset, 0.0, "mm", prior_sd=0.5))
+        for state in states[s.experiment.name]:
+            for p in state_parameters(s.experiment, s.experiment.state(state)):
+                found[p.name] = p
+    return ParameterSet.of(found.values())
+
+
+def _material_parameters(s: Specimen, knowledge: Knowledge, reference: float) -> list[Parameter]:
+    out = []
+    for m in s.experiment.materials:
+        given = knowledge.young_moduli.get(m)
+        # without a known material in the body its modulus cannot be told from displacements: one body of one material has no scale
+        alone = len(s.experiment.materials) == 1 and given is None
+        out.append(Parameter(young_modulus(m), given or reference, "kPa", "log", prior_sd=2.0, fixed=given is not None or alone))
+        out.append(Parameter(poisson_ratio(m), START_POISSON_RATIO, "", "incompressibility", prior_sd=1.0))
+        out += [Parameter(shape_parameter(m, k), 0.0, "", prior_sd=0.3) for k in SHAPE_NAMES.get(s.settings.law, ())]
+    return out
+
+
+def _friction_parameters(s: Specimen) -> list[Parameter]:
+    """Friction of the layers that touch the base and the indenter, and of joints that may slide."""
+    out = []
+    experiment, model = s.experiment, s.settings
+    if model.contact != "stick":
+        value, unit = (START_FRICTION, "") if model.contact == "coulomb" else (START_SPRING, "kPa/mm")
+        loading = experiment.loading
+        touching = [(experiment.layers[0].material, loading.base_material), (experiment.layers[-1].material, loading.counter_material)]
+        if loading.kind == "side_plates":
+            touching += [(layer.material, loading.counter_material) for layer in experiment.layers]
+        out += [Parameter(friction(*pair), value, unit, "log", prior_sd=1.0) for pair in dict.fromkeys(touching)]
+    if model.joined == "sliding":
+        out += [Parameter(joint_friction(experiment, h), 0.5, "", "log", prior_sd=1.0) for h in experiment.joined_at_mm]
+    return out
+
+
+def global_names(parameters: ParameterSet, trials: Sequence[Trial]) -> tuple[str, ...]:
+    """Return the names of the free parameters that belong to materials and friction, not to one experiment."""
+    own = {t.specimen.experiment.name for t in trials}
+    return tuple(p.name for p in parameters.free if p.name.split(":")[0].split("/")[0] not in own)
+
+
+def marginal(match: Match, names: Sequence[str]) -> NDArray[np.float64]:
+    """Return the covariance, on the optimiser's scale, of the free parameters called `names`."""
+    order = [p.name for p in match.parameters.free]
+    index = [order.index(n) for n in names]
+    return match.covariance[np.ix_(index, index)]

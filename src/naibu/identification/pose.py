@@ -1,0 +1,59 @@
+"""Rigid poses of an object in a scan, and the least-squares registration of points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pose:
+    """Rigid pose of the object in a loaded scan: ``x = rotation @ (X - centre) + position``."""
+
+    rotation: Array
+    centre: Array
+    position: Array
+
+    def applied(self, points: Array) -> Array:
+        """Return points (k, 3) of the object's frame in the scan's."""
+        return (points - self.centre) @ self.rotation.T + self.position
+
+    def moved(self, change: Array) -> Pose:
+        """Return the pose after a translation ``change[:3]``, mm, and a rotation vector ``change[3:]``, rad."""
+        return Pose(rotation_matrix(change[3:]) @ self.rotation, self.centre, self.position + change[:3])
+
+
+def registration(points: Array, measured: Array) -> Pose:
+    """Return the rigid motion that brings `points` (k, 3) closest to `measured` (k, 3), of which single coordinates may be missing.
+
+    Missing coordinates are filled with the moved points and the fit repeated, which converges to the least-squares pose.
+    """
+    seen = np.isfinite(measured)
+    whole = seen.all(axis=1)
+    pose = _kabsch(points[whole], measured[whole])
+    some = seen.any(axis=1)
+    for _ in range(30):
+        filled = np.where(seen, measured, pose.applied(points))
+        pose = _kabsch(points[some], filled[some])
+    return pose
+
+
+def _kabsch(points: Array, measured: Array) -> Pose:
+    """Least-squares rigid motion of complete points (Kabsch 1976; spec S2)."""
+    centre, position = points.mean(axis=0), measured.mean(axis=0)
+    u, _, vt = np.linalg.svd((measured - position).T @ (points - centre))
+    return Pose(u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt, centre, position)
+
+
+def rotation_matrix(vector: Array) -> Array:
+    """Return the rotation matrix (3, 3) of a rotation vector, rad (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    if angle == 0.0:
+        return np.eye(3)
+    x, y, z = vector / angle
+    k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k)

@@ -1,0 +1,62 @@
+"""What the documentation says of experiment folders is what the reader does."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from naibu.io import experiment_schema
+from naibu.io.experiments import read_experiment
+from naibu.io.state_csv import OPTIONAL, REQUIRED, STATUSES
+from naibu.mechanics.materials import LAWS
+
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+PAGE = (DOCS / "experiment_folder.rst").read_text(encoding="utf-8")
+TABLES = {name: getattr(experiment_schema, name) for name in dir(experiment_schema) if name.endswith("Table") and not name.startswith("_")}
+# read from families of keys, for which the page gives examples
+FAMILIES = {"rows_of_layers": "rows_layer_1", "values": "E_hardness_5_Pa"}
+
+
+def block(language: str, number: int = 0) -> str:
+    """Return a code block of the page."""
+    found = re.findall(rf"^\.\. code-block:: {language}\n\n((?:   .*\n|\n)+)", PAGE, re.MULTILINE)
+    return re.sub("^   ", "", found[number], flags=re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", [*TABLES, "Meta"])
+def test_every_key_is_told_in_the_page(name: str) -> None:
+    model = TABLES.get(name, experiment_schema.Meta)
+    headings = {"coordinates", "object", "markers", "layer", "loading", "scanner", "gel", "state"} if name == "Meta" else set()
+    for key, field in model.model_fields.items():
+        told = FAMILIES.get(key, key)
+        if key in headings:
+            assert f"[{key}]" in PAGE, f"the table [{key}] is not told in experiment_folder.rst"
+        elif field.is_required():
+            assert f"**{told}**" in PAGE, f"{name}: the required key {told} is not told in bold in experiment_folder.rst"
+        else:
+            assert f"``{told}``" in PAGE, f"{name}: {told} is not told in experiment_folder.rst"
+
+
+def test_every_column_and_status_is_told_in_the_page() -> None:
+    for word in (*REQUIRED, *OPTIONAL, *STATUSES):
+        assert f"``{word}``" in PAGE
+
+
+def test_the_example_of_the_page_is_a_valid_experiment(tmp_path: Path) -> None:
+    (tmp_path / "meta.toml").write_text(block("toml"), encoding="utf-8")
+    for state in ("initial", "pressed"):
+        (tmp_path / f"{state}.csv").write_text(block("text", 1), encoding="utf-8")
+    experiment = read_experiment(tmp_path)
+    assert experiment.materials == ("soft gel", "firm gel")
+    assert experiment.loaded_states[0].stated_mm == 45.0
+    assert experiment.initial.trusted.tolist() == [True, True, True, False, True, True]
+    assert np.isnan(experiment.initial.points[4, 1])
+
+
+def test_every_law_is_told() -> None:
+    concepts = (DOCS / "concepts.rst").read_text(encoding="utf-8")
+    for law in LAWS:
+        assert f"``{law}``" in concepts
