@@ -16,6 +16,7 @@ from naibu.identification.specimen import (
     SHAPE_NAMES,
     ModelSettings,
     Specimen,
+    base_offset,
     friction,
     joint_friction,
     poisson_ratio,
@@ -132,7 +133,10 @@ def initial_parameters(specimens: Sequence[Specimen], states: Mapping[str, Seque
     for s in specimens:
         for p in _material_parameters(s, knowledge, reference) + _friction_parameters(s):
             found.setdefault(p.name, p)
-        found.setdefault(offset := f"{s.experiment.name}: base_offset", Parameter(offset, 0.0, "mm", prior_sd=0.5))
+        offset = base_offset(s.experiment)
+        found.setdefault(offset, Parameter(offset, 0.0, "mm", prior_sd=0.5))
+        for name in s.shift_names:
+            found.setdefault(name, Parameter(name, 0.0, "mm", prior_sd=1.0))
         for state in states[s.experiment.name]:
             for p in state_parameters(s.experiment, s.experiment.state(state)):
                 found[p.name] = p

@@ -20,7 +20,7 @@ from naibu.core.parameters import ParameterSet
 from naibu.core.solution import Status
 from naibu.identification.lattice import FILLED_SD_MM
 from naibu.identification.pose import Pose, registration
-from naibu.identification.specimen import Specimen
+from naibu.identification.specimen import Specimen, base_offset
 from naibu.mechanics.linear_solvers import LinearSolver, use_one_thread
 from naibu.mechanics.sensitivities import sensitivities
 from naibu.mechanics.statics import Newton, Solution, SolverSettings, solve
@@ -69,11 +69,6 @@ class Trial:
     def label(self) -> str:
         """``experiment/state``."""
         return f"{self.specimen.experiment.name}/{self.state}"
-
-    @property
-    def base_offset(self) -> str:
-        """Name of the parameter that shifts the markers up against the base."""
-        return f"{self.specimen.experiment.name}: base_offset"
 
     @classmethod
     def of(cls, specimen: Specimen, state: str, noise: NoiseModel) -> Trial:
@@ -231,11 +226,10 @@ class Matcher:
         return tuple(d @ gather for d in raw)
 
     def _observed(self, trial: Trial, values: Mapping[str, float], solution: Solution, path: tuple[Array, ...], pose: Pose | None) -> TrialFit:
-        specimen = trial.specimen
+        specimen = trial.specimen.reshaped(values)
         u = specimen.observation @ solution.displacement
         gradient = specimen.deformation_gradient(solution.displacement)
-        offset = values.get(trial.base_offset, 0.0)
-        moved = specimen.marker_points + u + offset * gradient[:, :, 2]
+        moved = specimen.marker_points + u
         if pose is None:
             pose = _first_pose(specimen, moved, trial.measured)
         predicted = pose.applied(moved)
@@ -247,8 +241,10 @@ class Matcher:
         n_free = du.shape[2]
         at_markers = np.stack([specimen.observation @ du[:, i, :] for i in range(3)], axis=1) if n_free else np.zeros((len(u), 3, 0))
         for k, parameter in enumerate(self.parameters.free):
-            if parameter.name == trial.base_offset:
+            if parameter.name == base_offset(specimen.experiment):
                 at_markers[:, :, k] = gradient[:, :, 2]
+            elif (shift := specimen.shift(parameter.name)) is not None:  # the nodes move past the markers, which stay
+                at_markers[:, :, k] -= np.einsum("kij,kj->ki", gradient - np.eye(3), specimen.observation @ shift)
         jacobian = np.einsum("ij,kjp->kip", pose.rotation, at_markers)
         arm = predicted - pose.position
         pose_jacobian = np.zeros((len(u), 3, 6))

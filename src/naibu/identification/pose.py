@@ -22,6 +22,10 @@ class Pose:
         """Return points (k, 3) of the object's frame in the scan's."""
         return (points - self.centre) @ self.rotation.T + self.position
 
+    def undone(self, points: Array) -> Array:
+        """Return points (k, 3) of the scan in the object's frame."""
+        return (points - self.position) @ self.rotation + self.centre
+
     def moved(self, change: Array) -> Pose:
         """Return the pose after a translation ``change[:3]``, mm, and a rotation vector ``change[3:]``, rad."""
         return Pose(rotation_matrix(change[3:]) @ self.rotation, self.centre, self.position + change[:3])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,6 +44,10 @@ class Prediction:
         Measured minus predicted, true mm; NaN where not measured.
     opening_mm : float
         Height of the plate or bar, or distance of the side plates, that was used.
+    values : mapping
+        Physical values of all parameters that were used.
+    measured_in_object : ndarray, shape (k, 3)
+        Measured markers brought into the object's frame, mm; NaN where not measured.
     fit : TrialFit
         The solution behind it.
     notes : tuple of str
@@ -57,6 +61,8 @@ class Prediction:
     registered: bool
     residual: Array
     opening_mm: float
+    values: Mapping[str, float]
+    measured_in_object: Array
     fit: TrialFit
     notes: tuple[str, ...]
 
@@ -236,10 +242,12 @@ def _finished(
     scale = body.placement.scale
     measured = state.markers.aligned(body.marker_ids) * scale if state.markers is not None else np.full(fit.predicted.shape, np.nan)
     registered = bool(np.isfinite(measured).all(axis=1).sum() >= 4)
-    points = registration(fit.predicted, measured).applied(fit.predicted) if registered else fit.predicted
+    pose = registration(fit.predicted, measured) if registered else None
+    points = pose.applied(fit.predicted) if pose is not None else fit.predicted
+    back = pose.undone(measured) if pose is not None else measured
     return Prediction(
-        body, state.name, points / scale, _standard_deviation(model, parameters, fit), registered, measured - points,
-        parameters.values()[name], fit, tuple(notes),
+        body, state.name, points / scale, _standard_deviation(model, parameters, fit), registered, measured - points, parameters.values()[name],
+        parameters.values(), fit.pose.undone(back), fit, tuple(notes),
     )  # fmt: skip
 
 

@@ -18,9 +18,9 @@ from naibu.identification.lattice import completed
 from naibu.identification.model_mesh import element_size, model_mesh
 from naibu.identification.placement import Placement, placement
 from naibu.identification.pose import rotation_matrix
-from naibu.mechanics.assembly import Assembler, BlockPattern, block_pattern, body_force
+from naibu.mechanics.assembly import Assembler, block_pattern, body_force
 from naibu.mechanics.contact import STICK, Contact, bar, plane
-from naibu.mechanics.elements import Elements, elements
+from naibu.mechanics.elements import elements
 from naibu.mechanics.materials import Law, from_moduli, law_named, parameter_vector
 from naibu.mechanics.sensitivities import Direction
 from naibu.mechanics.statics import Problem
@@ -127,8 +127,7 @@ class Specimen:
     marker_filled: NDArray[np.bool_]
     observation: sp.csr_array
     _gradient: tuple[sp.csr_array, ...]
-    _elements: Elements
-    _pattern: BlockPattern
+    _rest_heights: Array
     _assembler: Assembler
     _contacts: tuple[Contact, ...]
     _pairs: tuple[tuple[str, ...], ...]
@@ -143,6 +142,42 @@ class Specimen:
     def indenters(self) -> tuple[int, ...]:
         """Indices of the contacts that move."""
         return tuple(i for i, c in enumerate(self._contacts) if not np.array_equal(c.start, c.stop) or c.name.startswith("indenter"))
+
+    def indenter_paths(self, values: Mapping[str, float], state: str) -> list[tuple[Array, Array, Array]]:
+        """Return start and end of the path (3,), mm, and the outward normal (3,) of every indenter in a state."""
+        moved = [self._moved(self._contacts[i], values, state) for i in self.indenters]
+        return [(c.start, c.stop, c.rotation @ c.surface.normal) for c in moved]
+
+    @property
+    def shift_names(self) -> tuple[str, ...]:
+        """Names of the shifts of the layers' boundaries."""
+        return tuple(layer_shift(self.experiment, b.to_base_mm) for b in self.experiment.layers[:-1])
+
+    def shift(self, name: str) -> Array | None:
+        """Return how the nodes (n, 3) move with a shift of a layer's boundary: fully at it, less towards its neighbours; None for other names."""
+        if name not in self.shift_names:
+            return None
+        heights = [0.0, *(layer.to_base_mm for layer in self.experiment.layers)]
+        at = self.shift_names.index(name) + 1
+        out = np.zeros_like(self.mesh.points)
+        out[:, 2] = np.interp(self._rest_heights, heights[at - 1 : at + 2], [0.0, 1.0, 0.0])
+        return out
+
+    def reshaped(self, values: Mapping[str, float]) -> Specimen:
+        """Return the specimen with its layers' boundaries and its markers where `values` put them."""
+        offset = values.get(base_offset(self.experiment), 0.0)
+        shift = sum(values.get(name, 0.0) * np.asarray(self.shift(name)) for name in self.shift_names) + np.zeros_like(self.mesh.points)
+        if offset == 0.0 and not shift.any():
+            return self
+        mesh = self.mesh.moved(shift)
+        points = self.marker_points + [0.0, 0.0, offset]
+        moving = [not c.name.startswith("joint") for c in self._contacts]
+        contacts = tuple(
+            replace(c, rest=np.einsum("pk,pki->pi", c.shape, mesh.points[c.nodes])) if m else c for c, m in zip(self._contacts, moving, strict=True)
+        )
+        observation, gradient = _observation(mesh, points, self.experiment, self.settings)
+        assembler = self._assembler.with_elements(self._assembler.elements.moved(shift))
+        return replace(self, mesh=mesh, marker_points=points, observation=observation, _gradient=gradient, _assembler=assembler, _contacts=contacts)
 
     def deformation_gradient(self, displacement: Array) -> Array:
         """Return F (k, 3, 3) at the markers, by central differences over a tenth of an element."""
@@ -169,16 +204,17 @@ class Specimen:
         state : str
             Name of the state.
         """
+        body = self.reshaped(values)
         contacts = []
-        for i in range(len(self._contacts)):
-            changed = self._with_friction(i, values)
+        for i in range(len(body._contacts)):
+            changed = body._with_friction(i, values)
             contacts.append(self._moved(changed, values, state) if i in self.indenters else changed)
-        assembler = self._assembler.with_parameters(self.material_parameters(values))
+        assembler = body._assembler.with_parameters(self.material_parameters(values))
         n = self.mesh.n_points
         weight = np.zeros((n, 3))
         if self.experiment.loading.kind == "side_plates":
-            weight = body_force(self._elements, np.full(self.mesh.n_cells, self.settings.density), GRAVITY)
-        return Problem(self.mesh.points, assembler, tuple(contacts), Prescribed.nothing(n), weight)
+            weight = body_force(body._assembler.elements, np.full(self.mesh.n_cells, self.settings.density), GRAVITY)
+        return Problem(body.mesh.points, assembler, tuple(contacts), Prescribed.nothing(n), weight)
 
     def direction(self, name: str, values: Mapping[str, float], state: str) -> list[Direction]:
         """Return how the problem of a state depends on the physical value of a parameter; empty where it does not.
@@ -193,6 +229,8 @@ class Specimen:
                 mask = (pair_of_point == pairs.index(name)).astype(float)
                 springs = self._is_spring(i)
                 out.append(Direction(contact=i, tangential_stiffness=mask) if springs else Direction(contact=i, friction=mask))
+        if (points := self.shift(name)) is not None:
+            out.append(Direction(points=points))
         for i in self.indenters:
             path = self._path_directions(self._contacts[i], state).get(name)
             if path is not None:
@@ -270,6 +308,16 @@ class Specimen:
         return out
 
 
+def base_offset(experiment: Experiment) -> str:
+    """Name of the height by which all markers lie above their supposed place in the object, mm."""
+    return f"{experiment.name}: base_offset"
+
+
+def layer_shift(experiment: Experiment, height: float) -> str:
+    """Name of the height by which the boundary between layers lies above its nominal `height`, mm."""
+    return f"{experiment.name}: shift_of_layer_at_{height:g}"
+
+
 def opening(experiment: Experiment, state: str) -> str:
     """Name of the height of the plate or bar above the base, or of the distance between side plates, in a state."""
     kind = "width" if experiment.loading.kind == "side_plates" else "height"
@@ -301,7 +349,7 @@ def specimen(experiment: Experiment, settings: ModelSettings | None = None) -> S
     pairs += [(joint_friction(experiment, float(height)),) for height in experiment.joined_at_mm[: len(joints)]]
     pair_of_points += [np.zeros(len(c.area), dtype=np.int64) for c in joints]
     contacts = (*bodies, *joints)
-    discrete = elements(mesh)
+    discrete = elements(mesh, "standard" if chosen.law == "linear_elastic" else "mean_dilatation")
     pattern = block_pattern(mesh.n_points, discrete.connectivity, *(c.nodes for c in contacts))
     placeholder = [from_moduli(law_named(chosen.law), 1.0, 10.0)] * len(mesh.region_names)
     assembler = Assembler.from_materials(discrete, mesh.regions, placeholder, pattern)
@@ -310,14 +358,20 @@ def specimen(experiment: Experiment, settings: ModelSettings | None = None) -> S
     partly = np.isfinite(np.where(initial.trusted[:, None], initial.points, np.nan)).any(axis=1)
     usable = partly & np.isfinite(filled).all(axis=1)
     points = place.to_object(filled[usable])
-    tolerance = 0.05 * experiment.height_mm
-    observation = interpolation_operator(mesh, points, tolerance_mm=tolerance)
-    step = _difference_step(chosen, experiment)
-    shifted = [interpolation_operator(mesh, points + sign * step * axis, tolerance_mm=2 * tolerance) for sign in (1.0, -1.0) for axis in np.eye(3)]
+    observation, gradient = _observation(mesh, points, experiment, chosen)
     return Specimen(
-        experiment, chosen, place, mesh, initial.ids[usable], points, was_missing[usable], observation, tuple(shifted), discrete, pattern, assembler, contacts,
-        tuple(pairs), tuple(pair_of_points),
+        experiment, chosen, place, mesh, initial.ids[usable], points, was_missing[usable], observation, gradient, mesh.points[:, 2].copy(), assembler,
+        contacts, tuple(pairs), tuple(pair_of_points),
     )  # fmt: skip
+
+
+def _observation(mesh: Mesh, points: Array, experiment: Experiment, settings: ModelSettings) -> tuple[sp.csr_array, tuple[sp.csr_array, ...]]:
+    """Interpolation at markers (k, 3), mm, and at points a little before and behind them along each axis."""
+    tolerance = 0.05 * experiment.height_mm
+    step = _difference_step(settings, experiment)
+    around = [points + sign * step * axis for sign in (1.0, -1.0) for axis in np.eye(3)]
+    here = interpolation_operator(mesh, points, tolerance_mm=tolerance)
+    return here, tuple(interpolation_operator(mesh, p, tolerance_mm=2 * tolerance) for p in around)
 
 
 def _require_supported(experiment: Experiment) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
@@ -97,7 +97,11 @@ class Assembler:
 
     def with_parameters(self, parameters: NDArray[np.float64]) -> Assembler:
         """Return the same assembler with other parameters (m, 4) of the cells, kPa."""
-        return Assembler(self.elements, self.law_codes, parameters, self.pattern, self._positions, self._order, self._colour_start)
+        return replace(self, parameters=parameters)
+
+    def with_elements(self, elements: Elements) -> Assembler:
+        """Return the same assembler for other elements of the same connectivity (moved nodes)."""
+        return replace(self, elements=elements)
 
     def evaluate(self, displacement: NDArray[np.float64]) -> tuple[float, NDArray[np.float64], NDArray[np.float64], float]:
         """Return energy (mN mm), internal forces (n, 3) mN, blocks of the tangent (n_blocks, 3, 3) mN/mm, and the smallest det F.

@@ -9,7 +9,7 @@ tangent is symmetric.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -57,6 +57,13 @@ class Elements:
     def volume(self) -> float:
         """Volume of all groups, mm3."""
         return float(self.weights.sum())
+
+    def moved(self, shift: NDArray[np.float64]) -> Elements:
+        """Return the elements of the same mesh with its nodes moved by `shift` (n, 3), mm, in the free state."""
+        gradient = np.eye(3) + np.einsum("mai,mqaj->mqij", shift[self.connectivity], self.gradients)
+        inverse = np.linalg.inv(gradient)
+        gradients = np.ascontiguousarray(np.einsum("mqaj,mqji->mqai", self.gradients, inverse))
+        return replace(self, gradients=gradients, weights=np.ascontiguousarray(self.weights * np.linalg.det(gradient)))
 
 
 def elements(mesh: Mesh, formulation: Formulation = "mean_dilatation") -> Elements:

@@ -35,6 +35,8 @@ class Direction:
         Change of the ends of the body's path, mm.
     rotation : ndarray, shape (3,), optional
         Rotation of the body about its reference point, rad.
+    points : ndarray, shape (n, 3), optional
+        Change of the nodes' positions in the free state, mm.
     """
 
     materials: Array | None = None
@@ -44,6 +46,7 @@ class Direction:
     start: Array | None = None
     stop: Array | None = None
     rotation: Array | None = None
+    points: Array | None = None
 
 
 def sensitivities(problem: Problem, states: tuple[LoadState, ...], directions: list[Direction], *, newton: Newton | None = None) -> list[Array]:
@@ -76,6 +79,8 @@ def sensitivities(problem: Problem, states: tuple[LoadState, ...], directions: l
         for k, direction in enumerate(directions):
             if direction.materials is not None:
                 rhs[:, :, k] = -problem.assembler.forces_of_parameter(state.displacement, direction.materials)
+            if direction.points is not None:
+                rhs[:, :, k] -= _forces_of_points(problem, state.displacement, direction.points)
         explicit = []
         for c, m, response, da in zip(problem.contacts, moving, responses, d_anchors, strict=True):
             change = m.explicit(c, response, da, state.load)
@@ -92,6 +97,14 @@ def sensitivities(problem: Problem, states: tuple[LoadState, ...], directions: l
     return out
 
 
+def _forces_of_points(problem: Problem, displacement: Array, change: Array) -> Array:
+    """Derivative (n, 3) of the internal forces when the free positions of the nodes change (central difference at fixed displacement)."""
+    step = 1e-5 / max(float(np.abs(change).max()), 1e-12) * float(np.ptp(problem.points, axis=0).max())
+    assembler = problem.assembler
+    forward, backward = (assembler.with_elements(assembler.elements.moved(sign * step * change)).forces(displacement)[1] for sign in (1.0, -1.0))
+    return np.asarray((forward - backward) / (2.0 * step))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _BodyDirections:
     """The parts of all directions that belong to one contact, stacked over the k directions."""
@@ -101,12 +114,15 @@ class _BodyDirections:
     start: Array
     stop: Array
     rotation: Array
+    points: Array
 
     @classmethod
     def gather(cls, index: int, contact: Contact, directions: list[Direction]) -> _BodyDirections:
         n, count = len(contact.area), len(directions)
-        parts = cls(np.zeros((n, count)), np.zeros((n, count)), np.zeros((3, count)), np.zeros((3, count)), np.zeros((3, count)))
+        parts = cls(np.zeros((n, count)), np.zeros((n, count)), np.zeros((3, count)), np.zeros((3, count)), np.zeros((3, count)), np.zeros((n, 3, count)))
         for k, d in enumerate(directions):
+            if d.points is not None:
+                parts.points[:, :, k] = np.einsum("pa,pai->pi", contact.shape, d.points[contact.nodes])
             if d.contact != index:
                 continue
             sources = ((parts.friction, d.friction), (parts.stiffness, d.tangential_stiffness), (parts.start, d.start), (parts.stop, d.stop), (parts.rotation, d.rotation))
@@ -119,7 +135,7 @@ class _BodyDirections:
         """Change (p, 3, k) of local positions of points that stay at `world` (p, 3), relative to the body's reference point."""
         translation = self.start + load * (self.stop - self.start)
         turned = np.cross(self.rotation.T[None, :, :], world[:, None, :])
-        return -np.einsum("pkj,ji->pik", turned + translation.T[None, :, :], contact.rotation)
+        return -np.einsum("pkj,ji->pik", turned + translation.T[None, :, :] - self.points.transpose(0, 2, 1), contact.rotation)
 
     def at_rest(self, contact: Contact) -> Array:
         """Change (p, 3, k) of the anchors at the beginning of loading."""

@@ -1,0 +1,32 @@
+"""Quantities with a unit, as users write them at the edges: ``"222 kPa"``; inside, everything is in mm, kg, s, mN and kPa."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from naibu.core.errors import InputError
+
+_KILOPASCALS = {"Pa": 1e-3, "kPa": 1.0, "MPa": 1e3, "GPa": 1e6, "N/m^2": 1e-3, "N/mm^2": 1e3}
+
+
+def kilopascals(text: str) -> float:
+    """Return a pressure or modulus in kPa; a bare number is taken as kPa.
+
+    Raises
+    ------
+    InputError
+        Not a number, an unknown unit, or a value that is not positive.
+    """
+    match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*([A-Za-z/^0-9]*)\s*", text)
+    try:
+        value = float(match.group(1)) if match else np.nan
+    except ValueError:
+        value = np.nan
+    unit = (match.group(2) if match else "") or "kPa"
+    if unit not in _KILOPASCALS or not np.isfinite(value):
+        raise InputError(f"{text!r} is not a modulus; write a number and one of {', '.join(_KILOPASCALS)}, such as '222 kPa'")
+    if not value > 0.0:
+        raise InputError(f"a modulus must be positive, not {text!r}")
+    return value * _KILOPASCALS[unit]

@@ -1,0 +1,241 @@
+"""Identification by force balance: at an unloaded marker the forces of the cells around it sum to zero, linearly in the parameters.
+
+The report's principle (spec I1, I3) with a finite-strain law: one linear least-squares problem for all trials, no initial guess, no
+boundary conditions. What it bears badly is noise in the displacement, which enters the matrix too and pulls Poisson's ratio down to
+nothing. Further sweeps therefore weigh the equations with the covariance that noise gives them, and move the displacement by the least
+that balances the forces: the Gauss-Helmert model of least squares with conditions (Mikhail & Ackermann 1976). Nodes interpolated on an
+interface have one strain on both sides, where nature has one stress: they pull unknown moduli towards the known ones. An estimate is good
+for a start, within a factor of two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.optimize import lsq_linear
+
+from naibu.core.errors import InputError
+from naibu.core.experiment import Experiment
+from naibu.core.parameters import MAX_POISSON_RATIO
+from naibu.identification.displacement_matching import NoiseModel
+from naibu.identification.marker_mesh import MarkerMesh, marker_mesh
+from naibu.mechanics.assembly import Assembler
+from naibu.mechanics.elements import elements
+from naibu.mechanics.materials import from_moduli, law_named
+
+if TYPE_CHECKING:
+    from naibu.identification.calibration import Knowledge
+
+Array = NDArray[np.float64]
+LAW = law_named("neo_hookean")
+SWEEPS = 2  # more follow the noise: the fit improves, the estimate does not
+UNMEASURED_SD_MM = 0.5  # of a node that was completed or interpolated
+POISSON_RATIO = 0.45  # of a known material, until a sweep has found its own
+SMALLEST, LARGEST = 1e-3, 1e3  # bounds of the moduli, in units of the known ones
+
+
+@dataclass(slots=True, eq=False)
+class _Trial:
+    """A marker mesh ready to be balanced; `displacement` moves with the sweeps."""
+
+    source: MarkerMesh
+    sd: Array
+    assembler: Assembler
+    displacement: Array
+
+    @classmethod
+    def of(cls, source: MarkerMesh, sd: Array) -> _Trial:
+        placeholder = [from_moduli(LAW, 1.0, 10.0)] * len(source.mesh.region_names)
+        assembler = Assembler.from_materials(elements(source.mesh), source.mesh.regions, placeholder)
+        if assembler.forces(source.displacement)[2] <= 0.0:
+            raise InputError(f"{source.label}: a cell between markers is turned inside out; check the markers' numbers and positions")
+        spread = np.where(source.measured, sd, UNMEASURED_SD_MM)
+        return cls(source, spread, assembler, source.displacement)
+
+    def column(self, material: str, which: int) -> Array:
+        """Forces (3 k,) on the interior nodes of a unit of the shear modulus (0) or of Lame's lambda (1) of a material."""
+        mesh = self.source.mesh
+        if material not in mesh.region_names:
+            return np.zeros(3 * len(self.source.interior))
+        direction = np.zeros((mesh.n_cells, 4))
+        direction[mesh.regions == mesh.region_names.index(material), which] = 1.0
+        return self.assembler.forces_of_parameter(self.displacement, direction)[self.source.interior].ravel()
+
+    def tangent(self, moduli: Mapping[str, tuple[float, float]]) -> Array:
+        """Derivatives (3 k, 3 n) of the forces on the interior nodes with respect to the displacement."""
+        mesh = self.source.mesh
+        table = np.zeros((len(mesh.region_names), 4))
+        table[:, :2] = [moduli[name] for name in mesh.region_names]
+        blocks = self.assembler.with_parameters(table[mesh.regions]).evaluate(self.displacement)[2]
+        rows = (3 * self.source.interior[:, None] + np.arange(3)).ravel()
+        return np.asarray(self.assembler.pattern.matrix(blocks).tocsr()[rows].toarray())
+
+
+def force_balance(
+    experiments: Sequence[Experiment],
+    knowledge: Knowledge,
+    states: Mapping[str, Sequence[str]] | None = None,
+    *,
+    poisson_ratios: Mapping[str, float] | None = None,
+    noise: NoiseModel | None = None,
+    sweeps: int = SWEEPS,
+) -> dict[str, tuple[float, float]]:
+    """Estimate the materials with unknown modulus from the balance of forces between markers, over all trials jointly.
+
+    Blocks that merely lie on each other are taken to be glued.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+        With markers numbered on a lattice.
+    knowledge : Knowledge
+        Materials with known Young's modulus, kPa; at least one.
+    states : mapping, optional
+        States to use, by experiment; all measured ones by default.
+    poisson_ratios : mapping, optional
+        Of known materials; sought too where not given.
+    noise : NoiseModel, optional
+        Of the measurement.
+    sweeps : int
+        Sweeps after the first, plain one; 0 gives the report's batch method.
+
+    Returns
+    -------
+    dict
+        (Young's modulus in kPa, Poisson's ratio) of every unknown material.
+
+    Raises
+    ------
+    InputError
+        No known material, no lattice, no loaded state, too few nodes in the inside, or an unknown material that no known one touches.
+    """
+    measured, meshes, spreads = noise or NoiseModel(), [], []
+    for e in experiments:
+        for state in (states or {}).get(e.name, [s.name for s in e.loaded_states]):
+            meshes.append(marker_mesh(e, state))
+            spreads.append(np.sqrt(2.0) * measured.standard_deviation(e.xy_step_mm, e.z_step_mm))
+    if not meshes:
+        raise InputError(f"no loaded state with measured positions in {', '.join(e.name for e in experiments) or 'no experiment'}")
+    return balanced(meshes, spreads, knowledge.young_moduli, poisson_ratios=poisson_ratios, sweeps=sweeps)
+
+
+def balanced(
+    meshes: Sequence[MarkerMesh],
+    spreads: Sequence[Array],
+    young_moduli: Mapping[str, float],
+    *,
+    poisson_ratios: Mapping[str, float] | None = None,
+    sweeps: int = SWEEPS,
+) -> dict[str, tuple[float, float]]:
+    """Estimate unknown materials from displaced meshes; see `force_balance`.
+
+    Parameters
+    ----------
+    meshes : sequence of MarkerMesh
+        One for each trial.
+    spreads : sequence of ndarray, shape (3,)
+        Standard deviation of a displacement along x, y, z in every trial, mm.
+    young_moduli, poisson_ratios : mapping of str to float
+        Known ones, kPa.
+    sweeps : int
+        Weighted sweeps.
+
+    Raises
+    ------
+    InputError
+        See `force_balance`.
+    """
+    names = list(dict.fromkeys(name for m in meshes for name in m.mesh.region_names))
+    known = {name: e for name, e in young_moduli.items() if name in names}
+    unknown = [name for name in names if name not in known]
+    _require_solvable(meshes, known, unknown)
+    given = {name: nu for name, nu in (poisson_ratios or {}).items() if name in known}
+    sought = [(name, which) for name in unknown for which in (0, 1)] + [(name, 1) for name in known if name not in given]
+    trials = [_Trial.of(mesh, sd) for mesh, sd in zip(meshes, spreads, strict=True)]
+    ratios = {name: given.get(name, POISSON_RATIO) for name in known}
+    moduli: dict[str, tuple[float, float]] = {}
+    for sweep in range(sweeps + 1):
+        fixed = {(name, 0): e / (2.0 * (1.0 + ratios[name])) for name, e in known.items()}
+        fixed |= {(name, 1): 2.0 * fixed[name, 0] * nu / (1.0 - 2.0 * nu) for name, nu in given.items()}
+        found = _sweep(trials, sought, fixed, moduli if sweep else None)
+        if found is None:
+            break
+        old, moduli = moduli, found
+        ratios |= {name: min(_young(*moduli[name])[1], MAX_POISSON_RATIO) for name in known if name not in given}
+        if old and all(np.allclose(moduli[name], old[name], rtol=1e-9) for name in names):
+            break
+    return {name: _young(*moduli[name]) for name in unknown}
+
+
+def _sweep(
+    trials: Sequence[_Trial], sought: Sequence[tuple[str, int]], fixed: Mapping[tuple[str, int], float], moduli: Mapping[str, tuple[float, float]] | None
+) -> dict[str, tuple[float, float]] | None:
+    """Solve for the moduli sought; with `moduli` to weigh by, also move the displacements to balance. None where a cell turned over."""
+    systems = []
+    for t in trials:
+        matrix = np.column_stack([t.column(*key) for key in sought])
+        right = -np.sum([value * t.column(*key) for key, value in fixed.items()], axis=0)
+        if moduli is None:
+            systems.append((matrix, right, None))
+            continue
+        tangent = t.tangent(moduli)
+        right = right - tangent @ (t.source.displacement - t.displacement).ravel()
+        scaled = tangent * t.sd.ravel()
+        factor = cho_factor(scaled @ scaled.T, lower=True)
+        systems.append((matrix, right, (factor, scaled)))
+    whitened = [s if s[2] is None else tuple(solve_triangular(s[2][0][0], a, lower=True) for a in s[:2]) for s in systems]
+    reference = float(np.mean([v for (_, which), v in fixed.items() if which == 0]))
+    values = _bounded(np.vstack([w[0] for w in whitened]), np.concatenate([w[1] for w in whitened]), reference)
+    for t, (matrix, right, weights) in zip(trials, systems, strict=True):
+        if weights is not None:
+            error = t.sd.ravel() * (weights[1].T @ cho_solve(weights[0], matrix @ values - right))
+            t.displacement = t.source.displacement - error.reshape(-1, 3)
+            if t.assembler.forces(t.displacement)[2] <= 0.0:
+                return None
+    both = dict(fixed) | dict(zip(sought, values.tolist(), strict=True))
+    return {name: (both[name, 0], both[name, 1]) for name, _ in both}
+
+
+def _bounded(matrix: Array, right: Array, reference: float) -> Array:
+    """Bounded least squares with columns scaled to one length."""
+    length = np.linalg.norm(matrix, axis=0)
+    if not (length > 0.0).all():
+        raise InputError("a material has no cell at a node in the inside of the marker lattice; leave it out or give its modulus")
+    found = lsq_linear(matrix / length, right, bounds=(SMALLEST * reference * length, LARGEST * reference * length), method="bvls")
+    return np.asarray(found.x / length)
+
+
+def _young(mu: float, lame_lambda: float) -> tuple[float, float]:
+    """Young's modulus and Poisson's ratio of Lame's parameters."""
+    nu = lame_lambda / (2.0 * (lame_lambda + mu))
+    return 2.0 * mu * (1.0 + nu), nu
+
+
+def _require_solvable(meshes: Sequence[MarkerMesh], known: Mapping[str, float], unknown: Sequence[str]) -> None:
+    """Refuse systems without a scale, with too few equations, or with an unknown material that no chain of neighbours ties to a known one."""
+    if not known:
+        raise InputError("force balance needs a material with known Young's modulus in the experiments; it finds the others by comparison")
+    if not unknown:
+        raise InputError(f"no material is unknown: {', '.join(known)} are all given")
+    equations = 3 * sum(len(m.interior) for m in meshes)
+    if equations < 2 * len(unknown) + len(known):
+        raise InputError(f"{equations} force balances do not suffice for {len(unknown)} unknown materials; at least 3 x 3 x 3 markers are needed")
+    reached = set(known)
+    groups = [{m.mesh.region_names[r] for r in np.unique(regions)} for m in meshes for regions in _regions_at(m)]
+    for _ in unknown:
+        for group in groups:
+            reached |= group if group & reached else set()
+    if lost := [name for name in unknown if name not in reached]:
+        raise InputError(f"no known material touches {', '.join(lost)} inside the marker lattice; name another known material or add an experiment")
+
+
+def _regions_at(mesh: MarkerMesh) -> list[NDArray[np.int64]]:
+    """Regions of the eight cells at every interior node."""
+    order = np.argsort(mesh.mesh.cells.ravel(), kind="stable")
+    node = mesh.mesh.cells.ravel()[order]
+    return [mesh.mesh.regions[order[a:b] // 8] for a, b in zip(*(np.searchsorted(node, mesh.interior, side) for side in ("left", "right")), strict=True)]
