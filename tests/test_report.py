@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from naibu.core.errors import InputError
-from naibu.report import MAX_BYTES, report_html, write_report
+from naibu.report_page import MAX_BYTES, report_html, write_report
 from naibu.viewer.document import asset
 from naibu.viewer.packing import packed_scene, packed_scenes, thinned
 from naibu.viewer.payload import (

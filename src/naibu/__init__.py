@@ -1,3 +1,27 @@
 """naibu: from images of the inside of a soft thing to a model that behaves like it."""
 
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from naibu import datasets
+    from naibu.workflow import identify, load_experiment, predict, report
+
 __version__ = "0.1.0"
+__all__ = ["__version__", "datasets", "identify", "load_experiment", "predict", "report"]
+
+# loaded when first used, by name, so that `import naibu` stays light
+_MODULES = {"datasets": "naibu.datasets"} | dict.fromkeys(("identify", "load_experiment", "predict", "report"), "naibu.workflow")
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULES:
+        raise AttributeError(f"module 'naibu' has no attribute {name!r}; it has {', '.join(__all__)}")
+    module = importlib.import_module(_MODULES[name])
+    return module if name == "datasets" else getattr(module, name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

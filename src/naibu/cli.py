@@ -1,51 +1,45 @@
-"""The command line: ``naibu demo``, ``identify``, ``predict``, ``report``, ``import``, ``doctor``."""
+"""The command line: ``naibu demo``, ``identify``, ``predict``, ``report``, ``import``, ``doctor``.
+
+Exit codes: 0 done, 1 the installation is not sound (``doctor``), 2 input that cannot be used, 3 a solve that failed, 130 interrupted.
+"""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
-from cyclopts import App, Parameter
+from cyclopts import App, CycloptsError, Parameter
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.markup import escape
+from rich.progress import Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 import naibu
-from naibu import workflow
-from naibu.core.errors import InputError, NaibuError
-from naibu.core.solution import Status
+from naibu.core.errors import ConvergenceError, InputError, NaibuError
 from naibu.doctor import doctor_rows, healthy
-from naibu.identification.calibration import global_names
-from naibu.identification.specimen import ContactModel, ModelSettings
-from naibu.io.tables import import_markers, write_experiment_folder
-from naibu.presentation import accuracy_table
-from naibu.validation.baselines import baselines
 
-app = App(name="naibu", help="Find the mechanical parameters of soft objects from markers measured inside them.", version=naibu.__version__)
-console = Console()
+# other parts are imported where they are used: --help answers at once, and doctor also runs where numpy itself is broken
+if TYPE_CHECKING:
+    from naibu.identification.specimen import ModelSettings
+    from naibu.workflow import Identification
+
+app = App(
+    name="naibu",
+    help="Find the mechanical parameters of soft objects from markers measured inside them.",
+    version=naibu.__version__,
+    default_parameter=Parameter(negative_iterable=()),
+)
+WIDTH_OF_FILES = 160  # where the output is no terminal
+console = Console(width=None if sys.stdout.isatty() else WIDTH_OF_FILES)
+errors = Console(stderr=True, width=None if sys.stderr.isatty() else WIDTH_OF_FILES)
+BAD_INPUT, NO_SOLUTION, INTERRUPTED = 2, 3, 130
 DEMO = ("ct_two_material_1", "ct_two_material_2", "ct_two_material_3")
 DEMO_KNOWN = "hardness 5=222 kPa"  # mean of the report's compression tests, Table 3.4
 Law = Literal["neo_hookean", "neo_hookean_isochoric", "mooney_rivlin", "yeoh", "saint_venant_kirchhoff"]
-
-
-@contextmanager
-def _progress() -> Iterator[workflow.Progress]:
-    """A progress line that tells the stage, the iteration and the objective."""
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TextColumn("chi-squared {task.fields[objective]}"), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
-        tasks: dict[str, object] = {}
-
-        def tell(stage: str, iteration: int, objective: float) -> None:
-            if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=None, objective="")
-            bar.update(tasks[stage], objective=f"{objective:.0f} (iteration {iteration + 1})")  # type: ignore[arg-type]
-
-        tell("identify", -1, float("inf"))
-        yield tell
 
 
 @app.command
@@ -57,19 +51,19 @@ def demo(*, out: Path = Path("naibu-demo")) -> None:
     out
         Folder for the results.
     """
-    console.print(f"Identifying both gels from {', '.join(DEMO)} (bundled CT measurements) ...")
-    _identify(list(DEMO), [DEMO_KNOWN], None, out, ModelSettings(), cross_validate=True, resume=False)
+    _say(f"Identifying both gels from {', '.join(DEMO)} (bundled CT measurements) ...")
+    _identify(DEMO, known=(DEMO_KNOWN,), out=out, cross_validate=True)
 
 
 @app.command
 def identify(
     experiments: list[str],
     *,
-    known: Annotated[list[str] | None, Parameter(negative=())] = None,
-    state: Annotated[list[str] | None, Parameter(negative=())] = None,
+    known: list[str] | None = None,
+    state: list[str] | None = None,
     out: Path = Path("naibu-results"),
     law: Law = "neo_hookean",
-    contact: ContactModel = "coulomb",
+    contact: Literal["coulomb", "stick", "springs"] = "coulomb",
     joined: Literal["glued", "sliding"] = "glued",
     element_size_mm: float = 0.0,
     cross_validate: bool = False,
@@ -100,44 +94,68 @@ def identify(
     resume
         Continue an interrupted search in the same folder.
     """
+    from naibu.identification.specimen import ModelSettings
+
     settings = ModelSettings(law=law, contact=contact, joined=joined, element_size_mm=element_size_mm)
-    _identify(experiments, known or [], _states(state or []), out, settings, cross_validate=cross_validate, resume=resume)
+    states = _states(experiments, state or [])
+    _identify(experiments, known=known or (), states=states, settings=settings, out=out, cross_validate=cross_validate, resume=resume)
 
 
-def _states(chosen: list[str]) -> dict[str, list[str]] | None:
+def _states(experiments: Sequence[str], chosen: Sequence[str]) -> dict[str, list[str]] | None:
+    """States by experiment; an experiment of which none is named keeps all."""
     out: dict[str, list[str]] = {}
     for text in chosen:
-        experiment, _, name = text.partition("/")
-        if not name:
+        experiment, _, name = text.rpartition("/")
+        if not experiment and len(experiments) == 1:
+            experiment = Path(experiments[0]).resolve().name
+        if not name or not experiment:
             raise InputError(f"--state {text!r} must name experiment and state, such as ct_cube_plate/height_45")
         out.setdefault(experiment, []).append(name)
     return out or None
 
 
 def _identify(
-    experiments: list[str], known: list[str], states: dict[str, list[str]] | None, out: Path, settings: ModelSettings, *, cross_validate: bool, resume: bool
+    experiments: Sequence[str],
+    *,
+    known: Sequence[str],
+    out: Path,
+    states: dict[str, list[str]] | None = None,
+    settings: ModelSettings | None = None,
+    cross_validate: bool = False,
+    resume: bool = True,
 ) -> None:
-    start = time.perf_counter()
+    from naibu import workflow
+
+    began = time.perf_counter()
     with _progress() as progress:
         result = workflow.identify(
-            experiments, known=known, states=states, settings=settings, out=out, cross_validate=cross_validate, resume=resume, progress=progress
-        )
-    calibration = result.calibration
-    for trial in calibration.trials:
-        for sentence in trial.specimen.experiment.loading.assumed:
-            console.print(f"[dim]{trial.specimen.experiment.name}: {sentence}[/dim]")
-    values = result.model.parameters.values()
-    compared = {t.label: baselines(t, values[workflow.opening(t.specimen.experiment, t.state)]) for t in calibration.trials}
-    table = accuracy_table(calibration, compared, result.left_out)
+            list(experiments), known=known, states=states, settings=settings, out=out, cross_validate=cross_validate, resume=resume,
+            progress=progress,
+        )  # fmt: skip
+    _show(result)
+    _say(f"{time.perf_counter() - began:.0f} s. Results in {out}: open report.html; naibu predict takes model.json.")
+    if result.interrupted:
+        _say("Interrupted: these are the results so far. The same command continues from here.")
+        sys.exit(INTERRUPTED)
+
+
+def _show(result: Identification) -> None:
+    """Print what was assumed, how well the markers fit, and the parameters."""
+    from naibu.presentation import accuracy_table, parameter_rows, shared_names, undetermined
+
+    calibration, model = result.calibration, result.model
+    experiments = {t.specimen.experiment.name: t.specimen.experiment for t in calibration.trials}
+    for experiment in experiments.values():
+        for line in experiment.loading.assumed:
+            _say(f"{experiment.name}: {line}", "dim")
+    table = accuracy_table(calibration, result.baselines, result.left_out)
     _print_table(table.title, table.columns, table.rows)
-    model = result.model
-    rows = [(p.name, f"{p.value:.4g}", *(f"{b:.4g}" for b in model.interval(p.name)), p.unit) for p in model.parameters if p.name in global_names(model.parameters, calibration.trials)]
-    _print_table("Parameters", ("parameter", "estimate", "95 % from", "to", "unit"), rows)
-    console.print(f"{calibration.match.status.value} Residuals are {model.noise_factor:.2f} times the stated noise. {time.perf_counter() - start:.0f} s.")
-    console.print(f"Report: {out / workflow.REPORT_FILE}   model: {out / workflow.MODEL_FILE}")
-    if calibration.match.status is Status.INTERRUPTED:
-        console.print("Interrupted. The same command continues from here.")
-        sys.exit(130)
+    names = shared_names(model)
+    rows = [(r.name, f"{r.estimate:.4g}", f"{r.lower:.4g}", f"{r.upper:.4g}", r.unit, r.note) for r in parameter_rows(model, names)]
+    _print_table("Parameters", ("parameter", "estimate", "95 % from", "to", "unit", ""), rows)
+    for line in undetermined(model, names):
+        _say(line, "dim")
+    _say(f"{calibration.match.status.value} Residuals are {model.noise_factor:.2f} times the stated noise.")
 
 
 @app.command
@@ -147,7 +165,7 @@ def predict(
     *,
     state: str | None = None,
     height_mm: float | None = None,
-    heights_from_markers: bool = False,
+    heights_from_markers: Annotated[bool, Parameter(negative=())] = False,
     out: Path = Path("naibu-prediction"),
 ) -> None:
     """Predict the markers of a state with a calibrated model.
@@ -165,37 +183,44 @@ def predict(
     heights_from_markers
         Take the height from the mean z of the lowest and the highest marker layer of the measured state, and from nothing else of it.
     out
-        Folder for predicted.csv, summary.json, report.html and files for ParaView.
+        Folder for predicted.csv, summary.json, predicted.html and files for ParaView; may be that of the model.
     """
+    from naibu import workflow
+    from naibu.presentation import accuracy
+
     result = workflow.predict(model, experiment, state=state, height_mm=height_mm, heights_from_markers=heights_from_markers, out=out)
     for note in (*result.specimen.experiment.loading.assumed, *result.notes):
-        console.print(f"[dim]{note}[/dim]")
+        _say(note, "dim")
     if result.registered:
-        n, x, y, z, total, noise = workflow.residual_rows(result.residual, result.fit.sd, ~result.specimen.marker_filled.any(axis=1))
-        console.print(f"{n} markers: RMS x {x:.3f}, y {y:.3f}, z {z:.3f}, 3-D {total:.3f} mm ({noise:.2f} times the noise)")
-    console.print(f"Predicted at {result.opening_mm:.2f} mm: {out / 'predicted.csv'}   report: {out / workflow.REPORT_FILE}")
+        a = accuracy(result.specimen, result.fit, result.residual)
+        rms = f"RMS x {a.x:.3f}, y {a.y:.3f}, z {a.z:.3f}, 3-D {a.total:.3f} mm"
+        _say(f"{a.markers} markers: {rms} ({a.noise_units:.2f} times the noise)")
+    _say(f"Predicted at {result.opening_mm:.2f} mm: {out / 'predicted.csv'}   page: {out / 'predicted.html'}")
 
 
 @app.command
 def report(folder: Path) -> None:
-    """Write report.html anew from the results in a folder.
+    """Write the HTML pages anew from the results in a folder; nothing is solved again.
 
     Parameters
     ----------
     folder
         Where 'naibu identify' or 'naibu predict' wrote its results.
     """
-    console.print(f"Report: {workflow.report(folder)}")
+    from naibu import workflow
+
+    for page in workflow.report(folder):
+        _say(f"Report: {page}")
 
 
 @app.command(name="import")
 def import_tables(
     initial: Path,
-    loaded: Annotated[list[Path], Parameter(negative=())],
+    loaded: list[Path],
     *,
     out: Path,
-    shape: Literal["box", "half_ellipsoid", "cylinder", "hemisphere"] = "box",
     size_mm: tuple[float, float, float],
+    shape: Literal["box", "half_ellipsoid", "cylinder", "hemisphere"] = "box",
     loading: Literal["plate", "bar", "side_plates"] = "plate",
     bar_width_mm: float | None = None,
     title: str = "Imported experiment",
@@ -212,10 +237,14 @@ def import_tables(
         Tables of the loaded states; their file names become the states' names.
     out
         Folder to make.
-    shape, size_mm
-        Outer shape of the object and its extents along x, y, z.
-    loading, bar_width_mm
-        What presses it, and how wide a bar is.
+    size_mm
+        Extents of the object along x, y, z.
+    shape
+        Outer shape of the object.
+    loading
+        What presses it.
+    bar_width_mm
+        How wide a bar is.
     title
         What the experiment is.
     unit
@@ -224,39 +253,78 @@ def import_tables(
         Spacing of a regular marker lattice.
     """
     from naibu.core.experiment import Loading, Shape
+    from naibu.io.tables import import_markers, write_experiment_folder
 
-    states = {path.stem: import_markers(path, unit=unit) for path in loaded}
-    folder = write_experiment_folder(
-        out, import_markers(initial, unit=unit), states, title=title, shape=Shape(shape, size_mm), loading=Loading(loading, bar_width_mm), spacing_mm=spacing_mm
-    )
-    console.print(f"Wrote {folder}. Describe layers and materials in its meta.toml, then run: naibu identify {folder}")
+    names = [path.stem for path in loaded]
+    if len(set(names)) < len(names):
+        raise InputError(f"two tables would both be the state {max(names, key=names.count)!r}; rename one file")
+    write_experiment_folder(
+        out, import_markers(initial, unit=unit), {path.stem: import_markers(path, unit=unit) for path in loaded}, title=title,
+        shape=Shape(shape, size_mm), loading=Loading(loading, bar_width_mm), spacing_mm=spacing_mm,
+    )  # fmt: skip
+    _say(f"Wrote {out}. Describe layers and materials in its meta.toml, then run: naibu identify {out}")
 
 
 @app.command
 def doctor() -> None:
     """Tell what is installed, what is missing, what that is for, and how to get it."""
     rows = doctor_rows()
-    _print_table("naibu doctor", ("what", "status", "found", "for", "remedy"), [(r.name, r.status, r.found, r.purpose, r.remedy) for r in rows])
+    columns = ("what", "status", "found", "for", "remedy")
+    _print_table("naibu doctor", columns, [(r.name, r.status, r.found, r.purpose, r.remedy) for r in rows], left=True)
     if not healthy(rows):
         sys.exit(1)
 
 
-def _print_table(title: str, columns: tuple[str, ...], rows: object) -> None:
+@contextmanager
+def _progress() -> Iterator[Callable[[str, int, float], None]]:
+    """A line for each stage that tells iteration and objective."""
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TextColumn("{task.fields[found]}"), TimeElapsedColumn())
+    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
+        tasks: dict[str, TaskID] = {"identify": bar.add_task("identify", total=None, found="reading, and solving with the first guess")}
+
+        def tell(stage: str, iteration: int, objective: float) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=None, found="")
+            bar.update(tasks[stage], found=f"iteration {iteration + 1}, chi-squared {objective:.0f}")
+
+        yield tell
+
+
+def _say(text: str, style: str | None = None) -> None:
+    """Print a line as it is, unbroken, so that paths can be copied."""
+    console.print(escape(text), style=style, soft_wrap=True, highlight=False)
+
+
+def _print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[object]], *, left: bool = False) -> None:
     table = Table(title=title, title_justify="left")
     for i, column in enumerate(columns):
-        table.add_column(column, justify="left" if i == 0 else "right")
-    for row in rows:  # type: ignore[attr-defined]
-        table.add_row(*("-" if c is None else str(c) for c in row))
+        table.add_column(column, justify="left" if i == 0 or left else "right", overflow="fold")
+    for row in rows:
+        table.add_row(*(_cell(c) for c in row))
     console.print(table)
+
+
+def _cell(value: object) -> str:
+    if value is None or value != value:
+        return "-"
+    return f"{value:.3f}" if isinstance(value, float) else escape(str(value))
+
+
+def _fail(text: str, code: int) -> NoReturn:
+    errors.print(f"[bold red]error[/bold red] {escape(text)}", soft_wrap=True, highlight=False)
+    sys.exit(code)
 
 
 def main() -> None:
     """Run the command line; a user's mistake ends with one message and exit code 2."""
     try:
-        app()
+        app(sys.argv[1:], exit_on_error=False, print_error=False)
+    except CycloptsError as error:
+        _fail(f"{' '.join(str(error).split())} See naibu --help, or naibu VERB --help.", BAD_INPUT)
+    except ConvergenceError as error:
+        _fail(str(error), NO_SOLUTION)
     except NaibuError as error:
-        console.print(f"[bold red]error[/bold red] {error}", highlight=False, markup=True)
-        sys.exit(2)
+        _fail(str(error), BAD_INPUT)
     except KeyboardInterrupt:
-        console.print("Interrupted; nothing half-written was left behind.")
-        sys.exit(130)
+        errors.print("Interrupted; every file written is whole. An identification goes on with the same command.", soft_wrap=True)
+        sys.exit(INTERRUPTED)

@@ -1,55 +1,79 @@
-"""Turn calibrations and predictions into the records that a report shows and the files that other programs open."""
+"""Turn calibrations and predictions into the records that a report shows. Here residuals are predicted minus measured."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from naibu.core.parameters import Parameter
-from naibu.identification.calibration import Calibration, global_names
+from naibu.identification.calibration import Calibration
 from naibu.identification.comparison import LeftOut
 from naibu.identification.displacement_matching import Trial, TrialFit
 from naibu.identification.model import CalibratedModel
 from naibu.identification.prediction import Prediction, marker_layers
 from naibu.identification.specimen import Specimen
 from naibu.meshing.surface import boundary_faces, triangles_of_faces
-from naibu.viewer.payload import Box, Correlation, ParameterRow, Report, ResidualSet, Scene, Step, Table
+from naibu.viewer.payload import Box, Cell, Correlation, ParameterRow, Report, ResidualSet, Scene, Step, Table
 
 Array = NDArray[np.float64]
+_ACCURACY_COLUMNS = ("experiment/state", "markers", "x mm", "y mm", "z mm", "3-D mm", "in noise units")
 
 
-def residual_rows(residual: Array, sd: Array, exact: NDArray[np.bool_]) -> tuple[int, float, float, float, float, float]:
-    """Return number of whole markers, RMS along x, y, z and in 3-D (mm), and RMS in units of the noise.
+@dataclass(frozen=True, slots=True)
+class Accuracy:
+    """How far predicted markers lie from measured ones.
 
-    Only markers measured completely in both states (`exact`) count.
+    Attributes
+    ----------
+    markers : int
+        Number of markers measured completely in both states; no others count.
+    x, y, z, total : float
+        Root mean square along the axes, and of the distance, mm; NaN without markers.
+    noise_units : float
+        Root mean square in units of the noise.
     """
-    whole = np.isfinite(residual).all(axis=1) & exact
-    r = residual[whole]
-    if not len(r):
-        return 0, *([np.nan] * 5)
-    x, y, z = np.sqrt((r**2).mean(axis=0))
-    return len(r), float(x), float(y), float(z), float(np.sqrt((r**2).sum(axis=1).mean())), float(np.sqrt(((r / sd[whole]) ** 2).mean()))
+
+    markers: int
+    x: float
+    y: float
+    z: float
+    total: float
+    noise_units: float
+
+
+def accuracy(specimen: Specimen, fit: TrialFit, residual: Array | None = None) -> Accuracy:
+    """Return the accuracy of a fit; of another `residual` (k, 3), mm, where the fit itself is not registered to the measured markers."""
+    r = fit.residual if residual is None else residual
+    whole = np.isfinite(r).all(axis=1) & ~np.any(specimen.marker_filled, axis=1)
+    if not whole.any():
+        return Accuracy(0, *([np.nan] * 5))
+    squared = r[whole] ** 2
+    x, y, z = np.sqrt(squared.mean(axis=0)).tolist()
+    noise_units = np.sqrt((squared / fit.sd[whole] ** 2).mean())
+    return Accuracy(int(whole.sum()), x, y, z, float(np.sqrt(squared.sum(axis=1).mean())), float(noise_units))
 
 
 def accuracy_table(calibration: Calibration, baselines: Mapping[str, Mapping[str, float]], left_out: Sequence[LeftOut] = ()) -> Table:
     """Return RMS of every trial, of its prediction when left out, and of simple baselines."""
     names = list(dict.fromkeys(k for row in baselines.values() for k in row))
     unseen = {f"{r.experiment}/{r.state}": r.rms_mm for r in left_out}
-    columns = ["experiment/state", "markers", "x mm", "y mm", "z mm", "3-D mm", "in noise units"]
-    columns += (["3-D mm, left out"] if unseen else []) + [f"{n}, 3-D mm" for n in names]
     rows = []
     for trial, fit in zip(calibration.trials, calibration.match.fits, strict=True):
-        numbers = residual_rows(fit.residual, fit.sd, ~trial.specimen.marker_filled.any(axis=1))
-        extra = [unseen.get(trial.label)] if unseen else []
-        rows.append((trial.label, *(round(v, 3) for v in numbers), *(_round(v) for v in extra), *(_round(baselines.get(trial.label, {}).get(n)) for n in names)))
-    note = "Root mean square over markers measured completely in both states. Left out: the other experiments identified the parameters."
-    return Table("Measured against predicted markers", tuple(columns), tuple(rows), note)
+        compared = baselines.get(trial.label, {})
+        extra = ([unseen.get(trial.label)] if unseen else []) + [compared.get(n) for n in names]
+        rows.append((*_accuracy_row(trial.label, accuracy(trial.specimen, fit)), *(None if v is None else round(v, 3) for v in extra)))
+    columns = (*_ACCURACY_COLUMNS, *(["left out, 3-D mm"] if unseen else []), *(f"{n}, 3-D mm" for n in names))
+    note = "Root mean square over markers measured completely in both states."
+    if unseen:
+        note += " Left out: the other experiments identified the parameters."
+    return Table("Measured against predicted markers", columns, tuple(rows), note)
 
 
-def _round(value: float | None) -> float | None:
-    return None if value is None else round(value, 3)
+def _accuracy_row(label: str, a: Accuracy) -> tuple[Cell, ...]:
+    return (label, a.markers, *(round(v, 3) for v in (a.x, a.y, a.z, a.total, a.noise_units)))
 
 
 def scene(specimen: Specimen, state: str, fit: TrialFit, measured: Array, values: Mapping[str, float], role: str) -> Scene:
@@ -75,19 +99,19 @@ def scene(specimen: Specimen, state: str, fit: TrialFit, measured: Array, values
     faces = triangles_of_faces(local.reshape(boundary.faces.shape))
     steps = []
     paths = specimen.indenter_paths(values, state)
-    base_offset = values.get(f"{specimen.experiment.name}: base_offset", 0.0)
+    body, experiment = specimen.reshaped(values), specimen.experiment
     for s in fit.solution.states:
-        gradient = specimen.deformation_gradient(s.displacement)
-        markers = specimen.marker_points + specimen.observation @ s.displacement + base_offset * gradient[:, :, 2]
+        markers = body.marker_points + body.observation @ s.displacement
         boxes = tuple(_box(specimen, start + s.load * (stop - start), normal) for start, stop, normal in paths)
         travel = float(max(np.linalg.norm(stop - start) for start, stop, _ in paths))
         label = f"{100 * s.load:.0f} % of the load" if s.load < 1.0 else "full load"
-        steps.append(Step(label, s.load * travel, specimen.mesh.points[nodes] + s.displacement[nodes], markers, boxes))
-    free = specimen.marker_points + [0.0, 0.0, base_offset]
-    layer = marker_layers(specimen.marker_points[:, 2], specimen.experiment.nominal_spacing_mm)
-    name = f"{specimen.experiment.name}/{state}"
+        steps.append(Step(label, s.load * travel, body.mesh.points[nodes] + s.displacement[nodes], markers, boxes))
+    layer = marker_layers(specimen.marker_points[:, 2], experiment.nominal_spacing_mm)
     sd = np.sqrt((fit.sd**2).mean(axis=1))
-    return Scene(name, specimen.experiment.name, state, faces, specimen.mesh.points[nodes], tuple(steps), specimen.marker_ids, free, measured, sd, layer, role)
+    return Scene(
+        f"{experiment.name}/{state}", experiment.name, state, faces, body.mesh.points[nodes], tuple(steps), body.marker_ids,
+        body.marker_points, measured, sd, layer, role,
+    )  # fmt: skip
 
 
 def _box(specimen: Specimen, position: Array, normal: Array) -> Box:
@@ -102,19 +126,26 @@ def _box(specimen: Specimen, position: Array, normal: Array) -> Box:
         half[2] = 5.0
     centre = position - normal * half[axis]
     if axis != 2:
-        centre = centre + [0.0, 0.0, size[2] - 4.0]
-    return Box(tuple(centre.tolist()), tuple(half.tolist()))
+        centre = centre + np.array([0.0, 0.0, size[2] - 4.0])
+    (x, y, z), (a, b, c) = centre.tolist(), half.tolist()
+    return Box((x, y, z), (a, b, c))
 
 
 def trial_scene(trial: Trial, fit: TrialFit, values: Mapping[str, float], role: str = "fitted") -> Scene:
     """Return a fitted trial for the 3-D view."""
-    measured = (trial.measured - fit.pose.position) @ fit.pose.rotation + fit.pose.centre
-    return scene(trial.specimen, trial.state, fit, measured, values, role)
+    return scene(trial.specimen, trial.state, fit, fit.pose.undone(trial.measured), values, role)
 
 
-def prediction_scene(prediction: Prediction) -> Scene:
+def prediction_scene(prediction: Prediction, role: str = "predicted unseen") -> Scene:
     """Return a prediction for the 3-D view."""
-    return scene(prediction.specimen, prediction.state, prediction.fit, prediction.measured_in_object, prediction.values, "predicted unseen")
+    p = prediction
+    return scene(p.specimen, p.state, p.fit, p.measured_in_object, p.values, role)
+
+
+def shared_names(model: CalibratedModel) -> tuple[str, ...]:
+    """Return the names of the free parameters of materials and friction, which hold beyond the experiments used."""
+    own = {label.partition("/")[0] for label in model.trials}
+    return tuple(p.name for p in model.parameters.free if p.name.partition(":")[0].partition("/")[0] not in own)
 
 
 def parameter_rows(model: CalibratedModel, names: Sequence[str]) -> tuple[ParameterRow, ...]:
@@ -151,28 +182,95 @@ def undetermined(model: CalibratedModel, names: Sequence[str]) -> tuple[str, ...
 
 
 def build_report(
-    calibration: Calibration, model: CalibratedModel, baselines: Mapping[str, Mapping[str, float]], left_out: Sequence[LeftOut] = (), tables: Sequence[Table] = ()
+    calibration: Calibration, model: CalibratedModel, baselines: Mapping[str, Mapping[str, float]], left_out: Sequence[LeftOut] = ()
 ) -> Report:
     """Gather everything that a calibration's page shows."""
-    names = global_names(model.parameters, calibration.trials)
-    values = model.parameters.values()
-    scenes = [trial_scene(t, f, values) for t, f in zip(calibration.trials, calibration.match.fits, strict=True)]
-    accuracy = accuracy_table(calibration, baselines, left_out)
-    worst = max(float(row[5]) for row in accuracy.rows)  # type: ignore[arg-type]
-    headline = [f"One set of parameters predicts the markers of {len(scenes)} loaded state{'s' * (len(scenes) > 1)} to {worst:.2f} mm or better (RMS, 3-D)."]
-    if left_out:
-        headline.append(f"Predicted from the other experiments, they lie within {max(r.rms_mm for r in left_out):.2f} mm.")
-    headline.append(f"Residuals are {model.noise_factor:.2f} times the stated measurement noise. {calibration.match.status.value}")
-    correlation = Correlation(tuple(names), model.correlation(names)) if len(names) > 1 else None
-    residuals = tuple(ResidualSet.from_scene(s) for s in scenes)
-    nuisance = [p for p in model.parameters.free if p.name not in names]
-    rows = tuple((p.name, p.value, *model.interval(p.name), p.unit) for p in nuisance)
-    boundary = Table("Boundary conditions, found with the rest", ("parameter", "estimate", "95 % from", "to", "unit"), tuple(tuple(_short(c) for c in r) for r in rows))
+    names, values = shared_names(model), model.parameters.values()
+    scenes = tuple(trial_scene(t, f, values) for t, f in zip(calibration.trials, calibration.match.fits, strict=True))
+    assumed = dict.fromkeys(f"{t.specimen.experiment.name}: {s}" for t in calibration.trials for s in t.specimen.experiment.loading.assumed)
     return Report(
-        "Calibration of " + ", ".join(dict.fromkeys(t.specimen.experiment.name for t in calibration.trials)), tuple(headline), tuple(scenes), accuracy,
-        residuals, parameter_rows(model, names), correlation, undetermined(model, names), (boundary, *tables), model.provenance,
-    )  # fmt: skip
+        title="Calibration of " + ", ".join(dict.fromkeys(t.specimen.experiment.name for t in calibration.trials)),
+        headline=_calibration_headline(calibration, model, left_out),
+        scenes=scenes,
+        accuracy=accuracy_table(calibration, baselines, left_out),
+        residuals=tuple(ResidualSet.from_scene(s) for s in scenes),
+        parameters=parameter_rows(model, names),
+        correlation=_correlation(model, names),
+        undetermined=undetermined(model, names),
+        tables=(_boundary_table(model, names), *_assumptions(tuple(assumed))),
+        provenance=model.provenance,
+    )
 
 
-def _short(cell: str | float) -> str | float:
-    return cell if isinstance(cell, str) else float(f"{cell:.4g}")
+def _calibration_headline(calibration: Calibration, model: CalibratedModel, left_out: Sequence[LeftOut]) -> tuple[str, ...]:
+    found = [accuracy(t.specimen, f).total for t, f in zip(calibration.trials, calibration.match.fits, strict=True)]
+    states = f"{len(found)} loaded states" if len(found) > 1 else "one loaded state"
+    out = [
+        f"One set of parameters predicts the markers of {states} to {np.nanmax(found):.2f} mm{' or better' * (len(found) > 1)} (RMS, 3-D)."
+    ]
+    if left_out:
+        out.append(f"Predicted from the other experiments, they lie within {max(r.rms_mm for r in left_out):.2f} mm.")
+    out.append(f"Residuals are {model.noise_factor:.2f} times the stated measurement noise. {calibration.match.status.value}")
+    return tuple(out)
+
+
+def _correlation(model: CalibratedModel, names: Sequence[str]) -> Correlation | None:
+    return Correlation(tuple(names), model.correlation(names)) if len(names) > 1 else None
+
+
+def _boundary_table(model: CalibratedModel, names: Sequence[str]) -> Table:
+    rows: list[tuple[Cell, ...]] = []
+    for p in model.parameters.free:
+        if p.name not in names:
+            low, high = model.interval(p.name)
+            rows.append((p.name, _short(p.value), _short(low), _short(high), p.unit))
+    return Table("Boundary conditions, found with the rest", ("parameter", "estimate", "95 % from", "to", "unit"), tuple(rows))
+
+
+def _assumptions(sentences: Sequence[str]) -> tuple[Table, ...]:
+    """A table of what was assumed; none where nothing was."""
+    return (Table("Assumptions", ("what was not told, and what was taken instead",), tuple((s,) for s in sentences)),) if sentences else ()
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.4g}")
+
+
+def prediction_report(model: CalibratedModel, prediction: Prediction) -> Report:
+    """Gather everything that a prediction's page shows."""
+    p, names = prediction, shared_names(model)
+    label = f"{p.specimen.experiment.name}/{p.state}"
+    view = prediction_scene(p, "also used to identify" if label in model.trials else "predicted unseen")
+    table = Table("Measured against predicted markers", _ACCURACY_COLUMNS, (_accuracy_row(label, accuracy(p.specimen, p.fit, p.residual)),))
+    return Report(
+        title=f"Prediction of {label}",
+        headline=_prediction_headline(p),
+        scenes=(view,),
+        accuracy=table if p.registered else None,
+        residuals=(ResidualSet.from_scene(view),) if p.registered else (),
+        parameters=parameter_rows(model, names),
+        correlation=_correlation(model, names),
+        undetermined=undetermined(model, names),
+        tables=(_used_table(model, p), *_assumptions((*p.specimen.experiment.loading.assumed, *p.notes))),
+        provenance=model.provenance,
+    )
+
+
+def _prediction_headline(p: Prediction) -> tuple[str, ...]:
+    what = {"side_plates": "side plates {} mm apart", "bar": "the bar {} mm above the base"}.get(
+        p.specimen.experiment.loading.kind, "the plate {} mm above the base"
+    )
+    place, label = what.format(f"{p.opening_mm:.2f}"), f"{p.specimen.experiment.name}/{p.state}"
+    spread = f"The stated standard deviation of a predicted coordinate is {np.median(p.sd_mm):.2f} mm (median over the markers)."
+    if not p.registered:
+        return (f"{len(p.points)} markers of {label} are predicted, with {place}; no measured positions are there to compare.", spread)
+    a = accuracy(p.specimen, p.fit, p.residual)
+    lead = f"The markers of {label} are predicted to {a.total:.2f} mm (RMS, 3-D), with {place}."
+    return (lead, f"Residuals are {a.noise_units:.2f} times the stated measurement noise, after a rigid registration of the scan.", spread)
+
+
+def _used_table(model: CalibratedModel, p: Prediction) -> Table:
+    """Values that the prediction used and the model did not estimate for it."""
+    known = model.parameters.values()
+    rows = tuple((name, _short(value)) for name, value in p.values.items() if name not in known or not np.isclose(known[name], value))
+    return Table("Boundary conditions and other values used (mm, rad, kPa)", ("parameter", "value"), rows)

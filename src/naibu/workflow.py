@@ -2,48 +2,72 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import json
+import difflib
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 import naibu
 from naibu import datasets
-from naibu.core.errors import InputError
+from naibu.core.errors import ConvergenceError, InputError, NaibuError
 from naibu.core.experiment import Experiment
 from naibu.core.solution import Status
 from naibu.core.units import kilopascals
 from naibu.identification.calibration import Calibration, Knowledge, calibrate
 from naibu.identification.comparison import LeftOut, leave_one_out
+from naibu.identification.displacement_matching import Trial
 from naibu.identification.model import CalibratedModel
-from naibu.identification.prediction import Prediction, opening, rms
+from naibu.identification.pose import registration
+from naibu.identification.prediction import Prediction, rms
 from naibu.identification.prediction import predict as predict_state
-from naibu.identification.specimen import ModelSettings
-from naibu.io.atomic import write_atomically
+from naibu.identification.specimen import ModelSettings, opening
 from naibu.io.experiments import META_FILE, read_experiment
-from naibu.io.results import write_vtu, write_vtkhdf_series
-from naibu.presentation import build_report, prediction_report, residual_rows
-from naibu.report import report_html
-from naibu.validation.baselines import baselines
+from naibu.result_files import (
+    CHECKPOINT_FILE,
+    read_checkpoint,
+    read_model,
+    result_folder,
+    rewrite_reports,
+    write_checkpoint,
+    write_identification,
+    write_prediction,
+)
+from naibu.validation.baselines import affine, baselines
 
-MODEL_FILE, REPORT_FILE, SUMMARY_FILE, CHECKPOINT_FILE = "model.json", "report.html", "summary.json", "checkpoint.json"
+__all__ = ["Identification", "identify", "load_experiment", "parse_known", "predict", "read_model", "report"]
+
 Source = str | os.PathLike[str] | Experiment
 Progress = Callable[[str, int, float], None]
+MOST_ELEMENTS = 100_000
+RATIO_REFERENCE_KPA = 200.0  # stands for 1 where only ratios of moduli are sought
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Identification:
-    """What `identify` returns: the model, the calibration behind it, and the experiments left out in turn."""
+    """What `identify` returns.
+
+    Attributes
+    ----------
+    model : CalibratedModel
+        What predictions need.
+    calibration : Calibration
+        The search behind it.
+    baselines : mapping of str to mapping
+        RMS distance (mm) of simple descriptions from the measured markers, by ``experiment/state`` and name.
+    left_out : tuple of LeftOut
+        Experiments predicted from the others; empty when that was not asked for.
+    interrupted : bool
+        Whether the user stopped it; the model is then the best so far, and the same call continues from there.
+    """
 
     model: CalibratedModel
     calibration: Calibration
+    baselines: Mapping[str, Mapping[str, float]]
     left_out: tuple[LeftOut, ...]
+    interrupted: bool
 
 
 def load_experiment(source: Source) -> Experiment:
@@ -56,12 +80,16 @@ def load_experiment(source: Source) -> Experiment:
     """
     if isinstance(source, Experiment):
         return source
-    path = Path(source)
-    if (path / META_FILE).is_file() or path.exists():
+    path, name = Path(source), str(source)
+    if path.exists():
         return read_experiment(path)
-    if str(source) in datasets.names():
-        return datasets.load(str(source))
-    raise InputError(f"{str(source)!r} is neither a folder with a {META_FILE} nor a bundled dataset ({', '.join(datasets.names())})")
+    if name in datasets.names():
+        return datasets.load(name)
+    close = difflib.get_close_matches(name, datasets.names(), n=1)
+    hint = f"did you mean {close[0]!r}? " if close else ""
+    raise InputError(
+        f"{name!r} is neither a folder with a {META_FILE} nor a bundled dataset; {hint}Bundled are {', '.join(datasets.names())}"
+    )
 
 
 def parse_known(known: Sequence[str]) -> Knowledge | None:
@@ -70,21 +98,30 @@ def parse_known(known: Sequence[str]) -> Knowledge | None:
     Raises
     ------
     InputError
-        A value that is not a modulus, or materials with and without a value mixed.
+        A value that is not a modulus, a material given twice, or materials with and without a value mixed.
     """
     if not known:
         return None
-    with_value = {k.split("=", 1)[0].strip(): kilopascals(k.split("=", 1)[1]) for k in known if "=" in k}
-    without = [k.strip() for k in known if "=" not in k]
-    if with_value and without:
-        raise InputError(f"--known gives a modulus for {', '.join(with_value)} but none for {', '.join(without)}; give one for each")
+    pairs = [(name.strip(), value.strip()) for name, _, value in (text.partition("=") for text in known)]
+    names = [name for name, _ in pairs]
+    for name in names:
+        if not name or names.count(name) > 1:
+            raise InputError(f"--known names {name!r} {names.count(name)} times; write each material once, such as 'hardness 5=222 kPa'")
+    without = [text for text in known if "=" not in text]
+    if without and len(without) < len(known):
+        raise InputError(f"--known gives a modulus for some materials but none for {', '.join(without)}; give one for each")
     if len(without) > 1:
         raise InputError("without moduli only one material can set the scale; write for instance --known 'hardness 5=222 kPa'")
-    return Knowledge(with_value) if with_value else Knowledge({without[0]: 200.0}, scale_is_absolute=False)
+    if without:
+        return Knowledge({names[0]: RATIO_REFERENCE_KPA}, scale_is_absolute=False)
+    try:
+        return Knowledge({name: kilopascals(value) for name, value in pairs})
+    except InputError as error:
+        raise InputError(f"--known {', '.join(repr(text) for text in known)}: {error}") from error
 
 
 def identify(
-    experiments: Sequence[Source],
+    experiments: Sequence[Source] | Source,
     *,
     known: Sequence[str] = (),
     states: Mapping[str, Sequence[str]] | None = None,
@@ -96,10 +133,12 @@ def identify(
 ) -> Identification:
     """Identify materials, friction and boundary conditions from experiments, and write model, tables and report.
 
+    Ctrl-C (KeyboardInterrupt) ends the search: what is returned and written is the best so far, and the same call goes on from it.
+
     Parameters
     ----------
     experiments : sequence
-        Folders, names of bundled datasets, or `Experiment` objects.
+        Folders, names of bundled datasets, or `Experiment` objects; or one of these.
     known : sequence of str
         ``"hardness 5=222 kPa"`` for materials with a known Young's modulus, or one name that sets the scale of ratios.
     states : mapping, optional
@@ -107,7 +146,8 @@ def identify(
     settings : ModelSettings, optional
         Law, contact, joints, mesh.
     out : path, optional
-        Folder for ``model.json``, ``summary.json``, ``residuals.csv``, ``report.html`` and one ``.vtkhdf`` for each state.
+        Folder for ``model.json``, ``identification.json`` (figures), ``residuals.csv`` (predicted minus measured), ``report.html`` with
+        ``report.json`` behind it, and one ``.vtkhdf`` for each state.
     cross_validate : bool
         Also predict every experiment from the others.
     resume : bool
@@ -115,41 +155,148 @@ def identify(
     progress : callable, optional
         ``progress(stage, iteration, objective)``.
 
+    Returns
+    -------
+    Identification
+        Model, search, and what it is compared with.
+
     Raises
     ------
     InputError
         Unusable input.
     ConvergenceError
-        A state cannot be solved at the starting values.
+        A state cannot be solved at the starting values, or, with `cross_validate`, with an experiment left out; in the latter case the
+        model has been written.
     """
-    loaded = [load_experiment(e) for e in experiments]
+    loaded = _loaded(experiments)
     knowledge, chosen = parse_known(known), settings or ModelSettings()
-    folder = _folder(out)
-    provenance = _provenance(loaded, known, chosen)
-    checkpoint = folder / CHECKPOINT_FILE if folder else None
+    _check_size(loaded, chosen.element_size_mm)
+    _check_states(loaded, states or {})
+    folder = None if out is None else result_folder(out)
+    provenance = _provenance(loaded, known, states or {}, chosen)
 
     def each(iteration: int, objective: float, values: Mapping[str, float]) -> None:
-        if checkpoint is not None:
-            write_atomically(checkpoint, json.dumps({"provenance": provenance, "values": dict(values)}))
+        if folder is not None:
+            write_checkpoint(folder, provenance, values)
         if progress is not None:
             progress("identify", iteration, objective)
 
-    start = _resumed(checkpoint, provenance) if resume else None
-    calibration = calibrate(loaded, knowledge=knowledge, states=states, settings=chosen, start=start, callback=each)
+    start = read_checkpoint(folder, provenance) if folder is not None and resume else None
+    try:
+        calibration = calibrate(loaded, knowledge=knowledge, states=states, settings=chosen, start=start, callback=each)
+    except ConvergenceError as error:
+        labels = [f"{e.name}/{s.name}" for e in loaded for s in _with_states(e, states or {}).loaded_states]
+        one_of = "one of " * (len(labels) > 1) + ", ".join(labels)
+        raise ConvergenceError(f"{one_of} cannot be solved with the starting values: {error}") from error
     model = CalibratedModel.of(calibration, provenance)
+    left_in_turn = [_with_states(e, states or {}) for e in loaded] if cross_validate else []
+    result, trouble = _compared(calibration, model, left_in_turn, progress)
+    if folder is not None:
+        write_identification(folder, calibration, model, result.baselines, result.left_out)
+        if result.interrupted:
+            write_checkpoint(folder, provenance, model.parameters.values())
+        else:
+            (folder / CHECKPOINT_FILE).unlink(missing_ok=True)
+    if trouble is not None:
+        raise trouble
+    return result
+
+
+def _loaded(experiments: Sequence[Source] | Source) -> list[Experiment]:
+    sources = [experiments] if isinstance(experiments, str | os.PathLike | Experiment) else list(experiments)
+    loaded = [load_experiment(e) for e in sources]
+    names = [e.name for e in loaded]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{names.count(name)} experiments are called {name!r}; give each once, or rename a folder")
+    return loaded
+
+
+def _check_size(loaded: Sequence[Experiment], edge_mm: float) -> None:
+    """Refuse elements of no size, and so many that no memory holds them."""
+    if not (math.isfinite(edge_mm) and edge_mm >= 0.0):
+        raise InputError(f"an element size of {edge_mm:g} mm cannot be; give a positive length, or 0 for an eighth of the object's height")
+    for e in loaded:
+        count = math.prod(e.shape.size_mm) / edge_mm**3 if edge_mm > 0.0 else 0.0
+        if count > MOST_ELEMENTS:
+            raise InputError(
+                f"an element size of {edge_mm:g} mm makes {count:.3g} elements of {e.name}, at most {MOST_ELEMENTS} are solved"
+            )
+
+
+def _check_states(loaded: Sequence[Experiment], states: Mapping[str, Sequence[str]]) -> None:
+    """Refuse states that no experiment has, or that show no load."""
+    by_name = {e.name: e for e in loaded}
+    for name, chosen in states.items():
+        if name not in by_name:
+            raise InputError(f"states of {name!r} are chosen, but the experiments are {', '.join(by_name)}")
+        for state in chosen:
+            _require_loaded(by_name[name], state)
+
+
+def _require_loaded(experiment: Experiment, state: str) -> None:
+    if not experiment.state(state).loaded:
+        raise InputError(f"{experiment.name}/{state} is not loaded; loaded are {_names(experiment)}")
+
+
+def _names(experiment: Experiment) -> str:
+    return ", ".join(s.name for s in experiment.states[1:] if s.loaded) or "none"
+
+
+def _with_states(experiment: Experiment, states: Mapping[str, Sequence[str]]) -> Experiment:
+    """Return the experiment without the loaded states that were not chosen."""
+    chosen = states.get(experiment.name)
+    if chosen is None:
+        return experiment
+    return replace(experiment, states=(experiment.states[0], *(s for s in experiment.states[1:] if s.name in chosen)))
+
+
+def _compared(
+    calibration: Calibration, model: CalibratedModel, left_in_turn: Sequence[Experiment], progress: Progress | None
+) -> tuple[Identification, NaibuError | None]:
+    """Compute what the calibration is compared with; what goes wrong here is returned, so that the model is written first."""
+    compared: dict[str, dict[str, float]] = {}
     left_out: tuple[LeftOut, ...] = ()
-    if cross_validate and calibration.match.status is not Status.INTERRUPTED and len(loaded) > 1:
+    interrupted, trouble = calibration.match.status is Status.INTERRUPTED, None
+    values = model.parameters.values()
 
-        def other(iteration: int, objective: float, values: Mapping[str, float]) -> None:
-            if progress is not None:
-                progress("leave one out", iteration, objective)
+    def each(left: str, iteration: int, objective: float) -> None:
+        if progress is not None:
+            progress(f"without {left}", iteration, objective)
 
-        left_out = tuple(leave_one_out(loaded, knowledge=calibration.knowledge, settings=chosen, start=model.parameters.values(), callback=other))
-    if folder:
-        _write_identification(folder, calibration, model, left_out)
-        if checkpoint is not None and calibration.match.status is not Status.INTERRUPTED:
-            checkpoint.unlink(missing_ok=True)
-    return Identification(model, calibration, left_out)
+    try:
+        if not interrupted:
+            compared = {t.label: _baselines(t, values[opening(t.specimen.experiment, t.state)]) for t in calibration.trials}
+        if not interrupted and left_in_turn:
+            found = leave_one_out(left_in_turn, knowledge=calibration.knowledge, settings=calibration.settings, start=values, callback=each)
+            left_out = tuple(found)
+    except KeyboardInterrupt:
+        interrupted = True
+    except NaibuError as error:
+        trouble = error
+    return Identification(model, calibration, compared, left_out, interrupted), trouble
+
+
+def _baselines(trial: Trial, opening_mm: float) -> dict[str, float]:
+    """Simple descriptions of a state; without the linear one where it does not apply."""
+    try:
+        return baselines(trial, opening_mm)
+    except NaibuError:
+        free, measured = trial.specimen.marker_points, trial.measured
+        return {"rigid": rms(measured - registration(free, measured).applied(free)), "affine": rms(measured - affine(free, measured))}
+
+
+def _provenance(
+    experiments: Sequence[Experiment], known: Sequence[str], states: Mapping[str, Sequence[str]], settings: ModelSettings
+) -> dict[str, Any]:
+    return {
+        "naibu": naibu.__version__,
+        "known": list(known),
+        "states": {name: list(chosen) for name, chosen in states.items()},
+        "settings": asdict(settings),
+        "inputs": {e.name: dict(e.input_hashes) for e in experiments},
+        "seed": "none: the search is deterministic",
+    }
 
 
 def predict(
@@ -176,7 +323,13 @@ def predict(
     heights_from_markers : bool
         Take the height from the lowest and highest marker layer of the measured state.
     out : path, optional
-        Folder for ``predicted.csv``, ``summary.json``, ``report.html``, ``predicted.vtu`` and ``path.vtkhdf``.
+        Folder for ``predicted.csv``, ``summary.json``, ``predicted.html`` with ``predicted.json`` behind it, and ``predicted.vtu`` and
+        ``predicted.vtkhdf`` for ParaView.
+
+    Returns
+    -------
+    Prediction
+        Positions, uncertainty and assumptions.
 
     Raises
     ------
@@ -188,150 +341,37 @@ def predict(
     calibrated = model if isinstance(model, CalibratedModel) else read_model(model)
     loaded = load_experiment(experiment)
     name = state or _only_state(loaded)
+    _require_loaded(loaded, name)
     if height_mm is not None and heights_from_markers:
-        raise InputError("give either a height or --heights-from-markers, not both")
-    prediction = predict_state(calibrated, loaded, name, opening_mm=height_mm, heights_from_markers=heights_from_markers)
-    folder = _folder(out)
-    if folder:
-        _write_prediction(folder, calibrated, prediction)
-    return prediction
-
-
-def read_model(path: str | os.PathLike[str]) -> CalibratedModel:
-    """Read a ``model.json``, or the one in a folder.
-
-    Raises
-    ------
-    InputError
-        No such file, or not a model.
-    """
-    file = Path(path)
-    file = file / MODEL_FILE if file.is_dir() else file
+        raise InputError("--height-mm and --heights-from-markers exclude each other; give one of them")
+    folder = None if out is None else result_folder(out)
     try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error.strerror}); name the {MODEL_FILE} that 'naibu identify' wrote") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: is not JSON ({error}); name the {MODEL_FILE} that 'naibu identify' wrote") from error
-    if not isinstance(data, dict):
-        raise InputError(f"{file}: holds a {type(data).__name__}, not a model")
-    return CalibratedModel.from_dict(data)
+        prediction = predict_state(calibrated, loaded, name, opening_mm=height_mm, heights_from_markers=heights_from_markers)
+    except ConvergenceError as error:
+        raise ConvergenceError(f"{loaded.name}/{name} cannot be solved: {error}") from error
+    if folder is not None:
+        write_prediction(folder, calibrated, prediction)
+    return prediction
 
 
 def _only_state(experiment: Experiment) -> str:
     loaded = [s.name for s in experiment.states[1:] if s.loaded]
     if len(loaded) != 1:
-        raise InputError(f"{experiment.name} has the loaded states {', '.join(loaded)}; choose one with --state")
+        raise InputError(f"{experiment.name} has {len(loaded)} loaded states ({_names(experiment)}); choose one with --state")
     return loaded[0]
 
 
-def _folder(out: str | os.PathLike[str] | None) -> Path | None:
-    if out is None:
-        return None
-    folder = Path(out)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made a folder for results ({error.strerror}); choose another with --out") from error
-    return folder
+def report(folder: str | os.PathLike[str]) -> list[Path]:
+    """Write the pages of an identification or a prediction anew from what is stored in its folder; nothing is solved.
 
-
-def _provenance(experiments: Sequence[Experiment], known: Sequence[str], settings: ModelSettings) -> dict[str, Any]:
-    return {
-        "naibu": naibu.__version__,
-        "known": list(known),
-        "settings": asdict(settings),
-        "inputs": {e.name: dict(e.input_hashes) for e in experiments},
-        "seed": "none: the search is deterministic",
-    }
-
-
-def _resumed(checkpoint: Path | None, provenance: Mapping[str, Any]) -> dict[str, float] | None:
-    """Values of an interrupted search with the same inputs and settings, if there are any."""
-    if checkpoint is None or not checkpoint.is_file():
-        return None
-    try:
-        data = json.loads(checkpoint.read_text(encoding="utf-8"))
-    except (OSError, json.JSONDecodeError):
-        return None
-    return dict(data["values"]) if data.get("provenance") == json.loads(json.dumps(provenance)) else None
-
-
-def _write_identification(folder: Path, calibration: Calibration, model: CalibratedModel, left_out: Sequence[LeftOut]) -> None:
-    values = model.parameters.values()
-    compared = {}
-    if calibration.match.status is not Status.INTERRUPTED:
-        compared = {t.label: baselines(t, values[opening(t.specimen.experiment, t.state)]) for t in calibration.trials}
-    report = build_report(calibration, model, compared, left_out)
-    summary: dict[str, Any] = {"status": calibration.match.status.name, "noise_factor": model.noise_factor, "trials": {}}
-    for trial, fit in zip(calibration.trials, calibration.match.fits, strict=True):
-        summary["trials"][trial.label] = _rms_summary(fit.residual, fit.sd, ~trial.specimen.marker_filled.any(axis=1)) | {
-            "baselines_rms_3d_mm": compared.get(trial.label, {}),
-            "linear_solver": fit.solution.linear_solver,
-            "reactions_mN": {k: v.tolist() for k, v in fit.solution.reactions.items()},
-        }
-        name = trial.label.replace("/", "_")
-        states = fit.solution.states
-        write_vtkhdf_series(folder / f"{name}.vtkhdf", trial.specimen.mesh, [s.load for s in states], [{"displacement_mm": s.displacement} for s in states])
-    summary["left_out"] = {f"{r.experiment}/{r.state}": {"rms_3d_mm": r.rms_mm, "markers": r.marker_count} for r in left_out}
-    write_atomically(folder / "residuals.csv", _residual_csv(calibration))
-    write_atomically(folder / SUMMARY_FILE, json.dumps(summary, indent=1))
-    write_atomically(folder / REPORT_FILE, report_html(report))
-    write_atomically(folder / MODEL_FILE, json.dumps(model.to_dict(), indent=1))
-
-
-def _rms_summary(residual: np.ndarray[Any, Any], sd: np.ndarray[Any, Any], exact: np.ndarray[Any, Any]) -> dict[str, float | int | None]:
-    names = ("markers", "rms_x_mm", "rms_y_mm", "rms_z_mm", "rms_3d_mm", "rms_noise_units")
-    return {k: (v if np.isfinite(v) else None) for k, v in zip(names, residual_rows(residual, sd, exact), strict=True)}
-
-
-def _residual_csv(calibration: Calibration) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["experiment", "state", "marker", "residual_x_mm", "residual_y_mm", "residual_z_mm", "sd_x_mm", "sd_y_mm", "sd_z_mm", "initial_completed"])
-    for trial, fit in zip(calibration.trials, calibration.match.fits, strict=True):
-        for i, marker in enumerate(trial.specimen.marker_ids):
-            numbers = [f"{v:.4f}" for v in (*fit.residual[i], *fit.sd[i])]
-            writer.writerow([trial.specimen.experiment.name, trial.state, int(marker), *numbers, int(trial.specimen.marker_filled[i].any())])
-    return text.getvalue()
-
-
-def _write_prediction(folder: Path, model: CalibratedModel, prediction: Prediction) -> None:
-    body = prediction.specimen
-    rows = {int(i): (p, sd) for i, p, sd in zip(body.marker_ids, prediction.points, prediction.sd_mm, strict=True)}
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["marker", "x_mm", "y_mm", "z_mm", "sd_mm"])
-    for marker in body.experiment.initial.ids:
-        point, sd = rows.get(int(marker), (np.full(3, np.nan), np.nan))
-        writer.writerow([int(marker), *(f"{v:.3f}" if np.isfinite(v) else "NaN" for v in (*point, sd))])
-    write_atomically(folder / "predicted.csv", text.getvalue())
-    summary = {
-        "experiment": body.experiment.name,
-        "state": prediction.state,
-        "opening_mm": prediction.opening_mm,
-        "registered_to_measured": prediction.registered,
-        "notes": list(prediction.notes),
-        "reactions_mN": {k: v.tolist() for k, v in prediction.fit.solution.reactions.items()},
-        "rms": _rms_summary(prediction.residual, prediction.fit.sd, ~body.marker_filled.any(axis=1)) if prediction.registered else None,
-        "rms_all_3d_mm": rms(prediction.residual) if prediction.registered else None,
-        "provenance": dict(model.provenance),
-    }
-    write_atomically(folder / SUMMARY_FILE, json.dumps(summary, indent=1))
-    states = prediction.fit.solution.states
-    write_vtu(folder / "predicted.vtu", body.mesh, {"displacement_mm": states[-1].displacement}, {})
-    write_vtkhdf_series(folder / "path.vtkhdf", body.mesh, [s.load for s in states], [{"displacement_mm": s.displacement} for s in states])
-    write_atomically(folder / REPORT_FILE, report_html(prediction_report(model, prediction)))
-
-
-def report(folder: str | os.PathLike[str]) -> Path:
-    """Write the report of an identification anew from its folder's ``model.json``, and return its path.
-
-    The experiments must be bundled datasets, or lie where they lay when the model was identified.
+    Returns
+    -------
+    list of Path
+        ``report.html``, ``predicted.html``, or both, whichever results the folder holds.
 
     Raises
     ------
     InputError
-        No model in the folder, or an experiment that cannot be found or has changed.
+        No results in the folder, or damaged ones.
     """
-    raise NotImplementedError(str(folder))
+    return rewrite_reports(Path(folder))

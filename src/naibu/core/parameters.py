@@ -122,6 +122,7 @@ class ParameterSet:
         """Return the set with other physical values, and optionally fixed or freed, for the names in `values`."""
         return ParameterSet(
             tuple(
-                replace(p, value=values[p.name], fixed=p.fixed if fixed is None else fixed) if p.name in values else p for p in self.parameters
+                replace(p, value=values[p.name], fixed=p.fixed if fixed is None else fixed) if p.name in values else p
+                for p in self.parameters
             )
         )

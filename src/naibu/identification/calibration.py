@@ -12,6 +12,7 @@ from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.identification.displacement_matching import Match, Matcher, MatchingSettings, NoiseModel, Trial
+from naibu.identification.force_balance import force_balance
 from naibu.identification.specimen import (
     SHAPE_NAMES,
     ModelSettings,
@@ -23,6 +24,7 @@ from naibu.identification.specimen import (
     shape_parameter,
     specimen,
     state_parameters,
+    straight_base,
     young_modulus,
 )
 
@@ -30,6 +32,7 @@ REFERENCE_MODULUS_KPA = 200.0  # of the known region when only ratios are sought
 START_POISSON_RATIO = 0.49
 START_FRICTION = 0.2
 START_SPRING = 30.0  # kPa/mm
+TRUSTED_RATIO = (0.05, 20.0)  # of an unknown modulus to the known ones; force balance is not believed beyond
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,12 +111,26 @@ def calibrate(
         raise InputError(f"no loaded state with measured positions in {', '.join(e.name for e in experiments)}")
     known = knowledge or _first_material(experiments)
     parameters = initial_parameters(specimens, used, known)
-    match = Matcher(trials, parameters, search or MatchingSettings()).run(callback, start=start)
+    begin = dict(start or {}) or _start_from_force_balance(experiments, known, used)
+    match = Matcher(trials, parameters, search or MatchingSettings()).run(callback, start=begin)
     return Calibration(trials, match, chosen, measured, known)
 
 
 def _first_material(experiments: Sequence[Experiment]) -> Knowledge:
     return Knowledge({experiments[0].materials[0]: REFERENCE_MODULUS_KPA}, scale_is_absolute=False)
+
+
+def _start_from_force_balance(
+    experiments: Sequence[Experiment], knowledge: Knowledge, states: Mapping[str, Sequence[str]]
+) -> dict[str, float]:
+    """Young's moduli, by parameter, from the force balance between markers, where it gives sensible ones; a start needs no more."""
+    try:
+        found = force_balance(experiments, knowledge, states)
+    except (InputError, np.linalg.LinAlgError):
+        return {}
+    reference = float(np.mean(list(knowledge.young_moduli.values())))
+    low, high = TRUSTED_RATIO
+    return {young_modulus(name): e for name, (e, _) in found.items() if low < e / reference < high}
 
 
 def initial_parameters(specimens: Sequence[Specimen], states: Mapping[str, Sequence[str]], knowledge: Knowledge) -> ParameterSet:
@@ -135,6 +152,9 @@ def initial_parameters(specimens: Sequence[Specimen], states: Mapping[str, Seque
             found.setdefault(p.name, p)
         offset = base_offset(s.experiment)
         found.setdefault(offset, Parameter(offset, 0.0, "mm", prior_sd=0.5))
+        if s.has_unknown_base:
+            below = straight_base(s.experiment)
+            found.setdefault(below, Parameter(below, 0.1 * s.experiment.height_mm, "mm", prior_sd=0.4 * s.experiment.height_mm))
         for name in s.shift_names:
             found.setdefault(name, Parameter(name, 0.0, "mm", prior_sd=1.0))
         for state in states[s.experiment.name]:

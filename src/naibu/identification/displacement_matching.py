@@ -16,17 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from naibu.core.errors import ConvergenceError, InputError
-from naibu.core.parameters import ParameterSet
+from naibu.core.parameters import Parameter, ParameterSet
 from naibu.core.solution import Status
 from naibu.identification.lattice import FILLED_SD_MM
 from naibu.identification.pose import Pose, registration
-from naibu.identification.specimen import Specimen, base_offset
+from naibu.identification.specimen import Specimen, base_offset, straight_base
 from naibu.mechanics.linear_solvers import LinearSolver, use_one_thread
 from naibu.mechanics.sensitivities import sensitivities
 from naibu.mechanics.statics import Newton, Solution, SolverSettings, solve
 
 Array = NDArray[np.float64]
-_PATH = SolverSettings(tolerance=1e-6)
+_PATH = SolverSettings(first_step=0.06, largest_step=0.15, tolerance=1e-6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,9 +241,9 @@ class Matcher:
         n_free = du.shape[2]
         at_markers = np.stack([specimen.observation @ du[:, i, :] for i in range(3)], axis=1) if n_free else np.zeros((len(u), 3, 0))
         for k, parameter in enumerate(self.parameters.free):
-            if parameter.name == base_offset(specimen.experiment):
-                at_markers[:, :, k] = gradient[:, :, 2]
-            elif (shift := specimen.shift(parameter.name)) is not None:  # the nodes move past the markers, which stay
+            if parameter.name in (base_offset(specimen.experiment), straight_base(specimen.experiment)):
+                at_markers[:, :, k] += gradient[:, :, 2]
+            if (shift := trial.specimen.shift(parameter.name, values)) is not None:  # the nodes move past the markers, which stay
                 at_markers[:, :, k] -= np.einsum("kij,kj->ki", gradient - np.eye(3), specimen.observation @ shift)
         jacobian = np.einsum("ij,kjp->kip", pose.rotation, at_markers)
         arm = predicted - pose.position
@@ -304,12 +304,12 @@ class Matcher:
                     break
                 found = self._try(inner, step, fits, objective)
                 if found is None:
-                    damping = max(10.0 * damping, 1e-3)
+                    damping = max(10.0 * damping, 0.05)
                     if damping > 1e6:
                         break
                     continue
                 inner, fits, hessian, gradient, objective = found
-                damping = max(damping / 5.0, 1e-8)
+                damping = max(damping / 10.0, 1e-8)
                 history.append(objective)
                 if callback is not None:
                     callback(iteration, objective, self.parameters.values(inner))
@@ -329,7 +329,7 @@ class Matcher:
         ]
         try:
             found = self.evaluate(new, shifted, change)
-        except ConvergenceError:
+        except (ConvergenceError, InputError):  # InputError: a step that moves markers out of the object
             return None
         hessian, gradient, value, _ = self.normal_equations(found, moved)
         return (moved, found, hessian, gradient, value) if value < objective else None
@@ -349,9 +349,10 @@ class Matcher:
         return Match(self.parameters.with_values({q.name: values[q.name] for q in free}), covariance, tuple(fits), chi_squared, dof, information, status, tuple(history))
 
 
-def _limits(free: Sequence[object]) -> Array:
+def _limits(free: Sequence[Parameter]) -> Array:
     """Largest change of each free parameter in one step, on the optimiser's scale."""
-    return np.array([{"log": 0.7, "incompressibility": 1.0}.get(q.scale, 3.0) for q in free])  # type: ignore[attr-defined]
+    linear = [max(3.0, 0.5 * q.prior_sd) if np.isfinite(q.prior_sd) else np.inf for q in free]
+    return np.array([{"log": 1.0, "incompressibility": 1.5}.get(q.scale, widest) for q, widest in zip(free, linear, strict=True)])
 
 
 def _first_pose(specimen: Specimen, points: Array, measured: Array) -> Pose:

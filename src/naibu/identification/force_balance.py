@@ -1,11 +1,11 @@
 """Identification by force balance: at an unloaded marker the forces of the cells around it sum to zero, linearly in the parameters.
 
-The report's principle (spec I1, I3) with a finite-strain law: one linear least-squares problem for all trials, no initial guess, no
+The report's principle (report ch. 3) with a finite-strain law: one linear least-squares problem for all trials, no initial guess, no
 boundary conditions. What it bears badly is noise in the displacement, which enters the matrix too and pulls Poisson's ratio down to
 nothing. Further sweeps therefore weigh the equations with the covariance that noise gives them, and move the displacement by the least
 that balances the forces: the Gauss-Helmert model of least squares with conditions (Mikhail & Ackermann 1976). Nodes interpolated on an
 interface have one strain on both sides, where nature has one stress: they pull unknown moduli towards the known ones. An estimate is good
-for a start, within a factor of two.
+for a start: within a factor of two under plates, and worse under a bar.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import cho_solve, solve_triangular
 from scipy.optimize import lsq_linear
 
 from naibu.core.errors import InputError
@@ -33,10 +33,20 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 LAW = law_named("neo_hookean")
-SWEEPS = 2  # more follow the noise: the fit improves, the estimate does not
+SWEEPS = 2  # with noise the estimate has not settled then, nor after 20: beyond about 4 it scatters from one noise draw to the next
 UNMEASURED_SD_MM = 0.5  # of a node that was completed or interpolated
 POISSON_RATIO = 0.45  # of a known material, until a sweep has found its own
 SMALLEST, LARGEST = 1e-3, 1e3  # bounds of the moduli, in units of the known ones
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _System:
+    """Equations ``matrix @ sought = right``, the lower Cholesky factor of their covariance, and the `scaled` tangent that noise passes."""
+
+    matrix: Array
+    right: Array
+    factor: Array
+    scaled: Array
 
 
 @dataclass(slots=True, eq=False)
@@ -74,6 +84,19 @@ class _Trial:
         blocks = self.assembler.with_parameters(table[mesh.regions]).evaluate(self.displacement)[2]
         rows = (3 * self.source.interior[:, None] + np.arange(3)).ravel()
         return np.asarray(self.assembler.pattern.matrix(blocks).tocsr()[rows].toarray())
+
+    def system(
+        self, sought: Sequence[tuple[str, int]], fixed: Mapping[tuple[str, int], float], moduli: Mapping[str, tuple[float, float]] | None
+    ) -> _System:
+        """Return the balances of this trial, linearised about `displacement`; without `moduli` all have unit weight."""
+        matrix = np.column_stack([self.column(*key) for key in sought])
+        right = -np.sum([value * self.column(*key) for key, value in fixed.items()], axis=0)
+        if moduli is None:
+            return _System(matrix, right, np.eye(len(right)), np.zeros((len(right), self.sd.size)))
+        tangent = self.tangent(moduli)
+        scaled = tangent * self.sd.ravel()
+        factor = np.asarray(np.linalg.cholesky(scaled @ scaled.T), dtype=np.float64)
+        return _System(matrix, right - tangent @ (self.source.displacement - self.displacement).ravel(), factor, scaled)
 
 
 def force_balance(
@@ -173,27 +196,19 @@ def balanced(
 
 
 def _sweep(
-    trials: Sequence[_Trial], sought: Sequence[tuple[str, int]], fixed: Mapping[tuple[str, int], float], moduli: Mapping[str, tuple[float, float]] | None
+    trials: Sequence[_Trial],
+    sought: Sequence[tuple[str, int]],
+    fixed: Mapping[tuple[str, int], float],
+    moduli: Mapping[str, tuple[float, float]] | None,
 ) -> dict[str, tuple[float, float]] | None:
     """Solve for the moduli sought; with `moduli` to weigh by, also move the displacements to balance. None where a cell turned over."""
-    systems = []
-    for t in trials:
-        matrix = np.column_stack([t.column(*key) for key in sought])
-        right = -np.sum([value * t.column(*key) for key, value in fixed.items()], axis=0)
-        if moduli is None:
-            systems.append((matrix, right, None))
-            continue
-        tangent = t.tangent(moduli)
-        right = right - tangent @ (t.source.displacement - t.displacement).ravel()
-        scaled = tangent * t.sd.ravel()
-        factor = cho_factor(scaled @ scaled.T, lower=True)
-        systems.append((matrix, right, (factor, scaled)))
-    whitened = [s if s[2] is None else tuple(solve_triangular(s[2][0][0], a, lower=True) for a in s[:2]) for s in systems]
+    systems = [t.system(sought, fixed, moduli) for t in trials]
     reference = float(np.mean([v for (_, which), v in fixed.items() if which == 0]))
+    whitened = [tuple(solve_triangular(s.factor, a, lower=True) for a in (s.matrix, s.right)) for s in systems]
     values = _bounded(np.vstack([w[0] for w in whitened]), np.concatenate([w[1] for w in whitened]), reference)
-    for t, (matrix, right, weights) in zip(trials, systems, strict=True):
-        if weights is not None:
-            error = t.sd.ravel() * (weights[1].T @ cho_solve(weights[0], matrix @ values - right))
+    if moduli is not None:
+        for t, s in zip(trials, systems, strict=True):
+            error = t.sd.ravel() * (s.scaled.T @ cho_solve((s.factor, True), s.matrix @ values - s.right))
             t.displacement = t.source.displacement - error.reshape(-1, 3)
             if t.assembler.forces(t.displacement)[2] <= 0.0:
                 return None
@@ -217,25 +232,26 @@ def _young(mu: float, lame_lambda: float) -> tuple[float, float]:
 
 
 def _require_solvable(meshes: Sequence[MarkerMesh], known: Mapping[str, float], unknown: Sequence[str]) -> None:
-    """Refuse systems without a scale, with too few equations, or with an unknown material that no chain of neighbours ties to a known one."""
+    """Refuse systems without a scale, with too few equations, or with an unknown material that nothing ties to a known one."""
     if not known:
-        raise InputError("force balance needs a material with known Young's modulus in the experiments; it finds the others by comparison")
+        raise InputError("force balance finds moduli by comparison: name a material of the experiments whose Young's modulus is known")
     if not unknown:
         raise InputError(f"no material is unknown: {', '.join(known)} are all given")
     equations = 3 * sum(len(m.interior) for m in meshes)
     if equations < 2 * len(unknown) + len(known):
-        raise InputError(f"{equations} force balances do not suffice for {len(unknown)} unknown materials; at least 3 x 3 x 3 markers are needed")
+        raise InputError(f"{equations} force balances are too few for {len(unknown)} unknown materials; use 3 x 3 x 3 markers or more")
     reached = set(known)
     groups = [{m.mesh.region_names[r] for r in np.unique(regions)} for m in meshes for regions in _regions_at(m)]
     for _ in unknown:
         for group in groups:
             reached |= group if group & reached else set()
     if lost := [name for name in unknown if name not in reached]:
-        raise InputError(f"no known material touches {', '.join(lost)} inside the marker lattice; name another known material or add an experiment")
+        raise InputError(f"no known material touches {', '.join(lost)} in the lattice; give another modulus")
 
 
 def _regions_at(mesh: MarkerMesh) -> list[NDArray[np.int64]]:
     """Regions of the eight cells at every interior node."""
-    order = np.argsort(mesh.mesh.cells.ravel(), kind="stable")
-    node = mesh.mesh.cells.ravel()[order]
-    return [mesh.mesh.regions[order[a:b] // 8] for a, b in zip(*(np.searchsorted(node, mesh.interior, side) for side in ("left", "right")), strict=True)]
+    nodes = mesh.mesh.cells.ravel()
+    order = np.argsort(nodes, kind="stable")
+    first = np.searchsorted(nodes[order], mesh.interior)
+    return [mesh.mesh.regions[order[at : at + 8] // 8] for at in first]

@@ -41,7 +41,7 @@ def lattice_indices(ids: NDArray[np.int64], points: Array) -> NDArray[np.int64] 
     return None if best is None else best[1]
 
 
-def completed(ids: NDArray[np.int64], points: Array) -> tuple[Array, Array]:
+def completed(ids: NDArray[np.int64], points: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Fill missing coordinates from the lattice; return positions (k, 3) and which of them, (k, 3) bool, were filled.
 
     A marker keeps its missing coordinates where the numbering shows no lattice.
@@ -61,7 +61,7 @@ def completed(ids: NDArray[np.int64], points: Array) -> tuple[Array, Array]:
 
 
 def _affine(index: NDArray[np.int64], points: Array) -> Array:
-    return np.linalg.lstsq(np.column_stack([np.ones(len(index)), index]), points, rcond=None)[0]
+    return np.asarray(np.linalg.lstsq(np.column_stack([np.ones(len(index)), index]), points, rcond=None)[0], dtype=float)
 
 
 def _apply(fit: Array, index: NDArray[np.int64]) -> Array:

@@ -1,4 +1,4 @@
-"""A lattice of markers as a finite element mesh: markers are its nodes, and what they did is its displacement (spec I5)."""
+"""A lattice of markers as a finite element mesh: markers are its nodes, and what they did is its displacement (report ch. 3)."""
 
 from __future__ import annotations
 
@@ -78,12 +78,12 @@ def _grids(experiment: Experiment, state: str) -> tuple[Array, Array, NDArray[np
     read = np.where(initial.trusted[:, None], initial.points, np.nan), markers.aligned(initial.ids)
     index = lattice_indices(initial.ids, read[0]) if len(initial) else None
     if index is None:
-        raise InputError(f"experiment {experiment.name!r}: its markers are not numbered on a lattice, so they cannot be nodes of a mesh; match displacements instead")
+        raise InputError(f"experiment {experiment.name!r}: its markers are not numbered on a lattice, so force balance cannot use them")
     place = placement(experiment)
     free, loaded = (place.to_object(completed(initial.ids, r)[0]) for r in read)
     whole = np.isfinite(free).all(axis=1)
     if (whole & np.isfinite(loaded).all(axis=1)).sum() < 8:
-        raise InputError(f"{experiment.name}/{state} shares fewer than 8 complete markers with the free state; force balance needs a cell at least")
+        raise InputError(f"{experiment.name}/{state} shares fewer than 8 complete markers with the free state; measure more")
     pose = registration(free[whole], loaded[whole])
     loaded = (loaded - pose.position) @ pose.rotation + pose.centre
     size = index.max(axis=0) + 1
@@ -93,7 +93,7 @@ def _grids(experiment: Experiment, state: str) -> tuple[Array, Array, NDArray[np
     grids[0][at], grids[1][at], seen[at] = free, loaded, np.isfinite(read[0]) & np.isfinite(read[1])
     steps = np.stack([np.nanmean(np.diff(grids[0], axis=axis), axis=(0, 1, 2)) for axis in (2, 1, 0)])
     if np.argmax(np.abs(steps[2])) != 2:
-        raise InputError(f"experiment {experiment.name!r}: the layers of its marker numbering are not horizontal; number markers layer by layer from the base")
+        raise InputError(f"experiment {experiment.name!r}: its markers are not numbered layer by layer; renumber them")
     up = slice(None, None, int(np.sign(steps[2, 2])))
     right = slice(None, None, int(np.sign(np.linalg.det(steps * [[1], [1], [np.sign(steps[2, 2])]]))))
     return grids[0][up, right], grids[1][up, right], seen[up, right]
@@ -119,17 +119,17 @@ def _assembled(label: str, experiment: Experiment, points: Array, moved: Array, 
     """Join planes (p, nj, ni, 3) of nodes by cells, leave out those at incomplete nodes, and give every cell the material at its middle."""
     names = experiment.materials
     n = np.arange(points.size // 3).reshape(points.shape[:3])
-    corners = [n[:-1, :-1, :-1], n[:-1, :-1, 1:], n[:-1, 1:, 1:], n[:-1, 1:, :-1], n[1:, :-1, :-1], n[1:, :-1, 1:], n[1:, 1:, 1:], n[1:, 1:, :-1]]
-    cells = np.stack([c.ravel() for c in corners], axis=1)
-    points, moved, measured = (a.reshape(-1, 3) for a in (points, moved, measured))
-    complete = np.isfinite(points).all(axis=1) & np.isfinite(moved).all(axis=1)
+    low, high = ([p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]] for p in (n[:-1].transpose(1, 2, 0), n[1:].transpose(1, 2, 0)))
+    cells = np.stack([c.ravel() for c in (*low, *high)], axis=1)
+    x, y, seen = points.reshape(-1, 3), moved.reshape(-1, 3), measured.reshape(-1, 3)
+    complete: NDArray[np.bool_] = np.isfinite(np.concatenate([x, y], axis=1)).all(axis=1)
     cells = cells[complete[cells].all(axis=1)]
     if len(cells) == 0:
         raise InputError(f"{label}: no eight neighbouring markers are complete; give more coordinates")
-    middle = points[cells, 2].mean(axis=1)
+    middle = x[cells, 2].mean(axis=1)
     tops = np.array([layer.to_base_mm for layer in experiment.layers[:-1]])
     material = np.array([names.index(layer.material) for layer in experiment.layers])
-    points, moved = (np.where(complete[:, None], a, 0.0) for a in (points, moved))
-    mesh = Mesh.from_arrays(points, cells, "hexahedron", regions=material[np.searchsorted(tops, middle)], region_names=names)
-    interior = np.flatnonzero(np.bincount(cells.ravel(), minlength=len(points)) == 8)
-    return MarkerMesh(label, mesh, moved - points, measured & complete[:, None], interior)
+    x, y = np.where(complete[:, None], x, 0.0), np.where(complete[:, None], y, 0.0)
+    mesh = Mesh.from_arrays(x, cells, "hexahedron", regions=material[np.searchsorted(tops, middle)], region_names=names)
+    interior = np.flatnonzero(np.bincount(cells.ravel(), minlength=len(x)) == 8)
+    return MarkerMesh(label, mesh, y - x, seen & complete[:, None], interior)

@@ -86,7 +86,7 @@ class CalibratedModel:
         index = [free.index(n) for n in names]
         block = self.covariance[np.ix_(index, index)]
         sd = np.sqrt(np.diag(block))
-        return block / np.outer(sd, sd)
+        return np.asarray(block / np.outer(sd, sd))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the model as plain numbers and strings, for JSON; infinite prior widths are None."""

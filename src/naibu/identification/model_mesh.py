@@ -11,12 +11,12 @@ from naibu.core.mesh import Mesh
 from naibu.meshing.generation import box_from_coordinates, cylinder, half_ellipsoid, hemisphere
 
 Array = NDArray[np.float64]
-CELLS_PER_HEIGHT = 8.0
-REFINEMENT = 0.45  # edge of the cells at a bar over that of the cells far from it
+CELLS_PER_HEIGHT = 7.0
+REFINEMENT = 0.4  # edge of the cells at a bar over that of the cells far from it
 
 
 def element_size(experiment: Experiment, element_size_mm: float) -> float:
-    """Return the edge of the cells far from the indenter, mm; 0 asks for an eighth of the object's height."""
+    """Return the edge of the cells far from the indenter, mm; 0 asks for a seventh of the object's height."""
     return element_size_mm or experiment.height_mm / CELLS_PER_HEIGHT
 
 
@@ -41,6 +41,27 @@ def model_mesh(experiment: Experiment, element_size_mm: float = 0.0) -> Mesh:
     return Mesh(mesh.points, mesh.cells, mesh.cell_type, mesh.regions, (layers[0][0],))
 
 
+def on_straight_base(points: Array, height: float, base: float) -> Array:
+    """Return the nodes of a half ellipsoid (n, 3) moved so that it stands on a straight-sided base of the same outline.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 3)
+        Nodes of a half ellipsoid with its flat side at z = 0, mm.
+    height : float
+        Its height, mm.
+    base : float
+        Height of the straight-sided part below it, mm; the nodes are spread over the whole body.
+    """
+    share = np.clip(points[:, 2] / height, 0.0, 1.0)
+    z = share * (height + base)
+    wanted = 1.0 - np.clip((z - base) / height, 0.0, 1.0) ** 2
+    had = 1.0 - share**2
+    apex = had < 1e-9
+    stretch = np.where(apex, 1.0, np.sqrt(wanted / np.where(apex, 1.0, had)))
+    return np.column_stack([points[:, :2] * stretch[:, None], z])
+
+
 def _box(experiment: Experiment, edge: float) -> Mesh:
     """A box; under a bar the cells shrink towards its edges and towards the top."""
     size, loading = np.array(experiment.shape.size_mm), experiment.loading
@@ -56,7 +77,7 @@ def _box(experiment: Experiment, edge: float) -> Mesh:
         inner = layer.from_base_mm + graded(layer.to_base_mm - layer.from_base_mm, *ends)
         heights.append(inner[1:])
         names += [layer.material] * (len(inner) - 1)
-    return box_from_coordinates(*flat, np.concatenate(heights), region_of_slab=names)
+    return box_from_coordinates(flat[0], flat[1], np.concatenate(heights), region_of_slab=names)
 
 
 def _across_bar(half_size: float, half_bar: float, fine: float, coarse: float) -> Array:
@@ -71,4 +92,4 @@ def graded(length: float, first: float, last: float) -> Array:
     mean = first if np.isclose(first, last) else (last - first) / np.log(last / first)
     count = max(1, round(length / mean))
     sizes = first * (last / first) ** ((np.arange(count) + 0.5) / count)
-    return np.concatenate([[0.0], np.cumsum(sizes)]) * (length / sizes.sum())
+    return np.asarray(np.concatenate([[0.0], np.cumsum(sizes)]) * (length / sizes.sum()))

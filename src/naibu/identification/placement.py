@@ -80,7 +80,7 @@ def _lattice_turn(points: Array, spacing: float) -> float:
 
 def _lattice_centre(flat: Array, spacing: float | None) -> Array:
     """Centre of the markers' extent; for a lattice, the middle of its outermost columns and rows (means over each)."""
-    centre = 0.5 * (flat.min(axis=0) + flat.max(axis=0))
+    centre: Array = 0.5 * (flat.min(axis=0) + flat.max(axis=0))
     if spacing is None:
         return centre
     for axis in range(2):

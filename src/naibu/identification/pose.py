@@ -47,7 +47,7 @@ def registration(points: Array, measured: Array) -> Pose:
 
 
 def _kabsch(points: Array, measured: Array) -> Pose:
-    """Least-squares rigid motion of complete points (Kabsch 1976; spec S2)."""
+    """Least-squares rigid motion of complete points (Kabsch 1976; report ch. 3.5)."""
     centre, position = points.mean(axis=0), measured.mean(axis=0)
     u, _, vt = np.linalg.svd((measured - position).T @ (points - centre))
     return Pose(u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt, centre, position)
@@ -60,4 +60,4 @@ def rotation_matrix(vector: Array) -> Array:
         return np.eye(3)
     x, y, z = vector / angle
     k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k)
+    return np.asarray(np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k))

@@ -15,7 +15,7 @@ from naibu.identification.calibration import REFERENCE_MODULUS_KPA, START_FRICTI
 from naibu.identification.displacement_matching import Matcher, Trial, TrialFit
 from naibu.identification.model import CalibratedModel
 from naibu.identification.pose import registration
-from naibu.identification.specimen import Specimen, opening, specimen
+from naibu.identification.specimen import Specimen, full_opening, opening, specimen
 
 Array = NDArray[np.float64]
 LAYER_GAP = 0.4  # a new marker layer starts where the height jumps by this share of the markers' spacing
@@ -134,15 +134,21 @@ def _relative(p: Parameter, model: CalibratedModel, experiment: Experiment, note
     similar = [q for q in model.parameters if q.name.endswith(f": {kind}")]
     if kind == "young_modulus":
         if len(experiment.materials) > 1:
-            raise InputError(f"the model does not know {subject!r}; it knows {_materials(model)}. Identify it with an experiment that contains it")
+            raise InputError(
+                f"the model does not know {subject!r}; it knows {_materials(model)}. Identify it with an experiment that contains it"
+            )
         return Parameter(p.name, REFERENCE_MODULUS_KPA, p.unit, p.scale, fixed=True)
     if kind == "friction":
         body = subject.rpartition(" on ")[2]
         material = subject.rpartition(" on ")[0]
-        same = [q for q in similar if q.name.startswith(f"{material} on ")] or [q for q in similar if q.name.startswith(f"{body} on ") or f" on {body}:" in q.name] or similar
+        same = (
+            [q for q in similar if q.name.startswith(f"{material} on ")]
+            or [q for q in similar if q.name.startswith(f"{body} on ") or f" on {body}:" in q.name]
+            or similar
+        )
         default = START_FRICTION if model.settings.contact == "coulomb" else START_SPRING
         value = float(np.exp(np.mean([np.log(q.value) for q in same]))) if same else default
-        notes.append(f"friction of {subject} was not identified; {value:.2f} is taken from {', '.join(q.name.partition(':')[0] for q in same) or 'nothing'}")
+        notes.append(f"friction of {subject} was not identified; {value:.2f} is taken from {_subjects(same) or 'nothing'}")
         return Parameter(p.name, value, p.unit, p.scale, prior_sd=UNKNOWN_SD["friction"])
     if kind in ("poisson_ratio", "c01_share", "c20_ratio", "c30_ratio"):
         if not similar:
@@ -151,9 +157,16 @@ def _relative(p: Parameter, model: CalibratedModel, experiment: Experiment, note
         centre = float(np.mean([q.inner(q.value) for q in similar]))
         return Parameter(p.name, p.physical(centre), p.unit, p.scale, prior_sd=0.5 if p.scale == "incompressibility" else 0.1)
     sisters = [q for q in similar if q.name.split("/")[0] == experiment.name]
+    if kind.startswith("shift_of_layer") and similar:
+        sisters = similar
+        notes.append(f"{kind.replace('_', ' ')} mm is that of {_subjects(similar)}, whose layers have the same nominal height")
     if sisters and kind not in ("height", "width"):
-        return Parameter(p.name, float(np.mean([q.value for q in sisters])), p.unit, p.scale, prior_sd=UNKNOWN_SD[kind])
+        return Parameter(p.name, float(np.mean([q.value for q in sisters])), p.unit, p.scale, prior_sd=UNKNOWN_SD.get(kind, p.prior_sd))
     return Parameter(p.name, p.value, p.unit, p.scale, prior_sd=UNKNOWN_SD.get(kind, p.prior_sd))
+
+
+def _subjects(parameters: Sequence[Parameter]) -> str:
+    return ", ".join(p.name.partition(":")[0] for p in parameters)
 
 
 def _materials(model: CalibratedModel) -> str:
@@ -163,7 +176,7 @@ def _materials(model: CalibratedModel) -> str:
 def _opening(model: CalibratedModel, experiment: Experiment, state: State, given: float | None, notes: list[str]) -> tuple[float, float]:
     """Height or width to start from, and its standard deviation, mm."""
     if given is not None:
-        full = experiment.shape.size_mm[1] if experiment.loading.kind == "side_plates" else experiment.height_mm
+        full = full_opening(experiment)
         if not 0.3 * full < given <= full:
             raise InputError(f"a height or width of {given:g} mm is not between 30 % and 100 % of the object's {full:g} mm")
         return given, OPENING_SD_MM["given"]
@@ -172,10 +185,14 @@ def _opening(model: CalibratedModel, experiment: Experiment, state: State, given
     if name in values:
         return values[name], max(model.standard_deviation(name), 1e-3)
     if state.stated_mm is not None:
-        shifts = [values[n] - s.stated_mm for s in experiment.states if s.stated_mm is not None and (n := opening(experiment, s.name)) in values]
+        shifts = [
+            values[n] - s.stated_mm for s in experiment.states if s.stated_mm is not None and (n := opening(experiment, s.name)) in values
+        ]
         shift = float(np.mean(shifts)) if shifts else 0.0
         if shifts:
-            notes.append(f"the stated {state.stated_mm:g} mm is corrected by {shift:+.2f} mm, as found in other states of {experiment.name}")
+            notes.append(
+                f"the stated {state.stated_mm:g} mm is corrected by {shift:+.2f} mm, as found in other states of {experiment.name}"
+            )
         else:
             notes.append(f"the stated {state.stated_mm:g} mm is taken as it is; stated heights are nominal")
         return state.stated_mm + shift, 0.5 if shifts else OPENING_SD_MM["stated"]
@@ -218,7 +235,9 @@ def _fit_height(matcher: Matcher, fit: TrialFit, name: str, state: State, notes:
     layer = marker_layers(body.marker_points[:, 2], body.experiment.nominal_spacing_mm)
     low, high = (layer == 0) & np.isfinite(z), (layer == layer.max()) & np.isfinite(z)
     if not low.any() or not high.any():
-        raise InputError(f"{body.experiment.name}/{state.name}: no height is known in the lowest or the highest marker layer; give --height-mm")
+        raise InputError(
+            f"{body.experiment.name}/{state.name}: no height is known in the lowest or the highest marker layer; give --height-mm"
+        )
     wanted = float(z[high].mean() - z[low].mean())
     free = [p.name for p in matcher.parameters.free]
     k = free.index(name)
@@ -246,13 +265,13 @@ def _finished(
     points = pose.applied(fit.predicted) if pose is not None else fit.predicted
     back = pose.undone(measured) if pose is not None else measured
     return Prediction(
-        body, state.name, points / scale, _standard_deviation(model, parameters, fit), registered, measured - points, parameters.values()[name],
-        parameters.values(), fit.pose.undone(back), fit, tuple(notes),
+        body, state.name, points / scale, _standard_deviation(model, parameters, fit), registered, measured - points,
+        parameters.values()[name], parameters.values(), fit.pose.undone(back), fit, tuple(notes),
     )  # fmt: skip
 
 
 def _standard_deviation(model: CalibratedModel, parameters: ParameterSet, fit: TrialFit) -> Array:
-    """Standard deviation (k,) of a predicted coordinate, mm, from the model's covariance, the priors of the rest, and the model's misfit."""
+    """Standard deviation (k,) of a predicted coordinate, mm: the model's covariance, the priors of the rest, the model's misfit."""
     free = parameters.free
     covariance = np.diag([p.prior_sd**2 if np.isfinite(p.prior_sd) else 0.0 for p in free])
     known = {p.name: i for i, p in enumerate(model.parameters.free)}
@@ -265,7 +284,7 @@ def _standard_deviation(model: CalibratedModel, parameters: ParameterSet, fit: T
     j = fit.jacobian * slope
     variance = np.einsum("kip,pq,kiq->k", j, covariance, j) / 3.0
     misfit = max(model.noise_factor**2 - 1.0, 0.0) * (fit.sd**2).mean(axis=1)
-    return np.sqrt(np.maximum(variance, 0.0) + misfit)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0) + misfit))
 
 
 def rms(residual: Array, axes: Sequence[int] = (0, 1, 2)) -> float:

@@ -15,7 +15,7 @@ from naibu.core.experiment import Experiment, State
 from naibu.core.mesh import Mesh
 from naibu.core.parameters import Parameter
 from naibu.identification.lattice import completed
-from naibu.identification.model_mesh import element_size, model_mesh
+from naibu.identification.model_mesh import element_size, model_mesh, on_straight_base
 from naibu.identification.placement import Placement, placement
 from naibu.identification.pose import rotation_matrix
 from naibu.mechanics.assembly import Assembler, block_pattern, body_force
@@ -48,7 +48,7 @@ class ModelSettings:
     joined : {"glued", "sliding"}
         What holds separately cast blocks together.
     element_size_mm : float
-        Edge of the hexahedra, smaller under a bar; 0 takes an eighth of the object's height.
+        Edge of the hexahedra, smaller under a bar; 0 takes a seventh of the object's height.
     normal_stiffness : float
         Contact penalty, kPa/mm.
     density : float
@@ -127,7 +127,7 @@ class Specimen:
     marker_filled: NDArray[np.bool_]
     observation: sp.csr_array
     _gradient: tuple[sp.csr_array, ...]
-    _rest_heights: Array
+    _rest_points: Array
     _assembler: Assembler
     _contacts: tuple[Contact, ...]
     _pairs: tuple[tuple[str, ...], ...]
@@ -149,31 +149,45 @@ class Specimen:
         return [(c.start, c.stop, c.rotation @ c.surface.normal) for c in moved]
 
     @property
+    def has_unknown_base(self) -> bool:
+        """Whether the object may reach below its nominal shape: a half ellipsoid whose base the file does not place."""
+        return self.experiment.shape.kind == "half_ellipsoid" and self.experiment.base_z_mm is None
+
+    @property
     def shift_names(self) -> tuple[str, ...]:
         """Names of the shifts of the layers' boundaries."""
         return tuple(layer_shift(self.experiment, b.to_base_mm) for b in self.experiment.layers[:-1])
 
-    def shift(self, name: str) -> Array | None:
-        """Return how the nodes (n, 3) move with a shift of a layer's boundary: fully at it, less towards its neighbours; None for other names."""
+    def shift(self, name: str, values: Mapping[str, float]) -> Array | None:
+        """Return how the nodes (n, 3) move with a parameter of the shape; None for other parameters.
+
+        A layer's boundary moves fully, what lies between it and its neighbours less.
+        """
+        if self.has_unknown_base and name == straight_base(self.experiment):
+            step, height, now = 1e-3, self.experiment.height_mm, values.get(name, 0.0)
+            ends = [on_straight_base(self._rest_points, height, now + sign * step) for sign in (1.0, -1.0)]
+            return np.asarray((ends[0] - ends[1]) / (2.0 * step))
         if name not in self.shift_names:
             return None
         heights = [0.0, *(layer.to_base_mm for layer in self.experiment.layers)]
         at = self.shift_names.index(name) + 1
         out = np.zeros_like(self.mesh.points)
-        out[:, 2] = np.interp(self._rest_heights, heights[at - 1 : at + 2], [0.0, 1.0, 0.0])
+        out[:, 2] = np.interp(self._rest_points[:, 2], heights[at - 1 : at + 2], [0.0, 1.0, 0.0])
         return out
 
     def reshaped(self, values: Mapping[str, float]) -> Specimen:
-        """Return the specimen with its layers' boundaries and its markers where `values` put them."""
-        offset = values.get(base_offset(self.experiment), 0.0)
-        shift = sum(values.get(name, 0.0) * np.asarray(self.shift(name)) for name in self.shift_names) + np.zeros_like(self.mesh.points)
+        """Return the specimen with its layers' boundaries, its base and its markers where `values` put them."""
+        below = values.get(straight_base(self.experiment), 0.0) if self.has_unknown_base else 0.0
+        offset = values.get(base_offset(self.experiment), 0.0) + below
+        shift = on_straight_base(self._rest_points, self.experiment.height_mm, below) - self._rest_points if below else np.zeros_like(self.mesh.points)
+        for name in self.shift_names:
+            shift += values.get(name, 0.0) * np.asarray(self.shift(name, values))
         if offset == 0.0 and not shift.any():
             return self
         mesh = self.mesh.moved(shift)
         points = self.marker_points + [0.0, 0.0, offset]
-        moving = [not c.name.startswith("joint") for c in self._contacts]
         contacts = tuple(
-            replace(c, rest=np.einsum("pk,pki->pi", c.shape, mesh.points[c.nodes])) if m else c for c, m in zip(self._contacts, moving, strict=True)
+            c if c.name.startswith("joint") else replace(c, rest=np.einsum("pk,pki->pi", c.shape, mesh.points[c.nodes])) for c in self._contacts
         )
         observation, gradient = _observation(mesh, points, self.experiment, self.settings)
         assembler = self._assembler.with_elements(self._assembler.elements.moved(shift))
@@ -229,7 +243,7 @@ class Specimen:
                 mask = (pair_of_point == pairs.index(name)).astype(float)
                 springs = self._is_spring(i)
                 out.append(Direction(contact=i, tangential_stiffness=mask) if springs else Direction(contact=i, friction=mask))
-        if (points := self.shift(name)) is not None:
+        if (points := self.shift(name, values)) is not None:
             out.append(Direction(points=points))
         for i in self.indenters:
             path = self._path_directions(self._contacts[i], state).get(name)
@@ -288,16 +302,14 @@ class Specimen:
     def _reference(self, contact: Contact, name: str, state: str) -> float:
         """Value of a path parameter at which the body is at its start."""
         if name == opening(self.experiment, state):
-            size = self.experiment.shape.size_mm
-            return size[1] if self.experiment.loading.kind == "side_plates" else size[2]
+            return full_opening(self.experiment)
         return 0.0
 
     def _path_directions(self, contact: Contact, state: str) -> dict[str, tuple[Array, Array]]:
         """For every parameter that moves the body: change of the end of its path, and rotation about its reference point."""
         zero = np.zeros(3)
         if self.experiment.loading.kind == "side_plates":
-            side = 0.5 if contact.start[1] > 0 else -0.5
-            return {opening(self.experiment, state): (np.array([0.0, side, 0.0]), zero)}
+            return {opening(self.experiment, state): (-0.5 * contact.surface.normal, zero)}
         out = {opening(self.experiment, state): (np.array([0.0, 0.0, 1.0]), zero)}
         prefix = f"{self.experiment.name}/{state}"
         out[f"{prefix}: tilt_x"] = (zero, np.array([1.0, 0.0, 0.0]))
@@ -316,6 +328,11 @@ def base_offset(experiment: Experiment) -> str:
 def layer_shift(experiment: Experiment, height: float) -> str:
     """Name of the height by which the boundary between layers lies above its nominal `height`, mm."""
     return f"{experiment.name}: shift_of_layer_at_{height:g}"
+
+
+def straight_base(experiment: Experiment) -> str:
+    """Name of the height of straight-sided material below a half ellipsoid, mm."""
+    return f"{experiment.name}: straight_base"
 
 
 def opening(experiment: Experiment, state: str) -> str:
@@ -360,7 +377,7 @@ def specimen(experiment: Experiment, settings: ModelSettings | None = None) -> S
     points = place.to_object(filled[usable])
     observation, gradient = _observation(mesh, points, experiment, chosen)
     return Specimen(
-        experiment, chosen, place, mesh, initial.ids[usable], points, was_missing[usable], observation, gradient, mesh.points[:, 2].copy(), assembler,
+        experiment, chosen, place, mesh, initial.ids[usable], points, was_missing[usable], observation, gradient, mesh.points, assembler,
         contacts, tuple(pairs), tuple(pair_of_points),
     )  # fmt: skip
 
@@ -407,8 +424,11 @@ def _bodies(experiment: Experiment, settings: ModelSettings, mesh: Mesh, faces: 
     bodies = [body(f"base of {loading.base_material}", plane((0.0, 0.0, 1.0)), (0.0, 0.0, ground))]
     counter = loading.counter_material
     if loading.kind == "side_plates":
+        axis = "xyz".index(loading.bar_axis)
         for sign, side in ((-1.0, "low"), (1.0, "high")):
-            bodies.append(body(f"indenter ({side} side) of {counter}", plane((0.0, -sign, 0.0)), (0.0, sign * size[1] / 2.0, 0.0)))
+            inward, place = np.zeros(3), np.zeros(3)
+            inward[axis], place[axis] = -sign, 0.5 * sign * size[axis]
+            bodies.append(body(f"indenter ({side} side) of {counter}", plane(tuple(inward)), tuple(place)))
     elif loading.kind == "bar":
         surface = bar(loading.bar_axis, loading.bar_width_mm or 0.0)
         bodies.append(body(f"indenter of {counter}", surface, (0.0, 0.0, size[2])))
@@ -432,11 +452,16 @@ def _shape(law: Law, material: str, values: Mapping[str, float]) -> tuple[float,
     return tuple(values.get(shape_parameter(material, name), 0.0) for name in SHAPE_NAMES.get(law.name, ()))
 
 
+def full_opening(experiment: Experiment) -> float:
+    """Height of the plate or bar, or distance of the side plates, at which they touch the free object, mm."""
+    loading, size = experiment.loading, experiment.shape.size_mm
+    return size["xyz".index(loading.bar_axis)] if loading.kind == "side_plates" else size[2]
+
+
 def state_parameters(experiment: Experiment, state: State) -> list[Parameter]:
     """Parameters of the boundary conditions of one state, with their priors: opening, tilt of a plate, offset of a bar."""
     prefix = f"{experiment.name}/{state.name}"
-    size = experiment.shape.size_mm
-    full = size[1] if experiment.loading.kind == "side_plates" else size[2]
+    full = full_opening(experiment)
     start = state.estimated_mm or state.stated_mm or 0.7 * full
     out = [Parameter(opening(experiment, state.name), float(start), "mm", prior_sd=5.0)]
     if experiment.loading.kind != "side_plates":

@@ -1,0 +1,1 @@
+"""Equilibrium at finite strain: elements, laws, supports with contact and friction, linear solvers, and sensitivities."""

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 from naibu.mechanics.elements import Elements
 from naibu.mechanics.materials import Material, inverse_transpose, parameter_table, stress_and_tangent
+from naibu.mechanics.tetrahedra import Shares, shares, threads
+from naibu.mechanics.tetrahedra import assemble_large as _tetrahedra_large
+from naibu.mechanics.tetrahedra import assemble_small as _tetrahedra_small
 
 _CHUNK = 64
 LARGE = 4000  # groups from which the threads' hand-over costs less than it saves
@@ -46,7 +49,7 @@ class BlockPattern:
 
     def positions(self, connectivity: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return (m, k, k): where the block of local nodes (a, b) of every group is stored."""
-        return _block_positions(self.indptr, self.indices, connectivity)
+        return np.asarray(_block_positions(self.indptr, self.indices, connectivity))
 
 
 def block_pattern(n_points: int, *connectivities: NDArray[np.int64]) -> BlockPattern:
@@ -84,6 +87,7 @@ class Assembler:
     _positions: NDArray[np.int32]
     _order: NDArray[np.int64]
     _colour_start: NDArray[np.int64]
+    _shares: Shares | None = None
 
     @classmethod
     def from_materials(
@@ -92,8 +96,14 @@ class Assembler:
         """Combine elements with one material for each region; `pattern` may hold more couplings than the elements need."""
         codes, parameters = parameter_table(materials, regions)
         chosen = block_pattern(elements.n_points, elements.connectivity) if pattern is None else pattern
+        positions = chosen.positions(elements.connectivity)
+        if elements.weights.shape[1] == 1 and elements.connectivity.shape[1] == 4 and not elements.shared_dilatation:
+            count = threads() if len(elements.connectivity) > LARGE else 1
+            divided = shares(elements.connectivity, chosen.indptr, chosen.indices, count)
+            none = np.empty(0, dtype=np.int64)
+            return cls(elements, codes, parameters, chosen, positions, none, none, divided)
         order, start = _colours(elements.connectivity, elements.n_points)
-        return cls(elements, codes, parameters, chosen, chosen.positions(elements.connectivity), order, start)
+        return cls(elements, codes, parameters, chosen, positions, order, start)
 
     def with_parameters(self, parameters: NDArray[np.float64]) -> Assembler:
         """Return the same assembler with other parameters (m, 4) of the cells, kPa."""
@@ -127,11 +137,24 @@ class Assembler:
         self, displacement: NDArray[np.float64], parameters: NDArray[np.float64], blocks: NDArray[np.float64]
     ) -> tuple[float, NDArray[np.float64], float]:
         force = np.zeros((self.elements.n_points, 3))
+        if self._shares is not None:
+            return self._run_tetrahedra(self._shares, np.ascontiguousarray(displacement), parameters, force, blocks)
         assemble = _assemble_large if len(self.elements.connectivity) > LARGE else _assemble_small
         energy, smallest = assemble(
             self._order, self._colour_start, self.elements.connectivity, self.elements.gradients, self.elements.weights,
             self.elements.cell_of_point, self.elements.shared_dilatation, self.law_codes, parameters,
             np.ascontiguousarray(displacement), self._positions, force, blocks,
+        )  # fmt: skip
+        return float(energy), force, float(smallest)
+
+    def _run_tetrahedra(
+        self, shares: Shares, displacement: NDArray[np.float64], parameters: NDArray[np.float64], force: NDArray[np.float64], blocks: NDArray[np.float64]
+    ) -> tuple[float, NDArray[np.float64], float]:
+        e = self.elements
+        assemble = _tetrahedra_large if len(shares.start) > 2 else _tetrahedra_small
+        energy, smallest = assemble(
+            shares.owner, shares.start, shares.cells, e.connectivity, e.gradients, e.weights, e.cell_of_point, self.law_codes, parameters,
+            displacement, self._positions, force, blocks,
         )  # fmt: skip
         return float(energy), force, float(smallest)
 
@@ -284,7 +307,9 @@ def _group(  # type: ignore[no-untyped-def]  # pragma: no cover
                 fbar[i, j] = scale * f[q, i, j]
                 gbar[i, j] = ft_inv[q, i, j] / scale
         j_bar = theta if shared else det[q]
-        energy += w * stress_and_tangent(codes[cells[q]], parameters[cells[q]], fbar, gbar, j_bar, d, c, stress[q], tangent[q], with_tangent)
+        energy += w * stress_and_tangent(
+            codes[cells[q]], parameters[cells[q]], fbar, gbar, j_bar, d, c, stress[q], tangent[q], with_tangent
+        )
         if shared:
             s[q] = 0.0
             for i in range(3):
@@ -397,5 +422,3 @@ def _contract(gradients, weights, shared, tangent, temporary, k_local):  # type:
     for row in range(3 * k):
         for col in range(row):
             k_local[row, col] = k_local[col, row]
-
-

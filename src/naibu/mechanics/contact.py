@@ -4,7 +4,7 @@ Contact is evaluated at points, each a fixed combination of nodes: quadrature po
 of nodes on an interface between blocks. Per unit of area of the free state the body presses with
 ``p = k_n <-g>`` (a C1 ramp; or ``-k_n g`` where bonded) and rubs with ``t``, the elastic slip law with Coulomb's limit:
 ``t = k_t P (y - a)``, scaled back to ``|t| = mu p`` where it exceeds that; `a` is the anchor of the point, carried from one load step to
-the next. Large k_t and mu stick; finite k_t with mu = inf are tangential springs; mu = 0 slips freely (spec M6).
+the next. Large k_t and mu stick; finite k_t with mu = inf are tangential springs; mu = 0 slips freely.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ class Contact:
     def local(self, displacement: Array, load: float) -> Array:
         """Return positions (p, 3) of the points in the body's frame, at the fraction `load` of the path."""
         moved = self.rest + np.einsum("pk,pki->pi", self.shape, displacement[self.nodes])
-        return (moved - (self.start + load * (self.stop - self.start))) @ self.rotation
+        return np.asarray((moved - (self.start + load * (self.stop - self.start))) @ self.rotation)
 
     def anchors_at_rest(self) -> Array:
         """Return anchors (p, 3) for the beginning of loading, in the body's frame."""

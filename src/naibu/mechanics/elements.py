@@ -90,7 +90,9 @@ def elements(mesh: Mesh, formulation: Formulation = "mean_dilatation") -> Elemen
     determinant = np.linalg.det(jacobian)
     if determinant.min() <= 0.0:
         bad = int(np.argmin(determinant.min(axis=1)))
-        raise InputError(f"cell {bad} of the mesh is inverted or flat (Jacobian {determinant[bad].min():.3g}); reorder its nodes or mend the mesh")
+        raise InputError(
+            f"cell {bad} of the mesh is inverted or flat (Jacobian {determinant[bad].min():.3g}); reorder its nodes or mend the mesh"
+        )
     gradients = np.einsum("qaj,mqji->mqai", derivatives, np.linalg.inv(jacobian))
     weights = np.ascontiguousarray(determinant * quadrature)
     cell = np.repeat(np.arange(mesh.n_cells)[:, None], len(quadrature), axis=1)

@@ -12,6 +12,7 @@ import ctypes
 import functools
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
@@ -25,6 +26,7 @@ from naibu.core.errors import ConvergenceError, InputError
 
 Array = NDArray[np.float64]
 DIRECT_LIMIT = 120_000
+RECYCLING_FROM = 10_000
 
 
 class Factorization(Protocol):
@@ -72,23 +74,26 @@ class PardisoSolver:
 
     name = "PARDISO (oneMKL)"
 
-    def __init__(self, matrix: sp.bsr_matrix, *, symmetric: bool) -> None:
+    def __init__(self, matrix: sp.bsr_matrix, *, symmetric: bool, single_precision: bool = False) -> None:
         library = pardiso_library()
         if library is None:
             raise InputError('PARDISO is not installed; run: pip install "naibu[fast]"')
         self._library = library
         self._symmetric = symmetric
-        marked = sp.bsr_matrix((np.arange(1.0, matrix.data.size + 1.0).reshape(matrix.data.shape), matrix.indices, matrix.indptr), shape=matrix.shape).tocsr()
+        marked = sp.bsr_matrix(
+            (np.arange(1.0, matrix.data.size + 1.0).reshape(matrix.data.shape), matrix.indices, matrix.indptr), shape=matrix.shape
+        ).tocsr()
         pattern = (sp.triu(marked, format="csr") if symmetric else marked).sorted_indices()
         self._take = pattern.data.astype(np.int64) - 1
         self._ia = pattern.indptr.astype(np.int32)
         self._ja = pattern.indices.astype(np.int32)
         self._n = matrix.shape[0]
         self._type = 2 if symmetric else 1
+        self._float = np.float32 if single_precision else np.float64
         self._handle = np.zeros(64, dtype=np.int64)
         self._parameters = np.zeros(64, dtype=np.int32)
         self._set_parameters()
-        self._values = np.zeros(len(self._ja))
+        self._values = np.zeros(len(self._ja), dtype=self._float)
         self._analysed = False
 
     def _set_parameters(self) -> None:
@@ -97,6 +102,7 @@ class PardisoSolver:
         iparm[0] = 1  # no defaults
         iparm[1] = 2  # METIS ordering
         iparm[9] = 13 if self._type in (1, 11) else 8  # pivot perturbation 10^-k
+        iparm[27] = int(self._float is np.float32)
         iparm[34] = 1  # indices count from 0
 
     def factorize(self, matrix: sp.bsr_matrix) -> PardisoSolver:
@@ -107,8 +113,8 @@ class PardisoSolver:
         ConvergenceError
             The matrix is singular.
         """
-        self._values = matrix.data.ravel()[self._take]
-        empty = np.zeros(1)
+        self._values = matrix.data.ravel()[self._take].astype(self._float, copy=False)
+        empty = np.zeros(1, dtype=self._float)
         if not self._analysed:
             self._call(11, empty, empty, 1)
             self._analysed = True
@@ -128,14 +134,14 @@ class PardisoSolver:
     def solve(self, b: Array) -> Array:
         """Return x for b of shape (n,) or (n, r)."""
         columns = 1 if b.ndim == 1 else b.shape[1]
-        rhs = np.asfortranarray(b, dtype=np.float64)
+        rhs = np.asfortranarray(b, dtype=self._float)
         x = np.zeros_like(rhs, order="F")
         error = self._call(33, rhs, x, columns)
         if error != 0:
             raise ConvergenceError(f"PARDISO could not solve the linear system (error {error})")
         return x
 
-    def _call(self, phase: int, b: Array, x: Array, columns: int) -> int:
+    def _call(self, phase: int, b: NDArray[np.floating], x: NDArray[np.floating], columns: int) -> int:
         def integer(value: int) -> ctypes._CArgObject:
             return ctypes.byref(ctypes.c_int32(value))
 
@@ -179,8 +185,137 @@ class SuperLUSolver:
             raise ConvergenceError(f"the linear system is singular ({error}): is every body held against rigid motion?") from error
 
 
-class MultigridSolver:
-    """Conjugate gradients with smoothed aggregation from the rigid-body modes; the hierarchy is rebuilt only when it has aged.
+class RecyclingSolver:
+    """Conjugate gradients with a preconditioner that is kept from an earlier matrix for as long as that is cheaper than a new one.
+
+    Parameters
+    ----------
+    relative_tolerance : float
+        Of the residual of each solve, unless it asks for another.
+    max_iterations : int
+        After which a preconditioner is given up.
+    """
+
+    name = "CG"
+    iterations_per_build = 12.0  # how many iterations cost as much as a new preconditioner
+
+    def __init__(self, *, relative_tolerance: float = 1e-8, max_iterations: int = 400) -> None:
+        self.tolerance = relative_tolerance
+        self.max_iterations = max_iterations
+        self._apply: Callable[[Array], Array] | None = None
+        self._spent = 0.0
+        self._digits = 0.0
+        self._rebuild = True
+        self._exact: LinearSolver | None = None
+
+    def preconditioner(self, matrix: sp.bsr_matrix) -> Callable[[Array], Array]:
+        """Return a map from residuals (n, r) to corrections made for `matrix`."""
+        raise NotImplementedError
+
+    def factorize(self, matrix: sp.bsr_matrix) -> Factorization:
+        """Prepare for `matrix`, keeping what was made for an earlier one while it still serves."""
+        if self._exact is not None:
+            return self._exact.factorize(matrix)
+        if self._rebuild:
+            try:
+                self._build(matrix)
+            except ConvergenceError:
+                return self._become_exact(matrix)
+        return ApproximateFactorization(self, matrix)
+
+    def _build(self, matrix: sp.bsr_matrix) -> None:
+        self._apply = self.preconditioner(matrix)
+        self._spent, self._digits, self._rebuild = self.iterations_per_build, 0.0, False
+
+    def _become_exact(self, matrix: sp.bsr_matrix) -> Factorization:
+        self._exact = direct_solver(matrix, symmetric=True)
+        self._apply = None
+        return self._exact.factorize(matrix)
+
+    def iterate(self, matrix: sp.bsr_matrix, b: Array, tolerance: float) -> Array:
+        """Solve for right-hand sides (n, r).
+
+        Raises
+        ------
+        ConvergenceError
+            No convergence even with a preconditioner made for this matrix.
+        """
+        for attempt in range(2):
+            if self._apply is None or attempt:
+                self._build(matrix)
+            assert self._apply is not None
+            x, iterations, definite = conjugate_gradients(matrix, b, self._apply, tolerance, self.max_iterations)
+            if x is not None:
+                digits = max(-np.log10(tolerance), 0.1)
+                self._spent += iterations
+                self._digits += digits
+                # the mean price of a digit since the last build has its minimum where the last digit costs as much as the mean
+                self._rebuild = iterations / digits > self._spent / self._digits
+                return x
+            if not definite and attempt:
+                return self._become_exact(matrix).solve(b)
+        raise ConvergenceError(f"conjugate gradients did not reach {tolerance:g} in {self.max_iterations} iterations; is every body held?")
+
+
+class ApproximateFactorization:
+    """A matrix with a preconditioner that may have been made for an earlier one; solves as accurately as asked."""
+
+    def __init__(self, solver: RecyclingSolver, matrix: sp.bsr_matrix) -> None:
+        self._solver, self._matrix = solver, matrix
+
+    def solve(self, b: Array, relative_tolerance: float | None = None) -> Array:
+        """Return x for b of shape (n,) or (n, r); the solver's own tolerance is the default."""
+        tolerance = self._solver.tolerance if relative_tolerance is None else relative_tolerance
+        return self._solver.iterate(self._matrix, b.reshape(len(b), -1), tolerance).reshape(b.shape)
+
+
+def conjugate_gradients(
+    matrix: sp.bsr_matrix, b: Array, precondition: Callable[[Array], Array], tolerance: float, max_iterations: int
+) -> tuple[Array | None, int, bool]:
+    """Return the solution (n, r), None where it fails, the number of iterations, and whether matrix and preconditioner looked definite.
+
+    Every right-hand side has its own iteration; those of one call are advanced together.
+    """
+    x, r = np.zeros_like(b), b.copy()
+    target = tolerance * np.linalg.norm(b, axis=0)
+    p, rz = np.zeros_like(b), np.ones(b.shape[1])
+    for iteration in range(max_iterations + 1):
+        active = np.linalg.norm(r, axis=0) > target
+        if not active.any():
+            return x, iteration, True
+        z = precondition(r)
+        new = np.einsum("ij,ij->j", r, z)
+        if not (new[active] > 0.0).all():
+            return None, iteration, False
+        p = z + p * (new / rz if iteration else 0.0)
+        rz = np.where(active, new, 1.0)
+        q = matrix @ p
+        curvature = np.einsum("ij,ij->j", p, q)
+        if not (curvature[active] > 0.0).all():
+            return None, iteration, False
+        alpha = np.where(active, new / np.where(active, curvature, 1.0), 0.0)
+        x += alpha * p
+        r -= alpha * q
+    return None, max_iterations, True
+
+
+class RecycledCholesky(RecyclingSolver):
+    """PARDISO in single precision, corrected by conjugate gradients in double precision; one factorization serves several tangents."""
+
+    name = "CG + PARDISO (oneMKL) in single precision"
+
+    def __init__(self, matrix: sp.bsr_matrix, *, relative_tolerance: float = 1e-11, max_iterations: int = 60) -> None:
+        super().__init__(relative_tolerance=relative_tolerance, max_iterations=max_iterations)
+        self._factor = PardisoSolver(matrix, symmetric=True, single_precision=True)
+
+    def preconditioner(self, matrix: sp.bsr_matrix) -> Callable[[Array], Array]:
+        """Return the solution with the factor of `matrix`."""
+        factor = self._factor.factorize(matrix)
+        return lambda r: factor.solve(r).astype(np.float64)
+
+
+class MultigridSolver(RecyclingSolver):
+    """Conjugate gradients with smoothed aggregation from the rigid-body modes.
 
     Parameters
     ----------
@@ -195,61 +330,19 @@ class MultigridSolver:
     name = "CG + smoothed aggregation (pyamg)"
 
     def __init__(self, points: Array, held: NDArray[np.bool_], *, relative_tolerance: float = 1e-8, max_iterations: int = 400) -> None:
+        super().__init__(relative_tolerance=relative_tolerance, max_iterations=max_iterations)
         self._modes = rigid_body_modes(points)
         self._modes[held] = 0.0
-        self._tolerance = relative_tolerance
-        self._max_iterations = max_iterations
-        self._preconditioner: spla.LinearOperator | None = None
-        self._fresh_iterations = 0
-        self._rebuild = True
 
-    def factorize(self, matrix: sp.bsr_matrix) -> Factorization:
-        """Prepare the hierarchy for `matrix` (or keep that of an earlier matrix while it still serves)."""
-        if self._rebuild or self._preconditioner is None:
-            self._build(matrix)
-        return _MultigridFactorization(self, matrix)
-
-    def _build(self, matrix: sp.bsr_matrix) -> None:
+    def preconditioner(self, matrix: sp.bsr_matrix) -> Callable[[Array], Array]:
+        """Return one V-cycle of a hierarchy made for `matrix`."""
         hierarchy = pyamg.smoothed_aggregation_solver(
             matrix, B=self._modes, strength=("symmetric", {"theta": 0.0}), smooth=("jacobi", {"omega": 4.0 / 3.0}),
             improve_candidates=None, max_coarse=600, coarse_solver="splu", presmoother=("block_gauss_seidel", {"sweep": "symmetric"}),
             postsmoother=("block_gauss_seidel", {"sweep": "symmetric"}),
         )  # fmt: skip
-        self._preconditioner = hierarchy.aspreconditioner()
-        self._rebuild = False
-        self._fresh_iterations = 0
-
-    def iterate(self, matrix: sp.bsr_matrix, b: Array) -> Array:
-        """Solve for one right-hand side.
-
-        Raises
-        ------
-        ConvergenceError
-            No convergence even with a hierarchy made for this matrix.
-        """
-        for attempt in range(2):
-            count = [0]
-            x, status = spla.cg(matrix, b, rtol=self._tolerance, maxiter=self._max_iterations, M=self._preconditioner, callback=lambda _, c=count: c.__setitem__(0, c[0] + 1))
-            if status == 0:
-                if self._fresh_iterations == 0:
-                    self._fresh_iterations = count[0]
-                self._rebuild = count[0] > 1.7 * self._fresh_iterations + 5
-                return np.asarray(x)
-            if attempt == 0:
-                self._build(matrix)
-        raise ConvergenceError(f"conjugate gradients did not reach {self._tolerance:g} in {self._max_iterations} iterations; is every body held?")
-
-
-class _MultigridFactorization:
-    """A matrix with a hierarchy that may have been made for an earlier one."""
-
-    def __init__(self, solver: MultigridSolver, matrix: sp.bsr_matrix) -> None:
-        self._solver, self._matrix = solver, matrix
-
-    def solve(self, b: Array) -> Array:
-        if b.ndim == 1:
-            return self._solver.iterate(self._matrix, b)
-        return np.stack([self._solver.iterate(self._matrix, column) for column in b.T], axis=1)
+        cycle = hierarchy.aspreconditioner()
+        return lambda r: np.stack([cycle @ column for column in r.T], axis=1)
 
 
 def rigid_body_modes(points: Array) -> Array:
@@ -275,4 +368,6 @@ def choose_solver(matrix: sp.bsr_matrix, points: Array, held: NDArray[np.bool_],
     limit = DIRECT_LIMIT if pardiso_library() is not None else DIRECT_LIMIT // 6
     if symmetric and matrix.shape[0] > limit:
         return MultigridSolver(points, held)
+    if symmetric and matrix.shape[0] > RECYCLING_FROM and pardiso_library() is not None:
+        return RecycledCholesky(matrix)
     return direct_solver(matrix, symmetric=symmetric)

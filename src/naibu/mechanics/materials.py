@@ -2,8 +2,8 @@
 
 Every law is written as ``W(F) = sum_k p_k W_k(I1, I2, J)`` with the invariants ``I1 = tr C``, ``I2 = (I1^2 - tr C^2) / 2`` of
 ``C = F^T F`` and ``J = det F``. A law supplies only the first and second derivatives of W with respect to the three invariants;
-stress and tangent follow from them once, for all laws. Because W is linear in the parameters, so is the force balance
-(spec I1, I6), and the derivative of the internal forces with respect to a parameter is the internal force of a unit parameter.
+stress and tangent follow from them once, for all laws. Because W is linear in the parameters, so is the force balance,
+and the derivative of the internal forces with respect to a parameter is the internal force of a unit parameter.
 """
 
 from __future__ import annotations
@@ -76,9 +76,13 @@ class Material:
         if not np.isfinite(self.parameters).all():
             raise InputError(f"parameters of {self.law.name} must be finite, not {self.parameters}")
         if self.small_strain_shear_modulus <= 0.0:
-            raise InputError(f"the shear modulus of {self.law.name} at small strain is {self.small_strain_shear_modulus:g} kPa; it must be positive")
+            raise InputError(
+                f"the shear modulus of {self.law.name} at small strain is {self.small_strain_shear_modulus:g} kPa; it must be positive"
+            )
         if self.small_strain_bulk_modulus <= 0.0:
-            raise InputError(f"the bulk modulus of {self.law.name} at small strain is {self.small_strain_bulk_modulus:g} kPa; it must be positive")
+            raise InputError(
+                f"the bulk modulus of {self.law.name} at small strain is {self.small_strain_bulk_modulus:g} kPa; it must be positive"
+            )
 
     @property
     def small_strain_shear_modulus(self) -> float:
@@ -121,7 +125,7 @@ def law_named(name: str) -> Law:
 
 
 def lame_parameters(young_modulus: float, poisson_ratio: float) -> tuple[float, float]:
-    """Return (lame_lambda, shear_modulus), kPa, of an isotropic linear solid (spec M1).
+    """Return (lame_lambda, shear_modulus), kPa, of an isotropic linear solid (report ch. 2).
 
     Parameters
     ----------
@@ -243,7 +247,7 @@ def invariant_derivatives(code, p, i1, i2, j, d):  # type: ignore[no-untyped-def
     return energy + 0.25 * kappa * (j * j - 1.0 - 2.0 * log_j)
 
 
-@njit(cache=True, fastmath=False)
+@njit(cache=True, fastmath=False, error_model="numpy")  # a flat element gives infinities, which callers tell by det F
 def inverse_transpose(f, g):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Put F^-T into `g` and return det F."""
     g[0, 0] = f[1, 1] * f[2, 2] - f[1, 2] * f[2, 1]

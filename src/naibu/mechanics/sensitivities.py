@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from naibu.mechanics.assembly import Assembler
 from naibu.mechanics.contact import Contact, ContactResponse
 from naibu.mechanics.statics import LoadState, Newton, Problem, SolverSettings
 
@@ -71,6 +72,7 @@ def sensitivities(problem: Problem, states: tuple[LoadState, ...], directions: l
     solver = newton or Newton(problem, SolverSettings())
     count = len(directions)
     out = [np.zeros((*problem.points.shape, count))]
+    reshaped = {k: _Reshaped.along(problem, d.points) for k, d in enumerate(directions) if d.points is not None}
     moving = [_BodyDirections.gather(i, c, directions) for i, c in enumerate(problem.contacts)]
     d_anchors = [m.at_rest(c) for m, c in zip(moving, problem.contacts, strict=True)]
     for before, state in zip(states[:-1], states[1:], strict=True):
@@ -80,7 +82,7 @@ def sensitivities(problem: Problem, states: tuple[LoadState, ...], directions: l
             if direction.materials is not None:
                 rhs[:, :, k] = -problem.assembler.forces_of_parameter(state.displacement, direction.materials)
             if direction.points is not None:
-                rhs[:, :, k] -= _forces_of_points(problem, state.displacement, direction.points)
+                rhs[:, :, k] -= reshaped[k].forces(state.displacement)
         explicit = []
         for c, m, response, da in zip(problem.contacts, moving, responses, d_anchors, strict=True):
             change = m.explicit(c, response, da, state.load)
@@ -97,12 +99,23 @@ def sensitivities(problem: Problem, states: tuple[LoadState, ...], directions: l
     return out
 
 
-def _forces_of_points(problem: Problem, displacement: Array, change: Array) -> Array:
-    """Derivative (n, 3) of the internal forces when the free positions of the nodes change (central difference at fixed displacement)."""
-    step = 1e-5 / max(float(np.abs(change).max()), 1e-12) * float(np.ptp(problem.points, axis=0).max())
-    assembler = problem.assembler
-    forward, backward = (assembler.with_elements(assembler.elements.moved(sign * step * change)).forces(displacement)[1] for sign in (1.0, -1.0))
-    return np.asarray((forward - backward) / (2.0 * step))
+@dataclass(frozen=True, slots=True, eq=False)
+class _Reshaped:
+    """Elements with their free nodes moved a little along a direction, forwards and backwards by `step`."""
+
+    forward: Assembler
+    backward: Assembler
+    step: float
+
+    @classmethod
+    def along(cls, problem: Problem, change: Array) -> _Reshaped:
+        step = 1e-5 / max(float(np.abs(change).max()), 1e-12) * float(np.ptp(problem.points, axis=0).max())
+        assembler = problem.assembler
+        return cls(*(assembler.with_elements(assembler.elements.moved(sign * step * change)) for sign in (1.0, -1.0)), step)
+
+    def forces(self, displacement: Array) -> Array:
+        """Derivative (n, 3) of the internal forces at fixed displacement (central difference)."""
+        return (self.forward.forces(displacement)[1] - self.backward.forces(displacement)[1]) / (2.0 * self.step)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

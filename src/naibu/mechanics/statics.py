@@ -14,10 +14,11 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.solution import Status
 from naibu.mechanics.assembly import Assembler
 from naibu.mechanics.contact import PLANE, Contact, ContactResponse
-from naibu.mechanics.linear_solvers import Factorization, LinearSolver, choose_solver
+from naibu.mechanics.linear_solvers import ApproximateFactorization, Factorization, LinearSolver, choose_solver
 from naibu.mechanics.supports import Prescribed
 
 Array = NDArray[np.float64]
+_COARSE = 0.01  # relative tolerance of linear solves far from equilibrium, for solvers that can make use of it
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +167,11 @@ class Newton:
         ConvergenceError
             An inverted element, or a singular tangent.
         """
+        residual, scale, matrix, responses = self._tangent(u, anchors, load)
+        return residual, scale, self._factorized(matrix), responses
+
+    def _tangent(self, u: Array, anchors: tuple[Array, ...], load: float) -> tuple[Array, float, sp.bsr_matrix, list[ContactResponse]]:
+        """Return residual, force scale, the tangent of all nodes, held or not, and contact responses."""
         p = self.problem
         _, internal, blocks, smallest = p.assembler.evaluate(u)
         if not smallest > 0.0:
@@ -178,35 +184,64 @@ class Newton:
             c.add_stiffness(response, p.assembler.pattern, positions, blocks)
             responses.append(response)
         residual, scale = self._balance(internal, contact)
-        matrix = constrained(p.assembler.pattern.matrix(blocks), p.prescribed.held, self.settings.anchor_stiffness)
+        return residual, scale, p.assembler.pattern.matrix(blocks), responses
+
+    def _factorized(self, matrix: sp.bsr_matrix) -> Factorization:
+        p = self.problem
+        matrix = constrained(matrix, p.prescribed.held, self.settings.anchor_stiffness)
         if self.solver is None:
             self.solver = choose_solver(matrix, p.points, p.prescribed.held.ravel(), symmetric=not p.unsymmetric)
-        return residual, scale, self.solver.factorize(matrix), responses
+        return self.solver.factorize(matrix)
 
     def solve(self, u: Array, anchors: tuple[Array, ...], load: float) -> tuple[Array, float] | None:
         """Return displacement and relative residual in equilibrium, starting from `u`; None where the iteration fails."""
-        u = np.where(self.problem.prescribed.held, load * self.problem.prescribed.values, u)
-        struggles = 0
+        struggles, previous = 0, 0.0
         extent = float(np.ptp(self.problem.points, axis=0).max())
-        for _ in range(self.settings.max_iterations):
-            try:
+        try:
+            u = self._carried(u, anchors, load)
+            for _ in range(self.settings.max_iterations):
                 residual, scale, factorization, _ = self.linearised(u, anchors, load)
-            except ConvergenceError:
-                return None
-            norm = float(np.abs(residual).sum())
-            if norm <= self.settings.tolerance * scale:
-                return u, norm / scale
-            self.iterations += 1
-            step = -factorization.solve(residual.ravel()).reshape(-1, 3)
-            found = self._line_search(u, step, anchors, load, residual)
-            struggles += found is None or found[1] < 0.15
-            if found is None or struggles > 2 or np.abs(step).max() > extent:
-                return None  # a shorter load step costs less than a long fight
-            u = found[0]
+                norm = float(np.abs(residual).sum())
+                if norm <= self.settings.tolerance * scale:
+                    return u, norm / scale
+                self.iterations += 1
+                step = -solved(factorization, residual, self._forcing(norm, previous, scale))
+                found = self._line_search(u, step, anchors, load, residual)
+                struggles += found is None or found[1] < 0.15
+                if found is None or struggles > 2 or np.abs(step).max() > extent:
+                    return None  # a shorter load step costs less than a long fight
+                u, previous = found[0], norm
+                if found[2] <= self.settings.tolerance:
+                    return u, found[2]
+        except ConvergenceError:
+            return None
         return None
 
-    def _line_search(self, u: Array, step: Array, anchors: tuple[Array, ...], load: float, residual: Array) -> tuple[Array, float] | None:
-        """Return ``u + a step`` and a in (0, 1] where the work of the residual on the step has fallen enough; None where all invert elements.
+    def _forcing(self, norm: float, previous: float, scale: float) -> float:
+        """Relative tolerance of a linear solve: coarse while Newton's method is far away, and never finer than the end needs."""
+        hoped = 0.5 * (norm / previous) ** 1.5 if previous else _COARSE
+        return min(_COARSE, max(hoped, 0.3 * self.settings.tolerance * scale / norm, 1e-9))
+
+    def _carried(self, u: Array, anchors: tuple[Array, ...], load: float) -> Array:
+        """Return `u` with the held nodes where `load` puts them, and the others moved along by the tangent at `u`.
+
+        Moving the held nodes alone would flatten the elements next to them.
+        """
+        p = self.problem
+        target = np.where(p.prescribed.held, load * p.prescribed.values, u)
+        jump = target - u
+        if np.abs(jump).max() <= 1e-9 * float(np.ptp(p.points, axis=0).max()):
+            return target
+        residual, _, matrix, _ = self._tangent(u, anchors, load)
+        residual += (matrix @ jump.ravel()).reshape(-1, 3)
+        residual[p.prescribed.held] = 0.0
+        self.iterations += 1
+        return np.asarray(target - solved(self._factorized(matrix), residual, _COARSE))
+
+    def _line_search(self, u: Array, step: Array, anchors: tuple[Array, ...], load: float, residual: Array) -> tuple[Array, float, float] | None:
+        """Return ``u + a step``, a in (0, 1] and the relative residual there; None where all invert elements.
+
+        It ends where the residual's work on the step has fallen enough.
 
         The work ``r . step`` vanishes at equilibrium along the step. Unlike the norm of r it may be trusted when points change their
         contact status.
@@ -217,13 +252,13 @@ class Newton:
         best = None
         for _ in range(9):
             trial = u + a * step
-            r, _, smallest = self.residual(trial, anchors, load)
+            r, scale, smallest = self.residual(trial, anchors, load)
             if not smallest > 0.0:
                 high = a
                 a = 0.5 * (low + a)
                 continue
             work = float(np.vdot(r, step))
-            best = trial, a
+            best = trial, a, float(np.abs(r).sum()) / scale
             if abs(work) <= 0.5 * abs(before) or (a == 1.0 and work * before > 0.0):
                 return best
             if work * before > 0.0:
@@ -234,6 +269,13 @@ class Newton:
                 guess = low + (a - low) * work_low / (work_low - work)
                 a = min(max(guess, low + 0.1 * (a - low)), low + 0.9 * (a - low))
         return best
+
+
+def solved(factorization: Factorization, residual: Array, relative_tolerance: float) -> Array:
+    """Return the solution (n, 3) for a residual (n, 3), as coarse as `relative_tolerance` allows where the solver can make use of that."""
+    b = residual.ravel()
+    coarse = isinstance(factorization, ApproximateFactorization)
+    return (factorization.solve(b, relative_tolerance) if coarse else factorization.solve(b)).reshape(-1, 3)
 
 
 def constrained(matrix: sp.bsr_matrix, held: NDArray[np.bool_], anchor_stiffness: float = 0.0) -> sp.bsr_matrix:

@@ -72,7 +72,9 @@ class Friction:
 
     def __post_init__(self) -> None:
         if not self.coefficient >= 0.0 or not self.stiffness > 0.0:
-            raise InputError(f"friction needs a coefficient >= 0 and a stiffness > 0 kPa/mm, not {self.coefficient:g} and {self.stiffness:g}")
+            raise InputError(
+                f"friction needs a coefficient >= 0 and a stiffness > 0 kPa/mm, not {self.coefficient:g} and {self.stiffness:g}"
+            )
 
 
 def rigid_contact(
@@ -123,7 +125,9 @@ def rigid_contact(
     )  # fmt: skip
 
 
-def interface(name: str, points: Array, pairs: NDArray[np.int64], area: Array, *, friction: Friction, normal_stiffness: float, bonded: bool = False) -> Contact:
+def interface(
+    name: str, points: Array, pairs: NDArray[np.int64], area: Array, *, friction: Friction, normal_stiffness: float, bonded: bool = False
+) -> Contact:
     """Lay one block on another: pairs (k, 2) of a lower and an upper node at the same place, each standing for `area` (k,) mm2.
 
     The blocks may separate and slide (``bonded=False``); the normal is vertical in the free state and kept, which suits interfaces that

@@ -102,9 +102,7 @@ def box(
     if unknown := set(breaks or {}) - set(_AXES):
         raise InputError(f"breaks name the axes {sorted(unknown)}; use 'x', 'y' or 'z'")
     forced["z"] += list(tops[:-1])
-    x, y, z = (
-        _graded(axis, start[i], start[i] + size[i], counts[i], ratios[i], forced[axis], size.max()) for i, axis in enumerate(_AXES)
-    )
+    x, y, z = (_graded(axis, start[i], start[i] + size[i], counts[i], ratios[i], forced[axis], size.max()) for i, axis in enumerate(_AXES))
     return box_from_coordinates(x, y, z, cell_type=cell_type, region_of_slab=_names_of_slabs(named, tops, z))
 
 
@@ -287,9 +285,7 @@ def _layer_tops(layers: Sequence[tuple[str, float]], height: float) -> NDArray[n
     return np.asarray(tops, dtype=np.float64)
 
 
-def _graded(
-    name: str, low: float, high: float, count: float, ratio: float, breaks: Sequence[float], scale: float
-) -> NDArray[np.float64]:
+def _graded(name: str, low: float, high: float, count: float, ratio: float, breaks: Sequence[float], scale: float) -> NDArray[np.float64]:
     """Return node coordinates from `low` to `high` that meet every break, with cells `ratio` times smaller at the ends."""
     inner = np.unique(np.asarray(breaks, dtype=np.float64))
     inner = inner[(np.abs(inner - low) > 1e-9 * scale) & (np.abs(inner - high) > 1e-9 * scale)]

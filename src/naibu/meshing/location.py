@@ -146,14 +146,10 @@ def _nearest(mesh: Mesh, points: NDArray[np.float64]) -> tuple[NDArray[np.int64]
     _, near = cKDTree(mesh.points[used]).query(points, k=min(_NEAR_NODES, len(used)))
     incidence = csr_array((np.ones(n * k), (order.ravel(), np.repeat(np.arange(n), k))), shape=(len(used), n))
     near = near.reshape(len(points), -1)
-    asked = csr_array(
-        (np.ones(near.size), near.ravel(), np.arange(0, near.size + 1, near.shape[1])), shape=(len(points), len(used))
-    )
+    asked = csr_array((np.ones(near.size), near.ravel(), np.arange(0, near.size + 1, near.shape[1])), shape=(len(points), len(used)))
     around = (asked @ incidence).tocsr()
     found, local, distance = np.zeros(len(points), dtype=np.int64), np.zeros((len(points), 3)), np.zeros(len(points))
-    search_nearest(
-        mesh.points, mesh.cells, points, around.indices.astype(np.int64), around.indptr.astype(np.int64), found, local, distance
-    )
+    search_nearest(mesh.points, mesh.cells, points, around.indices.astype(np.int64), around.indptr.astype(np.int64), found, local, distance)
     return found, local, distance
 
 

@@ -133,9 +133,7 @@ def _linear_part(mesh: Mesh) -> tuple[str, NDArray[np.int64]]:
 def _hex_jacobians(mesh: Mesh, at: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the Jacobian determinants (m, q) of trilinear cells at reference points `at` (q, 3) in [-1, 1]^3."""
     factors = 1 + at[:, None, :] * _HEX_SIGNS
-    gradients = np.stack(
-        [_HEX_SIGNS[:, i] * factors[:, :, (i + 1) % 3] * factors[:, :, (i + 2) % 3] / 8 for i in range(3)], axis=2
-    )
+    gradients = np.stack([_HEX_SIGNS[:, i] * factors[:, :, (i + 1) % 3] * factors[:, :, (i + 2) % 3] / 8 for i in range(3)], axis=2)
     return np.asarray(np.linalg.det(np.einsum("qni,cnx->cqix", gradients, mesh.points[mesh.cells], optimize=True)), dtype=np.float64)
 
 

@@ -118,9 +118,7 @@ def node_areas(mesh: Mesh, faces: NDArray[np.int64] | None = None) -> NDArray[np
     return np.asarray(np.bincount(faces.ravel(), weights=shares.ravel(), minlength=mesh.n_points), dtype=np.float64)
 
 
-def nodes_on_plane(
-    mesh: Mesh, point_mm: ArrayLike, normal: ArrayLike, *, tolerance_mm: float | None = None
-) -> NDArray[np.int64]:
+def nodes_on_plane(mesh: Mesh, point_mm: ArrayLike, normal: ArrayLike, *, tolerance_mm: float | None = None) -> NDArray[np.int64]:
     """Return the numbers of the nodes on a plane.
 
     Parameters

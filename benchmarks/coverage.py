@@ -1,0 +1,56 @@
+"""Are the stated intervals right? Virtual specimens with known truth, solved on another mesh: ``python benchmarks/coverage.py [DRAWS]``.
+
+Two gels between sticking and slipping plates, 0.15 mm noise a coordinate; prints the errors of the modulus ratio and of Poisson's
+ratio, and the share of 95 % intervals that hold the truth.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import numpy as np
+
+from naibu.core.experiment import Loading
+from naibu.identification.calibration import Knowledge, calibrate
+from naibu.identification.displacement_matching import NoiseModel
+from naibu.identification.model import CalibratedModel
+from naibu.identification.specimen import ModelSettings, friction, poisson_ratio, young_modulus
+from naibu.validation.phantoms import Scanner, box_experiment, virtual_specimen
+
+NOISE_MM = 0.15
+TRUTH = {
+    young_modulus("soft"): 90.0,
+    young_modulus("stiff"): 222.0,
+    poisson_ratio("soft"): 0.48,
+    poisson_ratio("stiff"): 0.47,
+    friction("soft", "table"): 0.45,
+    friction("stiff", "acrylic"): 0.25,
+}
+
+
+def main() -> None:
+    """Identify every draw and print the summary."""
+    draws = int(sys.argv[1]) if len(sys.argv) > 1 else 20
+    template = box_experiment("virtual", (60.0, 60.0, 60.0), [("soft", 30.0), ("stiff", 30.0)], Loading("plate"), {"pressed": 44.0})
+    virtual = virtual_specimen(template, TRUTH, settings=ModelSettings(element_size_mm=6.0))
+    inside, ratio, nu, start = [], [], [], time.perf_counter()
+    for seed in range(draws):
+        data = virtual.scanned(seed=seed, scanner=Scanner(placing_mm=NOISE_MM, xy_step_mm=0.0, z_step_mm=0.0))
+        found = calibrate(
+            [data.experiment], knowledge=Knowledge({"stiff": 222.0}), noise=NoiseModel(NOISE_MM), start={young_modulus("soft"): 120.0}
+        )
+        model = CalibratedModel.of(found)
+        values = model.parameters.values()
+        names = [n for n in TRUTH if n != young_modulus("stiff")]
+        inside.append([model.interval(n)[0] <= TRUTH[n] <= model.interval(n)[1] for n in names])
+        ratio.append(values[young_modulus("soft")] / TRUTH[young_modulus("soft")] - 1.0)
+        nu.append([values[poisson_ratio(m)] - TRUTH[poisson_ratio(m)] for m in ("soft", "stiff")])
+        print(f"draw {seed}: ratio {100 * ratio[-1]:+.2f} %, nu {nu[-1][0]:+.4f} {nu[-1][1]:+.4f}, intervals hold {sum(inside[-1])}/{len(names)}, {time.perf_counter() - start:.0f} s", flush=True)
+    print(f"modulus ratio: mean error {100 * np.mean(ratio):+.2f} %, RMS {100 * np.sqrt(np.mean(np.square(ratio))):.2f} %")
+    print(f"Poisson's ratio: RMS error {np.sqrt(np.mean(np.square(nu))):.4f}")
+    print(f"95 % intervals hold the truth in {100 * np.mean(inside):.1f} % of {np.size(inside)} cases; by parameter {np.mean(inside, axis=0).round(2)}")
+
+
+if __name__ == "__main__":
+    main()

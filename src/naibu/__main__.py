@@ -1,0 +1,5 @@
+"""``python -m naibu`` does what the command ``naibu`` does."""
+
+from naibu.cli import main
+
+main()
