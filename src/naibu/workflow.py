@@ -20,10 +20,11 @@ from naibu.identification.calibration import Calibration, Knowledge, calibrate
 from naibu.identification.comparison import LeftOut, leave_one_out
 from naibu.identification.displacement_matching import Trial
 from naibu.identification.model import CalibratedModel
+from naibu.identification.names import opening
 from naibu.identification.pose import registration
 from naibu.identification.prediction import Prediction, rms
 from naibu.identification.prediction import predict as predict_state
-from naibu.identification.specimen import ModelSettings, opening
+from naibu.identification.specimen import ModelSettings
 from naibu.io.experiments import META_FILE, read_experiment
 from naibu.result_files import (
     CHECKPOINT_FILE,

@@ -10,7 +10,8 @@ from naibu.identification import calibration, comparison
 from naibu.identification.calibration import Knowledge, calibrate
 from naibu.identification.comparison import LeftOut, compare_models, leave_one_out, pooled_rms
 from naibu.identification.displacement_matching import MatchingSettings, NoiseModel
-from naibu.identification.specimen import ModelSettings, poisson_ratio, young_modulus
+from naibu.identification.names import poisson_ratio, young_modulus
+from naibu.identification.specimen import ModelSettings
 from naibu.validation.phantoms import Scanner, box_experiment, virtual_specimen
 
 COARSE = ModelSettings(contact="stick", element_size_mm=10.0)

@@ -12,7 +12,8 @@ from naibu.core.mesh import Mesh
 from naibu.identification.calibration import Knowledge
 from naibu.identification.force_balance import balanced, force_balance
 from naibu.identification.marker_mesh import MarkerMesh, marker_mesh
-from naibu.identification.specimen import ModelSettings, poisson_ratio, young_modulus
+from naibu.identification.names import poisson_ratio, young_modulus
+from naibu.identification.specimen import ModelSettings
 from naibu.mechanics.assembly import Assembler
 from naibu.mechanics.elements import elements
 from naibu.mechanics.materials import material

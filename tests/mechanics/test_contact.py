@@ -152,7 +152,7 @@ def test_a_turned_body_gives_turned_forces():
     straight, turned = points(y, surface=BAR), points(y, surface=BAR, rotation=TILT)
     zero = np.zeros_like(y)
     one, two = straight.evaluate(zero, anchors, 0.0), turned.evaluate(zero, anchors, 0.0)
-    np.testing.assert_allclose(straight.scattered(one.force, 8) @ TILT.T, turned.scattered(two.force, 8), atol=1e-9)
+    np.testing.assert_allclose(straight.scattered(one.force, 8, np.eye(3)) @ TILT.T, turned.scattered(two.force, 8, TILT), atol=1e-9)
     h, move = 1e-6, np.random.default_rng(0).normal(size=y.shape)
     change = (turned.evaluate(h * move, anchors, 0.0).force - turned.evaluate(-h * move, anchors, 0.0).force) / (2 * h)
     np.testing.assert_allclose(change, -np.einsum("pij,pj->pi", two.stiffness, move @ TILT), rtol=1e-5, atol=1e-5 * np.abs(change).max())

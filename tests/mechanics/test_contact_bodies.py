@@ -89,7 +89,8 @@ def test_reactions_balance(surface, mu):
     state, before = solution.states[-1], solution.states[-2]
     moment, size = np.zeros(3), 0.0
     for c, anchors in zip(contacts, before.anchors, strict=True):
-        nodal = c.scattered(c.evaluate(state.displacement, anchors, 1.0).force, mesh.n_points)
+        response = c.evaluate(state.displacement, anchors, 1.0)
+        nodal = c.scattered(response.force, mesh.n_points, response.orientation)
         each = np.cross(mesh.points + state.displacement, nodal)
         moment, size = moment + each.sum(axis=0), size + np.abs(each).sum()
     np.testing.assert_allclose(moment, 0, atol=1e-6 * size)

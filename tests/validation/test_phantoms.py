@@ -8,9 +8,10 @@ from hypothesis import strategies as st
 from naibu import datasets
 from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, Loading
+from naibu.identification.names import friction, opening, poisson_ratio, young_modulus
 from naibu.identification.placement import placement
 from naibu.identification.pose import registration
-from naibu.identification.specimen import ModelSettings, friction, opening, poisson_ratio, specimen, young_modulus
+from naibu.identification.specimen import ModelSettings, specimen
 from naibu.mechanics.elements import elements
 from naibu.mechanics.materials import material
 from naibu.mechanics.statics import solve

@@ -9,24 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from naibu.core.errors import InputError
-from naibu.core.experiment import Experiment
+from naibu.core.experiment import Experiment, State
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.identification.displacement_matching import Match, Matcher, MatchingSettings, NoiseModel, Trial
 from naibu.identification.force_balance import force_balance
-from naibu.identification.specimen import (
+from naibu.identification.names import (
     SHAPE_NAMES,
-    ModelSettings,
-    Specimen,
     base_offset,
     friction,
     joint_friction,
+    opening,
     poisson_ratio,
     shape_parameter,
-    specimen,
-    state_parameters,
     straight_base,
     young_modulus,
 )
+from naibu.identification.specimen import ModelSettings, Specimen, full_opening, specimen
 
 REFERENCE_MODULUS_KPA = 200.0  # of the known region when only ratios are sought
 START_POISSON_RATIO = 0.49
@@ -191,10 +189,17 @@ def _friction_parameters(s: Specimen) -> list[Parameter]:
     return out
 
 
-def global_names(parameters: ParameterSet, trials: Sequence[Trial]) -> tuple[str, ...]:
-    """Return the names of the free parameters that belong to materials and friction, not to one experiment."""
-    own = {t.specimen.experiment.name for t in trials}
-    return tuple(p.name for p in parameters.free if p.name.split(":")[0].split("/")[0] not in own)
+def state_parameters(experiment: Experiment, state: State) -> list[Parameter]:
+    """Parameters of the boundary conditions of one state, with their priors: opening, tilt of a plate, offset of a bar."""
+    prefix = f"{experiment.name}/{state.name}"
+    full = full_opening(experiment)
+    start = state.estimated_mm or state.stated_mm or 0.7 * full
+    out = [Parameter(opening(experiment, state.name), float(start), "mm", prior_sd=5.0)]
+    if experiment.loading.kind != "side_plates":
+        out += [Parameter(f"{prefix}: tilt_{axis}", 0.0, "rad", prior_sd=0.01) for axis in "xy"]
+    if experiment.loading.kind == "bar":
+        out.append(Parameter(f"{prefix}: bar_offset", 0.0, "mm", prior_sd=1.0))
+    return out
 
 
 def marginal(match: Match, names: Sequence[str]) -> NDArray[np.float64]:

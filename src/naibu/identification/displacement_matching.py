@@ -1,4 +1,4 @@
-"""Identification by matching measured marker positions: Gauss-Newton on whitened residuals with exact sensitivities (spec I6).
+"""Identification by matching measured marker positions: Gauss-Newton on whitened residuals with exact sensitivities.
 
 Unknowns are the parameters of the materials and of friction, shared by all experiments; the boundary conditions of every state; where the
 base lies below the markers; and the rigid pose of the object in every loaded scan. All are estimated together, so that the covariance
@@ -19,8 +19,9 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.core.solution import Status
 from naibu.identification.lattice import FILLED_SD_MM
+from naibu.identification.names import base_offset, straight_base
 from naibu.identification.pose import Pose, registration
-from naibu.identification.specimen import Specimen, base_offset, straight_base
+from naibu.identification.specimen import Specimen
 from naibu.mechanics.linear_solvers import LinearSolver, use_one_thread
 from naibu.mechanics.sensitivities import sensitivities
 from naibu.mechanics.statics import Newton, Solution, SolverSettings, solve
@@ -182,7 +183,9 @@ class Matcher:
     settings: MatchingSettings = field(default_factory=MatchingSettings)
     _solvers: dict[int, LinearSolver | None] = field(default_factory=dict)
 
-    def evaluate(self, values: Mapping[str, float], previous: Sequence[TrialFit] | None = None, change: Array | None = None) -> list[TrialFit]:
+    def evaluate(
+        self, values: Mapping[str, float], previous: Sequence[TrialFit] | None = None, change: Array | None = None
+    ) -> list[TrialFit]:
         """Solve all trials at `values`; `previous` fits and the `change` of the free physical values since then give the first guess.
 
         Raises
@@ -190,6 +193,7 @@ class Matcher:
         ConvergenceError
             A trial cannot be solved at these values.
         """
+
         def one(i: int) -> TrialFit:
             return self._evaluate_one(i, values, previous[i] if previous else None, change)
 
@@ -206,7 +210,10 @@ class Matcher:
         if previous is not None and change is not None:
             states = previous.solution.states[1:]
             hints = [(s.load, s.displacement + d @ change) for s, d in zip(states, previous.path[1:], strict=True)]
-        solution = solve(problem, settings=_PATH, solver=self._solvers.get(index), hints=hints)
+        try:
+            solution = solve(problem, settings=_PATH, solver=self._solvers.get(index), hints=hints)
+        except ConvergenceError as error:
+            raise ConvergenceError(f"{trial.label}: {error}") from error
         newton = Newton(problem, _PATH, self._solvers.get(index))
         path = self._path_derivatives(trial, values, solution, newton)
         self._solvers[index] = newton.solver
@@ -225,7 +232,9 @@ class Matcher:
         raw = sensitivities(newton.problem, solution.states, directions, newton=newton)
         return tuple(d @ gather for d in raw)
 
-    def _observed(self, trial: Trial, values: Mapping[str, float], solution: Solution, path: tuple[Array, ...], pose: Pose | None) -> TrialFit:
+    def _observed(
+        self, trial: Trial, values: Mapping[str, float], solution: Solution, path: tuple[Array, ...], pose: Pose | None
+    ) -> TrialFit:
         specimen = trial.specimen.reshaped(values)
         u = specimen.observation @ solution.displacement
         gradient = specimen.deformation_gradient(solution.displacement)
@@ -279,7 +288,9 @@ class Matcher:
                 objective += deviation**2
         return hessian, gradient, objective, data
 
-    def run(self, callback: Callable[[int, float, Mapping[str, float]], None] | None = None, *, start: Mapping[str, float] | None = None) -> Match:
+    def run(
+        self, callback: Callable[[int, float, Mapping[str, float]], None] | None = None, *, start: Mapping[str, float] | None = None
+    ) -> Match:
         """Search for the parameters; `callback(iteration, objective, values)` is called after every accepted step.
 
         The search starts from the parameters' own values, or from those in `start`.
@@ -302,29 +313,39 @@ class Matcher:
                 if expected < self.settings.tolerance * max(1.0, 0.01 * objective):
                     status = Status.CONVERGED
                     break
-                found = self._try(inner, step, fits, objective)
+                found = self._try(inner, np.asarray(step, dtype=np.float64), fits, objective)
                 if found is None:
                     damping = max(10.0 * damping, 0.05)
                     if damping > 1e6:
                         break
                     continue
+                gained = objective - found[4]
                 inner, fits, hessian, gradient, objective = found
                 damping = max(damping / 10.0, 1e-8)
                 history.append(objective)
                 if callback is not None:
                     callback(iteration, objective, self.parameters.values(inner))
+                if gained < 2.0 * self.settings.tolerance * max(1.0, 0.01 * objective):
+                    status = Status.CONVERGED
+                    break
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
         return self._match(inner, fits, status, history)
 
-    def _try(self, inner: Array, step: Array, fits: list[TrialFit], objective: float) -> tuple[Array, list[TrialFit], Array, Array, float] | None:
+    def _try(
+        self, inner: Array, step: Array, fits: list[TrialFit], objective: float
+    ) -> tuple[Array, list[TrialFit], Array, Array, float] | None:
         """Evaluate a step; None where it does not lower the objective or a trial cannot be solved."""
         free = self.parameters.free
         moved = inner + step[: len(free)]
         old, new = self.parameters.values(inner), self.parameters.values(moved)
         change = np.array([new[q.name] - old[q.name] for q in free])
         shifted = [
-            TrialFit(f.solution, f.pose.moved(step[len(free) + 6 * t : len(free) + 6 * t + 6]), *[getattr(f, n) for n in ("predicted", "residual", "sd", "jacobian", "pose_jacobian", "path")])
+            TrialFit(
+                f.solution,
+                f.pose.moved(step[len(free) + 6 * t : len(free) + 6 * t + 6]),
+                *[getattr(f, n) for n in ("predicted", "residual", "sd", "jacobian", "pose_jacobian", "path")],
+            )
             for t, f in enumerate(fits)
         ]
         try:
@@ -343,10 +364,19 @@ class Matcher:
         effective = float(np.trace(np.linalg.solve(hessian, data)))
         dof = n_data - effective
         factor = max(1.0, chi_squared / max(dof, 1.0))
-        covariance = np.linalg.inv(hessian)[:p, :p] * factor
+        covariance = np.asarray(np.linalg.inv(hessian)[:p, :p] * factor, dtype=np.float64)
         information = data[:p, :p] - data[:p, p:] @ np.linalg.solve(data[p:, p:], data[p:, :p])
         values = self.parameters.values(inner)
-        return Match(self.parameters.with_values({q.name: values[q.name] for q in free}), covariance, tuple(fits), chi_squared, dof, information, status, tuple(history))
+        return Match(
+            self.parameters.with_values({q.name: values[q.name] for q in free}),
+            covariance,
+            tuple(fits),
+            chi_squared,
+            dof,
+            information,
+            status,
+            tuple(history),
+        )
 
 
 def _limits(free: Sequence[Parameter]) -> Array:

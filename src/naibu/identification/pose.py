@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from naibu.core.rotation import rotation_matrix
+
 Array = NDArray[np.float64]
 
 
@@ -51,13 +53,3 @@ def _kabsch(points: Array, measured: Array) -> Pose:
     centre, position = points.mean(axis=0), measured.mean(axis=0)
     u, _, vt = np.linalg.svd((measured - position).T @ (points - centre))
     return Pose(u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt, centre, position)
-
-
-def rotation_matrix(vector: Array) -> Array:
-    """Return the rotation matrix (3, 3) of a rotation vector, rad (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    if angle == 0.0:
-        return np.eye(3)
-    x, y, z = vector / angle
-    k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k))

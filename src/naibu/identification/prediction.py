@@ -14,8 +14,9 @@ from naibu.core.parameters import Parameter, ParameterSet
 from naibu.identification.calibration import REFERENCE_MODULUS_KPA, START_FRICTION, START_SPRING, Knowledge, initial_parameters
 from naibu.identification.displacement_matching import Matcher, Trial, TrialFit
 from naibu.identification.model import CalibratedModel
+from naibu.identification.names import opening
 from naibu.identification.pose import registration
-from naibu.identification.specimen import Specimen, full_opening, opening, specimen
+from naibu.identification.specimen import Specimen, full_opening, specimen
 
 Array = NDArray[np.float64]
 LAYER_GAP = 0.4  # a new marker layer starts where the height jumps by this share of the markers' spacing

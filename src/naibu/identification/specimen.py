@@ -8,18 +8,28 @@ from typing import Literal
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from naibu.core.errors import InputError
-from naibu.core.experiment import Experiment, State
+from naibu.core.experiment import Experiment
 from naibu.core.mesh import Mesh
-from naibu.core.parameters import Parameter
 from naibu.identification.lattice import completed
 from naibu.identification.model_mesh import element_size, model_mesh, on_straight_base
+from naibu.identification.names import (
+    SHAPE_NAMES,
+    base_offset,
+    friction,
+    joint_friction,
+    layer_shift,
+    opening,
+    poisson_ratio,
+    shape_parameter,
+    straight_base,
+    young_modulus,
+)
 from naibu.identification.placement import Placement, placement
-from naibu.identification.pose import rotation_matrix
 from naibu.mechanics.assembly import Assembler, block_pattern, body_force
-from naibu.mechanics.contact import STICK, Contact, bar, plane
+from naibu.mechanics.contact import STICK, Contact, RigidSurface, bar, plane
 from naibu.mechanics.elements import elements
 from naibu.mechanics.materials import Law, from_moduli, law_named, parameter_vector
 from naibu.mechanics.sensitivities import Direction
@@ -48,7 +58,7 @@ class ModelSettings:
     joined : {"glued", "sliding"}
         What holds separately cast blocks together.
     element_size_mm : float
-        Edge of the hexahedra, smaller under a bar; 0 takes a seventh of the object's height.
+        Edge of the hexahedra, smaller under a bar; 0 takes a seventh of the object's height, an eighth under a bar.
     normal_stiffness : float
         Contact penalty, kPa/mm.
     density : float
@@ -62,36 +72,6 @@ class ModelSettings:
     normal_stiffness: float = 5e3
     tangential_stiffness: float = 200.0
     density: float = 1e-6
-
-
-def young_modulus(material: str) -> str:
-    """Name of the Young's modulus of `material`."""
-    return f"{material}: young_modulus"
-
-
-def poisson_ratio(material: str) -> str:
-    """Name of the Poisson's ratio of `material`."""
-    return f"{material}: poisson_ratio"
-
-
-def shape_parameter(material: str, name: str) -> str:
-    """Name of a dimensionless parameter of the law of `material`, such as ``c01_share``."""
-    return f"{material}: {name}"
-
-
-def friction(material: str, body: str) -> str:
-    """Name of the friction coefficient (or, for springs, the tangential stiffness) of `material` on `body`."""
-    return f"{material} on {body}: friction"
-
-
-def joint_friction(experiment: Experiment, height: float) -> str:
-    """Name of the friction coefficient between the blocks that meet at `height` above the base, mm."""
-    below = next(layer.material for layer in experiment.layers if layer.to_base_mm >= height - 1e-9)
-    above = next(layer.material for layer in experiment.layers if layer.to_base_mm > height + 1e-9)
-    return friction(*sorted((below, above), reverse=True))
-
-
-SHAPE_NAMES: dict[str, tuple[str, ...]] = {"mooney_rivlin": ("c01_share",), "yeoh": ("c20_ratio", "c30_ratio")}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,7 +126,7 @@ class Specimen:
     def indenter_paths(self, values: Mapping[str, float], state: str) -> list[tuple[Array, Array, Array]]:
         """Return start and end of the path (3,), mm, and the outward normal (3,) of every indenter in a state."""
         moved = [self._moved(self._contacts[i], values, state) for i in self.indenters]
-        return [(c.start, c.stop, c.rotation @ c.surface.normal) for c in moved]
+        return [(c.start, c.stop, c.orientation(1.0) @ c.surface.normal) for c in moved]
 
     @property
     def has_unknown_base(self) -> bool:
@@ -179,19 +159,26 @@ class Specimen:
         """Return the specimen with its layers' boundaries, its base and its markers where `values` put them."""
         below = values.get(straight_base(self.experiment), 0.0) if self.has_unknown_base else 0.0
         offset = values.get(base_offset(self.experiment), 0.0) + below
-        shift = on_straight_base(self._rest_points, self.experiment.height_mm, below) - self._rest_points if below else np.zeros_like(self.mesh.points)
+        shift = (
+            on_straight_base(self._rest_points, self.experiment.height_mm, below) - self._rest_points
+            if below
+            else np.zeros_like(self.mesh.points)
+        )
         for name in self.shift_names:
             shift += values.get(name, 0.0) * np.asarray(self.shift(name, values))
         if offset == 0.0 and not shift.any():
             return self
         mesh = self.mesh.moved(shift)
-        points = self.marker_points + [0.0, 0.0, offset]
+        points = self.marker_points + np.array([0.0, 0.0, offset])
         contacts = tuple(
-            c if c.name.startswith("joint") else replace(c, rest=np.einsum("pk,pki->pi", c.shape, mesh.points[c.nodes])) for c in self._contacts
+            c if c.name.startswith("joint") else replace(c, rest=np.einsum("pk,pki->pi", c.shape, mesh.points[c.nodes]))
+            for c in self._contacts
         )
         observation, gradient = _observation(mesh, points, self.experiment, self.settings)
         assembler = self._assembler.with_elements(self._assembler.elements.moved(shift))
-        return replace(self, mesh=mesh, marker_points=points, observation=observation, _gradient=gradient, _assembler=assembler, _contacts=contacts)
+        return replace(
+            self, mesh=mesh, marker_points=points, observation=observation, _gradient=gradient, _assembler=assembler, _contacts=contacts
+        )
 
     def deformation_gradient(self, displacement: Array) -> Array:
         """Return F (k, 3, 3) at the markers, by central differences over a tenth of an element."""
@@ -248,8 +235,8 @@ class Specimen:
         for i in self.indenters:
             path = self._path_directions(self._contacts[i], state).get(name)
             if path is not None:
-                stop, rotation = path
-                out.append(Direction(contact=i, stop=stop, rotation=rotation))
+                stop, tilt = path
+                out.append(Direction(contact=i, stop=stop, tilt=tilt))
         return out
 
     def _material_direction(self, name: str, values: Mapping[str, float]) -> Array | None:
@@ -289,15 +276,12 @@ class Specimen:
 
     def _moved(self, contact: Contact, values: Mapping[str, float], state: str) -> Contact:
         """Set the end of the body's path and its tilt from the state's parameters."""
-        stop, rotation = contact.start.copy(), np.zeros(3)
+        stop, tilt = contact.start.copy(), np.zeros(3)
         for name, (rate, turn) in self._path_directions(contact, state).items():
             reference = self._reference(contact, name, state)
             stop = stop + rate * (values.get(name, reference) - reference)
-            rotation = rotation + turn * values.get(name, 0.0)
-        # a tilted plate starts higher, so that it touches the free object with its lowest edge
-        size = self.experiment.shape.size_mm
-        start = contact.start + [0.0, 0.0, 0.5 * (abs(rotation[0]) * size[1] + abs(rotation[1]) * size[0])]
-        return replace(contact, start=start, stop=stop, rotation=rotation_matrix(rotation))
+            tilt = tilt + turn * values.get(name, 0.0)
+        return replace(contact, stop=stop, tilt=tilt)
 
     def _reference(self, contact: Contact, name: str, state: str) -> float:
         """Value of a path parameter at which the body is at its start."""
@@ -320,27 +304,6 @@ class Specimen:
         return out
 
 
-def base_offset(experiment: Experiment) -> str:
-    """Name of the height by which all markers lie above their supposed place in the object, mm."""
-    return f"{experiment.name}: base_offset"
-
-
-def layer_shift(experiment: Experiment, height: float) -> str:
-    """Name of the height by which the boundary between layers lies above its nominal `height`, mm."""
-    return f"{experiment.name}: shift_of_layer_at_{height:g}"
-
-
-def straight_base(experiment: Experiment) -> str:
-    """Name of the height of straight-sided material below a half ellipsoid, mm."""
-    return f"{experiment.name}: straight_base"
-
-
-def opening(experiment: Experiment, state: str) -> str:
-    """Name of the height of the plate or bar above the base, or of the distance between side plates, in a state."""
-    kind = "width" if experiment.loading.kind == "side_plates" else "height"
-    return f"{experiment.name}/{state}: {kind}"
-
-
 def specimen(experiment: Experiment, settings: ModelSettings | None = None) -> Specimen:
     """Mesh an experiment and prepare its contacts and observations.
 
@@ -358,7 +321,16 @@ def specimen(experiment: Experiment, settings: ModelSettings | None = None) -> S
         if chosen.joined == "sliding":
             area = node_areas(mesh, _plane_faces(mesh, height))
             mesh, split = split_at_plane(mesh, height)
-            joints.append(interface(f"joint at {height:g} mm", mesh.points, split, area[split[:, 0]], friction=Friction(0.3), normal_stiffness=chosen.normal_stiffness))
+            joints.append(
+                interface(
+                    f"joint at {height:g} mm",
+                    mesh.points,
+                    split,
+                    area[split[:, 0]],
+                    friction=Friction(0.3),
+                    normal_stiffness=chosen.normal_stiffness,
+                )
+            )
     boundary = boundary_faces(mesh)
     bodies = _bodies(experiment, chosen, mesh, boundary.faces)
     pairs = [tuple(friction(m, _body(c)) for m in mesh.region_names) for c in bodies]
@@ -382,7 +354,9 @@ def specimen(experiment: Experiment, settings: ModelSettings | None = None) -> S
     )  # fmt: skip
 
 
-def _observation(mesh: Mesh, points: Array, experiment: Experiment, settings: ModelSettings) -> tuple[sp.csr_array, tuple[sp.csr_array, ...]]:
+def _observation(
+    mesh: Mesh, points: Array, experiment: Experiment, settings: ModelSettings
+) -> tuple[sp.csr_array, tuple[sp.csr_array, ...]]:
     """Interpolation at markers (k, 3), mm, and at points a little before and behind them along each axis."""
     tolerance = 0.05 * experiment.height_mm
     step = _difference_step(settings, experiment)
@@ -393,9 +367,13 @@ def _observation(mesh: Mesh, points: Array, experiment: Experiment, settings: Mo
 
 def _require_supported(experiment: Experiment) -> None:
     if experiment.dimensions != 3:
-        raise InputError(f"experiment {experiment.name!r} has two-dimensional data; displacement matching needs markers in three dimensions")
+        raise InputError(
+            f"experiment {experiment.name!r} has two-dimensional data; displacement matching needs markers in three dimensions"
+        )
     if experiment.up_axis != "z":
-        raise InputError(f"experiment {experiment.name!r} has its height along {experiment.up_axis}; turn its axes so that z points away from the base")
+        raise InputError(
+            f"experiment {experiment.name!r} has its height along {experiment.up_axis}; turn its axes so that z points away from the base"
+        )
     if experiment.loading.kind == "cylinder":
         raise InputError(f"experiment {experiment.name!r} is pressed by a cylinder; plates, bars and side plates are covered")
 
@@ -416,8 +394,10 @@ def _bodies(experiment: Experiment, settings: ModelSettings, mesh: Mesh, faces: 
     stick = Friction(STICK, settings.tangential_stiffness)
     loading, size = experiment.loading, experiment.shape.size_mm
 
-    def body(name, surface, start):  # type: ignore[no-untyped-def]
-        return rigid_contact(name, mesh.points, faces, surface, start=start, stop=start, friction=stick, normal_stiffness=settings.normal_stiffness)
+    def body(name: str, surface: RigidSurface, start: ArrayLike) -> Contact:
+        return rigid_contact(
+            name, mesh.points, faces, surface, start=start, stop=start, friction=stick, normal_stiffness=settings.normal_stiffness
+        )
 
     # where only its weight holds the object down, it starts pressed into the table by a hair, for the contact to have a stiffness
     ground = 1e-4 if loading.kind == "side_plates" else 0.0
@@ -426,9 +406,8 @@ def _bodies(experiment: Experiment, settings: ModelSettings, mesh: Mesh, faces: 
     if loading.kind == "side_plates":
         axis = "xyz".index(loading.bar_axis)
         for sign, side in ((-1.0, "low"), (1.0, "high")):
-            inward, place = np.zeros(3), np.zeros(3)
-            inward[axis], place[axis] = -sign, 0.5 * sign * size[axis]
-            bodies.append(body(f"indenter ({side} side) of {counter}", plane(tuple(inward)), tuple(place)))
+            inward = (-sign, 0.0, 0.0) if axis == 0 else (0.0, -sign, 0.0)
+            bodies.append(body(f"indenter ({side} side) of {counter}", plane(inward), -0.5 * size[axis] * np.array(inward)))
     elif loading.kind == "bar":
         surface = bar(loading.bar_axis, loading.bar_width_mm or 0.0)
         bodies.append(body(f"indenter of {counter}", surface, (0.0, 0.0, size[2])))
@@ -456,16 +435,3 @@ def full_opening(experiment: Experiment) -> float:
     """Height of the plate or bar, or distance of the side plates, at which they touch the free object, mm."""
     loading, size = experiment.loading, experiment.shape.size_mm
     return size["xyz".index(loading.bar_axis)] if loading.kind == "side_plates" else size[2]
-
-
-def state_parameters(experiment: Experiment, state: State) -> list[Parameter]:
-    """Parameters of the boundary conditions of one state, with their priors: opening, tilt of a plate, offset of a bar."""
-    prefix = f"{experiment.name}/{state.name}"
-    full = full_opening(experiment)
-    start = state.estimated_mm or state.stated_mm or 0.7 * full
-    out = [Parameter(opening(experiment, state.name), float(start), "mm", prior_sd=5.0)]
-    if experiment.loading.kind != "side_plates":
-        out += [Parameter(f"{prefix}: tilt_{axis}", 0.0, "rad", prior_sd=0.01) for axis in "xy"]
-    if experiment.loading.kind == "bar":
-        out.append(Parameter(f"{prefix}: bar_offset", 0.0, "mm", prior_sd=1.0))
-    return out

@@ -16,6 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from naibu.core.errors import InputError
+from naibu.core.rotation import rotation_matrix
 from naibu.mechanics.assembly import BlockPattern
 
 Array = NDArray[np.float64]
@@ -94,13 +95,16 @@ class Contact:
     start, stop : ndarray, shape (3,)
         Where the body's reference point is at the beginning and at the end of loading, mm.
     rotation : ndarray, shape (3, 3)
-        Constant orientation of the body.
+        Orientation of the body at the beginning.
     normal_stiffness : float
         kPa/mm.
     tangential_stiffness, friction_coefficient : ndarray, shape (p,)
         kPa/mm, and Coulomb's coefficient.
     bonded : bool
         Whether the body also holds the point back.
+    tilt : ndarray, shape (3,), optional
+        Rotation vector, rad, by which the body turns about its reference point, in proportion to the load. A plate that tilts as it
+        presses touches flat at first, where one tilted from the beginning would let the body rock on an edge.
     """
 
     name: str
@@ -116,6 +120,11 @@ class Contact:
     tangential_stiffness: Array
     friction_coefficient: Array
     bonded: bool = False
+    tilt: Array | None = None
+
+    def orientation(self, load: float) -> Array:
+        """Return the body's orientation (3, 3) at the fraction `load` of the path."""
+        return self.rotation if self.tilt is None else rotation_matrix(load * self.tilt) @ self.rotation
 
     def with_path(self, start: Array, stop: Array) -> Contact:
         """Return the contact with another path of the body."""
@@ -124,7 +133,7 @@ class Contact:
     def local(self, displacement: Array, load: float) -> Array:
         """Return positions (p, 3) of the points in the body's frame, at the fraction `load` of the path."""
         moved = self.rest + np.einsum("pk,pki->pi", self.shape, displacement[self.nodes])
-        return np.asarray((moved - (self.start + load * (self.stop - self.start))) @ self.rotation)
+        return np.asarray((moved - (self.start + load * (self.stop - self.start))) @ self.orientation(load))
 
     def anchors_at_rest(self) -> Array:
         """Return anchors (p, 3) for the beginning of loading, in the body's frame."""
@@ -135,7 +144,7 @@ class Contact:
         y = self.local(displacement, load)
         n = len(y)
         vectors, matrices = np.zeros((3, n, 3)), np.zeros((3, n, 3, 3))
-        response = ContactResponse(y, np.empty(n), *vectors, *matrices)
+        response = ContactResponse(self.orientation(load), y, np.empty(n), *vectors, *matrices)
         _tractions(
             self.surface.kind, self.surface.packed(), y, anchors, self.normal_stiffness, self.tangential_stiffness,
             self.friction_coefficient, self.bonded, response.gap, response.force, response.tangential, response.slip_direction,
@@ -145,9 +154,9 @@ class Contact:
             field *= self.area.reshape((-1,) + (1,) * (field.ndim - 1))
         return response
 
-    def scattered(self, force: Array, n_points: int) -> Array:
-        """Return nodal forces (n, 3) of point forces (p, 3) given in the body's frame."""
-        world = force @ self.rotation.T
+    def scattered(self, force: Array, n_points: int, orientation: Array) -> Array:
+        """Return nodal forces (n, 3) of point forces (p, 3) given in the frame of a body of this `orientation`."""
+        world = force @ orientation.T
         out = np.empty((n_points, 3))
         for i in range(3):
             out[:, i] = np.bincount(self.nodes.ravel(), (self.shape * world[:, i : i + 1]).ravel(), minlength=n_points)
@@ -155,7 +164,7 @@ class Contact:
 
     def add_stiffness(self, response: ContactResponse, pattern: BlockPattern, positions: NDArray[np.int32], blocks: Array) -> None:
         """Add the negative derivative of the contact forces to the tangent `blocks`; `positions` from ``pattern.positions(nodes)``."""
-        world = np.einsum("ij,pjk,lk->pil", self.rotation, response.stiffness, self.rotation)
+        world = np.einsum("ij,pjk,lk->pil", response.orientation, response.stiffness, response.orientation)
         _scatter_blocks(positions, self.shape, world, blocks)
 
     def next_anchors(self, response: ContactResponse) -> Array:
@@ -169,6 +178,8 @@ class ContactResponse:
 
     Attributes
     ----------
+    orientation : ndarray, shape (3, 3)
+        Of the body.
     local : ndarray, shape (p, 3)
         Positions, mm.
     gap : ndarray, shape (p,)
@@ -187,6 +198,7 @@ class ContactResponse:
         Derivative of the force with respect to the anchor, mN/mm.
     """
 
+    orientation: Array
     local: Array
     gap: Array
     force: Array

@@ -7,6 +7,7 @@ each parameter. Friction remembers, through the anchors `a` of the contact point
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,8 @@ class Direction:
         Change of the ends of the body's path, mm.
     rotation : ndarray, shape (3,), optional
         Rotation of the body about its reference point, rad.
+    tilt : ndarray, shape (3,), optional
+        Change of the rotation that grows with the load, rad at full load.
     points : ndarray, shape (n, 3), optional
         Change of the nodes' positions in the free state, mm.
     """
@@ -47,10 +50,13 @@ class Direction:
     start: Array | None = None
     stop: Array | None = None
     rotation: Array | None = None
+    tilt: Array | None = None
     points: Array | None = None
 
 
-def sensitivities(problem: Problem, states: tuple[LoadState, ...], directions: list[Direction], *, newton: Newton | None = None) -> list[Array]:
+def sensitivities(
+    problem: Problem, states: tuple[LoadState, ...], directions: list[Direction], *, newton: Newton | None = None
+) -> list[Array]:
     """Return, for every state of the path, the derivatives (n, 3, k) of the displacement along the k directions.
 
     Parameters
@@ -75,7 +81,7 @@ def sensitivities(problem: Problem, states: tuple[LoadState, ...], directions: l
     reshaped = {k: _Reshaped.along(problem, d.points) for k, d in enumerate(directions) if d.points is not None}
     moving = [_BodyDirections.gather(i, c, directions) for i, c in enumerate(problem.contacts)]
     d_anchors = [m.at_rest(c) for m, c in zip(moving, problem.contacts, strict=True)]
-    for before, state in zip(states[:-1], states[1:], strict=True):
+    for before, state in pairwise(states):
         _, _, factorization, responses = solver.linearised(state.displacement, before.anchors, state.load)
         rhs = np.zeros((*problem.points.shape, count))
         for k, direction in enumerate(directions):
@@ -88,7 +94,7 @@ def sensitivities(problem: Problem, states: tuple[LoadState, ...], directions: l
             change = m.explicit(c, response, da, state.load)
             explicit.append(change)
             for k in range(count):
-                rhs[:, :, k] += c.scattered(change.force[:, :, k], len(rhs))
+                rhs[:, :, k] += c.scattered(change.force[:, :, k], len(rhs), response.orientation)
         rhs[problem.prescribed.held] = 0.0
         du = factorization.solve(rhs.reshape(-1, count)).reshape(rhs.shape)
         out.append(du)
@@ -111,7 +117,8 @@ class _Reshaped:
     def along(cls, problem: Problem, change: Array) -> _Reshaped:
         step = 1e-5 / max(float(np.abs(change).max()), 1e-12) * float(np.ptp(problem.points, axis=0).max())
         assembler = problem.assembler
-        return cls(*(assembler.with_elements(assembler.elements.moved(sign * step * change)) for sign in (1.0, -1.0)), step)
+        forward, backward = (assembler.with_elements(assembler.elements.moved(sign * step * change)) for sign in (1.0, -1.0))
+        return cls(forward, backward, step)
 
     def forces(self, displacement: Array) -> Array:
         """Derivative (n, 3) of the internal forces at fixed displacement (central difference)."""
@@ -127,18 +134,34 @@ class _BodyDirections:
     start: Array
     stop: Array
     rotation: Array
+    tilt: Array
     points: Array
 
     @classmethod
     def gather(cls, index: int, contact: Contact, directions: list[Direction]) -> _BodyDirections:
         n, count = len(contact.area), len(directions)
-        parts = cls(np.zeros((n, count)), np.zeros((n, count)), np.zeros((3, count)), np.zeros((3, count)), np.zeros((3, count)), np.zeros((n, 3, count)))
+        parts = cls(
+            np.zeros((n, count)),
+            np.zeros((n, count)),
+            np.zeros((3, count)),
+            np.zeros((3, count)),
+            np.zeros((3, count)),
+            np.zeros((3, count)),
+            np.zeros((n, 3, count)),
+        )
         for k, d in enumerate(directions):
             if d.points is not None:
                 parts.points[:, :, k] = np.einsum("pa,pai->pi", contact.shape, d.points[contact.nodes])
             if d.contact != index:
                 continue
-            sources = ((parts.friction, d.friction), (parts.stiffness, d.tangential_stiffness), (parts.start, d.start), (parts.stop, d.stop), (parts.rotation, d.rotation))
+            sources = (
+                (parts.friction, d.friction),
+                (parts.stiffness, d.tangential_stiffness),
+                (parts.start, d.start),
+                (parts.stop, d.stop),
+                (parts.rotation, d.rotation),
+                (parts.tilt, d.tilt),
+            )
             for target, source in sources:
                 if source is not None:
                     target[:, k] = source
@@ -147,8 +170,9 @@ class _BodyDirections:
     def moved(self, contact: Contact, world: Array, load: float) -> Array:
         """Change (p, 3, k) of local positions of points that stay at `world` (p, 3), relative to the body's reference point."""
         translation = self.start + load * (self.stop - self.start)
-        turned = np.cross(self.rotation.T[None, :, :], world[:, None, :])
-        return -np.einsum("pkj,ji->pik", turned + translation.T[None, :, :] - self.points.transpose(0, 2, 1), contact.rotation)
+        turned = np.cross((self.rotation + load * self.tilt).T[None, :, :], world[:, None, :])
+        change = self.points.transpose(0, 2, 1) - turned - translation.T[None, :, :]
+        return np.asarray(np.einsum("pkj,ji->pik", change, contact.orientation(load)))
 
     def at_rest(self, contact: Contact) -> Array:
         """Change (p, 3, k) of the anchors at the beginning of loading."""
@@ -156,15 +180,18 @@ class _BodyDirections:
 
     def explicit(self, contact: Contact, response: ContactResponse, d_anchors: Array, load: float) -> _Explicit:
         """Change of local positions, tractions and forces while the nodes stay."""
-        local = self.moved(contact, response.local @ contact.rotation.T, load)
+        local = self.moved(contact, response.local @ response.orientation.T, load)
         area = contact.area[:, None, None]
         slipping = (response.slip_direction != 0.0).any(axis=1)
         by_stiffness = np.where(slipping[:, None], 0.0, response.tangential / contact.tangential_stiffness[:, None])
-        known = np.einsum("pij,pjk->pik", response.anchor_stiffness, d_anchors) + response.slip_direction[:, :, None] * self.friction[:, None, :]
+        known = (
+            np.einsum("pij,pjk->pik", response.anchor_stiffness, d_anchors)
+            + response.slip_direction[:, :, None] * self.friction[:, None, :]
+        )
         known -= area * by_stiffness[:, :, None] * self.stiffness[:, None, :]
         force = known - np.einsum("pij,pjk->pik", response.stiffness, local)
-        turned = np.cross(self.rotation.T[None, :, :], (response.force @ contact.rotation.T)[:, None, :])
-        force += np.einsum("pkj,ji->pik", turned, contact.rotation)
+        turned = np.cross((self.rotation + load * self.tilt).T[None, :, :], (response.force @ response.orientation.T)[:, None, :])
+        force += np.einsum("pkj,ji->pik", turned, response.orientation)
         return _Explicit(local, -known / area, force, self.stiffness)
 
 
@@ -179,7 +206,7 @@ class _Explicit:
 
     def anchors(self, contact: Contact, response: ContactResponse, d_points: Array) -> Array:
         """Change (p, 3, k) of the next step's anchors, ``a = y - t / k_t``, when the points also move by `d_points` (p, 3, k)."""
-        local = self.local + np.einsum("pjk,ji->pik", d_points, contact.rotation)
+        local = self.local + np.einsum("pjk,ji->pik", d_points, response.orientation)
         traction = self.traction + np.einsum("pij,pjk->pik", response.tangential_stiffness, local)
         k_t = contact.tangential_stiffness[:, None, None]
-        return local - traction / k_t + response.tangential[:, :, None] * self.stiffness[:, None, :] / k_t**2
+        return np.asarray(local - traction / k_t + response.tangential[:, :, None] * self.stiffness[:, None, :] / k_t**2)

@@ -147,7 +147,8 @@ class Newton:
             return internal, np.inf, smallest
         contact = np.zeros_like(internal)
         for c, a in zip(self.problem.contacts, anchors, strict=True):
-            contact += c.scattered(c.evaluate(u, a, load).force, len(u))
+            response = c.evaluate(u, a, load)
+            contact += c.scattered(response.force, len(u), response.orientation)
         return self._balance(internal, contact)[0], self._balance(internal, contact)[1], smallest
 
     def _balance(self, internal: Array, contact: Array) -> tuple[Array, float]:
@@ -180,7 +181,7 @@ class Newton:
         responses = []
         for c, a, positions in zip(p.contacts, anchors, p._positions, strict=True):
             response = c.evaluate(u, a, load)
-            contact += c.scattered(response.force, len(u))
+            contact += c.scattered(response.force, len(u), response.orientation)
             c.add_stiffness(response, p.assembler.pattern, positions, blocks)
             responses.append(response)
         residual, scale = self._balance(internal, contact)
@@ -395,9 +396,9 @@ def _finish(newton: Newton, states: list[LoadState], residual: float, status: St
     anchors = states[-2].anchors if len(states) > 1 else last.anchors
     for c, a in zip(problem.contacts, anchors, strict=True):
         response = c.evaluate(last.displacement, a, last.load)
-        nodal = c.scattered(response.force, len(contact))
+        nodal = c.scattered(response.force, len(contact), response.orientation)
         contact += nodal
-        reactions[c.name] = (response.force @ c.rotation.T).sum(axis=0)
+        reactions[c.name] = (response.force @ response.orientation.T).sum(axis=0)
         penetration = max(penetration, float(-response.gap.min()))
     internal = problem.assembler.forces(last.displacement)[1]
     held = problem.prescribed.held

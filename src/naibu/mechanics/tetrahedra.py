@@ -11,6 +11,7 @@ sums do not depend on the number of threads.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 
 import numba
@@ -20,7 +21,11 @@ from numba import njit, prange
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from naibu.mechanics.materials import LINEAR_ELASTIC, inverse_transpose, invariant_derivatives
+from naibu.mechanics.materials import LINEAR_ELASTIC, invariant_derivatives, inverse_transpose
+
+# Threads that wait at a barrier sleep. By default they spin for milliseconds, which costs several times the work itself where another
+# program, or the threads of the linear solver, need the core. Read when Numba starts its threads.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,9 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, Layer, Loading, Shape, State
 from naibu.core.markers import Markers
+from naibu.core.rotation import rotation_matrix
+from naibu.identification.calibration import state_parameters
+from naibu.identification.names import poisson_ratio, young_modulus
 from naibu.identification.placement import placement
-from naibu.identification.pose import Pose, rotation_matrix
-from naibu.identification.specimen import ModelSettings, Specimen, poisson_ratio, specimen, state_parameters, young_modulus
+from naibu.identification.pose import Pose
+from naibu.identification.specimen import ModelSettings, Specimen, specimen
 from naibu.mechanics.statics import Solution, SolverSettings, solve
 from naibu.meshing.location import interpolation_operator
 

@@ -1,0 +1,55 @@
+"""Names of the parameters of a measured object, each made in one place."""
+
+from __future__ import annotations
+
+from naibu.core.experiment import Experiment
+
+SHAPE_NAMES: dict[str, tuple[str, ...]] = {"mooney_rivlin": ("c01_share",), "yeoh": ("c20_ratio", "c30_ratio")}
+
+
+def young_modulus(material: str) -> str:
+    """Name of the Young's modulus of `material`."""
+    return f"{material}: young_modulus"
+
+
+def poisson_ratio(material: str) -> str:
+    """Name of the Poisson's ratio of `material`."""
+    return f"{material}: poisson_ratio"
+
+
+def shape_parameter(material: str, name: str) -> str:
+    """Name of a dimensionless parameter of the law of `material`, such as ``c01_share``."""
+    return f"{material}: {name}"
+
+
+def friction(material: str, body: str) -> str:
+    """Name of the friction coefficient (or, for springs, the tangential stiffness) of `material` on `body`."""
+    return f"{material} on {body}: friction"
+
+
+def joint_friction(experiment: Experiment, height: float) -> str:
+    """Name of the friction coefficient between the blocks that meet at `height` above the base, mm."""
+    below = next(layer.material for layer in experiment.layers if layer.to_base_mm >= height - 1e-9)
+    above = next(layer.material for layer in experiment.layers if layer.to_base_mm > height + 1e-9)
+    return friction(*sorted((below, above), reverse=True))
+
+
+def base_offset(experiment: Experiment) -> str:
+    """Name of the height by which all markers lie above their supposed place in the object, mm."""
+    return f"{experiment.name}: base_offset"
+
+
+def layer_shift(experiment: Experiment, height: float) -> str:
+    """Name of the height by which the boundary between layers lies above its nominal `height`, mm."""
+    return f"{experiment.name}: shift_of_layer_at_{height:g}"
+
+
+def straight_base(experiment: Experiment) -> str:
+    """Name of the height of straight-sided material below a half ellipsoid, mm."""
+    return f"{experiment.name}: straight_base"
+
+
+def opening(experiment: Experiment, state: str) -> str:
+    """Name of the height of the plate or bar above the base, or of the distance between side plates, in a state."""
+    kind = "width" if experiment.loading.kind == "side_plates" else "height"
+    return f"{experiment.name}/{state}: {kind}"

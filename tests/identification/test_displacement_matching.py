@@ -1,0 +1,125 @@
+"""The matching against finite differences, virtual specimens of known truth, and the measured gels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from naibu import datasets
+from naibu.core.experiment import Loading
+from naibu.core.markers import Markers
+from naibu.identification import displacement_matching
+from naibu.identification.calibration import Knowledge, calibrate, initial_parameters
+from naibu.identification.displacement_matching import Matcher, NoiseModel, Trial
+from naibu.identification.model import CalibratedModel
+from naibu.identification.names import base_offset, friction, poisson_ratio, straight_base, young_modulus
+from naibu.identification.prediction import predict, rms
+from naibu.identification.specimen import ModelSettings, specimen
+from naibu.mechanics.statics import SolverSettings
+from naibu.validation.baselines import affine
+from naibu.validation.phantoms import Scanner, box_experiment, virtual_specimen
+
+KNOWN = Knowledge({"hardness 5": 222.0})
+
+
+@pytest.mark.parametrize(
+    ("name", "state", "size", "law"),
+    [
+        ("ct_two_material_3", "deformed", 15.0, "neo_hookean"),
+        ("ct_two_material_2", "deformed", 20.0, "mooney_rivlin"),
+        ("ct_half_ellipsoid", "width_100", 14.0, "neo_hookean"),
+    ],
+)
+def test_derivatives_of_predicted_markers(name: str, state: str, size: float, law: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(displacement_matching, "_PATH", SolverSettings(first_step=0.1, largest_step=0.1, tolerance=1e-11))
+    experiment = datasets.load(name)
+    body = specimen(experiment, ModelSettings(element_size_mm=size, law=law))
+    known = KNOWN if "hardness 5" in experiment.materials else Knowledge()
+    parameters = initial_parameters([body], {name: [state]}, known)
+    matcher = Matcher([Trial.of(body, state, NoiseModel())], parameters)
+    values = parameters.values() | {base_offset(experiment): 0.3}
+    values |= {n: 0.4 for n in body.shift_names}
+    if body.has_unknown_base:
+        values[straight_base(experiment)] = 15.0
+    fit = matcher.evaluate(values)[0]
+    still = np.zeros(len(parameters.free))
+    for k, p in enumerate(parameters.free):
+        h = 1e-6 if p.scale == "incompressibility" else 1e-4 * max(1.0, abs(values[p.name]))
+        ends = [matcher.evaluate(values | {p.name: values[p.name] + s * h}, [fit], still)[0].predicted for s in (1.0, -1.0)]
+        difference = (ends[0] - ends[1]) / (2.0 * h)
+        assert np.abs(difference - fit.jacobian[:, :, k]).max() <= 2e-5 * max(np.abs(difference).max(), 1e-3), p.name
+
+
+def test_a_virtual_specimen_is_recovered_within_its_intervals() -> None:
+    truth = {
+        young_modulus("soft"): 90.0,
+        young_modulus("stiff"): 222.0,
+        poisson_ratio("soft"): 0.48,
+        poisson_ratio("stiff"): 0.47,
+        friction("soft", "table"): 0.45,
+        friction("stiff", "acrylic"): 0.25,
+    }
+    template = box_experiment("virtual", (60.0, 60.0, 60.0), [("soft", 30.0), ("stiff", 30.0)], Loading("plate"), {"pressed": 45.0})
+    virtual = virtual_specimen(template, truth, settings=ModelSettings(element_size_mm=7.5), seed=1)
+    data = virtual.scanned(seed=2, scanner=Scanner(placing_mm=0.15, xy_step_mm=0.0, z_step_mm=0.0))
+    found = calibrate(
+        [data.experiment], knowledge=Knowledge({"stiff": 222.0}), noise=NoiseModel(0.15), settings=ModelSettings(element_size_mm=10.0)
+    )
+    model = CalibratedModel.of(found)
+    assert found.match.status.ok
+    assert 0.8 < model.noise_factor < 1.25
+    assert model.parameters.values()[young_modulus("soft")] == pytest.approx(90.0, rel=0.05)
+    assert abs(model.parameters.values()[poisson_ratio("soft")] - 0.48) < 0.01
+    for name in truth:
+        low, high = model.interval(name, width=3.3)
+        assert low <= truth[name] <= high, name
+
+
+@pytest.fixture(scope="module")
+def plate_model() -> CalibratedModel:
+    found = calibrate(
+        [datasets.load("ct_cube_plate")], states={"ct_cube_plate": ["height_45"]}, settings=ModelSettings(element_size_mm=12.0)
+    )
+    return CalibratedModel.of(found)
+
+
+def test_the_measured_cube_is_predicted_far_better_than_by_an_affine_map(plate_model: CalibratedModel) -> None:
+    experiment = datasets.load("ct_cube_plate")
+    prediction = predict(plate_model, experiment, "height_35", heights_from_markers=True)
+    trial = Trial.of(prediction.specimen, "height_35", NoiseModel())
+    assert rms(prediction.residual) < 0.5 * affine(trial)
+    assert rms(prediction.residual) < 0.6
+    assert (prediction.sd_mm > 0.0).all()
+
+
+def test_heights_come_from_nothing_but_the_mean_z_of_two_layers(plate_model: CalibratedModel) -> None:
+    experiment = datasets.load("ct_cube_plate")
+    state = experiment.state("height_35")
+    assert state.markers is not None
+    points = state.markers.points.copy()
+    rng = np.random.default_rng(0)
+    points[:, :2] += rng.normal(0.0, 1.0, (len(points), 2))
+    points[25:100, 2] += rng.normal(0.0, 1.0, 75)
+    points[:25, 2] += rng.permutation(np.linspace(-1.0, 1.0, 25))
+    other = replace(state, markers=Markers.from_arrays(state.markers.ids, points, state.markers.trusted))
+    changed = replace(experiment, states=tuple(other if s.name == "height_35" else s for s in experiment.states))
+    one = predict(plate_model, experiment, "height_35", heights_from_markers=True)
+    two = predict(plate_model, changed, "height_35", heights_from_markers=True)
+    assert two.opening_mm == pytest.approx(one.opening_mm, abs=1e-6)
+
+
+def test_a_missing_coordinate_leaves_the_others_in_use() -> None:
+    experiment = datasets.load("ct_two_material_2")
+    body = specimen(experiment, ModelSettings(element_size_mm=20.0))
+    trial = Trial.of(body, "deformed", NoiseModel())
+    partly = np.isfinite(trial.measured).any(axis=1) & ~np.isfinite(trial.measured).all(axis=1)
+    assert partly.sum() >= 19  # the loaded state lacks y of 20 markers
+    fit = Matcher([trial], initial_parameters([body], {experiment.name: ["deformed"]}, KNOWN)).evaluate(
+        initial_parameters([body], {experiment.name: ["deformed"]}, KNOWN).values()
+    )[0]
+    assert np.isfinite(fit.residual[partly]).sum() >= partly.sum()
+    filled = body.marker_filled.any(axis=1)
+    assert filled.sum() == 21
+    assert (fit.sd[filled].max(axis=1) > fit.sd[~filled].max()).all()
