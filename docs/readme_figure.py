@@ -15,34 +15,35 @@ from naibu.viewer.payload import Scene
 from naibu.viewer.reading import report_from_json
 
 TITLES = {
-    "ct_two_material_1": "bar pressed into\nhard on soft",
-    "ct_two_material_2": "plate pressed on\nhard on soft",
-    "ct_two_material_3": "plate pressed on\nhard, soft, hard",
+    "ct_two_material_1": "bar on hard over soft",
+    "ct_two_material_2": "plate on hard over soft",
+    "ct_two_material_3": "plate on hard, soft, hard",
 }
 
 
 def draw(axes: plt.Axes, scene: Scene) -> None:
     """Draw the markers of one state seen from the front, with the model's outline."""
     last = scene.steps[-1]
-    edges = {tuple(sorted(e)) for f in scene.faces for e in ((f[0], f[1]), (f[1], f[2]), (f[2], f[0]))}
-    front = last.surface[:, 1] < np.quantile(last.surface[:, 1], 0.12)
-    for a, b in edges:
-        if front[a] and front[b]:
-            axes.plot(*last.surface[[a, b]][:, [0, 2]].T, color="0.85", lw=0.5, zorder=0)
+    front = scene.free_surface[:, 1] < scene.free_surface[:, 1].min() + 1e-6
+    for face in scene.faces[front[scene.faces].all(axis=1)]:
+        axes.fill(*last.surface[face][:, [0, 2]].T, color="0.93", lw=0, zorder=0)
     axes.plot(scene.initial_markers[:, 0], scene.initial_markers[:, 2], ".", color="0.7", ms=3, label="free state")
     axes.plot(scene.measured[:, 0], scene.measured[:, 2], "o", mfc="none", mec="#0072B2", ms=6, label="measured under load")
     axes.plot(last.markers[:, 0], last.markers[:, 2], "x", color="#D55E00", ms=4, label="model")
     residual = scene.residual_mm
     whole = np.isfinite(residual).all(axis=1)
-    axes.set_title(f"{TITLES.get(scene.experiment, scene.experiment)}\n{np.sqrt((residual[whole] ** 2).sum(axis=1).mean()):.2f} mm RMS", fontsize=10)
+    rms = np.sqrt((residual[whole] ** 2).sum(axis=1).mean())
+    axes.set_title(f"{TITLES.get(scene.experiment, scene.experiment)}: {rms:.2f} mm", fontsize=10)
     axes.set_aspect("equal")
+    axes.set_xlim(-42, 42)
+    axes.set_ylim(-2, 56)
     axes.set_xlabel("x, mm")
 
 
 def main() -> None:
     """Read the report's data and write the picture."""
     scenes = report_from_json((Path(sys.argv[1]) / "report.json").read_text(encoding="utf-8")).scenes
-    figure, axes = plt.subplots(1, len(scenes), figsize=(3.4 * len(scenes), 3.6), sharey=True, layout="constrained")
+    figure, axes = plt.subplots(1, len(scenes), figsize=(3.5 * len(scenes), 3.3), layout="constrained")
     for ax, scene in zip(np.atleast_1d(axes), scenes, strict=True):
         draw(ax, scene)
     np.atleast_1d(axes)[0].set_ylabel("z, mm")

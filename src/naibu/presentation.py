@@ -168,12 +168,12 @@ def undetermined(model: CalibratedModel, names: Sequence[str]) -> tuple[str, ...
     for name in names:
         p, sd = by_name[name], model.standard_deviation(name)
         low, high = model.interval(name)
-        if np.isfinite(p.prior_sd) and sd > 0.6 * p.prior_sd:
+        if name.endswith("poisson_ratio") and high > 0.499:
+            out.append(f"{name}: at least {low:.3f}; the data cannot tell it from incompressible.")
+        elif np.isfinite(p.prior_sd) and sd > 0.6 * p.prior_sd:
             out.append(f"{name}: the data hardly narrow it down; {p.value:.3g} {p.unit}".rstrip() + " is close to what was assumed before.")
         elif name.endswith("friction") and high > 4.0 * p.value:
             out.append(f"{name}: anything above {low:.2g} looks the same, because the surfaces do not slip.")
-        elif name.endswith("poisson_ratio") and high > 0.499:
-            out.append(f"{name}: at least {low:.3f}; the data cannot tell it from incompressible.")
     if len(names) > 1:
         correlation = model.correlation(names)
         for i, j in zip(*np.where(np.triu(np.abs(correlation), 1) > 0.9), strict=True):

@@ -123,10 +123,7 @@ CASES = {
 }
 
 
-_HALF = pytest.mark.xfail(strict=True, reason="sticking to a curved edge has an unsymmetric tangent, of which one triangle is used")
-
-
-@pytest.mark.parametrize("case", [pytest.param(name, marks=_HALF) if "stick" in name else name for name in CASES])
+@pytest.mark.parametrize("case", list(CASES))
 def test_every_direction_against_finite_differences(case):
     surface, mu, joined = CASES[case]
     body = pressed(surface, mu, joined=joined)
