@@ -47,15 +47,12 @@ def main() -> None:
         inside.append([model.interval(n)[0] <= TRUTH[n] <= model.interval(n)[1] for n in names])
         ratio.append(values[young_modulus("soft")] / TRUTH[young_modulus("soft")] - 1.0)
         nu.append([values[poisson_ratio(m)] - TRUTH[poisson_ratio(m)] for m in ("soft", "stiff")])
-        print(
-            f"draw {seed}: ratio {100 * ratio[-1]:+.2f} %, nu {nu[-1][0]:+.4f} {nu[-1][1]:+.4f}, intervals hold {sum(inside[-1])}/{len(names)}, {time.perf_counter() - start:.0f} s",
-            flush=True,
-        )
+        errors = f"ratio {100 * ratio[-1]:+.2f} %, nu {nu[-1][0]:+.4f} {nu[-1][1]:+.4f}"
+        print(f"draw {seed}: {errors}, intervals hold {sum(inside[-1])}/{len(names)}, {time.perf_counter() - start:.0f} s", flush=True)
     print(f"modulus ratio: mean error {100 * np.mean(ratio):+.2f} %, RMS {100 * np.sqrt(np.mean(np.square(ratio))):.2f} %")
     print(f"Poisson's ratio: RMS error {np.sqrt(np.mean(np.square(nu))):.4f}")
-    print(
-        f"95 % intervals hold the truth in {100 * np.mean(inside):.1f} % of {np.size(inside)} cases; by parameter {np.mean(inside, axis=0).round(2)}"
-    )
+    share = 100 * np.mean(inside)
+    print(f"95 % intervals hold the truth in {share:.1f} % of {np.size(inside)} cases; by parameter {np.mean(inside, axis=0).round(2)}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Draw the picture of the README from the results of ``naibu demo``: ``python docs/readme_figure.py naibu-demo docs/_static/readme.png``."""
+"""Draw the picture of the README: ``naibu demo``, then ``python docs/readme_figure.py naibu-demo docs/_static/readme.png``."""
 
 from __future__ import annotations
 

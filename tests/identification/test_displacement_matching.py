@@ -43,7 +43,7 @@ def test_derivatives_of_predicted_markers(
     parameters = initial_parameters([body], {name: [state]}, known)
     matcher = Matcher([Trial.of(body, state, NoiseModel())], parameters)
     values = parameters.values() | {base_offset(experiment): 0.3}
-    values |= {n: 0.4 for n in body.shift_names}
+    values |= dict.fromkeys(body.shift_names, 0.4)
     if body.has_unknown_base:
         values[straight_base(experiment)] = 15.0
     fit = matcher.evaluate(values)[0]

@@ -148,7 +148,12 @@ class Assembler:
         return float(energy), force, float(smallest)
 
     def _run_tetrahedra(
-        self, shares: Shares, displacement: NDArray[np.float64], parameters: NDArray[np.float64], force: NDArray[np.float64], blocks: NDArray[np.float64]
+        self,
+        shares: Shares,
+        displacement: NDArray[np.float64],
+        parameters: NDArray[np.float64],
+        force: NDArray[np.float64],
+        blocks: NDArray[np.float64],
     ) -> tuple[float, NDArray[np.float64], float]:
         e = self.elements
         assemble = _tetrahedra_large if len(shares.start) > 2 else _tetrahedra_small

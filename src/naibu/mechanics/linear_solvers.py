@@ -114,7 +114,7 @@ class PardisoSolver:
             The matrix is singular.
         """
         self._values = matrix.data.ravel()[self._take].astype(self._float, copy=False)
-        empty = np.zeros(1, dtype=self._float)
+        empty: NDArray[np.floating] = np.zeros(1, dtype=self._float)
         if not self._analysed:
             self._call(11, empty, empty, 1)
             self._analysed = True
@@ -134,12 +134,12 @@ class PardisoSolver:
     def solve(self, b: Array) -> Array:
         """Return x for b of shape (n,) or (n, r)."""
         columns = 1 if b.ndim == 1 else b.shape[1]
-        rhs = np.asfortranarray(b, dtype=self._float)
-        x = np.zeros_like(rhs, order="F")
+        rhs: NDArray[np.floating] = np.asarray(b, dtype=self._float, order="F")
+        x: NDArray[np.floating] = np.zeros(rhs.shape, dtype=self._float, order="F")
         error = self._call(33, rhs, x, columns)
         if error != 0:
             raise ConvergenceError(f"PARDISO could not solve the linear system (error {error})")
-        return x
+        return np.asarray(x, dtype=np.float64)
 
     def _call(self, phase: int, b: NDArray[np.floating], x: NDArray[np.floating], columns: int) -> int:
         def integer(value: int) -> ctypes._CArgObject:

@@ -239,7 +239,9 @@ class Newton:
         self.iterations += 1
         return np.asarray(target - solved(self._factorized(matrix), residual, _COARSE))
 
-    def _line_search(self, u: Array, step: Array, anchors: tuple[Array, ...], load: float, residual: Array) -> tuple[Array, float, float] | None:
+    def _line_search(
+        self, u: Array, step: Array, anchors: tuple[Array, ...], load: float, residual: Array
+    ) -> tuple[Array, float, float] | None:
         """Return ``u + a step``, a in (0, 1] and the relative residual there; None where all invert elements.
 
         It ends where the residual's work on the step has fallen enough.
@@ -275,8 +277,9 @@ class Newton:
 def solved(factorization: Factorization, residual: Array, relative_tolerance: float) -> Array:
     """Return the solution (n, 3) for a residual (n, 3), as coarse as `relative_tolerance` allows where the solver can make use of that."""
     b = residual.ravel()
-    coarse = isinstance(factorization, ApproximateFactorization)
-    return (factorization.solve(b, relative_tolerance) if coarse else factorization.solve(b)).reshape(-1, 3)
+    if isinstance(factorization, ApproximateFactorization):
+        return factorization.solve(b, relative_tolerance).reshape(-1, 3)
+    return factorization.solve(b).reshape(-1, 3)
 
 
 def constrained(matrix: sp.bsr_matrix, held: NDArray[np.bool_], anchor_stiffness: float = 0.0) -> sp.bsr_matrix:
