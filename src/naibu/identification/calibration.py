@@ -147,7 +147,8 @@ def initial_parameters(specimens: Sequence[Specimen], states: Mapping[str, Seque
     reference = float(np.mean(list(knowledge.young_moduli.values()) or [REFERENCE_MODULUS_KPA]))
     for s in specimens:
         for p in _material_parameters(s, knowledge, reference) + _friction_parameters(s):
-            found.setdefault(p.name, p)
+            if p.name not in found or (found[p.name].fixed and not p.fixed):  # free wherever one experiment can tell it
+                found[p.name] = p
         offset = base_offset(s.experiment)
         found.setdefault(offset, Parameter(offset, 0.0, "mm", prior_sd=0.5))
         if s.has_unknown_base:
@@ -183,7 +184,10 @@ def _friction_parameters(s: Specimen) -> list[Parameter]:
         touching = [(experiment.layers[0].material, loading.base_material), (experiment.layers[-1].material, loading.counter_material)]
         if loading.kind == "side_plates":
             touching += [(layer.material, loading.counter_material) for layer in experiment.layers]
-        out += [Parameter(friction(*pair), value, unit, "log", prior_sd=1.0) for pair in dict.fromkeys(touching)]
+        # an object that only its weight holds down does not feel the table's friction; a large one would jam it
+        loose = [(m, loading.base_material) for m, _ in touching] if loading.kind == "side_plates" else []
+        for pair in dict.fromkeys(touching):
+            out.append(Parameter(friction(*pair), value, unit, "log", prior_sd=1.0, fixed=pair in loose))
     if model.joined == "sliding":
         out += [Parameter(joint_friction(experiment, h), 0.5, "", "log", prior_sd=1.0) for h in experiment.joined_at_mm]
     return out

@@ -11,14 +11,15 @@ from naibu.core.mesh import Mesh
 from naibu.meshing.generation import box_from_coordinates, cylinder, half_ellipsoid, hemisphere
 
 Array = NDArray[np.float64]
-CELLS_PER_HEIGHT = 7.0
+CELLS_PER_HEIGHT = {"plate": 9.0, "bar": 8.0}  # of a box; its cells shrink further under a bar
+ROUND_CELLS_PER_HEIGHT = 7.0
 REFINEMENT = 0.45  # edge of the cells at a bar over that of the cells far from it
-BAR_CELLS_PER_HEIGHT = 8.0  # a bar bends the whole body more than a plate does
 
 
 def element_size(experiment: Experiment, element_size_mm: float) -> float:
-    """Return the edge of the cells far from the indenter, mm; 0 asks for a seventh of the object's height, under a bar an eighth."""
-    cells = BAR_CELLS_PER_HEIGHT if experiment.loading.kind == "bar" else CELLS_PER_HEIGHT
+    """Return the edge of the cells far from the indenter, mm; 0 chooses a seventh to a ninth of the object's height."""
+    box = experiment.shape.kind == "box"
+    cells = CELLS_PER_HEIGHT.get(experiment.loading.kind, ROUND_CELLS_PER_HEIGHT) if box else ROUND_CELLS_PER_HEIGHT
     return element_size_mm or experiment.height_mm / cells
 
 

@@ -58,7 +58,7 @@ class ModelSettings:
     joined : {"glued", "sliding"}
         What holds separately cast blocks together.
     element_size_mm : float
-        Edge of the hexahedra, smaller under a bar; 0 takes a seventh of the object's height, an eighth under a bar.
+        Edge of the hexahedra, smaller under a bar; 0 takes a seventh to a ninth of the object's height.
     normal_stiffness : float
         Contact penalty, kPa/mm.
     density : float

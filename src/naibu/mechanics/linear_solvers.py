@@ -338,8 +338,8 @@ class MultigridSolver(RecyclingSolver):
         """Return one V-cycle of a hierarchy made for `matrix`."""
         hierarchy = pyamg.smoothed_aggregation_solver(
             matrix, B=self._modes, strength=("symmetric", {"theta": 0.0}), smooth=("jacobi", {"omega": 4.0 / 3.0}),
-            improve_candidates=None, max_coarse=600, coarse_solver="splu", presmoother=("block_gauss_seidel", {"sweep": "symmetric"}),
-            postsmoother=("block_gauss_seidel", {"sweep": "symmetric"}),
+            improve_candidates=None, max_coarse=600, coarse_solver="splu", presmoother=("block_gauss_seidel", {"sweep": "forward"}),
+            postsmoother=("block_gauss_seidel", {"sweep": "backward"}),
         )  # fmt: skip
         cycle = hierarchy.aspreconditioner()
         return lambda r: np.stack([cycle @ column for column in r.T], axis=1)

@@ -249,7 +249,7 @@ class Newton:
         The work ``r . step`` vanishes at equilibrium along the step. Unlike the norm of r it may be trusted when points change their
         contact status.
         """
-        before = float(np.vdot(residual, step))
+        before = float((residual * step).sum())  # not a BLAS dot product: the threads of some wait for milliseconds
         low, high, a = 0.0, 1.0, 1.0
         work_low = before
         best = None
@@ -260,7 +260,7 @@ class Newton:
                 high = a
                 a = 0.5 * (low + a)
                 continue
-            work = float(np.vdot(r, step))
+            work = float((r * step).sum())
             best = trial, a, float(np.abs(r).sum()) / scale
             if abs(work) <= 0.5 * abs(before) or (a == 1.0 and work * before > 0.0):
                 return best
