@@ -15,6 +15,7 @@ from naibu.mechanics import linear_solvers
 from naibu.mechanics.linear_solvers import (
     MultigridSolver,
     PardisoSolver,
+    RecycledCholesky,
     SuperLUSolver,
     choose_solver,
     direct_solver,
@@ -175,3 +176,50 @@ def test_a_solver_left_at_exit_makes_no_noise():
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stderr == ""
+
+
+@needs_pardiso
+def test_recycled_cholesky_serves_other_tangents_and_many_columns():
+    made = []
+
+    class Counting(RecycledCholesky):
+        def preconditioner(self, matrix):
+            made.append(matrix)
+            return super().preconditioner(matrix)
+
+    matrices = [stiffness(squeeze=s) for s in (0.05, 0.06, 0.07, 0.08)]
+    solver, rng = Counting(matrices[0]), np.random.default_rng(6)
+    for matrix in matrices:
+        b = rng.normal(size=(matrix.shape[0], 3)) * ~HELD.reshape(-1, 1)
+        b[:, 1] = 0.0
+        factorization = solver.factorize(matrix)
+        x = factorization.solve(b)
+        assert not x[:, 1].any()
+        np.testing.assert_allclose(matrix @ x, b, atol=1e-10 * np.abs(b).max())
+        coarse = factorization.solve(b[:, 0], 0.01)
+        assert np.linalg.norm(matrix @ coarse - b[:, 0]) <= 0.01 * np.linalg.norm(b[:, 0])
+    assert len(made) < len(matrices)
+
+
+@needs_pardiso
+def test_recycled_cholesky_becomes_direct_where_the_tangent_is_indefinite_and_refuses_singular_ones():
+    matrix = stiffness()
+    shifted = matrix.copy()
+    blocks = np.flatnonzero(np.repeat(np.arange(MESH.n_points), np.diff(matrix.indptr)) == matrix.indices)
+    shifted.data[blocks] -= 0.2 * np.abs(matrix.data).max() * np.eye(3)
+    b = np.random.default_rng(7).normal(size=matrix.shape[0])
+    for first in (matrix, shifted):
+        solver = RecycledCholesky(matrix)
+        solver.factorize(first)
+        for m in (shifted, matrix):
+            assert relative(solver.factorize(m).solve(b), np.linalg.solve(m.toarray(), b)) < 1e-8
+    with pytest.raises(ConvergenceError, match=r"singular.*held"):
+        RecycledCholesky(matrix).factorize(stiffness(held=np.zeros_like(HELD), squeeze=0.0)).solve(b)
+
+
+@needs_pardiso
+def test_middle_sizes_recycle_their_factorization(monkeypatch):
+    monkeypatch.setattr(linear_solvers, "RECYCLING_FROM", 60)
+    matrix = stiffness()
+    assert isinstance(choose_solver(matrix, MESH.points, HELD.ravel(), symmetric=True), RecycledCholesky)
+    assert isinstance(choose_solver(matrix, MESH.points, HELD.ravel(), symmetric=False), PardisoSolver)

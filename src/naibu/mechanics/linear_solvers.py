@@ -2,8 +2,9 @@
 
 ``solver = direct_solver(matrix)`` analyses the pattern, ``factorization = solver.factorize(matrix)`` takes the values, and
 ``factorization.solve(b)`` may be called for any number of right-hand sides. Supernodal PARDISO (Intel oneMKL, a pip wheel) is used
-where it can be loaded, SuperLU of SciPy elsewhere. Large symmetric systems are better served by `MultigridSolver`: conjugate
-gradients preconditioned by smoothed aggregation with rigid-body modes.
+where it can be loaded, SuperLU of SciPy elsewhere. Symmetric systems that change little from one to the next are better served by
+`RecycledCholesky`, conjugate gradients preconditioned by an earlier factorization, and large ones by `MultigridSolver`, conjugate
+gradients preconditioned by smoothed aggregation with rigid-body modes. What these solve, they solve as accurately as asked.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from numpy.typing import NDArray
 from naibu.core.errors import ConvergenceError, InputError
 
 Array = NDArray[np.float64]
-DIRECT_LIMIT = 120_000
-RECYCLING_FROM = 10_000
+DIRECT_LIMIT = 200_000  # unknowns from which a factorization costs more than multigrid, even if it is recycled; a tenth of that for SuperLU
+RECYCLING_FROM = 4_000  # unknowns from which a factorization is worth recycling
 
 
 class Factorization(Protocol):
@@ -198,6 +199,7 @@ class RecyclingSolver:
 
     name = "CG"
     iterations_per_build = 12.0  # how many iterations cost as much as a new preconditioner
+    falls_back = False  # on a direct solver where the iteration fails, rather than to say so
 
     def __init__(self, *, relative_tolerance: float = 1e-8, max_iterations: int = 400) -> None:
         self.tolerance = relative_tolerance
@@ -214,23 +216,18 @@ class RecyclingSolver:
 
     def factorize(self, matrix: sp.bsr_matrix) -> Factorization:
         """Prepare for `matrix`, keeping what was made for an earlier one while it still serves."""
-        if self._exact is not None:
-            return self._exact.factorize(matrix)
-        if self._rebuild:
-            try:
-                self._build(matrix)
-            except ConvergenceError:
-                return self._become_exact(matrix)
-        return ApproximateFactorization(self, matrix)
+        if self._rebuild and self._exact is None:
+            self._build(matrix)
+        return ApproximateFactorization(self, matrix) if self._exact is None else self._exact.factorize(matrix)
 
     def _build(self, matrix: sp.bsr_matrix) -> None:
-        self._apply = self.preconditioner(matrix)
+        try:
+            self._apply = self.preconditioner(matrix)
+        except ConvergenceError:
+            if not self.falls_back:
+                raise
+            self._exact, self._apply = direct_solver(matrix, symmetric=True), None
         self._spent, self._digits, self._rebuild = self.iterations_per_build, 0.0, False
-
-    def _become_exact(self, matrix: sp.bsr_matrix) -> Factorization:
-        self._exact = direct_solver(matrix, symmetric=True)
-        self._apply = None
-        return self._exact.factorize(matrix)
 
     def iterate(self, matrix: sp.bsr_matrix, b: Array, tolerance: float) -> Array:
         """Solve for right-hand sides (n, r).
@@ -241,10 +238,11 @@ class RecyclingSolver:
             No convergence even with a preconditioner made for this matrix.
         """
         for attempt in range(2):
-            if self._apply is None or attempt:
+            if attempt:
                 self._build(matrix)
-            assert self._apply is not None
-            x, iterations, definite = conjugate_gradients(matrix, b, self._apply, tolerance, self.max_iterations)
+            if self._apply is None:
+                break
+            x, iterations = conjugate_gradients(matrix, b, self._apply, tolerance, self.max_iterations)
             if x is not None:
                 digits = max(-np.log10(tolerance), 0.1)
                 self._spent += iterations
@@ -252,9 +250,12 @@ class RecyclingSolver:
                 # the mean price of a digit since the last build has its minimum where the last digit costs as much as the mean
                 self._rebuild = iterations / digits > self._spent / self._digits
                 return x
-            if not definite and attempt:
-                return self._become_exact(matrix).solve(b)
-        raise ConvergenceError(f"conjugate gradients did not reach {tolerance:g} in {self.max_iterations} iterations; is every body held?")
+        if not self.falls_back:
+            raise ConvergenceError(
+                f"conjugate gradients did not reach {tolerance:g} in {self.max_iterations} iterations; is every body held?"
+            )
+        self._exact, self._apply = self._exact or direct_solver(matrix, symmetric=True), None
+        return self._exact.factorize(matrix).solve(b)
 
 
 class ApproximateFactorization:
@@ -271,8 +272,8 @@ class ApproximateFactorization:
 
 def conjugate_gradients(
     matrix: sp.bsr_matrix, b: Array, precondition: Callable[[Array], Array], tolerance: float, max_iterations: int
-) -> tuple[Array | None, int, bool]:
-    """Return the solution (n, r), None where it fails, the number of iterations, and whether matrix and preconditioner looked definite.
+) -> tuple[Array | None, int]:
+    """Return the solution (n, r) and the number of iterations; None where they do not converge or something is not positive definite.
 
     Every right-hand side has its own iteration; those of one call are advanced together.
     """
@@ -282,27 +283,28 @@ def conjugate_gradients(
     for iteration in range(max_iterations + 1):
         active = np.linalg.norm(r, axis=0) > target
         if not active.any():
-            return x, iteration, True
+            return x, iteration
         z = precondition(r)
         new = np.einsum("ij,ij->j", r, z)
         if not (new[active] > 0.0).all():
-            return None, iteration, False
+            return None, iteration
         p = z + p * (new / rz if iteration else 0.0)
         rz = np.where(active, new, 1.0)
         q = matrix @ p
         curvature = np.einsum("ij,ij->j", p, q)
         if not (curvature[active] > 0.0).all():
-            return None, iteration, False
+            return None, iteration
         alpha = np.where(active, new / np.where(active, curvature, 1.0), 0.0)
         x += alpha * p
         r -= alpha * q
-    return None, max_iterations, True
+    return None, max_iterations
 
 
 class RecycledCholesky(RecyclingSolver):
     """PARDISO in single precision, corrected by conjugate gradients in double precision; one factorization serves several tangents."""
 
     name = "CG + PARDISO (oneMKL) in single precision"
+    falls_back = True
 
     def __init__(self, matrix: sp.bsr_matrix, *, relative_tolerance: float = 1e-11, max_iterations: int = 60) -> None:
         super().__init__(relative_tolerance=relative_tolerance, max_iterations=max_iterations)
@@ -364,8 +366,8 @@ def direct_solver(matrix: sp.bsr_matrix, *, symmetric: bool) -> LinearSolver:
 
 
 def choose_solver(matrix: sp.bsr_matrix, points: Array, held: NDArray[np.bool_], *, symmetric: bool) -> LinearSolver:
-    """Choose by size: direct below `DIRECT_LIMIT` unknowns or for unsymmetric systems, multigrid above (measured in ``benchmarks/``)."""
-    limit = DIRECT_LIMIT if pardiso_library() is not None else DIRECT_LIMIT // 6
+    """Choose by size: direct for unsymmetric and for small systems, recycled Cholesky up to `DIRECT_LIMIT` unknowns, multigrid above."""
+    limit = DIRECT_LIMIT if pardiso_library() is not None else DIRECT_LIMIT // 10
     if symmetric and matrix.shape[0] > limit:
         return MultigridSolver(points, held)
     if symmetric and matrix.shape[0] > RECYCLING_FROM and pardiso_library() is not None:
