@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, State
@@ -204,10 +203,3 @@ def state_parameters(experiment: Experiment, state: State) -> list[Parameter]:
     if experiment.loading.kind == "bar":
         out.append(Parameter(f"{prefix}: bar_offset", 0.0, "mm", prior_sd=1.0))
     return out
-
-
-def marginal(match: Match, names: Sequence[str]) -> NDArray[np.float64]:
-    """Return the covariance, on the optimiser's scale, of the free parameters called `names`."""
-    order = [p.name for p in match.parameters.free]
-    index = [order.index(n) for n in names]
-    return match.covariance[np.ix_(index, index)]
