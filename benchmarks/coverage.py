@@ -13,10 +13,10 @@ import numpy as np
 
 from naibu.core.experiment import Loading
 from naibu.identification.calibration import Knowledge, calibrate
-from naibu.identification.displacement_matching import NoiseModel
 from naibu.identification.model import CalibratedModel
 from naibu.identification.names import friction, poisson_ratio, young_modulus
 from naibu.identification.specimen import ModelSettings
+from naibu.identification.trial import NoiseModel
 from naibu.validation.phantoms import Scanner, box_experiment, virtual_specimen
 
 NOISE_MM = 0.15

@@ -29,7 +29,8 @@ from naibu.mechanics.assembly import Assembler
 from naibu.mechanics.elements import elements
 from naibu.mechanics.linear_solvers import Factorization, LinearSolver, MultigridSolver, PardisoSolver, SuperLUSolver
 from naibu.mechanics.materials import lame_parameters, material
-from naibu.mechanics.statics import Problem, SolverSettings, constrained, solve
+from naibu.mechanics.newton import Problem, SolverSettings, constrained
+from naibu.mechanics.statics import solve
 from naibu.mechanics.supports import Prescribed
 from naibu.meshing.generation import box
 from naibu.meshing.splitting import to_tetra

@@ -18,7 +18,8 @@ from naibu.mechanics.assembly import Assembler, block_pattern
 from naibu.mechanics.contact import Contact, plane
 from naibu.mechanics.elements import elements
 from naibu.mechanics.materials import material
-from naibu.mechanics.statics import Problem, Solution, solve
+from naibu.mechanics.newton import Problem
+from naibu.mechanics.statics import Solution, solve
 from naibu.mechanics.supports import Friction, Prescribed, rigid_contact
 from naibu.meshing.generation import box
 from naibu.meshing.surface import boundary_faces

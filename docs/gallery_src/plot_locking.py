@@ -17,7 +17,8 @@ import numpy as np
 from naibu.mechanics.assembly import Assembler, block_pattern
 from naibu.mechanics.elements import Formulation, elements
 from naibu.mechanics.materials import LAWS, material
-from naibu.mechanics.statics import Problem, solve
+from naibu.mechanics.newton import Problem
+from naibu.mechanics.statics import solve
 from naibu.mechanics.supports import Prescribed
 from naibu.meshing.generation import box
 from naibu.meshing.surface import side_nodes

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from naibu.core.parameters import Parameter
 from naibu.identification.calibration import Calibration
 from naibu.identification.comparison import LeftOut
-from naibu.identification.displacement_matching import Trial, TrialFit
 from naibu.identification.model import CalibratedModel
 from naibu.identification.prediction import Prediction, marker_layers
 from naibu.identification.specimen import Specimen
+from naibu.identification.trial import Trial, TrialFit
 from naibu.meshing.surface import boundary_faces, triangles_of_faces
 from naibu.viewer.payload import Box, Cell, Correlation, ParameterRow, Report, ResidualSet, Scene, Step, Table
 

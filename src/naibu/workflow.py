@@ -18,13 +18,13 @@ from naibu.core.solution import Status
 from naibu.core.units import kilopascals
 from naibu.identification.calibration import Calibration, Knowledge, calibrate
 from naibu.identification.comparison import LeftOut, leave_one_out
-from naibu.identification.displacement_matching import Trial
 from naibu.identification.model import CalibratedModel
 from naibu.identification.names import opening
 from naibu.identification.pose import registration
 from naibu.identification.prediction import Prediction, rms
 from naibu.identification.prediction import predict as predict_state
 from naibu.identification.specimen import ModelSettings
+from naibu.identification.trial import Trial
 from naibu.io.experiments import META_FILE, read_experiment
 from naibu.result_files import (
     CHECKPOINT_FILE,
@@ -269,7 +269,9 @@ def _compared(
         if not interrupted:
             compared = {t.label: _baselines(t, values[opening(t.specimen.experiment, t.state)]) for t in calibration.trials}
         if not interrupted and left_in_turn:
-            found = leave_one_out(left_in_turn, knowledge=calibration.knowledge, settings=calibration.settings, start=values, callback=each)
+            found = leave_one_out(
+                left_in_turn, knowledge=calibration.knowledge, settings=calibration.settings, reference=calibration, callback=each
+            )
             left_out = tuple(found)
     except KeyboardInterrupt:
         interrupted = True

@@ -9,9 +9,10 @@ from naibu.core.experiment import Experiment, Loading
 from naibu.identification import calibration, comparison
 from naibu.identification.calibration import Knowledge, calibrate
 from naibu.identification.comparison import LeftOut, compare_models, leave_one_out, pooled_rms
-from naibu.identification.displacement_matching import MatchingSettings, NoiseModel
+from naibu.identification.displacement_matching import MatchingSettings
 from naibu.identification.names import poisson_ratio, young_modulus
 from naibu.identification.specimen import ModelSettings
+from naibu.identification.trial import NoiseModel
 from naibu.validation.phantoms import Scanner, box_experiment, virtual_specimen
 
 COARSE = ModelSettings(contact="stick", element_size_mm=10.0)
@@ -92,7 +93,7 @@ def test_calibration_starts_from_a_force_balance_that_can_be_believed(gels: list
 def test_the_users_own_start_comes_first(gels: list[Experiment], monkeypatch: pytest.MonkeyPatch) -> None:
     begun: dict[str, float] = {}
 
-    def run(self: object, callback: object = None, *, start: dict[str, float]) -> None:
+    def run(self: object, callback: object = None, *, start: dict[str, float], nearby: object) -> None:
         begun.update(start)
 
     monkeypatch.setattr(calibration.Matcher, "run", run)

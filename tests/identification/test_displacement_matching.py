@@ -10,14 +10,15 @@ import pytest
 from naibu import datasets
 from naibu.core.experiment import Loading
 from naibu.core.markers import Markers
-from naibu.identification import displacement_matching
+from naibu.identification import displacement_matching, trial
 from naibu.identification.calibration import Knowledge, calibrate, initial_parameters
-from naibu.identification.displacement_matching import Matcher, NoiseModel, Trial
+from naibu.identification.displacement_matching import Matcher
 from naibu.identification.model import CalibratedModel
-from naibu.identification.names import base_offset, friction, poisson_ratio, straight_base, young_modulus
+from naibu.identification.names import base_offset, batch_stiffness, friction, poisson_ratio, straight_base, young_modulus
 from naibu.identification.prediction import predict, rms
 from naibu.identification.specimen import ModelSettings, specimen
-from naibu.mechanics.statics import SolverSettings
+from naibu.identification.trial import Nearby, NoiseModel, Trial
+from naibu.mechanics.newton import SolverSettings
 from naibu.validation.baselines import affine
 from naibu.validation.phantoms import Scanner, box_experiment, virtual_specimen
 
@@ -29,6 +30,8 @@ KNOWN = Knowledge({"hardness 5": 222.0})
     [
         ("ct_two_material_3", "deformed", 15.0, "neo_hookean", 2e-5),
         ("ct_two_material_2", "deformed", 20.0, "mooney_rivlin", 2e-5),
+        # points that slip over the bar's edge change their stiffness at once
+        ("ct_cube_bar", "height_45", 15.0, "neo_hookean", 1e-2),
         # its base carries nothing but its weight, so that differences of 1e-4 mm open and close contact points
         ("ct_half_ellipsoid", "width_100", 14.0, "neo_hookean", 2e-3),
     ],
@@ -37,6 +40,7 @@ def test_derivatives_of_predicted_markers(
     name: str, state: str, size: float, law: str, tolerance: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(displacement_matching, "_PATH", SolverSettings(first_step=0.1, largest_step=0.1, tolerance=1e-11))
+    monkeypatch.setattr(trial, "HINT_SPACING", 0.0)  # all on the same path
     experiment = datasets.load(name)
     body = specimen(experiment, ModelSettings(element_size_mm=size, law=law))
     known = KNOWN if "hardness 5" in experiment.materials else Knowledge()
@@ -47,15 +51,37 @@ def test_derivatives_of_predicted_markers(
     if body.has_unknown_base:
         values[straight_base(experiment)] = 15.0
     fit = matcher.evaluate(values)[0]
-    still = np.zeros(len(parameters.free))
+    near = [Nearby(fit, parameters.with_values({p.name: values[p.name] for p in parameters.free}))]
     for k, p in enumerate(parameters.free):
         h = 1e-6 if p.scale == "incompressibility" else 1e-4 * max(1.0, abs(values[p.name]))
-        ends = [matcher.evaluate(values | {p.name: values[p.name] + s * h}, [fit], still)[0].predicted for s in (1.0, -1.0)]
+        ends = [matcher.evaluate(values | {p.name: values[p.name] + s * h}, near, [fit.pose])[0].predicted for s in (1.0, -1.0)]
         difference = (ends[0] - ends[1]) / (2.0 * h)
         error = np.abs(difference - fit.jacobian[:, :, k])
         # markers that move against the mesh see a gradient averaged over a part of an element, which jumps at its faces
         worst = np.median(error) if "base" in p.name else error.max()
         assert worst <= (2e-3 if "base" in p.name else tolerance) * max(np.abs(difference).max(), 1e-3), p.name
+
+
+def test_the_known_materials_batch_is_the_reference() -> None:
+    bodies = [specimen(datasets.load(f"ct_two_material_{n}"), ModelSettings(element_size_mm=20.0)) for n in (1, 3)]
+    states = {b.experiment.name: ["deformed"] for b in bodies}
+    by_name = {p.name: p for p in initial_parameters(bodies, states, KNOWN)}
+    assert by_name[batch_stiffness("I")].fixed
+    assert not by_name[batch_stiffness("II")].fixed
+    softer = {p.name: p.value for p in by_name.values()} | {batch_stiffness("II"): 0.5}
+    cells = bodies[1].material_parameters(softer)
+    names = bodies[1].mesh.region_names
+    lower, upper = (cells[bodies[1].mesh.regions == names.index(f"hardness 5, batch {b}")] for b in ("II", "I"))
+    np.testing.assert_allclose(lower[0], 0.5 * upper[0])
+
+
+def test_steps_stay_within_their_limits() -> None:
+    hessian, gradient = np.array([[4.0, 1.0, 0.0], [1.0, 3.0, 1.0], [0.0, 1.0, 2.0]]), np.array([8.0, 1.0, 2.0])
+    free = displacement_matching._bounded_step(hessian, gradient, np.array([np.inf]))
+    np.testing.assert_allclose(hessian @ free, gradient)
+    step = displacement_matching._bounded_step(hessian, gradient, np.array([0.5, 10.0]))
+    assert step[0] == 0.5
+    np.testing.assert_allclose((hessian @ step)[1:], gradient[1:])  # the others are the best for it
 
 
 def test_a_virtual_specimen_is_recovered_within_its_intervals() -> None:

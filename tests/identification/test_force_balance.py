@@ -17,7 +17,8 @@ from naibu.identification.specimen import ModelSettings
 from naibu.mechanics.assembly import Assembler
 from naibu.mechanics.elements import elements
 from naibu.mechanics.materials import material
-from naibu.mechanics.statics import Problem, solve
+from naibu.mechanics.newton import Problem
+from naibu.mechanics.statics import solve
 from naibu.mechanics.supports import Prescribed
 from naibu.meshing.generation import box_from_coordinates
 from naibu.validation.phantoms import Scanner, VirtualSpecimen, box_experiment, virtual_specimen

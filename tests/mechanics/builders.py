@@ -6,7 +6,7 @@ from naibu.core.mesh import Mesh
 from naibu.mechanics.assembly import Assembler, block_pattern
 from naibu.mechanics.elements import elements
 from naibu.mechanics.materials import Material, material
-from naibu.mechanics.statics import Problem
+from naibu.mechanics.newton import Problem
 from naibu.mechanics.supports import Prescribed
 from naibu.meshing.generation import box
 from naibu.meshing.splitting import to_quadratic, to_tetra

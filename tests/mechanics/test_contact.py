@@ -146,6 +146,16 @@ def test_pressure_starts_smoothly_and_is_linear_beyond_the_ramp():
     np.testing.assert_allclose(slopes[21:], K_N)
 
 
+def test_without_its_curvature_a_body_presses_alike_and_is_never_softer():
+    y = touching(5, BAR)
+    c, zero = points(y, surface=BAR), np.zeros_like(y)
+    full, plain = c.evaluate(zero, y, 0.0), c.evaluate(zero, y, 0.0, curvature=False)
+    np.testing.assert_array_equal(full.force, plain.force)
+    difference = np.linalg.eigvalsh(plain.stiffness - full.stiffness)
+    assert difference.min() > -1e-9 * np.abs(plain.stiffness).max()
+    assert difference.max() > 0.0
+
+
 def test_a_turned_body_gives_turned_forces():
     y = touching(5, BAR)
     anchors = y + 0.3

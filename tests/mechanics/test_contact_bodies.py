@@ -12,7 +12,8 @@ from naibu.core.solution import Status
 from naibu.mechanics.assembly import body_force
 from naibu.mechanics.contact import RAMP_MM, STICK, Contact, bar, plane
 from naibu.mechanics.elements import elements
-from naibu.mechanics.statics import SolverSettings, solve
+from naibu.mechanics.newton import Newton, SolverSettings
+from naibu.mechanics.statics import solve
 from naibu.mechanics.supports import Friction, Prescribed, interface, rigid_contact
 from naibu.meshing.generation import box
 from naibu.meshing.interfaces import split_at_plane
@@ -94,6 +95,17 @@ def test_reactions_balance(surface, mu):
         each = np.cross(mesh.points + state.displacement, nodal)
         moment, size = moment + each.sum(axis=0), size + np.abs(each).sum()
     np.testing.assert_allclose(moment, 0, atol=1e-6 * size)
+
+
+def test_relaxation_ends_in_the_same_equilibrium():
+    mesh = block()
+    contacts = plates(mesh, stop=(0.5, 0.0, 0.8 * SIZE), mu_top=0.2, surface=bar("y", 10.0), rotation=TILT, start=(0, 0, SIZE + 2))
+    body = problem(mesh, contacts=contacts)
+    solution = solve(body)
+    before, after = solution.states[-2:]
+    found = Newton(body, SolverSettings()).relax(before.displacement, before.anchors, after.load)
+    assert found is not None
+    np.testing.assert_allclose(found[0], after.displacement, atol=1e-5)
 
 
 def test_dragged_block_slips_at_coulombs_limit():

@@ -22,7 +22,7 @@ from naibu.mechanics.linear_solvers import (
     pardiso_library,
     rigid_body_modes,
 )
-from naibu.mechanics.statics import constrained
+from naibu.mechanics.newton import constrained
 from naibu.meshing.surface import side_nodes
 
 needs_pardiso = pytest.mark.skipif(pardiso_library() is None, reason="oneMKL is not installed")

@@ -20,7 +20,8 @@ import numpy as np
 import pytest
 from builders import as_kind, of, problem
 
-from naibu.mechanics.statics import SolverSettings, solve
+from naibu.mechanics.newton import SolverSettings
+from naibu.mechanics.statics import solve
 from naibu.mechanics.supports import Prescribed
 from naibu.meshing.generation import box
 from naibu.meshing.surface import side_nodes

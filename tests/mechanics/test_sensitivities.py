@@ -8,8 +8,9 @@ from builders import GEL, of, problem
 from scipy.spatial.transform import Rotation
 
 from naibu.mechanics.contact import STICK, Contact, RigidSurface, bar, plane
+from naibu.mechanics.newton import Problem, SolverSettings
 from naibu.mechanics.sensitivities import Direction, sensitivities
-from naibu.mechanics.statics import Problem, Solution, SolverSettings, solve
+from naibu.mechanics.statics import Solution, solve
 from naibu.mechanics.supports import Friction, interface, rigid_contact
 from naibu.meshing.generation import box
 from naibu.meshing.interfaces import split_at_plane

@@ -12,7 +12,8 @@ from naibu.mechanics.contact import plane
 from naibu.mechanics.elements import elements
 from naibu.mechanics.linear_solvers import MultigridSolver, SuperLUSolver
 from naibu.mechanics.materials import LAWS
-from naibu.mechanics.statics import Newton, SolverSettings, solve
+from naibu.mechanics.newton import Newton, SolverSettings
+from naibu.mechanics.statics import solve
 from naibu.mechanics.supports import Friction, Prescribed, rigid_contact
 from naibu.meshing.generation import box
 from naibu.meshing.splitting import to_quadratic, to_tetra

@@ -8,7 +8,8 @@ from builders import assembler, distorted, of, problem, relative
 
 from naibu.mechanics import assembly
 from naibu.mechanics.materials import LAWS
-from naibu.mechanics.statics import SolverSettings, solve
+from naibu.mechanics.newton import SolverSettings
+from naibu.mechanics.statics import solve
 from naibu.mechanics.supports import Prescribed
 from naibu.mechanics.tetrahedra import shares
 from naibu.meshing.surface import side_nodes

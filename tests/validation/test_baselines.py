@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from naibu import datasets
 from naibu.core.errors import InputError
 from naibu.core.experiment import Layer
-from naibu.identification.displacement_matching import NoiseModel, Trial
 from naibu.identification.specimen import ModelSettings, specimen
+from naibu.identification.trial import NoiseModel, Trial
 from naibu.validation.baselines import affine, baselines, report_parameters
 
 COARSE = ModelSettings(element_size_mm=12.0)

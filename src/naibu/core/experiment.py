@@ -24,11 +24,20 @@ class Shape:
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """A horizontal slab of one material, heights measured from the base, mm."""
+    """A horizontal slab of one material, heights measured from the base, mm.
+
+    `batch` names what was mixed and cured together, where that is known: the same material differs in stiffness from batch to batch.
+    """
 
     material: str
     from_base_mm: float
     to_base_mm: float
+    batch: str = ""
+
+    @property
+    def region(self) -> str:
+        """Name of the material in its batch."""
+        return f"{self.material}, batch {self.batch}" if self.batch else self.material
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +159,12 @@ class Experiment:
     def height_mm(self) -> float:
         """Height of the object above its base in the free state, mm."""
         return self.shape.size_mm["xyz".index(self.up_axis)]
+
+    @property
+    def full_opening_mm(self) -> float:
+        """Height of the plate or bar, or distance of the side plates, at which they touch the free object, mm."""
+        size = self.shape.size_mm
+        return size["xyz".index(self.loading.bar_axis)] if self.loading.kind == "side_plates" else size[2]
 
     @property
     def materials(self) -> tuple[str, ...]:

@@ -72,6 +72,11 @@ class Parameter:
             return value
         return value - MAX_POISSON_RATIO if self.scale == "incompressibility" else 1.0
 
+    @property
+    def bend(self) -> float:
+        """Second over first derivative of the physical value with respect to the inner one."""
+        return 0.0 if self.scale == "linear" else 1.0
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ParameterSet:

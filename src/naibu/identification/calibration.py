@@ -8,13 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from naibu.core.errors import InputError
-from naibu.core.experiment import Experiment, State
+from naibu.core.experiment import Experiment, Layer, State
 from naibu.core.parameters import Parameter, ParameterSet
-from naibu.identification.displacement_matching import Match, Matcher, MatchingSettings, NoiseModel, Trial
+from naibu.identification.displacement_matching import Match, Matcher, MatchingSettings
 from naibu.identification.force_balance import force_balance
 from naibu.identification.names import (
     SHAPE_NAMES,
     base_offset,
+    batch_stiffness,
     friction,
     joint_friction,
     opening,
@@ -23,12 +24,14 @@ from naibu.identification.names import (
     straight_base,
     young_modulus,
 )
-from naibu.identification.specimen import ModelSettings, Specimen, full_opening, specimen
+from naibu.identification.specimen import ModelSettings, Specimen, specimen
+from naibu.identification.trial import Nearby, NoiseModel, Trial
 
 REFERENCE_MODULUS_KPA = 200.0  # of the known region when only ratios are sought
 START_POISSON_RATIO = 0.49
 START_FRICTION = 0.2
 START_SPRING = 30.0  # kPa/mm
+BATCH_SD = 0.3  # of ln(stiffness) between batches: the report's samples of one gel scatter by 0.2 (Table 3.4)
 TRUSTED_RATIO = (0.05, 20.0)  # of an unknown modulus to the known ones; force balance is not believed beyond
 
 
@@ -58,6 +61,11 @@ class Calibration:
     noise: NoiseModel
     knowledge: Knowledge
 
+    @property
+    def nearby(self) -> dict[str, Nearby]:
+        """The solved trials by label, for other searches to start from."""
+        return {trial.label: Nearby(fit, self.match.parameters) for trial, fit in zip(self.trials, self.match.fits, strict=True)}
+
 
 def calibrate(
     experiments: Sequence[Experiment],
@@ -68,6 +76,7 @@ def calibrate(
     noise: NoiseModel | None = None,
     search: MatchingSettings | None = None,
     start: Mapping[str, float] | None = None,
+    nearby: Mapping[str, Nearby] | None = None,
     callback: Callable[[int, float, Mapping[str, float]], None] | None = None,
 ) -> Calibration:
     """Identify materials, friction and boundary conditions from all loaded states of some experiments jointly.
@@ -88,6 +97,8 @@ def calibrate(
         Iterations and tolerance.
     start : mapping, optional
         Physical values to start from, by name; priors keep their centres.
+    nearby : mapping, optional
+        Solutions near the start, by the labels of their trials (`Calibration.nearby`); they save time.
     callback : callable, optional
         ``callback(iteration, objective, values)`` after every step.
 
@@ -109,7 +120,7 @@ def calibrate(
     known = knowledge or _first_material(experiments)
     parameters = initial_parameters(specimens, used, known)
     begin = dict(start or {}) or _start_from_force_balance(experiments, known, used)
-    match = Matcher(trials, parameters, search or MatchingSettings()).run(callback, start=begin)
+    match = Matcher(trials, parameters, search or MatchingSettings()).run(callback, start=begin, nearby=nearby)
     return Calibration(trials, match, chosen, measured, known)
 
 
@@ -144,6 +155,8 @@ def initial_parameters(specimens: Sequence[Specimen], states: Mapping[str, Seque
         if name not in materials:
             raise InputError(f"known material {name!r} is in none of the experiments; they contain {', '.join(sorted(set(materials)))}")
     reference = float(np.mean(list(knowledge.young_moduli.values()) or [REFERENCE_MODULUS_KPA]))
+    for p in _batch_parameters([layer for s in specimens for layer in s.experiment.layers if layer.batch], knowledge):
+        found[p.name] = p
     for s in specimens:
         for p in _material_parameters(s, knowledge, reference) + _friction_parameters(s):
             if p.name not in found or (found[p.name].fixed and not p.fixed):  # free wherever one experiment can tell it
@@ -173,6 +186,15 @@ def _material_parameters(s: Specimen, knowledge: Knowledge, reference: float) ->
     return out
 
 
+def _batch_parameters(layers: Sequence[Layer], knowledge: Knowledge) -> list[Parameter]:
+    """Stiffness of every batch relative to the one from which the known material's modulus is taken, the topmost that holds some."""
+    order = [layer.batch for layer in layers if layer.material in knowledge.young_moduli][::-1] + [layer.batch for layer in layers]
+    return [
+        Parameter(batch_stiffness(batch), 1.0, "", "log", prior_sd=BATCH_SD, fixed=number == 0)
+        for number, batch in enumerate(dict.fromkeys(order))
+    ]
+
+
 def _friction_parameters(s: Specimen) -> list[Parameter]:
     """Friction of the layers that touch the base and the indenter, and of joints that may slide."""
     out = []
@@ -195,11 +217,12 @@ def _friction_parameters(s: Specimen) -> list[Parameter]:
 def state_parameters(experiment: Experiment, state: State) -> list[Parameter]:
     """Parameters of the boundary conditions of one state, with their priors: opening, tilt of a plate, offset of a bar."""
     prefix = f"{experiment.name}/{state.name}"
-    full = full_opening(experiment)
+    full = experiment.full_opening_mm
     start = state.estimated_mm or state.stated_mm or 0.7 * full
     out = [Parameter(opening(experiment, state.name), float(start), "mm", prior_sd=5.0)]
     if experiment.loading.kind != "side_plates":
         out += [Parameter(f"{prefix}: tilt_{axis}", 0.0, "rad", prior_sd=0.01) for axis in "xy"]
     if experiment.loading.kind == "bar":
         out.append(Parameter(f"{prefix}: bar_offset", 0.0, "mm", prior_sd=1.0))
+        out.append(Parameter(f"{prefix}: bar_yaw", 0.0, "rad", prior_sd=0.02))
     return out

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import threading
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,10 +14,12 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.experiment import Experiment
 from naibu.core.solution import Status
 from naibu.identification.calibration import Calibration, Knowledge, calibrate
-from naibu.identification.displacement_matching import MatchingSettings, NoiseModel
+from naibu.identification.displacement_matching import MatchingSettings
 from naibu.identification.model import CalibratedModel
 from naibu.identification.prediction import Prediction, predict, rms
 from naibu.identification.specimen import ModelSettings
+from naibu.identification.trial import NoiseModel
+from naibu.mechanics.linear_solvers import use_one_thread
 
 Callback = Callable[[str, int, float], None]
 
@@ -81,7 +86,7 @@ def leave_one_out(
     settings: ModelSettings | None = None,
     noise: NoiseModel | None = None,
     search: MatchingSettings | None = None,
-    start: Mapping[str, float] | None = None,
+    reference: Calibration | None = None,
     callback: Callback | None = None,
 ) -> list[LeftOut]:
     """Predict all loaded states of every experiment with a model calibrated on the others.
@@ -94,10 +99,10 @@ def leave_one_out(
         Two at least.
     knowledge, settings, noise, search : optional
         As for `calibrate`.
-    start : mapping, optional
-        Physical values to start every calibration from, by name.
+    reference : Calibration, optional
+        The calibration on all experiments: the others start from its solutions, which saves time.
     callback : callable, optional
-        ``callback(left_out, iteration, objective)`` after every step of a calibration.
+        ``callback(left_out, iteration, objective)`` after every step of a calibration; calls come from several threads.
 
     Raises
     ------
@@ -110,18 +115,32 @@ def leave_one_out(
     """
     if len(experiments) < 2:
         raise InputError(f"leaving one out needs at least 2 experiments, not {len(experiments)}")
-    out = []
-    for left in experiments:
+    start = None if reference is None else reference.match.parameters.values()
+    nearby = {} if reference is None else reference.nearby
+    stop = threading.Event()
+
+    def without(left: Experiment) -> list[LeftOut]:
         others = [e for e in experiments if e is not left]
         found = calibrate(
-            others, knowledge=_applicable(knowledge, others), settings=settings, noise=noise, search=search, start=start,
-            callback=None if callback is None else _reporting(callback, left.name),
+            others, knowledge=_applicable(knowledge, others), settings=settings, noise=noise, search=search, start=start, nearby=nearby,
+            callback=_reporting(callback, left.name, stop),
         )  # fmt: skip
         if found.match.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         model = CalibratedModel.of(found)
-        out += [_left_out(predict(model, left, state.name, heights_from_markers=True)) for state in left.loaded_states]
-    return out
+        return [
+            _left_out(predict(model, left, state.name, heights_from_markers=True, nearby=nearby.get(f"{left.name}/{state.name}")))
+            for state in left.loaded_states
+        ]
+
+    with ThreadPoolExecutor(min(len(experiments), os.cpu_count() or 1), initializer=use_one_thread) as pool:
+        turns = [pool.submit(without, left) for left in experiments]
+        try:
+            return [row for turn in turns for row in turn.result()]
+        except BaseException:
+            stop.set()
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def _applicable(knowledge: Knowledge | None, experiments: Sequence[Experiment]) -> Knowledge | None:
@@ -133,8 +152,18 @@ def _applicable(knowledge: Knowledge | None, experiments: Sequence[Experiment]) 
     return Knowledge(known, knowledge.scale_is_absolute) if known else None
 
 
-def _reporting(callback: Callback, name: str) -> Callable[[int, float, Mapping[str, float]], None]:
-    return lambda iteration, objective, values: callback(name, iteration, objective)
+def _reporting(
+    callback: Callback | None, name: str, stop: threading.Event | None = None
+) -> Callable[[int, float, Mapping[str, float]], None]:
+    """Report a calibration's steps under a name, and end it where it was stopped from another thread."""
+
+    def report(iteration: int, objective: float, values: Mapping[str, float]) -> None:
+        if stop is not None and stop.is_set():
+            raise KeyboardInterrupt
+        if callback is not None:
+            callback(name, iteration, objective)
+
+    return report
 
 
 def _left_out(p: Prediction) -> LeftOut:
@@ -172,18 +201,17 @@ def compare_models(
         try:
             found = calibrate(
                 experiments, knowledge=knowledge, settings=settings, noise=noise, search=search,
-                callback=None if callback is None else _reporting(callback, "none"),
+                callback=_reporting(callback, "none"),
             )  # fmt: skip
         except ConvergenceError as error:
             rows.append(ModelRow(settings, np.nan, np.nan, 0, np.nan, np.nan, str(error)))
             continue
         left_out, problem = np.nan, "" if found.match.status.ok else found.match.status.value
         if len(experiments) > 1:
-            start = found.match.parameters.values()
             try:
                 left_out = pooled_rms(
                     leave_one_out(
-                        experiments, knowledge=knowledge, settings=settings, noise=noise, search=search, start=start, callback=callback
+                        experiments, knowledge=knowledge, settings=settings, noise=noise, search=search, reference=found, callback=callback
                     )
                 )
             except ConvergenceError as error:

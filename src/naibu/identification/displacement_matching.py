@@ -18,105 +18,19 @@ from numpy.typing import NDArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.core.solution import Status
-from naibu.identification.lattice import FILLED_SD_MM
 from naibu.identification.names import base_offset, straight_base
 from naibu.identification.pose import Pose, registration
 from naibu.identification.specimen import Specimen
+from naibu.identification.trial import Nearby, Trial, TrialFit
 from naibu.mechanics.linear_solvers import LinearSolver, use_one_thread
+from naibu.mechanics.newton import Newton, SolverSettings
 from naibu.mechanics.sensitivities import sensitivities
-from naibu.mechanics.statics import Newton, Solution, SolverSettings, solve
+from naibu.mechanics.statics import Hint, Solution, solve
 
 Array = NDArray[np.float64]
-_PATH = SolverSettings(first_step=0.06, largest_step=0.15, tolerance=1e-6)
-
-
-@dataclass(frozen=True, slots=True)
-class NoiseModel:
-    """Standard deviation of a measured coordinate, mm: placing of the marker's centre, and quantisation to pixels and slices."""
-
-    placing_mm: float = 0.1
-
-    def standard_deviation(self, xy_step_mm: float, z_step_mm: float) -> Array:
-        """Return the standard deviation (3,) along x, y, z, mm."""
-        steps = np.array([xy_step_mm, xy_step_mm, z_step_mm])
-        return np.sqrt(self.placing_mm**2 + steps**2 / 12.0)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Trial:
-    """One measured state of a specimen.
-
-    Attributes
-    ----------
-    specimen : Specimen
-        The meshed experiment.
-    state : str
-        Name of the state.
-    measured : ndarray, shape (k, 3)
-        Positions in the scan's frame, true mm; NaN where missing.
-    sd : ndarray, shape (3,)
-        Standard deviation of a measured coordinate of the loaded state, mm.
-    free_sd : ndarray, shape (k, 3)
-        That of the free state; larger where a coordinate was completed from the lattice.
-    """
-
-    specimen: Specimen
-    state: str
-    measured: Array
-    sd: Array
-    free_sd: Array
-
-    @property
-    def label(self) -> str:
-        """``experiment/state``."""
-        return f"{self.specimen.experiment.name}/{self.state}"
-
-    @classmethod
-    def of(cls, specimen: Specimen, state: str, noise: NoiseModel) -> Trial:
-        """Gather the measured positions (true mm in the scan's frame) of a state, in the order of the specimen's markers.
-
-        Raises
-        ------
-        InputError
-            The state has no positions, or fewer than four markers in common with the free state.
-        """
-        experiment = specimen.experiment
-        markers = experiment.state(state).markers
-        if markers is None:
-            raise InputError(f"{experiment.name}/{state} has no measured positions; give its file or leave the state out")
-        measured = markers.aligned(specimen.marker_ids) * specimen.placement.scale
-        if np.isfinite(measured).any(axis=1).sum() < 4:
-            raise InputError(f"{experiment.name}/{state} shares fewer than 4 trusted markers with the free state")
-        sd = noise.standard_deviation(experiment.xy_step_mm, experiment.z_step_mm)
-        return cls(specimen, state, measured, sd, np.where(specimen.marker_filled, FILLED_SD_MM, sd))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TrialFit:
-    """A trial at one set of parameters.
-
-    Attributes
-    ----------
-    predicted : ndarray, shape (k, 3)
-        Predicted positions in the scan's frame, true mm.
-    residual : ndarray, shape (k, 3)
-        Measured minus predicted, mm; NaN where not measured.
-    sd : ndarray, shape (k, 3)
-        Standard deviation of the residual from noise in both states, mm.
-    jacobian : ndarray, shape (k, 3, p)
-        Derivatives of `predicted` with respect to the physical values of the free parameters.
-    pose_jacobian : ndarray, shape (k, 3, 6)
-        Derivatives with respect to the pose.
-    """
-
-    solution: Solution
-    pose: Pose
-    predicted: Array
-    residual: Array
-    sd: Array
-    jacobian: Array
-    pose_jacobian: Array
-    path: tuple[Array, ...]
+WIDEST_STEP = 3.0  # of an unknown on a linear scale: mm for positions
+ROUGH = 0.1  # a search is rough while a step may lower the objective by more than this share
+_PATH = SolverSettings(first_step=0.02, largest_step=0.15, tolerance=1e-6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,6 +88,32 @@ class Match:
         return float(np.sqrt(self.chi_squared / max(self.degrees_of_freedom, 1.0)))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class NormalEquations:
+    """The objective and its linearisation over the free parameters and the poses.
+
+    Attributes
+    ----------
+    hessian : ndarray, shape (s, s)
+        Of half of the objective, by Gauss and Newton.
+    gradient : ndarray, shape (s,)
+        Direction of steepest descent of half of the objective.
+    objective : float
+        Robust sum of squares, priors included.
+    data : ndarray, shape (s, s)
+        The data's part of `hessian`.
+    bend : ndarray, shape (s,)
+        What the curvature of the optimiser's scales adds to the diagonal of the Hessian where it stabilises: without it a modulus or a
+        Poisson's ratio that the data push to the end of its scale swings to and fro.
+    """
+
+    hessian: Array
+    gradient: Array
+    objective: float
+    data: Array
+    bend: Array
+
+
 @dataclass(slots=True, eq=False)
 class Matcher:
     """Trials and parameters, evaluated with warm starts along the search."""
@@ -184,9 +124,9 @@ class Matcher:
     _solvers: dict[int, LinearSolver | None] = field(default_factory=dict)
 
     def evaluate(
-        self, values: Mapping[str, float], previous: Sequence[TrialFit] | None = None, change: Array | None = None
+        self, values: Mapping[str, float], nearby: Sequence[Nearby | None] = (), poses: Sequence[Pose | None] = ()
     ) -> list[TrialFit]:
-        """Solve all trials at `values`; `previous` fits and the `change` of the free physical values since then give the first guess.
+        """Solve all trials at `values`; solutions `nearby` help, and `poses` stand in for those that register the markers best.
 
         Raises
         ------
@@ -195,21 +135,17 @@ class Matcher:
         """
 
         def one(i: int) -> TrialFit:
-            return self._evaluate_one(i, values, previous[i] if previous else None, change)
+            near = nearby[i] if nearby else None
+            return self._evaluate_one(i, values, near.hints(values) if near is not None else [], poses[i] if poses else None)
 
         if len(self.trials) == 1:
             return [one(0)]
         with ThreadPoolExecutor(min(len(self.trials), os.cpu_count() or 1), initializer=use_one_thread) as pool:
             return list(pool.map(one, range(len(self.trials))))
 
-    def _evaluate_one(self, index: int, values: Mapping[str, float], previous: TrialFit | None, change: Array | None) -> TrialFit:
+    def _evaluate_one(self, index: int, values: Mapping[str, float], hints: Sequence[Hint], pose: Pose | None) -> TrialFit:
         trial = self.trials[index]
-        specimen = trial.specimen
-        problem = specimen.problem(values, trial.state)
-        hints: list[tuple[float, Array]] = []
-        if previous is not None and change is not None:
-            states = previous.solution.states[1:]
-            hints = [(s.load, s.displacement + d @ change) for s, d in zip(states, previous.path[1:], strict=True)]
+        problem = trial.specimen.problem(values, trial.state)
         try:
             solution = solve(problem, settings=_PATH, solver=self._solvers.get(index), hints=hints)
         except ConvergenceError as error:
@@ -217,7 +153,7 @@ class Matcher:
         newton = Newton(problem, _PATH, self._solvers.get(index))
         path = self._path_derivatives(trial, values, solution, newton)
         self._solvers[index] = newton.solver
-        return self._observed(trial, values, solution, path, previous.pose if previous else None)
+        return self._observed(trial, values, solution, path, pose)
 
     def _path_derivatives(self, trial: Trial, values: Mapping[str, float], solution: Solution, newton: Newton) -> tuple[Array, ...]:
         """Derivatives (n, 3, p) of every state on the path with respect to the physical values of the free parameters."""
@@ -262,8 +198,8 @@ class Matcher:
             pose_jacobian[:, :, 3 + axis] = np.cross(np.eye(3)[axis], arm)
         return TrialFit(solution, pose, predicted, trial.measured - predicted, sd, jacobian, pose_jacobian, path)
 
-    def normal_equations(self, fits: Sequence[TrialFit], inner: Array, *, robust: bool = True) -> tuple[Array, Array, float, Array]:
-        """Return Hessian and gradient over (free parameters, poses), the objective, and the data's part of the Hessian."""
+    def normal_equations(self, fits: Sequence[TrialFit], inner: Array) -> NormalEquations:
+        """Linearise the objective at some fits of the trials and the free parameters that gave them, on the optimiser's scale."""
         free = self.parameters.free
         p, size = len(free), len(free) + 6 * len(fits)
         slope = np.array([q.slope(q.physical(x)) for q, x in zip(free, inner, strict=True)])
@@ -274,26 +210,32 @@ class Matcher:
             j = np.zeros((seen.sum(), size))
             j[:, :p] = (fit.jacobian * slope / fit.sd[:, :, None])[seen]
             j[:, p + 6 * t : p + 6 * t + 6] = (fit.pose_jacobian / fit.sd[:, :, None])[seen]
-            c = self.settings.huber if robust else np.inf
+            c = self.settings.huber
             weight = np.minimum(1.0, c / np.maximum(np.abs(r), 1e-300))
             hessian += j.T @ (weight[:, None] * j)
             gradient += j.T @ (weight * r)
-            objective += float(np.where(np.abs(r) <= c, r * r, 2.0 * c * np.abs(r) - c * c if np.isfinite(c) else 0.0).sum())
+            objective += float(np.where(np.abs(r) <= c, r * r, 2.0 * c * np.abs(r) - c * c).sum())
         data = hessian.copy()
+        bend = np.zeros(size)
+        bend[:p] = np.maximum(-gradient[:p] * [q.bend for q in free], 0.0)
         for k, q in enumerate(free):
             if np.isfinite(q.prior_sd):
                 deviation = (inner[k] - q.inner(q.value)) / q.prior_sd
                 hessian[k, k] += 1.0 / q.prior_sd**2
                 gradient[k] -= deviation / q.prior_sd
                 objective += deviation**2
-        return hessian, gradient, objective, data
+        return NormalEquations(hessian, gradient, objective, data, bend)
 
     def run(
-        self, callback: Callable[[int, float, Mapping[str, float]], None] | None = None, *, start: Mapping[str, float] | None = None
+        self,
+        callback: Callable[[int, float, Mapping[str, float]], None] | None = None,
+        *,
+        start: Mapping[str, float] | None = None,
+        nearby: Mapping[str, Nearby] | None = None,
     ) -> Match:
         """Search for the parameters; `callback(iteration, objective, values)` is called after every accepted step.
 
-        The search starts from the parameters' own values, or from those in `start`.
+        The search starts from the parameters' own values, or from those in `start`; solutions `nearby`, by the trials' labels, help.
 
         Raises
         ------
@@ -302,30 +244,33 @@ class Matcher:
         """
         free = self.parameters.free
         inner = np.array([p.inner((start or {}).get(p.name, p.value)) for p in free])
-        fits = self.evaluate(self.parameters.values(inner))
-        hessian, gradient, objective, _ = self.normal_equations(fits, inner)
-        history, damping, status = [objective], 1e-3, Status.ITERATION_LIMIT
+        fits = self.evaluate(self.parameters.values(inner), [(nearby or {}).get(t.label) for t in self.trials])
+        now = self.normal_equations(fits, inner)
+        history, damping, rough, status = [now.objective], 1e-3, True, Status.ITERATION_LIMIT
         try:
             for iteration in range(self.settings.max_iterations):
-                step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian) + 1e-12), gradient)
-                step *= min(1.0, float(np.min(_limits(free) / np.maximum(np.abs(step[: len(free)]), 1e-300), initial=1.0)))
-                expected = float(2.0 * gradient @ step - step @ hessian @ step)
-                if expected < self.settings.tolerance * max(1.0, 0.01 * objective):
+                hessian = now.hessian + np.diag(now.bend)
+                step = _bounded_step(hessian + damping * np.diag(np.diag(hessian) + 1e-12), now.gradient, _limits(free, rough))
+                expected = float(2.0 * now.gradient @ step - step @ hessian @ step)
+                if rough and expected < ROUGH * now.objective:
+                    rough = False
+                    continue
+                if expected < self.settings.tolerance * max(1.0, 0.01 * now.objective):
                     status = Status.CONVERGED
                     break
-                found = self._try(inner, np.asarray(step, dtype=np.float64), fits, objective)
+                found = self._try(inner, step, fits, now.objective)
                 if found is None:
                     damping = max(10.0 * damping, 0.05)
                     if damping > 1e6:
                         break
                     continue
-                gained = objective - found[4]
-                inner, fits, hessian, gradient, objective = found
+                gained = now.objective - found[2].objective
+                inner, fits, now = found
                 damping = max(damping / 10.0, 1e-8)
-                history.append(objective)
+                history.append(now.objective)
                 if callback is not None:
-                    callback(iteration, objective, self.parameters.values(inner))
-                if gained < 2.0 * self.settings.tolerance * max(1.0, 0.01 * objective):
+                    callback(iteration, now.objective, self.parameters.values(inner))
+                if gained < 2.0 * self.settings.tolerance * max(1.0, 0.01 * now.objective):
                     status = Status.CONVERGED
                     break
         except KeyboardInterrupt:
@@ -334,31 +279,25 @@ class Matcher:
 
     def _try(
         self, inner: Array, step: Array, fits: list[TrialFit], objective: float
-    ) -> tuple[Array, list[TrialFit], Array, Array, float] | None:
+    ) -> tuple[Array, list[TrialFit], NormalEquations] | None:
         """Evaluate a step; None where it does not lower the objective or a trial cannot be solved."""
         free = self.parameters.free
         moved = inner + step[: len(free)]
         old, new = self.parameters.values(inner), self.parameters.values(moved)
-        change = np.array([new[q.name] - old[q.name] for q in free])
-        shifted = [
-            TrialFit(
-                f.solution,
-                f.pose.moved(step[len(free) + 6 * t : len(free) + 6 * t + 6]),
-                *[getattr(f, n) for n in ("predicted", "residual", "sd", "jacobian", "pose_jacobian", "path")],
-            )
-            for t, f in enumerate(fits)
-        ]
+        here = self.parameters.with_values({q.name: old[q.name] for q in free})
+        poses = [f.pose.moved(step[len(free) + 6 * t : len(free) + 6 * t + 6]) for t, f in enumerate(fits)]
         try:
-            found = self.evaluate(new, shifted, change)
+            found = self.evaluate(new, [Nearby(f, here) for f in fits], poses)
         except (ConvergenceError, InputError):  # InputError: a step that moves markers out of the object
             return None
-        hessian, gradient, value, _ = self.normal_equations(found, moved)
-        return (moved, found, hessian, gradient, value) if value < objective else None
+        equations = self.normal_equations(found, moved)
+        return (moved, found, equations) if equations.objective < objective else None
 
     def _match(self, inner: Array, fits: list[TrialFit], status: Status, history: list[float]) -> Match:
         free = self.parameters.free
         p = len(free)
-        hessian, _, _, data = self.normal_equations(fits, inner)
+        equations = self.normal_equations(fits, inner)
+        hessian, data = equations.hessian, equations.data
         chi_squared = float(sum(np.nansum((f.residual / f.sd) ** 2) for f in fits))
         n_data = int(sum(np.isfinite(f.residual).sum() for f in fits))
         effective = float(np.trace(np.linalg.solve(hessian, data)))
@@ -379,10 +318,30 @@ class Matcher:
         )
 
 
-def _limits(free: Sequence[Parameter]) -> Array:
-    """Largest change of each free parameter in one step, on the optimiser's scale."""
-    linear = [max(3.0, 0.5 * q.prior_sd) if np.isfinite(q.prior_sd) else np.inf for q in free]
-    return np.array([{"log": 1.0, "incompressibility": 1.5}.get(q.scale, widest) for q, widest in zip(free, linear, strict=True)])
+def _limits(free: Sequence[Parameter], rough: bool) -> Array:
+    """Largest change of each free parameter in one step, on the optimiser's scale: what would be a surprise is approached slowly.
+
+    While the search is `rough`, whatever is nearly known beforehand (tilts, offsets) rests, lest it makes up for a wrong height.
+    """
+    limits = np.array([{"log": 1.0, "incompressibility": 1.5}.get(q.scale, min(q.prior_sd, WIDEST_STEP)) for q in free])
+    nearly_known = np.array([q.scale == "linear" and q.prior_sd < WIDEST_STEP for q in free])
+    return np.where(nearly_known & rough, 0.0, limits)
+
+
+def _bounded_step(hessian: Array, gradient: Array, limits: Array) -> Array:
+    """Minimise the quadratic model with the first unknowns within +-`limits`: those that would go further stay at their limit."""
+    step = np.zeros(len(gradient))
+    loose = np.ones(len(gradient), dtype=bool)
+    bound = np.concatenate([limits, np.full(len(gradient) - len(limits), np.inf)])
+    while loose.any():
+        rest = gradient[loose] - hessian[np.ix_(loose, ~loose)] @ step[~loose]
+        step[loose] = np.linalg.solve(hessian[np.ix_(loose, loose)], rest)
+        over = loose & (np.abs(step) > bound)
+        if not over.any():
+            break
+        step[over] = np.sign(step[over]) * bound[over]
+        loose &= ~over
+    return step
 
 
 def _first_pose(specimen: Specimen, points: Array, measured: Array) -> Pose:

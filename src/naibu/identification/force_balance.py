@@ -22,8 +22,8 @@ from scipy.optimize import lsq_linear
 from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment
 from naibu.core.parameters import MAX_POISSON_RATIO
-from naibu.identification.displacement_matching import NoiseModel
 from naibu.identification.marker_mesh import MarkerMesh, marker_mesh
+from naibu.identification.trial import NoiseModel
 from naibu.mechanics.assembly import Assembler
 from naibu.mechanics.elements import elements
 from naibu.mechanics.materials import from_moduli, law_named

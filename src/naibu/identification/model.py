@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from naibu.core.errors import InputError
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.identification.calibration import Calibration, Knowledge
-from naibu.identification.displacement_matching import NoiseModel
 from naibu.identification.specimen import ModelSettings
+from naibu.identification.trial import NoiseModel
 
 FORMAT = "naibu model 1"
 

@@ -24,7 +24,7 @@ def element_size(experiment: Experiment, element_size_mm: float) -> float:
 
 
 def model_mesh(experiment: Experiment, element_size_mm: float = 0.0) -> Mesh:
-    """Mesh an object in its own frame: base at z = 0, centred on x = y = 0, one region for each material.
+    """Mesh an object in its own frame: base at z = 0, centred on x = y = 0, one region for each material and batch.
 
     Raises
     ------
@@ -33,7 +33,7 @@ def model_mesh(experiment: Experiment, element_size_mm: float = 0.0) -> Mesh:
     """
     edge = element_size(experiment, element_size_mm)
     size, kind = experiment.shape.size_mm, experiment.shape.kind
-    layers = [(layer.material, layer.to_base_mm - layer.from_base_mm) for layer in experiment.layers]
+    layers = [(layer.region, layer.to_base_mm - layer.from_base_mm) for layer in experiment.layers]
     if kind == "box":
         return _box(experiment, edge)
     if kind == "cylinder":
@@ -79,7 +79,7 @@ def _box(experiment: Experiment, edge: float) -> Mesh:
         ends = [edge + (top - edge) * z / experiment.height_mm for z in (layer.from_base_mm, layer.to_base_mm)]
         inner = layer.from_base_mm + graded(layer.to_base_mm - layer.from_base_mm, *ends)
         heights.append(inner[1:])
-        names += [layer.material] * (len(inner) - 1)
+        names += [layer.region] * (len(inner) - 1)
     return box_from_coordinates(flat[0], flat[1], np.concatenate(heights), region_of_slab=names)
 
 

@@ -22,6 +22,11 @@ def shape_parameter(material: str, name: str) -> str:
     return f"{material}: {name}"
 
 
+def batch_stiffness(batch: str) -> str:
+    """Name of the factor by which all moduli of a batch differ from those of their materials."""
+    return f"batch {batch}: stiffness"
+
+
 def friction(material: str, body: str) -> str:
     """Name of the friction coefficient (or, for springs, the tangential stiffness) of `material` on `body`."""
     return f"{material} on {body}: friction"

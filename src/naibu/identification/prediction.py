@@ -12,15 +12,16 @@ from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, State
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.identification.calibration import REFERENCE_MODULUS_KPA, START_FRICTION, START_SPRING, Knowledge, initial_parameters
-from naibu.identification.displacement_matching import Matcher, Trial, TrialFit
+from naibu.identification.displacement_matching import Matcher
 from naibu.identification.model import CalibratedModel
 from naibu.identification.names import opening
 from naibu.identification.pose import registration
-from naibu.identification.specimen import Specimen, full_opening, specimen
+from naibu.identification.specimen import Specimen, specimen
+from naibu.identification.trial import Nearby, Trial, TrialFit
 
 Array = NDArray[np.float64]
 LAYER_GAP = 0.4  # a new marker layer starts where the height jumps by this share of the markers' spacing
-UNKNOWN_SD = {"tilt_x": 0.007, "tilt_y": 0.007, "bar_offset": 0.5, "base_offset": 0.5, "friction": 0.5}
+UNKNOWN_SD = {"tilt_x": 0.007, "tilt_y": 0.007, "bar_offset": 0.5, "bar_yaw": 0.01, "base_offset": 0.5, "friction": 0.5}
 OPENING_SD_MM = {"given": 0.3, "markers": 0.15, "stated": 1.0}
 
 
@@ -69,7 +70,13 @@ class Prediction:
 
 
 def predict(
-    model: CalibratedModel, experiment: Experiment, state: str, *, opening_mm: float | None = None, heights_from_markers: bool = False
+    model: CalibratedModel,
+    experiment: Experiment,
+    state: str,
+    *,
+    opening_mm: float | None = None,
+    heights_from_markers: bool = False,
+    nearby: Nearby | None = None,
 ) -> Prediction:
     """Predict one state of an experiment with a calibrated model.
 
@@ -86,6 +93,8 @@ def predict(
         other states of the same experiment showed.
     heights_from_markers : bool
         Take the height from the mean z of the lowest and the highest marker layer of the measured state, and from nothing else of it.
+    nearby : Nearby, optional
+        The state as solved before with similar parameters; it saves time and has no influence on the result.
 
     Raises
     ------
@@ -106,7 +115,7 @@ def predict(
     parameters = parameters.changed({name: Parameter(name, start, "mm", prior_sd=OPENING_SD_MM["markers"] if use_layers else sd)})
     trial = _unmeasured(body, state, model)
     matcher = Matcher([trial], parameters)
-    fit = matcher.evaluate(parameters.values())[0]
+    fit = matcher.evaluate(parameters.values(), [nearby])[0]
     if use_layers:
         parameters, fit = _fit_height(matcher, fit, name, target, notes)
     return _finished(model, body, target, parameters, fit, name, notes)
@@ -157,6 +166,9 @@ def _relative(p: Parameter, model: CalibratedModel, experiment: Experiment, note
         notes.append(f"{kind} of {subject} was not identified; the mean of the model's materials is taken")
         centre = float(np.mean([q.inner(q.value) for q in similar]))
         return Parameter(p.name, p.physical(centre), p.unit, p.scale, prior_sd=0.5 if p.scale == "incompressibility" else 0.1)
+    if kind == "stiffness":
+        notes.append(f"how stiff {subject} is was not identified; it is taken to be like the others")
+        return Parameter(p.name, 1.0, p.unit, p.scale, prior_sd=p.prior_sd)
     sisters = [q for q in similar if q.name.split("/")[0] == experiment.name]
     if kind.startswith("shift_of_layer") and similar:
         sisters = similar
@@ -177,7 +189,7 @@ def _materials(model: CalibratedModel) -> str:
 def _opening(model: CalibratedModel, experiment: Experiment, state: State, given: float | None, notes: list[str]) -> tuple[float, float]:
     """Height or width to start from, and its standard deviation, mm."""
     if given is not None:
-        full = full_opening(experiment)
+        full = experiment.full_opening_mm
         if not 0.3 * full < given <= full:
             raise InputError(f"a height or width of {given:g} mm is not between 30 % and 100 % of the object's {full:g} mm")
         return given, OPENING_SD_MM["given"]
@@ -246,12 +258,11 @@ def _fit_height(matcher: Matcher, fit: TrialFit, name: str, state: State, notes:
     for _ in range(8):
         spread = float(fit.predicted[high, 2].mean() - fit.predicted[low, 2].mean())
         rate = float(fit.jacobian[high, 2, k].mean() - fit.jacobian[low, 2, k].mean())
-        change = np.zeros(len(free))
-        change[k] = np.clip((wanted - spread) / rate, -5.0, 5.0)
-        if abs(change[k]) < 1e-3:
+        change = float(np.clip((wanted - spread) / rate, -5.0, 5.0))
+        if abs(change) < 1e-3:
             break
-        parameters = parameters.with_values({name: parameters.values()[name] + change[k]})
-        fit = matcher.evaluate(parameters.values(), [fit], change)[0]
+        before, parameters = parameters, parameters.with_values({name: parameters.values()[name] + change})
+        fit = matcher.evaluate(parameters.values(), [Nearby(fit, before)], [fit.pose])[0]
     notes.append(f"the height of {parameters.values()[name]:.2f} mm follows from the mean z of the lowest and the highest marker layer")
     return parameters, fit
 

@@ -11,13 +11,15 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
 from naibu.core.errors import InputError
-from naibu.core.experiment import Experiment
+from naibu.core.experiment import Experiment, Layer
 from naibu.core.mesh import Mesh
+from naibu.core.rotation import rotation_matrix
 from naibu.identification.lattice import completed
 from naibu.identification.model_mesh import element_size, model_mesh, on_straight_base
 from naibu.identification.names import (
     SHAPE_NAMES,
     base_offset,
+    batch_stiffness,
     friction,
     joint_friction,
     layer_shift,
@@ -32,8 +34,8 @@ from naibu.mechanics.assembly import Assembler, block_pattern, body_force
 from naibu.mechanics.contact import STICK, Contact, RigidSurface, bar, plane
 from naibu.mechanics.elements import elements
 from naibu.mechanics.materials import Law, from_moduli, law_named, parameter_vector
+from naibu.mechanics.newton import Problem
 from naibu.mechanics.sensitivities import Direction
-from naibu.mechanics.statics import Problem
 from naibu.mechanics.supports import Friction, Prescribed, interface, rigid_contact
 from naibu.meshing.interfaces import split_at_plane
 from naibu.meshing.location import interpolation_operator
@@ -190,8 +192,8 @@ class Specimen:
     def material_parameters(self, values: Mapping[str, float]) -> Array:
         """Return the parameters (cells, 4), kPa, of all cells."""
         rows = np.zeros((len(self.mesh.region_names), 4))
-        for row, name in zip(rows, self.mesh.region_names, strict=True):
-            vector = from_moduli(self.law, *_moduli(name, values), _shape(self.law, name, values)).parameters
+        for row, layer in zip(rows, self._region_layers, strict=True):
+            vector = from_moduli(self.law, *_moduli(layer, values), _shape(self.law, layer.material, values)).parameters
             row[: len(vector)] = vector
         return rows[self.mesh.regions]
 
@@ -227,7 +229,7 @@ class Specimen:
         out = []
         for i, (pairs, pair_of_point) in enumerate(zip(self._pairs, self._pair_of_points, strict=True)):
             if name in pairs:
-                mask = (pair_of_point == pairs.index(name)).astype(float)
+                mask = np.array([p == name for p in pairs], dtype=float)[pair_of_point]
                 springs = self._is_spring(i)
                 out.append(Direction(contact=i, tangential_stiffness=mask) if springs else Direction(contact=i, friction=mask))
         if (points := self.shift(name, values)) is not None:
@@ -235,30 +237,41 @@ class Specimen:
         for i in self.indenters:
             path = self._path_directions(self._contacts[i], state).get(name)
             if path is not None:
-                stop, tilt = path
-                out.append(Direction(contact=i, stop=stop, tilt=tilt))
+                out.append(replace(path, contact=i))
         return out
 
+    @property
+    def _region_layers(self) -> list[Layer]:
+        """A layer of every region of the mesh, for its material and batch."""
+        by_name = {layer.region: layer for layer in self.experiment.layers}
+        return [by_name[name] for name in self.mesh.region_names]
+
     def _material_direction(self, name: str, values: Mapping[str, float]) -> Array | None:
-        """Derivative (cells, 4) of the cells' parameters with respect to the physical value of a material's parameter."""
-        for index, region in enumerate(self.mesh.region_names):
-            shape = _shape(self.law, region, values)
-            mu, kappa = _moduli(region, values)
-            e, nu = values[young_modulus(region)], values[poisson_ratio(region)]
-            vector: tuple[float, ...] | None = None
-            if name == young_modulus(region):
-                vector = parameter_vector(self.law, mu / e, kappa / e, shape)
-            elif name == poisson_ratio(region):
-                vector = parameter_vector(self.law, -mu / (1.0 + nu), 2.0 * kappa / (1.0 - 2.0 * nu), shape)
-            for k, shape_name in enumerate(SHAPE_NAMES.get(self.law.name, ())):
-                if name == shape_parameter(region, shape_name):
-                    one = tuple(1.0 if k == j else 0.0 for j in range(len(shape)))
-                    zero = parameter_vector(self.law, mu, 0.0, tuple(0.0 for _ in shape))
-                    vector = tuple(a - b for a, b in zip(parameter_vector(self.law, mu, 0.0, one), zero, strict=True))
+        """Derivative (cells, 4) of the cells' parameters with respect to the physical value of a material's or a batch's parameter."""
+        out, found = np.zeros((self.mesh.n_cells, 4)), False
+        for index, layer in enumerate(self._region_layers):
+            vector = self._region_direction(layer, name, values)
             if vector is not None:
-                out = np.zeros((self.mesh.n_cells, 4))
                 out[self.mesh.regions == index, : len(vector)] = vector
-                return out
+                found = True
+        return out if found else None
+
+    def _region_direction(self, layer: Layer, name: str, values: Mapping[str, float]) -> tuple[float, ...] | None:
+        material, shape = layer.material, _shape(self.law, layer.material, values)
+        mu, kappa = _moduli(layer, values)
+        e, nu = values[young_modulus(material)], values[poisson_ratio(material)]
+        if name == young_modulus(material):
+            return parameter_vector(self.law, mu / e, kappa / e, shape)
+        if layer.batch and name == batch_stiffness(layer.batch):
+            factor = values[name]
+            return parameter_vector(self.law, mu / factor, kappa / factor, shape)
+        if name == poisson_ratio(material):
+            return parameter_vector(self.law, -mu / (1.0 + nu), 2.0 * kappa / (1.0 - 2.0 * nu), shape)
+        for k, shape_name in enumerate(SHAPE_NAMES.get(self.law.name, ())):
+            if name == shape_parameter(material, shape_name):
+                one = tuple(1.0 if k == j else 0.0 for j in range(len(shape)))
+                zero = parameter_vector(self.law, mu, 0.0, tuple(0.0 for _ in shape))
+                return tuple(a - b for a, b in zip(parameter_vector(self.law, mu, 0.0, one), zero, strict=True))
         return None
 
     def _is_spring(self, index: int) -> bool:
@@ -275,32 +288,34 @@ class Specimen:
         return replace(contact, friction_coefficient=given)
 
     def _moved(self, contact: Contact, values: Mapping[str, float], state: str) -> Contact:
-        """Set the end of the body's path and its tilt from the state's parameters."""
-        stop, tilt = contact.start.copy(), np.zeros(3)
-        for name, (rate, turn) in self._path_directions(contact, state).items():
+        """Set the ends of the body's path, its yaw and its tilt from the state's parameters."""
+        start, stop, yaw, tilt = contact.start.copy(), contact.stop.copy(), np.zeros(3), np.zeros(3)
+        for name, rate in self._path_directions(contact, state).items():
             reference = self._reference(contact, name, state)
-            stop = stop + rate * (values.get(name, reference) - reference)
-            tilt = tilt + turn * values.get(name, 0.0)
-        return replace(contact, stop=stop, tilt=tilt)
+            change = values.get(name, reference) - reference
+            for target, by in ((start, rate.start), (stop, rate.stop), (yaw, rate.rotation), (tilt, rate.tilt)):
+                if by is not None:
+                    target += by * change
+        return replace(contact, start=start, stop=stop, rotation=rotation_matrix(yaw) @ contact.rotation, tilt=tilt)
 
     def _reference(self, contact: Contact, name: str, state: str) -> float:
         """Value of a path parameter at which the body is at its start."""
         if name == opening(self.experiment, state):
-            return full_opening(self.experiment)
+            return self.experiment.full_opening_mm
         return 0.0
 
-    def _path_directions(self, contact: Contact, state: str) -> dict[str, tuple[Array, Array]]:
-        """For every parameter that moves the body: change of the end of its path, and rotation about its reference point."""
-        zero = np.zeros(3)
+    def _path_directions(self, contact: Contact, state: str) -> dict[str, Direction]:
+        """How every parameter of the state moves the body, per unit of the parameter."""
+        x, y, z = np.eye(3)
+        name = opening(self.experiment, state)
         if self.experiment.loading.kind == "side_plates":
-            return {opening(self.experiment, state): (-0.5 * contact.surface.normal, zero)}
-        out = {opening(self.experiment, state): (np.array([0.0, 0.0, 1.0]), zero)}
+            return {name: Direction(stop=-0.5 * contact.surface.normal)}
         prefix = f"{self.experiment.name}/{state}"
-        out[f"{prefix}: tilt_x"] = (zero, np.array([1.0, 0.0, 0.0]))
-        out[f"{prefix}: tilt_y"] = (zero, np.array([0.0, 1.0, 0.0]))
+        out = {name: Direction(stop=z), f"{prefix}: tilt_x": Direction(tilt=x), f"{prefix}: tilt_y": Direction(tilt=y)}
         if self.experiment.loading.kind == "bar":
-            lateral = np.array([1.0, 0.0, 0.0]) if self.experiment.loading.bar_axis == "y" else np.array([0.0, 1.0, 0.0])
-            out[f"{prefix}: bar_offset"] = (lateral, zero)
+            lateral = x if self.experiment.loading.bar_axis == "y" else y
+            out[f"{prefix}: bar_offset"] = Direction(start=lateral, stop=lateral)
+            out[f"{prefix}: bar_yaw"] = Direction(rotation=z)
         return out
 
 
@@ -333,7 +348,8 @@ def specimen(experiment: Experiment, settings: ModelSettings | None = None) -> S
             )
     boundary = boundary_faces(mesh)
     bodies = _bodies(experiment, chosen, mesh, boundary.faces)
-    pairs = [tuple(friction(m, _body(c)) for m in mesh.region_names) for c in bodies]
+    material = {layer.region: layer.material for layer in experiment.layers}
+    pairs = [tuple(friction(material[m], _body(c)) for m in mesh.region_names) for c in bodies]
     pair_of_points = [np.repeat(mesh.regions[boundary.cells], len(c.area) // len(boundary.cells)) for c in bodies]
     pairs += [(joint_friction(experiment, float(height)),) for height in experiment.joined_at_mm[: len(joints)]]
     pair_of_points += [np.zeros(len(c.area), dtype=np.int64) for c in joints]
@@ -421,17 +437,12 @@ def _body(contact: Contact) -> str:
     return contact.name.rpartition(" of ")[2]
 
 
-def _moduli(material: str, values: Mapping[str, float]) -> tuple[float, float]:
+def _moduli(layer: Layer, values: Mapping[str, float]) -> tuple[float, float]:
     """Shear and bulk modulus, kPa."""
-    e, nu = values[young_modulus(material)], values[poisson_ratio(material)]
+    e, nu = values[young_modulus(layer.material)], values[poisson_ratio(layer.material)]
+    e *= values.get(batch_stiffness(layer.batch), 1.0)
     return e / (2.0 * (1.0 + nu)), e / (3.0 * (1.0 - 2.0 * nu))
 
 
 def _shape(law: Law, material: str, values: Mapping[str, float]) -> tuple[float, ...]:
     return tuple(values.get(shape_parameter(material, name), 0.0) for name in SHAPE_NAMES.get(law.name, ()))
-
-
-def full_opening(experiment: Experiment) -> float:
-    """Height of the plate or bar, or distance of the side plates, at which they touch the free object, mm."""
-    loading, size = experiment.loading, experiment.shape.size_mm
-    return size["xyz".index(loading.bar_axis)] if loading.kind == "side_plates" else size[2]

@@ -84,6 +84,7 @@ class LayerTable(_Table):
     material: Annotated[str, Field(min_length=1)]
     from_base_mm: Annotated[list[NotNegative], Field(min_length=2, max_length=2)]
     markers: Annotated[list[int], Field(min_length=2, max_length=2)] | None = None
+    batch: str = ""
 
 
 class LoadingTable(_Table):

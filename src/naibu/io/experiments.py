@@ -147,7 +147,7 @@ def _layers(path: Path, meta: Meta, height: float) -> tuple[Layer, ...]:
         below = high
     if abs(below - height) > 1e-6:
         raise InputError(f"{path}: [[layer]] number {len(meta.layer)} from_base_mm ends at {below:g} mm; {mend}")
-    return tuple(Layer(layer.material, *layer.from_base_mm) for layer in meta.layer)
+    return tuple(Layer(layer.material, layer.from_base_mm[0], layer.from_base_mm[1], layer.batch) for layer in meta.layer)
 
 
 def _states(root: Path, meta: Meta, hashes: dict[str, str], assumed: list[str]) -> list[State]:

@@ -178,13 +178,18 @@ def write_experiment_folder(
         ("[coordinates]", {"up_axis": up_axis, "xy_step_mm": xy_step_mm, "z_step_mm": z_step_mm}),
         ("[object]", size | {"size_axes": ["x", "y", "z"], "joined_at_mm": list(joined_at_mm)}),
         ("[markers]", {"nominal_spacing_mm": spacing_mm}),
-        *(("[[layer]]", {"material": la.material, "from_base_mm": [la.from_base_mm, la.to_base_mm]}) for la in layers),
+        *(("[[layer]]", _layer_table(la)) for la in layers),
         ("[loading]", _loading_table(loading)),
         ("[[state]]", {"name": "initial", "what": "free", "file": "initial.csv"}),
         *(("[[state]]", {"name": name, "file": f"{name}.csv", key: heights.get(name)}) for name in states),
     )
     _place_checked(target, text, {"initial": initial, **states})
     return target
+
+
+def _layer_table(layer: Layer) -> dict[str, object]:
+    table: dict[str, object] = {"material": layer.material, "from_base_mm": [layer.from_base_mm, layer.to_base_mm]}
+    return table | ({"batch": layer.batch} if layer.batch else {})
 
 
 def _loading_table(loading: Loading) -> dict[str, object]:

@@ -139,16 +139,20 @@ class Contact:
         """Return anchors (p, 3) for the beginning of loading, in the body's frame."""
         return (self.rest - self.start) @ self.rotation
 
-    def evaluate(self, displacement: Array, anchors: Array, load: float) -> ContactResponse:
-        """Evaluate tractions and their derivatives at every point."""
+    def evaluate(self, displacement: Array, anchors: Array, load: float, *, curvature: bool = True) -> ContactResponse:
+        """Evaluate tractions and their derivatives at every point.
+
+        Without the `curvature` of the body the stiffness lacks what lets a pressed point slip off an edge by itself: it is not the
+        derivative of the force then, but keeps equilibrium iterations from circling there.
+        """
         y = self.local(displacement, load)
         n = len(y)
         vectors, matrices = np.zeros((3, n, 3)), np.zeros((3, n, 3, 3))
         response = ContactResponse(self.orientation(load), y, np.empty(n), *vectors, *matrices)
         _tractions(
             self.surface.kind, self.surface.packed(), y, anchors, self.normal_stiffness, self.tangential_stiffness,
-            self.friction_coefficient, self.bonded, response.gap, response.force, response.tangential, response.slip_direction,
-            response.stiffness, response.tangential_stiffness, response.anchor_stiffness,
+            self.friction_coefficient, self.bonded, float(curvature), response.gap, response.force, response.tangential,
+            response.slip_direction, response.stiffness, response.tangential_stiffness, response.anchor_stiffness,
         )  # fmt: skip
         for field in (response.force, response.stiffness, response.anchor_stiffness, response.slip_direction):
             field *= self.area.reshape((-1,) + (1,) * (field.ndim - 1))
@@ -239,7 +243,7 @@ def _gap(kind, s, y, n, h):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 @njit(cache=True, nogil=True)
 def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
-    kind, s, y, anchors, k_n, k_t, mu, bonded, gap, force, tangential, slip, stiffness, tangential_stiffness, anchor_stiffness
+    kind, s, y, anchors, k_n, k_t, mu, bonded, curvature, gap, force, tangential, slip, stiffness, tangential_stiffness, anchor_stiffness
 ):
     """Tractions of all points and their derivatives (per unit of area); see the module's text for the law."""
     n, e = np.empty(3), np.empty(3)
@@ -287,7 +291,7 @@ def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
                     dt = ratio * projected + mu[q] * dp * n[j] * e[i] / size
                     da = ratio * projected_a
                 tangential_stiffness[q, i, j] = dt
-                stiffness[q, i, j] = dt - dp * n[i] * n[j] - p * h[i, j]
+                stiffness[q, i, j] = dt - dp * n[i] * n[j] - curvature * p * h[i, j]
                 anchor_stiffness[q, i, j] = da
             if sliding:
                 slip[q, i] = -p * e[i] / size

@@ -12,9 +12,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from naibu.core.rotation import left_jacobian, rotation_matrix
 from naibu.mechanics.assembly import Assembler
 from naibu.mechanics.contact import Contact, ContactResponse
-from naibu.mechanics.statics import LoadState, Newton, Problem, SolverSettings
+from naibu.mechanics.newton import Newton, Problem, SolverSettings
+from naibu.mechanics.statics import LoadState
 
 Array = NDArray[np.float64]
 
@@ -36,7 +38,7 @@ class Direction:
     start, stop : ndarray, shape (3,), optional
         Change of the ends of the body's path, mm.
     rotation : ndarray, shape (3,), optional
-        Rotation of the body about its reference point, rad.
+        Rotation of the body about its reference point, rad, before any tilt.
     tilt : ndarray, shape (3,), optional
         Change of the rotation that grows with the load, rad at full load.
     points : ndarray, shape (n, 3), optional
@@ -167,10 +169,17 @@ class _BodyDirections:
                     target[:, k] = source
         return parts
 
+    def turning(self, contact: Contact, load: float) -> Array:
+        """Infinitesimal rotation vectors (3, k) of the body."""
+        if contact.tilt is None:
+            return self.rotation + load * self.tilt
+        tilt = load * contact.tilt
+        return np.asarray(rotation_matrix(tilt) @ self.rotation + load * left_jacobian(tilt) @ self.tilt)
+
     def moved(self, contact: Contact, world: Array, load: float) -> Array:
         """Change (p, 3, k) of local positions of points that stay at `world` (p, 3), relative to the body's reference point."""
         translation = self.start + load * (self.stop - self.start)
-        turned = np.cross((self.rotation + load * self.tilt).T[None, :, :], world[:, None, :])
+        turned = np.cross(self.turning(contact, load).T[None, :, :], world[:, None, :])
         change = self.points.transpose(0, 2, 1) - turned - translation.T[None, :, :]
         return np.asarray(np.einsum("pkj,ji->pik", change, contact.orientation(load)))
 
@@ -190,7 +199,7 @@ class _BodyDirections:
         )
         known -= area * by_stiffness[:, :, None] * self.stiffness[:, None, :]
         force = known - np.einsum("pij,pjk->pik", response.stiffness, local)
-        turned = np.cross((self.rotation + load * self.tilt).T[None, :, :], (response.force @ response.orientation.T)[:, None, :])
+        turned = np.cross(self.turning(contact, load).T[None, :, :], (response.force @ response.orientation.T)[:, None, :])
         force += np.einsum("pkj,ji->pik", turned, response.orientation)
         return _Explicit(local, -known / area, force, self.stiffness)
 

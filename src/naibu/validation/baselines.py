@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.experiment import Experiment
-from naibu.identification.displacement_matching import Trial
 from naibu.identification.names import opening, poisson_ratio, young_modulus
 from naibu.identification.pose import registration
 from naibu.identification.prediction import rms
 from naibu.identification.specimen import ModelSettings, specimen
+from naibu.identification.trial import Trial
 from naibu.mechanics.statics import solve
 
 Array = NDArray[np.float64]

@@ -23,7 +23,8 @@ from naibu.identification.names import poisson_ratio, young_modulus
 from naibu.identification.placement import placement
 from naibu.identification.pose import Pose
 from naibu.identification.specimen import ModelSettings, Specimen, specimen
-from naibu.mechanics.statics import Solution, SolverSettings, solve
+from naibu.mechanics.newton import SolverSettings
+from naibu.mechanics.statics import Solution, solve
 from naibu.meshing.location import interpolation_operator
 
 Array = NDArray[np.float64]
