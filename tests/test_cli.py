@@ -16,7 +16,8 @@ import pytest
 from conftest import Press
 from virtual_press import KNOWN, stop_at
 
-from naibu import cli
+from naibu import cli, workflow
+from naibu.identification.specimen import ModelSettings
 from naibu.mechanics.newton import Newton
 
 Run = Callable[..., tuple[int, str, str]]
@@ -65,6 +66,30 @@ def test_identify_predict_report(naibu: Run, press: Press) -> None:
         Path(f"here/{page}.html").unlink()
     code, out, _ = naibu("report", "here")
     assert code == 0 and Path("here/report.html").is_file() and Path("here/predicted.html").is_file()
+
+
+def test_compare_keeps_what_it_has_found(naibu: Run, press: Press, monkeypatch: pytest.MonkeyPatch) -> None:
+    models = ("--law", "neo_hookean", "--law", "mooney_rivlin", "--contact", "coulomb", "--out", "compared")
+    compare = workflow.compare_models
+    done: list[str] = []
+
+    def once(loaded: object, candidates: list[ModelSettings], **options: object) -> object:
+        if done:
+            raise KeyboardInterrupt
+        done.append(candidates[0].law)
+        return compare(loaded, candidates, **options)
+
+    monkeypatch.setattr(workflow, "compare_models", once)
+    assert naibu("compare", press.folder, *COARSE, *models)[0] == cli.INTERRUPTED
+    (first,) = json.loads(Path("compared/comparison.json").read_text(encoding="utf-8"))
+    assert first["result"]["noise_factor"] < 3.0 and first["result"]["left_out_mm"] is None
+    monkeypatch.setattr(workflow, "compare_models", compare)
+    code, out, _ = naibu("compare", press.folder, *COARSE, *models)
+    assert code == 0 and "neo_hookean" in out and "mooney_rivlin" in out and "BIC above best" in out
+    entries = json.loads(Path("compared/comparison.json").read_text(encoding="utf-8"))
+    assert entries[0] == first and len(entries) == 2
+    monkeypatch.setattr(workflow, "compare_models", None)  # nothing is left to be solved
+    assert naibu("compare", press.folder, *COARSE, *models)[1] == out
 
 
 def test_help_and_version_answer(naibu: Run) -> None:

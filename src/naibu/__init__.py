@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from naibu import datasets
-    from naibu.workflow import identify, load_experiment, predict, report
+    from naibu.workflow import compare, identify, load_experiment, predict, report
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "datasets", "identify", "load_experiment", "predict", "report"]
+__all__ = ["__version__", "compare", "datasets", "identify", "load_experiment", "predict", "report"]
 
 # loaded when first used, by name, so that `import naibu` stays light
-_MODULES = {"datasets": "naibu.datasets"} | dict.fromkeys(("identify", "load_experiment", "predict", "report"), "naibu.workflow")
+_MODULES = {"datasets": "naibu.datasets"} | dict.fromkeys(("compare", "identify", "load_experiment", "predict", "report"), "naibu.workflow")
 
 
 def __getattr__(name: str) -> object:

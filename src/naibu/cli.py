@@ -1,4 +1,4 @@
-"""The command line: ``naibu demo``, ``identify``, ``predict``, ``report``, ``import``, ``doctor``.
+"""The command line: ``naibu demo``, ``identify``, ``predict``, ``compare``, ``report``, ``import``, ``doctor``.
 
 Exit codes: 0 done, 1 the installation is not sound (``doctor``), 2 input that cannot be used, 3 a solve that failed, 130 interrupted.
 """
@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
@@ -39,6 +40,8 @@ errors = Console(stderr=True, width=None if sys.stderr.isatty() else WIDTH_OF_FI
 BAD_INPUT, NO_SOLUTION, INTERRUPTED = 2, 3, 130
 DEMO = ("ct_two_material_1", "ct_two_material_2", "ct_two_material_3")
 DEMO_KNOWN = "hardness 5=222 kPa"  # mean of the report's compression tests, Table 3.4
+ContactModel = Literal["coulomb", "stick", "springs"]
+Joined = Literal["glued", "sliding"]
 Law = Literal["neo_hookean", "neo_hookean_isochoric", "mooney_rivlin", "yeoh", "saint_venant_kirchhoff"]
 
 
@@ -63,8 +66,8 @@ def identify(
     state: list[str] | None = None,
     out: Path = Path("naibu-results"),
     law: Law = "neo_hookean",
-    contact: Literal["coulomb", "stick", "springs"] = "coulomb",
-    joined: Literal["glued", "sliding"] = "glued",
+    contact: ContactModel = "coulomb",
+    joined: Joined = "glued",
     element_size_mm: float = 0.0,
     cross_validate: bool = False,
     resume: bool = True,
@@ -196,6 +199,54 @@ def predict(
         rms = f"RMS x {a.x:.3f}, y {a.y:.3f}, z {a.z:.3f}, 3-D {a.total:.3f} mm"
         _say(f"{a.markers} markers: {rms} ({a.noise_units:.2f} times the noise)")
     _say(f"Predicted at {result.opening_mm:.2f} mm: {out / 'predicted.csv'}   page: {out / 'predicted.html'}")
+
+
+@app.command
+def compare(
+    experiments: list[str],
+    *,
+    known: list[str] | None = None,
+    law: list[Law] | None = None,
+    contact: list[ContactModel] | None = None,
+    joined: list[Joined] | None = None,
+    element_size_mm: float = 0.0,
+    out: Path = Path("naibu-comparison"),
+) -> None:
+    """Compare laws and contacts: calibrate each combination, and predict each experiment from the others.
+
+    Parameters
+    ----------
+    experiments
+        Folders or names of bundled datasets.
+    known
+        A material with known Young's modulus, or just its name. May be repeated.
+    law
+        Hyperelastic law to try. May be repeated; neo_hookean and mooney_rivlin by default.
+    contact
+        What plates and table do to the surface sideways. May be repeated; coulomb and stick by default.
+    joined
+        What holds blocks together that were cast apart. May be repeated; glued by default.
+    element_size_mm
+        Edge of the elements; 0 chooses.
+    out
+        Folder for comparison.json; models that it holds already are not repeated.
+    """
+    from naibu import workflow
+    from naibu.identification.specimen import ModelSettings
+    from naibu.presentation import comparison_table
+
+    laws: list[Law] = law or ["neo_hookean", "mooney_rivlin"]
+    contacts: list[ContactModel] = contact or ["coulomb", "stick"]
+    joints: list[Joined] = joined or ["glued"]
+    candidates = [
+        ModelSettings(law=one, contact=two, joined=three, element_size_mm=element_size_mm)
+        for one, two, three in product(laws, contacts, joints)
+    ]
+    with _progress() as progress:
+        rows = workflow.compare(experiments, candidates=candidates, known=known or (), out=out, progress=progress)
+    table = comparison_table(rows)
+    _print_table(table.title, table.columns, table.rows)
+    _say(table.note, "dim")
 
 
 @app.command

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from naibu.core.parameters import Parameter
 from naibu.identification.calibration import Calibration
-from naibu.identification.comparison import LeftOut
+from naibu.identification.comparison import LeftOut, ModelRow
 from naibu.identification.model import CalibratedModel
 from naibu.identification.prediction import Prediction, marker_layers
 from naibu.identification.specimen import Specimen
@@ -70,6 +70,22 @@ def accuracy_table(calibration: Calibration, baselines: Mapping[str, Mapping[str
     if unseen:
         note += " Left out: the other experiments identified the parameters."
     return Table("Measured against predicted markers", columns, tuple(rows), note)
+
+
+def comparison_table(rows: Sequence[ModelRow]) -> Table:
+    """Return candidate models side by side, in their order."""
+    best = min((r.bic for r in rows if np.isfinite(r.bic)), default=np.nan)
+    columns = ("law", "contact", "joints", "in noise units", "parameters", "BIC above best", "left out, 3-D mm", "trouble")
+    cells: list[tuple[Cell, ...]] = []
+    for r in rows:
+        figures = (r.noise_factor, r.bic - best, r.left_out_mm)
+        noise, above, left_out = (round(v, 3) if np.isfinite(v) else None for v in figures)
+        cells.append((r.settings.law, r.settings.contact, r.settings.joined, noise, r.parameter_count, above, left_out, r.problem))
+    note = (
+        "BIC: Bayesian information criterion, misfit with a penalty for parameters; differences above 10 are decisive. "
+        "Left out: over all markers of the experiments, each predicted from the others."
+    )
+    return Table("Models compared", columns, tuple(cells), note)
 
 
 def _accuracy_row(label: str, a: Accuracy) -> tuple[Cell, ...]:

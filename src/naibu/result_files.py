@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +17,10 @@ import numpy as np
 
 from naibu.core.errors import InputError
 from naibu.identification.calibration import Calibration
-from naibu.identification.comparison import LeftOut
+from naibu.identification.comparison import LeftOut, ModelRow
 from naibu.identification.model import CalibratedModel
 from naibu.identification.prediction import Prediction, rms
+from naibu.identification.specimen import ModelSettings
 from naibu.io.atomic import write_atomically
 from naibu.io.results import write_vtkhdf_series, write_vtu
 from naibu.mechanics.statics import Solution
@@ -27,7 +30,7 @@ from naibu.viewer.payload import Report, jsonable, report_json
 from naibu.viewer.reading import report_from_json
 
 MODEL_FILE, CHECKPOINT_FILE, RESIDUALS_FILE = "model.json", "checkpoint.json", "residuals.csv"
-IDENTIFICATION_FILE, REPORT_STEM = "identification.json", "report"
+IDENTIFICATION_FILE, COMPARISON_FILE, REPORT_STEM = "identification.json", "comparison.json", "report"
 # a prediction may share the folder of the model it was made with, so nothing but its own files bears these names
 PREDICTED_FILE, SUMMARY_FILE, PREDICTED_STEM = "predicted.csv", "summary.json", "predicted"
 Baselines = Mapping[str, Mapping[str, float]]
@@ -91,6 +94,30 @@ def read_checkpoint(folder: Path, provenance: Mapping[str, Any]) -> dict[str, fl
 def write_checkpoint(folder: Path, provenance: Mapping[str, Any], values: Mapping[str, float]) -> None:
     """Keep the best values so far."""
     write_atomically(folder / CHECKPOINT_FILE, json.dumps({"provenance": provenance, "values": dict(values)}))
+
+
+def read_comparison(folder: Path, provenance: Mapping[str, Any]) -> ModelRow | None:
+    """Return what a folder holds of a candidate model with the same inputs and settings, if there is anything."""
+    for entry in _compared(folder):
+        if entry.get("provenance") == json.loads(json.dumps(provenance)):
+            figures: dict[str, Any] = {name: math.nan if value is None else value for name, value in entry["result"].items()}
+            return ModelRow(ModelSettings(**entry["provenance"]["settings"]), **figures)
+    return None
+
+
+def write_comparison(folder: Path, provenance: Mapping[str, Any], row: ModelRow) -> None:
+    """Add a candidate model to the folder's comparison."""
+    figures = {k: v for k, v in asdict(row).items() if k != "settings"}
+    entry = {"provenance": provenance, "result": {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in figures.items()}}
+    write_atomically(folder / COMPARISON_FILE, _text([*_compared(folder), entry]))
+
+
+def _compared(folder: Path) -> list[dict[str, Any]]:
+    try:
+        data = json.loads((folder / COMPARISON_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return []
+    return [entry for entry in data if isinstance(entry, dict)] if isinstance(data, list) else []
 
 
 def write_identification(

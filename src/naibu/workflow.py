@@ -17,7 +17,7 @@ from naibu.core.experiment import Experiment
 from naibu.core.solution import Status
 from naibu.core.units import kilopascals
 from naibu.identification.calibration import Calibration, Knowledge, calibrate
-from naibu.identification.comparison import LeftOut, leave_one_out
+from naibu.identification.comparison import LeftOut, ModelRow, compare_models, leave_one_out
 from naibu.identification.model import CalibratedModel
 from naibu.identification.names import opening
 from naibu.identification.pose import registration
@@ -29,16 +29,18 @@ from naibu.io.experiments import META_FILE, read_experiment
 from naibu.result_files import (
     CHECKPOINT_FILE,
     read_checkpoint,
+    read_comparison,
     read_model,
     result_folder,
     rewrite_reports,
     write_checkpoint,
+    write_comparison,
     write_identification,
     write_prediction,
 )
 from naibu.validation.baselines import affine, baselines
 
-__all__ = ["Identification", "identify", "load_experiment", "parse_known", "predict", "read_model", "report"]
+__all__ = ["Identification", "compare", "identify", "load_experiment", "parse_known", "predict", "read_model", "report"]
 
 Source = str | os.PathLike[str] | Experiment
 Progress = Callable[[str, int, float], None]
@@ -362,6 +364,69 @@ def _only_state(experiment: Experiment) -> str:
     if len(loaded) != 1:
         raise InputError(f"{experiment.name} has {len(loaded)} loaded states ({_names(experiment)}); choose one with --state")
     return loaded[0]
+
+
+def compare(
+    experiments: Sequence[Source] | Source,
+    *,
+    candidates: Sequence[ModelSettings],
+    known: Sequence[str] = (),
+    out: str | os.PathLike[str] | None = None,
+    progress: Progress | None = None,
+) -> list[ModelRow]:
+    """Calibrate several models on the same experiments, and predict each experiment from the others with each of them.
+
+    Parameters
+    ----------
+    experiments : sequence of path, str or Experiment
+        As for `identify`.
+    candidates : sequence of ModelSettings
+        Laws, contacts and joints to compare.
+    known : sequence of str
+        As for `identify`.
+    out : path, optional
+        Folder for ``comparison.json``, written anew after every candidate; candidates that it holds already, of the same inputs, are not
+        repeated.
+    progress : callable, optional
+        ``progress(stage, iteration, objective)``.
+
+    Returns
+    -------
+    list of ModelRow
+        One for each candidate, in their order.
+
+    Raises
+    ------
+    InputError
+        Unusable input, or no candidate.
+    """
+    if not candidates:
+        raise InputError("no model is given to compare; name at least one law or contact")
+    loaded = _loaded(experiments)
+    knowledge = parse_known(known)
+    folder = None if out is None else result_folder(out)
+    rows: list[ModelRow] = []
+    for settings in candidates:
+        provenance = _provenance(loaded, known, {}, settings)
+        row = read_comparison(folder, provenance) if folder is not None else None
+        if row is None:
+            told = _stage(progress, settings)
+            row = compare_models(loaded, [settings], knowledge=knowledge, callback=told)[0]
+            if folder is not None:
+                write_comparison(folder, provenance, row)
+        rows.append(row)
+    return rows
+
+
+def _stage(progress: Progress | None, settings: ModelSettings) -> Callable[[str, int, float], None]:
+    """Report the steps of one candidate under its name."""
+
+    def tell(left: str, iteration: int, objective: float) -> None:
+        if progress is not None:
+            without = "" if left == "none" else f" without {left}"
+            progress(f"{settings.law}, {settings.contact}, {settings.joined}{without}", iteration, objective)
+
+    return tell
 
 
 def report(folder: str | os.PathLike[str]) -> list[Path]:
