@@ -29,6 +29,7 @@ from naibu.mechanics.statics import Hint, Solution, solve
 
 Array = NDArray[np.float64]
 WIDEST_STEP = 3.0  # of an unknown on a linear scale: mm for positions
+UNEVEN = 0.01  # points that slip over an edge make the objective uneven; a step that promises less than this and fails ends the search
 ROUGH = 0.1  # a search is rough while a step may lower the objective by more than this share
 _PATH = SolverSettings(first_step=0.02, largest_step=0.15, tolerance=1e-6)
 
@@ -260,6 +261,9 @@ class Matcher:
                     break
                 found = self._try(inner, step, fits, now.objective)
                 if found is None:
+                    if expected < UNEVEN * now.objective:
+                        status = Status.CONVERGED
+                        break
                     damping = max(10.0 * damping, 0.05)
                     if damping > 1e6:
                         break

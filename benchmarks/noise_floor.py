@@ -1,0 +1,57 @@
+"""How near any smooth model could come to the markers: ``python benchmarks/noise_floor.py MODEL_FOLDER_OF_NAIBU_DEMO``.
+
+To the residuals of the calibrated model (``residuals.csv``) a polynomial in the free positions is added, of growing degree. What remains,
+with the degrees of freedom counted, falls towards the noise of placing and reading the markers; what the same polynomial does for markers
+left out of its fit tells from where on it follows noise.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from naibu import datasets
+
+DEGREES = (0, 1, 2, 3)
+
+
+def residuals(path: Path) -> dict[str, dict[int, np.ndarray]]:
+    """Residuals (3,), mm, by trial and marker."""
+    out: dict[str, dict[int, np.ndarray]] = {}
+    with path.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            values = [float(row[f"residual_{axis}_mm"] or "nan") for axis in "xyz"]
+            out.setdefault(f"{row['experiment']}/{row['state']}", {})[int(row["marker"])] = np.array(values)
+    return out
+
+
+def smoothed(points: np.ndarray, residual: np.ndarray, degree: int) -> tuple[float, float]:
+    """RMS distance left by a polynomial, per degree of freedom, and for markers that it did not see, mm."""
+    x = (points - points.mean(axis=0)) / np.abs(points - points.mean(axis=0)).max(axis=0)
+    powers = [e for e in product(range(degree + 1), repeat=3) if sum(e) <= degree]
+    basis = np.stack([np.prod(x ** np.array(e), axis=1) for e in powers], axis=1)
+    hat = basis @ np.linalg.pinv(basis)
+    left = residual - hat @ residual
+    unseen = left / (1.0 - np.diag(hat))[:, None]
+    return float(np.sqrt((left**2).sum() / (len(x) - len(powers)))), float(np.sqrt((unseen**2).sum(axis=1).mean()))
+
+
+def main() -> None:
+    """Print one line for each trial and degree."""
+    for label, rows in residuals(Path(sys.argv[1]) / "residuals.csv").items():
+        experiment = datasets.load(label.split("/")[0])
+        ids = np.array([marker for marker, r in rows.items() if np.isfinite(r).all()])
+        points = experiment.initial.aligned(ids)
+        whole = np.isfinite(points).all(axis=1)
+        residual = np.stack([rows[i] for i in ids])[whole]
+        for degree in DEGREES:
+            left, unseen = smoothed(points[whole], residual, degree)
+            print(f"{label:28s} degree {degree}: {left:.3f} mm left, {unseen:.3f} mm for markers not seen")
+
+
+if __name__ == "__main__":
+    main()
