@@ -38,7 +38,7 @@ from naibu.result_files import (
     write_identification,
     write_prediction,
 )
-from naibu.validation.baselines import affine, baselines
+from naibu.validation.baselines import affine, balanced, baselines
 
 __all__ = ["Identification", "compare", "identify", "load_experiment", "parse_known", "predict", "read_model", "report"]
 
@@ -89,9 +89,9 @@ def load_experiment(source: Source) -> Experiment:
     if name in datasets.names():
         return datasets.load(name)
     close = difflib.get_close_matches(name, datasets.names(), n=1)
-    hint = f"did you mean {close[0]!r}? " if close else ""
+    hint = f"Did you mean {close[0]!r}? " if close else ""
     raise InputError(
-        f"{name!r} is neither a folder with a {META_FILE} nor a bundled dataset; {hint}Bundled are {', '.join(datasets.names())}"
+        f"{name!r} is neither a folder with a {META_FILE} nor a bundled dataset. {hint}Bundled are {', '.join(datasets.names())}"
     )
 
 
@@ -270,6 +270,8 @@ def _compared(
     try:
         if not interrupted:
             compared = {t.label: _baselines(t, values[opening(t.specimen.experiment, t.state)]) for t in calibration.trials}
+            for label, distance in balanced(calibration).items():
+                compared[label]["force balance"] = distance
         if not interrupted and left_in_turn:
             found = leave_one_out(
                 left_in_turn, knowledge=calibration.knowledge, settings=calibration.settings, reference=calibration, callback=each

@@ -10,9 +10,11 @@ from scipy.spatial.transform import Rotation
 from naibu import datasets
 from naibu.core.errors import InputError
 from naibu.core.experiment import Layer
+from naibu.identification.calibration import Knowledge, calibrate
+from naibu.identification.prediction import rms
 from naibu.identification.specimen import ModelSettings, specimen
 from naibu.identification.trial import NoiseModel, Trial
-from naibu.validation.baselines import affine, baselines, report_parameters
+from naibu.validation.baselines import affine, balanced, baselines, report_parameters
 
 COARSE = ModelSettings(element_size_mm=12.0)
 
@@ -72,3 +74,17 @@ def test_what_has_no_baseline_is_said(cube: Trial) -> None:
     other = replace(experiment, layers=(Layer("jelly", 0.0, 30.0), experiment.layers[1]))
     with pytest.raises(InputError, match="jelly"):
         report_parameters(other)
+
+
+def test_force_balance_stands_between_no_model_and_the_match() -> None:
+    coarse = ModelSettings(element_size_mm=15.0)
+    found = calibrate([datasets.load("ct_two_material_2")], knowledge=Knowledge({"hardness 5": 222.0}), settings=coarse)
+    (distance,) = balanced(found).values()
+    rigid = baselines(found.trials[0], 43.5)["rigid"]
+    assert rms(found.match.fits[0].residual) < distance < 0.6 * rigid
+
+
+def test_one_material_has_no_balance(cube: Trial) -> None:
+    e = cube.specimen.experiment
+    found = calibrate([e], states={e.name: ["height_45"]}, settings=ModelSettings(element_size_mm=20.0))
+    assert balanced(found) == {}

@@ -152,8 +152,8 @@ def _relative(p: Parameter, model: CalibratedModel, experiment: Experiment, note
         body = subject.rpartition(" on ")[2]
         material = subject.rpartition(" on ")[0]
         same = (
-            [q for q in similar if q.name.startswith(f"{material} on ")]
-            or [q for q in similar if q.name.startswith(f"{body} on ") or f" on {body}:" in q.name]
+            [q for q in similar if f" on {body}:" in q.name]  # two gels on one table rub more alike than one gel on two bodies
+            or [q for q in similar if q.name.startswith(f"{material} on ")]
             or similar
         )
         default = START_FRICTION if model.settings.contact == "coulomb" else START_SPRING

@@ -17,6 +17,7 @@ from naibu.mechanics.supports import Prescribed
 
 Array = NDArray[np.float64]
 RELAXATION_ITERATIONS = 40
+DRIFT = 100.0  # extents of the body
 DRAG = 0.01  # stiffness of the drag at first, as a fraction of the mean diagonal of the tangent
 _COARSE = 0.01  # relative tolerance of linear solves far from equilibrium, for solvers that can make use of it
 
@@ -94,6 +95,7 @@ class Newton:
     settings: SolverSettings
     solver: LinearSolver | None = None
     iterations: int = 0
+    drifts: bool = False  # whether the last step would have thrown the body away: nothing holds it
 
     def residual(self, u: Array, anchors: tuple[Array, ...], load: float) -> tuple[Array, float, float]:
         """Return the out-of-balance force (n, 3) mN, a force scale mN, and the smallest det F."""
@@ -164,6 +166,7 @@ class Newton:
                     return u, norm / scale
                 self.iterations += 1
                 step = -solved(factorization, residual, self._forcing(norm, previous, scale))
+                self.drifts = float(np.abs(step).max()) > DRIFT * extent
                 found = self._line_search(u, step, anchors, load, residual)
                 struggles += found is None or found[1] < 0.15
                 if found is None or struggles > 2 or np.abs(step).max() > extent:

@@ -120,7 +120,7 @@ def solve(
             step = 0.5 * (load - last.load)
             ceiling = 1.6 * step
             if step < chosen.smallest_step:
-                return _finish(newton, states, residual, Status.STEP_TOO_SMALL, throw)
+                return _finish(newton, states, residual, Status.SINGULAR if newton.drifts else Status.STEP_TOO_SMALL, throw)
             continue
         residual = found[1]
         states.append(advanced(problem, found[0], last.anchors, load))

@@ -7,6 +7,9 @@ from numpy.typing import NDArray
 
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.experiment import Experiment
+from naibu.core.parameters import MAX_POISSON_RATIO
+from naibu.identification.calibration import Calibration
+from naibu.identification.force_balance import force_balance
 from naibu.identification.names import opening, poisson_ratio, young_modulus
 from naibu.identification.pose import registration
 from naibu.identification.prediction import rms
@@ -49,6 +52,34 @@ def baselines(trial: Trial, opening_mm: float) -> dict[str, float]:
         "affine": rms(measured - affine(free, measured)),
         "linear": rms(residual) if np.isfinite(residual := measured - _linear(trial, opening_mm)).any() else np.nan,
     }
+
+
+def balanced(calibration: Calibration) -> dict[str, float]:
+    """Return the root mean square distance (mm) of every trial with the moduli that force balance between the markers gives (spec I2, I3).
+
+    The boundary conditions, friction and the materials known beforehand are those of the calibration. Empty where force balance has no
+    answer (no lattice, one material); without the trials that cannot be solved with its moduli.
+    """
+    experiments = {t.specimen.experiment.name: t.specimen.experiment for t in calibration.trials}
+    states = {name: [t.state for t in calibration.trials if t.specimen.experiment.name == name] for name in experiments}
+    try:
+        found = force_balance(list(experiments.values()), calibration.knowledge, states)
+    except (InputError, np.linalg.LinAlgError):
+        return {}
+    values = calibration.match.parameters.values()
+    for name, (modulus, ratio) in found.items():
+        values[young_modulus(name)] = modulus
+        values[poisson_ratio(name)] = min(ratio, MAX_POISSON_RATIO - 1e-4)
+    out = {}
+    for trial in calibration.trials:
+        try:
+            displacement = solve(trial.specimen.problem(values, trial.state)).displacement
+        except ConvergenceError:
+            continue
+        body = trial.specimen.reshaped(values)
+        moved = body.marker_points + body.observation @ displacement
+        out[trial.label] = rms(trial.measured - registration(moved, trial.measured).applied(moved))
+    return out
 
 
 def affine(points: Array, measured: Array) -> Array:
