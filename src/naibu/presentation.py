@@ -65,10 +65,12 @@ def accuracy_table(calibration: Calibration, baselines: Mapping[str, Mapping[str
         compared = baselines.get(trial.label, {})
         extra = ([unseen.get(trial.label)] if unseen else []) + [compared.get(n) for n in names]
         rows.append((*_accuracy_row(trial.label, accuracy(trial.specimen, fit)), *(None if v is None else round(v, 3) for v in extra)))
-    columns = (*_ACCURACY_COLUMNS, *(["left out, 3-D mm"] if unseen else []), *(f"{n}, 3-D mm" for n in names))
+    columns = (*_ACCURACY_COLUMNS, *(["left out mm"] if unseen else []), *(f"{n} mm" for n in names))
     note = "Root mean square over markers measured completely in both states."
     if unseen:
         note += " Left out: the other experiments identified the parameters."
+    if names:
+        note += " What comes last are distances in 3-D that simple descriptions leave."
     return Table("Measured against predicted markers", columns, tuple(rows), note)
 
 
