@@ -192,6 +192,55 @@ def run_felupe(case: Case) -> Result:
     return Result(field[0].values.copy(), force[case.top].sum(axis=0), count)
 
 
+def run_ngsolve(case: Case) -> Result:
+    """NGSolve: its compiled energy, its assembly and its sparse Cholesky on all cores, iterated like the others."""
+    import netgen.meshing as netgen
+    import ngsolve as ng
+
+    grid = netgen.Mesh(dim=3)
+    grid.AddPoints(np.ascontiguousarray(case.mesh.points))
+    for region, name in enumerate(case.mesh.region_names):
+        grid.SetMaterial(region + 1, name)
+        grid.AddElements(dim=3, index=region + 1, data=case.mesh.cells[case.mesh.regions == region].astype(np.int32), base=0)
+    mesh = ng.Mesh(grid)
+    values = {name: int(np.flatnonzero(case.mesh.regions == region)[0]) for region, name in enumerate(case.mesh.region_names)}
+    mu = mesh.MaterialCF({name: case.shear[cell] for name, cell in values.items()})
+    lame = mesh.MaterialCF({name: case.lame[cell] for name, cell in values.items()})
+    space = ng.VectorH1(mesh, order=1)
+    gradient = ng.Id(3) + ng.Grad(space.TrialFunction())
+    volume = ng.Det(gradient)
+    energy = mu / 2 * (ng.InnerProduct(gradient, gradient) - 3) - mu * ng.log(volume) + lame / 2 * ng.log(volume) ** 2
+    form = ng.BilinearForm(space, symmetric=True)
+    form += ng.Variation(energy.Compile() * ng.dx)
+    support, count = prescribed(case), 0
+    held = support.held.T.ravel()  # unknowns stand component after component
+    free = ng.BitArray(space.ndof)
+    for dof, fixed in enumerate(held):
+        free[dof] = not fixed
+    u, r, jump = (ng.GridFunction(space).vec for _ in range(3))
+
+    def residual() -> Array:
+        form.Apply(u, r)
+        return np.asarray(r.FV().NumPy())
+
+    with ng.TaskManager():
+        for step in range(1, STEPS + 1):
+            target = step / STEPS * support.values.T.ravel()
+            jump.FV().NumPy()[:] = np.where(held, target - u.FV().NumPy(), 0.0)
+            force = residual()
+            for _ in range(20):
+                form.AssembleLinearization(u)
+                r.data += form.mat * jump
+                u.data += jump - form.mat.Inverse(free, inverse="sparsecholesky") * r
+                jump[:] = 0.0
+                count += 1
+                force = residual()
+                if np.abs(force[~held]).sum() <= TOLERANCE * np.abs(force[held]).sum():
+                    break
+    displacement = np.array(u.FV().NumPy()).reshape(3, -1).T
+    return Result(displacement, np.array(force).reshape(3, -1).T[case.top].sum(axis=0), count)
+
+
 PEERS: dict[str, tuple[str, Callable[[Case], Result]]] = {
     "naibu": ("naibu, 5 steps", run_naibu),
     "naibu-adaptive": ("naibu, default steps", lambda case: run_naibu(case, load_steps=None)),
@@ -199,6 +248,7 @@ PEERS: dict[str, tuple[str, Callable[[Case], Result]]] = {
     "naibu-direct": ("naibu, 5 steps, Cholesky at each iteration", lambda case: run_naibu(case, solver="direct")),
     "naibu-multigrid": ("naibu, 5 steps, multigrid", lambda case: run_naibu(case, solver="multigrid")),
     "felupe": ("FElupe, 5 steps, same Cholesky", run_felupe),
+    "ngsolve": ("NGSolve, 5 steps, its sparse Cholesky", run_ngsolve),
     "scikit-fem": ("scikit-fem, 5 steps, same Cholesky", run_scikit_fem),
     "scikit-fem-superlu": ("scikit-fem, 5 steps, SuperLU", lambda case: run_scikit_fem(case, "superlu")),
 }
@@ -242,7 +292,7 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=20, help="cells along an edge; 20 gives 27 783 unknowns")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument(
-        "--peers", default="naibu,naibu-adaptive,naibu-once,naibu-direct,felupe,scikit-fem", help=f"among {', '.join(PEERS)}"
+        "--peers", default="naibu,naibu-adaptive,naibu-once,naibu-direct,felupe,ngsolve,scikit-fem", help=f"among {', '.join(PEERS)}"
     )
     parser.add_argument("--json", type=Path, help="also write the table to this file")
     parser.add_argument("--one", nargs=2, metavar=("PEER", "FILE"), help=argparse.SUPPRESS)
