@@ -56,6 +56,14 @@ def test_a_failed_candidate_is_a_row_that_says_so(gels: list[Experiment], monkey
     assert np.isnan([row.noise_factor, row.chi_squared, row.bic, row.left_out_mm]).all()
 
 
+def test_an_interrupted_candidate_is_no_row(gels: list[Experiment]) -> None:
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        compare_models(gels[:1], [COARSE], knowledge=KNOWN, noise=NoiseModel(0.05), search=QUICK, callback=stopped)
+
+
 def test_a_failure_with_an_experiment_left_out_keeps_the_rest_of_the_row(gels: list[Experiment], monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(*_: object, **__: object) -> list[LeftOut]:
         raise ConvergenceError("no equilibrium")

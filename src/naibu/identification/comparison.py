@@ -195,6 +195,8 @@ def compare_models(
     ------
     InputError
         Experiments that cannot be used.
+    KeyboardInterrupt
+        The user stopped one of the calibrations.
     """
     rows = []
     for settings in candidates:
@@ -206,6 +208,8 @@ def compare_models(
         except ConvergenceError as error:
             rows.append(ModelRow(settings, np.nan, np.nan, 0, np.nan, np.nan, str(error)))
             continue
+        if found.match.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
         left_out, problem = np.nan, "" if found.match.status.ok else found.match.status.value
         if len(experiments) > 1:
             try:
