@@ -92,6 +92,16 @@ def test_compare_keeps_what_it_has_found(naibu: Run, press: Press, monkeypatch: 
     assert naibu("compare", press.folder, *COARSE, *models)[1] == out
 
 
+@pytest.mark.parametrize("content", ["{", '{"a": 1}', "[1]"])
+def test_a_damaged_comparison_is_kept(naibu: Run, press: Press, content: str) -> None:
+    Path("compared").mkdir()
+    file = Path("compared/comparison.json")
+    file.write_text(content, encoding="utf-8")
+    code, _, message = naibu("compare", press.folder, *COARSE, "--out", "compared")
+    assert code == cli.BAD_INPUT and "comparison.json" in message and "delete it" in message
+    assert file.read_text(encoding="utf-8") == content
+
+
 def test_help_and_version_answer(naibu: Run) -> None:
     for verb in ("demo", "identify", "predict", "report", "import", "doctor"):
         code, out, _ = naibu(verb, "--help")

@@ -99,7 +99,7 @@ def write_checkpoint(folder: Path, provenance: Mapping[str, Any], values: Mappin
 def read_comparison(folder: Path, provenance: Mapping[str, Any]) -> ModelRow | None:
     """Return what a folder holds of a candidate model with the same inputs and settings, if there is anything."""
     for entry in _compared(folder):
-        if entry.get("provenance") == json.loads(json.dumps(provenance)):
+        if entry["provenance"] == json.loads(json.dumps(provenance)):
             figures: dict[str, Any] = {name: math.nan if value is None else value for name, value in entry["result"].items()}
             return ModelRow(ModelSettings(**entry["provenance"]["settings"]), **figures)
     return None
@@ -113,11 +113,17 @@ def write_comparison(folder: Path, provenance: Mapping[str, Any], row: ModelRow)
 
 
 def _compared(folder: Path) -> list[dict[str, Any]]:
-    try:
-        data = json.loads((folder / COMPARISON_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    """Entries of the folder's comparison, none where there is no file."""
+    file = folder / COMPARISON_FILE
+    if not file.exists():
         return []
-    return [entry for entry in data if isinstance(entry, dict)] if isinstance(data, list) else []
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{file} cannot be read ({error}); delete it, or choose another folder with --out") from error
+    if not isinstance(data, list) or not all(isinstance(entry, dict) and {"provenance", "result"} <= entry.keys() for entry in data):
+        raise InputError(f"{file} is not a comparison of models; delete it, or choose another folder with --out")
+    return data
 
 
 def write_identification(

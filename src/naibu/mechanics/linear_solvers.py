@@ -13,6 +13,7 @@ import ctypes
 import functools
 import os
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
@@ -186,7 +187,7 @@ class SuperLUSolver:
             raise ConvergenceError(f"the linear system is singular ({error}): is every body held against rigid motion?") from error
 
 
-class RecyclingSolver:
+class RecyclingSolver(ABC):
     """Conjugate gradients with a preconditioner that is kept from an earlier matrix for as long as that is cheaper than a new one.
 
     Parameters
@@ -210,9 +211,9 @@ class RecyclingSolver:
         self._rebuild = True
         self._exact: LinearSolver | None = None
 
+    @abstractmethod
     def preconditioner(self, matrix: sp.bsr_matrix) -> Callable[[Array], Array]:
         """Return a map from residuals (n, r) to corrections made for `matrix`."""
-        raise NotImplementedError
 
     def factorize(self, matrix: sp.bsr_matrix) -> Factorization:
         """Prepare for `matrix`, keeping what was made for an earlier one while it still serves."""
