@@ -106,7 +106,7 @@ class Newton:
         for c, a in zip(self.problem.contacts, anchors, strict=True):
             response = c.evaluate(u, a, load)
             contact += c.scattered(response.force, len(u), response.orientation)
-        return self._balance(internal, contact)[0], self._balance(internal, contact)[1], smallest
+        return *self._balance(internal, contact), smallest
 
     def _balance(self, internal: Array, contact: Array) -> tuple[Array, float]:
         r = internal - contact - self.problem.external_force
@@ -160,12 +160,12 @@ class Newton:
         try:
             u = self._carried(u, anchors, load)
             for _ in range(self.settings.max_iterations):
-                residual, scale, factorization, _ = self.linearised(u, anchors, load)
+                residual, scale, matrix, _ = self._tangent(u, anchors, load)
                 norm = float(np.abs(residual).sum())
                 if norm <= self.settings.tolerance * scale:
                     return u, norm / scale
                 self.iterations += 1
-                step = -solved(factorization, residual, self._forcing(norm, previous, scale))
+                step = -solved(self._factorized(matrix), residual, self._forcing(norm, previous, scale))
                 self.drifts = float(np.abs(step).max()) > DRIFT * extent
                 found = self._line_search(u, step, anchors, load, residual)
                 struggles += found is None or found[1] < 0.15
