@@ -10,21 +10,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from naibu.core.errors import InputError
 
-NODES_PER_CELL = {"tetra": 4, "tetra10": 10, "hexahedron": 8}
+NODES_PER_CELL = {"line": 2, "triangle": 3, "tetra": 4, "tetra10": 10, "hexahedron": 8}
+DIMENSION = {"line": 1, "triangle": 2, "tetra": 3, "tetra10": 3, "hexahedron": 3}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
-    """Points and cells in three dimensions.
+    """Points and cells: solids in three dimensions, triangles in the plane, or lines on an axis.
 
     Attributes
     ----------
-    points : ndarray, shape (n, 3), float64
-        Node positions, mm.
+    points : ndarray, shape (n, d), float64
+        Node positions, mm; d is the dimension of the cells.
     cells : ndarray, shape (m, k), int64
         Node numbers of every cell, in VTK order (a positively oriented cell has a positive Jacobian).
     cell_type : str
-        ``"tetra"`` (k = 4), ``"tetra10"`` (k = 10) or ``"hexahedron"`` (k = 8).
+        ``"tetra"`` (k = 4), ``"tetra10"`` (k = 10) or ``"hexahedron"`` (k = 8) with d = 3; ``"triangle"`` (k = 3, d = 2); ``"line"``
+        (k = 2, d = 1).
     regions : ndarray, shape (m,), int64
         Index into `region_names` for every cell.
     region_names : tuple of str
@@ -58,8 +60,9 @@ class Mesh:
         c = np.ascontiguousarray(cells, dtype=np.int64)
         if cell_type not in NODES_PER_CELL:
             raise InputError(f"cell type {cell_type!r} is not known; use one of {sorted(NODES_PER_CELL)}")
-        if p.ndim != 2 or p.shape[1] != 3:
-            raise InputError(f"mesh points must have shape (n, 3), not {p.shape}")
+        dimension = DIMENSION[cell_type]
+        if p.ndim != 2 or p.shape[1] != dimension:
+            raise InputError(f"points of a mesh of {cell_type} cells must have shape (n, {dimension}), not {p.shape}")
         if c.ndim != 2 or c.shape[1] != NODES_PER_CELL[cell_type] or len(c) == 0:
             raise InputError(f"{cell_type} cells must have shape (m, {NODES_PER_CELL[cell_type]}) with m > 0, not {c.shape}")
         if not np.isfinite(p).all():
@@ -80,12 +83,17 @@ class Mesh:
         return len(self.points)
 
     @property
+    def dimension(self) -> int:
+        """Number of coordinates of a point."""
+        return int(self.points.shape[1])
+
+    @property
     def n_cells(self) -> int:
         """Number of cells."""
         return len(self.cells)
 
     def moved(self, displacement: NDArray[np.float64]) -> Mesh:
-        """Return the mesh with every node moved by `displacement` (n, 3), mm."""
+        """Return the mesh with every node moved by `displacement` (n, d), mm."""
         if displacement.shape != self.points.shape:
             raise InputError(f"displacement must have shape {self.points.shape}, not {displacement.shape}")
         return replace(self, points=self.points + displacement)

@@ -21,7 +21,7 @@ LARGE = 4000  # groups from which the threads' hand-over costs less than it save
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockPattern:
-    """Sparsity of a matrix of 3 x 3 blocks, one row of blocks a node.
+    """Sparsity of a matrix of d x d blocks, one row of blocks a node.
 
     Attributes
     ----------
@@ -43,8 +43,8 @@ class BlockPattern:
         return len(self.indices)
 
     def matrix(self, blocks: NDArray[np.float64]) -> sp.bsr_matrix:
-        """Return the matrix whose blocks are `blocks` (n_blocks, 3, 3)."""
-        n = 3 * self.n_points
+        """Return the matrix whose blocks are `blocks` (n_blocks, d, d)."""
+        n = blocks.shape[1] * self.n_points
         return sp.bsr_matrix((blocks, self.indices, self.indptr), shape=(n, n))
 
     def positions(self, connectivity: NDArray[np.int64]) -> NDArray[np.int32]:

@@ -281,17 +281,18 @@ def constrained(matrix: sp.bsr_matrix, held: NDArray[np.bool_], anchor_stiffness
 
 @njit(cache=True)
 def _constrain(indptr, indices, blocks, held, anchor_stiffness):  # type: ignore[no-untyped-def]  # pragma: no cover
-    n = len(held)
+    n, d = held.shape
     mean = 0.0
     for i in range(n):
         for at in range(indptr[i], indptr[i + 1]):
             if indices[at] == i:
-                mean += (blocks[at, 0, 0] + blocks[at, 1, 1] + blocks[at, 2, 2]) / (3.0 * n)
+                for a in range(d):
+                    mean += blocks[at, a, a] / (d * n)
     for i in range(n):
         for at in range(indptr[i], indptr[i + 1]):
             j = indices[at]
-            for a in range(3):
-                for b in range(3):
+            for a in range(d):
+                for b in range(d):
                     if held[i, a] or held[j, b]:
                         blocks[at, a, b] = mean if (i == j and a == b) else 0.0
                     elif i == j and a == b:

@@ -20,9 +20,9 @@ class Prescribed:
 
     Attributes
     ----------
-    held : ndarray, shape (n, 3), bool
+    held : ndarray, shape (n, d), bool
         Which components are prescribed.
-    values : ndarray, shape (n, 3)
+    values : ndarray, shape (n, d)
         Their values at full load, mm.
     """
 
@@ -30,12 +30,12 @@ class Prescribed:
     values: Array
 
     @classmethod
-    def nothing(cls, n_points: int) -> Prescribed:
+    def nothing(cls, n_points: int, dimension: int = 3) -> Prescribed:
         """Return a support that holds nothing."""
-        return cls(np.zeros((n_points, 3), dtype=bool), np.zeros((n_points, 3)))
+        return cls(np.zeros((n_points, dimension), dtype=bool), np.zeros((n_points, dimension)))
 
-    def and_also(self, nodes: ArrayLike, values: ArrayLike, components: tuple[bool, bool, bool] = (True, True, True)) -> Prescribed:
-        """Return the support with the `components` of `nodes` prescribed to `values` (3,) or (len(nodes), 3), mm, as well.
+    def and_also(self, nodes: ArrayLike, values: ArrayLike, components: tuple[bool, ...] | None = None) -> Prescribed:
+        """Return the support with the `components` (all by default) of `nodes` prescribed to `values` (d,) or (len(nodes), d), mm, as well.
 
         Raises
         ------
@@ -43,13 +43,13 @@ class Prescribed:
             A node number outside the mesh, or a value that is not finite.
         """
         index = np.asarray(nodes, dtype=np.int64)
-        given = np.broadcast_to(np.asarray(values, dtype=float), (len(index), 3))
+        given = np.broadcast_to(np.asarray(values, dtype=float), (len(index), self.held.shape[1]))
         if len(index) and (index.min() < 0 or index.max() >= len(self.held)):
             raise InputError(f"prescribed node {index.max()} does not exist; the mesh has nodes 0 to {len(self.held) - 1}")
         if not np.isfinite(given).all():
             raise InputError("prescribed displacements must be finite numbers; leave a component free instead of giving NaN")
         held, all_values = self.held.copy(), self.values.copy()
-        for axis in np.flatnonzero(components):
+        for axis in range(self.held.shape[1]) if components is None else np.flatnonzero(components):
             held[index, axis] = True
             all_values[index, axis] = given[:, axis]
         return Prescribed(held, all_values)
