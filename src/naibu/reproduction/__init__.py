@@ -1,0 +1,1 @@
+"""The report's tables and figures, one module a chapter, each beside ours."""
