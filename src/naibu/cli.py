@@ -41,6 +41,7 @@ BAD_INPUT, NO_SOLUTION, INTERRUPTED = 2, 3, 130
 DEMO = ("ct_two_material_1", "ct_two_material_2", "ct_two_material_3")
 DEMO_KNOWN = "hardness 5=222 kPa"  # mean of the report's compression tests, Table 3.4
 ContactModel = Literal["coulomb", "stick", "springs"]
+PixelScale = Literal["given", "sought"]
 Joined = Literal["glued", "sliding"]
 Law = Literal["neo_hookean", "neo_hookean_isochoric", "mooney_rivlin", "yeoh", "saint_venant_kirchhoff"]
 
@@ -68,6 +69,7 @@ def identify(
     law: Law = "neo_hookean",
     contact: ContactModel = "coulomb",
     joined: Joined = "glued",
+    pixel_scale: PixelScale = "given",
     element_size_mm: float = 0.0,
     cross_validate: bool = False,
     resume: bool = True,
@@ -90,6 +92,8 @@ def identify(
         What plates and table do to the surface sideways: rub (coulomb), hold it (stick), or hold it by springs.
     joined
         Whether blocks that were cast apart are glued or may slide.
+    pixel_scale
+        Whether the size of a pixel along x and y is that of the file (given) or an unknown of every experiment (sought).
     element_size_mm
         Edge of the elements; 0 chooses.
     cross_validate
@@ -99,7 +103,7 @@ def identify(
     """
     from naibu.identification.specimen import ModelSettings
 
-    settings = ModelSettings(law=law, contact=contact, joined=joined, element_size_mm=element_size_mm)
+    settings = ModelSettings(law=law, contact=contact, joined=joined, element_size_mm=element_size_mm, pixel_scale=pixel_scale)
     states = _states(experiments, state or [])
     _identify(experiments, known=known or (), states=states, settings=settings, out=out, cross_validate=cross_validate, resume=resume)
 

@@ -153,7 +153,8 @@ def _box(specimen: Specimen, position: Array, normal: Array) -> Box:
 
 def trial_scene(trial: Trial, fit: TrialFit, values: Mapping[str, float], role: str = "fitted") -> Scene:
     """Return a fitted trial for the 3-D view."""
-    return scene(trial.specimen, trial.state, fit, fit.pose.undone(trial.measured), values, role)
+    measured = fit.pose.undone(trial.measured * trial.specimen.enlargement(values))
+    return scene(trial.specimen, trial.state, fit, measured, values, role)
 
 
 def prediction_scene(prediction: Prediction, role: str = "predicted unseen") -> Scene:

@@ -14,7 +14,7 @@ from naibu.identification import displacement_matching, trial
 from naibu.identification.calibration import Knowledge, calibrate, initial_parameters
 from naibu.identification.displacement_matching import Matcher
 from naibu.identification.model import CalibratedModel
-from naibu.identification.names import base_offset, batch_stiffness, friction, poisson_ratio, straight_base, young_modulus
+from naibu.identification.names import base_offset, batch_stiffness, friction, pixel_scale, poisson_ratio, straight_base, young_modulus
 from naibu.identification.prediction import predict, rms
 from naibu.identification.specimen import ModelSettings, specimen
 from naibu.identification.trial import Nearby, NoiseModel, Trial
@@ -42,11 +42,11 @@ def test_derivatives_of_predicted_markers(
     monkeypatch.setattr(displacement_matching, "_PATH", SolverSettings(first_step=0.1, largest_step=0.1, tolerance=1e-11))
     monkeypatch.setattr(trial, "HINT_SPACING", 0.0)  # all on the same path
     experiment = datasets.load(name)
-    body = specimen(experiment, ModelSettings(element_size_mm=size, law=law))
+    body = specimen(experiment, ModelSettings(element_size_mm=size, law=law, pixel_scale="sought"))
     known = KNOWN if "hardness 5" in experiment.materials else Knowledge()
     parameters = initial_parameters([body], {name: [state]}, known)
     matcher = Matcher([Trial.of(body, state, NoiseModel())], parameters)
-    values = parameters.values() | {base_offset(experiment): 0.3}
+    values = parameters.values() | {base_offset(experiment): 0.3, pixel_scale(experiment): 1.01}
     values |= dict.fromkeys(body.shift_names, 0.4)
     if body.has_unknown_base:
         values[straight_base(experiment)] = 15.0
@@ -58,8 +58,24 @@ def test_derivatives_of_predicted_markers(
         difference = (ends[0] - ends[1]) / (2.0 * h)
         error = np.abs(difference - fit.jacobian[:, :, k])
         # markers that move against the mesh see a gradient averaged over a part of an element, which jumps at its faces
-        worst = np.median(error) if "base" in p.name else error.max()
-        assert worst <= (2e-3 if "base" in p.name else tolerance) * max(np.abs(difference).max(), 1e-3), p.name
+        across = "base" in p.name or "pixel" in p.name
+        worst = np.median(error) if across else error.max()
+        assert worst <= (2e-3 if across else tolerance) * max(np.abs(difference).max(), 1e-3), p.name
+
+
+def test_pixels_of_another_size_are_the_same_object() -> None:
+    """Coordinates printed 2 % too small, with the scale that mends them, are explained by the same body in the same way."""
+    experiment = datasets.load("ct_cube_plate")
+    shrink = np.array([1.02, 1.02, 1.0])
+    states = tuple(replace(s, markers=replace(s.markers, points=s.markers.points / shrink)) if s.markers else s for s in experiment.states)
+    fits = []
+    for scan, scale in ((experiment, experiment.xy_scale), (replace(experiment, states=states), 1.02 * experiment.xy_scale)):
+        body = specimen(scan, ModelSettings(element_size_mm=20.0, pixel_scale="sought"))
+        parameters = initial_parameters([body], {scan.name: ["height_45"]}, Knowledge())
+        matcher = Matcher([Trial.of(body, "height_45", NoiseModel())], parameters)
+        fits.append(matcher.evaluate(parameters.values() | {pixel_scale(scan): scale})[0])
+    np.testing.assert_allclose(fits[1].predicted * shrink, fits[0].predicted, atol=1e-4)
+    np.testing.assert_allclose(fits[1].residual * shrink, fits[0].residual, atol=1e-4)
 
 
 def test_the_known_materials_batch_is_the_reference() -> None:

@@ -19,6 +19,7 @@ from naibu.identification.names import (
     friction,
     joint_friction,
     opening,
+    pixel_scale,
     poisson_ratio,
     shape_parameter,
     straight_base,
@@ -31,6 +32,7 @@ REFERENCE_MODULUS_KPA = 200.0  # of the known region when only ratios are sought
 START_POISSON_RATIO = 0.49
 START_FRICTION = 0.2
 START_SPRING = 30.0  # kPa/mm
+PIXEL_SCALE_SD = 0.005  # a size printed with two digits, 0.29 mm for 0.293
 BATCH_SD = 0.3  # of ln(stiffness) between batches: the report's samples of one gel scatter by 0.2 (Table 3.4)
 TRUSTED_RATIO = (0.05, 20.0)  # of an unknown modulus to the known ones; force balance is not believed beyond
 
@@ -163,6 +165,8 @@ def initial_parameters(specimens: Sequence[Specimen], states: Mapping[str, Seque
                 found[p.name] = p
         offset = base_offset(s.experiment)
         found.setdefault(offset, Parameter(offset, 0.0, "mm", prior_sd=0.5))
+        if s.settings.pixel_scale == "sought":
+            found.setdefault(name := pixel_scale(s.experiment), Parameter(name, s.experiment.xy_scale, "", prior_sd=PIXEL_SCALE_SD))
         if s.has_unknown_base:
             below = straight_base(s.experiment)
             found.setdefault(below, Parameter(below, 0.1 * s.experiment.height_mm, "mm", prior_sd=0.4 * s.experiment.height_mm))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.core.solution import Status
-from naibu.identification.names import base_offset, straight_base
+from naibu.identification.names import pixel_scale
 from naibu.identification.pose import Pose, registration
 from naibu.identification.specimen import Specimen
 from naibu.identification.trial import Nearby, Trial, TrialFit
@@ -176,9 +176,11 @@ class Matcher:
         u = specimen.observation @ solution.displacement
         gradient = specimen.deformation_gradient(solution.displacement)
         moved = specimen.marker_points + u
+        enlargement = specimen.enlargement(values)
         if pose is None:
-            pose = _first_pose(specimen, moved, trial.measured)
-        predicted = pose.applied(moved)
+            pose = _first_pose(specimen, moved, trial.measured * enlargement)
+        placed = pose.applied(moved)
+        predicted = placed / enlargement  # residuals stay in the file's millimetres: a smaller scale must not make them smaller
         turned = np.einsum("ij,kjl->kil", pose.rotation, gradient)
         rotated = specimen.placement.rotation.T  # noise of the free scan, turned into the object's frame
         both = np.einsum("kij,jl->kil", turned, rotated)
@@ -187,16 +189,21 @@ class Matcher:
         n_free = du.shape[2]
         at_markers = np.stack([specimen.observation @ du[:, i, :] for i in range(3)], axis=1) if n_free else np.zeros((len(u), 3, 0))
         for k, parameter in enumerate(self.parameters.free):
-            if parameter.name in (base_offset(specimen.experiment), straight_base(specimen.experiment)):
-                at_markers[:, :, k] += gradient[:, :, 2]
+            if (motion := trial.specimen.marker_motion(parameter.name, values)) is not None:
+                at_markers[:, :, k] += np.einsum("kij,kj->ki", gradient, motion)
             if (shift := trial.specimen.shift(parameter.name, values)) is not None:  # the nodes move past the markers, which stay
                 at_markers[:, :, k] -= np.einsum("kij,kj->ki", gradient - np.eye(3), specimen.observation @ shift)
         jacobian = np.einsum("ij,kjp->kip", pose.rotation, at_markers)
-        arm = predicted - pose.position
+        for k, parameter in enumerate(self.parameters.free):
+            if parameter.name == pixel_scale(specimen.experiment):
+                jacobian[:, :2, k] -= placed[:, :2] / values[parameter.name]
+        jacobian /= enlargement[:, None]
+        arm = placed - pose.position
         pose_jacobian = np.zeros((len(u), 3, 6))
         pose_jacobian[:, :, :3] = np.eye(3)
         for axis in range(3):
             pose_jacobian[:, :, 3 + axis] = np.cross(np.eye(3)[axis], arm)
+        pose_jacobian /= enlargement[:, None]
         return TrialFit(solution, pose, predicted, trial.measured - predicted, sd, jacobian, pose_jacobian, path)
 
     def normal_equations(self, fits: Sequence[TrialFit], inner: Array) -> NormalEquations:

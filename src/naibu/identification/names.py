@@ -44,6 +44,11 @@ def base_offset(experiment: Experiment) -> str:
     return f"{experiment.name}: base_offset"
 
 
+def pixel_scale(experiment: Experiment) -> str:
+    """Name of the true mm along x and y for a printed mm."""
+    return f"{experiment.name}: pixel_scale"
+
+
 def layer_shift(experiment: Experiment, height: float) -> str:
     """Name of the height by which the boundary between layers lies above its nominal `height`, mm."""
     return f"{experiment.name}: shift_of_layer_at_{height:g}"

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, Layer
@@ -24,22 +24,23 @@ from naibu.identification.names import (
     joint_friction,
     layer_shift,
     opening,
+    pixel_scale,
     poisson_ratio,
     shape_parameter,
     straight_base,
     young_modulus,
 )
 from naibu.identification.placement import Placement, placement
+from naibu.identification.touching_bodies import material_of, rigid_bodies, sliding_joints
 from naibu.mechanics.assembly import Assembler, block_pattern, body_force
-from naibu.mechanics.contact import STICK, Contact, RigidSurface, bar, plane
+from naibu.mechanics.contact import STICK, Contact
 from naibu.mechanics.elements import elements
 from naibu.mechanics.materials import Law, from_moduli, law_named, parameter_vector
 from naibu.mechanics.newton import Problem
 from naibu.mechanics.sensitivities import Direction
-from naibu.mechanics.supports import Friction, Prescribed, interface, rigid_contact
-from naibu.meshing.interfaces import split_at_plane
+from naibu.mechanics.supports import Prescribed
 from naibu.meshing.location import interpolation_operator
-from naibu.meshing.surface import boundary_faces, faces_among, node_areas
+from naibu.meshing.surface import boundary_faces
 
 Array = NDArray[np.float64]
 ContactModel = Literal["coulomb", "stick", "springs"]
@@ -65,6 +66,8 @@ class ModelSettings:
         Contact penalty, kPa/mm.
     density : float
         kg/mm3; weight is applied where an object is not pressed onto its base.
+    pixel_scale : {"given", "sought"}
+        Whether the true size of a pixel along x and y is that of the file, or an unknown of every experiment.
     """
 
     law: str = "neo_hookean"
@@ -74,6 +77,7 @@ class ModelSettings:
     normal_stiffness: float = 5e3
     tangential_stiffness: float = 200.0
     density: float = 1e-6
+    pixel_scale: Literal["given", "sought"] = "given"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,6 +161,19 @@ class Specimen:
         out[:, 2] = np.interp(self._rest_points[:, 2], heights[at - 1 : at + 2], [0.0, 1.0, 0.0])
         return out
 
+    def enlargement(self, values: Mapping[str, float]) -> Array:
+        """Return by what (3,) printed coordinates are larger in truth than the file's scale makes them."""
+        r = values.get(pixel_scale(self.experiment), self.experiment.xy_scale) / self.experiment.xy_scale
+        return np.array([r, r, 1.0])
+
+    def marker_motion(self, name: str, values: Mapping[str, float]) -> Array | None:
+        """Return how the markers' places (k, 3) in the free object move with a parameter; None for other parameters."""
+        if name in (base_offset(self.experiment), straight_base(self.experiment)):
+            return np.tile([0.0, 0.0, 1.0], (len(self.marker_points), 1))
+        if name == pixel_scale(self.experiment):  # the centre of the lattice stays the centre of the object
+            return np.asarray(self.marker_points * np.array([1.0, 1.0, 0.0]) / self.experiment.xy_scale)
+        return None
+
     def reshaped(self, values: Mapping[str, float]) -> Specimen:
         """Return the specimen with its layers' boundaries, its base and its markers where `values` put them."""
         below = values.get(straight_base(self.experiment), 0.0) if self.has_unknown_base else 0.0
@@ -168,10 +185,11 @@ class Specimen:
         )
         for name in self.shift_names:
             shift += values.get(name, 0.0) * np.asarray(self.shift(name, values))
-        if offset == 0.0 and not shift.any():
+        enlargement = self.enlargement(values)
+        if offset == 0.0 and not shift.any() and enlargement[0] == 1.0:
             return self
         mesh = self.mesh.moved(shift)
-        points = self.marker_points + np.array([0.0, 0.0, offset])
+        points = self.marker_points * enlargement + np.array([0.0, 0.0, offset])
         contacts = tuple(
             c if c.name.startswith("joint") else replace(c, rest=np.einsum("pk,pki->pi", c.shape, mesh.points[c.nodes]))
             for c in self._contacts
@@ -331,25 +349,11 @@ def specimen(experiment: Experiment, settings: ModelSettings | None = None) -> S
     _require_supported(experiment)
     place = placement(experiment)
     mesh = model_mesh(experiment, chosen.element_size_mm)
-    joints: list[Contact] = []
-    for height in experiment.joined_at_mm:
-        if chosen.joined == "sliding":
-            area = node_areas(mesh, _plane_faces(mesh, height))
-            mesh, split = split_at_plane(mesh, height)
-            joints.append(
-                interface(
-                    f"joint at {height:g} mm",
-                    mesh.points,
-                    split,
-                    area[split[:, 0]],
-                    friction=Friction(0.3),
-                    normal_stiffness=chosen.normal_stiffness,
-                )
-            )
+    mesh, joints = sliding_joints(experiment, mesh, chosen.normal_stiffness) if chosen.joined == "sliding" else (mesh, [])
     boundary = boundary_faces(mesh)
-    bodies = _bodies(experiment, chosen, mesh, boundary.faces)
+    bodies = rigid_bodies(experiment, mesh, boundary.faces, chosen.normal_stiffness, chosen.tangential_stiffness)
     material = {layer.region: layer.material for layer in experiment.layers}
-    pairs = [tuple(friction(material[m], _body(c)) for m in mesh.region_names) for c in bodies]
+    pairs = [tuple(friction(material[m], material_of(c)) for m in mesh.region_names) for c in bodies]
     pair_of_points = [np.repeat(mesh.regions[boundary.cells], len(c.area) // len(boundary.cells)) for c in bodies]
     pairs += [(joint_friction(experiment, float(height)),) for height in experiment.joined_at_mm[: len(joints)]]
     pair_of_points += [np.zeros(len(c.area), dtype=np.int64) for c in joints]
@@ -396,45 +400,6 @@ def _require_supported(experiment: Experiment) -> None:
 
 def _difference_step(settings: ModelSettings, experiment: Experiment) -> float:
     return 0.1 * element_size(experiment, settings.element_size_mm)
-
-
-def _plane_faces(mesh: Mesh, height: float) -> NDArray[np.int64]:
-    """Faces of the cells below a horizontal plane that lie on it."""
-    below = mesh.points[mesh.cells][:, :, 2].max(axis=1) <= height + 1e-6
-    lower = Mesh(mesh.points, mesh.cells[below], mesh.cell_type, mesh.regions[below], mesh.region_names)
-    return faces_among(lower, np.flatnonzero(np.abs(mesh.points[:, 2] - height) < 1e-6))
-
-
-def _bodies(experiment: Experiment, settings: ModelSettings, mesh: Mesh, faces: NDArray[np.int64]) -> list[Contact]:
-    """The table and the indenters; an indenter starts where it touches the free object."""
-    stick = Friction(STICK, settings.tangential_stiffness)
-    loading, size = experiment.loading, experiment.shape.size_mm
-
-    def body(name: str, surface: RigidSurface, start: ArrayLike) -> Contact:
-        return rigid_contact(
-            name, mesh.points, faces, surface, start=start, stop=start, friction=stick, normal_stiffness=settings.normal_stiffness
-        )
-
-    # where only its weight holds the object down, it starts pressed into the table by a hair, for the contact to have a stiffness
-    ground = 1e-4 if loading.kind == "side_plates" else 0.0
-    bodies = [body(f"base of {loading.base_material}", plane((0.0, 0.0, 1.0)), (0.0, 0.0, ground))]
-    counter = loading.counter_material
-    if loading.kind == "side_plates":
-        axis = "xyz".index(loading.bar_axis)
-        for sign, side in ((-1.0, "low"), (1.0, "high")):
-            inward = (-sign, 0.0, 0.0) if axis == 0 else (0.0, -sign, 0.0)
-            bodies.append(body(f"indenter ({side} side) of {counter}", plane(inward), -0.5 * size[axis] * np.array(inward)))
-    elif loading.kind == "bar":
-        surface = bar(loading.bar_axis, loading.bar_width_mm or 0.0)
-        bodies.append(body(f"indenter of {counter}", surface, (0.0, 0.0, size[2])))
-    else:
-        bodies.append(body(f"indenter of {counter}", plane((0.0, 0.0, -1.0)), (0.0, 0.0, size[2])))
-    return bodies
-
-
-def _body(contact: Contact) -> str:
-    """Material of a rigid body, from its name."""
-    return contact.name.rpartition(" of ")[2]
 
 
 def _moduli(layer: Layer, values: Mapping[str, float]) -> tuple[float, float]:
