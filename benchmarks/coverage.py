@@ -11,30 +11,21 @@ import time
 
 import numpy as np
 
-from naibu.core.experiment import Loading
 from naibu.identification.calibration import Knowledge, calibrate
 from naibu.identification.model import CalibratedModel
-from naibu.identification.names import friction, poisson_ratio, young_modulus
+from naibu.identification.names import poisson_ratio, young_modulus
 from naibu.identification.specimen import ModelSettings
 from naibu.identification.trial import NoiseModel
-from naibu.validation.phantoms import Scanner, box_experiment, virtual_specimen
+from naibu.validation.phantoms import Scanner, two_gels, virtual_specimen
 
 NOISE_MM = 0.15
-TRUTH = {
-    young_modulus("soft"): 90.0,
-    young_modulus("stiff"): 222.0,
-    poisson_ratio("soft"): 0.48,
-    poisson_ratio("stiff"): 0.47,
-    friction("soft", "table"): 0.45,
-    friction("stiff", "acrylic"): 0.25,
-}
 
 
 def main() -> None:
     """Identify every draw and print the summary."""
     draws = int(sys.argv[1]) if len(sys.argv) > 1 else 20
-    template = box_experiment("virtual", (60.0, 60.0, 60.0), [("soft", 30.0), ("stiff", 30.0)], Loading("plate"), {"pressed": 44.0})
-    virtual = virtual_specimen(template, TRUTH, settings=ModelSettings(element_size_mm=6.0))
+    template, truth = two_gels(44.0)
+    virtual = virtual_specimen(template, truth, settings=ModelSettings(element_size_mm=6.0))
     inside, ratio, nu, start = [], [], [], time.perf_counter()
     for seed in range(draws):
         data = virtual.scanned(seed=seed, scanner=Scanner(placing_mm=NOISE_MM, xy_step_mm=0.0, z_step_mm=0.0))
@@ -43,10 +34,10 @@ def main() -> None:
         )
         model = CalibratedModel.of(found)
         values = model.parameters.values()
-        names = [n for n in TRUTH if n != young_modulus("stiff")]
-        inside.append([model.interval(n)[0] <= TRUTH[n] <= model.interval(n)[1] for n in names])
-        ratio.append(values[young_modulus("soft")] / TRUTH[young_modulus("soft")] - 1.0)
-        nu.append([values[poisson_ratio(m)] - TRUTH[poisson_ratio(m)] for m in ("soft", "stiff")])
+        names = [n for n in truth if n != young_modulus("stiff")]
+        inside.append([model.interval(n)[0] <= truth[n] <= model.interval(n)[1] for n in names])
+        ratio.append(values[young_modulus("soft")] / truth[young_modulus("soft")] - 1.0)
+        nu.append([values[poisson_ratio(m)] - truth[poisson_ratio(m)] for m in ("soft", "stiff")])
         errors = f"ratio {100 * ratio[-1]:+.2f} %, nu {nu[-1][0]:+.4f} {nu[-1][1]:+.4f}"
         print(f"draw {seed}: {errors}, intervals hold {sum(inside[-1])}/{len(names)}, {time.perf_counter() - start:.0f} s", flush=True)
     print(f"modulus ratio: mean error {100 * np.mean(ratio):+.2f} %, RMS {100 * np.sqrt(np.mean(np.square(ratio))):.2f} %")

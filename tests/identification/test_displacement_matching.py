@@ -8,19 +8,18 @@ import numpy as np
 import pytest
 
 from naibu import datasets
-from naibu.core.experiment import Loading
 from naibu.core.markers import Markers
 from naibu.identification import displacement_matching, trial
 from naibu.identification.calibration import Knowledge, calibrate, initial_parameters
 from naibu.identification.displacement_matching import Matcher
 from naibu.identification.model import CalibratedModel
-from naibu.identification.names import base_offset, batch_stiffness, friction, pixel_scale, poisson_ratio, straight_base, young_modulus
+from naibu.identification.names import base_offset, batch_stiffness, pixel_scale, poisson_ratio, straight_base, young_modulus
 from naibu.identification.prediction import predict, rms
 from naibu.identification.specimen import ModelSettings, specimen
 from naibu.identification.trial import Nearby, NoiseModel, Trial
 from naibu.mechanics.newton import SolverSettings
 from naibu.validation.baselines import affine
-from naibu.validation.phantoms import Scanner, box_experiment, virtual_specimen
+from naibu.validation.phantoms import Scanner, two_gels, virtual_specimen
 
 KNOWN = Knowledge({"hardness 5": 222.0})
 
@@ -101,15 +100,7 @@ def test_steps_stay_within_their_limits() -> None:
 
 
 def test_a_virtual_specimen_is_recovered_within_its_intervals() -> None:
-    truth = {
-        young_modulus("soft"): 90.0,
-        young_modulus("stiff"): 222.0,
-        poisson_ratio("soft"): 0.48,
-        poisson_ratio("stiff"): 0.47,
-        friction("soft", "table"): 0.45,
-        friction("stiff", "acrylic"): 0.25,
-    }
-    template = box_experiment("virtual", (60.0, 60.0, 60.0), [("soft", 30.0), ("stiff", 30.0)], Loading("plate"), {"pressed": 45.0})
+    template, truth = two_gels(45.0)
     virtual = virtual_specimen(template, truth, settings=ModelSettings(element_size_mm=7.5), seed=1)
     data = virtual.scanned(seed=2, scanner=Scanner(placing_mm=0.15, xy_step_mm=0.0, z_step_mm=0.0))
     found = calibrate(

@@ -15,6 +15,7 @@ import os
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 from typing import Protocol
 
@@ -55,6 +56,11 @@ def pardiso_library() -> ctypes.CDLL | None:
     os.environ.setdefault("KMP_BLOCKTIME", "0")  # idle threads sleep at once instead of spinning beside Numba's
     names = ("libmkl_rt.so.3", "libmkl_rt.so.2", "libmkl_rt.so.1", "libmkl_rt.2.dylib", "mkl_rt.3.dll", "mkl_rt.2.dll")
     folders = [Path(sys.prefix) / "lib", Path(sys.prefix) / "Library" / "bin"]
+    try:  # wherever pip put it: a user's own site, a base environment below a virtual one
+        files = metadata.files("mkl") or []
+        folders += [Path(str(file.locate())).resolve().parent for file in files if file.name in names]
+    except metadata.PackageNotFoundError:
+        pass
     for path in (folder / name for folder in folders for name in names):
         if path.exists():
             try:

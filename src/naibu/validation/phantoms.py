@@ -19,7 +19,7 @@ from naibu.core.experiment import Experiment, Layer, Loading, Shape, State
 from naibu.core.markers import Markers
 from naibu.core.rotation import rotation_matrix
 from naibu.identification.calibration import state_parameters
-from naibu.identification.names import poisson_ratio, young_modulus
+from naibu.identification.names import friction, poisson_ratio, young_modulus
 from naibu.identification.placement import placement
 from naibu.identification.pose import Pose
 from naibu.identification.specimen import ModelSettings, Specimen, specimen
@@ -324,3 +324,16 @@ def _complete(experiment: Experiment, model: Specimen, truth: Mapping[str, float
         if not any(model.direction(name, values, state.name) for state in experiment.states[1:]):
             raise InputError(f"experiment {experiment.name!r} does not depend on {name!r}; it knows {', '.join(sorted(needed))}, ...")
     return values
+
+
+def two_gels(height_mm: float) -> tuple[Experiment, dict[str, float]]:
+    """Return an experiment to be made virtual, and its truth: a soft gel under a stiff one, a 60 mm cube pressed to `height_mm`."""
+    truth = {
+        young_modulus("soft"): 90.0,
+        young_modulus("stiff"): 222.0,
+        poisson_ratio("soft"): 0.48,
+        poisson_ratio("stiff"): 0.47,
+        friction("soft", "table"): 0.45,
+        friction("stiff", "acrylic"): 0.25,
+    }
+    return box_experiment("virtual", (60.0,) * 3, [("soft", 30.0), ("stiff", 30.0)], Loading("plate"), {"pressed": height_mm}), truth
