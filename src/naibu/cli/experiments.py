@@ -1,43 +1,24 @@
-"""The command line: ``naibu demo``, ``identify``, ``predict``, ``compare``, ``report``, ``import``, ``doctor``.
-
-Exit codes: 0 done, 1 the installation is not sound (``doctor``), 2 input that cannot be used, 3 a solve that failed, 130 interrupted.
-"""
+"""Verbs for objects with measured markers: ``demo``, ``identify``, ``predict``, ``compare``, ``report``, ``import``."""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from cyclopts import App, CycloptsError, Parameter
-from rich.console import Console
-from rich.markup import escape
-from rich.progress import Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
-from rich.table import Table
+from cyclopts import Parameter
 
-import naibu
-from naibu.core.errors import ConvergenceError, InputError, NaibuError
-from naibu.doctor import doctor_rows, healthy
+from naibu.cli.console import INTERRUPTED, app, print_table, progress_lines, say
+from naibu.core.errors import InputError
 
 # other parts are imported where they are used: --help answers at once, and doctor also runs where numpy itself is broken
 if TYPE_CHECKING:
     from naibu.identification.specimen import ModelSettings
     from naibu.workflow import Identification
 
-app = App(
-    name="naibu",
-    help="Find the mechanical parameters of soft objects from markers measured inside them.",
-    version=naibu.__version__,
-    default_parameter=Parameter(negative_iterable=()),
-)
-WIDTH_OF_FILES = 160  # where the output is no terminal
-console = Console(width=None if sys.stdout.isatty() else WIDTH_OF_FILES)
-errors = Console(stderr=True, width=None if sys.stderr.isatty() else WIDTH_OF_FILES)
-BAD_INPUT, NO_SOLUTION, INTERRUPTED = 2, 3, 130
 DEMO = ("ct_two_material_1", "ct_two_material_2", "ct_two_material_3")
 DEMO_KNOWN = "hardness 5=222 kPa"  # mean of the report's compression tests, Table 3.4
 ContactModel = Literal["coulomb", "stick", "springs"]
@@ -55,7 +36,7 @@ def demo(*, out: Path = Path("naibu-demo")) -> None:
     out
         Folder for the results.
     """
-    _say(f"Identifying both gels from {', '.join(DEMO)} (bundled CT measurements) ...")
+    say(f"Identifying both gels from {', '.join(DEMO)} (bundled CT measurements) ...")
     _identify(DEMO, known=(DEMO_KNOWN,), out=out, cross_validate=True)
 
 
@@ -134,15 +115,15 @@ def _identify(
     from naibu import workflow
 
     began = time.perf_counter()
-    with _progress() as progress:
+    with progress_lines() as progress:
         result = workflow.identify(
             list(experiments), known=known, states=states, settings=settings, out=out, cross_validate=cross_validate, resume=resume,
             progress=progress,
         )  # fmt: skip
     _show(result)
-    _say(f"{time.perf_counter() - began:.0f} s. Results in {out}: open report.html; naibu predict takes model.json.")
+    say(f"{time.perf_counter() - began:.0f} s. Results in {out}: open report.html; naibu predict takes model.json.")
     if result.interrupted:
-        _say("Interrupted: these are the results so far. The same command continues from here.")
+        say("Interrupted: these are the results so far. The same command continues from here.")
         sys.exit(INTERRUPTED)
 
 
@@ -154,15 +135,15 @@ def _show(result: Identification) -> None:
     experiments = {t.specimen.experiment.name: t.specimen.experiment for t in calibration.trials}
     for experiment in experiments.values():
         for line in experiment.loading.assumed:
-            _say(f"{experiment.name}: {line}", "dim")
+            say(f"{experiment.name}: {line}", "dim")
     table = accuracy_table(calibration, result.baselines, result.left_out)
-    _print_table(table.title, table.columns, table.rows)
+    print_table(table.title, table.columns, table.rows)
     names = shared_names(model)
     rows = [(r.name, f"{r.estimate:.4g}", f"{r.lower:.4g}", f"{r.upper:.4g}", r.unit, r.note) for r in parameter_rows(model, names)]
-    _print_table("Parameters", ("parameter", "estimate", "95 % from", "to", "unit", ""), rows)
+    print_table("Parameters", ("parameter", "estimate", "95 % from", "to", "unit", ""), rows)
     for line in undetermined(model, names):
-        _say(line, "dim")
-    _say(f"{calibration.match.status.value} Residuals are {model.noise_factor:.2f} times the stated noise.")
+        say(line, "dim")
+    say(f"{calibration.match.status.value} Residuals are {model.noise_factor:.2f} times the stated noise.")
 
 
 @app.command
@@ -197,12 +178,12 @@ def predict(
 
     result = workflow.predict(model, experiment, state=state, height_mm=height_mm, heights_from_markers=heights_from_markers, out=out)
     for note in (*result.specimen.experiment.loading.assumed, *result.notes):
-        _say(note, "dim")
+        say(note, "dim")
     if result.registered:
         a = accuracy(result.specimen, result.fit, result.residual)
         rms = f"RMS x {a.x:.3f}, y {a.y:.3f}, z {a.z:.3f}, 3-D {a.total:.3f} mm"
-        _say(f"{a.markers} markers: {rms} ({a.noise_units:.2f} times the noise)")
-    _say(f"Predicted at {result.opening_mm:.2f} mm: {out / 'predicted.csv'}   page: {out / 'predicted.html'}")
+        say(f"{a.markers} markers: {rms} ({a.noise_units:.2f} times the noise)")
+    say(f"Predicted at {result.opening_mm:.2f} mm: {out / 'predicted.csv'}   page: {out / 'predicted.html'}")
 
 
 @app.command
@@ -246,11 +227,11 @@ def compare(
         ModelSettings(law=one, contact=two, joined=three, element_size_mm=element_size_mm)
         for one, two, three in product(laws, contacts, joints)
     ]
-    with _progress() as progress:
+    with progress_lines() as progress:
         rows = workflow.compare(experiments, candidates=candidates, known=known or (), out=out, progress=progress)
     table = comparison_table(rows)
-    _print_table(table.title, table.columns, table.rows)
-    _say(table.note, "dim")
+    print_table(table.title, table.columns, table.rows)
+    say(table.note, "dim")
 
 
 @app.command
@@ -265,7 +246,7 @@ def report(folder: Path) -> None:
     from naibu import workflow
 
     for page in workflow.report(folder):
-        _say(f"Report: {page}")
+        say(f"Report: {page}")
 
 
 @app.command(name="import")
@@ -317,69 +298,4 @@ def import_tables(
         out, import_markers(initial, unit=unit), {path.stem: import_markers(path, unit=unit) for path in loaded}, title=title,
         shape=Shape(shape, size_mm), loading=Loading(loading, bar_width_mm), spacing_mm=spacing_mm,
     )  # fmt: skip
-    _say(f"Wrote {out}. Describe layers and materials in its meta.toml, then run: naibu identify {out}")
-
-
-@app.command
-def doctor() -> None:
-    """Tell what is installed, what is missing, what that is for, and how to get it."""
-    rows = doctor_rows()
-    columns = ("what", "status", "found", "for", "remedy")
-    _print_table("naibu doctor", columns, [(r.name, r.status, r.found, r.purpose, r.remedy) for r in rows], left=True)
-    if not healthy(rows):
-        sys.exit(1)
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[str, int, float], None]]:
-    """A line for each stage that tells iteration and objective."""
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TextColumn("{task.fields[found]}"), TimeElapsedColumn())
-    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
-        tasks: dict[str, TaskID] = {"identify": bar.add_task("identify", total=None, found="reading, and solving with the first guess")}
-
-        def tell(stage: str, iteration: int, objective: float) -> None:
-            if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=None, found="")
-            bar.update(tasks[stage], found=f"iteration {iteration + 1}, chi-squared {objective:.0f}")
-
-        yield tell
-
-
-def _say(text: str, style: str | None = None) -> None:
-    """Print a line as it is, unbroken, so that paths can be copied."""
-    console.print(escape(text), style=style, soft_wrap=True, highlight=False)
-
-
-def _print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[object]], *, left: bool = False) -> None:
-    table = Table(title=title, title_justify="left")
-    for i, column in enumerate(columns):
-        table.add_column(column, justify="left" if i == 0 or left else "right", overflow="fold")
-    for row in rows:
-        table.add_row(*(_cell(c) for c in row))
-    console.print(table)
-
-
-def _cell(value: object) -> str:
-    if value is None or value != value:
-        return "-"
-    return f"{value:.3f}" if isinstance(value, float) else escape(str(value))
-
-
-def _fail(text: str, code: int) -> NoReturn:
-    errors.print(f"[bold red]error[/bold red] {escape(text)}", soft_wrap=True, highlight=False)
-    sys.exit(code)
-
-
-def main() -> None:
-    """Run the command line; a user's mistake ends with one message and exit code 2."""
-    try:
-        app(sys.argv[1:], exit_on_error=False, print_error=False)
-    except CycloptsError as error:
-        _fail(f"{' '.join(str(error).split())} See naibu --help, or naibu VERB --help.", BAD_INPUT)
-    except ConvergenceError as error:
-        _fail(str(error), NO_SOLUTION)
-    except NaibuError as error:
-        _fail(str(error), BAD_INPUT)
-    except KeyboardInterrupt:
-        errors.print("Interrupted; every file written is whole. An identification goes on with the same command.", soft_wrap=True)
-        sys.exit(INTERRUPTED)
+    say(f"Wrote {out}. Describe layers and materials in its meta.toml, then run: naibu identify {out}")

@@ -1,0 +1,37 @@
+"""The command line: ``naibu demo``, ``identify``, ``predict``, ``compare``, ``report``, ``import``, ``reproduce``, ``doctor``."""
+
+from __future__ import annotations
+
+import sys
+
+from cyclopts import CycloptsError
+
+from naibu.cli import experiments, studies  # noqa: F401  they bring their verbs
+from naibu.cli.console import BAD_INPUT, INTERRUPTED, NO_SOLUTION, app, errors, fail, print_table
+from naibu.core.errors import ConvergenceError, NaibuError
+from naibu.doctor import doctor_rows, healthy
+
+
+@app.command
+def doctor() -> None:
+    """Tell what is installed, what is missing, what that is for, and how to get it."""
+    rows = doctor_rows()
+    columns = ("what", "status", "found", "for", "remedy")
+    print_table("naibu doctor", columns, [(r.name, r.status, r.found, r.purpose, r.remedy) for r in rows], left=True)
+    if not healthy(rows):
+        sys.exit(1)
+
+
+def main() -> None:
+    """Run the command line; a user's mistake ends with one message and exit code 2."""
+    try:
+        app(sys.argv[1:], exit_on_error=False, print_error=False)
+    except CycloptsError as error:
+        fail(f"{' '.join(str(error).split())} See naibu --help, or naibu VERB --help.", BAD_INPUT)
+    except ConvergenceError as error:
+        fail(str(error), NO_SOLUTION)
+    except NaibuError as error:
+        fail(str(error), BAD_INPUT)
+    except KeyboardInterrupt:
+        errors.print("Interrupted; every file written is whole. An identification goes on with the same command.", soft_wrap=True)
+        sys.exit(INTERRUPTED)
