@@ -147,3 +147,16 @@ def test_a_failed_series_leaves_the_old_file(tmp_path, times, points, told):
         write_vtkhdf_series(path, MESHES["tetra"], times, points)
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_plane_meshes_are_written_in_space(tmp_path):
+    mesh = Mesh.from_arrays([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], [[0, 1, 2]], "triangle")
+    motion = np.arange(12.0).reshape(2, 3, 2)
+    write_vtkhdf_series(tmp_path / "a.vtkhdf", mesh, [0.0, 1.0], {"u_mm": motion})
+    with h5py.File(tmp_path / "a.vtkhdf") as file:
+        root = file["VTKHDF"]
+        np.testing.assert_array_equal(root["Points"][:], np.pad(mesh.points, ((0, 0), (0, 1))))
+        np.testing.assert_array_equal(root["PointData/u_mm"][:], np.pad(motion.reshape(6, 2), ((0, 0), (0, 1))))
+        assert root["Types"][:].tolist() == [5]
+    write_vtu(tmp_path / "a.vtu", mesh, {"u_mm": motion[0]})
+    assert b'Name="u_mm" NumberOfComponents="3"' in (tmp_path / "a.vtu").read_bytes()

@@ -19,7 +19,7 @@ from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.io.atomic import write_atomically
 
-_VTK_TYPES = {"tetra": 10, "hexahedron": 12, "tetra10": 24}
+_VTK_TYPES = {"line": 3, "triangle": 5, "tetra": 10, "hexahedron": 12, "tetra10": 24}
 _NAMES = {"i": "Int", "u": "UInt", "f": "Float"}
 
 
@@ -49,7 +49,7 @@ def write_vtu(
     InputError
         Arrays whose length does not fit, that are not numbers, or a file that cannot be written.
     """
-    points = {name: _values(name, values, mesh.n_points, "points") for name, values in (point_data or {}).items()}
+    points = {name: _in_space(mesh, _values(name, values, mesh.n_points, "points")) for name, values in (point_data or {}).items()}
     cells = {name: _values(name, values, mesh.n_cells, "cells") for name, values in (cell_data or {}).items()}
     cells.setdefault("region", mesh.regions)
     appended = _Appended()
@@ -65,7 +65,7 @@ def write_vtu(
             '<VTKFile type="UnstructuredGrid" version="1.0" byte_order="LittleEndian" header_type="UInt64">',
             f"<UnstructuredGrid>{_names_field(mesh)}",
             f'<Piece NumberOfPoints="{mesh.n_points}" NumberOfCells="{n}">',
-            f"<Points>{appended.element('Points', mesh.points)}</Points>",
+            f"<Points>{appended.element('Points', _in_space(mesh, mesh.points))}</Points>",
             appended.section("Cells", topology),
             appended.section("PointData", points),
             appended.section("CellData", cells),
@@ -117,8 +117,8 @@ def write_vtkhdf_series(
             root = file.create_group("VTKHDF")
             _write_static(root, mesh)
             group = _write_steps(root, steps)
-            _write_series(root, group, "PointData", point_data_steps or {}, len(steps), mesh.n_points)
-            _write_series(root, group, "CellData", cell_data_steps or {}, len(steps), mesh.n_cells)
+            _write_series(root, group, "PointData", point_data_steps or {}, len(steps), mesh)
+            _write_series(root, group, "CellData", cell_data_steps or {}, len(steps), mesh)
         # The temporary file is private; the result gets the rights of any new file.
         mask = os.umask(0)
         os.umask(mask)
@@ -173,6 +173,14 @@ def _values(name: str, values: ArrayLike, n: int, what: str) -> NDArray[np.gener
     return array.reshape(n, -1) if array.ndim == 3 else array
 
 
+def _in_space(mesh: Mesh, vectors: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Return vectors of a plane or a line with the components that VTK, which knows only space, wants besides."""
+    missing = 3 - mesh.dimension
+    if missing == 0 or vectors.ndim != 2 or vectors.shape[1] != mesh.dimension:
+        return vectors
+    return np.pad(vectors, ((0, 0), (0, missing)))
+
+
 def _write_static(root: h5py.Group, mesh: Mesh) -> None:
     """Write the grid, which all steps share."""
     n, k = mesh.cells.shape
@@ -182,7 +190,7 @@ def _write_static(root: h5py.Group, mesh: Mesh) -> None:
     root["NumberOfPoints"] = np.array([mesh.n_points], dtype=np.int64)
     root["NumberOfCells"] = np.array([n], dtype=np.int64)
     root["NumberOfConnectivityIds"] = np.array([n * k], dtype=np.int64)
-    root["Points"] = mesh.points
+    root["Points"] = _in_space(mesh, mesh.points)
     root["Connectivity"] = mesh.cells.ravel()
     root["Offsets"] = np.arange(0, n * k + 1, k, dtype=np.int64)
     root["Types"] = np.full(n, _VTK_TYPES[mesh.cell_type], dtype=np.uint8)
@@ -210,19 +218,20 @@ def _write_steps(root: h5py.Group, times: NDArray[np.float64]) -> h5py.Group:
 
 
 def _write_series(
-    root: h5py.Group, steps: h5py.Group, where: str, data: Mapping[str, Sequence[ArrayLike] | NDArray[np.generic]], n_steps: int, n: int
+    root: h5py.Group, steps: h5py.Group, where: str, data: Mapping[str, Sequence[ArrayLike] | NDArray[np.generic]], n_steps: int, mesh: Mesh
 ) -> None:
     """Write the values of all steps of every array, one step below the other, and where each starts."""
+    n = mesh.n_points if where == "PointData" else mesh.n_cells
     for name, values in data.items():
         if not name or "/" in name or (where == "CellData" and name == "region"):
             raise InputError(f"array name {name!r} cannot be used in a VTKHDF file; take another one without '/'")
         if len(values) != n_steps:
             raise InputError(f"{name!r} has {len(values)} steps, but there are {n_steps} times; give one array for each time")
         what = "points" if where == "PointData" else "cells"
-        first = _values(name, values[0], n, what)
+        first = _in_space(mesh, _values(name, values[0], n, what))
         dataset = root[where].create_dataset(name, shape=(n_steps * n, *first.shape[1:]), dtype=first.dtype)
         for step in range(n_steps):
-            own = _values(name, values[step], n, what)
+            own = _in_space(mesh, _values(name, values[step], n, what))
             if own.shape != first.shape:
                 raise InputError(f"{name!r} has shape {own.shape} in step {step}, but {first.shape} in step 0; give the same shape in all")
             dataset[step * n : (step + 1) * n] = own

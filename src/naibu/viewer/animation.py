@@ -1,0 +1,105 @@
+"""An animation of plane meshes as one self-contained page: several bodies side by side, one clock, colours with a scale."""
+
+from __future__ import annotations
+
+import base64
+import json
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+
+import numpy as np
+from numpy.typing import NDArray
+
+from naibu.core.errors import InputError
+
+STEPS = 32_000  # of a 16-bit number that the page stores, from the smallest to the largest value
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MovingBody:
+    """A plane mesh over time.
+
+    Attributes
+    ----------
+    title : str
+        Shown above it.
+    points : ndarray, shape (n, 2)
+        Nodes at rest, mm.
+    triangles : ndarray, shape (m, 3), int
+        Node numbers.
+    displacement : ndarray, shape (s, n, 2)
+        In every step, mm.
+    values : ndarray, shape (s, n)
+        What the colours show.
+    marks : tuple of (name, ndarray of shape (s, 2))
+        Points to follow, mm, such as measured markers.
+    """
+
+    title: str
+    points: NDArray[np.float64]
+    triangles: NDArray[np.int64]
+    displacement: NDArray[np.float64]
+    values: NDArray[np.float64]
+    marks: tuple[tuple[str, NDArray[np.float64]], ...] = ()
+
+
+def animation_html(title: str, times_s: NDArray[np.float64], bodies: tuple[MovingBody, ...], value_name: str, note: str = "") -> str:
+    """Return the page.
+
+    Parameters
+    ----------
+    title : str
+        Heading.
+    times_s : ndarray, shape (s,)
+        Times of the steps, s.
+    bodies : tuple of MovingBody
+        Shown side by side, on one scale of lengths and colours.
+    value_name : str
+        What the colours show, with its unit.
+    note : str
+        A sentence below the title.
+
+    Raises
+    ------
+    InputError
+        No body, or steps that do not fit the times.
+    """
+    if not bodies:
+        raise InputError("an animation needs at least one body")
+    for body in bodies:
+        if body.displacement.shape != (len(times_s), *body.points.shape) or body.values.shape != (len(times_s), len(body.points)):
+            raise InputError(f"{body.title!r}: displacement and values must have {len(times_s)} steps of {len(body.points)} points")
+    low = float(min(np.nanmin(body.values) for body in bodies))
+    high = float(max(np.nanmax(body.values) for body in bodies))
+    payload = {
+        "times": [round(float(t), 6) for t in times_s],
+        "value": value_name,
+        "low": low,
+        "high": high if high > low else low + 1.0,
+        "bodies": [_packed(body, low, high) for body in bodies],
+    }
+    template = files("naibu.viewer").joinpath("assets/animation.html").read_text(encoding="utf-8")
+    data = json.dumps(payload, separators=(",", ":")).replace("</", "<\\/")
+    return template.replace("$TITLE", escape(title)).replace("$NOTE", escape(note)).replace("$DATA", data)
+
+
+def _packed(body: MovingBody, low: float, high: float) -> dict[str, object]:
+    largest = float(np.abs(body.displacement).max()) or 1.0
+    span = high - low or 1.0
+    return {
+        "title": body.title,
+        "points": np.round(body.points, 4).ravel().tolist(),
+        "triangles": body.triangles.ravel().tolist(),
+        "quantum": largest / STEPS,
+        "displacement": _base64(body.displacement / largest * STEPS),
+        "values": _base64((body.values - low) / span * STEPS),
+        "steps": STEPS,
+        "marks": [
+            {"name": name, "path": [None if np.isnan(p).any() else np.round(p, 3).tolist() for p in path]} for name, path in body.marks
+        ],
+    }
+
+
+def _base64(values: NDArray[np.float64]) -> str:
+    return base64.b64encode(np.round(np.nan_to_num(values)).astype("<i2").tobytes()).decode()
