@@ -1,0 +1,104 @@
+"""A scanned volume: voxels and where they lie in the scanner."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from naibu.core.errors import InputError
+
+Array = NDArray[np.float64]
+NEARLY = 1e-4  # of a direction cosine, or of a voxel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Volume:
+    """Voxels with their geometry, as SimpleITK gives it; the values are never rescaled.
+
+    Attributes
+    ----------
+    values : ndarray, shape (nz, ny, nx)
+        Grey values, in the type of the file.
+    spacing_mm : ndarray, shape (3,)
+        Distance between the centres of voxels along x, y, z, mm.
+    origin_mm : ndarray, shape (3,)
+        Centre of the first voxel, mm.
+    direction : ndarray, shape (3, 3)
+        Columns are the unit vectors along which x, y and z indices grow.
+    """
+
+    values: NDArray[Any]
+    spacing_mm: Array
+    origin_mm: Array
+    direction: Array
+
+    @classmethod
+    def from_array(
+        cls, values: ArrayLike, *, spacing_mm: ArrayLike, origin_mm: ArrayLike = (0.0, 0.0, 0.0), direction: ArrayLike | None = None
+    ) -> Volume:
+        """Check the arrays and make a volume of them.
+
+        Raises
+        ------
+        InputError
+            Values that are not a three-dimensional array of real numbers, NaN, a spacing that is not positive, axes that are not orthonormal.
+        """
+        v = np.asarray(values)
+        if v.ndim != 3 or 0 in v.shape:
+            raise InputError(f"a volume has three axes z, y, x; the values have shape {v.shape}. Choose one time or one colour")
+        if v.dtype.kind not in "biuf":
+            raise InputError(f"grey values must be real numbers, not {v.dtype}")
+        if v.dtype.kind == "f" and not np.isfinite(v).all():
+            bad = tuple(int(i) for i in np.argwhere(~np.isfinite(v))[0])
+            raise InputError(f"voxel {bad} (z, y, x) is {v[bad]}; mask or repair it")
+        spacing, origin = np.array(spacing_mm, dtype=float), np.array(origin_mm, dtype=float)
+        axes = np.eye(3) if direction is None else np.array(direction, dtype=float).reshape(3, 3)
+        if spacing.shape != (3,) or not (np.isfinite(spacing).all() and (spacing > 0.0).all()):
+            raise InputError(f"spacing must be three positive numbers (x, y, z), mm, not {spacing.tolist()}")
+        if origin.shape != (3,) or not np.isfinite(origin).all():
+            raise InputError(f"origin must be three numbers (x, y, z), mm, not {origin.tolist()}")
+        if np.abs(axes.T @ axes - np.eye(3)).max() > NEARLY:
+            raise InputError(f"the axes of the volume are not orthonormal: {axes.tolist()}; sheared slices must be resampled first")
+        return cls(v, spacing, origin, axes)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Number of voxels along z, y, x."""
+        nz, ny, nx = self.values.shape
+        return int(nz), int(ny), int(nx)
+
+    def to_physical(self, index: ArrayLike) -> Array:
+        """Return positions (..., 3), mm, of continuous indices (..., 3) in the order x, y, z."""
+        return np.asarray((np.asarray(index, dtype=float) * self.spacing_mm) @ self.direction.T + self.origin_mm)
+
+    def to_index(self, points_mm: ArrayLike) -> Array:
+        """Return continuous indices (..., 3) in the order x, y, z of positions (..., 3), mm."""
+        return np.asarray(((np.asarray(points_mm, dtype=float) - self.origin_mm) @ self.direction) / self.spacing_mm)
+
+    def same_grid(self, other: Volume) -> bool:
+        """Whether the voxels of another volume lie at the same places."""
+        return (
+            self.shape == other.shape
+            and bool(np.abs(self.spacing_mm - other.spacing_mm).max() < NEARLY * self.spacing_mm.min())
+            and bool(np.abs(self.origin_mm - other.origin_mm).max() < NEARLY * self.spacing_mm.min())
+            and bool(np.abs(self.direction - other.direction).max() < NEARLY)
+        )
+
+    def with_values(self, values: ArrayLike) -> Volume:
+        """Return other values on the same grid."""
+        v = np.asarray(values)
+        if v.shape != self.values.shape:
+            raise InputError(f"values must have shape {self.values.shape} (z, y, x), not {v.shape}")
+        return replace(self, values=v)
+
+    def cropped(self, low: ArrayLike, high: ArrayLike) -> Volume:
+        """Return the voxels with indices from `low` up to, not including, `high`, in the order x, y, z."""
+        a, b = np.asarray(low, dtype=int), np.asarray(high, dtype=int)
+        size = np.array(self.shape[::-1])
+        if (a < 0).any() or (b > size).any() or (a >= b).any():
+            raise InputError(f"cannot crop to {a.tolist()}..{b.tolist()}: the volume has {size.tolist()} voxels along x, y, z")
+        box = tuple(slice(int(s), int(e)) for s, e in zip(a[::-1], b[::-1], strict=True))
+        return replace(self, values=self.values[box], origin_mm=self.to_physical(a))

@@ -1,0 +1,1 @@
+"""From images to the motion inside: registration, matching, correlation, markers."""
