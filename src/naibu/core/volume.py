@@ -44,7 +44,7 @@ class Volume:
         Raises
         ------
         InputError
-            Values that are not a three-dimensional array of real numbers, NaN, a spacing that is not positive, axes that are not orthonormal.
+            Values that are no three-dimensional array of real numbers, NaN, a spacing that is not positive, axes not orthonormal.
         """
         v = np.asarray(values)
         if v.ndim != 3 or 0 in v.shape:
