@@ -120,7 +120,7 @@ def solve(
             step = 0.5 * (load - last.load)
             ceiling = 1.6 * step
             if step < chosen.smallest_step:
-                return _finish(newton, states, residual, Status.SINGULAR if newton.drifts else Status.STEP_TOO_SMALL, throw)
+                return finished(newton, states, residual, Status.SINGULAR if newton.drifts else Status.STEP_TOO_SMALL, throw)
             continue
         residual = found[1]
         states.append(advanced(problem, found[0], last.anchors, load))
@@ -131,7 +131,7 @@ def solve(
             step = min(ceiling, step * _growth(newton.iterations - before))
         if callback is not None:
             callback(load)
-    return _finish(newton, states, residual, Status.CONVERGED, throw)
+    return finished(newton, states, residual, Status.CONVERGED, throw)
 
 
 def _growth(iterations: int) -> float:
@@ -162,7 +162,8 @@ def advanced(problem: Problem, u: Array, anchors: tuple[Array, ...], load: float
     return LoadState(load, u, moved)
 
 
-def _finish(newton: Newton, states: list[LoadState], residual: float, status: Status, throw: bool) -> Solution:
+def finished(newton: Newton, states: list[LoadState], residual: float, status: Status, throw: bool) -> Solution:
+    """Return the solution that ends with the last of `states`, with its reactions; raises a `ConvergenceError` if asked to."""
     if throw and not status.ok:
         raise ConvergenceError(f"stopped at {100 * states[-1].load:.1f} % of the load. {status.value}")
     problem, last = newton.problem, states[-1]
