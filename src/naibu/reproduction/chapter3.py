@@ -1,0 +1,42 @@
+"""Chapter 3 of the report: nonuniform elasticity from inner deformation, in simulation and from measured markers (spec I1 to I5)."""
+
+from __future__ import annotations
+
+from naibu.core.errors import InputError
+from naibu.reproduction.chapter import Chapter
+from naibu.reproduction.chapter3_cubes import layer_section, reach_section, uniform_section
+from naibu.reproduction.chapter3_experiment import MARKER_SD_MM, experiment_section
+from naibu.reproduction.chapter3_noise import NOISE_MM, noise_section
+from naibu.reproduction.chapter3_square import square_section
+from naibu.reproduction.material_test_tables import table_3_4, table_3_5
+
+
+def chapter3(seed: int = 0, *, draws: int = 20) -> Chapter:
+    """Reproduce chapter 3, but for what it measures in images (3.5).
+
+    Parameters
+    ----------
+    seed : int
+        Of all noise.
+    draws : int
+        Of noise, for medians and standard deviations; at least 2.
+
+    Raises
+    ------
+    InputError
+        Fewer than two draws.
+    """
+    if draws < 2:
+        raise InputError(f"scatter needs at least 2 draws of noise, not {draws}")
+    sections = (
+        square_section(seed, draws),
+        uniform_section(),
+        layer_section(),
+        reach_section(),
+        noise_section(seed, draws),
+        table_3_4(),
+        table_3_5(),
+        experiment_section(),
+    )
+    settings = {"seed": seed, "draws": draws, "noise_mm": NOISE_MM, "marker_sd_mm": MARKER_SD_MM}
+    return Chapter("ch3", "Chapter 3: nonuniform elasticity from inner deformation", sections, {**settings})
