@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import Delaunay
 
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
@@ -110,3 +111,21 @@ def test_bad_points_are_named():
     with pytest.raises(InputError, match="point 1 is"):
         locate(mesh, [[0, 0, 0], [0, np.nan, 0]])
     assert locate(mesh, np.zeros((0, 3))).weights.shape == (0, 8)
+
+
+@pytest.mark.parametrize(("cell_type", "dimension"), [("triangle", 2), ("line", 1)])
+def test_points_in_planes_and_on_lines(cell_type, dimension):
+    rng = np.random.default_rng(0)
+    if dimension == 2:
+        points = np.vstack([[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]], rng.uniform(0.0, 1.0, (30, 2))])
+        cells = Delaunay(points).simplices
+    else:
+        points = np.sort(np.append(rng.uniform(0.0, 1.0, 20), [0.0, 1.0]))[:, None]
+        cells = np.column_stack([np.arange(21), np.arange(1, 22)])
+    mesh = Mesh.from_arrays(points, cells, cell_type)
+    wanted = rng.uniform(0.01, 0.99, (600, dimension))
+    linear = mesh.points @ rng.standard_normal((dimension, 2)) + 1.0
+    slope = np.linalg.lstsq(np.c_[mesh.points, np.ones(len(points))], linear, rcond=None)[0]
+    np.testing.assert_allclose(interpolation_operator(mesh, wanted) @ linear, np.c_[wanted, np.ones(600)] @ slope, atol=1e-12)
+    with pytest.raises(InputError, match="outside the mesh"):
+        interpolation_operator(mesh, [[1.5] * dimension])

@@ -68,7 +68,7 @@ class LinearBody:
         InputError
             The body can move freely.
         """
-        _require_held(self.points, held)
+        require_held(self.points, held)
         matrix = constrained(self.stiffness(lame_lambda, shear_modulus), held)
         return choose_solver(matrix, self.points, held, symmetric=True).factorize(matrix)
 
@@ -94,7 +94,14 @@ class LinearBody:
         return np.where(held, prescribed.values, solution)
 
 
-def _require_held(points: Array, held: NDArray[np.bool_]) -> None:
+def require_held(points: Array, held: NDArray[np.bool_]) -> None:
+    """Check that holding the components `held` (n, d) of points (n, d) leaves no rigid motion.
+
+    Raises
+    ------
+    InputError
+        The body can move freely; the message says in how many ways.
+    """
     d = points.shape[1]
     centred = points - points.mean(axis=0)
     modes = [np.broadcast_to(np.eye(d)[a], points.shape) for a in range(d)]

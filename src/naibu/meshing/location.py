@@ -18,6 +18,7 @@ from naibu.meshing.quality import mean_edge_length
 _SLACK = 1e-9
 # Nodes near a point outside whose cells are tried for the nearest one.
 _NEAR_NODES = 8
+_BLOCK = 256  # points located at a time
 # Most bins a cell of the search grid may cost: bounds memory on slender meshes.
 _BINS_PER_CELL = 2.0
 
@@ -47,7 +48,7 @@ def locate(mesh: Mesh, points_mm: ArrayLike, *, tolerance_mm: float | None = Non
     ----------
     mesh : Mesh
         Any mesh without inverted cells.
-    points_mm : array_like, shape (n, 3)
+    points_mm : array_like, shape (n, d)
         Points, mm.
     tolerance_mm : float, optional
         How far outside a point may lie; it is then extrapolated from the nearest cell, so that linear fields stay exact. Default: a tenth
@@ -61,9 +62,11 @@ def locate(mesh: Mesh, points_mm: ArrayLike, *, tolerance_mm: float | None = Non
     Raises
     ------
     InputError
-        Points that are not (n, 3) finite numbers, or that lie farther outside than the tolerance: they are listed.
+        Points that are not (n, d) finite numbers, or that lie farther outside than the tolerance: they are listed.
     """
-    points = _checked(points_mm)
+    points = _checked(points_mm, mesh.dimension)
+    if mesh.dimension < 3:
+        return _in_simplices(mesh, points, tolerance_mm)
     found = np.full(len(points), -1, dtype=np.int64)
     local = np.zeros((len(points), 3))
     distance = np.zeros(len(points))
@@ -106,11 +109,30 @@ def operator_of(mesh: Mesh, location: Location) -> csr_array:
     return operator
 
 
-def _checked(points_mm: ArrayLike) -> NDArray[np.float64]:
-    """Return the points as (n, 3) floats."""
+def _in_simplices(mesh: Mesh, points: NDArray[np.float64], tolerance_mm: float | None) -> Location:
+    """Locate points among triangles or lines: all against all, a block of points at a time, for such meshes are small."""
+    corners = mesh.points[mesh.cells]
+    inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1])
+    edge = float(np.abs(corners[:, 1:] - corners[:, :1]).max(axis=2).mean())
+    found, weights = np.empty(len(points), dtype=np.int64), np.empty((len(points), mesh.cells.shape[1]))
+    for start in range(0, len(points), _BLOCK):
+        here = points[start : start + _BLOCK]
+        inner = np.einsum("pmd,mdk->pmk", here[:, None] - corners[None, :, 0], inverse)
+        shares = np.concatenate([1.0 - inner.sum(axis=2, keepdims=True), inner], axis=2)
+        cell = shares.min(axis=2).argmax(axis=1)
+        found[start : start + _BLOCK], weights[start : start + _BLOCK] = cell, shares[np.arange(len(here)), cell]
+    inside = np.clip(weights, 0.0, None)
+    nearest = np.einsum("pk,pkd->pd", inside / inside.sum(axis=1, keepdims=True), corners[found])
+    distance = np.where(weights.min(axis=1) < -_SLACK, np.linalg.norm(points - nearest, axis=1), 0.0)
+    _refuse_far(points, distance, 0.1 * edge if tolerance_mm is None else tolerance_mm)
+    return Location(found, weights, distance)
+
+
+def _checked(points_mm: ArrayLike, dimension: int) -> NDArray[np.float64]:
+    """Return the points as (n, d) floats."""
     points = np.ascontiguousarray(points_mm, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"points to locate must have shape (n, 3), not {points.shape}")
+    if points.ndim != 2 or points.shape[1] != dimension:
+        raise InputError(f"points to locate must have shape (n, {dimension}), not {points.shape}")
     if len(bad := np.flatnonzero(~np.isfinite(points).all(axis=1))):
         raise InputError(f"point {int(bad[0])} is {points[bad[0]].tolist()} ({len(bad)} such points); leave unseen points out")
     return points

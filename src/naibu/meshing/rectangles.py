@@ -1,0 +1,62 @@
+"""Meshes of lines and triangles: an interval, and a rectangle whose cells are cut along diagonals (spec M5, I4, P1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from naibu.core.errors import InputError
+from naibu.core.mesh import Mesh
+
+DIAGONALS = ("alternating", "one_way")
+
+
+def interval(length_mm: float, divisions: int) -> Mesh:
+    """Mesh the interval from 0 to `length_mm` with lines of equal length, numbered from left to right.
+
+    Raises
+    ------
+    InputError
+        A length that is not positive, or no division.
+    """
+    if not (np.isfinite(length_mm) and length_mm > 0.0) or divisions < 1:
+        raise InputError(f"an interval needs a positive length and at least one division, not {length_mm:g} mm and {divisions}")
+    nodes = np.arange(divisions + 1)
+    return Mesh.from_arrays(np.linspace(0.0, length_mm, divisions + 1)[:, None], np.stack([nodes[:-1], nodes[1:]], axis=1), "line")
+
+
+def rectangle(size_mm: Sequence[float], divisions: Sequence[int], *, diagonals: str = "alternating", centred: bool = True) -> Mesh:
+    """Mesh a rectangle that stands on y = 0; node (i, j) has number ``i + (nx + 1) j``.
+
+    Parameters
+    ----------
+    size_mm : sequence of 2 floats
+        Width and height, mm.
+    divisions : sequence of 2 ints
+        Cells across and upwards; each is cut into two triangles.
+    diagonals : {"alternating", "one_way"}
+        Diagonals of neighbouring cells in turn one way and the other, or all from lower left to upper right.
+    centred : bool
+        Whether x = 0 is the middle or the left side.
+
+    Raises
+    ------
+    InputError
+        A size or a number of divisions that is not positive, or another word for `diagonals`.
+    """
+    (width, height), (nx, ny) = size_mm, divisions
+    if not (np.isfinite([width, height]).all() and min(width, height) > 0.0) or min(nx, ny) < 1:
+        raise InputError(f"a rectangle needs positive sizes and divisions, not {list(size_mm)} mm in {list(divisions)}")
+    if diagonals not in DIAGONALS:
+        raise InputError(f"diagonals are {' or '.join(map(repr, DIAGONALS))}, not {diagonals!r}")
+    x = np.linspace(0.0, width, nx + 1) - (0.5 * width if centred else 0.0)
+    gx, gy = np.meshgrid(x, np.linspace(0.0, height, ny + 1))
+    i, j = (a.ravel() for a in np.meshgrid(np.arange(nx), np.arange(ny)))
+    a = i + (nx + 1) * j
+    b, c, d = a + 1, a + nx + 2, a + nx + 1
+    rising = np.stack([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)], axis=1)
+    falling = np.stack([np.stack([a, b, d], axis=1), np.stack([b, c, d], axis=1)], axis=1)
+    turn = (i + j) % 2 == 1 if diagonals == "alternating" else np.zeros(len(i), dtype=bool)
+    cells = np.where(turn[:, None, None], falling, rising).reshape(-1, 3)
+    return Mesh.from_arrays(np.stack([gx.ravel(), gy.ravel()], axis=1), cells, "triangle")
