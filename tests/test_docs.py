@@ -60,3 +60,12 @@ def test_every_law_is_told() -> None:
     concepts = (DOCS / "concepts.rst").read_text(encoding="utf-8")
     for law in LAWS:
         assert f"``{law}``" in concepts
+
+
+@pytest.mark.parametrize("page", ["motion", "fields"])
+def test_the_example_of_a_page_runs(page: str, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (DOCS / f"{page}.rst").read_text(encoding="utf-8")
+    found = re.findall(r"^\.\. code-block:: python\n\n((?:   .*\n|\n)+)", text, re.MULTILINE)
+    assert found
+    exec("\n".join(re.sub("^   ", "", code, flags=re.MULTILINE) for code in found), {})
+    assert capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""Verbs that work with what naibu brings along: ``reproduce``."""
+"""Verbs that work with what naibu brings along: ``reproduce``, ``simulate``."""
 
 from __future__ import annotations
 
@@ -37,3 +37,23 @@ def reproduce(chapter: ChapterName, *, out: Path = Path("naibu-reproduction"), s
                 say(table.note, "dim")
     page, numbers = write_chapter(done, out)
     say(f"{time.perf_counter() - began:.0f} s. Page: {page}   numbers: {numbers}")
+
+
+@app.command
+def simulate(study: str, *, out: Path = Path("naibu-simulation")) -> None:
+    """Run one of the report's simulations, and write its motion for ParaView, an animated page and the numbers.
+
+    Parameters
+    ----------
+    study
+        squares (all three side by side), elastic-square, viscoplastic-square, rheological-square, agar-block, agar-block-3-d,
+        agar-under-a-bar.
+    out
+        Folder for the files.
+    """
+    from naibu.study_runs import simulate_study
+
+    began = time.perf_counter()
+    with errors.status(f"computing {study}"):
+        files = simulate_study(study, out)
+    say(f"{time.perf_counter() - began:.0f} s. {', '.join(str(path) for path in files)}")
