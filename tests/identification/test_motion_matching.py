@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from naibu.core.errors import InputError
-from naibu.identification.motion_matching import MotionTrial, identify_motion, rheology_parameters
+from naibu.identification.motion_matching import MotionTrial, _Problem, identify_motion, rheology_parameters
 from naibu.mechanics.dynamics import simulate
 from naibu.mechanics.linear_elasticity import LinearBody
 from naibu.mechanics.mass import mass_of
@@ -104,3 +104,14 @@ def test_bad_input_is_named() -> None:
         )
     with pytest.raises(InputError, match="times, points, axes"):
         MotionTrial.of("a", trial.mesh, trial.supports, TIMES, POINTS, trial.displacement[1:], sd_mm=0.1)
+
+
+def test_derivatives_against_differences_of_motions() -> None:
+    trial = measured(heavy=True, force=True)
+    parameters = rheology_parameters(START)
+    problem = _Problem((trial,), parameters, None)
+    inner = parameters.start()
+    exact = problem.jacobian(inner)
+    for k, step in enumerate(1e-4 * np.eye(len(inner))):
+        difference = (problem.residuals(inner + step) - problem.residuals(inner - step)) / 2e-4
+        assert exact[:, k] == pytest.approx(difference, abs=1e-5 * np.abs(difference).max())

@@ -22,13 +22,14 @@ from naibu.mechanics.dynamics import Load, Series, simulate
 from naibu.mechanics.linear_elasticity import LinearBody
 from naibu.mechanics.moving_supports import Support
 from naibu.mechanics.rheology import CellRheology, Rheology, per_region, three_element
+from naibu.mechanics.rheology_sensitivities import MaterialChange, SeriesDerivatives, simulate_with_derivatives
 from naibu.meshing.location import interpolation_operator
 
 Array = NDArray[np.float64]
 KINDS = ("young_modulus", "voigt_viscosity", "series_viscosity", "poisson_ratio")
 UNITS = {"young_modulus": "kPa", "voigt_viscosity": "kPa s", "series_viscosity": "kPa s", "poisson_ratio": ""}
 PRIOR_SD = {"young_modulus": 3.0, "voigt_viscosity": 3.0, "series_viscosity": 3.0, "poisson_ratio": 1.5}
-DIFFERENCE = 1e-4  # on the optimiser's scale, for central differences: the motion is smooth in the parameters
+DIFFERENCE = 1e-4  # on the optimiser's scale, between the tables of materials that give the direction of a parameter
 TOLD = 0.5  # a direction is told by the data where they narrow its prior to less than this share
 
 
@@ -129,6 +130,17 @@ class MotionTrial:
     def simulated(self, materials: CellRheology) -> Series:
         """Return the motion with these materials."""
         return simulate(self.body, materials, self.density, self.supports, self.times_s, step=self.step_s, load=self.load)
+
+    def differentiated(self, materials: CellRheology, directions: Sequence[MaterialChange]) -> SeriesDerivatives:
+        """Return the derivatives of the motion along changes of the materials."""
+        given = self.body, materials, self.density, self.supports, self.times_s
+        return simulate_with_derivatives(*given, directions, step=self.step_s, load=self.load)[1]
+
+    def compared(self, displacement: Array, forces: Mapping[str, Array]) -> Array:
+        """Return computed displacements (k, q, d) and forces in units of the noise, in one row, where there is a measurement."""
+        parts = [(displacement / self.sd_mm)[1:][np.isfinite(self.displacement[1:])]]
+        parts += [(forces[name] / self.force_sd_mn)[1:][np.isfinite(force[1:])] for name, force in self.force.items()]
+        return np.concatenate(parts)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -262,21 +274,20 @@ class _Problem:
                 if f"{region}: young_modulus" not in parameters.values():
                     raise InputError(f"trial {trial.name!r}: region {region!r} has no parameters; give a starting value for it")
 
-    def simulated(self, inner: Array) -> list[Series]:
+    def materials(self, trial: MotionTrial, inner: Array) -> CellRheology:
         values = self.parameters.values(inner)
-        return [
-            trial.simulated(per_region(trial.mesh, {r: _rheology(r, values) for r in trial.mesh.region_names})) for trial in self.trials
-        ]
+        return per_region(trial.mesh, {region: _rheology(region, values) for region in trial.mesh.region_names})
+
+    def simulated(self, inner: Array) -> list[Series]:
+        return [trial.simulated(self.materials(trial, inner)) for trial in self.trials]
 
     def data_residuals(self, series: Sequence[Series]) -> Array:
         parts = []
         for trial, operator, motion in zip(self.trials, self.operators, series, strict=True):
             modelled = np.stack([operator @ u for u in motion.displacement])
-            parts.append(((modelled - trial.displacement) / trial.sd_mm)[1:].ravel())
-            for name, force in trial.force.items():
-                parts.append(((motion.force(name) - force) / trial.force_sd_mn)[1:].ravel())
-        whole = np.concatenate(parts)
-        return whole[np.isfinite(whole)]
+            forces = {name: motion.force(name) - force for name, force in trial.force.items()}
+            parts.append(trial.compared(modelled - trial.displacement, forces))
+        return np.concatenate(parts)
 
     def residuals(self, inner: Array) -> Array:
         data = self.data_residuals(self.simulated(inner))
@@ -286,11 +297,24 @@ class _Problem:
         return np.concatenate([data, (inner - self.centre) / self.prior_sd])
 
     def jacobian(self, inner: Array) -> Array:
-        columns = [
-            (self.data_residuals(self.simulated(inner + step)) - self.data_residuals(self.simulated(inner - step))) / (2.0 * DIFFERENCE)
-            for step in DIFFERENCE * np.eye(len(inner))
-        ]
-        return np.vstack([np.column_stack(columns), np.diag(1.0 / self.prior_sd)])
+        data = np.vstack([self._data_jacobian(trial, operator, inner) for trial, operator in zip(self.trials, self.operators, strict=True)])
+        return np.vstack([data, np.diag(1.0 / self.prior_sd)])
+
+    def _data_jacobian(self, trial: MotionTrial, operator: sp.csr_array, inner: Array) -> Array:
+        """Exact derivatives of the computed motion; only the tables of materials are differenced."""
+        directions = []
+        for step in DIFFERENCE * np.eye(len(inner)):
+            ends = self.materials(trial, inner - step), self.materials(trial, inner + step)
+            directions.append(MaterialChange.between(*ends, 2.0 * DIFFERENCE))
+        found = trial.differentiated(self.materials(trial, inner), directions)
+        columns = []
+        for k, moved in enumerate(found.displacement):
+            forces = {}
+            for support in trial.supports:
+                acts = (trial.times_s > support.start_s) & (trial.times_s <= support.end_s)
+                forces[support.name] = found.force(support)[k] * acts[:, None]
+            columns.append(trial.compared(np.stack([operator @ u for u in moved]), forces))
+        return np.column_stack(columns)
 
     def estimate(self, inner: Array) -> MotionEstimate:
         series = self.simulated(inner)
