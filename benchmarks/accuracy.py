@@ -5,8 +5,8 @@ Prints one line for each claim: RMS distance (3-D, mm) over the markers that wer
 
 from __future__ import annotations
 
+import argparse
 import json
-import sys
 import time
 from pathlib import Path
 
@@ -29,6 +29,9 @@ def fitted(calibration: Calibration) -> dict[str, float]:
 
 def main() -> None:
     """Run all cases and print a table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("out", nargs="?", type=Path, help="also write the rows to this JSON file")
+    out = parser.parse_args().out
     rows: list[tuple[str, str, float, float]] = []
 
     def add(what: str, values: dict[str, float], goal: float, start: float) -> None:
@@ -52,8 +55,8 @@ def main() -> None:
     for p in two.model.parameters:
         if "ct_" not in p.name:
             print(p.name, p.value, two.model.interval(p.name))
-    if len(sys.argv) > 1:
-        Path(sys.argv[1]).write_text(json.dumps([list(r) for r in rows], indent=1))
+    if out:
+        out.write_text(json.dumps([list(r) for r in rows], indent=1))
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ ratio, and the share of 95 % intervals that hold the truth.
 
 from __future__ import annotations
 
-import sys
+import argparse
 import time
 
 import numpy as np
@@ -23,7 +23,9 @@ NOISE_MM = 0.15
 
 def main() -> None:
     """Identify every draw and print the summary."""
-    draws = int(sys.argv[1]) if len(sys.argv) > 1 else 20
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("draws", nargs="?", type=int, default=20, help="noisy scans to identify")
+    draws = parser.parse_args().draws
     template, truth = two_gels(44.0)
     virtual = virtual_specimen(template, truth, settings=ModelSettings(element_size_mm=6.0))
     inside, ratio, nu, start = [], [], [], time.perf_counter()

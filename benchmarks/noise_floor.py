@@ -7,8 +7,8 @@ left out of its fit tells from where on it follows noise.
 
 from __future__ import annotations
 
+import argparse
 import csv
-import sys
 from itertools import product
 from pathlib import Path
 
@@ -42,7 +42,9 @@ def smoothed(points: np.ndarray, residual: np.ndarray, degree: int) -> tuple[flo
 
 def main() -> None:
     """Print one line for each trial and degree."""
-    for label, rows in residuals(Path(sys.argv[1]) / "residuals.csv").items():
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path, help="of results, with residuals.csv")
+    for label, rows in residuals(parser.parse_args().folder / "residuals.csv").items():
         experiment = datasets.load(label.split("/")[0])
         ids = np.array([marker for marker, r in rows.items() if np.isfinite(r).all()])
         points = experiment.initial.aligned(ids)
