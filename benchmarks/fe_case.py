@@ -1,9 +1,9 @@
-"""The compression that ``fe_compression.py`` measures, and what its programs share (mm, kPa, mN)."""
+"""The cube that ``fe_compression.py`` and ``fe_linear.py`` press together, and what their programs share (mm, kPa, mN)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.sparse as sp
@@ -36,11 +36,11 @@ class Case:
 
 @dataclass(frozen=True)
 class Result:
-    """Displacement (n, 3), mm, force on the top, mN, and number of linear systems solved."""
+    """Displacement (n, 3), mm, force on the top, mN (none of linear problems), and number of linear systems solved."""
 
     displacement: Array
-    force: Array
-    iterations: int
+    force: Array = field(default_factory=lambda: np.empty(0))
+    iterations: int = 1
 
 
 def make_case(cells: int) -> Case:
@@ -54,9 +54,9 @@ def make_case(cells: int) -> Case:
     return Case(mesh, values[:, 1].copy(), values[:, 0].copy(), below, above)
 
 
-def prescribed(case: Case) -> Prescribed:
+def prescribed(case: Case, depth: float = DEPTH) -> Prescribed:
     nothing = Prescribed.nothing(case.mesh.n_points)
-    return nothing.and_also(case.bottom, (0.0, 0.0, 0.0)).and_also(case.top, (0.0, 0.0, -DEPTH))
+    return nothing.and_also(case.bottom, (0.0, 0.0, 0.0)).and_also(case.top, (0.0, 0.0, -depth))
 
 
 def largest_residual(case: Case) -> float:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import logging
 import tempfile
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -92,8 +93,8 @@ def run_felupe(case: Case) -> Result:
     return Result(field[0].values.copy(), force[case.top].sum(axis=0), count)
 
 
-def run_ngsolve(case: Case) -> Result:
-    """NGSolve: its compiled energy, its assembly and its sparse Cholesky on all cores, iterated like the others."""
+def ngsolve_mesh(case: Case) -> tuple[Any, Any, Any]:
+    """Return NGSolve's mesh and its coefficients mu and lambda."""
     import netgen.meshing as netgen
     import ngsolve as ng
 
@@ -106,6 +107,24 @@ def run_ngsolve(case: Case) -> Result:
     values = {name: int(np.flatnonzero(case.mesh.regions == region)[0]) for region, name in enumerate(case.mesh.region_names)}
     mu = mesh.MaterialCF({name: case.shear[cell] for name, cell in values.items()})
     lame = mesh.MaterialCF({name: case.lame[cell] for name, cell in values.items()})
+    return mesh, mu, lame
+
+
+def ngsolve_free(held: Any) -> Any:
+    """Return the unknowns that are not held, for NGSolve."""
+    import ngsolve as ng
+
+    free = ng.BitArray(held.size)
+    for dof, fixed in enumerate(held):
+        free[dof] = not fixed
+    return free
+
+
+def run_ngsolve(case: Case) -> Result:
+    """NGSolve: its compiled energy, its assembly and its sparse Cholesky on all cores, iterated like the others."""
+    import ngsolve as ng
+
+    mesh, mu, lame = ngsolve_mesh(case)
     space = ng.VectorH1(mesh, order=1)
     gradient = ng.Id(3) + ng.Grad(space.TrialFunction())
     volume = ng.Det(gradient)
@@ -114,9 +133,7 @@ def run_ngsolve(case: Case) -> Result:
     form += ng.Variation(energy.Compile() * ng.dx)
     support, count = prescribed(case), 0
     held = support.held.T.ravel()  # unknowns stand component after component
-    free = ng.BitArray(space.ndof)
-    for dof, fixed in enumerate(held):
-        free[dof] = not fixed
+    free = ngsolve_free(held)
     u, r, jump = (ng.GridFunction(space).vec for _ in range(3))
 
     def residual() -> Array:
@@ -141,8 +158,35 @@ def run_ngsolve(case: Case) -> Result:
     return Result(displacement, np.array(force).reshape(3, -1).T[case.top].sum(axis=0), count)
 
 
+def jax_fem_ends(depth: float) -> list[Any]:
+    """Return JAX-FEM's conditions: the base held, the top lowered by `depth`, mm."""
+    import jax.numpy as jnp
+
+    def below(point: Any) -> Any:
+        return jnp.isclose(point[2], 0.0)
+
+    def above(point: Any) -> Any:
+        return jnp.isclose(point[2], SIDE)
+
+    return [[below] * 3 + [above] * 3, [0, 1, 2] * 2, [lambda _: 0.0] * 5 + [lambda _: -depth]]
+
+
+def jax_fem_linear(case: Case) -> Callable[..., Array]:
+    """Return naibu's direct solver for JAX-FEM; the rows of held nodes, which it replaces, are made symmetric again."""
+    held, cholesky = prescribed(case).held, Cholesky()
+
+    def linear(matrix: Any, b: Any, start: Any, _: Any) -> Array:
+        indptr, indices, data = matrix.getValuesCSR()
+        square, moved = sp.csr_matrix((data, indices, indptr), shape=matrix.getSize()), np.asarray(start)
+        rhs = np.asarray(b) - square @ moved
+        rhs[held.ravel()] = 0.0
+        return moved + cholesky.factorize(constrained(square.tobsr((3, 3)), held)).solve(rhs)
+
+    return linear
+
+
 def run_jax_fem(case: Case) -> Result:
-    """JAX-FEM's `Problem` and `solver`; the rows of held nodes, which it replaces, are made symmetric again for Cholesky."""
+    """JAX-FEM's `Problem` and `solver`."""
     import jax
     import jax.numpy as jnp
     from jax_fem.generate_mesh import Mesh
@@ -163,33 +207,19 @@ def run_jax_fem(case: Case) -> Result:
         def get_tensor_map(self) -> Any:
             return lambda gradient, mu, lame: jax.grad(energy)(gradient + jnp.eye(3), mu, lame)
 
-    def ends(step: int) -> list[Any]:
-        def below(point: Any) -> Any:
-            return jnp.isclose(point[2], 0.0)
+    linear, count = jax_fem_linear(case), 0
 
-        def above(point: Any) -> Any:
-            return jnp.isclose(point[2], SIDE)
-
-        values = [lambda _: 0.0] * 5 + [lambda _: -DEPTH * step / STEPS]
-        return [[below] * 3 + [above] * 3, [0, 1, 2] * 2, values]
-
-    held, cholesky, count = prescribed(case).held, Cholesky(), 0
-
-    def linear(matrix: Any, b: Any, start: Any, _: Any) -> Array:
+    def counted(*arguments: Any) -> Array:
         nonlocal count
         count += 1
-        indptr, indices, data = matrix.getValuesCSR()
-        square, moved = sp.csr_matrix((data, indices, indptr), shape=matrix.getSize()), np.asarray(start)
-        rhs = np.asarray(b) - square @ moved
-        rhs[held.ravel()] = 0.0
-        return moved + cholesky.factorize(constrained(square.tobsr((3, 3)), held)).solve(rhs)
+        return linear(*arguments)
 
     mesh = Mesh(case.mesh.points, case.mesh.cells, "TET4")
-    problem = Compression(mesh, vec=3, dim=3, ele_type="TET4", dirichlet_bc_info=ends(0), additional_info=(case.shear, case.lame))
-    options = {"custom_solver": linear, "tol": largest_residual(case), "rel_tol": 0.0}
+    problem = Compression(mesh, vec=3, dim=3, ele_type="TET4", dirichlet_bc_info=jax_fem_ends(0.0), additional_info=(case.shear, case.lame))
+    options = {"custom_solver": counted, "tol": largest_residual(case), "rel_tol": 0.0}
     solution = [jnp.zeros((case.mesh.n_points, 3))]
     for step in range(1, STEPS + 1):
-        problem.fes[0].update_Dirichlet_boundary_conditions(ends(step))
+        problem.fes[0].update_Dirichlet_boundary_conditions(jax_fem_ends(DEPTH * step / STEPS))
         solution = solver(problem, options | {"initial_guess": solution})
     force = np.asarray(problem.compute_residual(solution)[0])
     return Result(np.asarray(solution[0]), force[case.top].sum(axis=0), count)
@@ -216,19 +246,25 @@ def tatva_forces() -> Any:
     return jax.jit(jax.grad(energy))
 
 
-def run_tatva(case: Case) -> Result:
-    """tatva: energy, automatic differentiation and coloured sparse tangent; Newton's method is `newton`."""
-    import jax
+def tatva_tangent(case: Case, forces: Any) -> tuple[Any, tuple[Any, ...]]:
+    """Return the coloured sparse derivative of forces, and what they take besides the displacement."""
     import jax.numpy as jnp
     from tatva import Mesh, Operator, element, sparse
 
-    jax.config.update("jax_enable_x64", True)
+    compiled_once()
     mesh = Mesh(jnp.asarray(case.mesh.points), jnp.asarray(case.mesh.cells))
     operator = Operator(mesh, element.Tetrahedron4(), cache_weights=True)
     data = operator, jnp.asarray(case.shear[:, None]), jnp.asarray(case.lame[:, None])
-    gradient = tatva_forces()
     pattern = sparse.ColoredMatrix.from_csr(sparse.pattern_from_mesh(mesh, 3))
-    stiffness = sparse.jacfwd(gradient, pattern, color_batch_size=1)  # all colours at once took longer
+    return sparse.jacfwd(forces, pattern, color_batch_size=1), data  # all colours at once took longer
+
+
+def run_tatva(case: Case) -> Result:
+    """tatva: energy, automatic differentiation and coloured sparse tangent; Newton's method is `newton`."""
+    import jax.numpy as jnp
+
+    gradient = tatva_forces()
+    stiffness, data = tatva_tangent(case, gradient)
 
     def forces(u: Array) -> Array:
         return np.array(gradient(jnp.asarray(u.ravel()), *data)).reshape(-1, 3)
@@ -302,8 +338,8 @@ def register_sfepy_law() -> str:
     return NeoHookean.name
 
 
-def sfepy_problem(case: Case) -> Any:
-    """Return SfePy's problem, whose held nodes move with the time from 0 to 1."""
+def sfepy_problem(case: Case, term: str, parameters: Array, depth: Callable[[Any], float]) -> Any:
+    """Return SfePy's problem for a term with parameters (m, r, c); the top is lowered by a depth, mm, that may depend on the time step."""
     from sfepy.discrete import Equation, Equations, FieldVariable, Function, Integral, Material, Problem
     from sfepy.discrete.conditions import Conditions, EssentialBC
     from sfepy.discrete.fem import FEDomain, Field, Mesh
@@ -316,19 +352,36 @@ def sfepy_problem(case: Case) -> Any:
     above = domain.create_region("Above", f"vertices in (z > {SIDE - 1e-6})", "facet")
     field = Field.from_args("displacement", np.float64, "vector", everything, approx_order=1)
     u, v = FieldVariable("u", "unknown", field), FieldVariable("v", "test", field, primary_var_name="u")
-    values = np.stack([case.shear, case.lame], axis=1)[:, :, None]
-    data = Material("m", function=lambda ts, coors, mode=None, **_: {"p": values} if mode == "qp" else None)
+    data = Material("m", function=lambda ts, coors, mode=None, **_: {"p": parameters} if mode == "qp" else None)
     integral = Integral("i", order=1)
     field.get_mapping(everything, integral, "cell")
     field.save_mappings()  # or it would be computed anew at every iteration
-    law = Term.new(f"{register_sfepy_law()}(m.p, v, u)", integral, everything, m=data, v=v, u=u)
+    law = Term.new(f"{term}(m.p, v, u)", integral, everything, m=data, v=v, u=u)
     problem = Problem("compression", equations=Equations([Equation("balance", law)]))
-    lowered = Function("lowered", lambda ts, coors, **_: np.full(len(coors), -DEPTH * ts.time))
+    lowered = Function("lowered", lambda ts, coors, **_: np.full(len(coors), -depth(ts)))
     fixed = EssentialBC("fixed", below, {"u.all": 0.0})
     moved = EssentialBC("moved", above, {"u.[0,1]": 0.0, "u.2": lowered})
     problem.set_bcs(ebcs=Conditions([fixed, moved]))
     problem.set_ics(ics=Conditions([]))
     return problem
+
+
+def sfepy_linear() -> Any:
+    """Return naibu's direct solver for SfePy, which counts the systems that it has solved."""
+    from sfepy.solvers.ls import LinearSolver
+
+    class Direct(LinearSolver):
+        name = "ls.naibu"
+        count, cholesky = 0, Cholesky()
+
+        def __call__(self, rhs: Array, mtx: Any = None, status: Any = None, **_: Any) -> Array:
+            self.count += 1
+            if status is not None:
+                status["n_iter"] = 1
+            matrix = sp.csr_matrix(mtx).sorted_indices().tobsr((1, 1))
+            return np.asarray(self.cholesky.factorize(matrix).solve(rhs))
+
+    return Direct({})
 
 
 def run_sfepy(case: Case) -> Result:
@@ -338,30 +391,20 @@ def run_sfepy(case: Case) -> Result:
     in proportion to their height.
     """
     from sfepy.base.base import output
-    from sfepy.solvers.ls import LinearSolver
     from sfepy.solvers.nls import Newton
     from sfepy.solvers.ts_solvers import SimpleTimeSteppingSolver
 
     output.set_output(quiet=True)
-    cholesky, count = Cholesky(), 0
-
-    class Direct(LinearSolver):
-        name = "ls.naibu"
-
-        def __call__(self, rhs: Array, mtx: Any = None, status: Any = None, **_: Any) -> Array:
-            nonlocal count
-            count += 1
-            status["n_iter"] = 1
-            matrix = sp.csr_matrix(mtx).sorted_indices().tobsr((1, 1))
-            return np.asarray(cholesky.factorize(matrix).solve(rhs))
+    direct = sfepy_linear()
 
     class Steps(SimpleTimeSteppingSolver):
         def solve_step(self, ts: Any, nls: Any, vec: Array, prestep_fun: Any = None) -> Any:
             return super().solve_step(ts, nls, vec + move, prestep_fun)
 
-    problem = sfepy_problem(case)
+    parameters = np.stack([case.shear, case.lame], axis=1)[:, :, None]
+    problem = sfepy_problem(case, register_sfepy_law(), parameters, lambda ts: DEPTH * ts.time)
     settings = {"i_max": 20, "eps_a": largest_residual(case), "eps_r": 1.0, "lin_red": None}
-    problem.set_solver(Steps({"t0": 0.0, "t1": 1.0, "n_step": STEPS + 1}, nls=Newton(settings, lin_solver=Direct({})), context=problem))
+    problem.set_solver(Steps({"t0": 0.0, "t1": 1.0, "n_step": STEPS + 1}, nls=Newton(settings, lin_solver=direct), context=problem))
     guess = np.zeros_like(case.mesh.points)
     guess[:, 2] = -DEPTH / STEPS * case.mesh.points[:, 2] / SIDE
     problem.time_update()
@@ -370,4 +413,4 @@ def run_sfepy(case: Case) -> Result:
     u = variables()
     problem.remove_bcs()
     force = np.asarray(problem.evaluator.eval_residual(u)).reshape(-1, 3)
-    return Result(u.reshape(-1, 3), force[case.top].sum(axis=0), count)
+    return Result(u.reshape(-1, 3), force[case.top].sum(axis=0), direct.count)

@@ -53,7 +53,7 @@ class LinearBody:
         m, d = self.simplices.n_cells, self.simplices.dimension
         blocks = np.zeros((self.pattern.n_blocks, d, d))
         lame, shear = per_cell(lame_lambda, m, "lame_lambda"), per_cell(shear_modulus, m, "shear_modulus")
-        _assemble(self.simplices.gradients, self.simplices.measures, lame, shear, self.positions, blocks)
+        _assemble(self.simplices.gradients, self.simplices.measures, lame, shear, self.positions, (0,) * d, blocks)
         return self.pattern.matrix(blocks)
 
     def forces(self, lame_lambda: ArrayLike, shear_modulus: ArrayLike, displacement: Array) -> Array:
@@ -68,8 +68,12 @@ class LinearBody:
         InputError
             The body can move freely.
         """
+        return self._factorized(self.stiffness(lame_lambda, shear_modulus), held)
+
+    def _factorized(self, stiffness: sp.bsr_matrix, held: NDArray[np.bool_]) -> Factorization:
+        """Factorize a stiffness, which is changed in place."""
         require_held(self.points, held)
-        matrix = constrained(self.stiffness(lame_lambda, shear_modulus), held)
+        matrix = constrained(stiffness, held)
         return choose_solver(matrix, self.points, held, symmetric=True).factorize(matrix)
 
     def solve(self, lame_lambda: ArrayLike, shear_modulus: ArrayLike, prescribed: Prescribed, external_force: Array | None = None) -> Array:
@@ -83,14 +87,14 @@ class LinearBody:
         held = prescribed.held
         if held.shape != self.points.shape:
             raise InputError(f"the supports are for {held.shape} components, the body has {self.points.shape}")
-        moved = np.where(held, prescribed.values, 0.0)
-        right = -self.forces(lame_lambda, shear_modulus, moved)
+        stiffness = self.stiffness(lame_lambda, shear_modulus)
+        right = -(stiffness @ np.where(held, prescribed.values, 0.0).ravel()).reshape(held.shape)
         if external_force is not None:
             if external_force.shape != self.points.shape:
                 raise InputError(f"external forces must have shape {self.points.shape}, not {external_force.shape}")
             right += external_force
         right[held] = 0.0
-        solution = self.factorized(lame_lambda, shear_modulus, held).solve(right.ravel()).reshape(right.shape)
+        solution = self._factorized(stiffness, held).solve(right.ravel()).reshape(right.shape)
         return np.where(held, prescribed.values, solution)
 
 
@@ -116,9 +120,11 @@ def require_held(points: Array, held: NDArray[np.bool_]) -> None:
 
 
 @njit(cache=True)
-def _assemble(gradients, measures, lame, shear, positions, blocks):  # type: ignore[no-untyped-def]  # pragma: no cover
-    m, k, d = gradients.shape
-    for c in range(m):
+def _assemble(gradients, measures, lame, shear, positions, zeros, blocks):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add the blocks of all cells; `zeros` is a tuple of d zeros, whose length the compiler knows, so that it unrolls the loops."""
+    d = len(zeros)
+    k = d + 1
+    for c in range(len(gradients)):
         g = gradients[c]
         of_lame, of_shear = measures[c] * lame[c], measures[c] * shear[c]
         for i in range(k):

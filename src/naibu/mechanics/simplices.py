@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from math import factorial
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from naibu.core.errors import InputError
@@ -77,16 +78,47 @@ def simplices(mesh: Mesh, *, thickness_mm: float = 1.0, cross_section_mm2: float
     if not (thickness_mm > 0.0 and cross_section_mm2 > 0.0):
         raise InputError(f"thickness and cross-section must be positive, not {thickness_mm:g} mm and {cross_section_mm2:g} mm^2")
     d = mesh.dimension
-    corners = mesh.points[mesh.cells]
-    edges = corners[:, 1:] - corners[:, :1]
-    measures = np.linalg.det(edges) / factorial(d)
+    measures, gradients = (_tetrahedra if d == 3 else _lines_or_triangles)(mesh.points, mesh.cells)
     if not (measures > 0.0).all():
         bad = int(np.argmin(measures))
         raise InputError(f"cell {bad} has volume {measures[bad]:g} mm^{d}; number its nodes the other way round, or mend the mesh")
+    extent = {1: cross_section_mm2, 2: thickness_mm, 3: 1.0}[d]
+    return Simplices(mesh.cells, gradients, measures * extent, mesh.n_points)
+
+
+def _lines_or_triangles(points: Array, cells: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Return lengths or areas (m,) and, where they are positive, the gradients of the shape functions (m, d + 1, d)."""
+    corners = points[cells]
+    edges = corners[:, 1:] - corners[:, :1]
+    determinants = np.linalg.det(edges)
+    edges[~(determinants > 0.0)] = np.eye(points.shape[1])  # can be inverted; the caller refuses these cells
     inner = np.swapaxes(np.linalg.inv(edges), 1, 2)
     gradients = np.concatenate([-inner.sum(axis=1, keepdims=True), inner], axis=1)
-    extent = {1: cross_section_mm2, 2: thickness_mm, 3: 1.0}[d]
-    return Simplices(mesh.cells, np.ascontiguousarray(gradients), measures * extent, mesh.n_points)
+    return determinants / factorial(points.shape[1]), np.ascontiguousarray(gradients)
+
+
+@njit(cache=True, error_model="numpy")
+def _tetrahedra(points, cells):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return volumes (m,) and, where they are positive, the gradients of the shape functions (m, 4, 3): cofactors of the edges."""
+    volumes, gradients = np.empty(len(cells)), np.zeros((len(cells), 4, 3))
+    edges = np.empty((3, 3))
+    for c in range(len(cells)):
+        g = gradients[c]
+        for i in range(3):
+            for a in range(3):
+                edges[i, a] = points[cells[c, i + 1], a] - points[cells[c, 0], a]
+        for i in range(3):
+            p, q = edges[(i + 1) % 3], edges[(i + 2) % 3]
+            for a in range(3):
+                b, e = (a + 1) % 3, (a + 2) % 3
+                g[i + 1, a] = p[b] * q[e] - p[e] * q[b]
+        determinant = (edges[0] * g[1]).sum()
+        volumes[c] = determinant / 6.0
+        for i in range(1, 4):
+            for a in range(3):
+                g[i, a] /= determinant
+                g[0, a] -= g[i, a]
+    return volumes, gradients
 
 
 def connection_matrices(body: Simplices) -> tuple[Array, Array]:
