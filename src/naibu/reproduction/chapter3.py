@@ -8,6 +8,7 @@ from naibu.reproduction.chapter3_cubes import layer_section, reach_section, unif
 from naibu.reproduction.chapter3_experiment import MARKER_SD_MM, experiment_section
 from naibu.reproduction.chapter3_noise import NOISE_MM, noise_section
 from naibu.reproduction.chapter3_square import square_section
+from naibu.reproduction.design_study import design_section
 from naibu.reproduction.material_test_tables import table_3_4, table_3_5
 
 
@@ -37,6 +38,7 @@ def chapter3(seed: int = 0, *, draws: int = 20) -> Chapter:
         table_3_4(),
         table_3_5(),
         experiment_section(),
+        design_section(draws=draws, seed=seed),
     )
     settings = {"seed": seed, "draws": draws, "noise_mm": NOISE_MM, "marker_sd_mm": MARKER_SD_MM}
     return Chapter("ch3", "Chapter 3: nonuniform elasticity from inner deformation", sections, {**settings})
