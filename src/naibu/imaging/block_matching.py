@@ -1,0 +1,190 @@
+"""Block matching: the displacement of every voxel by full search (spec S7, equations 3.38-3.40)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from naibu.core.errors import InputError
+from naibu.core.volume import Volume
+from naibu.imaging._block_kernels import NCC, SAD, SSD, between_voxels, full_search
+from naibu.imaging.dense import DenseDisplacement
+from naibu.imaging.pairs import grey_pair, to_millimetres
+from naibu.imaging.resampling import require_mask
+
+Measure = Literal["sad", "ssd", "ncc"]
+MEASURES: dict[Measure, int] = {"sad": SAD, "ssd": SSD, "ncc": NCC}
+Mask = NDArray[np.bool_]
+# grey values of a task: few enough that they stay in the fastest cache
+VALUES_AT_ONCE = 3000
+
+
+def block_matching(
+    reference: Volume,
+    deformed: Volume,
+    *,
+    block: ArrayLike = (3, 3, 3),
+    search: ArrayLike = (15, 15, 1),
+    measure: Measure = "sad",
+    sub_voxel: bool = True,
+    least_range: float = 0.0,
+    unmeasured: Literal["nan", "zero"] = "nan",
+    mask: ArrayLike | None = None,
+) -> DenseDisplacement:
+    """Return the displacement of every voxel whose surroundings look most like its own (spec S7).
+
+    Parameters
+    ----------
+    reference, deformed : Volume
+        Before and after, on one grid; a volume of one slice is an image.
+    block : array_like, shape (3,)
+        Size of the block along x, y, z, voxels, odd. The report: 3 x 3 x 3, or 5 x 5 in images.
+    search : array_like, shape (3,)
+        Largest displacement along x, y, z, voxels. The report: 15, 15, 1, or 30, 35 in images.
+    measure : {"sad", "ssd", "ncc"}
+        Sum of absolute (3.38) or squared (3.39) differences, or normalised correlation (3.40), which tells gain and offset apart from
+        motion.
+    sub_voxel : bool
+        Whether the least of a quadratic function through the costs of neighbouring places is taken; of their squares where they are
+        absolute differences, which grow in proportion with distance.
+    least_range : float
+        A block whose grey values span no more than this has nothing to be known by, and is not measured.
+    unmeasured : {"nan", "zero"}
+        What stands where nothing was measured; the report puts zero.
+    mask : array_like, shape (nz, ny, nx), optional
+        Voxels that are wanted; by default all.
+
+    Returns
+    -------
+    DenseDisplacement
+        Its quality is the mean absolute or squared difference, or the correlation. Voxels whose block leaves the volume are not measured.
+
+    Raises
+    ------
+    InputError
+        Volumes on different grids or without contrast, sizes that are no sizes, an empty mask, or no block with enough contrast.
+    """
+    if measure not in MEASURES or unmeasured not in ("nan", "zero"):
+        raise InputError(f"measure must be one of {', '.join(MEASURES)} and unmeasured 'nan' or 'zero', not {measure!r} and {unmeasured!r}")
+    a, b = grey_pair(reference, deformed)
+    half, reach = _sizes(block, search, reference)
+    # a range with unknown voxels in it is unknown
+    wanted = np.asarray(grey_range(reference, 2 * half + 1) > least_range)
+    if mask is not None:
+        wanted &= require_mask(mask, reference)
+    if not wanted.any():
+        raise InputError(
+            f"no block of {(2 * half + 1).tolist()} voxels has a grey range above {least_range:g} in the mask: lower least_range"
+        )
+    kind = MEASURES[measure]
+    offsets = _offsets(reach, reference)
+    which = np.full(reference.shape, -1, dtype=np.int32)
+    box = _reached(wanted, half + reach)
+    which[box] = _search(kind, a[box], b[box], half, reach, offsets, wanted[box])
+    which[~wanted] = -1
+    move, cost = np.full((3, *reference.shape), np.nan), np.full(reference.shape, np.nan)
+    between_voxels(kind, a, b, half, offsets, which, sub_voxel, move, cost)
+    vectors = to_millimetres(move, reference)
+    valid = which >= 0
+    if unmeasured == "zero":
+        vectors[~valid] = 0.0
+    return DenseDisplacement(vectors, valid, -cost if kind == NCC else cost)
+
+
+def grey_range(volume: Volume, block: ArrayLike) -> NDArray[np.float64]:
+    """Return the difference (nz, ny, nx) of the largest and the smallest grey value in the block about every voxel.
+
+    Parameters
+    ----------
+    volume : Volume
+        Voxels.
+    block : array_like, shape (3,)
+        Size of the block along x, y, z, voxels.
+    """
+    size = tuple(int(n) for n in np.asarray(block)[::-1])
+    values = np.asarray(volume.values, dtype=np.float64)
+    return np.asarray(ndimage.maximum_filter(values, size) - ndimage.minimum_filter(values, size))
+
+
+def _sizes(block: ArrayLike, search: ArrayLike, volume: Volume) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    size, reach = np.asarray(block), np.asarray(search)
+    for values, name, least in ((size, "block", 1), (reach, "search", 0)):
+        if values.shape != (3,) or values.dtype.kind not in "iu" or (values < least).any():
+            raise InputError(f"{name} must be three whole numbers of voxels along x, y, z, at least {least}, not {values.tolist()}")
+    if (size % 2 == 0).any():
+        raise InputError(f"a block has a voxel in its middle: its sizes must be odd, not {size.tolist()}")
+    active = np.array(volume.shape[::-1]) > 1
+    size, reach = np.where(active, size, 1), np.where(active, reach, 0)
+    if (size > volume.shape[::-1]).any():
+        raise InputError(f"a block of {size.tolist()} voxels does not fit into a volume of {list(volume.shape[::-1])}")
+    return (size // 2).astype(np.int64), reach.astype(np.int64)
+
+
+def _offsets(reach: NDArray[np.int64], volume: Volume) -> NDArray[np.int64]:
+    """Return all displacements (m, 3), the shortest first: of equal costs the first one wins."""
+    axes = np.meshgrid(*(np.arange(-r, r + 1) for r in reach), indexing="ij")
+    offsets = np.stack(axes, axis=-1).reshape(-1, 3)
+    return np.ascontiguousarray(offsets[np.argsort(np.linalg.norm(offsets * volume.spacing_mm, axis=1), kind="stable")])
+
+
+def _reached(wanted: Mask, margin: NDArray[np.int64]) -> tuple[slice, slice, slice]:
+    """Return the box that holds all that the wanted voxels are compared with."""
+    where = [np.flatnonzero(np.any(wanted, axis=tuple(a for a in range(3) if a != axis))) for axis in range(3)]
+    first, second, third = (slice(max(int(w[0] - m), 0), int(w[-1] + m + 1)) for w, m in zip(where, margin[::-1], strict=True))
+    return first, second, third
+
+
+def _search(
+    kind: int,
+    a: NDArray[np.float32],
+    b: NDArray[np.float32],
+    half: NDArray[np.int64],
+    reach: NDArray[np.int64],
+    offsets: NDArray[np.int64],
+    wanted: Mask,
+) -> NDArray[np.int32]:
+    """Return the number (nz, ny, nx) of the best offset, -1 where there is none."""
+    nz, ny, nx = a.shape
+    spare = int(reach[0] + half[0])
+    width, guard = nx + spare, (ny + 1) * (nx + spare)
+    flat = [_flat(v, spare, guard, np.nan) for v in (a, b)]
+    if kind == NCC:
+        statistics = [np.stack([_flat(s, spare, guard, np.nan) for s in _statistics(v, half)]) for v in (a, b)]
+    else:
+        statistics = [np.zeros((2, 1), dtype=np.float32)] * 2
+    chunks = -(-ny // int(np.clip(VALUES_AT_ONCE // width, 8, 64)))
+    rows = -(-ny // chunks)
+    some = np.zeros((nz, chunks * rows), dtype=bool)
+    some[:, :ny] = np.any(wanted, axis=2)
+    best, which = np.full(flat[0].size, np.inf, dtype=np.float32), np.full(flat[0].size, -1, dtype=np.int32)
+    layout = np.array([nz, ny, width, guard])
+    busy = np.any(some.reshape(nz, chunks, rows), axis=2)
+    full_search(kind, flat[0], flat[1], layout, half, offsets, busy, statistics[0], statistics[1], best, which)
+    return which[guard : guard + nz * ny * width].reshape(nz, ny, width)[:, :, :nx]
+
+
+def _flat(values: NDArray[np.float32], spare: int, guard: int, fill: float) -> NDArray[np.float32]:
+    """Return a volume as one long row, with room after every row and at both ends."""
+    nz, ny, nx = values.shape
+    out = np.full(2 * guard + nz * ny * (nx + spare), fill, dtype=np.float32)
+    out[guard : len(out) - guard].reshape(nz, ny, nx + spare)[:, :, :nx] = values
+    return out
+
+
+def _statistics(values: NDArray[np.float32], half: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Return the mean of every block and the inverse of its standard deviation, zero where it has none (2, nz, ny, nx).
+
+    Both are NaN where a block holds unknown voxels.
+    """
+    size = tuple(int(n) for n in 2 * half[::-1] + 1)
+    known = np.isfinite(values)
+    v = np.where(known, values, 0.0).astype(float)
+    mean = ndimage.uniform_filter(v, size)
+    variance = ndimage.uniform_filter(v * v, size) - mean**2
+    flat = variance <= 1e-10 * float(np.var(v))
+    found = np.stack([mean, np.where(flat, 0.0, 1.0 / np.sqrt(np.where(flat, 1.0, variance)))]).astype(np.float32)
+    found[:, ~ndimage.minimum_filter(known, size)] = np.nan
+    return found

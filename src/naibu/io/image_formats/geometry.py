@@ -1,0 +1,164 @@
+"""What the readers share: axes with lengths made into the geometry of a volume, units of length, and arrays that are no volumes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from naibu.core.errors import InputError
+from naibu.core.volume import NEARLY, Volume
+
+Array = NDArray[np.float64]
+MM_PER_UNIT = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "nm": 1e-6, "inch": 25.4, "in": 25.4}
+_LONG_NAMES = {
+    "meter": "m",
+    "metre": "m",
+    "centimeter": "cm",
+    "centimetre": "cm",
+    "millimeter": "mm",
+    "millimetre": "mm",
+    "micron": "um",
+    "micrometer": "um",
+    "micrometre": "um",
+    "nanometer": "nm",
+    "nanometre": "nm",
+}
+# x and y grow to the left and the back in LPS, to the right and the front in RAS
+FLIP_RAS = np.diag([-1.0, -1.0, 1.0])
+
+
+class ReadOptions(NamedTuple):
+    """What the user may say about a file.
+
+    Attributes
+    ----------
+    unit_mm : float or None
+        Length of the file's unit, mm; None takes the unit the file states, or mm.
+    spacing_mm : ndarray, shape (3,), or None
+        Distance of voxels along x, y, z, mm, for files that do not say.
+    series : str or None
+        Series of a DICOM folder.
+    rescaled : bool
+        Whether slope and intercept of the file are applied to its values.
+    """
+
+    unit_mm: float | None = None
+    spacing_mm: Array | None = None
+    series: str | None = None
+    rescaled: bool = False
+
+
+def unit_length(source: str, name: str) -> float:
+    """Return the length of a unit, mm, by any of its usual names.
+
+    Raises
+    ------
+    InputError
+        A name that is no unit of length.
+    """
+    short = name.strip().strip('"').lower()
+    singular = short[:-1] if short.endswith("s") and len(short) > 2 else short
+    key = _LONG_NAMES.get(singular, singular)
+    if key not in MM_PER_UNIT:
+        raise InputError(f"{source}: states its lengths in {name!r}, which is no unit naibu knows; give unit_mm, the length of one in mm")
+    return MM_PER_UNIT[key]
+
+
+def volume_with_axes(source: str, values: ArrayLike, origin: ArrayLike, axes: ArrayLike, unit_mm: float = 1.0) -> Volume:
+    """Return a volume of values, the centre of the first voxel, and one step along each index.
+
+    Parameters
+    ----------
+    source : str
+        Name of the file, for errors.
+    values : array_like, shape (nz, ny, nx)
+        Grey values.
+    origin : array_like, shape (3,)
+        Centre of the first voxel, LPS, in the file's unit.
+    axes : array_like, shape (3, 3)
+        Columns are the steps to the next voxel along x, y, z, LPS, in the file's unit.
+    unit_mm : float
+        Length of the file's unit, mm.
+
+    Raises
+    ------
+    InputError
+        Steps of no length, sheared axes (slices that are not orthogonal), or values that make no volume.
+    """
+    steps = np.asarray(axes, dtype=float)
+    spacing = np.linalg.norm(steps, axis=0)
+    if not (np.isfinite(steps).all() and (spacing > 0.0).all()):
+        raise InputError(f"{source}: the distance of its voxels is {spacing.tolist()} along x, y, z; the geometry of the file is damaged")
+    direction = steps / spacing
+    skew = np.abs(direction.T @ direction - np.eye(3))
+    if skew.max() > NEARLY:
+        degrees = np.degrees(np.arcsin(min(float(skew.max()), 1.0)))
+        raise InputError(
+            f"{source}: its axes are {90.0 - degrees:.2f} degrees apart instead of 90 (slices that are not orthogonal, as with a tilted "
+            "gantry); resample it to orthogonal slices first"
+        )
+    try:
+        return Volume.from_array(
+            values, spacing_mm=spacing * unit_mm, origin_mm=np.asarray(origin, dtype=float) * unit_mm, direction=nearest_rotation(direction)
+        )
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from error
+
+
+def nearest_rotation(direction: Array) -> Array:
+    """Return the orthonormal axes (3, 3) nearest to axes that were rounded in a file; exact ones stay exact."""
+    if np.abs(direction.T @ direction - np.eye(3)).max() < 1e-12:
+        return direction
+    u, _, vt = np.linalg.svd(direction)
+    return np.asarray(u @ vt)
+
+
+def three_axes(source: str, values: NDArray[Any]) -> NDArray[Any]:
+    """Return values (nz, ny, nx) of an array whose further leading axes have length one; a plane becomes one slice.
+
+    Raises
+    ------
+    InputError
+        Several times, echoes or channels.
+    """
+    v = values
+    while v.ndim > 3 and v.shape[0] == 1:
+        v = v[0]
+    if v.ndim == 2:
+        v = v[None]
+    if v.ndim != 3:
+        raise InputError(
+            f"{source}: holds {values.ndim} axes with {values.shape[::-1]} samples (several times, echoes or channels); "
+            "save the one you mean as a volume of its own"
+        )
+    return v
+
+
+def no_colours(source: str, samples: int, what: str = "colour samples a voxel") -> None:
+    """Refuse more than one sample a voxel.
+
+    Raises
+    ------
+    InputError
+        `samples` is not one.
+    """
+    if samples != 1:
+        raise InputError(f"{source}: has {samples} {what} (RGB or vectors), not one grey value; convert it to grey values first")
+
+
+def content(path: str | os.PathLike[str]) -> bytes:
+    """Return the bytes of a file.
+
+    Raises
+    ------
+    InputError
+        It is not there or may not be read.
+    """
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error

@@ -1,0 +1,176 @@
+"""MetaImage (``.mha``, ``.mhd``): the format of ITK, 3D Slicer and ParaView, grey values and vectors.
+
+Described in "MetaIO Documentation", https://docs.itk.org/en/latest/learn/metaio.html.
+"""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from naibu.core.errors import InputError
+from naibu.core.volume import Volume
+from naibu.io.atomic import write_atomically
+from naibu.io.image_formats.geometry import ReadOptions, content, no_colours, three_axes, unit_length, volume_with_axes
+
+_TYPES = {
+    "MET_CHAR": "i1",
+    "MET_UCHAR": "u1",
+    "MET_SHORT": "i2",
+    "MET_USHORT": "u2",
+    "MET_INT": "i4",
+    "MET_UINT": "u4",
+    # a "long" has 4 bytes in this format, whatever the machine
+    "MET_LONG": "i4",
+    "MET_ULONG": "u4",
+    "MET_LONG_LONG": "i8",
+    "MET_ULONG_LONG": "u8",
+    "MET_FLOAT": "f4",
+    "MET_DOUBLE": "f8",
+}
+_NAMES = {code: name for name, code in _TYPES.items() if name not in ("MET_LONG", "MET_ULONG")}
+
+
+def read(path: Path, options: ReadOptions) -> Volume:
+    """Read grey values (see `naibu.io.images.read_volume`)."""
+    header, values = _parts(path)
+    no_colours(path.name, int(header.get("ElementNumberOfChannels", "1")), "channels a voxel")
+    return _with_geometry(path, header, values, options)
+
+
+def read_vectors(path: Path, options: ReadOptions) -> tuple[NDArray[np.float64], Volume]:
+    """Read vectors (nz, ny, nx, 3) and the grid they stand on, whose values tell where they are finite."""
+    header, values = _parts(path)
+    if int(header.get("ElementNumberOfChannels", "1")) != 3 or values.ndim != 4:
+        raise InputError(f"{path.name}: holds no vectors with three components; read it with read_volume")
+    vectors = np.asarray(values, dtype=float)
+    grid = _with_geometry(path, header, np.isfinite(vectors).all(axis=3), options)
+    return vectors, grid
+
+
+def write(path: Path, values: NDArray[Any], grid: Volume, *, compressed: bool) -> Path:
+    """Write values (nz, ny, nx), or vectors (nz, ny, nx, 3), that stand on the grid of a volume."""
+    stored = values.astype(np.uint8) if values.dtype == bool else values
+    stored = stored.astype(np.float32) if stored.dtype == np.float16 else stored
+    code = f"{stored.dtype.kind}{stored.dtype.itemsize}"
+    if code not in _NAMES:
+        raise InputError(f"{path.name}: MetaImage has no type for values of {values.dtype}; convert them first")
+    data = np.ascontiguousarray(stored, dtype=stored.dtype.newbyteorder("<")).tobytes()
+    data = zlib.compress(data, 1) if compressed else data
+    header = {
+        "ObjectType": "Image",
+        "NDims": "3",
+        "BinaryData": "True",
+        "BinaryDataByteOrderMSB": "False",
+        "CompressedData": str(compressed),
+        **({"CompressedDataSize": str(len(data))} if compressed else {}),
+        "TransformMatrix": _numbers(grid.direction.T.ravel()),
+        "Offset": _numbers(grid.origin_mm),
+        "CenterOfRotation": "0 0 0",
+        "ElementSpacing": _numbers(grid.spacing_mm),
+        "DimSize": " ".join(str(n) for n in values.shape[2::-1]),
+        **({"ElementNumberOfChannels": str(values.shape[3])} if values.ndim == 4 else {}),
+        "ElementType": _NAMES[code],
+    }
+    apart = path.suffix.lower() == ".mhd"
+    beside = path.with_suffix(".zraw" if compressed else ".raw")
+    text = "".join(f"{key} = {value}\n" for key, value in header.items())
+    text += f"ElementDataFile = {beside.name if apart else 'LOCAL'}\n"
+    if apart:
+        write_atomically(beside, data)
+        return write_atomically(path, text)
+    return write_atomically(path, text.encode() + data)
+
+
+def _numbers(values: NDArray[np.float64]) -> str:
+    return " ".join(repr(float(v)) for v in values)
+
+
+def _parts(path: Path) -> tuple[dict[str, str], NDArray[Any]]:
+    """Return the header of a file and its values, (nz, ny, nx) or (nz, ny, nx, channels)."""
+    raw = content(path)
+    header, end = _header(path.name, raw)
+    missing = [key for key in ("NDims", "DimSize", "ElementType", "ElementDataFile") if key not in header]
+    if missing:
+        raise InputError(f"{path.name}: is no MetaImage file, or a damaged one: its header lacks {', '.join(missing)}")
+    kind = header["ElementType"].upper().removesuffix("_ARRAY")
+    if kind not in _TYPES:
+        raise InputError(f"{path.name}: its values are of type {header['ElementType']}, which is none of {sorted(_TYPES)}")
+    size = [int(n) for n in header["DimSize"].split()]
+    channels = int(header.get("ElementNumberOfChannels", "1"))
+    shape = (*size[::-1], *((channels,) if channels > 1 else ()))
+    return header, _values(path, header, raw[end:], np.dtype(_TYPES[kind]), shape)
+
+
+def _header(source: str, raw: bytes) -> tuple[dict[str, str], int]:
+    """Return the fields of the header and where it ends."""
+    header: dict[str, str] = {}
+    at = 0
+    while at < len(raw) and "ElementDataFile" not in header:
+        end = raw.find(b"\n", at)
+        end = len(raw) if end < 0 else end
+        try:
+            key, found, value = raw[at:end].decode("utf-8").partition("=")
+        except UnicodeDecodeError as error:
+            raise InputError(f"{source}: is no MetaImage file: its header is not text") from error
+        if found:
+            header[key.strip()] = value.strip()
+        at = end + 1
+    return header, at
+
+
+def _values(path: Path, header: dict[str, str], rest: bytes, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """Return the values that follow the header, or stand in the files it names."""
+    named = header["ElementDataFile"]
+    if "%" in named:
+        raise InputError(f"{path.name}: spreads its slices over files {named!r}, which naibu does not read; save it as one .mha file")
+    if named.split()[0] == "LIST":
+        data = b"".join(content(path.parent / name.strip()) for name in rest.decode().splitlines() if name.strip())
+    else:
+        data = rest if named == "LOCAL" else content(path.parent / named)
+    skip = int(header.get("HeaderSize", "0"))
+    if _true(header.get("CompressedData")):
+        try:
+            data = zlib.decompress(data)
+        except zlib.error as error:
+            raise InputError(f"{path.name}: its compressed values are damaged or cut off ({error}); copy the file again") from error
+    n = int(np.prod(shape))
+    if not _true(header.get("BinaryData", "True")):
+        return _counted(path.name, np.array(data.split()[:n]).astype(dtype), n).reshape(shape)
+    data = data[-n * dtype.itemsize :] if skip < 0 else data[skip:]
+    msb = header.get("BinaryDataByteOrderMSB", header.get("ElementByteOrderMSB"))
+    order = dtype.newbyteorder(">" if _true(msb) else "<")
+    there = np.frombuffer(data, dtype=order, count=min(n, len(data) // order.itemsize))
+    return _counted(path.name, there.astype(dtype), n).reshape(shape)
+
+
+def _counted(source: str, values: NDArray[Any], n: int) -> NDArray[Any]:
+    if len(values) != n:
+        raise InputError(f"{source}: holds {len(values)} of {n} values: the file was cut off; copy it again")
+    return values
+
+
+def _true(text: str | None) -> bool:
+    return text is not None and text.strip().lower() in ("true", "1", "t")
+
+
+def _with_geometry(path: Path, header: dict[str, str], values: NDArray[Any], options: ReadOptions) -> Volume:
+    n = int(header["NDims"])
+    place = next((header[key] for key in ("Offset", "Origin", "Position") if key in header), None)
+    turn = next((header[key] for key in ("TransformMatrix", "Rotation", "Orientation") if key in header), None)
+    length = header.get("ElementSpacing", header.get("ElementSize"))
+    if length is None and options.spacing_mm is None:
+        raise InputError(f"{path.name}: does not say how far its voxels are apart; give spacing_mm")
+    spacing = np.array(length.split(), dtype=float) if length is not None else np.asarray(options.spacing_mm, dtype=float)[:n]
+    origin = np.array(place.split(), dtype=float) if place else np.zeros(n)
+    direction = np.array(turn.split(), dtype=float).reshape(n, n).T if turn else np.eye(n)
+    if n == 2:
+        spacing, origin = np.append(spacing, 1.0), np.append(origin, 0.0)
+        direction = np.block([[direction, np.zeros((2, 1))], [np.zeros((1, 2)), np.ones((1, 1))]])
+    values = three_axes(path.name, values)
+    unit = options.unit_mm or (unit_length(path.name, header["DistanceUnits"]) if "DistanceUnits" in header else 1.0)
+    return volume_with_axes(path.name, values, origin[:3], direction[:3, :3] * spacing[:3], unit)

@@ -1,0 +1,61 @@
+"""NIfTI (``.nii``, ``.nii.gz``) through nibabel; its axes run to the right, front and top (RAS), ours to the left, back and top (LPS)."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from naibu.core.errors import InputError
+from naibu.core.optional_packages import optional_package
+from naibu.core.volume import Volume
+from naibu.io.atomic import write_atomically
+from naibu.io.image_formats.geometry import FLIP_RAS, ReadOptions, content, three_axes, unit_length, volume_with_axes
+
+_STORED = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
+
+
+def read(path: Path, options: ReadOptions) -> Volume:
+    """Read grey values (see `naibu.io.images.read_volume`); they are those stored, unless `rescaled` is asked for."""
+    nibabel = optional_package("nibabel", f"{path.name}: reading NIfTI files")
+    if not path.is_file():
+        content(path)
+    try:
+        image = nibabel.load(path)
+        stored = np.asarray(image.dataobj) if options.rescaled else image.dataobj.get_unscaled()
+    # nibabel raises whatever its readers meet
+    except Exception as error:
+        raise InputError(f"{path.name}: cannot be read as NIfTI ({error}); copy the file again") from error
+    if stored.dtype.kind not in "biuf":
+        raise InputError(
+            f"{path.name}: holds colours or complex numbers ({stored.dtype}), not grey values; convert it to grey values first"
+        )
+    values = three_axes(path.name, np.asarray(stored).T)
+    affine = np.asarray(image.affine, dtype=float)
+    named = image.header.get_xyzt_units()[0] if hasattr(image.header, "get_xyzt_units") else "unknown"
+    unit = options.unit_mm or (1.0 if named == "unknown" else unit_length(path.name, named))
+    return volume_with_axes(path.name, values, FLIP_RAS @ affine[:3, 3], FLIP_RAS @ affine[:3, :3], unit)
+
+
+def write(path: Path, values: NDArray[Any], grid: Volume, *, compressed: bool) -> Path:
+    """Write grey values (nz, ny, nx) that stand on the grid of a volume; the ending of the name tells whether they are compressed."""
+    nibabel = optional_package("nibabel", f"{path.name}: writing NIfTI files")
+    stored = values.astype(np.uint8) if values.dtype == bool else values
+    stored = stored.astype(np.float32) if stored.dtype == np.float16 else stored
+    if stored.ndim != 3 or stored.dtype.str[1:] not in _STORED:
+        raise InputError(f"{path.name}: NIfTI files are written of grey values, not of {values.ndim}-dimensional {values.dtype}; use .mha")
+    affine = np.eye(4)
+    affine[:3, :3] = FLIP_RAS @ (grid.direction * grid.spacing_mm)
+    affine[:3, 3] = FLIP_RAS @ grid.origin_mm
+    image = nibabel.Nifti1Image(np.ascontiguousarray(stored).T, affine, dtype=stored.dtype)
+    image.header.set_xyzt_units("mm")
+    image.header.set_slope_inter(1.0, 0.0)
+    image.set_qform(affine, code="scanner")
+    image.set_sform(affine, code="scanner")
+    data = image.to_bytes()
+    if path.name.lower().endswith(".gz"):
+        data = gzip.compress(data, compresslevel=1, mtime=0)
+    return write_atomically(path, data)

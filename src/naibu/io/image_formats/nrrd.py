@@ -1,0 +1,127 @@
+"""NRRD (``.nrrd``, ``.nhdr``) through pynrrd: grey values and vectors.
+
+Described in "Definition of NRRD File Format", https://teem.sourceforge.net/nrrd/format.html.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from naibu.core.errors import InputError
+from naibu.core.optional_packages import optional_package
+from naibu.core.volume import Volume
+from naibu.io.atomic import write_atomically
+from naibu.io.image_formats.geometry import FLIP_RAS, ReadOptions, content, three_axes, unit_length, volume_with_axes
+
+_TO_LPS = {
+    **dict.fromkeys(("left-posterior-superior", "lps", "scanner-xyz", "3d-right-handed", ""), np.eye(3)),
+    **dict.fromkeys(("right-anterior-superior", "ras"), FLIP_RAS),
+    **dict.fromkeys(("left-anterior-superior", "las"), np.diag([1.0, -1.0, 1.0])),
+}
+_COLOURS = ("rgb", "rgba", "hsv", "xyz-color")
+
+
+def read(path: Path, options: ReadOptions) -> Volume:
+    """Read grey values (see `naibu.io.images.read_volume`)."""
+    values, header = _loaded(path)
+    spatial = _spatial_axes(path.name, header, values.ndim)
+    if len(spatial) < values.ndim and any(values.shape[a] != 1 for a in range(values.ndim) if a not in spatial):
+        raise InputError(
+            f"{path.name}: has several samples a voxel or several times (axes {list(values.shape)}, kinds {header.get('kinds')}); "
+            "save the one you mean as a volume of its own"
+        )
+    keep = values.reshape([values.shape[a] for a in spatial])
+    return _with_geometry(path, header, three_axes(path.name, keep.T), spatial, options)
+
+
+def read_vectors(path: Path, options: ReadOptions) -> tuple[NDArray[np.float64], Volume]:
+    """Read vectors (nz, ny, nx, 3) and the grid they stand on, whose values tell where they are finite."""
+    values, header = _loaded(path)
+    spatial = _spatial_axes(path.name, header, values.ndim)
+    if values.ndim != 4 or len(spatial) != 3 or values.shape[({0, 1, 2, 3} - set(spatial)).pop()] != 3:
+        raise InputError(f"{path.name}: holds no vectors with three components; read it with read_volume")
+    vectors = np.asarray(np.moveaxis(values, spatial, (2, 1, 0)), dtype=float)
+    grid = _with_geometry(path, header, np.isfinite(vectors).all(axis=3), spatial, options)
+    turn = _TO_LPS[str(header.get("space", "")).lower()]
+    return vectors @ turn.T, grid
+
+
+def write(path: Path, values: NDArray[Any], grid: Volume, *, compressed: bool) -> Path:
+    """Write values (nz, ny, nx), or vectors (nz, ny, nx, 3), that stand on the grid of a volume."""
+    nrrd = optional_package("nrrd", f"{path.name}: writing NRRD files", "pynrrd")
+    if path.suffix.lower() != ".nrrd":
+        raise InputError(f"{path.name}: NRRD is written as one file; let its name end in .nrrd")
+    stored = values.astype(np.uint8) if values.dtype == bool else values
+    steps = (grid.direction * grid.spacing_mm).T
+    vectors = values.ndim == 4
+    header = {
+        "space": "left-posterior-superior",
+        "space directions": np.vstack([np.full((1, 3), np.nan), steps]) if vectors else steps,
+        "space origin": grid.origin_mm,
+        "space units": ["mm", "mm", "mm"],
+        "kinds": (["vector"] if vectors else []) + ["domain"] * 3,
+        "encoding": "gzip" if compressed else "raw",
+    }
+    handle, aside = tempfile.mkstemp(suffix=".nrrd")
+    os.close(handle)
+    try:
+        nrrd.write(aside, np.ascontiguousarray(stored).T, header, compression_level=1)
+        return write_atomically(path, Path(aside).read_bytes())
+    finally:
+        Path(aside).unlink(missing_ok=True)
+
+
+def _loaded(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
+    nrrd = optional_package("nrrd", f"{path.name}: reading NRRD files", "pynrrd")
+    if not path.is_file():
+        content(path)
+    try:
+        values, header = nrrd.read(str(path))
+    # pynrrd raises whatever its parsers and zlib meet
+    except Exception as error:
+        raise InputError(f"{path.name}: cannot be read as NRRD ({error}); copy the file again") from error
+    return np.asarray(values), dict(header)
+
+
+def _spatial_axes(source: str, header: dict[str, Any], n: int) -> list[int]:
+    """Return which axes lie in space: those with a direction, or, where none is given, of kind domain or space."""
+    kinds = [str(kind).lower() for kind in header.get("kinds") or ["domain"] * n]
+    if any(kind in _COLOURS or kind.endswith("-color") for kind in kinds):
+        raise InputError(f"{source}: holds colours ({kinds}), not grey values; convert it to grey values first")
+    directions = header.get("space directions")
+    if directions is not None:
+        return [a for a, row in enumerate(directions) if row is not None and np.isfinite(np.asarray(row, dtype=float)).all()]
+    return [a for a, kind in enumerate(kinds) if kind in ("domain", "space", "???", "none")]
+
+
+def _with_geometry(path: Path, header: dict[str, Any], values: NDArray[Any], spatial: list[int], options: ReadOptions) -> Volume:
+    n = len(spatial)
+    space = str(header.get("space", "")).lower()
+    if space not in _TO_LPS:
+        raise InputError(
+            f"{path.name}: lies in space {header['space']!r}; naibu reads left-posterior-superior, RAS and LAS: resave it in one"
+        )
+    if header.get("space directions") is not None:
+        axes = np.array([np.asarray(header["space directions"][a], dtype=float) for a in spatial]).T
+    else:
+        spacings = np.asarray(header.get("spacings", np.full(values.ndim, np.nan)), dtype=float)
+        length = spacings[spatial] if spacings.shape[0] > max(spatial) else np.full(n, np.nan)
+        if not np.isfinite(length).all():
+            if options.spacing_mm is None:
+                raise InputError(f"{path.name}: does not say how far its voxels are apart; give spacing_mm")
+            length = np.asarray(options.spacing_mm, dtype=float)[:n]
+        axes = np.diag(length)
+    origin = np.asarray(header.get("space origin", np.zeros(n)), dtype=float)
+    if n == 2 or len(axes) == 2:
+        axes = np.block([[axes, np.zeros((2, 1))], [np.zeros((1, 2)), np.ones((1, 1))]])
+        origin = np.append(origin[:2], 0.0)
+    units = header.get("space units") or header.get("units")
+    unit = options.unit_mm or (unit_length(path.name, str(units[-1])) if units is not None and str(units[-1]).strip('"') else 1.0)
+    turn = _TO_LPS[space]
+    return volume_with_axes(path.name, values, turn @ origin, turn @ axes, unit)

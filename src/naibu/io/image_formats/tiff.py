@@ -1,0 +1,140 @@
+"""Stacks of TIFF pages, or a folder of TIFF files, through tifffile."""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from naibu.core.errors import InputError
+from naibu.core.optional_packages import optional_package
+from naibu.core.volume import Volume
+from naibu.io.atomic import write_atomically
+from naibu.io.image_formats.geometry import MM_PER_UNIT, ReadOptions, content, no_colours, three_axes, unit_length, volume_with_axes
+
+_ENDINGS = (".tif", ".tiff")
+_NUMBER = re.compile(r"(\d+)(?!.*\d)")
+
+
+def read(path: Path, options: ReadOptions) -> Volume:
+    """Read grey values (see `naibu.io.images.read_volume`) of one file, or of a folder with one slice a file."""
+    tifffile = optional_package("tifffile", f"{path.name}: reading TIFF files")
+    if path.is_dir():
+        files = slices_of_folder(path)
+        parts = [_loaded(tifffile, file) for file in files]
+        different = next((f.name for f, p in zip(files, parts, strict=True) if p[0].shape != parts[0][0].shape), None)
+        if different:
+            raise InputError(f"{path.name}: slice {different} has another size than {files[0].name}; keep one stack in a folder")
+        values, stated = np.stack([part[0] for part in parts]), parts[0][1]
+    else:
+        values, stated = _loaded(tifffile, path)
+    values = three_axes(path.name, values)
+    if options.spacing_mm is not None:
+        return volume_with_axes(path.name, values, (0.0, 0.0, 0.0), np.diag(options.spacing_mm))
+    steps = np.asarray(stated["steps"], dtype=float)
+    if not np.isfinite(steps).all():
+        raise InputError(
+            f"{path.name}: does not say how far its voxels are apart (stated along x, y, z: {stated['told']}); give spacing_mm, for "
+            "example (0.8, 0.8, 2.0)"
+        )
+    return volume_with_axes(path.name, values, stated["origin"], steps, options.unit_mm or 1.0)
+
+
+def write(path: Path, values: NDArray[Any], grid: Volume, *, compressed: bool) -> Path:
+    """Write grey values (nz, ny, nx); the geometry goes along as JSON in the description, where `read` finds it."""
+    tifffile = optional_package("tifffile", f"{path.name}: writing TIFF files")
+    if values.ndim != 3:
+        raise InputError(f"{path.name}: TIFF stacks are written of grey values; write vectors as .mha")
+    stored = values.astype(np.uint8) if values.dtype == bool else values
+    metadata = {
+        "spacing_mm": grid.spacing_mm.tolist(),
+        "origin_mm": grid.origin_mm.tolist(),
+        "direction": grid.direction.tolist(),
+    }
+    buffer = io.BytesIO()
+    tifffile.imwrite(
+        buffer,
+        stored,
+        photometric="minisblack",
+        compression="zlib" if compressed else None,
+        resolution=tuple(10.0 / grid.spacing_mm[:2]),
+        resolutionunit="CENTIMETER",
+        metadata=metadata,
+    )
+    return write_atomically(path, buffer.getvalue())
+
+
+def slices_of_folder(folder: Path) -> list[Path]:
+    """Return the TIFF files of a folder by the last number in their names.
+
+    Raises
+    ------
+    InputError
+        No such files, names without numbers, or a number that is missing or there twice.
+    """
+    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in _ENDINGS)
+    if not files:
+        raise InputError(f"{folder.name}: holds neither DICOM nor TIFF slices; name the folder with the slices, or a file")
+    found = [_NUMBER.search(file.stem) for file in files]
+    if not all(found):
+        nameless = next(file.name for file, match in zip(files, found, strict=True) if not match)
+        raise InputError(f"{folder.name}: {nameless} has no number in its name, so its place among the slices is open; number the files")
+    numbers = [int(match.group(1)) for match in found if match]
+    order = np.argsort(numbers, kind="stable")
+    steps = np.diff(np.array(numbers)[order])
+    if len(steps) and (steps != steps[0]).any():
+        bad = int(np.flatnonzero(steps != np.median(steps))[0])
+        raise InputError(
+            f"{folder.name}: between {files[order[bad]].name} and {files[order[bad + 1]].name} slices are missing or named twice; "
+            "complete the stack"
+        )
+    return [files[i] for i in order]
+
+
+def _loaded(tifffile: Any, path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
+    """Return the values of a file and what it says of the distance of its voxels."""
+    if not path.is_file():
+        content(path)
+    try:
+        with tifffile.TiffFile(path) as file:
+            series, page = file.series[0], file.pages[0]
+            samples = int(page.samplesperpixel)
+            n_series, axes = len(file.series), str(series.axes)
+            stated = _stated_geometry(path.name, file, page)
+            values = np.asarray(series.asarray()) if samples == 1 else np.zeros((1, 1, 1))
+    except InputError:
+        raise
+    # tifffile raises whatever its decoders meet
+    except Exception as error:
+        raise InputError(f"{path.name}: cannot be read as TIFF ({error}); copy the file again") from error
+    no_colours(path.name, samples)
+    if n_series > 1:
+        raise InputError(f"{path.name}: holds {n_series} images of different size or kind; save the stack you mean as a file of its own")
+    if any(axis in axes and values.shape[axes.index(axis)] > 1 for axis in "TCS"):
+        raise InputError(f"{path.name}: holds several times or channels (axes {axes}, {values.shape}); save the one you mean as a stack")
+    return values, stated
+
+
+def _stated_geometry(source: str, file: Any, page: Any) -> dict[str, Any]:
+    """Return the steps along x, y, z as columns (NaN where the file does not say), and the origin, mm."""
+    shaped: dict[str, Any] = (file.shaped_metadata or ({},))[0] if file.is_shaped else {}
+    if "spacing_mm" in shaped:
+        axes = np.asarray(shaped.get("direction", np.eye(3)), dtype=float) * np.asarray(shaped["spacing_mm"], dtype=float)
+        return {"steps": axes, "origin": shaped.get("origin_mm", (0.0, 0.0, 0.0)), "told": shaped["spacing_mm"]}
+    imagej = file.imagej_metadata or {}
+    named = str(imagej.get("unit", "")).replace("\\u00B5", "u")
+    resolution_unit = {2: "inch", 3: "cm"}.get(int(getattr(page, "resolutionunit", 1) or 1))
+    plane = unit_length(source, named) if named and named != "pixel" else (MM_PER_UNIT[resolution_unit] if resolution_unit else np.nan)
+    step = np.full(3, np.nan)
+    for axis, tag in ((0, "XResolution"), (1, "YResolution")):
+        if tag in page.tags:
+            numerator, denominator = page.tags[tag].value
+            step[axis] = plane * denominator / numerator if numerator else np.nan
+    if "spacing" in imagej:
+        step[2] = plane * float(imagej["spacing"])
+    steps = np.diag(step)
+    return {"steps": np.where(np.eye(3, dtype=bool), steps, 0.0), "origin": (0.0, 0.0, 0.0), "told": step.tolist()}

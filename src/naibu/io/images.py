@@ -1,0 +1,202 @@
+"""Reading and writing scanned volumes and displacement fields; the ending of the file name picks the format (spec S1).
+
+Values are never rescaled: what is stored is what is returned, in its own type. Positions are in the frame of DICOM and SimpleITK, where
+x grows to the patient's left, y to the back and z to the head.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from naibu.core.errors import InputError
+from naibu.core.volume import Volume
+from naibu.io.image_formats import dicom, hdf5, metaimage, nifti, nrrd, tiff
+from naibu.io.image_formats.geometry import ReadOptions
+
+Array = NDArray[np.float64]
+_Handler = TypeVar("_Handler")
+VOLUME_READERS: dict[str, Callable[[Path, ReadOptions], Volume]] = {
+    **dict.fromkeys((".mha", ".mhd"), metaimage.read),
+    **dict.fromkeys((".nii", ".nii.gz", ".hdr", ".img"), nifti.read),
+    **dict.fromkeys((".nrrd", ".nhdr"), nrrd.read),
+    **dict.fromkeys((".tif", ".tiff"), tiff.read),
+    **dict.fromkeys((".h5", ".hdf5"), hdf5.read),
+    **dict.fromkeys((".dcm", ".dicom", ".ima"), dicom.read),
+}
+VOLUME_WRITERS: dict[str, Callable[..., Path]] = {
+    **dict.fromkeys((".mha", ".mhd"), metaimage.write),
+    **dict.fromkeys((".nii", ".nii.gz"), nifti.write),
+    ".nrrd": nrrd.write,
+    **dict.fromkeys((".tif", ".tiff"), tiff.write),
+    **dict.fromkeys((".h5", ".hdf5"), hdf5.write),
+}
+_VECTOR_READERS: dict[str, Callable[[Path, ReadOptions], tuple[Array, Volume]]] = {
+    **dict.fromkeys((".mha", ".mhd"), metaimage.read_vectors),
+    **dict.fromkeys((".nrrd", ".nhdr"), nrrd.read_vectors),
+}
+_VECTOR_WRITERS = {".mha": metaimage.write, ".mhd": metaimage.write, ".nrrd": nrrd.write}
+
+
+def read_volume(
+    path: str | os.PathLike[str],
+    *,
+    series: str | None = None,
+    spacing_mm: ArrayLike | None = None,
+    unit_mm: float | None = None,
+    rescaled: bool = False,
+) -> Volume:
+    """Read a scanned volume with its geometry (spec S1).
+
+    Parameters
+    ----------
+    path : path-like
+        MetaImage (``.mha``, ``.mhd``), NIfTI (``.nii``, ``.nii.gz``), NRRD (``.nrrd``, ``.nhdr``), TIFF stack (``.tif``), HDF5 (``.h5``,
+        see `naibu.io.image_formats.hdf5`), a DICOM file, or a folder with the slices of a DICOM series or of a TIFF stack.
+    series : str, optional
+        Which series of a folder with several: its SeriesInstanceUID or its description.
+    spacing_mm : array_like, shape (3,), optional
+        Distance of voxels along x, y, z, mm, for files that do not say (most TIFF stacks).
+    unit_mm : float, optional
+        Length of the file's unit, mm: 1000 if it was written in metres. By default the unit the file states, or mm.
+    rescaled : bool
+        Whether the slope and intercept that DICOM and NIfTI files carry are applied (CT numbers in HU, for example). By default the
+        values are those stored.
+
+    Returns
+    -------
+    Volume
+        Values in the type of the file; a plane is a volume of one slice.
+
+    Raises
+    ------
+    InputError
+        No such file, a format that is not read, a damaged file, several times or colours, a missing slice, mixed series, slices that are
+        not orthogonal, or no distance of voxels.
+    MissingDependencyError
+        The package that reads the format is not installed.
+    """
+    source = Path(path)
+    reader = dicom.read if _is_dicom(source) else tiff.read if source.is_dir() else _of(VOLUME_READERS, source, "read")
+    spacing = None if spacing_mm is None else np.asarray(spacing_mm, dtype=float)
+    if spacing is not None and (spacing.shape != (3,) or not (np.isfinite(spacing).all() and (spacing > 0.0).all())):
+        raise InputError(f"spacing_mm must be three positive numbers (x, y, z), not {spacing.tolist()}")
+    if unit_mm is not None and not (np.isfinite(unit_mm) and unit_mm > 0.0):
+        raise InputError(f"unit_mm is {unit_mm!r}; give the length of the file's unit in mm, 1 for mm or 1000 for metres")
+    return reader(source, ReadOptions(unit_mm, spacing, series, rescaled))
+
+
+def write_volume(path: str | os.PathLike[str], volume: Volume, *, compressed: bool = True) -> Path:
+    """Write a volume with its geometry; an old file is replaced only when the new one is complete (spec S1).
+
+    Parameters
+    ----------
+    path : path-like
+        ``.mha``, ``.mhd``, ``.nii``, ``.nii.gz``, ``.nrrd``, ``.tif`` or ``.h5``.
+    volume : Volume
+        Voxels; truth values are stored as 0 and 1.
+    compressed : bool
+        Whether the values are packed without loss, where the format leaves the choice.
+
+    Raises
+    ------
+    InputError
+        A format that is not written, one that has no such type of values, or a file that cannot be written.
+    MissingDependencyError
+        The package that writes the format is not installed.
+    """
+    return _of(VOLUME_WRITERS, Path(path), "write")(Path(path), volume.values, volume, compressed=compressed)
+
+
+def read_displacement(path: str | os.PathLike[str]) -> tuple[Array, Volume]:
+    """Read a displacement field on the voxels of a volume.
+
+    Parameters
+    ----------
+    path : path-like
+        ``.mha``, ``.mhd`` or ``.nrrd`` with three components a voxel, as ITK and 3D Slicer write them.
+
+    Returns
+    -------
+    displacement : ndarray, shape (nz, ny, nx, 3), float64
+        Displacement along x, y, z, mm; NaN where there is none.
+    grid : Volume
+        Where the voxels lie; its values tell where all components are finite.
+
+    Raises
+    ------
+    InputError
+        A file without vectors, or one that cannot be read.
+    """
+    return _of(_VECTOR_READERS, Path(path), "read displacement fields from")(Path(path), ReadOptions())
+
+
+def write_displacement(path: str | os.PathLike[str], displacement: ArrayLike, grid: Volume, *, compressed: bool = True) -> Path:
+    """Write a displacement field as an image of vectors, which opens in 3D Slicer and ParaView (spec S6).
+
+    Parameters
+    ----------
+    path : path-like
+        ``.mha``, ``.mhd`` or ``.nrrd``.
+    displacement : array_like, shape (nz, ny, nx, 3)
+        Displacement along x, y, z, mm; stored in single precision.
+    grid : Volume
+        Where the voxels lie.
+    compressed : bool
+        Whether the values are packed without loss.
+
+    Raises
+    ------
+    InputError
+        Another shape, a format that holds no vectors, or a file that cannot be written.
+    """
+    vectors = np.asarray(displacement, dtype=np.float32)
+    if vectors.shape != (*grid.shape, 3):
+        raise InputError(f"displacement must have shape {(*grid.shape, 3)} (z, y, x, component), mm, not {vectors.shape}")
+    return _of(_VECTOR_WRITERS, Path(path), "write displacement fields to")(Path(path), vectors, grid, compressed=compressed)
+
+
+def read_volume_box(path: str | os.PathLike[str], low: ArrayLike, high: ArrayLike) -> Volume:
+    """Read a part of a volume that was written as HDF5; the rest of the file stays unread.
+
+    Parameters
+    ----------
+    path : path-like
+        ``.h5`` or ``.hdf5``.
+    low, high : array_like, shape (3,)
+        First voxel, and the one after the last, along x, y, z.
+
+    Raises
+    ------
+    InputError
+        Another format, a box outside the volume, or a file that cannot be read.
+    """
+    source = Path(path)
+    if _ending(source) not in (".h5", ".hdf5"):
+        raise InputError(f"{source.name}: only HDF5 volumes are read in parts; write it once with write_volume as .h5")
+    return hdf5.read_box(source, low, high, ReadOptions())
+
+
+def _ending(path: Path) -> str:
+    name = path.name.lower()
+    return ".nii.gz" if name.endswith(".nii.gz") else path.suffix.lower()
+
+
+def _of(formats: dict[str, _Handler], path: Path, what: str) -> _Handler:
+    """Return what handles the ending of a file name."""
+    ending = _ending(path)
+    if ending not in formats:
+        raise InputError(f"{path.name}: naibu does not {what} files ending in {ending!r}; it knows {', '.join(sorted(formats))}")
+    return formats[ending]
+
+
+def _is_dicom(path: Path) -> bool:
+    """Whether a folder holds DICOM files, or a file is one whatever its ending."""
+    if path.is_dir():
+        return any(dicom.is_dicom(file) for file in path.rglob("*") if file.is_file())
+    return _ending(path) not in VOLUME_READERS and dicom.is_dicom(path)
