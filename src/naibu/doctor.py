@@ -31,12 +31,18 @@ _REQUIRED = {
     "cyclopts": "the command line",
     "rich": "progress and tables on the command line",
     "matplotlib": "figures",
+    "nibabel": "volumes in NIfTI files",
+    "pydicom": "volumes in DICOM series",
+    "pynrrd": "volumes in NRRD files",
+    "tifffile": "volumes in TIFF stacks",
 }
 _OPTIONAL = {
     "openpyxl": "importing marker tables from Excel files",
     "pyvista": "looking at .vtu and VTKHDF results from Python (ParaView reads them too)",
     "SimpleITK": "finding markers in image volumes before naibu reads them",
 }
+# where the package that is imported has another name than the distribution that is installed
+_MODULES = {"pynrrd": "nrrd"}
 _PROBE_TIMEOUT_S = 60.0
 
 
@@ -105,7 +111,7 @@ def _required_row(name: str, purpose: str) -> DoctorRow:
     if version is None:
         return DoctorRow(name, "missing", "not installed", purpose, f"pip install {name}")
     try:
-        importlib.import_module(name)
+        importlib.import_module(_MODULES.get(name, name))
     # a damaged package may raise anything while it is imported
     except Exception as error:
         return DoctorRow(name, "broken", f"{version}: {_first_line(error)}", purpose, f"pip install --force-reinstall {name}")
