@@ -18,6 +18,7 @@ from virtual_press import KNOWN, stop_at
 
 from naibu import cli, workflow
 from naibu.identification.specimen import ModelSettings
+from naibu.io.experiments import read_experiment
 from naibu.mechanics.newton import Newton
 
 Run = Callable[..., tuple[int, str, str]]
@@ -116,6 +117,19 @@ def test_tables_become_an_experiment(naibu: Run, press: Press) -> None:
     assert sorted(os.listdir("mine")) == ["initial.csv", "meta.toml", "pressed.csv"]
     shutil.rmtree("mine")
     refused(naibu("import", *tables, tables[1], "--out", "mine", "--size-mm", 60, 60, 60), "'pressed'", "rename")
+
+
+def test_layers_and_heights_are_told_with_the_tables(naibu: Run, press: Press) -> None:
+    tables = [press.folder / f"{name}.csv" for name in ("initial", "pressed")]
+    shape = ("--out", "mine", "--size-mm", 60, 60, 60)
+    layers = ("--layer", "soft=0..30", "--layer", "firm=30..60")
+    assert naibu("import", *tables, *shape, *layers, "--stated-mm", "pressed=45")[0] == 0
+    experiment = read_experiment(Path("mine"))
+    assert [(la.material, la.from_base_mm, la.to_base_mm) for la in experiment.layers] == [("soft", 0.0, 30.0), ("firm", 30.0, 60.0)]
+    assert experiment.loaded_states[0].stated_mm == 45.0
+    shutil.rmtree("mine")
+    refused(naibu("import", *tables, *shape, "--layer", "soft 0-30"), "soft 0-30", "NAME=FROM..TO")
+    refused(naibu("import", *tables, *shape, "--stated-mm", "45"), "'45'", "STATE=HEIGHT")
 
 
 def replaced(old: str, new: str, file: str = "meta.toml") -> Callable[[Path], None]:

@@ -259,6 +259,8 @@ def import_tables(
     shape: Literal["box", "half_ellipsoid", "cylinder", "hemisphere"] = "box",
     loading: Literal["plate", "bar", "side_plates"] = "plate",
     bar_width_mm: float | None = None,
+    layer: list[str] | None = None,
+    stated_mm: list[str] | None = None,
     title: str = "Imported experiment",
     unit: str | None = None,
     spacing_mm: float | None = None,
@@ -281,6 +283,10 @@ def import_tables(
         What presses it.
     bar_width_mm
         How wide a bar is.
+    layer
+        A layer of one material, 'NAME=FROM..TO' with heights from the base in mm. May be repeated.
+    stated_mm
+        Height of the plate or bar in a state, or distance of the side plates, 'STATE=HEIGHT' in mm. May be repeated.
     title
         What the experiment is.
     unit
@@ -288,14 +294,17 @@ def import_tables(
     spacing_mm
         Spacing of a regular marker lattice.
     """
+    from naibu.cli.described import heights_of, layers_of
     from naibu.core.experiment import Loading, Shape
     from naibu.io.tables import import_markers, write_experiment_folder
 
+    layers, heights = layers_of(layer or ()), heights_of(stated_mm or ())
     names = [path.stem for path in loaded]
     if len(set(names)) < len(names):
         raise InputError(f"two tables would both be the state {max(names, key=names.count)!r}; rename one file")
     write_experiment_folder(
         out, import_markers(initial, unit=unit), {path.stem: import_markers(path, unit=unit) for path in loaded}, title=title,
-        shape=Shape(shape, size_mm), loading=Loading(loading, bar_width_mm), spacing_mm=spacing_mm,
+        shape=Shape(shape, size_mm), loading=Loading(loading, bar_width_mm), layers=layers, stated_mm=heights, spacing_mm=spacing_mm,
     )  # fmt: skip
-    say(f"Wrote {out}. Describe layers and materials in its meta.toml, then run: naibu identify {out}")
+    before = "" if layers else "Describe layers and materials in its meta.toml, then run"
+    say(f"Wrote {out}. {before or 'Run'}: naibu identify {out}")
