@@ -10,8 +10,6 @@ from naibu.core.errors import InputError
 from naibu.core.rotation import rotation_matrix
 from naibu.core.volume import Volume
 from naibu.imaging.block_matching import block_matching, grey_range
-from naibu.imaging.hybrid import hybrid_flow
-from naibu.imaging.optical_flow import horn_schunck
 from naibu.imaging.resampling import positions
 
 RNG = np.random.default_rng(4)
@@ -157,19 +155,3 @@ def test_bad_pairs_and_sizes_are_refused() -> None:
     ):
         with pytest.raises(InputError, match=told):
             block_matching(volume, volume, **options)
-
-
-def test_the_hybrid_takes_blocks_where_they_have_contrast_and_flow_elsewhere() -> None:
-    frame = grid((8, 36, 40))
-
-    def motion(x: np.ndarray) -> np.ndarray:
-        return np.stack([1.2 + 0 * x[..., 0], 0.5 + 0.02 * x[..., 0], 0 * x[..., 0]], axis=-1)
-
-    before, after, _ = pair(frame, motion, seed=6, wave_mm=(10.0, 25.0))
-    limit = float(np.median(grey_range(before, (3, 3, 3))))
-    options = {"search": (3, 3, 1), "least_range": limit}
-    found = hybrid_flow(before, after, **options, data_weight=0.01)
-    blocks, flow = block_matching(before, after, **options), horn_schunck(before, after, data_weight=0.01)
-    assert 0.2 < blocks.valid.mean() < 0.8
-    np.testing.assert_array_equal(found.vectors[blocks.valid], blocks.vectors[blocks.valid])
-    np.testing.assert_array_equal(found.vectors[~blocks.valid], flow.vectors[~blocks.valid])

@@ -219,7 +219,9 @@ def displacement_gradient(displacement: ArrayLike, grid: Volume) -> Array:
 
 def jacobian_determinant(displacement: ArrayLike, grid: Volume) -> Array:
     """Return the volume ratio ``det(I + du/dx)`` (nz, ny, nx); the field folds where it is not positive (spec S8)."""
-    return np.asarray(np.linalg.det(np.eye(3) + displacement_gradient(displacement, grid)))
+    gradient = displacement_gradient(displacement, grid)
+    with np.errstate(invalid="ignore"):  # the field may be unknown at some voxels
+        return np.asarray(np.linalg.det(np.eye(3) + gradient))
 
 
 def folded_share(displacement: ArrayLike, grid: Volume, mask: ArrayLike | None = None) -> float:
@@ -241,7 +243,12 @@ def small_strain(displacement: ArrayLike, grid: Volume) -> Array:
 
 def green_lagrange_strain(displacement: ArrayLike, grid: Volume) -> Array:
     """Return the strain ``(F^T F - I) / 2`` (nz, ny, nx, 3, 3), ``F = I + du/dx``, which is zero for any rigid motion."""
-    f = displacement_gradient(displacement, grid) + np.eye(3)
+    return green_lagrange_strain_of(displacement_gradient(displacement, grid))
+
+
+def green_lagrange_strain_of(gradient: ArrayLike) -> Array:
+    """Return the strain ``(F^T F - I) / 2`` (..., 3, 3) of displacement gradients (..., 3, 3), a before b in ``du_a / dx_b``."""
+    f = np.asarray(gradient, dtype=float) + np.eye(3)
     return np.asarray(0.5 * (np.swapaxes(f, -1, -2) @ f - np.eye(3)))
 
 

@@ -24,7 +24,7 @@ def hybrid_flow(
     data_weight: float = 0.002,
     full_scale: float | None = None,
     iterations: int = 25,
-    warps: int = 3,
+    warps: int = 5,
     levels: int | None = None,
     mask: ArrayLike | None = None,
 ) -> DenseDisplacement:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -24,6 +27,8 @@ REPORT_LEVELS = 256.0
 # Horn and Schunck as in chapter 3 of the report: one grid, 40 plain steps, lambda = 4
 AS_REPORTED: dict[str, Any] = {"data_weight": 4.0, "iterations": 40, "warps": 1, "levels": 1, "median_filter": False, "accelerated": False}
 SLOWEST = 0.99
+# voxels below which sharing a step among threads costs more than it saves; on a busy machine much more
+WORTH_SHARING = 200_000
 
 
 def horn_schunck(
@@ -33,7 +38,7 @@ def horn_schunck(
     data_weight: float = 0.002,
     full_scale: float | None = None,
     iterations: int = 25,
-    warps: int = 3,
+    warps: int = 5,
     levels: int | None = None,
     median_filter: bool = True,
     accelerated: bool = True,
@@ -100,11 +105,12 @@ def horn_schunck(
     grids = pyramid(a, b, wanted, reference.spacing_mm, levels)
     u = _start(start, reference, grids)
     for number, grid in enumerate(grids):
-        if number:
-            u = refined(u, grids[number - 1], grid)
-        for _ in range(warps):
-            u = _relaxed(u, grid, weight, iterations, accelerated)
-            u = _median(u) if median_filter else u
+        with _threads_worth(grid):
+            if number:
+                u = refined(u, grids[number - 1], grid)
+            for _ in range(warps):
+                u = _relaxed(u, grid, weight, iterations, accelerated)
+                u = _median(u) if median_filter else u
     return _result(u, reference, a, b, wanted)
 
 
@@ -173,16 +179,28 @@ def lucas_kanade(
     u = _start(start, reference, grids)
     eigenvalue = np.zeros(reference.shape, dtype=np.float32)
     for number, grid in enumerate(grids):
-        if number:
-            u = refined(u, grids[number - 1], grid)
-        eigenvalue = np.zeros(grid.reference.shape, dtype=np.float32)
-        for _ in range(warps):
-            _solve_windows(u, grid, size // 2, least_eigenvalue, damping, eigenvalue)
-            u = _median(u) if median_filter else u
+        with _threads_worth(grid):
+            if number:
+                u = refined(u, grids[number - 1], grid)
+            eigenvalue = np.zeros(grid.reference.shape, dtype=np.float32)
+            for _ in range(warps):
+                _solve_windows(u, grid, size // 2, least_eigenvalue, damping, eigenvalue)
+                u = _median(u) if median_filter else u
     found = _result(u, reference, a, b, wanted)
     # a single direction has no eigenvalue but that of rounding
     fixed = eigenvalue > max(least_eigenvalue, 1e-6 * float(eigenvalue.max()))
     return DenseDisplacement(found.vectors, found.valid & fixed, eigenvalue.astype(float))
+
+
+@contextmanager
+def _threads_worth(grid: Level) -> Iterator[None]:
+    """Use one thread alone while the grid is small."""
+    before = numba.get_num_threads()
+    numba.set_num_threads(before if grid.reference.size >= WORTH_SHARING else 1)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before)
 
 
 def _relaxed(u: Single, grid: Level, weight: float, iterations: int, accelerated: bool) -> Single:
