@@ -72,40 +72,53 @@ class RegularizedSystem:
         return np.repeat(mean, n)
 
     def masked(self, v: Parts) -> Parts:
-        """Return a vector without the logarithms that may not move."""
-        return [np.where(self.free, v[0], 0.0), *v[1:]]
+        """Return vectors without the logarithms that may not move."""
+        return [np.where(self.free if v[0].ndim == 1 else self.free[:, None], v[0], 0.0), *v[1:]]
 
     def product(self, v: Parts) -> Parts:
-        """Return the Hessian times (theta, b_1, ..., b_T)."""
-        theta, loaded = self.at.product(v[0][:, None], [b[:, None] for b in v[1:]])
-        return self.masked([theta[:, 0] + self.curvature @ v[0], *(b[:, 0] for b in loaded)])
+        """Return the Hessian times (theta, b_1, ..., b_T), one vector each or several as columns."""
+        theta, loaded = self.at.product(*_as_columns(v))
+        products = [theta.reshape(v[0].shape) + self.curvature @ v[0]]
+        return self.masked([*products, *(b.reshape(x.shape) for b, x in zip(loaded, v[1:], strict=True))])
 
     def preconditioned(self, r: Parts) -> Parts:
-        """Return about what the inverse of the Hessian makes of a vector."""
-        return self.masked([self._factor.solve(r[0]), *(b[:, 0] for b in self.at.preconditioned([b[:, None] for b in r[1:]]))])
+        """Return about what the inverse of the Hessian makes of vectors."""
+        loaded = self.at.preconditioned(_as_columns(r)[1])
+        return self.masked([self._factor.solve(r[0]), *(b.reshape(x.shape) for b, x in zip(loaded, r[1:], strict=True))])
+
+
+def _as_columns(v: Parts) -> tuple[Array, Parts]:
+    """Return the moduli's part and those of the loaded components as matrices, a vector as one column."""
+    columns = [p.reshape(len(p), -1) for p in v]
+    return columns[0], columns[1:]
 
 
 def conjugate_gradients(
     product: Callable[[Parts], Parts], precondition: Callable[[Parts], Parts], right: Parts, forcing: float, max_iterations: int
 ) -> tuple[Parts, Parts]:
-    """Return solution and residual once the residual, in the preconditioner's norm, has fallen to the share `forcing`."""
+    """Return solution and residual once the residual, in the preconditioner's norm, has fallen to the share `forcing`.
+
+    Every part of `right` may have columns: these have their own iterations, which are advanced together.
+    """
     x, r = [np.zeros_like(b) for b in right], list(right)
     z = precondition(r)
     p, rz = z, _dot(r, z)
     enough = forcing**2 * rz
     for _ in range(max_iterations):
-        if rz <= enough:
+        open_ = rz > enough
+        if not open_.any():
             break
         q = product(p)
-        a = rz / _dot(p, q)
+        a = np.where(open_, rz / np.where(open_, _dot(p, q), 1.0), 0.0)
         x = [u + a * v for u, v in zip(x, p, strict=True)]
         r = [u - a * v for u, v in zip(r, q, strict=True)]
         z = precondition(r)
         new = _dot(r, z)
-        p = [u + new / rz * v for u, v in zip(z, p, strict=True)]
-        rz = new
+        p = [u + np.where(open_, new / np.where(open_, rz, 1.0), 0.0) * v for u, v in zip(z, p, strict=True)]
+        rz = np.where(open_, new, rz)
     return x, r
 
 
-def _dot(a: Parts, b: Parts) -> float:
-    return sum(float(p @ q) for p, q in zip(a, b, strict=True))
+def _dot(a: Parts, b: Parts) -> Array:
+    """Return the scalar products of columns; by einsum, because threads of BLAS cost more than they save here."""
+    return np.asarray(sum(np.einsum("i...,i...->...", p, q) for p, q in zip(a, b, strict=True)))

@@ -192,10 +192,21 @@ class Linearised:
     columns: list[sp.csr_matrix]
     stiffness: list[sp.bsr_matrix]
     _transposed: list[sp.csr_matrix] = field(default_factory=list)
+    _border: list[sp.csr_matrix] = field(default_factory=list)
     _gradient: tuple[Array, list[Array]] | None = None
 
     def __post_init__(self) -> None:
         self._transposed = [c.T.tocsr() for c in self.columns]
+        rows: dict[tuple[int, bytes], sp.csr_matrix] = {}
+        for o, matrix in zip(self.model.observed, self.stiffness, strict=True):
+            key = id(matrix), o.loaded.tobytes()
+            if key not in rows:
+                rows[key] = matrix.tocsr()[o.loaded]
+            self._border.append(rows[key])
+
+    def border(self, t: int) -> sp.csr_matrix:
+        """Return the rows (n_b, n d) of the stiffness of trial `t`, mN/mm, that belong to its loaded components; also its columns."""
+        return self._border[t]
 
     def solved(self, right: list[Array]) -> list[Array]:
         """Solve with the tangents of all trials, right-hand sides (n d, r) of trials that share a factor together."""
@@ -213,24 +224,18 @@ class Linearised:
 
     def forward(self, theta: Array | None, loaded: Sequence[Array] | None) -> list[Array]:
         """Return the change of every trial's displacement (n d, r), mm, for changes of theta (2 count, r) and of b_t (n_b, r)."""
-        right, moved = [], []
+        right = []
         for t, o in enumerate(self.model.observed):
-            nodes = self.columns[t].shape[0]
             b = None if loaded is None else loaded[t]
-            full = np.zeros((nodes, (theta if b is None else b).shape[1]))  # type: ignore[union-attr]
-            if b is not None:
-                full[o.loaded] = b
-            force = np.zeros_like(full) if b is None else self.stiffness[t] @ full
+            force = 0.0 if b is None else self._border[t].T @ b
             if theta is not None:
-                force += self.columns[t] @ theta
+                force = force + self.columns[t] @ theta
+            force = -np.asarray(force)
             force[o.loaded] = 0.0
-            right.append(-force)
-            moved.append(full)
-        for t, x in enumerate(self.solved(right)):
-            o = self.model.observed[t]
-            moved_at = moved[t][o.loaded]
-            moved[t] = x
-            moved[t][o.loaded] = moved_at
+            right.append(force)
+        moved = self.solved(right)
+        for t, o in enumerate(self.model.observed):
+            moved[t][o.loaded] = 0.0 if loaded is None else loaded[t]
         return moved
 
     def adjoint(self, gradients: list[Array]) -> tuple[Array, list[Array]]:
@@ -243,7 +248,7 @@ class Linearised:
             o = self.model.observed[t]
             w[o.loaded] = 0.0
             theta -= self._transposed[t] @ w
-            loaded.append(gradients[t][o.loaded] - (self.stiffness[t] @ w)[o.loaded])
+            loaded.append(gradients[t][o.loaded] - self._border[t] @ w)
         return theta, loaded
 
     def gradient(self) -> tuple[Array, list[Array]]:
@@ -264,7 +269,16 @@ class Linearised:
 
     def preconditioned(self, loaded: Sequence[Array]) -> list[Array]:
         """Return about what the inverse of the Hessian of the loaded components makes of (n_b, r) of every trial."""
-        return [self.boundary(t).solve(b) for t, b in enumerate(loaded)]
+        made = [self.boundary(t) for t in range(len(loaded))]
+        groups: dict[int, list[int]] = {}
+        for t, one in enumerate(made):
+            groups.setdefault(id(one.factor), []).append(t)
+        out: list[Array] = [np.empty(0)] * len(loaded)
+        for members in groups.values():
+            solved = made[members[0]].unscaled(np.concatenate([loaded[t] for t in members], axis=1))
+            for t, x in zip(members, np.split(solved, np.cumsum([loaded[t].shape[1] for t in members])[:-1], axis=1), strict=True):
+                out[t] = x / made[t].scale
+        return out
 
     def boundary(self, t: int) -> BoundaryPreconditioner:
         """Return the preconditioner of the loaded components of trial `t`, made on first use and kept."""
@@ -348,21 +362,20 @@ class BoundaryPreconditioner:
     def of(cls, at: Linearised, t: int) -> BoundaryPreconditioner:
         """Make it from the response to every loaded component."""
         o = at.model.observed[t]
-        factor, stiffness, n_b = at.point.factors[t], at.stiffness[t], len(o.loaded)
+        factor, border, n_b = at.point.factors[t], at.border(t), len(o.loaded)
         hessian = np.empty((n_b, n_b))
         for start in range(0, n_b, BLOCK):
             stop = min(start + BLOCK, n_b)
-            moved = np.zeros((stiffness.shape[0], stop - start))
-            moved[o.loaded[start:stop], np.arange(stop - start)] = 1.0
-            force = stiffness @ moved
+            force = border[start:stop].T.toarray()
             force[o.loaded] = 0.0
-            moved -= factor.solve(force)
+            moved = -factor.solve(force)
+            moved[o.loaded[start:stop], np.arange(stop - start)] = 1.0
             pull = np.asarray(o.operator.T @ (o.operator @ moved))
             inner = pull.copy()
             inner[o.loaded] = 0.0
             answer = factor.solve(inner)
             answer[o.loaded] = 0.0
-            hessian[:, start:stop] = pull[o.loaded] - (stiffness @ answer)[o.loaded]
+            hessian[:, start:stop] = pull[o.loaded] - border @ answer
         hessian = 0.5 * (hessian + hessian.T)
         full = hessian + o.prior.toarray()
         try:
@@ -379,9 +392,9 @@ class BoundaryPreconditioner:
         ratio = (observed[source].noise_mm / observed[target].noise_mm) ** 2
         return BoundaryPreconditioner(self.factor, self.informed, self.scale * ratio)
 
-    def solve(self, b: Array) -> Array:
-        """Return the solution (n_b, r)."""
-        return np.asarray(sl.cho_solve(self.factor, b) / self.scale)
+    def unscaled(self, b: Array) -> Array:
+        """Return the solution (n_b, r) with the factor, before it is divided by `scale`."""
+        return np.asarray(sl.cho_solve(self.factor, b, check_finite=False))  # the check would cost as much as the solution
 
 
 def _alike(one: Observed, other: Observed) -> bool:
