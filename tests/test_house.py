@@ -19,7 +19,23 @@ LONGEST_FILE, LONGEST_FUNCTION = 450, 60
 TEXT = {".py", ".md", ".toml", ".rst", ".cff", ".js", ".mjs", ".css", ".sh", ".txt", ".cfg", ".yml", ".yaml", ""}
 NOT_OURS = {"__pycache__", "node_modules", "assets", "build", "dist", "_build", "gallery", "generated", "LICENSE"}
 # loaded by none but those who ask for what they do
-ON_DEMAND = ("cyclopts", "h5py", "matplotlib", "mkl", "openpyxl", "pyamg", "pydantic", "pyvista", "rich", "SimpleITK", "starlette", "vtk")
+ON_DEMAND = (
+    "cyclopts",
+    "dask",
+    "distributed",
+    "h5py",
+    "matplotlib",
+    "mkl",
+    "openpyxl",
+    "pyamg",
+    "pydantic",
+    "pyvista",
+    "rich",
+    "SimpleITK",
+    "starlette",
+    "vtk",
+    "zarr",
+)
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 

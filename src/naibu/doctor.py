@@ -38,6 +38,9 @@ _REQUIRED = {
 }
 _OPTIONAL = {
     "openpyxl": "importing marker tables from Excel files",
+    "zarr": "volumes in Zarr stores",
+    "dask": "volumes larger than memory, block by block",
+    "distributed": "the same on several processes or computers",
     "pyvista": "looking at .vtu and VTKHDF results from Python (ParaView reads them too)",
     "SimpleITK": "finding markers in image volumes before naibu reads them",
 }

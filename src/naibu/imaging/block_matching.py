@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -18,6 +19,7 @@ from naibu.imaging.resampling import require_mask
 Measure = Literal["sad", "ssd", "ncc"]
 MEASURES: dict[Measure, int] = {"sad": SAD, "ssd": SSD, "ncc": NCC}
 Mask = NDArray[np.bool_]
+Single = NDArray[np.float32]
 # grey values of a task: few enough that they stay in the fastest cache
 VALUES_AT_ONCE = 3000
 
@@ -70,7 +72,8 @@ def block_matching(
     if measure not in MEASURES or unmeasured not in ("nan", "zero"):
         raise InputError(f"measure must be one of {', '.join(MEASURES)} and unmeasured 'nan' or 'zero', not {measure!r} and {unmeasured!r}")
     a, b = grey_pair(reference, deformed)
-    half, reach = _sizes(block, search, reference)
+    chosen = Search.of(measure, block, search, reference.shape, reference.spacing_mm, sub_voxel)
+    half = chosen.half
     # a range with unknown voxels in it is unknown
     wanted = np.asarray(grey_range(reference, 2 * half + 1) > least_range)
     if mask is not None:
@@ -79,19 +82,67 @@ def block_matching(
         raise InputError(
             f"no block of {(2 * half + 1).tolist()} voxels has a grey range above {least_range:g} in the mask: lower least_range"
         )
-    kind = MEASURES[measure]
-    offsets = _offsets(reach, reference)
-    which = np.full(reference.shape, -1, dtype=np.int32)
-    box = _reached(wanted, half + reach)
-    which[box] = _search(kind, a[box], b[box], half, reach, offsets, wanted[box])
-    which[~wanted] = -1
-    move, cost = np.full((3, *reference.shape), np.nan), np.full(reference.shape, np.nan)
-    between_voxels(kind, a, b, half, offsets, which, sub_voxel, move, cost)
-    vectors = to_millimetres(move, reference)
-    valid = which >= 0
+    move, cost = matched(a, b, wanted, chosen)
+    vectors, valid = to_millimetres(move, reference), np.isfinite(move[0])
     if unmeasured == "zero":
         vectors[~valid] = 0.0
-    return DenseDisplacement(vectors, valid, -cost if kind == NCC else cost)
+    return DenseDisplacement(vectors, valid, -cost if measure == "ncc" else cost)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Search:
+    """How the best displacement is looked for.
+
+    Attributes
+    ----------
+    kind : int
+        Measure: `SAD`, `SSD` or `NCC`.
+    half, reach : ndarray, shape (3,), int64
+        Half the block and largest displacement along x, y, z, voxels.
+    spacing_mm : ndarray, shape (3,)
+        Of the voxels, mm.
+    sub_voxel : bool
+        Whether places between voxels are looked at.
+    spread : float, optional
+        Standard deviation of all grey values, against which a block may count as flat; by default that of the voxels given.
+    """
+
+    kind: int
+    half: NDArray[np.int64]
+    reach: NDArray[np.int64]
+    spacing_mm: NDArray[np.float64]
+    sub_voxel: bool
+    spread: float | None = None
+
+    @classmethod
+    def of(
+        cls,
+        measure: Measure,
+        block: ArrayLike,
+        search: ArrayLike,
+        shape: tuple[int, int, int],
+        spacing_mm: NDArray[np.float64],
+        sub_voxel: bool,
+        spread: float | None = None,
+    ) -> Search:
+        """Check the sizes for a volume of that shape (nz, ny, nx); see `block_matching`."""
+        half, reach = _sizes(block, search, shape)
+        return cls(MEASURES[measure], half, reach, spacing_mm, sub_voxel, spread)
+
+
+def matched(a: Single, b: Single, wanted: Mask, search: Search) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return displacement (3, nz, ny, nx), voxels along x, y, z, and cost (nz, ny, nx) of wanted voxels; NaN where there is none."""
+    kind, half, reach = search.kind, search.half, search.reach
+    move, cost = np.full((3, *a.shape), np.nan), np.full(a.shape, np.nan)
+    if not wanted.any():
+        return move, cost
+    offsets = _offsets(reach, search.spacing_mm)
+    which = np.full(a.shape, -1, dtype=np.int32)
+    box = _reached(wanted, half + reach)
+    which[box] = _search(search, a[box], b[box], offsets, wanted[box])
+    which[~wanted] = -1
+    between_voxels(kind, a, b, half, offsets, which, search.sub_voxel, move, cost)
+    return move, cost
 
 
 def grey_range(volume: Volume, block: ArrayLike) -> NDArray[np.float64]:
@@ -109,25 +160,25 @@ def grey_range(volume: Volume, block: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(ndimage.maximum_filter(values, size) - ndimage.minimum_filter(values, size))
 
 
-def _sizes(block: ArrayLike, search: ArrayLike, volume: Volume) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _sizes(block: ArrayLike, search: ArrayLike, shape: tuple[int, int, int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     size, reach = np.asarray(block), np.asarray(search)
     for values, name, least in ((size, "block", 1), (reach, "search", 0)):
         if values.shape != (3,) or values.dtype.kind not in "iu" or (values < least).any():
             raise InputError(f"{name} must be three whole numbers of voxels along x, y, z, at least {least}, not {values.tolist()}")
     if (size % 2 == 0).any():
         raise InputError(f"a block has a voxel in its middle: its sizes must be odd, not {size.tolist()}")
-    active = np.array(volume.shape[::-1]) > 1
+    active = np.array(shape[::-1]) > 1
     size, reach = np.where(active, size, 1), np.where(active, reach, 0)
-    if (size > volume.shape[::-1]).any():
-        raise InputError(f"a block of {size.tolist()} voxels does not fit into a volume of {list(volume.shape[::-1])}")
+    if (size > shape[::-1]).any():
+        raise InputError(f"a block of {size.tolist()} voxels does not fit into a volume of {list(shape[::-1])}")
     return (size // 2).astype(np.int64), reach.astype(np.int64)
 
 
-def _offsets(reach: NDArray[np.int64], volume: Volume) -> NDArray[np.int64]:
+def _offsets(reach: NDArray[np.int64], spacing_mm: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return all displacements (m, 3), the shortest first: of equal costs the first one wins."""
     axes = np.meshgrid(*(np.arange(-r, r + 1) for r in reach), indexing="ij")
     offsets = np.stack(axes, axis=-1).reshape(-1, 3)
-    return np.ascontiguousarray(offsets[np.argsort(np.linalg.norm(offsets * volume.spacing_mm, axis=1), kind="stable")])
+    return np.ascontiguousarray(offsets[np.argsort(np.linalg.norm(offsets * spacing_mm, axis=1), kind="stable")])
 
 
 def _reached(wanted: Mask, margin: NDArray[np.int64]) -> tuple[slice, slice, slice]:
@@ -137,22 +188,15 @@ def _reached(wanted: Mask, margin: NDArray[np.int64]) -> tuple[slice, slice, sli
     return first, second, third
 
 
-def _search(
-    kind: int,
-    a: NDArray[np.float32],
-    b: NDArray[np.float32],
-    half: NDArray[np.int64],
-    reach: NDArray[np.int64],
-    offsets: NDArray[np.int64],
-    wanted: Mask,
-) -> NDArray[np.int32]:
+def _search(search: Search, a: Single, b: Single, offsets: NDArray[np.int64], wanted: Mask) -> NDArray[np.int32]:
     """Return the number (nz, ny, nx) of the best offset, -1 where there is none."""
+    kind, half, reach = search.kind, search.half, search.reach
     nz, ny, nx = a.shape
     spare = int(reach[0] + half[0])
     width, guard = nx + spare, (ny + 1) * (nx + spare)
     flat = [_flat(v, spare, guard, np.nan) for v in (a, b)]
     if kind == NCC:
-        statistics = [np.stack([_flat(s, spare, guard, np.nan) for s in _statistics(v, half)]) for v in (a, b)]
+        statistics = [np.stack([_flat(s, spare, guard, np.nan) for s in _statistics(v, half, search.spread)]) for v in (a, b)]
     else:
         statistics = [np.zeros((2, 1), dtype=np.float32)] * 2
     chunks = -(-ny // int(np.clip(VALUES_AT_ONCE // width, 8, 64)))
@@ -166,7 +210,7 @@ def _search(
     return which[guard : guard + nz * ny * width].reshape(nz, ny, width)[:, :, :nx]
 
 
-def _flat(values: NDArray[np.float32], spare: int, guard: int, fill: float) -> NDArray[np.float32]:
+def _flat(values: Single, spare: int, guard: int, fill: float) -> Single:
     """Return a volume as one long row, with room after every row and at both ends."""
     nz, ny, nx = values.shape
     out = np.full(2 * guard + nz * ny * (nx + spare), fill, dtype=np.float32)
@@ -174,7 +218,7 @@ def _flat(values: NDArray[np.float32], spare: int, guard: int, fill: float) -> N
     return out
 
 
-def _statistics(values: NDArray[np.float32], half: NDArray[np.int64]) -> NDArray[np.float32]:
+def _statistics(values: Single, half: NDArray[np.int64], spread: float | None) -> Single:
     """Return the mean of every block and the inverse of its standard deviation, zero where it has none (2, nz, ny, nx).
 
     Both are NaN where a block holds unknown voxels.
@@ -184,7 +228,7 @@ def _statistics(values: NDArray[np.float32], half: NDArray[np.int64]) -> NDArray
     v = np.where(known, values, 0.0).astype(float)
     mean = ndimage.uniform_filter(v, size)
     variance = ndimage.uniform_filter(v * v, size) - mean**2
-    flat = variance <= 1e-10 * float(np.var(v))
+    flat = variance <= 1e-10 * (float(np.var(v)) if spread is None else spread**2)
     found = np.stack([mean, np.where(flat, 0.0, 1.0 / np.sqrt(np.where(flat, 1.0, variance)))]).astype(np.float32)
     found[:, ~ndimage.minimum_filter(known, size)] = np.nan
     return found

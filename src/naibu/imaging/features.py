@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +16,7 @@ from naibu.imaging.filters import gradient, smoothed
 from naibu.imaging.resampling import require_mask
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
 Response = Literal["ratio", "harris"]
 
 
@@ -81,23 +82,45 @@ def harris_response(
     """
     if response not in ("ratio", "harris") or k < 0.0:
         raise InputError(f"response must be 'ratio' or 'harris' with k >= 0, not {response!r} with {k}")
-    grey = np.asarray(volume.values - np.mean(volume.values, dtype=float), dtype=np.float32)
-    if not np.isfinite(grey).all():
-        raise InputError("the volume has unknown voxels (NaN); look for interest points before it is resampled, or fill them")
+    inner, outer = default_sigmas(volume.spacing_mm, volume.shape, gradient_sigma_mm, window_sigma_mm)
+    grey = known_grey(volume.values, float(np.mean(volume.values, dtype=float)))
     if not float(grey.max()) > float(grey.min()):
         raise InputError("the volume is constant: it has no interest points")
-    active = np.array(volume.shape[::-1]) > 1
-    finest = float(volume.spacing_mm[active].min())
-    inner = 0.7 * finest if gradient_sigma_mm is None else gradient_sigma_mm
-    outer = 1.0 * finest if window_sigma_mm is None else window_sigma_mm
-    slopes = gradient(smoothed(grey, inner / volume.spacing_mm), volume.spacing_mm)
-    tensor = np.empty((6, *volume.shape), dtype=np.float32)
+    return response_of(grey, volume.spacing_mm, inner, outer, k if response == "harris" else None)
+
+
+def default_sigmas(
+    spacing_mm: Array, shape: tuple[int, ...], gradient_sigma_mm: float | None, window_sigma_mm: float | None
+) -> tuple[float, float]:
+    """Return the standard deviations, mm, before derivatives and of the window; see `harris_response`."""
+    finest = float(spacing_mm[np.array(shape[::-1]) > 1].min())
+    return 0.7 * finest if gradient_sigma_mm is None else gradient_sigma_mm, finest if window_sigma_mm is None else window_sigma_mm
+
+
+def known_grey(values: NDArray[Any], shift: float) -> Single:
+    """Return grey values less a shift, in single precision.
+
+    Raises
+    ------
+    InputError
+        Unknown voxels.
+    """
+    grey = np.asarray(values - shift, dtype=np.float32)
+    if not np.isfinite(grey).all():
+        raise InputError("the volume has unknown voxels (NaN); look for interest points before it is resampled, or fill them")
+    return grey
+
+
+def response_of(grey: Single, spacing_mm: Array, gradient_sigma_mm: float, window_sigma_mm: float, k: float | None) -> Single:
+    """Return the response (nz, ny, nx) of the Harris operator on grey values; without k the ratio of determinant and trace."""
+    slopes = gradient(smoothed(grey, gradient_sigma_mm / spacing_mm), spacing_mm)
+    tensor = np.empty((6, *grey.shape), dtype=np.float32)
     products(slopes, tensor)
-    plane = not active[2]
+    plane = grey.shape[0] == 1
     for entry in (0, 1, 3) if plane else range(6):
-        tensor[entry] = smoothed(tensor[entry], outer / volume.spacing_mm)
-    out = np.empty(volume.shape, dtype=np.float32)
-    respond(tensor, plane, k if response == "harris" else -1.0, out)
+        tensor[entry] = smoothed(tensor[entry], window_sigma_mm / spacing_mm)
+    out = np.empty(grey.shape, dtype=np.float32)
+    respond(tensor, plane, -1.0 if k is None else k, out)
     return out
 
 

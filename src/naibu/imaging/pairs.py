@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,18 +41,27 @@ def grey_pair(reference: Volume, deformed: Volume) -> tuple[Single, Single]:
     known = np.isfinite(reference.values)
     if not (known & np.isfinite(deformed.values)).any():
         raise InputError("the volumes do not overlap: where one is known the other is not; check the motion that brought them together")
-    shift = np.mean(reference.values, dtype=np.float64, where=known)
-    return _grey(reference, shift, "reference"), _grey(deformed, shift, "deformed")
+    shift = float(np.mean(reference.values, dtype=np.float64, where=known))
+    a, b = shifted_grey(reference.values, shift, "reference"), shifted_grey(deformed.values, shift, "deformed")
+    for values, name in ((a, "reference"), (b, "deformed")):
+        low, high = float(np.nanmin(values)), float(np.nanmax(values))
+        if low == high:
+            raise InputError(f"the {name} volume is constant (every voxel is {low + shift:g}): there is nothing to match")
+    return a, b
 
 
-def _grey(volume: Volume, shift: np.floating, name: str) -> Single:
-    values = np.asarray(volume.values - shift, dtype=np.float32)
-    if np.isinf(values).any():
+def shifted_grey(values: NDArray[Any], shift: float, name: str) -> Single:
+    """Return values less a shift, in single precision; NaN where unknown.
+
+    Raises
+    ------
+    InputError
+        Infinite values.
+    """
+    grey = np.asarray(values - shift, dtype=np.float32)
+    if np.isinf(grey).any():
         raise InputError(f"the {name} volume has infinite values; mask or repair them")
-    low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    if low == high:
-        raise InputError(f"the {name} volume is constant (every voxel is {low + shift:g}): there is nothing to match")
-    return np.ascontiguousarray(values)
+    return np.ascontiguousarray(grey)
 
 
 def _told(volume: Volume) -> str:

@@ -14,9 +14,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from naibu.core.chunked_volume import ChunkedVolume
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
-from naibu.io.image_formats import dicom, hdf5, metaimage, nifti, nrrd, tiff
+from naibu.io.image_formats import dicom, hdf5, metaimage, nifti, nrrd, tiff, zarr_store
 from naibu.io.image_formats.geometry import ReadOptions
 
 Array = NDArray[np.float64]
@@ -27,6 +28,7 @@ VOLUME_READERS: dict[str, Callable[[Path, ReadOptions], Volume]] = {
     **dict.fromkeys((".nrrd", ".nhdr"), nrrd.read),
     **dict.fromkeys((".tif", ".tiff"), tiff.read),
     **dict.fromkeys((".h5", ".hdf5"), hdf5.read),
+    ".zarr": zarr_store.read,
     **dict.fromkeys((".dcm", ".dicom", ".ima"), dicom.read),
 }
 VOLUME_WRITERS: dict[str, Callable[..., Path]] = {
@@ -35,10 +37,15 @@ VOLUME_WRITERS: dict[str, Callable[..., Path]] = {
     ".nrrd": nrrd.write,
     **dict.fromkeys((".tif", ".tiff"), tiff.write),
     **dict.fromkeys((".h5", ".hdf5"), hdf5.write),
+    ".zarr": zarr_store.write,
 }
 _VECTOR_READERS: dict[str, Callable[[Path, ReadOptions], tuple[Array, Volume]]] = {
     **dict.fromkeys((".mha", ".mhd"), metaimage.read_vectors),
     **dict.fromkeys((".nrrd", ".nhdr"), nrrd.read_vectors),
+}
+_BOX_READERS: dict[str, Callable[[Path, ArrayLike, ArrayLike, ReadOptions], Volume]] = {
+    **dict.fromkeys((".h5", ".hdf5"), hdf5.read_box),
+    ".zarr": zarr_store.read_box,
 }
 _VECTOR_WRITERS = {".mha": metaimage.write, ".mhd": metaimage.write, ".nrrd": nrrd.write}
 
@@ -57,7 +64,8 @@ def read_volume(
     ----------
     path : path-like
         MetaImage (``.mha``, ``.mhd``), NIfTI (``.nii``, ``.nii.gz``), NRRD (``.nrrd``, ``.nhdr``), TIFF stack (``.tif``), HDF5 (``.h5``,
-        see `naibu.io.image_formats.hdf5`), a DICOM file, or a folder with the slices of a DICOM series or of a TIFF stack.
+        see `naibu.io.image_formats.hdf5`), Zarr (``.zarr``, see `naibu.io.image_formats.zarr_store`), a DICOM file, or a folder with the
+        slices of a DICOM series or of a TIFF stack.
     series : str, optional
         Which series of a folder with several: its SeriesInstanceUID or its description.
     spacing_mm : array_like, shape (3,), optional
@@ -82,7 +90,7 @@ def read_volume(
         The package that reads the format is not installed.
     """
     source = Path(path)
-    reader = dicom.read if _is_dicom(source) else tiff.read if source.is_dir() else _of(VOLUME_READERS, source, "read")
+    reader = _reader(source)
     spacing = None if spacing_mm is None else np.asarray(spacing_mm, dtype=float)
     if spacing is not None and (spacing.shape != (3,) or not (np.isfinite(spacing).all() and (spacing > 0.0).all())):
         raise InputError(f"spacing_mm must be three positive numbers (x, y, z), not {spacing.tolist()}")
@@ -97,7 +105,7 @@ def write_volume(path: str | os.PathLike[str], volume: Volume, *, compressed: bo
     Parameters
     ----------
     path : path-like
-        ``.mha``, ``.mhd``, ``.nii``, ``.nii.gz``, ``.nrrd``, ``.tif`` or ``.h5``.
+        ``.mha``, ``.mhd``, ``.nii``, ``.nii.gz``, ``.nrrd``, ``.tif``, ``.h5`` or ``.zarr``.
     volume : Volume
         Voxels; truth values are stored as 0 and 1.
     compressed : bool
@@ -162,12 +170,12 @@ def write_displacement(path: str | os.PathLike[str], displacement: ArrayLike, gr
 
 
 def read_volume_box(path: str | os.PathLike[str], low: ArrayLike, high: ArrayLike) -> Volume:
-    """Read a part of a volume that was written as HDF5; the rest of the file stays unread.
+    """Read a part of a volume that was written as HDF5 or Zarr; the rest stays unread.
 
     Parameters
     ----------
     path : path-like
-        ``.h5`` or ``.hdf5``.
+        ``.h5``, ``.hdf5`` or ``.zarr``.
     low, high : array_like, shape (3,)
         First voxel, and the one after the last, along x, y, z.
 
@@ -177,9 +185,37 @@ def read_volume_box(path: str | os.PathLike[str], low: ArrayLike, high: ArrayLik
         Another format, a box outside the volume, or a file that cannot be read.
     """
     source = Path(path)
-    if _ending(source) not in (".h5", ".hdf5"):
-        raise InputError(f"{source.name}: only HDF5 volumes are read in parts; write it once with write_volume as .h5")
-    return hdf5.read_box(source, low, high, ReadOptions())
+    if _ending(source) not in _BOX_READERS:
+        raise InputError(f"{source.name}: only HDF5 and Zarr volumes are read in parts; write it once with write_volume as .h5")
+    return _BOX_READERS[_ending(source)](source, low, high, ReadOptions())
+
+
+def open_volume(path: str | os.PathLike[str]) -> ChunkedVolume:
+    """Open a volume that need not fit into memory; only what is sliced is read (see `naibu.imaging.chunked`).
+
+    Parameters
+    ----------
+    path : path-like
+        ``.zarr``.
+
+    Raises
+    ------
+    InputError
+        Another format, no such store, or one that is no volume.
+    MissingDependencyError
+        The package zarr is not installed.
+    """
+    source = Path(path)
+    if _ending(source) != ".zarr":
+        raise InputError(f"{source.name}: only Zarr volumes are opened without being read; write it once with write_volume as .zarr")
+    return zarr_store.open_chunked(source)
+
+
+def _reader(source: Path) -> Callable[[Path, ReadOptions], Volume]:
+    """Return what reads a file or folder."""
+    if source.is_dir() and _ending(source) != ".zarr":
+        return dicom.read if _is_dicom(source) else tiff.read
+    return dicom.read if _is_dicom(source) else _of(VOLUME_READERS, source, "read")
 
 
 def _ending(path: Path) -> str:
@@ -197,6 +233,6 @@ def _of(formats: dict[str, _Handler], path: Path, what: str) -> _Handler:
 
 def _is_dicom(path: Path) -> bool:
     """Whether a folder holds DICOM files, or a file is one whatever its ending."""
-    if path.is_dir():
+    if path.is_dir() and _ending(path) != ".zarr":
         return any(dicom.is_dicom(file) for file in path.rglob("*") if file.is_file())
     return _ending(path) not in VOLUME_READERS and dicom.is_dicom(path)

@@ -1,0 +1,145 @@
+"""Volumes in Zarr, in chunks: for volumes larger than memory, and for several processes that read and write parts of one.
+
+The store is a group with an array ``values`` (nz, ny, nx) and the attributes ``spacing_mm``, ``origin_mm`` (x, y, z) and ``direction``
+(3 x 3, columns are the axes). Needs the package zarr (extra ``naibu[cluster]``).
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from naibu.core.chunked_volume import ChunkedVolume
+from naibu.core.errors import InputError
+from naibu.core.optional_packages import optional_package
+from naibu.core.volume import Volume
+from naibu.io.image_formats.geometry import ReadOptions, volume_with_axes
+
+CHUNK = 64
+_ATTRIBUTES = ("spacing_mm", "origin_mm", "direction")
+
+
+def read(path: Path, options: ReadOptions) -> Volume:
+    """Read grey values (see `naibu.io.images.read_volume`)."""
+    stored = open_chunked(path, options)
+    return _part(path, stored, np.zeros(3, dtype=int), np.array(stored.shape[::-1]))
+
+
+def read_box(path: Path, low: ArrayLike, high: ArrayLike, options: ReadOptions) -> Volume:
+    """Read the voxels with indices from `low` up to, not including, `high`, in the order x, y, z; other chunks stay unread.
+
+    Raises
+    ------
+    InputError
+        A box that is not inside the volume, or a store that is no volume.
+    """
+    stored = open_chunked(path, options)
+    a, b = np.asarray(low, dtype=int), np.asarray(high, dtype=int)
+    size = np.array(stored.shape[::-1])
+    if (a < 0).any() or (b > size).any() or (a >= b).any():
+        raise InputError(f"{path.name}: cannot read {a.tolist()}..{b.tolist()}: it has {size.tolist()} voxels along x, y, z")
+    return _part(path, stored, a, b)
+
+
+def open_chunked(path: Path, options: ReadOptions | None = None) -> ChunkedVolume:
+    """Open a volume without reading its voxels.
+
+    Raises
+    ------
+    InputError
+        No such store, one that is no volume, or one with other axes than z, y, x.
+    MissingDependencyError
+        The package zarr is not installed.
+    """
+    zarr = _zarr()
+    if not path.is_dir():
+        raise InputError(f"{path}: there is no such Zarr store; a Zarr volume is a folder")
+    try:
+        group = zarr.open_group(str(path), mode="r")
+        stored = group["values"]
+    except (KeyError, ValueError, OSError) as error:
+        raise InputError(f"{path.name}: holds no volume: naibu looks for a Zarr group with an array 'values' ({error})") from error
+    missing = [name for name in _ATTRIBUTES if name not in group.attrs]
+    if missing or not hasattr(stored, "chunks"):
+        raise InputError(f"{path.name}: holds no volume: its group lacks the attributes {', '.join(missing) or 'of an array'}")
+    if stored.ndim != 3:
+        raise InputError(f"{path.name}: its values have {stored.ndim} axes {stored.shape}, not z, y, x; choose one time or component")
+    unit = (options.unit_mm if options else None) or 1.0
+    origin, spacing = (unit * np.asarray(group.attrs[name], dtype=float) for name in ("origin_mm", "spacing_mm"))
+    return ChunkedVolume.from_array(stored, spacing_mm=spacing, origin_mm=origin, direction=group.attrs["direction"])
+
+
+def create_chunked(
+    path: Path, grid: Volume | ChunkedVolume, *, dtype: Any = np.float32, components: int | None = None, chunk: int = CHUNK
+) -> Any:
+    """Make an empty volume, or one of vectors (nz, ny, nx, components), that can be written part by part; an old one is removed.
+
+    Parameters
+    ----------
+    path : Path
+        Folder of the store, ``NAME.zarr``.
+    grid : Volume or ChunkedVolume
+        Where the voxels lie.
+    dtype : dtype
+        Of the values.
+    components : int, optional
+        Length of a fourth axis.
+    chunk : int
+        Voxels along an edge of a chunk.
+
+    Returns
+    -------
+    zarr.Array
+        To be assigned to by slices, for example by `naibu.imaging.chunked.stored`.
+    """
+    zarr = _zarr()
+    try:
+        if path.exists():
+            shutil.rmtree(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        group = zarr.create_group(str(path))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose a folder you may write to") from error
+    group.attrs.update({"spacing_mm": grid.spacing_mm.tolist(), "origin_mm": grid.origin_mm.tolist(), "direction": grid.direction.tolist()})
+    shape = (*grid.shape, *(() if components is None else (components,)))
+    chunks = (*(min(n, chunk) for n in grid.shape), *shape[3:])
+    return group.create_array("values", shape=shape, chunks=chunks, dtype=np.dtype(dtype))
+
+
+def write(path: Path, values: NDArray[Any], grid: Volume, *, compressed: bool) -> Path:
+    """Write grey values (nz, ny, nx), or vectors (nz, ny, nx, 3); chunks are always packed, without loss.
+
+    An old store is replaced when the new one is complete.
+    """
+    _zarr()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        aside = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose a folder you may write to") from error
+    try:
+        stored = create_chunked(aside / "store", grid, dtype=values.dtype, components=values.shape[3] if values.ndim == 4 else None)
+        stored[...] = values
+        if path.exists():
+            path.rename(aside / "old")
+        (aside / "store").rename(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error}); free some space or choose another folder") from error
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+    return path
+
+
+def _part(path: Path, stored: ChunkedVolume, low: NDArray[Any], high: NDArray[Any]) -> Volume:
+    box = tuple(slice(int(a), int(b)) for a, b in zip(low[::-1], high[::-1], strict=True))
+    axes = stored.direction * stored.spacing_mm
+    return volume_with_axes(path.name, np.asarray(stored.values[box]), stored.origin_mm + axes @ low.astype(float), axes, 1.0)
+
+
+def _zarr() -> Any:
+    return optional_package("zarr", "reading and writing Zarr volumes", "naibu[cluster]")
