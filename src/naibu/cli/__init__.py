@@ -6,7 +6,7 @@ import sys
 
 from cyclopts import CycloptsError
 
-from naibu.cli import experiments, studies  # noqa: F401  they bring their verbs
+from naibu.cli import experiments, imaging, studies  # noqa: F401  they bring their verbs
 from naibu.cli.console import BAD_INPUT, INTERRUPTED, NO_SOLUTION, app, errors, fail, print_table
 from naibu.core.errors import ConvergenceError, NaibuError
 from naibu.doctor import doctor_rows, healthy

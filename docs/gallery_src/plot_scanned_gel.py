@@ -1,0 +1,106 @@
+"""
+From scans to a prediction, where the truth is known
+====================================================
+
+A virtual gel of two layers with 64 washers inside is pressed by a plate and scanned three times by a virtual CT scanner, each time in
+another pose. The washers are found and linked in the volumes, the moduli are identified from the first pressed state, and the second one
+is predicted. Here everything is known, so that every step can be judged. The gel was computed on a finer mesh than the one on which it is
+identified.
+"""
+
+import tempfile
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from scipy.spatial import cKDTree
+
+import naibu
+from naibu.core.experiment import Loading
+from naibu.identification.specimen import ModelSettings
+from naibu.imaging.marker_tracking import track_markers
+from naibu.io.tables import write_experiment_folder
+from naibu.validation.phantoms import box_experiment, virtual_specimen
+from naibu.validation.scanned_experiments import scanned_states
+
+HEIGHTS = {"pressed": 35.0, "pressed_more": 32.0}
+TRUTH = {
+    "soft: young_modulus": 100.0,  # kPa
+    "firm: young_modulus": 200.0,
+    "soft: poisson_ratio": 0.47,
+    "firm: poisson_ratio": 0.47,
+    "soft on table: friction": 0.35,
+    "firm on acrylic: friction": 0.35,
+}
+described = box_experiment(
+    "gel", (40.0, 40.0, 40.0), [("soft", 20.0), ("firm", 20.0)], Loading("plate"), HEIGHTS, spacing_mm=8.0, margin_mm=8.0
+)
+gel = virtual_specimen(described, TRUTH, settings=ModelSettings(element_size_mm=6.7), jitter_mm=0.3, seed=3)
+scans = scanned_states(gel, spacing_mm=(0.7, 0.7, 0.7), seed=5)
+
+# %%
+# The washers of every scan, and what the scanner saw of them. Grey values of one slice, free and pressed; circles are the washers found
+# within a millimetre of it.
+
+tracked = track_markers([scan.volume for scan in scans.values()], diameter_mm=2.8, thickness_mm=0.3, polarity="bright", names=list(scans))
+
+figure, axes = plt.subplots(1, 2, figsize=(8, 4), layout="constrained", sharey=True)
+for shown, name, markers in zip(axes, scans, tracked.markers, strict=False):
+    volume = scans[name].volume
+    row = int(np.rint(volume.to_index(markers.points)[:, 1].mean() + 4.0 / 0.7))
+    low, high = volume.to_physical([0, row, 0]), volume.to_physical(np.array([volume.shape[2] - 1, row, volume.shape[0] - 1]))
+    drawn = shown.imshow(
+        volume.values[:, row], origin="lower", extent=(low[0], high[0], low[2], high[2]), cmap="gray", vmin=0, vmax=2500, aspect="equal"
+    )
+    near = np.abs(markers.points[:, 1] - low[1]) < 1.0
+    shown.plot(markers.points[near, 0], markers.points[near, 2], "o", mfc="none", mec="tab:orange", ms=10)
+    shown.set(title=name, xlabel="x, mm")
+axes[0].set_ylabel("z, mm")
+figure.colorbar(drawn, ax=axes, label="grey value")
+plt.show()
+
+for scan, name, markers in zip(scans.values(), tracked.names, tracked.markers, strict=True):
+    missed = cKDTree(scan.markers.points).query(markers.points[np.isfinite(markers.points).all(axis=1)])[0]
+    print(f"{name}: {len(missed)} of {len(gel.free)} washers found, centres off by {np.median(missed):.3f} mm (median)")
+
+# %%
+# The markers go into a folder as measured ones do, and the rest is what is done with measurements. The firm gel is known.
+
+step = np.sqrt(12.0) * np.nanmedian(tracked.sd_mm, axis=(0, 1))  # rounding to such steps would be as uncertain
+with tempfile.TemporaryDirectory() as aside:
+    folder = write_experiment_folder(
+        Path(aside) / "gel",
+        tracked.markers[0],
+        tracked.states,
+        title="A virtual gel, scanned",
+        shape=described.shape,
+        loading=described.loading,
+        layers=described.layers,
+        stated_mm=HEIGHTS,
+        spacing_mm=described.nominal_spacing_mm,
+        xy_step_mm=float(step[:2].mean()),
+        z_step_mm=float(step[2]),
+    )
+    settings = ModelSettings(element_size_mm=10.0)
+    found = naibu.identify(folder, known=["firm=200 kPa"], settings=settings, states={"gel": ["pressed"]})
+    unseen = naibu.predict(found.model, folder, state="pressed_more", heights_from_markers=True)
+
+for parameter in found.model.parameters.free:
+    if parameter.name in TRUTH:
+        low, high = found.model.interval(parameter.name)
+        print(
+            f"{parameter.name}: {parameter.value:.3g} (95 % from {low:.3g} to {high:.3g}), truth {TRUTH[parameter.name]:g} {parameter.unit}"
+        )
+
+# %%
+# How far the washers moved in the state that was not used, and how far the prediction misses where they were seen.
+
+moved = np.linalg.norm(unseen.measured_in_object - unseen.specimen.marker_points, axis=1)
+missed = np.linalg.norm(unseen.residual, axis=1)
+figure, shown = plt.subplots(figsize=(7, 4), layout="constrained")
+drawn = shown.scatter(moved, missed, c=unseen.specimen.marker_points[:, 2], cmap="viridis")
+shown.set(xlabel="distance the washer moved, mm", ylabel="distance to its prediction, mm")
+shown.set_ylim(bottom=0.0)
+shown.set_title(f"pressed to 32 mm, predicted from 35 mm: {np.sqrt(np.nanmean(missed**2)):.2f} mm RMS")
+figure.colorbar(drawn, label="height in the free gel, mm")
+plt.show()
