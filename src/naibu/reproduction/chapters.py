@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from naibu.reproduction.chapter import Chapter
+from naibu.reproduction.chapter1 import chapter1
 from naibu.reproduction.chapter2 import chapter2
 from naibu.reproduction.chapter3 import chapter3
 
-CHAPTERS: dict[str, Callable[[int], Chapter]] = {"ch2": chapter2, "ch3": chapter3}
+CHAPTERS: dict[str, Callable[[int], Chapter]] = {"ch1": chapter1, "ch2": chapter2, "ch3": chapter3}
