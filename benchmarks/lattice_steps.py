@@ -1,0 +1,215 @@
+"""How long a step of a lattice takes: explicit and implicit, classic and octree, beside a plain loop and NumPy; jitter; gradients.
+
+A cube of 80 mm and 630 g with 9^3, 17^3 and 33^3 masses. The references take the explicit Euler step of the same elements: one in
+NumPy, one as a plain Numba loop over the elements on one thread, as one would write it first. Each time is the least over many repeats,
+and that of a step in a long call, without what the call itself costs; `cpu` is the time of the processor (all threads), `wall` that of
+the clock, which on a shared machine counts what others do. Jitter is that of single steps, called one by one, while another process
+keeps a core busy.
+
+Run: ``MKL_NUM_THREADS=1 OMP_NUM_THREADS=2 python benchmarks/lattice_steps.py [--sizes 8,16,32] [--repeats 20]``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+import numba
+import numpy as np
+
+from naibu.mechanics.lattice import Lattice, LatticeParameters, box_mask, classic_lattice, lattice_parameters
+from naibu.mechanics.lattice_adjoint import push_gradient, recorded_push
+from naibu.mechanics.lattice_blocks import explicit_coefficients
+from naibu.mechanics.lattice_stepping import HeldNodes, LatticeEngine
+from naibu.mechanics.octree_lattice import octree_lattice
+
+SIDE_MM, MASS_KG, STEP_S = 80.0, 0.63, 2e-3
+GENTLE = (0.03, 0.002, 0.003)  # K, C1, C2 for which explicit steps of 2 ms are stable
+STIFF = (10.0, 5.0, 10.0)  # within the printed ranges, read in g/s^2 and g/s; far beyond what explicit steps of 2 ms allow
+
+
+def least(action: Callable[[], object], steps: int, repeats: int) -> tuple[float, float]:
+    """Return the least processor and wall time of a step, ms."""
+    action()
+    cpu = wall = np.inf
+    for _ in range(repeats):
+        start, began = time.process_time(), time.perf_counter()
+        action()
+        cpu, wall = min(cpu, time.process_time() - start), min(wall, time.perf_counter() - began)
+    return 1e3 * cpu / steps, 1e3 * wall / steps
+
+
+def row(name: str, cpu: float, wall: float, told: str = "") -> None:
+    print(f"  {name:42s} cpu {cpu:9.4f}   wall {wall:9.4f} ms   {told}", flush=True)
+
+
+@numba.njit(cache=True)
+def plain_loop(i, j, a, b, d, g, mass, x, v, y, step, steps):  # type: ignore[no-untyped-def]
+    force = np.zeros_like(x)
+    for _ in range(steps):
+        force[:] = 0.0
+        for e in range(len(i)):
+            p, q = i[e], j[e]
+            d0, d1, d2 = x[q, 0] - x[p, 0], x[q, 1] - x[p, 1], x[q, 2] - x[p, 2]
+            length = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
+            rate = ((v[q, 0] - v[p, 0]) * d0 + (v[q, 1] - v[p, 1]) * d1 + (v[q, 2] - v[p, 2]) * d2) / length
+            tension = (a[e] * rate + b[e] * y[e]) / length
+            y[e] += step * (d[e] * rate - g[e] * y[e])
+            for axis, along in ((0, d0), (1, d1), (2, d2)):
+                force[p, axis] += tension * along
+                force[q, axis] -= tension * along
+        for k in range(len(x)):
+            for axis in range(3):
+                x[k, axis] += step * v[k, axis]
+                v[k, axis] += step * force[k, axis] / mass[k]
+
+
+def numpy_steps(lattice: Lattice, coefficients: tuple[np.ndarray, ...], steps: int) -> None:
+    i, j = lattice.elements.T
+    a, b, d, g = coefficients
+    x, v, y = lattice.points.copy(), np.zeros_like(lattice.points), np.zeros(len(i))
+    for _ in range(steps):
+        along = x[j] - x[i]
+        length = np.linalg.norm(along, axis=1)
+        along /= length[:, None]
+        rate = ((v[j] - v[i]) * along).sum(axis=1)
+        pull = (a * rate + b * y)[:, None] * along
+        y += STEP_S * (d * rate - g * y)
+        force = [np.bincount(i, pull[:, k], lattice.n_nodes) - np.bincount(j, pull[:, k], lattice.n_nodes) for k in range(3)]
+        x, v = x + STEP_S * v, v + STEP_S * np.stack(force, axis=1) / lattice.node_mass[:, None]
+
+
+def pushed(lattice: Lattice) -> tuple[HeldNodes, np.ndarray]:
+    """Return a floor that holds the lowest masses and a stamp of 20 mm on the top, and their velocities."""
+    x, y, z = lattice.points.T
+    stamp = (z > SIDE_MM - 0.1) & (np.abs(x - 40.0) < 10.1) & (np.abs(y - 40.0) < 10.1)
+    return HeldNodes.of(np.flatnonzero(z < 0.1), 0) + HeldNodes.of(np.flatnonzero(stamp), 1), np.array([[0, 0, 0], [0, 0, -20.0]])
+
+
+def timed(lattice: Lattice, parameters: LatticeParameters, steps: int, repeats: int, **options: object) -> tuple[float, float, float]:
+    engine = LatticeEngine.of(lattice, parameters, step=STEP_S, **options)  # type: ignore[arg-type]
+    held, velocity = pushed(lattice)
+    start = engine.rest()
+    start = engine.run(start, steps, held, velocity).state  # not from rest
+    iterations = engine.run(start, steps, held, velocity).iterations
+    call = least(lambda: engine.run(start, 0, held, velocity), 1, repeats)
+    whole = least(lambda: engine.run(start, steps, held, velocity), 1, repeats)
+    return (whole[0] - call[0]) / steps, (whole[1] - call[1]) / steps, iterations
+
+
+def sizes(n: int, repeats: int) -> None:
+    lattice = classic_lattice(box_mask((n,) * 3), SIDE_MM / n, total_mass_kg=MASS_KG)
+    gentle = lattice_parameters(lattice, *(p * 8.0 / n for p in GENTLE))
+    steps = {8: 500, 16: 100}.get(n, 20)
+    print(f"{n + 1}^3 masses, {lattice.n_elements} elements")
+    c = explicit_coefficients(gentle)
+    few = max(2, 200 // n)
+    row("NumPy, explicit", *least(lambda: numpy_steps(lattice, c, few), few, max(2, repeats // 6)))
+    i, j = (np.ascontiguousarray(e) for e in lattice.elements.T)
+
+    def loop() -> None:
+        x, y = lattice.points.copy(), np.zeros(lattice.n_elements)
+        plain_loop(i, j, *c, lattice.node_mass, x, np.zeros_like(x), y, STEP_S, steps)
+
+    reference = least(loop, steps, repeats)
+    row("plain Numba loop, explicit, double", *reference)
+    for precision in ("double", "single"):
+        for threads in (1, 2) if lattice.n_elements >= 20_000 else (1,):
+            cpu, wall, _ = timed(lattice, gentle, steps, repeats, method="euler", precision=precision, threads=threads)
+            row(
+                f"explicit, {precision}, {threads} thread(s)",
+                cpu,
+                wall,
+                f"plain loop over this: {reference[threads > 1] / (cpu, wall)[threads > 1]:.2f}",
+            )
+    held, velocity = pushed(lattice)
+    engine = LatticeEngine.of(lattice, gentle, method="euler", threads=1)
+    state = engine.rest()
+    row(
+        "a call without steps",
+        *least(lambda: engine.run(state, 0, held, velocity), 1, repeats),
+        "conversion of the state, not in the rows of steps",
+    )
+    few = max(5, steps // 5)
+    cpu, wall, iterations = timed(lattice, lattice_parameters(lattice, *STIFF), few, max(2, repeats // 4))
+    row("implicit, 1 thread", cpu, wall, f"{iterations:.1f} iterations")
+    classic, _, _ = timed(lattice, gentle, steps, repeats, method="euler", threads=1)
+    for kind in (0, 1, 2):
+        octree = octree_lattice(box_mask((n,) * 3), SIDE_MM / n, kind, total_mass_kg=MASS_KG)
+        cpu, wall, _ = timed(octree, lattice_parameters(octree, *(p * 8.0 / n for p in GENTLE)), steps, repeats, method="euler", threads=1)
+        row(
+            f"octree type {kind}, explicit, 1 thread",
+            cpu,
+            wall,
+            f"of classic: time {cpu / classic:.3f}, elements {octree.n_elements / lattice.n_elements:.3f}",
+        )
+
+
+def jitter(n: int, **options: object) -> None:
+    lattice = classic_lattice(box_mask((n,) * 3), SIDE_MM / n, total_mass_kg=MASS_KG)
+    engine = LatticeEngine.of(lattice, lattice_parameters(lattice, *(p * 8.0 / n for p in GENTLE)), step=STEP_S, **options)  # type: ignore[arg-type]
+    held, velocity = pushed(lattice)
+    state = engine.run(engine.rest(), 5, held, velocity).state
+    busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    try:
+        taken = []
+        for _ in range(1500 if n < 32 else 400):
+            start = time.perf_counter()
+            engine.run(state, 1, held, velocity)
+            taken.append(time.perf_counter() - start)
+    finally:
+        busy.kill()
+        busy.wait()
+    middle, late, worst = 1e3 * np.quantile(taken, (0.5, 0.99, 1.0))
+    told = ", ".join(f"{key} {value}" for key, value in options.items())
+    print(
+        f"  jitter {n + 1}^3, {told}: median {middle:.3f}, p99 - median {late - middle:.3f}, worst {worst:.3f} ms, with conversion",
+        flush=True,
+    )
+
+
+def gradients(repeats: int) -> None:
+    lattice = classic_lattice(box_mask((8, 8, 8)), 10.0, total_mass_kg=MASS_KG)
+    engine = LatticeEngine.of(lattice, lattice_parameters(lattice, *GENTLE), step=STEP_S, method="symplectic_euler")
+    held, velocity = pushed(lattice)
+    path = np.zeros((2500, 2, 3))
+    path[:500] = velocity
+
+    def gradient() -> float:
+        push = recorded_push(engine, engine.rest(), [500, 1000, 1500, 2000, 2500], held, path)
+        push_gradient(push, push.positions - lattice.points, push.reaction)
+        return push.memory_mb
+
+    cpu, wall = least(gradient, 1, max(3, repeats // 3))
+    print(f"gradient of 2500 steps at 9^3: cpu {cpu / 1e3:.3f}, wall {wall / 1e3:.3f} s, states {gradient():.1f} MB", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--sizes", default="8,16,32", help="voxels an edge")
+    parser.add_argument("--repeats", type=int, default=20)
+    asked = parser.parse_args()
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
+    print(f"{os.cpu_count()} cores, Numba threads {numba.get_num_threads()}, load {load:.1f} at the start")
+    chosen = [int(n) for n in asked.sizes.split(",")]
+    for n in chosen:
+        sizes(n, asked.repeats)
+    gradients(asked.repeats)
+    for n in chosen:
+        jitter(n, method="euler", threads=1)
+        if n > 8:
+            jitter(n, method="euler", threads=2)
+        if n < 32:
+            jitter(n, method="implicit")
+    try:
+        print(f"threading layer {numba.threading_layer()}")
+    except ValueError:
+        print("no threads were used")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,430 @@
+"""Lattices in motion: states, held masses, and engines that take many steps in one call (spec L1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from naibu.core.errors import ConvergenceError, InputError
+from naibu.mechanics import lattice_implicit, lattice_kernels
+from naibu.mechanics.lattice import Array, Integers, Lattice, LatticeParameters, require_positive
+from naibu.mechanics.lattice_blocks import Blocks, explicit_coefficients, explicit_kernel, implicit_kernel
+from naibu.mechanics.lattice_blocks import aligned as aligned
+from naibu.mechanics.simd import WIDTH
+
+Method = Literal["implicit", "euler", "symplectic_euler"]
+THREADED_FROM = 20_000  # elements; below, one thread is faster than two that wait for each other
+STEP_S = 2e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LatticeState:
+    """What changes while a lattice moves.
+
+    Attributes
+    ----------
+    position : ndarray, shape (n, 3)
+        mm.
+    velocity : ndarray, shape (n, 3)
+        mm/s.
+    extension : ndarray, shape (m,)
+        How much longer than at rest the Voigt part of every element is, y = Z - a L, mm.
+    length : ndarray, shape (m,)
+        Lengths of the elements that the extensions have followed so far, mm; by default the distances of the masses. They lag behind where
+        the implicit method held back what rotation adds, and catch up.
+    """
+
+    position: Array
+    velocity: Array
+    extension: Array
+    length: Array | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldNodes:
+    """Components of masses that move as rigid bodies do.
+
+    Attributes
+    ----------
+    node : ndarray, shape (h,), int64
+        Masses; one occurs once for each direction in which it is held.
+    direction : ndarray, shape (h, 3)
+        Unit vectors, orthogonal where they belong to one mass.
+    weight : ndarray, shape (h,)
+        Share of the body's velocity that the mass takes on.
+    body : ndarray, shape (h,), int64
+        Number of the body.
+    """
+
+    node: Integers
+    direction: Array
+    weight: Array
+    body: Integers
+
+    @classmethod
+    def none(cls) -> HeldNodes:
+        """Hold nothing."""
+        return cls(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
+
+    @classmethod
+    def of(cls, nodes: ArrayLike, body: int = 0, *, axes: Sequence[int] = (0, 1, 2), weight: ArrayLike = 1.0) -> HeldNodes:
+        """Hold masses along axes of the frame by a body, with a weight, or one a mass."""
+        chosen = np.atleast_1d(np.asarray(nodes, dtype=np.int64))
+        share = np.broadcast_to(np.asarray(weight, dtype=float), chosen.shape)
+        k = len(axes)
+        return cls(
+            np.repeat(chosen, k), np.tile(np.eye(3)[list(axes)], (len(chosen), 1)), np.repeat(share, k), np.full(k * len(chosen), body)
+        )
+
+    def __add__(self, other: HeldNodes) -> HeldNodes:
+        """Hold what either holds."""
+        pairs = ((getattr(self, name), getattr(other, name)) for name in ("node", "direction", "weight", "body"))
+        return HeldNodes(*(np.concatenate(pair) for pair in pairs))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """What a run of steps gave.
+
+    Attributes
+    ----------
+    state : LatticeState
+        After the last step.
+    reaction : ndarray, shape (steps, bodies, 3)
+        Forces that the bodies exert on the lattice, mN: with them its momentum balances.
+    iterations : float
+        Mean number of iterations of the solver in a step.
+    held_back : int
+        Steps in which the stretching by rotation was held back so that the energy does not grow; other than zero for steps of large turns.
+    """
+
+    state: LatticeState
+    reaction: Array
+    iterations: float = 0.0
+    held_back: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LatticeEngine:
+    """A lattice prepared for steps of one length by one method.
+
+    Attributes
+    ----------
+    lattice : Lattice
+        Masses and elements.
+    parameters : LatticeParameters
+        Of the elements.
+    step : float
+        s.
+    method : str
+        ``"implicit"`` (default, stable for all parameters), ``"euler"`` (the report's explicit method) or ``"symplectic_euler"``
+        (explicit; positions move by the new velocity, and the tension follows the extension that the old one leads to).
+    blocks : Blocks
+        Where elements are stored.
+    tolerance : float
+        Of the implicit solver, relative to the residual that the old velocity leaves.
+    threads : int
+        Threads of the explicit steps.
+    """
+
+    lattice: Lattice
+    parameters: LatticeParameters
+    step: float
+    method: Method
+    blocks: Blocks
+    tolerance: float
+    threads: int
+    kernel: tuple[Any, ...]
+    mass: NDArray[np.floating]
+
+    @classmethod
+    def of(
+        cls,
+        lattice: Lattice,
+        parameters: LatticeParameters,
+        *,
+        step: float = STEP_S,
+        method: Method = "implicit",
+        precision: Literal["double", "single"] = "double",
+        tolerance: float = 1e-2,
+        threads: int | None = None,
+    ) -> LatticeEngine:
+        """Prepare a lattice.
+
+        Parameters
+        ----------
+        lattice, parameters : Lattice, LatticeParameters
+            What moves.
+        step : float
+            s.
+        method, precision : str
+            See the attributes; explicit steps in single precision take half the time.
+        tolerance : float
+            Of the implicit solver: 0.01 changes displacements by some 1e-5, forces by 2e-5 of their size. Stability does not depend on it.
+        threads : int
+            Of explicit steps; by default those of Numba from 20 000 elements, else one.
+
+        Raises
+        ------
+        InputError
+            A step, tolerance or number of threads that is not positive, parameters of another lattice, an unknown method or precision, or
+            single precision with the implicit method.
+        """
+        _check(lattice, parameters, step, method, precision, tolerance, threads)
+        kind = np.float32 if precision == "single" else np.float64
+        blocks = Blocks.of(lattice)
+        if threads is None:
+            threads = numba.get_num_threads() if method != "implicit" and lattice.n_elements >= THREADED_FROM else 1
+        pad = -(-lattice.n_nodes // WIDTH) * WIDTH + WIDTH
+        mass = aligned((pad,), kind)
+        mass[: lattice.n_nodes] = lattice.node_mass
+        if method == "implicit":
+            kernel = implicit_kernel(lattice, parameters, step, blocks, mass)
+        else:
+            kernel = explicit_kernel(parameters, step, blocks, mass, min(threads, numba.get_num_threads()), method == "euler")
+        return cls(lattice, parameters, float(step), method, blocks, float(tolerance), threads, kernel, mass)
+
+    def rest(self) -> LatticeState:
+        """Return the lattice at rest, without any force."""
+        return LatticeState(self.lattice.points.copy(), np.zeros_like(self.lattice.points), np.zeros(self.lattice.n_elements))
+
+    def run(
+        self,
+        state: LatticeState,
+        steps: int,
+        held: HeldNodes | None = None,
+        velocity: ArrayLike = 0.0,
+        external_force: ArrayLike | None = None,
+    ) -> Motion:
+        """Take steps.
+
+        Parameters
+        ----------
+        state : LatticeState
+            Where they begin; unchanged.
+        steps : int
+            How many.
+        held : HeldNodes
+            Masses that bodies move.
+        velocity : array_like
+            Velocity of the bodies, mm/s, broadcast to (steps, bodies, 3).
+        external_force : array_like
+            Forces on the masses that do not change, mN, broadcast to (n, 3).
+
+        Raises
+        ------
+        InputError
+            Shapes that do not fit, or NaN.
+        ConvergenceError
+            The explicit method blew up.
+        """
+        held = held or HeldNodes.none()
+        path = checked_velocity(velocity, steps, int(held.body.max(initial=-1)) + 1)
+        x, v, y = self.stored(state)
+        external = aligned((0,), x.dtype)
+        if external_force is not None:
+            force = np.broadcast_to(np.asarray(external_force, dtype=float), self.lattice.points.shape)
+            require_numbers(force, "external_force")
+            external = self.by_component(force, x.dtype)
+        reaction = np.zeros(path.shape)
+        entries = (held.node, held.direction, held.weight, held.body)
+        require_held(held, self.lattice.n_nodes)
+        if self.method != "implicit":
+            self._explicit(x, v, y, external, entries, path, reaction)
+            return Motion(self._checked(self.read(x, v, y), steps), reaction)
+        lengths = self.stored_lengths(state)
+        blocks, tables, work, inner = self.kernel
+        count, held_back = lattice_implicit.implicit_steps(
+            blocks, tables, x, v, y, lengths, self.mass, external, work, inner, entries, path, self.step, (self.tolerance, 20_000), reaction
+        )
+        known = lengths[self.blocks.lane]
+        return Motion(replace(self.read(x, v, y), length=known), reaction, count / max(steps, 1), held_back)
+
+    def _explicit(self, x: Any, v: Any, y: Any, external: Any, held: tuple[Any, ...], velocity: Array, reaction: Array) -> None:
+        blocks, tables, masses, parts = self.kernel
+        step, forward = x.dtype.type(self.step), self.method == "euler"
+        if parts is None:
+            lattice_kernels.explicit_steps(blocks, tables, x, v, y, masses, external, held, velocity, step, forward, reaction)
+            return
+        order = np.argsort(held[0], kind="stable")
+        entries = tuple(values[order] for values in held)
+        mine = np.searchsorted(entries[0], parts[1])
+        lattice_kernels.explicit_steps_threaded(
+            blocks, (*parts, mine), tables, x, v, y, masses, external, entries, velocity, step, forward, reaction
+        )
+
+    def energy(self, state: LatticeState) -> float:
+        """Return kinetic energy plus that of the springs, mN mm; free of supports and forces it never grows."""
+        kinetic = 0.5 * float((self.lattice.node_mass * (state.velocity**2).sum(axis=1)).sum())
+        return kinetic + 0.5 * float((self.parameters.stiffness * state.extension**2).sum())
+
+    def stored(self, state: LatticeState) -> tuple[Any, Any, Any]:
+        """Return position, velocity (3 pad,) and extension (8 nb,) as the kernels hold them, copied.
+
+        Raises
+        ------
+        InputError
+            Arrays of other shapes, or NaN.
+        """
+        n, m = self.lattice.n_nodes, self.lattice.n_elements
+        for name, array, shape in (
+            ("position", state.position, (n, 3)),
+            ("velocity", state.velocity, (n, 3)),
+            ("extension", state.extension, (m,)),
+        ):
+            if np.shape(array) != shape:
+                raise InputError(f"the {name} of the state has shape {np.shape(array)}, the lattice needs {shape}")
+            require_numbers(np.asarray(array), f"the {name} of the state")
+        kind = self.mass.dtype
+        y = aligned((WIDTH * self.blocks.n_blocks,), kind)
+        y[self.blocks.lane] = state.extension
+        return self.by_component(state.position, kind), self.by_component(state.velocity, kind), y
+
+    def stored_lengths(self, state: LatticeState) -> Any:
+        """Return the lengths that the extensions followed (8 nb,), as kernels hold them."""
+        known = state.length
+        if known is None:
+            i, j = self.lattice.elements.T
+            known = np.linalg.norm(state.position[j] - state.position[i], axis=1)
+        if np.shape(known) != (self.lattice.n_elements,):
+            raise InputError(f"the length of the state has shape {np.shape(known)}, the lattice has {self.lattice.n_elements} elements")
+        lengths = aligned((WIDTH * self.blocks.n_blocks,), float)
+        lengths[self.blocks.lane] = known
+        return lengths
+
+    def read(self, x: Any, v: Any, y: Any) -> LatticeState:
+        """Return the state that arrays of the kernels hold."""
+        n = self.lattice.n_nodes
+        position, velocity = (np.ascontiguousarray(a.reshape(3, -1)[:, :n].T, dtype=np.float64) for a in (x, v))
+        return LatticeState(position, velocity, y[self.blocks.lane].astype(np.float64))
+
+    def by_component(self, values: Array, kind: Any) -> Any:
+        """Return values of the masses (n, 3) as kernels hold them, (3 pad,)."""
+        result = aligned((3 * len(self.mass),), kind)
+        result.reshape(3, -1)[:, : len(values)] = values.T
+        return result
+
+    def _checked(self, state: LatticeState, steps: int) -> LatticeState:
+        reach = 1e3 * (np.ptp(self.lattice.points, axis=0).max() + self.lattice.spacing_mm)
+        if not (np.isfinite(state.velocity).all() and np.abs(state.position - self.lattice.points).max() < reach):
+            limit = explicit_step_limit(self.lattice, self.parameters)
+            raise ConvergenceError(
+                f"the explicit steps of {self.step:g} s blew up within {steps} steps; the springs and dampers allow about {limit:.2g} s: "
+                "take shorter steps, or method='implicit', which is stable for all parameters"
+            )
+        return state
+
+
+def _check(
+    lattice: Lattice, parameters: LatticeParameters, step: float, method: str, precision: str, tolerance: float, threads: int | None
+) -> None:
+    require_positive(step, "the step", "s")
+    require_positive(tolerance, "the tolerance", "")
+    if tolerance >= 1.0:
+        raise InputError(f"the tolerance is a share of the residual and must be below 1, not {tolerance:g}")
+    if len(parameters.stiffness) != lattice.n_elements:
+        raise InputError(f"there are parameters for {len(parameters.stiffness)} elements, the lattice has {lattice.n_elements}")
+    if method not in ("implicit", "euler", "symplectic_euler"):
+        raise InputError(f"methods are 'implicit', 'euler' and 'symplectic_euler', not {method!r}")
+    if precision not in ("double", "single"):
+        raise InputError(f"precision is 'double' or 'single', not {precision!r}")
+    if precision == "single" and method == "implicit":
+        raise InputError("the implicit method solves in single precision already; give precision='double', or an explicit method")
+    if threads is not None and threads < 1:
+        raise InputError(f"the number of threads must be positive, not {threads}")
+
+
+def checked_velocity(velocity: ArrayLike, steps: int, bodies: int) -> Array:
+    """Return velocities of bodies (steps, bodies, 3), mm/s.
+
+    Raises
+    ------
+    InputError
+        No number of steps, values that cannot be broadcast, or NaN.
+    """
+    if steps < 0:
+        raise InputError(f"the number of steps must not be negative, not {steps}")
+    given = np.asarray(velocity, dtype=float)
+    bodies = max(bodies, given.shape[-2] if given.ndim >= 2 else 0)
+    try:
+        path = np.array(np.broadcast_to(given, (steps, bodies, 3)))
+    except ValueError:
+        raise InputError(
+            f"velocities of shape {given.shape} do not fit {steps} steps of {bodies} bodies: give (steps, bodies, 3)"
+        ) from None
+    require_numbers(path, "velocity")
+    return path
+
+
+def require_numbers(values: Array, what: str) -> None:
+    """Check that all values are finite.
+
+    Raises
+    ------
+    InputError
+        Some are not; the message counts them.
+    """
+    wrong = ~np.isfinite(values)
+    if wrong.any():
+        at = tuple(int(k) for k in np.argwhere(wrong)[0])
+        raise InputError(f"{what} holds {int(wrong.sum())} NaN or infinite values, the first at {at}; leave them out or fill them")
+
+
+def require_held(held: HeldNodes, n_nodes: int) -> None:
+    """Check held masses.
+
+    Raises
+    ------
+    InputError
+        A mass that is not there, directions that are not of unit length, or two that are not orthogonal at one mass.
+    """
+    if not len(held.node):
+        return
+    if held.node.min() < 0 or held.node.max() >= n_nodes:
+        raise InputError(f"held masses have the numbers {held.node.min()} to {held.node.max()}, the lattice has 0 to {n_nodes - 1}")
+    require_numbers(held.direction, "the direction of held masses")
+    if np.abs(np.linalg.norm(held.direction, axis=1) - 1.0).max() > 1e-6:
+        raise InputError("the directions of held masses must be of unit length; divide them by their norm")
+    order = np.argsort(held.node, kind="stable")
+    node, direction = held.node[order], held.direction[order]
+    for apart in range(1, min(4, len(node))):
+        together = node[apart:] == node[:-apart]
+        cosine = np.abs((direction[apart:] * direction[:-apart]).sum(axis=1))[together]
+        if len(cosine) and cosine.max() > 1e-6:
+            bad = int(node[apart:][together][int(np.argmax(cosine))])
+            raise InputError(f"mass {bad} is held twice in directions that are not orthogonal; hold each component by one body only")
+
+
+def explicit_step_limit(lattice: Lattice, parameters: LatticeParameters) -> float:
+    """Return a step, s, up to which explicit steps are stable for small motions; a bound, reached within about a factor of two.
+
+    From Gershgorin's bound of the damping and of the stiffness of all elements at a mass, and the elements' own times (C1 + C2) / K.
+    """
+    a, b, _, g = explicit_coefficients(parameters)
+    ends = lattice.elements.ravel()
+    damping, stiffness = (np.bincount(ends, np.repeat(2.0 * c, 2)) / lattice.node_mass for c in (a, b))
+    fastest = 0.5 * damping.max() + np.sqrt(0.25 * damping.max() ** 2 + stiffness.max())
+    slowest = float(g.max())
+    return float(2.0 / max(fastest, slowest, 1e-300))
+
+
+def with_parameters(engine: LatticeEngine, parameters: LatticeParameters) -> LatticeEngine:
+    """Return the engine for other parameters of the same lattice.
+
+    Raises
+    ------
+    InputError
+        Parameters of another lattice.
+    """
+    precision: Literal["double", "single"] = "single" if engine.mass.dtype == np.float32 else "double"
+    _check(engine.lattice, parameters, engine.step, engine.method, precision, engine.tolerance, engine.threads)
+    if engine.method == "implicit":
+        kernel = implicit_kernel(engine.lattice, parameters, engine.step, engine.blocks, engine.mass)
+    else:
+        kernel = explicit_kernel(parameters, engine.step, engine.blocks, engine.mass, engine.threads, engine.method == "euler")
+    return replace(engine, parameters=parameters, kernel=kernel)
