@@ -23,8 +23,8 @@ from naibu.mechanics.supports import Prescribed
 from naibu.meshing.generation import box
 from naibu.meshing.splitting import to_tetra
 from naibu.validation.ct_streaks import streaks
-from naibu.validation.scanned_experiments import rescanned
 from naibu.validation.scan_devices import CTDevice, MRDevice
+from naibu.validation.scanned_experiments import rescanned
 from naibu.validation.virtual_motion import FormulaMotion, MatchedMotion, MeshMotion, PosedMotion, Still
 from naibu.validation.virtual_scanner import PLASTIC_BEAD, STEEL_WASHER, MarkerKind, VirtualObject, empty_grid, scan
 from naibu.validation.virtual_textures import Texture, layered_block
