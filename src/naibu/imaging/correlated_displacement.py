@@ -24,8 +24,10 @@ VOXELS_A_CELL = 6
 # cells: few samples of neighbours are worth more samples of one
 SHARED = 0.7
 STILL = 0.1  # voxels
-# displacement that a cell misses, of the root mean square second derivative times the square of its size
-UNRESOLVED = 0.15
+# displacement that is missed, of the root mean square second derivative times the square of what is resolved
+UNRESOLVED = 0.065
+SQUARE = 151 / 315  # sum of the squares of a spline along an axis
+LEAST_SHARE = 0.003  # the data of so little are not asked: seven cells is as far as a field is believed to be smooth
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -216,7 +218,9 @@ def collected(
     maps = [np.full(volume.shape, np.nan) for _ in range(2)]
     for full, listed in zip(maps, (fit.gain, fit.offset), strict=True):
         full[valid] = listed[fit.seen]
-    covariance = _per_cell(system.grid, fit, sampled_covariance(fit, samples) + _unresolved(fit)[:, None, None] * np.eye(3))
+    covariance = _per_cell(
+        system.grid, fit, sampled_covariance(fit, samples) + _unresolved(fit, c, samples, bending)[:, None, None] * np.eye(3)
+    )
     converged = np.ones(tuple(int(n) for n in system.grid.cells[::-1]), dtype=bool)
     still = np.linalg.norm(system.at_middles(fit.last_step), axis=1) <= STILL * np.prod(level.spacing) ** (1 / 3)
     converged[tuple(system.cells[system.inner, 2:].T)] = still
@@ -253,23 +257,42 @@ def sampled_covariance(fit: Correlation, samples: Single) -> Array:
     return np.asarray((wide[:, 1:] / wide[:, :1]).reshape(-1, 3, 3))
 
 
-def _unresolved(fit: Correlation) -> Array:
-    """Return the variance (m,), mm^2, of what cells of this size cannot follow: as the field's own curvature, so what is finer."""
-    step = fit.system.grid.step_mm
-    curvature = fit.system.bent.astype(float).mean(axis=1) / np.prod(step)
-    return np.asarray((UNRESOLVED * np.prod(step) ** (2 / 3)) ** 2 * curvature)
+def _unresolved(fit: Correlation, c: Array, samples: Single, bending: Array) -> Array:
+    """Return the variance (m,), mm^2, of what the field does not follow, being finer than the data resolve.
+
+    Notes
+    -----
+    Where the data make up a share s of the stiffness of a coefficient, theirs and that of bending, they resolve lengths of about
+    ``h s^(-1/3)``. What is finer is missed: the second derivative of the field, as likely as the samples say, times the square of that
+    length.
+    """
+    system = fit.system
+    h = float(np.prod(system.grid.step_mm) ** (1 / 3))
+    likely = (system.bent + system.energies(samples, c)[0]).astype(float).mean(axis=1) / h**3
+    cell, _ = cells_of_voxels(fit)
+    known = np.bincount(cell, fit.products[:, [0, 3, 5]].sum(axis=1) / 3, minlength=len(system.cells))
+    dense = np.zeros((*(int(n) for n in system.grid.cells[::-1]), 2))
+    at = tuple(system.cells[:, 2:].T)
+    dense[at] = np.stack([SQUARE**3 * known, bending.mean(axis=1) * float(np.trace(system.stiffness))], axis=-1)
+    wide = ndimage.gaussian_filter(dense, (SHARED, SHARED, SHARED, 0), mode="constant", truncate=3.0)[at]
+    share = np.clip(wide[:, 0] / wide.sum(axis=1), LEAST_SHARE, 1.0)
+    return np.asarray((UNRESOLVED * h**2) ** 2 * share ** (-4 / 3) * likely)
+
+
+def cells_of_voxels(fit: Correlation) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the cell of every listed voxel (n,), and the number of voxels of every cell (m,)."""
+    system, level = fit.system, fit.level
+    where = (level.index.astype(np.int64) - level.low[::-1]).T
+    number = np.full(tuple(int(n) for n in system.grid.cells[::-1]), -1, np.int64)
+    number[tuple(system.cells[:, 2:].T)] = np.arange(len(system.cells))
+    of = number[tuple(system.cell_of[a][where[a]] for a in (2, 1, 0))]
+    return of, np.bincount(of, minlength=len(system.cells))
 
 
 def _some_voxels(fit: Correlation) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return cells and listed voxels, a few of them spread over every cell."""
-    system, level = fit.system, fit.level
-    where = (level.index.astype(np.int64) - level.low[::-1]).T
-    cell = [system.cell_of[a][where[a]] for a in range(3)]
-    number = np.full(tuple(int(n) for n in system.grid.cells[::-1]), -1, np.int64)
-    number[tuple(system.cells[:, 2:].T)] = np.arange(len(system.cells))
-    of = number[cell[2], cell[1], cell[0]]
+    of, count = cells_of_voxels(fit)
     order = np.argsort(of, kind="stable")
-    count = np.bincount(of, minlength=len(system.cells))
     first = np.cumsum(count) - count
     rank = np.arange(len(of)) - first[of[order]]
     # voxels in the middles of so many equal stretches of the cell's list

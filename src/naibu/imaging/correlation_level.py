@@ -15,7 +15,7 @@ Single = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 MARGIN = 12  # voxels about the object that are kept of the reference
 GAIN_RANGE = (0.2, 5.0)
-# prior scatter of the gain, and of the offset in units of the scatter of the grey values
+# prior scatter of the gain, of itself, and of the offset, of the scatter of the grey values
 GAIN_SCATTER = 0.1
 ENOUGH = 30000  # voxels for one gain
 
@@ -114,7 +114,7 @@ class GainMap:
         gain_normal_equations(self.level.grey, value, weight, self.level.index, self.low, self.step, self.n, left, right)
         matrix, load = left.sum(axis=0) / variance, right.sum(axis=0) / variance
         first = np.tile([gain, offset], n)
-        prior = np.tile([GAIN_SCATTER**-2, (GAIN_SCATTER * max(spread, 1e-30)) ** -2], n)
+        prior = np.tile([(GAIN_SCATTER * gain) ** -2, (GAIN_SCATTER * gain * max(spread, 1e-30)) ** -2], n)
         solution = first + linalg.solve(matrix + np.diag(prior), load - matrix @ first, assume_a="pos")
         a, b = np.empty(len(value), np.float32), np.empty(len(value), np.float32)
         gain_values(solution, self.level.index, self.low, self.step, self.n, a, b)

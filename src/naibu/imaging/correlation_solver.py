@@ -21,8 +21,8 @@ MAD = 1.4826  # standard deviation of a normal distribution, in median absolute 
 SOLVE = 3e-2  # relative accuracy of a step
 SAMPLE_SOLVE = 3e-2  # of random samples
 AT_ONCE = 16
-# share of the unknowns that a place keeps at least when its weight is chosen: no place is smoothed without limit
-LEAST_SHARE = 0.02
+# of the unknowns: fewer than the first are not determined by any data, and the second are taken to be as everywhere else
+LEAST_SHARE, COMMON = 0.02, 0.05
 LEAST_AGREEMENT = 0.01
 
 
@@ -227,8 +227,10 @@ def chosen_weights(
             wide = ndimage.gaussian_filter(full, [*(width_mm / system.grid.step_mm[::-1]), 0], mode="constant", truncate=3.0)
             return np.asarray(wide[z[m], y[m], x[m]])
 
-        floor = 1e-12 * max(float(energy[m].mean()), 1e-30)
-        out[m] = np.maximum(shared(determined), LEAST_SHARE * shared(held)) / np.maximum(shared(energy), floor)
+        # where the data say little the weight is that of all cells together
+        common = np.maximum(determined[m].sum(axis=0), LEAST_SHARE * held[m].sum(axis=0)) / np.maximum(energy[m].sum(axis=0), 1e-30)
+        believed = COMMON * shared(held)
+        out[m] = (np.maximum(shared(determined), 0.0) + believed) / (shared(energy) + believed / common)
     per_cell = system.watched
     left = system.n - volume_weight * float(per_cell @ swollen)
     return out, left / max(float(per_cell @ system.swollen), 1e-30)

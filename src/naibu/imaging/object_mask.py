@@ -15,7 +15,6 @@ DIMMEST = 0.3
 CLOSING = 2
 
 
-
 def object_mask(volume: Volume, *, margin: int = 0) -> Mask:
     """Return the largest body of a scan, holes in its slices filled.
 

@@ -44,6 +44,7 @@ LEAST_SIZE = 4
 LEAST_OVERLAP = 0.05
 # stretch of the outline from which an affine start is tried, and by how much better it must correlate
 LEAST_STRETCH, STRETCHED = 0.15, 0.05
+FIRST = 0.1
 SQUEEZED = 0.02  # such an object also changes its volume: of SWELLING
 LOOSER = (3.0, 2.0, 1.0, 1.0)
 ROUGH = 1  # levels, from the coarsest, where the scatter is that of all residuals
@@ -187,9 +188,11 @@ class _Work:
         )
 
     def weights(self, system: SplineSystem, stiffer: float) -> tuple[Array, float]:
+        # less at first: of a field that is held back too much nobody can tell how much its volume changes
+        first = FIRST if self.settings.adaptive_weight else 1.0
         h = system.grid.step_mm
         bending = np.full((len(system.cells), 3), stiffer * BENDING / float(np.prod(h) ** (1 / 3)))
-        return bending, self.swells * SWELLING / float(np.prod(h)) if self.settings.volume_term else 0.0
+        return bending, first * self.swells * SWELLING / float(np.prod(h)) if self.settings.volume_term else 0.0
 
     def start(self) -> None:
         """Find the rigid motion and put it on the coarsest grid."""
@@ -253,7 +256,7 @@ class _Work:
         if not self.settings.adaptive_weight:
             return
         kinds, width = _kinds(fit, self.bodies), WINDOW * float(self.step.mean())
-        most = self.swelling / self.swells
+        most = self.swelling / (FIRST * self.swells)
         for _ in range(ROUNDS):
             samples = fit.samples(self.c, self.bending, self.swelling * system.watched, ADAPT_SAMPLES, None, SEED)
             self.bending, swelling = chosen_weights(fit, samples, self.c, self.bending, self.swelling, width, kinds)
