@@ -42,7 +42,7 @@ _OPTIONAL = {
     "dask": "volumes larger than memory, block by block",
     "distributed": "the same on several processes or computers",
     "pyvista": "looking at .vtu and VTKHDF results from Python (ParaView reads them too)",
-    "SimpleITK": "finding markers in image volumes before naibu reads them",
+    "SimpleITK": "rigid registration by grey values",
 }
 # where the package that is imported has another name than the distribution that is installed
 _MODULES = {"pynrrd": "nrrd"}
