@@ -106,9 +106,7 @@ def main() -> None:
     arguments = parser.parse_args()
     compile_all()
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
-    print(
-        "                           mean / median / 95 %, mm   tissues, mm   gradient   covered   answered   wall (processor)   peak"
-    )
+    print("                           mean / median / 95 %, mm   tissues, mm   gradient   covered   answered   wall (processor)   peak")
     for path in arguments.cases:
         case = dict(np.load(path))
         meta = json.loads(str(case["meta"]))

@@ -25,7 +25,7 @@ VOXELS_A_CELL = 6
 SHARED = 0.7
 STILL = 0.1  # voxels
 # displacement that is missed, of the root mean square second derivative times the square of what is resolved
-UNRESOLVED = 0.065
+UNRESOLVED = 0.055
 SQUARE = 151 / 315  # sum of the squares of a spline along an axis
 LEAST_SHARE = 0.003  # the data of so little are not asked: seven cells is as far as a field is believed to be smooth
 

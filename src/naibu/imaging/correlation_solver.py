@@ -18,8 +18,8 @@ from naibu.imaging.stiff_bodies import StiffBody
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 MAD = 1.4826  # standard deviation of a normal distribution, in median absolute deviations
-SOLVE = 3e-2  # relative accuracy of a step
-SAMPLE_SOLVE = 3e-2  # of random samples
+SOLVE = 0.1  # relative accuracy of a step
+SAMPLE_SOLVE = 0.06  # of random samples
 AT_ONCE = 16
 # of the unknowns: fewer than the first are not determined by any data, and the second are taken to be as everywhere else
 LEAST_SHARE, COMMON = 0.02, 0.05
