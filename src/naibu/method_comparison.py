@@ -74,7 +74,7 @@ def compare_methods(
                 raise
     columns, rows = _table(pair, runs)
     note = " ".join(f"{name} could not be used: {why}." for name, why in failures.items())
-    caption = f"{pair.names[0]} to {pair.names[1]}; the first row moves nothing but the object as a whole where 'rigid' is among them."
+    caption = f"{pair.names[0]} to {pair.names[1]}; 'rigid' moves the object as one piece."
     table = Table("Methods", caption, columns, rows, note)
     figures = tuple(_figure(pair, name, run) for name, run in runs.items())
     section = Section("Methods side by side", _words(pair), (table,), figures)
