@@ -1,6 +1,6 @@
 """Moduli from measured displacement fields: the whole recipe, from a homogeneous start to regions with standard errors (spec I6).
 
-The estimate is that of maximum likelihood: moduli p and the displacement of the loaded nodes, where forces are unknown, minimise
+The estimate is that of maximum likelihood: moduli p and the displacement of the loaded nodes, where forces are unknown, minimise::
 
     sum_t |S_t^-1/2 (H_t u_t - d_t)|^2 / 2 + w R(p),    with u_t in equilibrium at all other nodes,
 

@@ -218,7 +218,7 @@ def shape_difference(points: ArrayLike, hull: Hull, positions: ArrayLike, *, thr
 
 
 def force_difference(measured: ArrayLike, computed: ArrayLike) -> tuple[float, Array]:
-    """Return S_force, the sum over samples (and sensors) of |F_measured - F_computed|, mN, and its derivative by the computed forces.
+    """Return S_force, the sum over samples (and sensors) of ``|F_measured - F_computed|``, mN, and its derivative by the computed forces.
 
     Parameters
     ----------

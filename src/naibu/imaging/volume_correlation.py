@@ -1,6 +1,6 @@
 """The displacement between two scans by volume correlation that mechanics hold together: the default way of sensing (spec S7, S8).
 
-The displacement is a field of cubic B-splines on a grid about the object. It minimises
+The displacement is a field of cubic B-splines on a grid about the object. It minimises::
 
     sum_voxels rho((f - a g(x + u) - b) / s) + sum_cells lambda_c |grad grad u|^2 / 2 + kappa (det(I + grad u) - 1)^2 / 2
 
