@@ -1,4 +1,4 @@
-"""Verbs that start from images: ``sense``, ``compare-methods``, ``track``."""
+"""Verbs that start from images: ``sense``, ``compare-methods``, ``track``, ``track-sequence``."""
 
 from __future__ import annotations
 
@@ -195,3 +195,48 @@ def track(
         say("Give --size-mm X Y Z, --layer and --stated-mm to make an experiment folder that 'naibu identify' takes.", "dim")
     else:
         say(f"{'Run' if layers else 'Describe layers and materials in its meta.toml, then run'}: naibu identify {out}")
+
+
+@app.command
+def track_sequence(
+    frames: Path,
+    *,
+    pixel_mm: float,
+    diameter_mm: float,
+    frame_rate_hz: float = 1.0,
+    region_mm: tuple[float, float, float, float] | None = None,
+    count: int | None = None,
+    polarity: Literal["bright", "dark"] = "bright",
+    out: Path = Path("naibu-tracks"),
+) -> None:
+    """Follow markers through a sequence of images, such as ultrasound.
+
+    Parameters
+    ----------
+    frames
+        Stack of images (TIFF, MetaImage, NRRD, ...), the times along its third axis.
+    pixel_mm
+        Size of a pixel.
+    diameter_mm
+        How large a marker looks.
+    frame_rate_hz
+        Frames a second.
+    region_mm
+        Least x, greatest x, least y, greatest y of the part of the image in which markers may lie.
+    count
+        How many markers there are, where that is known.
+    polarity
+        Whether markers are brighter or darker than what lies around.
+    out
+        Folder for tracks.csv, tracks.html and tracks.json.
+    """
+    from naibu.sequence_runs import track_sequence_file
+
+    with _stages() as tell:
+        tell("following markers")
+        run = track_sequence_file(
+            frames, out=out, pixel_mm=pixel_mm, diameter_mm=diameter_mm, frame_rate_hz=frame_rate_hz, region_mm=region_mm, count=count,
+            polarity=polarity,
+        )  # fmt: skip
+    print_table("Markers", run.columns, run.rows)
+    say(f"Table: {run.table}   page: {run.page}")
