@@ -78,5 +78,5 @@ def test_exact_twin_and_cube_sections() -> None:
     assert [list(r[:5]) for r in third.rows] == PAPER["4-III"]
     shown = fifth.rows[-2]
     classic = shown[fifth.columns.index("ours, classic, sum, m")]
-    for kind in range(3):  # octrees describe the shape about as well as the classic lattice
-        assert shown[fifth.columns.index(f"ours, type {kind}, sum, m")] == pytest.approx(classic, rel=0.1)
+    for kind in range(3):  # octrees describe the shape about as well as the classic lattice, or better
+        assert 0.5 * classic < shown[fifth.columns.index(f"ours, type {kind}, sum, m")] < 1.1 * classic
