@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import sys
@@ -11,13 +12,14 @@ import numpy as np
 import pytest
 
 from naibu.cli import main
-from naibu.core.errors import InputError
+from naibu.core.errors import InputError, NaibuError
 from naibu.core.field import Field
 from naibu.core.volume import Volume
 from naibu.imaging.methods import METHODS, rigid_start, sense
-from naibu.io.images import read_displacement, write_displacement, write_volume
+from naibu.io.images import read_displacement, read_volume, write_displacement, write_volume
 from naibu.io.meshes import read_mesh
 from naibu.io.tables import import_markers
+from naibu.method_comparison import compare_methods
 from naibu.sense_runs import read_pair, sense_pair
 from naibu.validation.squeezed_ball import squeezed_ball
 
@@ -84,7 +86,8 @@ def test_files_are_what_other_programs_read(folder: Path, tmp_path: Path) -> Non
     assert np.abs(after.points - before.points - run.sensed.displacement.vectors[at(pair.before, before.points)]).max() < 1e-6
     told = json.loads((tmp_path / "sense.json").read_text())
     assert told["figures"]["error, median, mm"] < 0.15
-    assert set(told["inputs"]) == {"before.mha", "after.nrrd", "mask.nii.gz", "truth.mha"}
+    assert set(told["inputs"]) == {"before", "after", "mask", "truth"}
+    assert told["inputs"]["after"] == f"after.nrrd, SHA-256 {hashlib.sha256((folder / 'after.nrrd').read_bytes()).hexdigest()}"
     page = (tmp_path / "report.html").read_text()
     assert "standard deviation of the displacement" in page
     assert not re.search(r"(?:src|href)=\"https?:", page)
@@ -96,6 +99,31 @@ def test_the_same_scans_give_the_same_files(folder: Path, tmp_path: Path) -> Non
         sense_pair(pair, out=tmp_path / name)
     for file in ("displacement.mha", "field.npz"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+def test_scans_of_one_name_in_two_folders_are_both_recorded(folder: Path, tmp_path: Path) -> None:
+    for part, file in (("a", "before.mha"), ("b", "mask.nii.gz")):
+        (tmp_path / part).mkdir()
+        write_volume(tmp_path / part / "scan.mha", read_volume(folder / file))
+    inputs = read_pair(tmp_path / "a" / "scan.mha", tmp_path / "b" / "scan.mha").inputs
+    assert inputs["before"] != inputs["after"]
+
+
+def test_a_single_slice_has_all_files_but_the_mesh(folder: Path, tmp_path: Path) -> None:
+    for name in ("before.mha", "after.nrrd"):
+        volume = read_volume(folder / name)
+        middle = Volume.from_array(volume.values[11:12], spacing_mm=volume.spacing_mm)
+        write_volume(tmp_path / name, middle)
+    run = sense_pair(read_pair(tmp_path / "before.mha", tmp_path / "after.nrrd"), method="horn-schunck", out=tmp_path / "out")
+    assert {p.name for p in run.files} == {p.name for p in (tmp_path / "out").iterdir()}
+    assert {"report.html", "displacement.mha", "field.npz", "sense.json"} <= {p.name for p in run.files}
+    assert not (tmp_path / "out" / "displacement.vtu").exists()
+
+
+def test_methods_that_all_fail_say_why(folder: Path, tmp_path: Path) -> None:
+    tiny = write_volume(tmp_path / "tiny.mha", Volume.from_array(np.zeros((6, 6, 6)), spacing_mm=(1, 1, 1)))
+    with pytest.raises(NaibuError):
+        compare_methods(read_pair(tiny, tiny), ["features", "features"], out=tmp_path / "out")
 
 
 def test_scans_on_different_grids_are_refused(folder: Path) -> None:

@@ -57,8 +57,7 @@ def chain(folder: Path, side: float, apart: float, made_mm: float, sought_mm: fl
         volumes, diameter_mm=STEEL_WASHER.diameter_mm, thickness_mm=STEEL_WASHER.thickness_mm, names=list(scans), polarity="bright"
     )
     described = specimen.experiment
-    # rounding to a step leaves a standard deviation of the step over sqrt(12): that of the markers found
-    step = np.sqrt(12.0) * np.nanmedian(tracked.sd_mm, axis=(0, 1))
+    xy_step, z_step = tracked.steps_mm
     write_experiment_folder(
         folder / "press",
         tracked.markers[0],
@@ -69,8 +68,8 @@ def chain(folder: Path, side: float, apart: float, made_mm: float, sought_mm: fl
         layers=described.layers,
         stated_mm=openings,
         spacing_mm=described.nominal_spacing_mm,
-        xy_step_mm=float(step[:2].mean()),
-        z_step_mm=float(step[2]),
+        xy_step_mm=xy_step,
+        z_step_mm=z_step,
     )
     settings = ModelSettings(element_size_mm=sought_mm)
     found = workflow.identify(folder / "press", known=["firm=200 kPa"], settings=settings, states={"press": ["pressed"]})

@@ -66,7 +66,7 @@ for scan, name, markers in zip(scans.values(), tracked.names, tracked.markers, s
 # %%
 # The markers go into a folder as measured ones do, and the rest is what is done with measurements. The firm gel is known.
 
-step = np.sqrt(12.0) * np.nanmedian(tracked.sd_mm, axis=(0, 1))  # rounding to such steps would be as uncertain
+xy_step, z_step = tracked.steps_mm  # rounding to such steps would leave positions as uncertain as they are
 with tempfile.TemporaryDirectory() as aside:
     folder = write_experiment_folder(
         Path(aside) / "gel",
@@ -78,8 +78,8 @@ with tempfile.TemporaryDirectory() as aside:
         layers=described.layers,
         stated_mm=HEIGHTS,
         spacing_mm=described.nominal_spacing_mm,
-        xy_step_mm=float(step[:2].mean()),
-        z_step_mm=float(step[2]),
+        xy_step_mm=xy_step,
+        z_step_mm=z_step,
     )
     settings = ModelSettings(element_size_mm=10.0)
     found = naibu.identify(folder, known=["firm=200 kPa"], settings=settings, states={"gel": ["pressed"]})

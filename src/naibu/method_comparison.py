@@ -63,14 +63,15 @@ def compare_methods(
     folder = result_folder(out)
     runs: dict[Method, SenseRun] = {}
     failures: dict[Method, str] = {}
-    for method in methods:
+    wanted = tuple(dict.fromkeys(methods))
+    for method in wanted:
         if tell is not None:
             tell(method)
         try:
             runs[method] = sense_pair(pair, method=method)
         except NaibuError as error:
             failures[method] = str(error)
-            if len(failures) == len(methods):
+            if len(failures) == len(wanted):
                 raise
     columns, rows = _table(pair, runs)
     note = " ".join(f"{name} could not be used: {why}." for name, why in failures.items())

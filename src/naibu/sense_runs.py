@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import os
@@ -26,6 +25,7 @@ from naibu.imaging.methods import Method, Sensed, sense
 from naibu.imaging.resampling import positions, warped
 from naibu.io.atomic import write_atomically
 from naibu.io.images import read_displacement, read_volume, write_displacement, write_volume
+from naibu.io.provenance import input_record
 from naibu.io.results import write_vtu
 from naibu.io.tables import import_markers, write_markers
 from naibu.meshing.generation import grid_cells
@@ -94,7 +94,6 @@ def read_pair(
     InputError
         A file that cannot be read, or a mask or truth on another grid.
     """
-    files = [Path(p) for p in (before, after, mask, truth, *(check_points or ())) if p is not None]
     a, b = (read_volume(p, spacing_mm=spacing_mm) for p in (before, after))
     inside = None
     if mask is not None:
@@ -106,7 +105,9 @@ def read_pair(
         known, grid = read_displacement(truth)
         _same(grid, a, Path(truth), Path(before))
     points = None if check_points is None else _common_points(*check_points)
-    return Pair(a, b, inside, {p.name: _hash(p) for p in files}, (Path(before).name, Path(after).name), known, points)
+    files = {"before": before, "after": after, "mask": mask, "truth": truth}
+    tables = dict(zip(("check points before", "check points after"), check_points or (), strict=False))
+    return Pair(a, b, inside, input_record(files | tables), (Path(before).name, Path(after).name), known, points)
 
 
 def _common_points(before: str | os.PathLike[str], after: str | os.PathLike[str]) -> tuple[Array, Array]:
@@ -126,14 +127,6 @@ def _same(grid: Volume, other: Volume, file: Path, reference: Path) -> None:
         )
 
 
-def _hash(path: Path) -> str:
-    """SHA-256 of a file, or of the files of a folder in order of their names."""
-    digest = hashlib.sha256()
-    for file in sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]:
-        digest.update(file.read_bytes())
-    return digest.hexdigest()
-
-
 def sense_pair(
     pair: Pair, *, method: Method = "default", out: str | os.PathLike[str] | None = None, progress: Progress | None = None
 ) -> SenseRun:
@@ -146,8 +139,8 @@ def sense_pair(
     method : str
         See `naibu.imaging.methods.sense`.
     out : path-like, optional
-        Folder for ``displacement.mha``, ``standard_deviation.mha`` (where the method states one), ``displacement.vtu``, ``field.npz``,
-        ``initial.csv`` and ``pressed.csv`` (places in the object as markers), ``sense.json`` and the page ``report.html``.
+        Folder for ``displacement.mha``, ``standard_deviation.mha`` (where the method states one), ``displacement.vtu`` (of volumes),
+        ``field.npz``, ``initial.csv`` and ``pressed.csv`` (places in the object as markers), ``sense.json`` and the page ``report.html``.
     progress : callable, optional
         Told what begins.
 
@@ -194,7 +187,9 @@ def _written(pair: Pair, run: SenseRun, folder: Path) -> list[Path]:
     sd = sensed.sd_mm
     if sd is not None:
         files.append(write_volume(folder / "standard_deviation.mha", grid.with_values(np.nan_to_num(sd).astype(np.float32))))
-    files += [_vtu(folder / "displacement.vtu", grid, sensed), _npz(folder / "field.npz", sensed, grid)]
+    if min(grid.shape) > 1:  # between the voxels of a single slice there are no cells
+        files.append(_vtu(folder / "displacement.vtu", grid, sensed))
+    files.append(_npz(folder / "field.npz", sensed, grid))
     files += [
         write_markers(folder / f"{name}.csv", markers) for name, markers in zip(MARKER_TABLES, _as_markers(sensed, grid), strict=True)
     ]
@@ -229,8 +224,6 @@ def _vtu(path: Path, grid: Volume, sensed: Sensed) -> Path:
         step += 1
     some = (slice(None, None, step),) * 3
     nz, ny, nx = known[some].shape
-    if min(nz, ny, nx) < 2:
-        raise InputError("a plane has no cells for ParaView; use volumes of at least two slices")
     cells = grid_cells(nx - 1, ny - 1, nz - 1)
     cells = cells[known[some].ravel()[cells].all(axis=1)]
     if not len(cells):

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from naibu.imaging.marker_sequence import TrackedSequence, track_sequence
 from naibu.io.atomic import write_atomically
 from naibu.io.images import read_volume
+from naibu.io.provenance import input_record
 from naibu.reproduction.chapter import Cell, Chapter, Figure, Section, Table
 from naibu.reproduction.page import write_chapter
 from naibu.result_files import result_folder
@@ -79,7 +80,8 @@ def track_sequence_file(
         (i + 1, int(tracked.seen[:, i].sum()), float(moved[i]), float(np.median(tracked.sd_mm[:, i])), float(tracked.strength[i]))
         for i in range(len(tracked))
     )
-    settings: dict[str, Cell] = {"frames": len(stack), "frame rate, Hz": frame_rate_hz, "file": Path(frames).name}
+    settings: dict[str, Cell] = {"frames": len(stack), "frame rate, Hz": frame_rate_hz, "pixel, mm": f"{dx:g}, {dy:g}", "diameter, mm": f"{diameter_mm}"}
+    settings |= input_record({"images": frames})
     rejected = "; ".join(f"{n} {why}" for why, n in Counter(r.reason for r in tracked.rejected).items()) or "none"
     section = Section(
         "Markers",

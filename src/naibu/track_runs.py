@@ -16,6 +16,7 @@ from naibu.core.experiment import Layer, Loading, Shape
 from naibu.imaging.marker_detection import Polarity
 from naibu.imaging.marker_tracking import TrackedMarkers, track_markers
 from naibu.io.images import read_volume
+from naibu.io.provenance import input_record
 from naibu.io.tables import write_experiment_folder, write_markers
 from naibu.reproduction.chapter import Cell, Chapter, Figure, Section, Table
 from naibu.reproduction.page import write_chapter
@@ -103,7 +104,7 @@ def track_files(
     files = _written(target, tracked, description)
     columns, rows = _table(tracked)
     settings: dict[str, Cell] = {"diameter, mm": diameter_mm, "thickness, mm": thickness_mm, "polarity": tracked.found[0].polarity}
-    settings |= {"scans": ", ".join(Path(p).name for p in scans)}
+    settings |= input_record({**{f"scan of {name}": scan for name, scan in zip(names, scans, strict=True)}, "mask": mask})
     page, numbers = write_chapter(Chapter("tracking", "Markers followed", (_section(tracked, columns, rows),), settings), target)
     return TrackRun(tracked, columns, rows, page, (*files, numbers))
 
@@ -124,10 +125,11 @@ def _written(target: Path, tracked: TrackedMarkers, description: ObjectDescripti
     if description is None:
         result_folder(target)
         return [write_markers(target / f"{n}.csv", m) for n, m in zip(tracked.names, tracked.markers, strict=True)]
-    d = description
+    d, (xy_step, z_step) = description, tracked.steps_mm
     write_experiment_folder(
-        target, tracked.markers[0], tracked.states, title=d.title, shape=d.shape, loading=d.loading, layers=d.layers, stated_mm=d.stated_mm
-    )
+        target, tracked.markers[0], tracked.states, title=d.title, shape=d.shape, loading=d.loading, layers=d.layers, stated_mm=d.stated_mm,
+        xy_step_mm=xy_step, z_step_mm=z_step,
+    )  # fmt: skip
     return [target / "meta.toml", *(target / f"{n}.csv" for n in tracked.names)]
 
 

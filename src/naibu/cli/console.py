@@ -45,6 +45,15 @@ def progress_lines() -> Iterator[Callable[[str, int, float], None]]:
         yield tell
 
 
+@contextmanager
+def stages() -> Iterator[Callable[[str], None]]:
+    """One line that tells the present stage."""
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
+        task = bar.add_task("reading", total=None)
+        yield lambda stage: bar.update(task, description=stage)
+
+
 def say(text: str, style: str | None = None) -> None:
     """Print a line as it is, unbroken, so that paths can be copied."""
     console.print(escape(text), style=style, soft_wrap=True, highlight=False)

@@ -1,11 +1,90 @@
-"""What several verbs take to describe an object: layers and stated heights, as texts."""
+"""What several verbs take: a pair of scans with what goes with them, and the description of an object."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from cyclopts import Parameter
 
 from naibu.core.errors import InputError
-from naibu.core.experiment import Layer
+
+# what needs numpy is imported where it is used: --help answers at once, and doctor also runs where numpy itself is broken
+if TYPE_CHECKING:
+    from naibu.core.experiment import Layer
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class PairOptions:
+    """What goes with two scans.
+
+    Parameters
+    ----------
+    mask
+        Volume on the grid of the first scan, not zero where the object is; by default it is found.
+    spacing
+        Distance of voxels along x, y, z, mm, for files that do not say.
+    truth
+        Known displacement (.mha, .nrrd), to be compared with.
+    check_points
+        Two tables of points, before and after, to be compared with.
+    """
+
+    mask: Path | None = None
+    spacing: tuple[float, float, float] | None = None
+    truth: Path | None = None
+    check_points: tuple[Path, Path] | None = None
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """As `naibu.sense_runs.read_pair` takes them."""
+        return {"mask": self.mask, "spacing_mm": self.spacing, "truth": self.truth, "check_points": self.check_points}
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ObjectOptions:
+    """What an object is made of and what presses it.
+
+    Parameters
+    ----------
+    shape
+        Outer shape of the object.
+    loading
+        What presses it.
+    bar_width_mm
+        How wide a bar is.
+    layer
+        A layer of one material, 'NAME=FROM..TO' with heights from the base in mm. May be repeated.
+    stated_mm
+        Height of the plate or bar in a state, or distance of the side plates, 'STATE=HEIGHT' in mm. May be repeated.
+    """
+
+    shape: Literal["box", "half_ellipsoid", "cylinder", "hemisphere"] = "box"
+    loading: Literal["plate", "bar", "side_plates"] = "plate"
+    bar_width_mm: float | None = None
+    layer: list[str] | None = None
+    stated_mm: list[str] | None = None
+
+    def described(self, size_mm: tuple[float, float, float]) -> dict[str, Any]:
+        """Return shape, loading, layers and stated_mm, as `naibu.io.tables.write_experiment_folder` takes them.
+
+        Raises
+        ------
+        InputError
+            A layer or a height of another form.
+        """
+        from naibu.core.experiment import Loading, Shape
+
+        return {
+            "shape": Shape(self.shape, size_mm),
+            "loading": Loading(self.loading, self.bar_width_mm),
+            "layers": layers_of(self.layer or ()),
+            "stated_mm": heights_of(self.stated_mm or ()),
+        }
 
 
 def layers_of(texts: Sequence[str]) -> tuple[Layer, ...]:
@@ -16,6 +95,8 @@ def layers_of(texts: Sequence[str]) -> tuple[Layer, ...]:
     InputError
         A text of another form.
     """
+    from naibu.core.experiment import Layer
+
     layers = []
     for text in texts:
         material, _, span = text.rpartition("=")

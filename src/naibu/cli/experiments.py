@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from naibu.cli.console import INTERRUPTED, app, print_table, progress_lines, say
+from naibu.cli.described import ObjectOptions
 from naibu.core.errors import InputError
 
 # other parts are imported where they are used: --help answers at once, and doctor also runs where numpy itself is broken
@@ -256,14 +257,12 @@ def import_tables(
     *,
     out: Path,
     size_mm: tuple[float, float, float],
-    shape: Literal["box", "half_ellipsoid", "cylinder", "hemisphere"] = "box",
-    loading: Literal["plate", "bar", "side_plates"] = "plate",
-    bar_width_mm: float | None = None,
-    layer: list[str] | None = None,
-    stated_mm: list[str] | None = None,
+    described: ObjectOptions | None = None,
     title: str = "Imported experiment",
     unit: str | None = None,
     spacing_mm: float | None = None,
+    xy_step_mm: float | None = None,
+    z_step_mm: float | None = None,
 ) -> None:
     """Make an experiment folder from tables of marker positions (CSV, TSV or Excel).
 
@@ -277,34 +276,26 @@ def import_tables(
         Folder to make.
     size_mm
         Extents of the object along x, y, z.
-    shape
-        Outer shape of the object.
-    loading
-        What presses it.
-    bar_width_mm
-        How wide a bar is.
-    layer
-        A layer of one material, 'NAME=FROM..TO' with heights from the base in mm. May be repeated.
-    stated_mm
-        Height of the plate or bar in a state, or distance of the side plates, 'STATE=HEIGHT' in mm. May be repeated.
     title
         What the experiment is.
     unit
         Unit of the coordinates where the column names do not tell it.
     spacing_mm
         Spacing of a regular marker lattice.
+    xy_step_mm
+        Step of the coordinates across the slices, such as the pixel; the identification takes from it how certain they are.
+    z_step_mm
+        Step of the heights, such as the distance of slices.
     """
-    from naibu.cli.described import heights_of, layers_of
-    from naibu.core.experiment import Loading, Shape
     from naibu.io.tables import import_markers, write_experiment_folder
 
-    layers, heights = layers_of(layer or ()), heights_of(stated_mm or ())
+    about = (described or ObjectOptions()).described(size_mm)
     names = [path.stem for path in loaded]
     if len(set(names)) < len(names):
         raise InputError(f"two tables would both be the state {max(names, key=names.count)!r}; rename one file")
     write_experiment_folder(
         out, import_markers(initial, unit=unit), {path.stem: import_markers(path, unit=unit) for path in loaded}, title=title,
-        shape=Shape(shape, size_mm), loading=Loading(loading, bar_width_mm), layers=layers, stated_mm=heights, spacing_mm=spacing_mm,
+        spacing_mm=spacing_mm, xy_step_mm=xy_step_mm, z_step_mm=z_step_mm, **about,
     )  # fmt: skip
-    before = "" if layers else "Describe layers and materials in its meta.toml, then run"
+    before = "" if about["layers"] else "Describe layers and materials in its meta.toml, then run"
     say(f"Wrote {out}. {before or 'Run'}: naibu identify {out}")

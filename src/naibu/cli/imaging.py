@@ -2,35 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-from naibu.cli.console import app, errors, print_table, say
+from naibu.cli.console import app, print_table, say, stages
+from naibu.cli.described import ObjectOptions, PairOptions
 from naibu.core.errors import InputError
 
 # other parts are imported where they are used: --help answers at once
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
 Method = Literal["default", "features", "sad-blocks", "ssd-blocks", "ncc-blocks", "horn-schunck", "lucas-kanade", "hybrid", "rigid"]
 Polarity = Literal["auto", "bright", "dark"]
-ShapeName = Literal["box", "half_ellipsoid", "cylinder", "hemisphere"]
-LoadingName = Literal["plate", "bar", "side_plates"]
 Spacing = tuple[float, float, float]
-
-
-@contextmanager
-def _stages() -> Iterator[Callable[[str], None]]:
-    """One line that tells the present stage."""
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
-        task = bar.add_task("reading", total=None)
-
-        yield lambda stage: bar.update(task, description=stage)
 
 
 @app.command
@@ -38,12 +20,9 @@ def sense(
     before: Path,
     after: Path,
     *,
-    mask: Path | None = None,
     method: Method = "default",
+    pair: PairOptions | None = None,
     out: Path = Path("naibu-sense"),
-    spacing: Spacing | None = None,
-    truth: Path | None = None,
-    check_points: tuple[Path, Path] | None = None,
 ) -> None:
     """Find how the inside of an object moved between two scans, with standard deviations, strains and a page of slices.
 
@@ -53,24 +32,16 @@ def sense(
         Scan before: MetaImage, NIfTI, NRRD, TIFF stack, HDF5, Zarr, or a folder with a DICOM series.
     after
         Scan after, on the same grid.
-    mask
-        Volume on the grid of the first scan, not zero where the object is; by default it is found.
     method
         How: volume correlation regularised by mechanics (default), or one of the classic ways.
     out
         Folder for displacement.mha, standard_deviation.mha, displacement.vtu, field.npz, sense.json and report.html.
-    spacing
-        Distance of voxels along x, y, z, mm, for files that do not say.
-    truth
-        Known displacement (.mha, .nrrd), to be compared with.
-    check_points
-        Two tables of points, before and after, to be compared with.
     """
     from naibu.sense_runs import read_pair, sense_pair
 
-    with _stages() as tell:
-        pair = read_pair(before, after, mask=mask, truth=truth, check_points=check_points, spacing_mm=spacing)
-        run = sense_pair(pair, method=method, out=out, progress=tell)
+    with stages() as tell:
+        scans = read_pair(before, after, **(pair or PairOptions()).arguments)
+        run = sense_pair(scans, method=method, out=out, progress=tell)
     print_table(f"{before.name} -> {after.name}, {run.sensed.method}", ("what", "value"), list(run.figures.items()))
     say(f"{run.seconds:.1f} s. Page: {run.files[0]}   fields: {', '.join(str(p.name) for p in run.files[1:])}")
 
@@ -80,12 +51,9 @@ def compare_methods(
     before: Path,
     after: Path,
     *,
-    mask: Path | None = None,
     method: list[Method] | None = None,
+    pair: PairOptions | None = None,
     out: Path = Path("naibu-methods"),
-    spacing: Spacing | None = None,
-    truth: Path | None = None,
-    check_points: tuple[Path, Path] | None = None,
 ) -> None:
     """Sense one pair of scans by every method, and set errors, times and pictures side by side.
 
@@ -95,26 +63,18 @@ def compare_methods(
         Scan before.
     after
         Scan after, on the same grid.
-    mask
-        Volume on the grid of the first scan, not zero where the object is; by default it is found.
     method
         Only this one; may be repeated.
     out
         Folder for methods.html and methods.json.
-    spacing
-        Distance of voxels along x, y, z, mm, for files that do not say.
-    truth
-        Known displacement (.mha, .nrrd), to be compared with.
-    check_points
-        Two tables of points, before and after, to be compared with.
     """
     from naibu.imaging.methods import METHODS
     from naibu.method_comparison import compare_methods as compared
     from naibu.sense_runs import read_pair
 
-    with _stages() as tell:
-        pair = read_pair(before, after, mask=mask, truth=truth, check_points=check_points, spacing_mm=spacing)
-        result = compared(pair, method or METHODS, out=out, tell=tell)
+    with stages() as tell:
+        scans = read_pair(before, after, **(pair or PairOptions()).arguments)
+        result = compared(scans, method or METHODS, out=out, tell=tell)
     print_table(f"{before.name} -> {after.name}", result.columns, result.rows)
     say(f"Page: {result.page}   numbers: {result.numbers}")
 
@@ -130,11 +90,7 @@ def track(
     mask: Path | None = None,
     spacing: Spacing | None = None,
     size_mm: tuple[float, float, float] | None = None,
-    shape: ShapeName = "box",
-    loading: LoadingName = "plate",
-    bar_width_mm: float | None = None,
-    layer: list[str] | None = None,
-    stated_mm: list[str] | None = None,
+    described: ObjectOptions | None = None,
     title: str = "Markers followed through scans",
     out: Path = Path("naibu-markers"),
 ) -> None:
@@ -158,43 +114,31 @@ def track(
         Distance of voxels along x, y, z, mm, for files that do not say.
     size_mm
         Extents of the object along x, y, z; without them only the tables of markers are written.
-    shape
-        Outer shape of the object.
-    loading
-        What presses it.
-    bar_width_mm
-        How wide a bar is.
-    layer
-        A layer of one material, 'NAME=FROM..TO' with heights from the base in mm. May be repeated.
-    stated_mm
-        Height of the plate or bar in a state, or distance of the side plates, 'STATE=HEIGHT' in mm. May be repeated.
     title
         What the experiment is.
     out
         Folder to make: the experiment, with tracking.html and tracking.json beside its tables.
     """
-    from naibu.cli.described import heights_of, layers_of
-    from naibu.core.experiment import Loading, Shape
     from naibu.track_runs import ObjectDescription, track_files
 
-    layers, heights = layers_of(layer or ()), heights_of(stated_mm or ())
-    described = None
+    options = described or ObjectOptions()
+    description = None
     if size_mm is not None:
-        described = ObjectDescription(Shape(shape, size_mm), Loading(loading, bar_width_mm), layers, heights, title)
-    elif layers or heights:
+        description = ObjectDescription(**options.described(size_mm), title=title)
+    elif options.layer or options.stated_mm:
         raise InputError("--layer and --stated-mm describe an object: give its extents too, --size-mm X Y Z")
-    with _stages() as tell:
+    with stages() as tell:
         tell("finding markers and linking them")
         run = track_files(
             scans, out=out, diameter_mm=diameter_mm, thickness_mm=thickness_mm, polarity=polarity, count=count, mask=mask,
-            spacing_mm=spacing, description=described,
+            spacing_mm=spacing, description=description,
         )  # fmt: skip
     print_table("Markers", run.columns, run.rows)
     say(f"Wrote {out}. Page: {run.page}")
-    if described is None:
+    if description is None:
         say("Give --size-mm X Y Z, --layer and --stated-mm to make an experiment folder that 'naibu identify' takes.", "dim")
     else:
-        say(f"{'Run' if layers else 'Describe layers and materials in its meta.toml, then run'}: naibu identify {out}")
+        say(f"{'Run' if description.layers else 'Describe layers and materials in its meta.toml, then run'}: naibu identify {out}")
 
 
 @app.command
@@ -232,7 +176,7 @@ def track_sequence(
     """
     from naibu.sequence_runs import track_sequence_file
 
-    with _stages() as tell:
+    with stages() as tell:
         tell("following markers")
         run = track_sequence_file(
             frames, out=out, pixel_mm=pixel_mm, diameter_mm=diameter_mm, frame_rate_hz=frame_rate_hz, region_mm=region_mm, count=count,

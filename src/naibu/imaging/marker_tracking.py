@@ -73,6 +73,12 @@ class TrackedMarkers:
         return np.asarray(np.sqrt(np.einsum("snii->sni", self.covariance)))
 
     @property
+    def steps_mm(self) -> tuple[float, float]:
+        """Steps across and along z, mm, that leave coordinates rounded to them as uncertain as these are (median): root 12 of the sd."""
+        x, y, z = np.sqrt(12.0) * np.nanmedian(self.sd_mm, axis=(0, 1))
+        return 0.5 * float(x + y), float(z)
+
+    @property
     def states(self) -> dict[str, Markers]:
         """Markers of the other states than the free one by name, in order: what `naibu.io.tables.write_experiment_folder` takes."""
         return dict(zip(self.names[1:], self.markers[1:], strict=True))

@@ -1,0 +1,32 @@
+"""Which files a result was made from."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from naibu.core.errors import InputError
+
+
+def sha256(path: str | os.PathLike[str]) -> str:
+    """Return the SHA-256 of a file, or of the files of a folder in order of their names, in hexadecimal digits.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read.
+    """
+    place, digest = Path(path), hashlib.sha256()
+    try:
+        for file in sorted(p for p in place.rglob("*") if p.is_file()) if place.is_dir() else [place]:
+            digest.update(file.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    return digest.hexdigest()
+
+
+def input_record(files: Mapping[str, str | os.PathLike[str] | None]) -> dict[str, str]:
+    """Return names and hashes of files by the part they play, those that are None left out: ``before: scan.mha, SHA-256 ...``."""
+    return {role: f"{Path(path).name}, SHA-256 {sha256(path)}" for role, path in files.items() if path is not None}
