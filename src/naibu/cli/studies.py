@@ -8,7 +8,7 @@ from typing import Literal
 
 from naibu.cli.console import app, errors, print_table, say
 
-ChapterName = Literal["ch1", "ch2", "ch3", "ch4-lattice", "ch4-octree"]
+ChapterName = Literal["ch1", "ch2", "ch3", "ch4-lattice", "ch4-cube", "ch4-octree"]
 
 
 @app.command

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from naibu.identification.lattice_calibration import (
     CalibrationProblem,
     Index,
@@ -108,3 +110,8 @@ def calibrated(lattice: Lattice, captures: tuple[Capture, ...], key: Key) -> Lat
     problem = CalibrationProblem.of(lattice, [captures[number]], index=index, mode=mode, window="keep")
     scale = lattice.spacing_mm / 10.0
     return calibrate_lattice(problem, {name: value * scale for name, value in START.items()}, max_iterations=80)
+
+
+def with_spread(estimate: LatticeEstimate, k: int) -> str:
+    """Return a parameter's value, and the factor by which its 95 % interval reaches up and down."""
+    return f"{estimate.values[k]:.3g} (x/÷ {np.exp(1.96 * np.sqrt(estimate.covariance[k, k])):.2g})"
