@@ -80,8 +80,8 @@ def track_sequence_file(
         (i + 1, int(tracked.seen[:, i].sum()), float(moved[i]), float(np.median(tracked.sd_mm[:, i])), float(tracked.strength[i]))
         for i in range(len(tracked))
     )
-    settings: dict[str, Cell] = {"frames": len(stack), "frame rate, Hz": frame_rate_hz, "pixel, mm": f"{dx:g}, {dy:g}", "diameter, mm": f"{diameter_mm}"}
-    settings |= input_record({"images": frames})
+    settings: dict[str, Cell] = {"frames": len(stack), "frame rate, Hz": frame_rate_hz, "pixel, mm": f"{dx:g}, {dy:g}"}
+    settings |= {"diameter, mm": f"{diameter_mm}", **input_record({"images": frames})}
     rejected = "; ".join(f"{n} {why}" for why, n in Counter(r.reason for r in tracked.rejected).items()) or "none"
     section = Section(
         "Markers",
