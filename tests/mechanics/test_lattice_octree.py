@@ -20,7 +20,7 @@ def test_the_counts_of_the_report(edge):
     masses, elements = (next(row for row in TABLES[name] if row[0] == edge) for name in ("4-I", "4-II"))
     mask = box_mask((edge - 1,) * 3)
     lattices = {"classic": classic_lattice(mask, 80.0 / (edge - 1), total_mass_kg=0.63)}
-    lattices |= {kind: octree_lattice(mask, 80.0 / (edge - 1), kind, total_mass_kg=0.63) for kind in (0, 1, 2)}
+    lattices |= {kind: octree_lattice(mask, 80.0 / (edge - 1), kind, total_mass_kg=0.63, scaling="edge") for kind in (0, 1, 2)}
     for column, (kind, lattice) in enumerate(lattices.items(), start=1):
         printed, right = MISPRINTS.get((edge, kind), (elements[column], elements[column]))
         assert elements[column] == printed
@@ -55,7 +55,7 @@ def test_any_mask_is_filled_once_and_connected_without_overlap(kind, mask):
     for at, size in zip(cubes, sizes, strict=True):
         count[tuple(slice(a, a + size) for a in at)] += 1
     np.testing.assert_array_equal(count, mask)
-    lattice = octree_lattice(mask, 1.0, kind, density=1e-6)
+    lattice = octree_lattice(mask, 1.0, kind, density=1e-6, scaling="energy")
     assert lattice.total_mass == pytest.approx(1e-6 * mask.sum())
     grid = {tuple(p): k for k, p in enumerate(np.rint(lattice.points * 2).astype(int))}
     for i, j in lattice.elements[:: max(1, lattice.n_elements // 400)]:
@@ -78,7 +78,7 @@ def test_an_octree_of_the_finest_cubes_is_the_classic_lattice():
 def test_cubes_of_one_size_scale_with_their_edge():
     """Springs K between masses l apart make a solid of stiffness K / l: a lattice twice as coarse needs twice the K."""
     mask = box_mask((8, 8, 8))
-    lattice = octree_lattice(mask, 1.0, 0, density=1e-6)
+    lattice = octree_lattice(mask, 1.0, 0, density=1e-6, scaling="edge")
     inner = (
         (lattice.element_level == 1)
         & (lattice.points[lattice.elements] > 2.5).all(axis=(1, 2))

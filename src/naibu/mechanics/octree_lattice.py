@@ -18,6 +18,10 @@ from naibu.mechanics.lattice import (
     lumped_masses,
     require_positive,
 )
+from naibu.mechanics.octree_response import response_factors
+from naibu.mechanics.octree_scaling import OctreeGrid, edge_factors, energy_factors
+
+SCALINGS = ("response", "energy", "edge")
 
 _FACES = np.array([(-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1)])
 
@@ -31,6 +35,8 @@ def octree_lattice(
     density: float | None = None,
     lumping: str = "volume",
     origin: ArrayLike = (0.0, 0.0, 0.0),
+    scaling: str = "response",
+    class_stiffness: ArrayLike = (1.0, 1.0, 1.0),
 ) -> Lattice:
     """Return the octree lattice of a mask (spec L3).
 
@@ -53,11 +59,17 @@ def octree_lattice(
         smallest; it loses mass (up to a quarter of it).
     origin : array_like, shape (3,)
         Position of the corner (0, 0, 0) of the grid, mm.
+    scaling : str
+        Rule for `Lattice.scale`: ``"response"``, such that forces and the shape of the surface are those of the classic lattice;
+        ``"energy"``, quicker, with the same energy in uniform strain, but softer as masses on faces of coarser cubes yield; ``"edge"``, the
+        mean edge of the cubes around an element. See `naibu.mechanics.octree_response`.
+    class_stiffness : array_like, shape (3,)
+        K of short, normal and long elements, in any unit, if they are known to differ much; for ``"response"`` only.
 
     Raises
     ------
     InputError
-        An unknown type or lumping, or what `classic_lattice` refuses.
+        An unknown type, lumping or scaling, or what `classic_lattice` refuses.
     """
     if kind not in (0, 1, 2):
         raise InputError(f"octree lattices are of type 0, 1 or 2, not {kind!r}")
@@ -73,8 +85,36 @@ def octree_lattice(
     masses = lumped_masses(corners, volumes, len(nodes), total_mass_kg=total_mass_kg, density=density, lumping=rule)
     if lumping == "smallest":
         masses = _masses_of_smallest(corners, sizes, len(nodes), filled, float(masses.sum()))
-    scale = _mean_sizes(nodes, pairs, cubes, sizes)
+    scale = octree_factors(OctreeGrid(filled, cubes, sizes, nodes, pairs), scaling, class_stiffness)
     return assembled(nodes, pairs, level, masses, _on_surface(nodes, filled), spacing_mm, origin, scale)
+
+
+def octree_factors(grid: OctreeGrid, scaling: str = "response", class_stiffness: ArrayLike = (1.0, 1.0, 1.0)) -> Array:
+    """Return the factors (m,) by which K, C1 and C2 of the elements of an octree are to be multiplied (spec L3).
+
+    Parameters
+    ----------
+    grid : OctreeGrid
+        The octree.
+    scaling : str
+        ``"response"``, ``"energy"`` or ``"edge"``.
+    class_stiffness : array_like, shape (3,)
+        K of short, normal and long elements of the classic lattice, in any unit; for ``"response"`` only.
+
+    Raises
+    ------
+    InputError
+        An unknown rule, or a K that is not positive.
+    """
+    stiffness = np.asarray(class_stiffness, dtype=float)
+    if scaling not in SCALINGS:
+        raise InputError(f"octree lattices are scaled by 'response', 'energy' or 'edge', not by {scaling!r}")
+    if stiffness.shape != (3,) or not (np.isfinite(stiffness) & (stiffness > 0.0)).all():
+        raise InputError(f"class_stiffness must be three positive numbers (short, normal, long), not {class_stiffness!r}")
+    if scaling == "edge":
+        return edge_factors(grid)
+    factors = energy_factors(grid)
+    return response_factors(grid, factors, stiffness) if scaling == "response" else factors
 
 
 def _finest_first(corners: Integers, nodes: Integers, sizes: Integers) -> tuple[Integers, Integers]:
@@ -85,19 +125,6 @@ def _finest_first(corners: Integers, nodes: Integers, sizes: Integers) -> tuple[
     number = np.empty(len(nodes), dtype=np.int64)
     number[order] = np.arange(len(nodes))
     return number[corners], nodes[order]
-
-
-def _mean_sizes(nodes: Integers, pairs: Integers, cubes: Integers, sizes: Integers) -> Array:
-    """Return the mean edge, in voxels, of the cubes around the middle of every element (m,)."""
-    edge = int((cubes + sizes[:, None]).max())
-    size_at = np.zeros((edge + 2,) * 3)
-    for size in np.unique(sizes):
-        steps = np.array(list(np.ndindex(size, size, size))) + 1
-        size_at[tuple((cubes[sizes == size][:, None, :] + steps).reshape(-1, 3).T)] = size
-    middle = nodes[pairs].sum(axis=1)  # in half voxels
-    around = np.stack([size_at[tuple(((middle - np.array(step)) // 2 + 1).T)] for step in np.ndindex(2, 2, 2)])
-    count = (around > 0.0).sum(axis=0)
-    return np.asarray(around.sum(axis=0) / count)
 
 
 def _masses_of_smallest(corners: Integers, sizes: Integers, n_nodes: int, filled: NDArray[np.bool_], total: float) -> Array:
