@@ -22,6 +22,7 @@ exclude_patterns = ["_build", "_templates", "gallery_src", "sg_execution_times.r
 templates_path = ["_templates"]
 
 autosummary_generate = True
+autodoc_mock_imports = ["warp"]  # an extra
 autodoc_typehints = "none"  # types stand in the numpydoc sections
 autodoc_member_order = "bysource"
 numpydoc_show_class_members = False

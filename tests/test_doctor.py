@@ -78,6 +78,30 @@ def test_an_optional_package_that_ends_the_process_is_broken(monkeypatch: pytest
     assert not doctor.healthy([found])
 
 
+def test_without_warp_the_gpu_is_missing_and_its_extra_named(uninstalled) -> None:
+    uninstalled("warp-lang")
+    found = row("GPU")
+    assert (found.status, found.remedy) == ("missing", 'pip install "naibu[gpu]"') and doctor.healthy([found])
+
+
+@pytest.mark.parametrize(
+    ("body", "status", "said"),
+    [
+        ("def get_cuda_devices(): return []", "missing", "no CUDA device"),
+        ("def get_cuda_devices(): return [types.SimpleNamespace(name='Card', alias='cuda:0')]", "ok", "Card (cuda:0)"),
+        ("raise OSError('libcuda is damaged')", "broken", "libcuda is damaged"),
+    ],
+)
+def test_the_gpu_is_what_warp_finds(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, body: str, status: str, said: str) -> None:
+    (tmp_path / "warp.py").write_text(f"import types\ndef init(): print('Warp greets')\n{body}\n", encoding="utf-8")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    version = importlib.metadata.version
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: "1.12" if name == "warp-lang" else version(name))
+    found = row("GPU")
+    assert found.status == status and said in found.found and "1.12" in found.found
+    assert doctor.healthy([found]) == (status != "broken")
+
+
 @pytest.mark.parametrize("installed", [False, True])
 def test_without_pardiso_superlu_is_named(monkeypatch: pytest.MonkeyPatch, uninstalled, installed: bool) -> None:
     monkeypatch.setattr(linear_solvers, "pardiso_library", lambda: None)

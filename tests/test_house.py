@@ -34,6 +34,7 @@ ON_DEMAND = (
     "SimpleITK",
     "starlette",
     "vtk",
+    "warp",
     "zarr",
 )
 

@@ -47,6 +47,8 @@ _OPTIONAL = {
 # where the package that is imported has another name than the distribution that is installed
 _MODULES = {"pynrrd": "nrrd"}
 _PROBE_TIMEOUT_S = 60.0
+# the last line is the answer: Warp greets on the standard output
+_CUDA_DEVICES = "import warp; warp.init(); print('CUDA:', *(f'{d.name} ({d.alias}),' for d in warp.get_cuda_devices()))"
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +90,7 @@ def doctor_rows() -> list[DoctorRow]:
     rows = [_python_row(), DoctorRow("naibu", "ok", naibu.__version__, "this package")]
     rows += [_required_row(name, purpose) for name, purpose in _REQUIRED.items()]
     rows += [_threading_row(), _cache_row(), _data_row(), _solver_row()]
-    return rows + [_optional_row(name, purpose) for name, purpose in _OPTIONAL.items()]
+    return [*rows, *(_optional_row(name, purpose) for name, purpose in _OPTIONAL.items()), _gpu_row()]
 
 
 def healthy(rows: Iterable[DoctorRow]) -> bool:
@@ -133,15 +135,34 @@ def _optional_row(name: str, purpose: str) -> DoctorRow:
 
 def _trouble_in_a_process_of_its_own(module: str) -> str:
     """Import a package whose libraries may end the process, and return what went wrong; empty where nothing did."""
-    command = [sys.executable, "-c", f"import {module}"]
+    return _said_in_a_process_of_its_own(f"import {module}")[0]
+
+
+def _said_in_a_process_of_its_own(code: str) -> tuple[str, str]:
+    """Run code that begins with an import; return what went wrong, empty where nothing did, and the last line that it printed."""
     try:
-        probe = subprocess.run(command, capture_output=True, text=True, timeout=_PROBE_TIMEOUT_S, check=False)
+        probe = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=_PROBE_TIMEOUT_S, check=False)
     except subprocess.TimeoutExpired:
-        return f"the import took more than {_PROBE_TIMEOUT_S:g} s"
+        return f"the import took more than {_PROBE_TIMEOUT_S:g} s", ""
+    said, printed = probe.stderr.strip().splitlines(), probe.stdout.strip().splitlines()
     if probe.returncode == 0:
-        return ""
-    said = probe.stderr.strip().splitlines()
-    return said[-1] if said else f"the import ended with code {probe.returncode}"
+        return "", printed[-1] if printed else ""
+    return said[-1] if said else f"the import ended with code {probe.returncode}", ""
+
+
+def _gpu_row() -> DoctorRow:
+    name, purpose, install = "GPU", "lattices on an NVIDIA GPU, with Warp", 'pip install "naibu[gpu]"'
+    version = _version("warp-lang")
+    if version is None:
+        return DoctorRow(name, "missing", "Warp is not installed", purpose, install, optional=True)
+    trouble, said = _said_in_a_process_of_its_own(_CUDA_DEVICES)
+    devices = said.removeprefix("CUDA:").strip(" ,")
+    if trouble:
+        return DoctorRow(name, "broken", f"Warp {version}: {trouble}", purpose, "pip install --force-reinstall warp-lang", optional=True)
+    if not devices:
+        found, remedy = f"Warp {version}, no CUDA device", "needs an NVIDIA GPU and its driver; without, lattices move on the processor"
+        return DoctorRow(name, "missing", found, purpose, remedy, optional=True)
+    return DoctorRow(name, "ok", f"Warp {version}: {devices}", purpose, optional=True)
 
 
 def _threading_row() -> DoctorRow:

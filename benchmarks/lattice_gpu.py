@@ -1,0 +1,140 @@
+"""How long a step of a lattice takes on a device of Warp, beside the engine of the processor, and how far their results differ.
+
+A cube of 80 mm and 630 g, its floor held, a stamp pressing on its top. Steps are those of one call on a state that stays on the device;
+compilation, and the way of the state to the device and back, are not counted. Explicit steps are half as long as
+`explicit_step_limit` allows. Bytes are those that an explicit step cannot avoid to move: the lists of neighbours with their rows of
+coefficients and extensions, and the masses once each.
+
+Run: ``python benchmarks/lattice_gpu.py [--device cuda:0] [--sizes 8,16,32,64,128] [--steps 100] [--no-cpu] [--no-implicit]``;
+128 is the lattice of 129^3 masses and 27 million elements, which takes minutes to build.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+import warp
+
+from naibu.mechanics.lattice import Lattice, box_mask, classic_lattice, lattice_parameters
+from naibu.mechanics.lattice_gpu import WarpLatticeEngine
+from naibu.mechanics.lattice_stepping import HeldNodes, LatticeEngine, Motion, explicit_step_limit
+
+SIDE_MM, MASS_KG = 80.0, 0.63
+GENTLE = (0.03, 0.002, 0.003)  # K, C1, C2 at 9^3 masses
+STIFF = (10.0, 5.0, 10.0)
+
+
+def clocked(action: Callable[[], Any]) -> tuple[float, Any]:
+    """Return the seconds that an action takes, and its result."""
+    start = time.perf_counter()
+    result = action()
+    warp.synchronize()
+    return time.perf_counter() - start, result
+
+
+def least(action: Callable[[], Any], repeats: int) -> float:
+    return min(clocked(action)[0] for _ in range(repeats))
+
+
+def peak_gb() -> float:
+    return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) / 2**20
+
+
+def pushed(lattice: Lattice) -> tuple[HeldNodes, np.ndarray]:
+    """Return a floor and a stamp of 20 mm on the top, and their velocities."""
+    x, y, z = lattice.points.T
+    stamp = (z > SIDE_MM - 0.1) & (np.abs(x - 40.0) < 10.1) & (np.abs(y - 40.0) < 10.1)
+    return HeldNodes.of(np.flatnonzero(z < 0.1), 0) + HeldNodes.of(np.flatnonzero(stamp), 1), np.array([[0, 0, 0], [0, 0, -20.0]])
+
+
+def differences(one: Motion, other: Motion) -> str:
+    moved = np.abs(other.state.position - other.state.position[0]).max()
+    position = np.abs(one.state.position - other.state.position).max() / moved
+    reaction = np.abs(one.reaction - other.reaction).max() / np.abs(other.reaction).max()
+    return f"position {position:.1e}, reaction {reaction:.1e}"
+
+
+def row(name: str, seconds: float, told: str = "") -> None:
+    print(f"  {name:44s} {1e3 * seconds:10.4f} ms a step   {told}", flush=True)
+
+
+def explicit(lattice: Lattice, n: int, device: str, steps: int, repeats: int, cpu: bool) -> None:
+    parameters = lattice_parameters(lattice, *(p * 8.0 / n for p in GENTLE))
+    step = 0.5 * explicit_step_limit(lattice, parameters)
+    held, velocity = pushed(lattice)
+    for precision in ("double", "single"):
+        options: dict[str, Any] = {"step": step, "method": "euler", "precision": precision}
+        built, engine = clocked(lambda options=options: WarpLatticeEngine.of(lattice, parameters, device=device, **options))
+        session = engine.session(None, held)
+        session.advance(32, velocity)
+        taken = least(lambda session=session: session.advance(steps, velocity), repeats) / steps
+        entries, size = 2 * lattice.n_elements, 8 if precision == "double" else 4
+        moved = entries * (4 + warp.types.type_size_in_bytes(engine.row.dtype) + 2 * size)
+        moved += lattice.n_nodes * size * (6 + 3 + 3 + 1 + 12)
+        row(f"{device}, explicit, {precision}", taken, f"{moved / 1e9:.3f} GB, {moved / taken / 1e9:.1f} GB/s; prepared in {built:.1f} s")
+        if not cpu:
+            continue
+        built, reference = clocked(lambda options=options: LatticeEngine.of(lattice, parameters, **options))
+        start = reference.rest()
+        least(lambda reference=reference, start=start: reference.run(start, 1, held, velocity), 1)
+        call = least(lambda reference=reference, start=start: reference.run(start, 0, held, velocity), repeats)
+        whole = least(lambda reference=reference, start=start: reference.run(start, steps, held, velocity), repeats)
+        expected = reference.run(start, steps, held, velocity)
+        told = f"{differences(engine.run(engine.rest(), steps, held, velocity), expected)} apart; prepared in {built:.1f} s"
+        row(f"processor, explicit, {precision}, {reference.threads} thread(s)", (whole - call) / steps, told)
+
+
+def implicit(lattice: Lattice, device: str, steps: int, repeats: int, cpu: bool) -> None:
+    parameters = lattice_parameters(lattice, *STIFF)
+    held, velocity = pushed(lattice)
+    engine = WarpLatticeEngine.of(lattice, parameters, device=device)
+    session = engine.session(None, held)
+    session.advance(2, velocity)
+    before = session.iterations
+    taken = least(lambda: session.advance(steps, velocity), repeats) / steps
+    row(f"{device}, implicit", taken, f"{(session.iterations - before) / (steps * repeats):.1f} iterations")
+    if cpu:
+        reference = LatticeEngine.of(lattice, parameters)
+        start = reference.run(reference.rest(), 2, held, velocity).state
+        call = least(lambda: reference.run(start, 0, held, velocity), repeats)
+        whole = least(lambda: reference.run(start, steps, held, velocity), repeats)
+        row(
+            "processor, implicit, 1 thread",
+            (whole - call) / steps,
+            f"{reference.run(start, steps, held, velocity).iterations:.1f} iterations",
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--device", help="by default the first CUDA device, else the processor")
+    parser.add_argument("--sizes", default="8,16,32", help="voxels an edge")
+    parser.add_argument("--steps", type=int, default=96)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--no-cpu", action="store_true", help="leave out the engine of the processor")
+    parser.add_argument("--no-implicit", action="store_true")
+    asked = parser.parse_args()
+    warp.config.log_level = warp.LOG_WARNING
+    cards = [f"{d.alias} {d.name}" for d in warp.get_cuda_devices()]
+    print("CUDA devices: " + (", ".join(cards) or "none. What follows is Warp on the processor and says nothing about a GPU."))
+    device = asked.device or ("cuda:0" if cards else "cpu")
+    cores = f"{os.cpu_count()} cores, Numba threads {numba.get_num_threads()}"
+    print(f"Warp {warp.__version__}, {cores}, load {os.getloadavg()[0]:.1f} at the start")
+    for n in (int(size) for size in asked.sizes.split(",")):
+        built, lattice = clocked(lambda n=n: classic_lattice(box_mask((n,) * 3), SIDE_MM / n, total_mass_kg=MASS_KG))
+        print(f"{n + 1}^3 masses, {lattice.n_elements} elements, built in {built:.1f} s, peak {peak_gb():.2f} GB", flush=True)
+        explicit(lattice, n, device, asked.steps, asked.repeats, not asked.no_cpu)
+        if not asked.no_implicit:
+            implicit(lattice, device, max(asked.steps // 10, 2), asked.repeats, not asked.no_cpu)
+        print(f"  peak {peak_gb():.2f} GB", flush=True)
+
+
+if __name__ == "__main__":
+    main()
