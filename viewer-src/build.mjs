@@ -10,7 +10,7 @@ const LIMIT_BYTES = 700_000;
 const licence = readFileSync(here("node_modules/three/LICENSE"), "utf8").trim();
 mkdirSync(outdir, { recursive: true });
 await build({
-  entryPoints: { report: here("src/page.js") },
+  entryPoints: { report: here("src/main.js") },
   bundle: true,
   minify: true,
   format: "iife",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
@@ -22,7 +23,7 @@ SLUGS = {name.replace(",", "").replace(" ", "-").lower(): name for name in NAMES
 SQUARES_TOGETHER = "squares"
 
 
-def simulate_study(name: str, out: str | os.PathLike[str]) -> list[Path]:
+def simulate_study(name: str, out: str | os.PathLike[str], *, tell: Callable[[int, int], None] | None = None) -> list[Path]:
     """Run a named study and write ``STUDY.vtkhdf``, ``STUDY.json`` and, for plane ones, the animation ``STUDY.html``.
 
     Parameters
@@ -31,6 +32,8 @@ def simulate_study(name: str, out: str | os.PathLike[str]) -> list[Path]:
         ``"elastic-square"``, ``"agar-block"``, ...; ``"squares"`` runs the three squares and animates them side by side.
     out : path-like
         Folder for the files.
+    tell : callable
+        Told how many studies are done, and how many there are.
 
     Returns
     -------
@@ -45,8 +48,14 @@ def simulate_study(name: str, out: str | os.PathLike[str]) -> list[Path]:
     if name != SQUARES_TOGETHER and name not in SLUGS:
         raise InputError(f"there is no study {name!r}; choose one of {', '.join([SQUARES_TOGETHER, *SLUGS])}")
     folder = Path(out)
-    studies = [run(each) for each in (SQUARES if name == SQUARES_TOGETHER else (SLUGS[name],))]
-    files = [path for study in studies for path in _written(study, folder)]
+    names = SQUARES if name == SQUARES_TOGETHER else (SLUGS[name],)
+    studies: list[Study] = []
+    files: list[Path] = []
+    for each in names:
+        if tell is not None:
+            tell(len(studies), len(names))
+        studies.append(run(each))
+        files += _written(studies[-1], folder)
     if all(study.mesh.dimension == 2 for study in studies):
         files.insert(0, write_atomically(folder / f"{name}.html", _page(studies)))
     return files

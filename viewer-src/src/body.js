@@ -44,7 +44,7 @@ export function sharpEdges(points, faces, degrees) {
   return new Uint32Array(sharp.flatMap(({ pair }) => pair));
 }
 
-function lines(points, index, material) {
+export function lines(points, index, material) {
   const geometry = new BufferGeometry();
   geometry.setAttribute("position", points);
   geometry.setIndex(new BufferAttribute(index, 1));
@@ -53,7 +53,7 @@ function lines(points, index, material) {
   return out;
 }
 
-function gridLines(free, spacing) {
+export function gridLines(free, spacing) {
   const low = [Infinity, Infinity, Infinity];
   const high = [-Infinity, -Infinity];
   for (let i = 0; i < free.length; i += 1) {

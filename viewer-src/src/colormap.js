@@ -25,3 +25,27 @@ export function niceCeiling(value) {
   const step = [1, 1.5, 2, 3, 4, 5, 6, 8, 10].find((m) => m * power >= value * 0.999999);
   return step * power;
 }
+
+// Two-sided map of equal lightness on both sides (ColorBrewer RdBu), for what may be more or less than zero.
+const TWO_SIDED = ["#2166ac", "#67a9cf", "#d1e5f0", "#f7f7f7", "#fddbc7", "#ef8a62", "#b2182b"]
+  .map((hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16) / 255));
+
+/** 256 colours as RGBA bytes: viridis from dark to bright, or two-sided about the middle. */
+export function colourTable(twoSided) {
+  const stops = twoSided ? TWO_SIDED : VIRIDIS;
+  const out = new Uint8Array(4 * 256);
+  for (let i = 0; i < 256; i += 1) {
+    const s = (i / 255) * (stops.length - 1);
+    const k = Math.min(stops.length - 2, Math.floor(s));
+    for (let c = 0; c < 3; c += 1) out[4 * i + c] = Math.round(255 * (stops[k][c] + (s - k) * (stops[k + 1][c] - stops[k][c])));
+    out[4 * i + 3] = 255;
+  }
+  return out;
+}
+
+/** The same map as a CSS gradient. */
+export function tableGradient(twoSided) {
+  const table = colourTable(twoSided);
+  const stops = Array.from({ length: 17 }, (_, i) => Math.round((255 * i) / 16)).map((i) => `rgb(${table.slice(4 * i, 4 * i + 3).join(",")})`);
+  return `linear-gradient(to right, ${stops.join(", ")})`;
+}

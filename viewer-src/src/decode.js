@@ -62,3 +62,32 @@ export function decodeScene(packed) {
     residualLength: length,
   };
 }
+
+/** base64 of gzip -> bytes. */
+export async function unzip(base64) {
+  const bytes = Uint8Array.from(atob(base64), (c) => c.charCodeAt(0));
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+  return new Uint8Array(await new Response(stream).arrayBuffer());
+}
+
+/** 16-bit numbers whose low bytes stand before their high bytes. */
+function joined(bytes) {
+  const n = bytes.length / 2;
+  return Int16Array.from({ length: n }, (_, i) => bytes[i] | (bytes[n + i] << 8));
+}
+
+/** Rows of 16-bit numbers from their second differences down the rows (first row as it is, second as first difference). */
+function summed(differences, width) {
+  const out = differences;
+  for (let i = width; i < out.length; i += 1) out[i] += i < 2 * width ? out[i - width] : 2 * out[i - width] - out[i - 2 * width];
+  return out;
+}
+
+/** A motion as naibu/viewer/motion_page.py packs it -> what MotionView.show takes. */
+export async function decodeMotion(packed) {
+  const frames = packed.times.length;
+  const rest = Float32Array.from(packed.rest);
+  const displacement = summed(joined(await unzip(packed.displacement)), rest.length);
+  const fields = await Promise.all(packed.fields.map(async (field) => ({ ...field, levels: await unzip(field.levels) })));
+  return { ...packed, frames, rest, displacement, fields, faces: Uint32Array.from(packed.faces) };
+}

@@ -1,21 +1,11 @@
 // The result page: puts the 3-D view and its controls into #naibu-viewer. All tables and figures are already in the HTML.
 import { residualGradient } from "./colormap.js";
 import { decodeScene, inflate } from "./decode.js";
-import { SceneView, VIEWS, canDraw } from "./scene.js";
+import { canDrawOr, h } from "./elements.js";
+import { SceneView } from "./scene.js";
+import { VIEWS } from "./view.js";
 
 const PLAY_SECONDS = 3;
-
-/** Make an element: h("p", {class: "note"}, "text", child). */
-function h(name, attributes = {}, ...children) {
-  const element = document.createElement(name);
-  for (const [key, value] of Object.entries(attributes)) {
-    if (key.startsWith("on")) element.addEventListener(key.slice(2), value);
-    else if (value === true) element.setAttribute(key, "");
-    else if (value !== false && value !== null) element.setAttribute(key, value);
-  }
-  element.append(...children);
-  return element;
-}
 
 const mm = (value) => (Number.isFinite(value) ? value.toFixed(2) : "–");
 const signed = (value) => (Number.isFinite(value) ? `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(2)}` : "–");
@@ -29,8 +19,7 @@ class ViewerPage {
     this.#build();
     this.view = new SceneView(this.stage, { onPick: (i, at) => this.#tip(i, at) });
     this.stage.append(this.tip);
-    this.#guardWheel();
-    this.#keys();
+    this.view.listenToKeys({ n: () => this.#walk(1), p: () => this.#walk(-1), Escape: () => this.view.select(null) });
     const colours = window.matchMedia("(prefers-color-scheme: dark)");
     colours.addEventListener("change", () => this.#theme());
     window.matchMedia("print").addEventListener("change", () => { this.#theme(); this.view.render(); });
@@ -205,41 +194,6 @@ class ViewerPage {
     this.tip.style.top = `${Math.max(4, Math.min(v - th - 4, at.y - th / 2))}px`;
   }
 
-  /** The wheel scrolls the page until the view has been clicked. */
-  #guardWheel() {
-    let clicked = false;
-    this.stage.addEventListener("wheel", (e) => {
-      if (!clicked && !e.ctrlKey) e.stopImmediatePropagation();
-    }, { capture: true, passive: true });
-    this.stage.addEventListener("pointerdown", () => {
-      clicked = true;
-      this.stage.focus({ preventScroll: true });
-    }, { capture: true });
-    this.stage.addEventListener("mouseleave", () => { clicked = false; });
-  }
-
-  #keys() {
-    const actions = {
-      ArrowLeft: () => this.view.turn(-0.1, 0),
-      ArrowRight: () => this.view.turn(0.1, 0),
-      ArrowUp: () => this.view.turn(0, 0.1),
-      ArrowDown: () => this.view.turn(0, -0.1),
-      "+": () => this.view.zoomBy(1.2),
-      "=": () => this.view.zoomBy(1.2),
-      "-": () => this.view.zoomBy(1 / 1.2),
-      r: () => this.view.look("oblique"),
-      n: () => this.#walk(1),
-      p: () => this.#walk(-1),
-      Escape: () => this.view.select(null),
-    };
-    this.stage.addEventListener("keydown", (e) => {
-      const action = actions[e.key.length === 1 ? e.key.toLowerCase() : e.key];
-      if (!action || e.ctrlKey || e.metaKey || e.altKey) return;
-      e.preventDefault();
-      action();
-    });
-  }
-
   #walk(way) {
     if (this.ranked.length === 0) return;
     const at = this.ranked.indexOf(this.view.selected);
@@ -248,23 +202,13 @@ class ViewerPage {
   }
 }
 
-function explain(root, text) {
-  root.replaceChildren(h("p", { class: "no-3d", role: "status" }, text));
-}
-
 async function begin() {
   window.addEventListener("beforeprint", () => document.querySelectorAll("details").forEach((d) => { d.open = true; }));
   const root = document.getElementById("naibu-viewer");
   const data = document.getElementById("naibu-scenes");
-  if (!root || !data) return;
-  if (!canDraw()) {
-    explain(root, "This browser cannot draw in 3-D (WebGL 2 is missing or switched off). Everything else on this page is complete.");
-  } else if (!("DecompressionStream" in window)) {
-    explain(root, "This browser is too old for the 3-D view (it needs DecompressionStream: any browser since 2023). Everything else on this page is complete.");
-  } else {
-    const { scenes } = await inflate(data.textContent);
-    window.naibuViewer = new ViewerPage(root, scenes);
-  }
+  if (!root || !data || !canDrawOr(root)) return;
+  const { scenes } = await inflate(data.textContent);
+  window.naibuViewer = new ViewerPage(root, scenes);
 }
 
 begin();

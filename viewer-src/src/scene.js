@@ -1,48 +1,12 @@
-// The 3-D view, apart from any page: result page, live page and notebook use the same class.
-import { Box3, DirectionalLight, HemisphereLight, OrthographicCamera, Scene, Sphere, Vector3, WebGLRenderer } from "three";
-import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
+// The 3-D view of a result: markers, residuals, body. Result page, live page and notebook use the same class.
+import { Box3, DirectionalLight, HemisphereLight, Scene, Sphere, Vector3 } from "three";
 import { Body } from "./body.js";
 import { niceCeiling, residualColour } from "./colormap.js";
 import { Arrows, measuredGlyphs, place, predictedGlyphs } from "./glyphs.js";
-import { Overlay } from "./overlay.js";
+import { readTheme, View } from "./view.js";
 
-export const VIEWS = {
-  oblique: { label: "Oblique", from: [0.62, -1.25, 0.6] },
-  front: { label: "Front (x, z)", from: [0, -1, 0] },
-  side: { label: "Side (y, z)", from: [1, 0, 0] },
-  top: { label: "Top (x, y)", from: [0, 0, 1] },
-};
 const PICK_RADIUS_PX = 16;
 const FULL = 1e-6;
-
-/** True if the browser can draw: asked on a canvas of its own, so that a refusal leaves no error in the console. */
-export function canDraw() {
-  try {
-    const context = document.createElement("canvas").getContext("webgl2");
-    context?.getExtension("WEBGL_lose_context")?.loseContext();
-    return Boolean(context);
-  } catch {
-    return false;
-  }
-}
-
-/** Colours of the page as CSS variables of `element`. */
-function readTheme(element) {
-  const style = getComputedStyle(element);
-  const of = (name) => style.getPropertyValue(`--scene-${name}`).trim();
-  return {
-    dark: of("dark") === "1",
-    background: of("background"),
-    measured: of("measured"),
-    predicted: of("predicted"),
-    skin: of("skin"),
-    skinOpacity: Number(of("skin-opacity")),
-    edge: of("edge"),
-    free: of("free"),
-    grid: of("grid"),
-    box: of("box"),
-  };
-}
 
 /** Corners of [centre x, y, z, half size x, y, z] as a flat list. */
 function boxCorners(box) {
@@ -63,26 +27,15 @@ function medianSpacing(points) {
   return nearest.sort((p, q) => p - q)[nearest.length >> 1] ?? Infinity;
 }
 
-export class SceneView {
+export class SceneView extends View {
   /** @param {HTMLElement} host empty, positioned element; @param {{onPick?: (index: number|null, at: {x,y}|null) => void}} events */
   constructor(host, events = {}) {
-    this.host = host;
+    super(host);
     this.onPick = events.onPick ?? (() => {});
-    this.renderer = new WebGLRenderer({ antialias: true, preserveDrawingBuffer: true });
-    this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
-    this.canvas = this.renderer.domElement;
-    host.append(this.canvas);
-    this.overlay = new Overlay(host);
-    this.camera = new OrthographicCamera(-1, 1, 1, -1, 0.1, 10);
-    this.camera.up.set(0, 0, 1);
-    this.controls = new OrbitControls(this.camera, this.canvas);
-    this.controls.addEventListener("change", () => this.requestRender());
     this.visible = { measured: true, predicted: true, arrows: true, skin: true, free: true, boxes: true };
     this.load = 0;
     this.magnification = 1;
     this.selected = null;
-    this.resizing = new ResizeObserver(() => this.resize());
-    this.resizing.observe(host);
     this.#listen();
   }
 
@@ -95,7 +48,7 @@ export class SceneView {
   /** Show a decoded scene at full load. */
   show(data) {
     this.data = data;
-    this.world?.traverse((o) => { o.geometry?.dispose(); o.material?.dispose(); });
+    this.clear();
     this.world = new Scene();
     this.extent = new Sphere();
     const box = new Box3();
@@ -188,82 +141,9 @@ export class SceneView {
     this.requestRender();
   }
 
-  /** Look from one of VIEWS and fit the object into the frame. */
-  look(name) {
-    const { center, radius } = this.extent;
-    const forward = new Vector3(...VIEWS[name].from).normalize();
-    this.controls.target.copy(center);
-    this.camera.position.copy(center).addScaledVector(forward, 6 * radius);
-    this.camera.near = 0.1 * radius;
-    this.camera.far = 20 * radius;
-    this.camera.zoom = 1;
-    this.controls.update();
-    this.camera.updateMatrixWorld();
-    this.#frame();
-    this.resize();
-  }
-
-  /** Half extents of all that is drawn, as the camera now sees it, and the point in their middle as the new target. */
-  #frame() {
-    const [right, up] = [0, 1].map((k) => new Vector3().setFromMatrixColumn(this.camera.matrixWorld, k));
-    const low = [Infinity, Infinity];
-    const high = [-Infinity, -Infinity];
-    const p = new Vector3();
-    for (const points of this.frameful) {
-      for (let i = 0; i < points.length; i += 3) {
-        p.fromArray(points, i).sub(this.extent.center);
-        [right, up].forEach((axis, k) => {
-          low[k] = Math.min(low[k], p.dot(axis));
-          high[k] = Math.max(high[k], p.dot(axis));
-        });
-      }
-    }
-    const shift = right.clone().multiplyScalar((low[0] + high[0]) / 2).addScaledVector(up, (low[1] + high[1]) / 2);
-    this.controls.target.add(shift);
-    this.camera.position.add(shift);
-    this.controls.update();
-    this.half = [0, 1].map((k) => (high[k] - low[k]) / 2);
-  }
-
-  zoomBy(factor) {
-    this.camera.zoom = Math.min(40, Math.max(0.2, this.camera.zoom * factor));
-    this.camera.updateProjectionMatrix();
-    this.requestRender();
-  }
-
-  /** Turn the camera about the object, radians. */
-  turn(azimuth, elevation) {
-    const { target } = this.controls;
-    const arm = this.camera.position.clone().sub(target);
-    const r = arm.length();
-    const theta = Math.atan2(arm.y, arm.x) + azimuth;
-    const phi = Math.min(1.5707, Math.max(-1.5707, Math.asin(arm.z / r) + elevation));
-    this.camera.position.set(Math.cos(phi) * Math.cos(theta), Math.cos(phi) * Math.sin(theta), Math.sin(phi)).multiplyScalar(r).add(target);
-    this.controls.update();
-    this.requestRender();
-  }
-
-  resize() {
-    const { clientWidth: w, clientHeight: h } = this.host;
-    if (!w || !h || !this.half) return;
-    this.renderer.setSize(w, h, false);
-    // 30 px are left free on every side, for the triad and the scale bar
-    const half = Math.max((this.half[1] * h) / (h - 60), (this.half[0] * h) / (w - 60));
-    Object.assign(this.camera, { top: half, bottom: -half, right: (half * w) / h, left: (-half * w) / h });
-    this.camera.updateProjectionMatrix();
-    this.requestRender();
-  }
-
-  requestRender() {
-    if (this.pending || !this.world) return;
-    this.pending = requestAnimationFrame(() => { this.pending = 0; this.render(); });
-  }
-
   render() {
     if (this.camera.zoom !== this.placedZoom) this.#placeGlyphs();
-    this.sun.position.copy(this.camera.position).sub(this.controls.target).applyAxisAngle(this.camera.up, 0.5);
-    this.renderer.render(this.world, this.camera);
-    this.overlay.update(this.camera, this.host.clientWidth, this.host.clientHeight);
+    super.render();
     this.overlay.mark(this.selected === null ? null : this.screenPoint(this.selected));
   }
 
@@ -304,13 +184,5 @@ export class SceneView {
     this.selected = i;
     this.onPick(i, i === null ? null : this.screenPoint(i));
     this.requestRender();
-  }
-
-  dispose() {
-    this.resizing.disconnect();
-    this.controls.dispose();
-    this.renderer.dispose();
-    this.canvas.remove();
-    this.overlay.svg.remove();
   }
 }

@@ -214,7 +214,7 @@ def load_meta(path: Path, content: bytes) -> Meta:
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise InputError(_syntax_message(path, text, error)) from error
+        raise InputError(syntax_message(path, text, error)) from error
     try:
         return Meta.model_validate(data)
     except ValidationError as error:
@@ -222,7 +222,8 @@ def load_meta(path: Path, content: bytes) -> Meta:
         raise InputError("\n".join(dict.fromkeys(faults))) from error
 
 
-def _syntax_message(path: Path, text: str, error: tomllib.TOMLDecodeError) -> str:
+def syntax_message(path: Path, text: str, error: tomllib.TOMLDecodeError) -> str:
+    """Return what is wrong with a text that is no TOML, with the line that it stands on."""
     found = re.search(r"at line (\d+)", str(error))
     lines = text.splitlines()
     number = int(found[1]) if found else len(lines)

@@ -6,20 +6,18 @@ Both formats are described in "VTK File Formats", https://docs.vtk.org/en/latest
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
-import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.io.atomic import write_atomically
+from naibu.io.series import VTK_TYPES, SeriesFile, in_space, numbers
 
-_VTK_TYPES = {"line": 3, "triangle": 5, "tetra": 10, "hexahedron": 12, "tetra10": 24}
 _NAMES = {"i": "Int", "u": "UInt", "f": "Float"}
 
 
@@ -49,15 +47,15 @@ def write_vtu(
     InputError
         Arrays whose length does not fit, that are not numbers, or a file that cannot be written.
     """
-    points = {name: _in_space(mesh, _values(name, values, mesh.n_points, "points")) for name, values in (point_data or {}).items()}
-    cells = {name: _values(name, values, mesh.n_cells, "cells") for name, values in (cell_data or {}).items()}
+    points = {name: in_space(mesh, numbers(name, values, mesh.n_points, "points")) for name, values in (point_data or {}).items()}
+    cells = {name: numbers(name, values, mesh.n_cells, "cells") for name, values in (cell_data or {}).items()}
     cells.setdefault("region", mesh.regions)
     appended = _Appended()
     n, k = mesh.cells.shape
     topology = {
         "connectivity": mesh.cells.ravel(),
         "offsets": np.arange(k, n * k + 1, k, dtype=np.int64),
-        "types": np.full(n, _VTK_TYPES[mesh.cell_type], dtype=np.uint8),
+        "types": np.full(n, VTK_TYPES[mesh.cell_type], dtype=np.uint8),
     }
     head = "\n".join(
         [
@@ -65,7 +63,7 @@ def write_vtu(
             '<VTKFile type="UnstructuredGrid" version="1.0" byte_order="LittleEndian" header_type="UInt64">',
             f"<UnstructuredGrid>{_names_field(mesh)}",
             f'<Piece NumberOfPoints="{mesh.n_points}" NumberOfCells="{n}">',
-            f"<Points>{appended.element('Points', _in_space(mesh, mesh.points))}</Points>",
+            f"<Points>{appended.element('Points', in_space(mesh, mesh.points))}</Points>",
             appended.section("Cells", topology),
             appended.section("PointData", points),
             appended.section("CellData", cells),
@@ -105,29 +103,15 @@ def write_vtkhdf_series(
     steps = np.asarray(times, dtype=np.float64)
     if steps.ndim != 1 or len(steps) == 0 or not np.isfinite(steps).all() or (np.diff(steps) <= 0).any():
         raise InputError(f"times are {steps.tolist()}; give at least one, in one row, each greater than the one before")
-    target = Path(path)
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        handle, aside = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
-        os.close(handle)
-    except OSError as error:
-        raise InputError(f"{target}: cannot be written ({error.strerror or error}); choose a folder you may write to") from error
-    try:
-        with h5py.File(aside, "w") as file:
-            root = file.create_group("VTKHDF")
-            _write_static(root, mesh)
-            group = _write_steps(root, steps)
-            _write_series(root, group, "PointData", point_data_steps or {}, len(steps), mesh)
-            _write_series(root, group, "CellData", cell_data_steps or {}, len(steps), mesh)
-        # The temporary file is private; the result gets the rights of any new file.
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(aside, 0o666 & ~mask)
-        os.replace(aside, target)
-    except OSError as error:
-        raise InputError(f"{target}: cannot be written ({error}); free some space or choose another folder") from error
-    finally:
-        Path(aside).unlink(missing_ok=True)
+    for data in (point_data_steps or {}, cell_data_steps or {}):
+        for name, values in data.items():
+            if len(values) != len(steps):
+                raise InputError(f"{name!r} has {len(values)} steps, but there are {len(steps)} times; give one array for each time")
+    with SeriesFile.begun(path, mesh) as series:
+        for step, time in enumerate(steps.tolist()):
+            points, cells = ({name: v[step] for name, v in (data or {}).items()} for data in (point_data_steps, cell_data_steps))
+            series.append(time, points, cells)
+        series.finish()
 
 
 class _Appended:
@@ -157,82 +141,3 @@ def _names_field(mesh: Mesh) -> str:
     codes = b"".join(name.encode() + b"\0" for name in mesh.region_names)
     head = f'<DataArray type="UInt8" Name="region_names" NumberOfTuples="{len(codes)}" format="ascii">'
     return f"<FieldData>\n{head}{' '.join(map(str, codes))}</DataArray>\n</FieldData>"
-
-
-def _values(name: str, values: ArrayLike, n: int, what: str) -> NDArray[np.generic]:
-    """Return values as (n,) or (n, d) numbers that VTK knows."""
-    array = np.asarray(values)
-    if array.ndim not in (1, 2, 3) or len(array) != n:
-        raise InputError(f"{name!r} has shape {array.shape}, but the mesh has {n} {what}; give one row for each")
-    if array.dtype == bool:
-        array = array.astype(np.uint8)
-    if array.dtype.kind not in "iuf":
-        raise InputError(f"{name!r} is of type {array.dtype}; give real numbers")
-    if array.dtype.kind == "f" and array.dtype.itemsize not in (4, 8):
-        array = array.astype(np.float64)
-    return array.reshape(n, -1) if array.ndim == 3 else array
-
-
-def _in_space(mesh: Mesh, vectors: NDArray[np.generic]) -> NDArray[np.generic]:
-    """Return vectors of a plane or a line with the components that VTK, which knows only space, wants besides."""
-    missing = 3 - mesh.dimension
-    if missing == 0 or vectors.ndim != 2 or vectors.shape[1] != mesh.dimension:
-        return vectors
-    return np.pad(vectors, ((0, 0), (0, missing)))
-
-
-def _write_static(root: h5py.Group, mesh: Mesh) -> None:
-    """Write the grid, which all steps share."""
-    n, k = mesh.cells.shape
-    root.attrs["Version"] = np.array([2, 0], dtype=np.int64)
-    # VTK's reader wants a string of fixed length here, not h5py's default.
-    root.attrs["Type"] = np.bytes_("UnstructuredGrid")
-    root["NumberOfPoints"] = np.array([mesh.n_points], dtype=np.int64)
-    root["NumberOfCells"] = np.array([n], dtype=np.int64)
-    root["NumberOfConnectivityIds"] = np.array([n * k], dtype=np.int64)
-    root["Points"] = _in_space(mesh, mesh.points)
-    root["Connectivity"] = mesh.cells.ravel()
-    root["Offsets"] = np.arange(0, n * k + 1, k, dtype=np.int64)
-    root["Types"] = np.full(n, _VTK_TYPES[mesh.cell_type], dtype=np.uint8)
-    root.create_group("PointData")
-    root.create_group("CellData")["region"] = mesh.regions
-    # An attribute, not field data: VTK 9.7's reader crashed on UTF-8 strings there.
-    root.attrs["region_names"] = list(mesh.region_names)
-
-
-def _write_steps(root: h5py.Group, times: NDArray[np.float64]) -> h5py.Group:
-    """Write the times, and offsets that send every step to the one grid."""
-    n = len(times)
-    group = root.create_group("Steps")
-    group.attrs["NSteps"] = np.int64(n)
-    group["Values"] = times
-    zeros = np.zeros(n, dtype=np.int64)
-    group["NumberOfParts"] = zeros + 1
-    for name in ("PartOffsets", "PointOffsets"):
-        group[name] = zeros
-    for name in ("CellOffsets", "ConnectivityIdOffsets"):
-        group[name] = zeros[:, None]
-    group.create_group("PointDataOffsets")
-    group.create_group("CellDataOffsets")["region"] = zeros
-    return group
-
-
-def _write_series(
-    root: h5py.Group, steps: h5py.Group, where: str, data: Mapping[str, Sequence[ArrayLike] | NDArray[np.generic]], n_steps: int, mesh: Mesh
-) -> None:
-    """Write the values of all steps of every array, one step below the other, and where each starts."""
-    n = mesh.n_points if where == "PointData" else mesh.n_cells
-    for name, values in data.items():
-        if not name or "/" in name or (where == "CellData" and name == "region"):
-            raise InputError(f"array name {name!r} cannot be used in a VTKHDF file; take another one without '/'")
-        if len(values) != n_steps:
-            raise InputError(f"{name!r} has {len(values)} steps, but there are {n_steps} times; give one array for each time")
-        what = "points" if where == "PointData" else "cells"
-        first = _in_space(mesh, _values(name, values[0], n, what))
-        dataset = root[where].create_dataset(name, shape=(n_steps * n, *first.shape[1:]), dtype=first.dtype)
-        for step in range(n_steps):
-            own = _in_space(mesh, _values(name, values[step], n, what))
-            if own.shape != first.shape:
-                raise InputError(f"{name!r} has shape {own.shape} in step {step}, but {first.shape} in step 0; give the same shape in all")
-            dataset[step * n : (step + 1) * n] = own
-        steps[f"{where}Offsets"][name] = n * np.arange(n_steps, dtype=np.int64)

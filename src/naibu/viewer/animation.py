@@ -103,8 +103,3 @@ def _packed(body: MovingBody, low: float, high: float) -> dict[str, object]:
 
 def _base64(values: NDArray[np.float64]) -> str:
     return base64.b64encode(np.round(np.nan_to_num(values)).astype("<i2").tobytes()).decode()
-
-
-def _position(p: NDArray[np.float64]) -> list[float] | None:
-    """A point of the page, or None where there is no measurement."""
-    return None if np.isnan(p).any() else [round(float(x), 3) for x in p]
