@@ -52,7 +52,7 @@ def cube_section(n: int, seed: int, points: int) -> Section:
     capture = virtual_capture(truth, dough_parameters(truth, zones=True), CUBE_PUSHING, seed=seed, points=points)
     mask, mass = box_mask((n, n, n)), 1e-3 * CUBE_G
     lattices = [classic_lattice(mask, spacing, total_mass_kg=mass)]
-    lattices += [octree_lattice(mask, spacing, kind, total_mass_kg=mass) for kind in range(3)]
+    lattices += [octree_lattice(mask, spacing, kind, total_mass_kg=mass, scaling="edge") for kind in range(3)]
     fits = [_fitted(lattice, capture) for lattice in lattices]
     text = (
         "A cube of 8 cm and 630 g, pushed at two facing sides by bodies 2 cm wide. One set of K, C1 and C2 for every level of the octree, "

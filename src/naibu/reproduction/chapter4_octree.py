@@ -59,7 +59,7 @@ def _counts(n: int) -> tuple[list[int], list[int]]:
 
 def _lattices(n: int) -> list[Lattice]:
     mask, spacing = box_mask((n, n, n)), EDGE_MM / n
-    octrees = [octree_lattice(mask, spacing, kind, total_mass_kg=MASS_KG) for kind in range(3)]
+    octrees = [octree_lattice(mask, spacing, kind, total_mass_kg=MASS_KG, scaling="edge") for kind in range(3)]
     return [classic_lattice(mask, spacing, total_mass_kg=MASS_KG), *octrees]
 
 
