@@ -3,8 +3,8 @@
 A cube of 80 mm and 630 g with 9^3, 17^3 and 33^3 masses. The references take the explicit Euler step of the same elements: one in
 NumPy, one as a plain Numba loop over the elements on one thread, as one would write it first. Each time is the least over many repeats,
 and that of a step in a long call, without what the call itself costs; `cpu` is the time of the processor (all threads), `wall` that of
-the clock, which on a shared machine counts what others do. Jitter is that of single steps, called one by one, while another process
-keeps a core busy.
+the clock, which on a shared machine counts what others do. Rows of sessions are single steps, called one by one, with all that a call
+costs. Jitter is that of a session's single steps while another process keeps a core busy, one after the other or a thousand in a second.
 
 Run: ``MKL_NUM_THREADS=1 OMP_NUM_THREADS=2 python benchmarks/lattice_steps.py [--sizes 8,16,32] [--repeats 20]``.
 """
@@ -24,6 +24,7 @@ import numpy as np
 from naibu.mechanics.lattice import Lattice, LatticeParameters, box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattice_adjoint import push_gradient, recorded_push
 from naibu.mechanics.lattice_blocks import explicit_coefficients
+from naibu.mechanics.lattice_session import LatticeSession
 from naibu.mechanics.lattice_stepping import HeldNodes, LatticeEngine
 from naibu.mechanics.octree_lattice import octree_lattice
 
@@ -101,13 +102,21 @@ def timed(lattice: Lattice, parameters: LatticeParameters, steps: int, repeats: 
     return (whole[0] - call[0]) / steps, (whole[1] - call[1]) / steps, iterations
 
 
-def sizes(n: int, repeats: int) -> None:
-    lattice = classic_lattice(box_mask((n,) * 3), SIDE_MM / n, total_mass_kg=MASS_KG)
-    gentle = lattice_parameters(lattice, *(p * 8.0 / n for p in GENTLE))
-    steps = {8: 500, 16: 100}.get(n, 20)
-    print(f"{n + 1}^3 masses, {lattice.n_elements} elements")
-    c = explicit_coefficients(gentle)
-    few = max(2, 200 // n)
+def in_session(lattice: Lattice, parameters: LatticeParameters, steps: int, repeats: int, **options: object) -> tuple[float, float]:
+    held, velocity = pushed(lattice)
+    with LatticeSession.of(LatticeEngine.of(lattice, parameters, step=STEP_S, **options), held=held) as session:  # type: ignore[arg-type]
+
+        def one_by_one() -> None:
+            for _ in range(steps):
+                session.advance(velocity)
+
+        return least(one_by_one, steps, repeats)
+
+
+def references(lattice: Lattice, parameters: LatticeParameters, steps: int, repeats: int) -> tuple[float, float]:
+    """Print the rows of NumPy and of a plain loop, and return the latter's times."""
+    c = explicit_coefficients(parameters)
+    few = max(2, 1600 // round(lattice.n_nodes ** (1 / 3)) // 8)
     row("NumPy, explicit", *least(lambda: numpy_steps(lattice, c, few), few, max(2, repeats // 6)))
     i, j = (np.ascontiguousarray(e) for e in lattice.elements.T)
 
@@ -115,61 +124,72 @@ def sizes(n: int, repeats: int) -> None:
         x, y = lattice.points.copy(), np.zeros(lattice.n_elements)
         plain_loop(i, j, *c, lattice.node_mass, x, np.zeros_like(x), y, STEP_S, steps)
 
-    reference = least(loop, steps, repeats)
-    row("plain Numba loop, explicit, double", *reference)
+    found = least(loop, steps, repeats)
+    row("plain Numba loop, explicit, double", *found)
+    return found
+
+
+def sizes(n: int, repeats: int) -> None:
+    lattice = classic_lattice(box_mask((n,) * 3), SIDE_MM / n, total_mass_kg=MASS_KG)
+    gentle, stiff = lattice_parameters(lattice, *(p * 8.0 / n for p in GENTLE)), lattice_parameters(lattice, *STIFF)
+    steps = {8: 500, 16: 100}.get(n, 20)
+    print(f"{n + 1}^3 masses, {lattice.n_elements} elements")
+    reference = references(lattice, gentle, steps, repeats)
+    team = (1, 2) if lattice.n_elements >= 20_000 else (1,)
     for precision in ("double", "single"):
-        for threads in (1, 2) if lattice.n_elements >= 20_000 else (1,):
+        for threads in team:
             cpu, wall, _ = timed(lattice, gentle, steps, repeats, method="euler", precision=precision, threads=threads)
-            row(
-                f"explicit, {precision}, {threads} thread(s)",
-                cpu,
-                wall,
-                f"plain loop over this: {reference[threads > 1] / (cpu, wall)[threads > 1]:.2f}",
-            )
+            told = f"plain loop over this: {reference[threads > 1] / (cpu, wall)[threads > 1]:.2f}"
+            row(f"explicit, {precision}, {threads} thread(s)", cpu, wall, told)
+    for threads in team:
+        row(f"explicit, session, {threads} thread(s)", *in_session(lattice, gentle, steps, repeats, method="euler", threads=threads))
     held, velocity = pushed(lattice)
     engine = LatticeEngine.of(lattice, gentle, method="euler", threads=1)
     state = engine.rest()
-    row(
-        "a call without steps",
-        *least(lambda: engine.run(state, 0, held, velocity), 1, repeats),
-        "conversion of the state, not in the rows of steps",
-    )
+    row("run without steps", *least(lambda: engine.run(state, 0, held, velocity), 1, repeats), "conversion of the state, not in the rows")
     few = max(5, steps // 5)
-    cpu, wall, iterations = timed(lattice, lattice_parameters(lattice, *STIFF), few, max(2, repeats // 4))
+    cpu, wall, iterations = timed(lattice, stiff, few, max(2, repeats // 4))
     row("implicit, 1 thread", cpu, wall, f"{iterations:.1f} iterations")
-    classic, _, _ = timed(lattice, gentle, steps, repeats, method="euler", threads=1)
+    row("implicit, session, 1 thread", *in_session(lattice, stiff, few, max(2, repeats // 4)))
+    octrees(n, lattice, steps, repeats)
+
+
+def octrees(n: int, lattice: Lattice, steps: int, repeats: int) -> None:
+    def gentle(of: Lattice) -> LatticeParameters:
+        return lattice_parameters(of, *(p * 8.0 / n for p in GENTLE))
+
+    classic, _, _ = timed(lattice, gentle(lattice), steps, repeats, method="euler", threads=1)
     for kind in (0, 1, 2):
         octree = octree_lattice(box_mask((n,) * 3), SIDE_MM / n, kind, total_mass_kg=MASS_KG)
-        cpu, wall, _ = timed(octree, lattice_parameters(octree, *(p * 8.0 / n for p in GENTLE)), steps, repeats, method="euler", threads=1)
-        row(
-            f"octree type {kind}, explicit, 1 thread",
-            cpu,
-            wall,
-            f"of classic: time {cpu / classic:.3f}, elements {octree.n_elements / lattice.n_elements:.3f}",
-        )
+        cpu, wall, _ = timed(octree, gentle(octree), steps, repeats, method="euler", threads=1)
+        told = f"of classic: time {cpu / classic:.3f}, elements {octree.n_elements / lattice.n_elements:.3f}"
+        row(f"octree type {kind}, explicit, 1 thread", cpu, wall, told)
 
 
-def jitter(n: int, **options: object) -> None:
+def jitter(n: int, rate: float, **options: object) -> None:
+    """Print how much single steps of a session differ while a core is busy, in a tight loop or at a rate, Hz."""
     lattice = classic_lattice(box_mask((n,) * 3), SIDE_MM / n, total_mass_kg=MASS_KG)
-    engine = LatticeEngine.of(lattice, lattice_parameters(lattice, *(p * 8.0 / n for p in GENTLE)), step=STEP_S, **options)  # type: ignore[arg-type]
+    factors = STIFF if options["method"] == "implicit" else tuple(p * 8.0 / n for p in GENTLE)
     held, velocity = pushed(lattice)
-    state = engine.run(engine.rest(), 5, held, velocity).state
-    busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
-    try:
-        taken = []
-        for _ in range(1500 if n < 32 else 400):
-            start = time.perf_counter()
-            engine.run(state, 1, held, velocity)
-            taken.append(time.perf_counter() - start)
-    finally:
-        busy.kill()
-        busy.wait()
+    engine = LatticeEngine.of(lattice, lattice_parameters(lattice, *factors), step=STEP_S, **options)  # type: ignore[arg-type]
+    with LatticeSession.of(engine, held=held) as session:
+        session.advance(velocity, 5)
+        busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+        try:
+            taken, due = [], time.perf_counter()
+            for _ in range(3000 if n < 32 else 600):
+                due = max(due + 1.0 / rate, time.perf_counter()) if rate else 0.0
+                time.sleep(max(due - time.perf_counter(), 0.0)) if rate else None
+                start = time.perf_counter()
+                session.advance(velocity)
+                taken.append(time.perf_counter() - start)
+        finally:
+            busy.kill()
+            busy.wait()
     middle, late, worst = 1e3 * np.quantile(taken, (0.5, 0.99, 1.0))
     told = ", ".join(f"{key} {value}" for key, value in options.items())
-    print(
-        f"  jitter {n + 1}^3, {told}: median {middle:.3f}, p99 - median {late - middle:.3f}, worst {worst:.3f} ms, with conversion",
-        flush=True,
-    )
+    loop = f"{rate:g} Hz" if rate else "tight loop"
+    print(f"  jitter {n + 1}^3, {told}, {loop}: median {middle:.3f}, p99 - median {late - middle:.3f}, worst {worst:.3f} ms", flush=True)
 
 
 def gradients(repeats: int) -> None:
@@ -200,15 +220,14 @@ def main() -> None:
         sizes(n, asked.repeats)
     gradients(asked.repeats)
     for n in chosen:
-        jitter(n, method="euler", threads=1)
-        if n > 8:
-            jitter(n, method="euler", threads=2)
-        if n < 32:
-            jitter(n, method="implicit")
-    try:
-        print(f"threading layer {numba.threading_layer()}")
-    except ValueError:
-        print("no threads were used")
+        for rate in (0.0, 1000.0):
+            for threads in (1, 2) if n > 8 else (1,):
+                jitter(n, rate, method="euler", threads=threads)
+            if n < 32:
+                jitter(n, rate, method="implicit")
+    print(
+        f"load {os.getloadavg()[0] if hasattr(os, 'getloadavg') else float('nan'):.1f} at the end, the busy process of the jitter included"
+    )
 
 
 if __name__ == "__main__":

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -195,3 +197,34 @@ def test_bad_input_is_named(call, said):
     with pytest.raises(InputError) as caught:
         call()
     assert said in str(caught.value)
+
+
+@pytest.mark.parametrize("friction", [0.2, 0.5])
+@pytest.mark.parametrize("slope", [0.6, 0.9])
+def test_a_soft_block_slides_down_a_slope_as_coulomb_says(friction, slope):
+    """Set upon a slope at once, it bounces and leans; it still gains (tan - mu) g on the mean, with equal coefficients too."""
+    lattice, engine = block((4, 4, 2), mass=0.04, k=40.0, c1=20.0, c2=60.0)
+    floor = [plane((0, 0, 0), static_friction=friction, kinetic_friction=friction)]
+    forces = GRAVITY * np.outer(lattice.node_mass, [slope, 0.0, -1.0])
+    motion = push(engine, engine.rest(), floor, 0.0, steps=300, external_force=forces)
+    speed = (lattice.node_mass @ motion.state.velocity[:, 0]) / lattice.total_mass
+    assert speed == pytest.approx((slope - friction) * GRAVITY * 300 * engine.step, rel=0.03)
+    assert motion.unsettled == 0
+    tangential, normal = np.hypot(motion.reaction[:, 0, 0], motion.reaction[:, 0, 1]), motion.reaction[:, 0, 2]
+    assert (tangential <= 1.1 * friction * normal + 1e-3).all()
+
+
+def test_a_thrown_block_stops_and_stays():
+    """It slides v^2 / (2 mu g) and then sticks."""
+    lattice, engine = block((4, 4, 1), mass=0.04, k=400.0, c1=20.0)
+    floor = [plane((0, 0, 0), static_friction=0.4, kinetic_friction=0.4)]
+    weight = GRAVITY * np.outer(lattice.node_mass, [0.0, 0.0, -1.0])
+    rest = push(engine, engine.rest(), floor, 0.0, steps=500, external_force=weight)
+    thrown = replace(rest.state, velocity=rest.state.velocity + np.array([300.0, 0.0, 0.0]))
+    motion = push(engine, thrown, floor, 0.0, steps=150, contact=rest.contact, external_force=weight)
+    way = (motion.state.position - rest.state.position)[:, 0].mean()
+    assert way == pytest.approx(300.0**2 / (2 * 0.4 * GRAVITY), rel=0.05)
+    assert np.abs(motion.state.velocity).max() < 0.5
+    low = lattice.points[motion.contact.nodes, 2] == 0.0
+    assert (motion.contact.mode[low & (motion.contact.mode[:, 0] > 0), 0] == 1).all()
+    assert np.abs(motion.reaction[-1, 0, :2]).max() < 0.4 * lattice.total_mass * GRAVITY

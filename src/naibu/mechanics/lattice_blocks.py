@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from naibu.mechanics.lattice import Array, Integers, Lattice, LatticeParameters
-from naibu.mechanics.simd import WIDTH
+from naibu.mechanics.lattice_coarse import coarse_space
+from naibu.mechanics.simd import WIDTH, aligned
 
 _STRIDE = 4  # a neighbour along y, z or a diagonal, and the two beside it along x, overlap
 
@@ -135,27 +136,19 @@ def _exponential_means(x: Array) -> tuple[Array, Array]:
     return np.where(small, series_first, first), np.where(small, series_second, second)
 
 
-def aligned(shape: tuple[int, ...], kind: Any) -> Any:
-    """Return zeros that begin where a line of the cache does."""
-    size = int(np.prod(shape)) * np.dtype(kind).itemsize
-    raw = np.zeros(size + 64, dtype=np.uint8)
-    start = -raw.ctypes.data % 64
-    return raw[start : start + size].view(kind).reshape(shape)
-
-
 def explicit_kernel(parameters: LatticeParameters, step: float, blocks: Blocks, mass: Any, threads: int, forward: bool) -> tuple[Any, ...]:
-    """Return what explicit steps need: blocks, tables, masses with their inverses, and the parts of several threads or None."""
+    """Return what explicit steps need: blocks, tables, masses with their inverses, and the parts of each thread.
+
+    A part has blocks and masses; the masses that its blocks touch begin and end at the last two.
+    """
     rows, tables = blocks.patterns(*explicit_tables(parameters, step, forward), dtype=mass.dtype.type)
     inverse = np.divide(1.0, mass, out=np.zeros_like(mass), where=mass > 0.0)
-    parts = None
     first, second = blocks.first, blocks.second
-    if threads > 1:
-        nodes = np.append(np.round(np.arange(threads) * blocks.n_nodes / threads / WIDTH).astype(np.int64) * WIDTH, len(mass) - WIDTH)
-        cuts = np.searchsorted(first, nodes)
-        low = np.minimum(first[np.minimum(cuts[:-1], len(first) - 1)], nodes[:-1])
-        ends = [second[i:j].max(initial=first[min(i, len(first) - 1)]) + WIDTH for i, j in pairwise(cuts)]
-        parts = (cuts, nodes, low, np.maximum(np.array(ends), nodes[1:]))
-    return (first, second, rows), tuple(tables), (mass, inverse), parts
+    nodes = np.append(np.round(np.arange(threads) * blocks.n_nodes / threads / WIDTH).astype(np.int64) * WIDTH, len(mass) - WIDTH)
+    cuts = np.searchsorted(first, nodes)
+    low = np.minimum(first[np.minimum(cuts[:-1], len(first) - 1)], nodes[:-1]) if len(first) else nodes[:-1]
+    ends = [second[i:j].max(initial=0) + WIDTH for i, j in pairwise(cuts)]
+    return (first, second, rows), tuple(tables), (mass, inverse), (cuts, nodes, low, np.maximum(np.array(ends), nodes[1:]))
 
 
 def implicit_kernel(lattice: Lattice, parameters: LatticeParameters, step: float, blocks: Blocks, mass: Any) -> tuple[Any, ...]:
@@ -164,9 +157,10 @@ def implicit_kernel(lattice: Lattice, parameters: LatticeParameters, step: float
     rows, tables = blocks.patterns(a, b, decay, g, parameters.stiffness, step**2 * a)
     single, places, pad = np.float32, WIDTH * blocks.n_blocks, len(mass)
     diagonal = np.bincount(lattice.elements.ravel(), np.repeat(step**2 * a / 3.0, 2), minlength=lattice.n_nodes) + lattice.node_mass
-    smoother, light = aligned((3 * pad,), single), aligned((pad,), single)
-    smoother.reshape(3, -1)[:, : lattice.n_nodes] = 1.0 / diagonal
+    smoother, light = aligned((pad,), single), aligned((pad,), single)
+    smoother[: lattice.n_nodes] = 1.0 / diagonal
     light[:] = mass
     work = (aligned((3, places), float), *(aligned((3 * pad,), float) for _ in range(3)))
+    coarse = coarse_space(lattice, step**2 * a, diagonal, smoother, pad, 1)
     inner = (tables[5].astype(single), aligned((3, places), single), light, smoother, *(aligned((3 * pad,), single) for _ in range(4)))
-    return (blocks.first, blocks.second, rows), tuple(tables), work, inner
+    return (blocks.first, blocks.second, rows), tuple(tables), work, (*inner, coarse)

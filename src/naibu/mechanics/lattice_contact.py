@@ -17,6 +17,7 @@ from naibu.mechanics.rigid_pushers import KINDS, Pusher
 
 SNAP = 0.25  # a point nearer to a line of masses than this share of the spacing stands on it (equation 5 of the ICAT 2007 paper)
 _TOUCH_MM = 1e-6
+SLOW = 1e-5  # spacings a step: masses that slide more slowly stick
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,10 +181,11 @@ def push(
     reaction = np.zeros(path.shape)
     blocks, tables, work, inner = engine.kernel
     bodies = _stored_bodies(pushers, places, known.nodes)
-    solver = (engine.tolerance, 20_000)
+    limit = (passes, SLOW * engine.lattice.spacing_mm / engine.step)
     _, tries, unsettled = contact_steps(
-        blocks, tables, x, v, y, lengths, engine.mass, external, work, inner, bodies, memory, path, engine.step, solver, reaction, passes
-    )
+        blocks, tables, x, v, y, lengths, engine.mass, external, work, inner, bodies, memory, path, engine.step, (engine.tolerance, 20_000),
+        reaction, limit,
+    )  # fmt: skip
     end = replace(engine.read(x, v, y), length=lengths[engine.blocks.lane])
     return ContactMotion(end, ContactState(known.nodes, *memory, places), reaction, path, tries / max(count, 1), int(unsettled))
 

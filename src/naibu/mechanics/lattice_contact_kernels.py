@@ -1,15 +1,23 @@
-"""Implicit steps of a lattice in contact with rigid bodies: which masses stick, slide or leave is settled within every step (spec L5)."""
+"""Implicit steps of a lattice in contact with rigid bodies: which masses stick, slide or leave is settled within every step (spec L5).
+
+Friction on a sliding mass is ``mu_k N`` against the velocity v at which it slides. In a pass it is taken as a drag, ``-w v`` with
+``w = mu_k N / |v|`` of the pass before, which adds to the matrix what keeps it positive: it can slow a mass down, never turn it round, and
+no force outside the cone is left behind whenever the passes end.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
+from naibu.mechanics.lattice_coarse_kernels import begin
 from naibu.mechanics.lattice_implicit import add_momenta, advance, new_velocity
 from naibu.mechanics.rigid_pushers import surface_gap
 
 FREE, STICK, SLIDE = range(3)
-PASSES = 8
+PASSES = 20
+REFINED = 4  # times that the drag of a mass is found anew within a step
+AGREED = 0.01  # relative error of the friction at which a step is settled
 
 
 @njit(cache=True)
@@ -103,36 +111,86 @@ def _forces(held, count, candidates, row, r, pad, step, near, force):  # type: i
 
 
 @njit(cache=True)
-def _oppose(sliding, v, velocity, normal, i, pad, size):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Set the friction on a sliding mass to a size, mN, against the velocity at which it slides; along its old direction where it rests."""
-    slip = np.empty(3)
-    away, fast, old = 0.0, 0.0, 0.0
+def _slip(v, velocity, normal, i, pad, slip):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set slip to the velocity at which mass i slides over a body, mm/s, and return its size."""
+    away = 0.0
     for a in range(3):
         slip[a] = v[a * pad + i] - velocity[a]
         away += slip[a] * normal[a]
-        old += sliding[a] ** 2
     for a in range(3):
         slip[a] -= away * normal[a]
-        fast += slip[a] ** 2
-    for a in range(3):
-        sliding[a] = -size * slip[a] / np.sqrt(fast) if fast > 0.0 else size * sliding[a] / np.sqrt(old)
+    return np.sqrt(slip[0] ** 2 + slip[1] ** 2 + slip[2] ** 2)
 
 
 @njit(cache=True)
-def _judge(mode, friction, near, after, force, sliding, v, candidates, velocity, pad, tolerance, rough, switched):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Change modes that the solution contradicts, and the friction of sliding masses; return how many changed.
+def _begin(mode, friction, near, sliding, drag, v, candidates, velocity, pad, slow):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Let masses that hardly slide stick, and give the others the drag that makes the friction of the step before."""
+    slip = np.empty(3)
+    drag[:] = 0.0
+    for c in range(mode.shape[0]):
+        for k in range(mode.shape[1]):
+            if mode[c, k] != SLIDE or friction[k, 0] == 0.0:
+                continue
+            speed = _slip(v, velocity[k], near[c, k], candidates[c], pad, slip)
+            if speed < slow:
+                mode[c, k] = STICK
+            else:
+                drag[c, k] = np.sqrt((sliding[c, k] ** 2).sum()) / speed
+            sliding[c, k, :] = 0.0
 
-    `sliding` (c, bodies, 3) is the friction on sliding masses, mN; `switched` counts how often a mass began to touch
-    or to slide in this step: in circles it ends sticking, or apart.
+
+@njit(cache=True)
+def _load(candidates, mass, smoother, drag, sliding, velocity, step, pad, heavy, light, smooth, right):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add drags and friction that is given as a force to the masses of the matrix, its smoother and the right side."""
+    for c in range(len(candidates)):
+        i = candidates[c]
+        added = 0.0
+        for k in range(drag.shape[1]):
+            added += step * drag[c, k]
+            for a in range(3):
+                right[a * pad + i] += step * (drag[c, k] * velocity[k, a] + sliding[c, k, a])
+        heavy[i] = mass[i] + added
+        light[i] = heavy[i]
+        smooth[i] = 1.0 / (1.0 / smoother[i] + added)
+
+
+@njit(cache=True)
+def _dragged(candidates, mode, drag, sliding, near, velocity, v, pad, force, applied):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set applied (c, bodies, 3) to the friction on sliding masses, and give the normal part of the drag to `force`."""
+    slip = np.empty(3)
+    for c in range(mode.shape[0]):
+        i = candidates[c]
+        for k in range(mode.shape[1]):
+            applied[c, k, :] = sliding[c, k]
+            if drag[c, k] == 0.0:
+                continue
+            _slip(v, velocity[k], near[c, k], i, pad, slip)
+            for a in range(3):
+                applied[c, k, a] -= drag[c, k] * slip[a]
+                force[c, k, a] += drag[c, k] * (velocity[k, a] - v[a * pad + i] + slip[a])
+
+
+@njit(cache=True)
+def _judge(modes, seen, friction, v, candidates, velocity, pad, bounds):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Change modes that the solution contradicts, and the drag of sliding masses; return how many changed.
+
+    `modes` are mode, friction that is given as a force, drag, the limits mu_k N (the mean of passes: alone they swing), and how often a
+    mass began to touch in this step and had its drag changed, which ends circles; `seen` are `near`, gaps after the step, forces and
+    friction; `bounds` the depth that counts as none, mm, and the speed, mm/s, below which friction is a drag.
     """
+    mode, sliding, drag, limits, switched = modes
+    near, after, force, applied = seen
+    deep, slow = bounds
     changed = 0
+    slip = np.empty(3)
     for c in range(mode.shape[0]):
         i = candidates[c]
         for k in range(mode.shape[1]):
             if mode[c, k] == FREE:
-                if after[c, k, 3] < -tolerance and switched[c, k] < 3:
-                    mode[c, k] = STICK if friction[k, 0] > 0.0 else SLIDE
-                    switched[c, k] += 1
+                if after[c, k, 3] < -deep and switched[c, k, 0] < 3:
+                    moving = _slip(v, velocity[k], after[c, k], i, pad, slip) > slow
+                    mode[c, k] = SLIDE if moving or friction[k, 0] == 0.0 else STICK
+                    switched[c, k, 0] += 1
                     changed += 1
                 continue
             press = 0.0
@@ -140,32 +198,31 @@ def _judge(mode, friction, near, after, force, sliding, v, candidates, velocity,
                 press += force[c, k, a] * near[c, k, a]
             if press < 0.0:
                 mode[c, k] = FREE
-                sliding[c, k, :] = 0.0
+                sliding[c, k, :], drag[c, k], limits[c, k] = 0.0, 0.0, 0.0
                 changed += 1
                 continue
             if friction[k, 0] == 0.0:
                 continue
-            tangential, along, size = 0.0, 0.0, 0.0
-            for a in range(3):
-                tangential += (force[c, k, a] - press * near[c, k, a]) ** 2
-                along += sliding[c, k, a] * (v[a * pad + i] - velocity[k, a])
-                size += sliding[c, k, a] ** 2
-            tangential, size = np.sqrt(tangential), np.sqrt(size)
             if mode[c, k] == STICK:
-                if tangential > friction[k, 0] * press and switched[c, k] < 2:
+                tangential = 0.0
+                for a in range(3):
+                    tangential += (force[c, k, a] - press * near[c, k, a]) ** 2
+                tangential = np.sqrt(tangential)
+                if tangential > friction[k, 0] * press * (1.0 + AGREED):
                     mode[c, k] = SLIDE
-                    switched[c, k] += 1
                     changed += 1
                     for a in range(3):
                         sliding[c, k, a] = friction[k, 1] * press * (force[c, k, a] - press * near[c, k, a]) / tangential
-            elif along > 0.0 or size == 0.0:
-                mode[c, k] = STICK
-                sliding[c, k, :] = 0.0
+                continue
+            limits[c, k] = friction[k, 1] * press if limits[c, k] == 0.0 else 0.5 * (limits[c, k] + friction[k, 1] * press)
+            speed, limit = _slip(v, velocity[k], near[c, k], i, pad, slip), limits[c, k]
+            new = limit / max(speed, slow)
+            size = np.sqrt((applied[c, k] ** 2).sum())
+            wrong = abs(new * speed - size) > AGREED * limit
+            if (wrong or (sliding[c, k] != 0.0).any()) and switched[c, k, 1] < REFINED:
+                sliding[c, k, :], drag[c, k] = 0.0, new
+                switched[c, k, 1] += 1
                 changed += 1
-            else:
-                if rough and abs(friction[k, 1] * press - size) > 0.02 * size:
-                    changed += 1
-                _oppose(sliding[c, k], v, velocity[k], near[c, k], i, pad, friction[k, 1] * press)
     return changed
 
 
@@ -188,60 +245,80 @@ def _pull_off(touched, mode, pull, near, velocity, v, mass, candidates, step, pa
 
 
 @njit(cache=True)
-def contact_steps(blocks, tables, x, v, y, lengths, mass, external, work, inner, bodies, memory, velocity, step, solver, reaction, most):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _settle(engine, held, modes, seen, shapes, places, friction, candidates, base, masses, velocity, most, slow):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Solve a step until its contacts agree with the solution; return iterations, passes, what the solver lost, and whether they agree.
+
+    `engine` are what `new_velocity` takes; `base` the right side without friction (3 pad,); `masses` those of the lattice, its smoother
+    and, for the matrix, all of them with drags.
+    """
+    blocks, tables, x, v, y, right, work, inner, step, solver = engine
+    node, direction, speed, body = held
+    mode, sliding, drag, _, _ = modes
+    near, after, force, applied = seen
+    mass, smoother, heavy = masses
+    pad, iterations, lost = len(mass), 0, 0.0
+    moved, row = np.empty_like(x), np.zeros(pad, np.int64)
+    for m in range(len(candidates)):
+        row[candidates[m]] = m
+    for attempt in range(most):
+        right[:] = base
+        _load(candidates, mass, smoother, drag, sliding, velocity, step, pad, heavy, inner[2], inner[3], right)
+        count = _constraints(candidates, mode, near, velocity, step, held)
+        now = (node[:count], direction[:count], speed[:count], body[:count])
+        done, lost = new_velocity(blocks, tables, x, v, y, heavy, right, work, inner, now, step, solver)
+        iterations += done
+        _forces(now, count, candidates, row, work[1], pad, step, near, force)
+        _dragged(candidates, mode, drag, sliding, near, velocity, v, pad, force, applied)
+        for i in range(len(x)):
+            moved[i] = x[i] + step * v[i]
+        _look(shapes, places, moved, candidates, pad, after)
+        if _judge(modes, seen, friction, v, candidates, velocity, pad, (1e-9, slow)) == 0:
+            return iterations, attempt + 1, lost, True
+    return iterations, most, lost, False
+
+
+@njit(cache=True)
+def contact_steps(blocks, tables, x, v, y, lengths, mass, external, work, inner, bodies, memory, velocity, step, solver, reaction, limit):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Take len(velocity) steps in contact; x, v, y, lengths, `memory` and places are changed, reaction (steps, bodies, 3) is filled.
 
     `bodies` are shapes (kinds, axes, sizes), places (bodies, 3), friction (bodies, 2), pull-off (bodies, 3) and the masses that may touch;
-    `memory` mode (c, bodies), friction of sliding masses (c, bodies, 3) and whether they ever touched (c, bodies). Returns iterations,
-    passes and the steps whose contacts did not settle.
+    `memory` mode (c, bodies), friction of sliding masses (c, bodies, 3) and whether they ever touched (c, bodies); `limit` the most passes
+    and the speed, mm/s, below which masses stick. Returns iterations, passes and the steps whose contacts did not settle.
     """
     shapes, places, friction, pull, candidates = bodies
     mode, sliding, touched = memory
+    most, slow = limit
     pad, c, k = len(mass), len(candidates), len(places)
-    near, after, force, applied = np.zeros((c, k, 4)), np.zeros((c, k, 4)), np.zeros((c, k, 3)), np.zeros((c, k, 3))
-    node, direction, speed, body = np.zeros(3 * c, np.int64), np.zeros((3 * c, 3)), np.zeros(3 * c), np.zeros(3 * c, np.int64)
-    row = np.zeros(pad, np.int64)
-    for m in range(c):
-        row[candidates[m]] = m
-    right, before, moved, base = np.zeros_like(x), np.zeros_like(x), np.zeros_like(x), np.zeros_like(x)
+    near, force, applied = np.zeros((c, k, 4)), np.zeros((c, k, 3)), np.zeros((c, k, 3))
+    held = (np.zeros(3 * c, np.int64), np.zeros((3 * c, 3)), np.zeros(3 * c), np.zeros(3 * c, np.int64))
+    right, before, base, drag = np.zeros_like(x), np.zeros_like(x), np.zeros_like(x), np.zeros((c, k))
+    heavy, smoother = mass.copy(), inner[3].copy()
     iterations, passes, unsettled = 0, 0, 0
+    begin(inner[8])
     for n in range(len(velocity)):
-        for i in range(len(v)):
-            before[i] = v[i]
-            base[i] = step * external[i] if len(external) else 0.0
+        before[:] = v
+        base[:] = 0.0
+        for i in range(len(external)):
+            base[i] = step * external[i]
         places += step * velocity[n]
         _look(shapes, places, x, candidates, pad, near)  # gaps of the old masses from the new bodies
         _pull_off(touched, mode, pull, near, velocity[n], v, mass, candidates, step, pad, base, reaction[n])
         add_momenta(mass, v, 1.0, base)
-        lost = 0.0
-        switched = np.zeros((c, k), np.int64)
-        settled = False
-        for attempt in range(most):
-            for i in range(len(v)):
-                right[i] = base[i]
-            for m in range(c):
-                for q in range(k):
-                    for a in range(3):
-                        applied[m, q, a] = sliding[m, q, a] if mode[m, q] == SLIDE else 0.0
-                        right[a * pad + candidates[m]] += step * applied[m, q, a]
-            count = _constraints(candidates, mode, near, velocity[n], step, (node, direction, speed, body))
-            held = (node[:count], direction[:count], speed[:count], body[:count])
-            done, lost = new_velocity(blocks, tables, x, v, y, mass, right, work, inner, held, step, solver)
-            iterations += done
-            passes += 1
-            _forces(held, count, candidates, row, work[1], pad, step, near, force)
-            for i in range(len(x)):
-                moved[i] = x[i] + step * v[i]
-            _look(shapes, places, moved, candidates, pad, after)
-            if _judge(mode, friction, near, after, force, sliding, v, candidates, velocity[n], pad, 1e-9, attempt < 3, switched) == 0:
-                settled = True
-                break
-        unsettled += not settled
+        _begin(mode, friction, near, sliding, drag, v, candidates, velocity[n], pad, slow)
+        modes = (mode, sliding, drag, np.zeros((c, k)), np.zeros((c, k, 2), np.int64))
+        seen, solved = (near, np.zeros_like(near), force, applied), (blocks, tables, x, v, y, right, work, inner, step, solver)
+        masses = (mass, smoother, heavy)
+        done, tries, lost, agreed = _settle(
+            solved, held, modes, seen, shapes, places, friction, candidates, base, masses, velocity[n], most, slow
+        )
+        iterations, passes, unsettled = iterations + done, passes + tries, unsettled + (not agreed)
         for m in range(c):
             for q in range(k):
                 for a in range(3):
                     reaction[n, q, a] += force[m, q, a] + applied[m, q, a]
-                if mode[m, q] != FREE:
-                    touched[m, q] = True
+                    sliding[m, q, a] = applied[m, q, a] if mode[m, q] == SLIDE else 0.0
+                touched[m, q] |= mode[m, q] != FREE
         advance(blocks, tables, x, v, before, y, lengths, mass, work[0], step, lost)
+    for m in candidates:  # the engine's own, as they were
+        inner[2][m], inner[3][m] = mass[m], smoother[m]
     return iterations, passes, unsettled

@@ -16,6 +16,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from naibu.mechanics.lattice_coarse_kernels import begin_with, follow
+from naibu.mechanics.lattice_solver import dot, multiply, project, solve
 from naibu.mechanics.simd import WIDTH, inverse_root, load, single, splat, store, total
 
 _FAST = {"contract", "nsz"}
@@ -65,157 +67,6 @@ def prepare(first, second, rows, tables, x, y, v, axes, rough, r, step):  # type
         store(f1, i, load(f1, i) + fy)
         store(f2, i, load(f2, i) + fz)
     return float(total(strength))
-
-
-@njit(cache=True, fastmath=_FAST)
-def multiply(first, second, rows, stiff, axes, mass, p, q):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Set q to A p and return p . q; `stiff` is the table of h^2 a."""
-    pad = len(p) // 3
-    e0, e1, e2 = axes[0], axes[1], axes[2]
-    p0, p1, p2, q0, q1, q2 = p[:pad], p[pad : 2 * pad], p[2 * pad :], q[:pad], q[pad : 2 * pad], q[2 * pad :]
-    zero = splat(p.dtype.type(0))
-    energy = zero
-    for i in range(0, pad, WIDTH):
-        m = load(mass, i)
-        px, py, pz = load(p0, i), load(p1, i), load(p2, i)
-        energy = energy + m * (px * px + py * py + pz * pz)
-        store(q0, i, m * px)
-        store(q1, i, m * py)
-        store(q2, i, m * pz)
-    b, end = 0, len(first)
-    while b < end:
-        i = first[b]
-        px, py, pz = load(p0, i), load(p1, i), load(p2, i)
-        fx, fy, fz = zero, zero, zero
-        while b < end and first[b] == i:
-            j, at = second[b], WIDTH * b
-            ex, ey, ez = load(e0, at), load(e1, at), load(e2, at)
-            change = (load(p0, j) - px) * ex + (load(p1, j) - py) * ey + (load(p2, j) - pz) * ez
-            force = load(stiff, rows[b]) * change
-            energy = energy + force * change
-            ex, ey, ez = ex * force, ey * force, ez * force
-            fx, fy, fz = fx + ex, fy + ey, fz + ez
-            store(q0, j, load(q0, j) + ex)
-            store(q1, j, load(q1, j) + ey)
-            store(q2, j, load(q2, j) + ez)
-            b += 1
-        store(q0, i, load(q0, i) - fx)
-        store(q1, i, load(q1, i) - fy)
-        store(q2, i, load(q2, i) - fz)
-    return float(total(energy))
-
-
-@njit(cache=True, fastmath=_FAST)
-def dot(a, b):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return a . b of arrays whose length is a multiple of eight."""
-    s = splat(a.dtype.type(0))
-    for i in range(0, len(a), WIDTH):
-        s = s + load(a, i) * load(b, i)
-    return float(total(s))
-
-
-@njit(cache=True, fastmath=_FAST)
-def _descend(v, r, p, q, smoother, alpha):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Move v by alpha p and r by -alpha q; return r . smoother r."""
-    s, along = splat(v.dtype.type(0)), splat(alpha)
-    for i in range(0, len(v), WIDTH):
-        store(v, i, load(v, i) + along * load(p, i))
-        residual = load(r, i) - along * load(q, i)
-        store(r, i, residual)
-        s = s + residual * (residual * load(smoother, i))
-    return float(total(s))
-
-
-@njit(cache=True, fastmath=_FAST)
-def _turn(p, r, smoother, beta):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Set p to smoother r + beta p."""
-    part = splat(beta)
-    for i in range(0, len(p), WIDTH):
-        store(p, i, load(smoother, i) * load(r, i) + part * load(p, i))
-
-
-@njit(cache=True, fastmath=_FAST)
-def project(held, q, pad):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Take the held components out of q; the directions at one mass are orthogonal."""
-    node, direction = held[0], held[1]
-    for h in range(len(node)):
-        i = node[h]
-        along = direction[h, 0] * q[i] + direction[h, 1] * q[pad + i] + direction[h, 2] * q[2 * pad + i]
-        for a in range(3):
-            q[a * pad + i] -= along * direction[h, a]
-
-
-@njit(cache=True, fastmath=_FAST)
-def conjugate_gradients(first, second, rows, inner, held, goal, limit):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Set w to about A^-1 r with held components zero, until the square of the residual's norm, times `smoother`, is below `goal`.
-
-    `inner` are h^2 a, axes, mass, smoother, w, r, p, q. Returns the number of iterations.
-    """
-    stiff, axes, mass, smoother, w, r, p, q = inner
-    kind = w.dtype.type
-    w[:] = 0
-    project(held, r, len(mass))
-    _turn(p, r, smoother, kind(0))
-    old = dot(r, p)
-    count = 0
-    while count < limit and old > goal:
-        curvature = multiply(first, second, rows, stiff, axes, mass, p, q)
-        if not curvature > 0.0:
-            break
-        project(held, q, len(mass))
-        new = _descend(w, r, p, q, smoother, kind(old / curvature))
-        _turn(p, r, smoother, kind(new / old))
-        old = new
-        count += 1
-    return count
-
-
-@njit(cache=True, fastmath=_FAST)
-def _norm(r, smoother, held):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return the square of the norm of the free part of r in `smoother`."""
-    pad = len(r) // 3
-    norm = 0.0
-    for i in range(len(r)):
-        norm += r[i] * r[i] * smoother[i]
-    for h in range(len(held[0])):
-        i = held[0][h]
-        along = held[1][h, 0] * r[i] + held[1][h, 1] * r[pad + i] + held[1][h, 2] * r[2 * pad + i]
-        norm -= along * along * smoother[i]
-    return norm
-
-
-@njit(cache=True, fastmath=_FAST)
-def _correct(v, r, q, share):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Take share times q from r."""
-    part = splat(share)
-    for i in range(0, len(v), WIDTH):
-        store(r, i, load(r, i) - part * load(q, i))
-
-
-@njit(cache=True, fastmath=_FAST)
-def solve(first, second, rows, stiff, axes, mass, v, r, p, q, inner, held, floor, tolerance, limit):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Improve v, whose residual is r, by conjugate gradients in single precision, again while r in full precision asks for it.
-
-    It stops where the residual's norm fell to `tolerance` of its start or its square below `floor`. Returns the number of iterations.
-    """
-    norm = _norm(r, inner[3], held)
-    goal = max(tolerance**2 * norm, floor)
-    count = 0
-    w, rough = inner[4], inner[5]
-    for _ in range(8):
-        if not norm > goal or count >= limit:
-            break
-        unit = np.sqrt(norm)
-        for i in range(len(r)):
-            rough[i] = r[i] / unit
-        count += conjugate_gradients(first, second, rows, inner, held, max(0.9 * goal / norm, 1e-10), limit - count)
-        for i in range(len(v)):
-            p[i] = unit * w[i]
-            v[i] += p[i]
-        multiply(first, second, rows, stiff, axes, mass, p, q)
-        _correct(v, r, q, 1.0)
-        norm = _norm(r, inner[3], held)
-    return count
 
 
 @njit(cache=True)
@@ -365,6 +216,7 @@ def new_velocity(blocks, tables, x, v, y, mass, right, work, inner, held, step, 
     first, second, rows = blocks
     axes, r, p, q = work
     hold(held, v, len(mass))
+    follow(inner[8], inner[3], held, False)
     r[:] = right
     add_momenta(mass, v, -1.0, r)
     floor = prepare(first, second, rows, tables, x, y, v, axes, inner[1], r, step) * 1e-20 / mass.max()
@@ -415,18 +267,22 @@ def advance(blocks, tables, x, v, before, y, lengths, mass, axes, step, lost):  
     return True
 
 
-@njit(cache=True, fastmath=_FAST)
-def implicit_steps(blocks, tables, x, v, y, lengths, mass, external, work, inner, held, velocity, step, solver, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Take len(velocity) steps with constant external forces (3 pad,), mN, or none; reaction (steps, bodies, 3) is filled.
+@njit(cache=True, fastmath=_FAST, nogil=True)
+def implicit_steps(blocks, tables, state, mass, external, work, inner, held, velocity, step, solver, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Take len(velocity) steps with constant external forces (3 pad,), mN, or none.
+
+    The state x, v, y and lengths is changed, reaction (steps, bodies, 3), zero before, is filled.
 
     `held` are mass, direction, weight and body of held components, which move by their weights times the velocity (steps, bodies, 3) of
     their bodies. Returns the number of iterations, and in how many steps rotation had to be held back.
     """
+    x, v, y, lengths = state
     iterations, checked = 0, 0
     right, before = np.zeros_like(x), np.zeros_like(x)
     node, direction, weight, body = held
     speed = np.zeros(len(node))
     now = (node, direction, speed, body)
+    begin_with(inner, now)
     for n in range(len(velocity)):
         for i in range(len(v)):
             before[i] = v[i]

@@ -3,12 +3,13 @@
 # arrays of masses hold x, y and z one after the other, each with `pad` places; y is the extension of the Voigt parts, as blocks store it
 from __future__ import annotations
 
-import numpy as np
-from numba import njit, prange
+from numba import njit
 
+from naibu.mechanics.lattice_team import JOB, PARTS, REST, claim, expect, finish, judge, publish, wait
 from naibu.mechanics.simd import WIDTH, inverse_root, load, splat, store
 
 _FAST = {"contract", "nsz"}
+FORCES = 0  # the first job of a step; the second one moves the masses
 
 
 @njit(cache=True, fastmath=_FAST)
@@ -75,26 +76,6 @@ def move(x, v, f, inverse_mass, step, forward, pad, begin, end):  # type: ignore
 
 
 @njit(cache=True, fastmath=_FAST)
-def explicit_steps(blocks, tables, x, v, y, masses, external, held, velocity, step, forward, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Take len(velocity) steps on one thread; x, v, y are changed, reaction (steps, bodies, 3) is filled.
-
-    `blocks` are first, second and rows, `masses` mass and inverse mass, `held` as in `drive`, `external` forces or empty.
-    """
-    first, second, rows = blocks
-    mass, inverse_mass = masses
-    pad = len(mass)
-    f = np.zeros_like(x)
-    for n in range(len(velocity)):
-        if len(external):
-            f[:] = external
-        else:
-            f[:] = 0
-        element_forces(first, second, rows, tables, x, v, y, f, pad, 0, len(first))
-        drive(held, velocity[n], v, f, mass, step, reaction[n])
-        move(x, v, f, inverse_mass, step, forward, pad, 0, pad - WIDTH)
-
-
-@njit(cache=True, fastmath=_FAST)
 def _gather(forces, external, low, high, begin, end, p, pad):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add to the forces of part p what other parts and external forces exert on the masses begin to end."""
     f = forces[p]
@@ -109,31 +90,71 @@ def _gather(forces, external, low, high, begin, end, p, pad):  # type: ignore[no
                 f[place] += external[place]
 
 
-@njit(cache=True, fastmath=_FAST, parallel=True)
-def explicit_steps_threaded(blocks, parts, tables, x, v, y, masses, external, held, velocity, step, forward, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Take steps as `explicit_steps` does, on several threads without any race.
+@njit(cache=True, fastmath=_FAST)
+def _part(job, p, data):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Do part p of a step's first job, the forces of its blocks, or of the second, the motion of its masses; see `explicit_steps`."""
+    (first, second, rows), parts, tables, (x, v, y), (mass, inverse_mass), external, held, (now, shares), forces, (step, forward) = data
+    cuts, nodes, low, high, mine = parts
+    pad, f = len(mass), forces[p]
+    if job == FORCES:
+        for axis in range(3):
+            f[axis * pad + low[p] : axis * pad + high[p]] = 0
+        element_forces(first, second, rows, tables, x, v, y, f, pad, cuts[p], cuts[p + 1])
+        return
+    _gather(forces, external, low, high, nodes[p], nodes[p + 1], p, pad)
+    begin, end = mine[p], mine[p + 1]
+    own = (held[0][begin:end], held[1][begin:end], held[2][begin:end], held[3][begin:end])
+    shares[p] = 0.0
+    drive(own, now, v, f, mass, step, shares[p])
+    move(x, v, f, inverse_mass, step, forward, pad, nodes[p], nodes[p + 1])
+
+
+@njit(cache=True)
+def _share(control, job, data):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Have all parts of a job done; return how many naps it took to wait for helpers."""
+    alone, part = control[PARTS] == 1 or control[REST] > 0, 0
+    if not alone:
+        publish(control, job)
+        part = claim(control)
+    while 0 <= part < control[PARTS]:
+        _part(job, part, data)
+        if alone:
+            part += 1
+        else:
+            finish(control)
+            part = claim(control)
+    return 0 if alone else wait(control)
+
+
+@njit(cache=True, nogil=True)
+def help_explicit(control, data):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Take parts of the jobs of `explicit_steps` while there are some."""
+    part = expect(control)
+    while part >= 0:
+        _part(control[JOB], part, data)
+        finish(control)
+        part = expect(control)
+
+
+@njit(cache=True, nogil=True)
+def explicit_steps(control, data, velocity, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Take len(velocity) steps, alone or with helpers, who change nothing in the result; reaction (steps, bodies, 3) is filled.
+
+    `data` are blocks (first, second, rows), parts, tables, the state x, v, y, which is changed, masses with their inverses, external
+    forces or none, what is held as in `drive`, the velocities of bodies (bodies, 3) in a step and each part's reactions
+    (parts, bodies, 3), each part's forces (parts, 3 pad), and the step with whether it is forward (Euler's).
 
     Part p has the blocks parts[0][p] to parts[0][p + 1], which touch the masses parts[2][p] to parts[3][p] and have forces of their own;
     it moves the masses parts[1][p] to parts[1][p + 1], among them the held ones parts[4][p] to parts[4][p + 1]. Sums are made in the same
     order each time.
     """
-    first, second, rows = blocks
-    mass, inverse_mass = masses
-    cuts, nodes, low, high, mine = parts
-    pad, count = len(mass), len(cuts) - 1
-    forces = np.zeros((count, 3 * pad), x.dtype)
-    shares = np.zeros((count, len(velocity), reaction.shape[1], 3), reaction.dtype)
+    now, shares = data[7]
     for n in range(len(velocity)):
-        for p in prange(count):
-            f = forces[p]
-            for axis in range(3):
-                f[axis * pad + low[p] : axis * pad + high[p]] = 0
-            element_forces(first, second, rows, tables, x, v, y, f, pad, cuts[p], cuts[p + 1])
-        for p in prange(count):
-            _gather(forces, external, low, high, nodes[p], nodes[p + 1], p, pad)
-            begin, end = mine[p], mine[p + 1]
-            own = (held[0][begin:end], held[1][begin:end], held[2][begin:end], held[3][begin:end])
-            drive(own, velocity[n], v, forces[p], mass, step, shares[p, n])
-            move(x, v, forces[p], inverse_mass, step, forward, pad, nodes[p], nodes[p + 1])
-    for p in range(count):
-        reaction += shares[p]
+        now[:] = velocity[n]
+        naps = 0
+        for job in range(2):
+            naps += _share(control, job, data)
+        judge(control, naps)
+        reaction[n] = 0.0
+        for p in range(len(shares)):
+            reaction[n] += shares[p]

@@ -18,7 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from naibu.core.errors import InputError
 from naibu.mechanics.lattice import Array, Integers, LatticeParameters
 from naibu.mechanics.lattice_blocks import implicit_coefficients
-from naibu.mechanics.lattice_implicit import add_momenta, add_reactions, advance, hold, multiply, new_velocity, solve
+from naibu.mechanics.lattice_coarse_kernels import begin_with
+from naibu.mechanics.lattice_implicit import add_momenta, add_reactions, advance, hold, new_velocity
+from naibu.mechanics.lattice_solver import multiply, solve
 from naibu.mechanics.lattice_stepping import (
     HeldNodes,
     LatticeEngine,
@@ -310,6 +312,7 @@ def _driven_steps(  # type: ignore[no-untyped-def]  # pragma: no cover
     speed, weightless = np.zeros(len(held_node)), np.zeros_like(force[0])
     now, still, pad = (held_node, direction, speed, held_by), (held_node, direction, np.zeros(len(held_node)), held_by), len(mass)
     right, before, old_lengths = np.zeros_like(x), np.zeros_like(x), np.zeros_like(lengths)
+    begin_with(inner, now)
     for n in range(len(velocity)):
         before[:] = v
         right[:] = 0

@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from naibu.core.errors import ConvergenceError, InputError
-from naibu.mechanics import lattice_implicit, lattice_kernels
 from naibu.mechanics.lattice import Array, Integers, Lattice, LatticeParameters, require_positive
 from naibu.mechanics.lattice_blocks import Blocks, explicit_coefficients, explicit_kernel, implicit_kernel
-from naibu.mechanics.lattice_blocks import aligned as aligned
+from naibu.mechanics.lattice_stepper import ExplicitStepper, ImplicitStepper, Stepper, own_copy
+from naibu.mechanics.lattice_team import MOST_PARTS
 from naibu.mechanics.simd import WIDTH
+from naibu.mechanics.simd import aligned as aligned
 
 Method = Literal["implicit", "euler", "symplectic_euler"]
 THREADED_FROM = 20_000  # elements; below, one thread is faster than two that wait for each other
@@ -186,7 +187,7 @@ class LatticeEngine:
         if method == "implicit":
             kernel = implicit_kernel(lattice, parameters, step, blocks, mass)
         else:
-            kernel = explicit_kernel(parameters, step, blocks, mass, min(threads, numba.get_num_threads()), method == "euler")
+            kernel = explicit_kernel(parameters, step, blocks, mass, min(threads, MOST_PARTS), method == "euler")
         return cls(lattice, parameters, float(step), method, blocks, float(tolerance), threads, kernel, mass)
 
     def rest(self) -> LatticeState:
@@ -224,39 +225,36 @@ class LatticeEngine:
             The explicit method blew up.
         """
         held = held or HeldNodes.none()
-        path = checked_velocity(velocity, steps, int(held.body.max(initial=-1)) + 1)
+        bodies = int(held.body.max(initial=-1)) + 1
+        path = checked_velocity(velocity, steps, bodies)
+        stepper = self.stepper(state, external_force, shared=True)
+        require_held(held, self.lattice.n_nodes)
+        reaction = np.zeros(path.shape)
+        stepper.hold((held.node, held.direction, held.weight, held.body), path.shape[1])
+        iterations, held_back = stepper.advance(path, reaction)
+        stepper.close()
+        self.check(stepper, steps)
+        return Motion(self.state(stepper), reaction, iterations / max(steps, 1), held_back)
+
+    def stepper(self, state: LatticeState, external_force: ArrayLike | None = None, *, shared: bool) -> Stepper:
+        """Return what takes steps from a state on; if `shared`, with the engine's working arrays, which serve one at a time.
+
+        Raises
+        ------
+        InputError
+            Arrays of other shapes, or NaN.
+        """
         x, v, y = self.stored(state)
         external = aligned((0,), x.dtype)
         if external_force is not None:
             force = np.broadcast_to(np.asarray(external_force, dtype=float), self.lattice.points.shape)
             require_numbers(force, "external_force")
             external = self.by_component(force, x.dtype)
-        reaction = np.zeros(path.shape)
-        entries = (held.node, held.direction, held.weight, held.body)
-        require_held(held, self.lattice.n_nodes)
         if self.method != "implicit":
-            self._explicit(x, v, y, external, entries, path, reaction)
-            return Motion(self._checked(self.read(x, v, y), steps), reaction)
-        lengths = self.stored_lengths(state)
+            return ExplicitStepper(x, v, y, None, self.kernel, external, self.step, self.method == "euler")
         blocks, tables, work, inner = self.kernel
-        count, held_back = lattice_implicit.implicit_steps(
-            blocks, tables, x, v, y, lengths, self.mass, external, work, inner, entries, path, self.step, (self.tolerance, 20_000), reaction
-        )
-        known = lengths[self.blocks.lane]
-        return Motion(replace(self.read(x, v, y), length=known), reaction, count / max(steps, 1), held_back)
-
-    def _explicit(self, x: Any, v: Any, y: Any, external: Any, held: tuple[Any, ...], velocity: Array, reaction: Array) -> None:
-        blocks, tables, masses, parts = self.kernel
-        step, forward = x.dtype.type(self.step), self.method == "euler"
-        if parts is None:
-            lattice_kernels.explicit_steps(blocks, tables, x, v, y, masses, external, held, velocity, step, forward, reaction)
-            return
-        order = np.argsort(held[0], kind="stable")
-        entries = tuple(values[order] for values in held)
-        mine = np.searchsorted(entries[0], parts[1])
-        lattice_kernels.explicit_steps_threaded(
-            blocks, (*parts, mine), tables, x, v, y, masses, external, entries, velocity, step, forward, reaction
-        )
+        own = (blocks, tables, work, inner) if shared else (blocks, tables, own_copy(work), own_copy(inner))
+        return ImplicitStepper(x, v, y, self.stored_lengths(state), own, shared, external, self.step, self.mass, self.tolerance)
 
     def energy(self, state: LatticeState) -> float:
         """Return kinetic energy plus that of the springs, mN mm; free of supports and forces it never grows."""
@@ -309,15 +307,30 @@ class LatticeEngine:
         result.reshape(3, -1)[:, : len(values)] = values.T
         return result
 
-    def _checked(self, state: LatticeState, steps: int) -> LatticeState:
-        reach = 1e3 * (np.ptp(self.lattice.points, axis=0).max() + self.lattice.spacing_mm)
-        if not (np.isfinite(state.velocity).all() and np.abs(state.position - self.lattice.points).max() < reach):
+    def state(self, stepper: Stepper) -> LatticeState:
+        """Return a copy of the state that a stepper has reached."""
+        found = self.read(stepper.position, stepper.velocity, stepper.extension)
+        return found if stepper.length is None else replace(found, length=stepper.length[self.blocks.lane])
+
+    def check(self, stepper: Stepper, steps: int) -> None:
+        """Check that explicit steps did not blow up; the implicit ones cannot.
+
+        Raises
+        ------
+        ConvergenceError
+            They did.
+        """
+        if self.method == "implicit":
+            return
+        n, points = self.lattice.n_nodes, self.lattice.points
+        reach = 1e3 * (np.ptp(points, axis=0).max() + self.lattice.spacing_mm)
+        moved = np.abs(stepper.position.reshape(3, -1)[:, :n] - points.T).max()
+        if not (np.isfinite(stepper.velocity).all() and moved < reach):
             limit = explicit_step_limit(self.lattice, self.parameters)
             raise ConvergenceError(
                 f"the explicit steps of {self.step:g} s blew up within {steps} steps; the springs and dampers allow about {limit:.2g} s: "
                 "take shorter steps, or method='implicit', which is stable for all parameters"
             )
-        return state
 
 
 def _check(
@@ -426,5 +439,6 @@ def with_parameters(engine: LatticeEngine, parameters: LatticeParameters) -> Lat
     if engine.method == "implicit":
         kernel = implicit_kernel(engine.lattice, parameters, engine.step, engine.blocks, engine.mass)
     else:
-        kernel = explicit_kernel(parameters, engine.step, engine.blocks, engine.mass, engine.threads, engine.method == "euler")
+        threads = min(engine.threads, MOST_PARTS)
+        kernel = explicit_kernel(parameters, engine.step, engine.blocks, engine.mass, threads, engine.method == "euler")
     return replace(engine, parameters=parameters, kernel=kernel)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import operator
 from typing import Any
 
+import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
 from numba.core import cgutils
@@ -112,6 +113,16 @@ def _single(typingcontext, value):  # type: ignore[no-untyped-def]
     return narrow(value), codegen
 
 
+def _double(typingcontext, value):  # type: ignore[no-untyped-def]
+    """Return the numbers in double precision."""
+    wide = Vector(types.float64)
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return args[0] if value == wide else builder.fpext(args[0], _ir_type(types.float64))
+
+    return wide(value), codegen
+
+
 def _inverse_root(typingcontext, value):  # type: ignore[no-untyped-def]
     """Return 1 / sqrt(value) of positive numbers; in double precision by a step of third order from the single one.
 
@@ -141,12 +152,21 @@ def _inverse_root(typingcontext, value):  # type: ignore[no-untyped-def]
     return value(value), codegen
 
 
+def aligned(shape: tuple[int, ...], kind: Any) -> Any:
+    """Return zeros that begin where a line of the cache does."""
+    size = int(np.prod(shape)) * np.dtype(kind).itemsize
+    raw = np.zeros(size + 64, dtype=np.uint8)
+    start = -raw.ctypes.data % 64
+    return raw[start : start + size].view(kind).reshape(shape)
+
+
 # known to the type checker as anything: it takes the typing context for an argument
 load: Any = intrinsic(_load)
 store: Any = intrinsic(_store)
 splat: Any = intrinsic(_splat)
 total: Any = intrinsic(_total)
 single: Any = intrinsic(_single)
+double: Any = intrinsic(_double)
 inverse_root: Any = intrinsic(_inverse_root)
 
 
