@@ -15,8 +15,8 @@ from naibu.core.errors import NaibuError
 from naibu.imaging.evaluation import end_point_error
 from naibu.imaging.methods import Method
 from naibu.imaging.resampling import warped
-from naibu.reproduction.chapter import Cell, Chapter, Figure, Section, Table
-from naibu.reproduction.page import write_chapter
+from naibu.pages.chapter import Cell, Chapter, Figure, Section, Table
+from naibu.pages.page import write_chapter
 from naibu.result_files import result_folder
 from naibu.sense_runs import Pair, SenseRun, sense_pair
 

@@ -18,8 +18,8 @@ from naibu.imaging.marker_tracking import TrackedMarkers, track_markers
 from naibu.io.images import read_volume
 from naibu.io.provenance import input_record
 from naibu.io.tables import write_experiment_folder, write_markers
-from naibu.reproduction.chapter import Cell, Chapter, Figure, Section, Table
-from naibu.reproduction.page import write_chapter
+from naibu.pages.chapter import Cell, Chapter, Figure, Section, Table
+from naibu.pages.page import write_chapter
 from naibu.result_files import result_folder
 
 if TYPE_CHECKING:

@@ -13,9 +13,10 @@ from matplotlib.figure import Figure as Canvas
 from naibu import datasets
 from naibu.imaging.evaluation import intensity_rms, moved_back
 from naibu.imaging.rigid import rigid_from_points
+from naibu.pages.chapter import Chapter, Table
+from naibu.pages.page import chapter_numbers, write_chapter
 from naibu.reproduction.calf_motion import FIBULA, FIBULA_REACH, TIBIA, TIBIA_REACH, CalfMotion, leg_pose
 from naibu.reproduction.calf_phantom import TISSUES, CalfCase, CalfPhantom, calf_case
-from naibu.reproduction.chapter import Chapter, Table
 from naibu.reproduction.chapter1 import chapter1
 from naibu.reproduction.chapter1_matching import (
     WAYS,
@@ -28,7 +29,6 @@ from naibu.reproduction.chapter1_matching import (
     picked_registration,
     under_noise,
 )
-from naibu.reproduction.page import chapter_numbers, write_chapter
 
 PAPER = {t["id"]: t["rows"] for t in datasets.paper_tables()["tables"]}
 SIZES = {"pixels": 96, "slices": 15, "plane_points": (100, 120), "space_points": (300, 900), "draws": 1}

@@ -11,7 +11,7 @@ from naibu.mechanics.linear_elasticity import LinearBody
 from naibu.mechanics.materials import lame_parameters
 from naibu.mechanics.rheology import three_element
 from naibu.mechanics.supports import Prescribed
-from naibu.reproduction.chapter import Chapter, Table
+from naibu.pages.chapter import Chapter, Table
 from naibu.reproduction.chapter2 import (
     COMPARED,
     REPORTED_ERROR_MM,

@@ -13,13 +13,13 @@ from naibu.core.errors import InputError
 from naibu.identification.field_balance import field_balance
 from naibu.identification.field_trial import Zones
 from naibu.mechanics.simplices import simplices
-from naibu.reproduction.chapter import Section, Table
+from naibu.pages.chapter import Section, Table
+from naibu.pages.page import write_chapter
 from naibu.reproduction.chapter3 import chapter3
 from naibu.reproduction.chapter3_cubes import every_cell, layer_section, mean_error_percent, most_frequent, reach_section, uniform_section
 from naibu.reproduction.chapter3_experiment import EXPERIMENT, experiment_section, lattice, printed_errors
 from naibu.reproduction.chapter3_noise import noise_scatter, noise_section
 from naibu.reproduction.chapter3_square import accumulation, square_section
-from naibu.reproduction.page import write_chapter
 from naibu.reproduction.report_cubes import LAYERS, UNIFORM, PushedBody, Split, cube, shape_error_percent, split_hexahedra, square
 
 PAPER = {t["id"]: t["rows"] for t in datasets.paper_tables()["tables"]}

@@ -7,7 +7,7 @@ import pytest
 
 from naibu import datasets
 from naibu.identification.lattice_calibration import ReportIndices
-from naibu.reproduction.chapter import Table
+from naibu.pages.chapter import Table
 from naibu.reproduction.chapter4_cube import TABLES, cube_section
 from naibu.reproduction.chapter4_lattice import _one_set, _pattern_table, exact_section
 from naibu.reproduction.chapter4_octree import chapter4_octree, cost_section

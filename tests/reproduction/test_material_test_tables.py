@@ -7,7 +7,7 @@ import pytest
 
 from naibu import datasets
 from naibu.core.errors import InputError
-from naibu.reproduction.chapter import Section
+from naibu.pages.chapter import Section
 from naibu.reproduction.material_test_tables import CHANCE, COMPLIANCE, HELD, SLACK, Specimens, explained_spread, table_3_4, table_3_5
 from naibu.reproduction.poisson_readings import GELS, held_block, marker_ratios, pairs_that_fit, readings
 

@@ -32,8 +32,8 @@ def reproduce(chapter: ChapterName, *, out: Path = Path("naibu-reproduction"), s
     seed
         Of all random numbers.
     """
+    from naibu.pages.page import write_chapter
     from naibu.reproduction.chapters import CHAPTERS
-    from naibu.reproduction.page import write_chapter
 
     began = time.perf_counter()
     with errors.status("starting"):

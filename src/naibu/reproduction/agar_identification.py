@@ -13,7 +13,7 @@ from naibu.core.parameters import MAX_POISSON_RATIO
 from naibu.identification.motion_matching import MotionTrial, identify_motion, rheology_parameters
 from naibu.mechanics.moving_supports import Path, Support
 from naibu.mechanics.rheology import elastic
-from naibu.reproduction.chapter import Cell, Section, Table
+from naibu.pages.chapter import Cell, Section, Table
 from naibu.reproduction.rheology_studies import AGAR, AGAR_PUSH_MM, AGAR_SIZE_MM, WEIGHT_MM, agar_block_3d
 
 Array = NDArray[np.float64]

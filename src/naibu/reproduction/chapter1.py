@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from naibu.imaging.evaluation import end_point_error, intensity_rms, moved_back
 from naibu.imaging.rigid import RigidMotion
+from naibu.pages.chapter import Cell, Chapter, Figure, Section, Table
 from naibu.reproduction import chapter1_figures as drawn
 from naibu.reproduction.calf_motion import leg_pose
 from naibu.reproduction.calf_phantom import CalfCase, calf_case
-from naibu.reproduction.chapter import Cell, Chapter, Figure, Section, Table
 from naibu.reproduction.chapter1_flow import flow_section
 from naibu.reproduction.chapter1_matching import (
     RIGHT_MM,

@@ -16,9 +16,9 @@ from naibu.imaging.hybrid import hybrid_flow
 from naibu.imaging.optical_flow import AS_REPORTED, REPORT_LEVELS, horn_schunck, lucas_kanade
 from naibu.imaging.resampling import resampled_to_grid
 from naibu.imaging.rigid import RigidMotion
+from naibu.pages.chapter import Cell, Figure, Section, Table
 from naibu.reproduction import chapter1_figures as drawn
 from naibu.reproduction.calf_phantom import CalfCase, Tissue
-from naibu.reproduction.chapter import Cell, Figure, Section, Table
 from naibu.reproduction.chapter1_matching import REPORT_PIXEL_MM, judged, picked_registration
 
 Array = NDArray[np.float64]

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from naibu import datasets
 from naibu.mechanics.rheology import Rheology
+from naibu.pages.chapter import Cell, Chapter, Figure, Section, Table
 from naibu.reproduction import chapter2_figures as drawn
 from naibu.reproduction.agar_identification import agar_section
-from naibu.reproduction.chapter import Cell, Chapter, Figure, Section, Table
 from naibu.reproduction.rheology_studies import (
     AGAR,
     AGAR_PUSH_MM,

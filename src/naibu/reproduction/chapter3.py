@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from naibu.core.errors import InputError
-from naibu.reproduction.chapter import Chapter, Section
+from naibu.pages.chapter import Chapter, Section
 from naibu.reproduction.chapter3_cubes import layer_section, reach_section, uniform_section
 from naibu.reproduction.chapter3_experiment import MARKER_SD_MM, experiment_section
 from naibu.reproduction.chapter3_noise import NOISE_MM, noise_section

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from naibu.identification.field_balance import BalanceEstimate, field_balance
 from naibu.identification.field_trial import Zones
+from naibu.pages.chapter import Cell, Figure, Section, Table
 from naibu.reproduction import chapter3_figures as drawn
-from naibu.reproduction.chapter import Cell, Figure, Section, Table
 from naibu.reproduction.material_test_tables import printed_table
 from naibu.reproduction.report_cubes import LAYERS, PushedBody, Split, cube, shape_error_percent
 

@@ -17,8 +17,8 @@ from naibu.identification.field_trial import FieldTrial, Zones
 from naibu.identification.marker_mesh import MarkerMesh, marker_mesh
 from naibu.identification.whitened_balance import whitened_balance
 from naibu.mechanics.simplex_laws import SimplexLaw
+from naibu.pages.chapter import Cell, Figure, Section, Table
 from naibu.reproduction import chapter3_figures as drawn
-from naibu.reproduction.chapter import Cell, Figure, Section, Table
 from naibu.reproduction.chapter3_cubes import mean_error_percent
 from naibu.reproduction.material_test_tables import printed_table
 from naibu.reproduction.report_cubes import LAYERS, Split, cube, split_hexahedra

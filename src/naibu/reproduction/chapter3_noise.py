@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from naibu.core.field import Field
 from naibu.identification.field_balance import BalanceEstimate, field_balance
 from naibu.identification.whitened_balance import whitened_balance
+from naibu.pages.chapter import Cell, Figure, Section, Table
 from naibu.reproduction import chapter3_figures as drawn
-from naibu.reproduction.chapter import Cell, Figure, Section, Table
 from naibu.reproduction.report_cubes import LAYERS, PushedBody, cube
 
 Array = NDArray[np.float64]

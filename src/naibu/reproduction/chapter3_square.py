@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from naibu.identification.field_balance import field_balance
 from naibu.identification.field_trial import KNOWN, Zones
 from naibu.identification.incremental_balance import IncrementalStep, incremental_balance
-from naibu.reproduction.chapter import Cell, Figure, Section, Table
+from naibu.pages.chapter import Cell, Figure, Section, Table
 from naibu.reproduction.material_test_tables import printed_table
 from naibu.reproduction.report_cubes import SQUARE, PushedBody, square
 

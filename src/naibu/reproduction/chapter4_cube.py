@@ -7,7 +7,7 @@ from naibu.identification.lattice_pushing import Capture, PushedLattice
 from naibu.identification.lattice_unknowns import LatticeUnknowns
 from naibu.mechanics.lattice import Lattice, box_mask, classic_lattice
 from naibu.mechanics.octree_lattice import octree_lattice
-from naibu.reproduction.chapter import Cell, Chapter, Section, Table
+from naibu.pages.chapter import Cell, Chapter, Section, Table
 from naibu.reproduction.lattice_patterns import START, with_spread
 from naibu.reproduction.material_test_tables import printed_table
 from naibu.validation.lattice_twin import (

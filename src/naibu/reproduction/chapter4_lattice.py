@@ -6,7 +6,7 @@ import numpy as np
 
 from naibu.identification.lattice_calibration import CalibrationProblem, ReportIndices, calibrate_lattice
 from naibu.identification.lattice_unknowns import UNITS
-from naibu.reproduction.chapter import Cell, Chapter, Section, Table
+from naibu.pages.chapter import Cell, Chapter, Section, Table
 from naibu.reproduction.lattice_patterns import START, PatternStudy, pattern_study, with_spread
 from naibu.reproduction.material_test_tables import printed_table
 from naibu.validation.lattice_twin import FORCE_SD_MN, POINT_SD_MM, POINTS, TRUTH, dough_lattice, dough_twin

@@ -10,7 +10,7 @@ import numpy as np
 from naibu.mechanics.lattice import Lattice, box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattice_stepping import LatticeEngine
 from naibu.mechanics.octree_lattice import octree_lattice
-from naibu.reproduction.chapter import Cell, Chapter, Section, Table
+from naibu.pages.chapter import Cell, Chapter, Section, Table
 from naibu.reproduction.material_test_tables import printed_table
 
 KINDS = ("classic", "type 0", "type 1", "type 2")

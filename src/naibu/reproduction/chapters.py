@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from naibu.reproduction.chapter import Chapter
+from naibu.pages.chapter import Chapter
 from naibu.reproduction.chapter1 import chapter1
 from naibu.reproduction.chapter2 import chapter2
 from naibu.reproduction.chapter3 import chapter3

@@ -14,7 +14,7 @@ from naibu.identification.field_search import Objective, first_point, search
 from naibu.identification.field_sensitivity import FieldModel, logarithms, young_and_poisson
 from naibu.identification.field_trial import FieldTrial
 from naibu.meshing.location import interpolation_operator
-from naibu.reproduction.chapter import Figure, Section, Table
+from naibu.pages.chapter import Figure, Section, Table
 from naibu.reproduction.report_cubes import PushedBody, cube
 
 if TYPE_CHECKING:

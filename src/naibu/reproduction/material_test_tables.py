@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 
 from naibu import datasets
 from naibu.identification.material_tests import Specimen, poisson_ratio, specimen_mean
-from naibu.reproduction.chapter import Cell, Figure, Section, Table
+from naibu.pages.chapter import Cell, Figure, Section, Table
 from naibu.reproduction.poisson_readings import (
     GELS,
     PIXEL_MM,

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from matplotlib.figure import Figure as Canvas
 
-from naibu.reproduction.chapter import Chapter, Figure, Section, Table
-from naibu.reproduction.page import write_chapter
+from naibu.pages.chapter import Chapter, Figure, Section, Table
+from naibu.pages.page import write_chapter
 
 
 def draw(canvas: Canvas) -> None:

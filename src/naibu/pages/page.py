@@ -1,4 +1,4 @@
-"""A reproduced chapter as one self-contained HTML page, and its numbers as JSON."""
+"""A chapter as one self-contained HTML page, and its numbers as JSON."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 import naibu
 from naibu.io.atomic import write_atomically
-from naibu.reproduction.chapter import Cell, Chapter, Figure, Section, Table
+from naibu.pages.chapter import Cell, Chapter, Figure, Section, Table
 
 STYLE = """
 :root { color-scheme: light; --line: #d5d8dc; --soft: #5b6470; --band: #f5f7f9; }

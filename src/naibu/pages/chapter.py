@@ -1,4 +1,4 @@
-"""What a reproduced chapter is made of: sections with tables (printed beside ours) and figures."""
+"""What a page of results is made of: sections with tables and figures, such as a reproduced chapter of the report."""
 
 from __future__ import annotations
 

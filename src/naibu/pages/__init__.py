@@ -1,0 +1,1 @@
+"""Pages of tables and figures: what is on them, and how they become HTML and JSON."""
