@@ -95,12 +95,12 @@ def _differences(n: int, fits: list[LatticeEstimate], lattices: list[Lattice], c
     rows: list[tuple[Cell, ...]] = []
     for time, *cells in printed:
         chosen = range(5) if time == "sum" else [int(time) - 1]
-        sums = [sum(f.shape_mm[k] for k in chosen) for f in found]
-        counts = [sum(f.points[k] for k in chosen) for f in found]
-        rows.append((time, *cells[:4], *(s / 1e3 for s in sums), *cells[4:], *(s / n for s, n in zip(sums, counts, strict=True))))
-    rows.append(("S_force, N", *[None] * 4, *(f.force_mn / 1e3 for f in found), *[None] * 8))
-    who = [f"{by}, {m}, {what}" for what in ("sum, m", "mean, mm") for by in ("paper", "ours") for m in MODELS]
+        for k, (model, ours) in enumerate(zip(MODELS, found, strict=True)):
+            distance, points = sum(ours.shape_mm[i] for i in chosen), sum(ours.points[i] for i in chosen)
+            rows.append((time, model, cells[k], distance / 1e3, cells[4 + k], distance / points))
+    rows += [("S_force, N", model, None, ours.force_mn / 1e3, None, None) for model, ours in zip(MODELS, found, strict=True)]
+    columns = ("time", "lattice", "paper, sum, m", "ours, sum, m", "paper, mean, mm", "ours, mean, mm")
     note = "The paper's 4 to 5 mm a point hold errors of registration, ours none."
     if number == "4-V":
         note = f"The report prints the octrees' means at the second time in cm. {note}"
-    return Table(f"Table {number[2:]}", f"S_shape at five times, {n + 1} masses an edge.", ("time", *who), tuple(rows), note)
+    return Table(f"Table {number[2:]}", f"S_shape at five times, {n + 1} masses an edge.", columns, tuple(rows), note)
