@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 from pathlib import Path
 
@@ -67,5 +68,7 @@ def test_the_example_of_a_page_runs(page: str, capsys: pytest.CaptureFixture[str
     text = (DOCS / f"{page}.rst").read_text(encoding="utf-8")
     found = re.findall(r"^\.\. code-block:: python\n\n((?:   .*\n|\n)+)", text, re.MULTILINE)
     assert found
+    if importlib.util.find_spec("warp") is None:  # an extra of 400 MB, for a device that few have
+        found = [code for code in found if "lattice_gpu" not in code]
     exec("\n".join(re.sub("^   ", "", code, flags=re.MULTILINE) for code in found), {})
     assert capsys.readouterr().out
