@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 from collections.abc import Sequence
+from concurrent.futures import Executor, Future
 from dataclasses import replace
 from typing import Any
 
@@ -204,6 +206,34 @@ def test_costs_are_the_same_in_processes_and_on_a_cluster(lattice: Lattice, capt
     options = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
     with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as client, evaluator(problem, client=client) as remote:
         assert remote(thetas) == expected
+
+
+class Copying(Executor):
+    """An executor that gives the work away as bytes, as one of other processes does, and computes it at once."""
+
+    def submit(self, function: Any, /, *arguments: Any, **named: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        function, arguments = pickle.loads(pickle.dumps((function, arguments)))
+        future.set_result(pickle.loads(pickle.dumps(function(*arguments, **named))))
+        return future
+
+
+def test_derivatives_are_the_same_by_any_executor(lattice: Lattice, capture: Capture, unknowns: LatticeUnknowns) -> None:
+    problem = CalibrationProblem.of(lattice, [capture], unknowns)
+    here, there = (calibrate_lattice(problem, START, executor=executor) for executor in (None, Copying()))
+    np.testing.assert_array_equal(here.values, there.values)
+    np.testing.assert_array_equal(here.covariance, there.covariance)
+
+
+@pytest.mark.slow
+def test_a_calibration_on_a_cluster_is_the_same(lattice: Lattice, capture: Capture, unknowns: LatticeUnknowns) -> None:
+    distributed = pytest.importorskip("distributed")
+    problem = CalibrationProblem.of(lattice, [capture], unknowns)
+    here = calibrate_lattice(problem, START)
+    options = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
+    with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as client:
+        there = calibrate_lattice(problem, START, executor=client.get_executor())
+    np.testing.assert_allclose(there.values, here.values, rtol=1e-12)
 
 
 def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch, lattice: Lattice, capture: Capture, unknowns: LatticeUnknowns) -> None:

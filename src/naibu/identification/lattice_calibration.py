@@ -7,9 +7,11 @@ indices S_shape and S_force are sums of absolute values; `indices` returns them,
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -207,14 +209,25 @@ class _Point:
         return np.asarray(sum(j.T @ r for j, r in zip(self.slopes, residual or self.residual, strict=True)))
 
 
-def evaluated(problem: CalibrationProblem, theta: Array, *, derivatives: bool = True, fine: bool = False, threads: int = 2) -> _Point:
-    """Return residuals, and their derivatives by the logarithms theta (p,); directions are shared among threads."""
+Evaluate = Callable[..., _Point]
+
+
+def evaluated(
+    problem: CalibrationProblem,
+    theta: Array,
+    *,
+    derivatives: bool = True,
+    fine: bool = False,
+    threads: int = 2,
+    executor: Executor | None = None,
+) -> _Point:
+    """Return residuals, and their derivatives by the logarithms theta (p,); directions are shared among threads, or what executes them."""
     values = np.exp(theta)
     parameters, changes = problem.unknowns.parameters(values), problem.unknowns.changes(values) if derivatives else ()
     parts = [changes[k::threads] for k in range(min(threads, len(changes)))] or [()]
     order = np.concatenate([np.arange(len(changes))[k::threads] for k in range(len(parts))]).astype(np.int64)
     rows: list[tuple[tuple[Array, Array], tuple[Array, Array]]] = []
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(threads) if executor is None else nullcontext(executor) as pool:
         runs = [[pool.submit((t.fine if fine else t.coarse).run, parameters, part) for part in parts] for t in problem.trials]
         for trial, jobs in zip(problem.trials, runs, strict=True):
             found = _joined([job.result() for job in jobs], order)
@@ -238,6 +251,7 @@ def calibrate_lattice(
     max_iterations: int = 40,
     reweigh: bool = True,
     threads: int = 2,
+    executor: Executor | None = None,
 ) -> LatticeEstimate:
     """Return the parameters that reproduce captures best, with their covariance.
 
@@ -259,7 +273,9 @@ def calibrate_lattice(
     reweigh : bool
         Whether the noise is enlarged to the misfit.
     threads : int
-        Threads that share the derivatives.
+        Into how many parts the derivatives of every capture are shared; by default as many threads compute them.
+    executor : concurrent.futures.Executor
+        Computes the parts instead: a ``ProcessPoolExecutor``, or ``client.get_executor()`` of a `dask.distributed.Client`.
 
     Raises
     ------
@@ -268,24 +284,25 @@ def calibrate_lattice(
     ConvergenceError
         The iterations did not settle.
     """
+    at = partial(evaluated, threads=threads, executor=executor)
     theta = np.log(problem.unknowns.vector(start))
     centre, runs, count = theta.copy(), 0, 0
     here, used = problem, 0
     for _ in range(3 if reweigh else 1):
-        point, used = _descend(here, theta, centre, prior_sd, max_iterations, threads)
+        point, used = _descend(here, theta, centre, prior_sd, max_iterations, at)
         count, theta = count + used, point.theta
         factors = _noise_factors(here, point)
         if not reweigh or max(abs(np.log(max(f, 1.0) / e)) for f, e in zip(factors, here.excess, strict=True)) < 0.05:
             break
         here = replace(here, excess=(max(factors[0], 1.0), max(factors[1], 1.0)))
     runs, each = count * (1 + len(theta)), 1 + len(theta)
-    point, polished, settled = _polished(here, point, centre, prior_sd, threads)
+    point, polished, settled = _polished(here, point, centre, prior_sd, at)
     runs += polished + (polished - 1) * each
     if not settled:  # coarse derivatives do not lead there
-        point, used = _descend(here, point.theta, centre, prior_sd, FINE_ITERATIONS, threads, fine=True)
+        point, used = _descend(here, point.theta, centre, prior_sd, FINE_ITERATIONS, at, fine=True)
         count, runs = count + used, runs + used * each
     information = point.information
-    covariance, extra = _widest(here, point, prior_sd, threads)
+    covariance, extra = _widest(here, point, prior_sd, at)
     runs += extra * each
     factors = _noise_factors(here, point)
     shown = tuple(f if len(r) else np.nan for f, r in zip(factors, point.residual, strict=True))
@@ -295,7 +312,7 @@ def calibrate_lattice(
     )  # fmt: skip
 
 
-def _widest(problem: CalibrationProblem, point: _Point, prior_sd: float, threads: int) -> tuple[Array, int]:
+def _widest(problem: CalibrationProblem, point: _Point, prior_sd: float, at: Evaluate) -> tuple[Array, int]:
     """Return the covariance at the estimate, or at an end of the 95 % interval of its least determined combination if it is wider there.
 
     What the data tell of the weakest combination changes by tens of per cent along its own interval. Returns the runs, too.
@@ -306,7 +323,7 @@ def _widest(problem: CalibrationProblem, point: _Point, prior_sd: float, threads
     reach = min(1.96 * float(np.sqrt(values[-1])), FARTHEST)
     found = [here]
     for side in (-1.0, 1.0):
-        end = evaluated(problem, point.theta + side * reach * vectors[:, -1], threads=threads)
+        end = at(problem, point.theta + side * reach * vectors[:, -1])
         found.append(np.asarray(np.linalg.inv(end.information + prior), dtype=np.float64))
     return max(found, key=lambda c: float(np.trace(c))), 2
 
@@ -321,10 +338,10 @@ def _cost(point: _Point, centre: Array, prior_sd: float) -> float:
 
 
 def _descend(
-    problem: CalibrationProblem, theta: Array, centre: Array, prior_sd: float, most: int, threads: int, *, fine: bool = False
+    problem: CalibrationProblem, theta: Array, centre: Array, prior_sd: float, most: int, at: Evaluate, *, fine: bool = False
 ) -> tuple[_Point, int]:
     """Iterate by Gauss and Newton; a step that does not help is shortened. Returns the last point and the iterations."""
-    point, damping = evaluated(problem, theta, fine=fine, threads=threads), 0.0
+    point, damping = at(problem, theta, fine=fine), 0.0
     cost, used = _cost(point, centre, prior_sd), 1
     while used < most:
         hessian = point.information + np.eye(len(theta)) / prior_sd**2
@@ -333,7 +350,7 @@ def _descend(
         if -slope @ step < SETTLED:
             return point, used
         step *= min(1.0, LONGEST / np.abs(step).max())
-        trial = evaluated(problem, point.theta + step, fine=fine, threads=threads)
+        trial = at(problem, point.theta + step, fine=fine)
         used += 1
         if (new := _cost(trial, centre, prior_sd)) < cost:
             settled = cost - new < SETTLED + (1e-6 if fine else 1e-5) * cost
@@ -353,12 +370,12 @@ def _descend(
     )
 
 
-def _polished(problem: CalibrationProblem, point: _Point, centre: Array, prior_sd: float, threads: int) -> tuple[_Point, int, bool]:
+def _polished(problem: CalibrationProblem, point: _Point, centre: Array, prior_sd: float, at: Evaluate) -> tuple[_Point, int, bool]:
     """Move on to the minimum of residuals of fine steps by derivatives of coarse ones; return it, the runs, and whether it settled."""
 
     def fine(theta: Array, slopes: tuple[Array, Array] | None = None) -> _Point:
-        residual = evaluated(problem, theta, derivatives=False, fine=True, threads=threads).residual
-        return _Point(theta, residual, slopes or evaluated(problem, theta, threads=threads).slopes)
+        residual = at(problem, theta, derivatives=False, fine=True).residual
+        return _Point(theta, residual, slopes or at(problem, theta).slopes)
 
     best, damping = fine(point.theta, point.slopes), 0.0
     cost = _cost(best, centre, prior_sd)
