@@ -14,7 +14,7 @@ from naibu.core.volume import Volume
 from naibu.identification.shape_difference import hull_of
 from naibu.io.images import write_volume
 from naibu.io.study_schema import load_study
-from naibu.lattice_setup import BASES, NAMED, lattice_mesh, prepared_study, resampled_mask, study_text
+from naibu.lattice_setup import BASES, NAMED, class_ratios, lattice_mesh, prepared_study, resampled_mask, study_text
 from naibu.mechanics.lattice import classic_lattice
 from naibu.mechanics.octree_lattice import octree_lattice
 from naibu.validation.lattice_twin import CUBE_PUSHING, FIRST, SECOND, dough_lattice, dough_parameters
@@ -240,3 +240,17 @@ def test_settings_change_the_fingerprint_and_comments_do_not(tmp_path: Path) -> 
     first = prepared_study(study_file(tmp_path)).fingerprint
     assert prepared_study(study_file(tmp_path, "# a comment\n" + STUDY)).fingerprint == first
     assert prepared_study(study_file(tmp_path, STUDY.replace("K = 40.0", "K = 40.1"))).fingerprint != first
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "ratios"),
+    [
+        (40.0, (1.0, 1.0, 1.0)),
+        ({"short": 60.0, "normal": 40.0, "long": 20.0}, (60.0, 40.0, 20.0)),
+        ({"core": {"short": 6.0, "normal": 4.0, "long": 2.0}, "surface": 9.0}, (6.0, 4.0, 2.0)),
+        ({"core": 6.0, "surface": 9.0}, (1.0, 1.0, 1.0)),
+        ({"short": 60.0, "normal": 40.0, "long": 0.0}, (1.0, 1.0, 1.0)),
+    ],
+)
+def test_octrees_are_told_how_classes_differ(stiffness, ratios) -> None:
+    assert class_ratios(stiffness) == ratios

@@ -23,7 +23,7 @@ from naibu.core.volume import Volume
 from naibu.io.images import read_volume
 from naibu.io.provenance import sha256
 from naibu.io.study_schema import FloorTable, ObjectTable, PusherTable, StudyFile, load_study
-from naibu.mechanics.lattice import Lattice, box_mask, classic_lattice, lattice_parameters
+from naibu.mechanics.lattice import CLASSES, Lattice, box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattice_contact import begin_contact
 from naibu.mechanics.lattice_study import Drive, LatticeStudy, StudyBody, check_study
 from naibu.mechanics.octree_lattice import octree_lattice
@@ -257,9 +257,21 @@ def _lattice(path: Path, settings: StudyFile, mask: NDArray[np.bool_]) -> Lattic
     try:
         if table.kind == "classic":
             return classic_lattice(mask, table.spacing_mm, lumping=table.masses, **amount)
-        return octree_lattice(mask, table.spacing_mm, int(table.kind[-1]), lumping=table.masses, **amount)
+        ratios = class_ratios(settings.parameters.K)
+        return octree_lattice(mask, table.spacing_mm, int(table.kind[-1]), lumping=table.masses, class_stiffness=ratios, **amount)
     except InputError as error:
         raise InputError(f"{path}: [lattice] {error}") from error
+
+
+def class_ratios(stiffness: float | Mapping[str, Any]) -> tuple[float, ...]:
+    """Return what the factors of an octree need to know of K: those of short, normal and long elements, of the core where zones differ.
+
+    Where they are alike, or one is 0, the factors are those of equal ones.
+    """
+    given = stiffness.get("core", stiffness) if isinstance(stiffness, Mapping) else stiffness
+    if not isinstance(given, Mapping) or any(not given.get(name) for name in CLASSES):
+        return (1.0, 1.0, 1.0)
+    return tuple(float(given[name]) for name in CLASSES)
 
 
 def _bodies(path: Path, settings: StudyFile, lattice: Lattice) -> tuple[StudyBody, ...]:
