@@ -249,6 +249,7 @@ def test_settings_change_the_fingerprint_and_comments_do_not(tmp_path: Path) -> 
         ({"short": 60.0, "normal": 40.0, "long": 20.0}, (60.0, 40.0, 20.0)),
         ({"core": {"short": 6.0, "normal": 4.0, "long": 2.0}, "surface": 9.0}, (6.0, 4.0, 2.0)),
         ({"core": 6.0, "surface": 9.0}, (1.0, 1.0, 1.0)),
+        ({"short": {"core": 6.0, "surface": 7.0}, "normal": 4.0, "long": 2.0}, (6.0, 4.0, 2.0)),
         ({"short": 60.0, "normal": 40.0, "long": 0.0}, (1.0, 1.0, 1.0)),
     ],
 )

@@ -268,10 +268,13 @@ def class_ratios(stiffness: float | Mapping[str, Any]) -> tuple[float, ...]:
 
     Where they are alike, or one is 0, the factors are those of equal ones.
     """
-    given = stiffness.get("core", stiffness) if isinstance(stiffness, Mapping) else stiffness
-    if not isinstance(given, Mapping) or any(not given.get(name) for name in CLASSES):
-        return (1.0, 1.0, 1.0)
-    return tuple(float(given[name]) for name in CLASSES)
+
+    def of_core(given: Any) -> Any:
+        return given.get("core", given) if isinstance(given, Mapping) else given
+
+    by_class = of_core(stiffness)
+    ratios = tuple(of_core(by_class.get(name)) for name in CLASSES) if isinstance(by_class, Mapping) else ()
+    return ratios if ratios and all(isinstance(ratio, float) and ratio > 0.0 for ratio in ratios) else (1.0, 1.0, 1.0)
 
 
 def _bodies(path: Path, settings: StudyFile, lattice: Lattice) -> tuple[StudyBody, ...]:
