@@ -31,24 +31,51 @@ def write_atomically(path: str | os.PathLike[str], data: str | bytes) -> Path:
     """
     target = Path(path)
     content = data.encode("utf-8") if isinstance(data, str) else data
+    aside = new_aside(target)
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        handle, aside_name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
-    except OSError as error:
-        raise _not_writable(target, error) from error
-    aside = Path(aside_name)
-    try:
-        with os.fdopen(handle, "wb") as stream:
+        with aside.open("wb") as stream:
             stream.write(content)
             stream.flush()
             os.fsync(stream.fileno())
-        # mkstemp makes the file private; give it the rights an ordinary new file would have
-        aside.chmod(0o666 & ~_umask())
-        aside.replace(target)
+        return put_in_place(aside, target)
     except OSError as error:
         raise _not_writable(target, error) from error
     finally:
         aside.unlink(missing_ok=True)
+
+
+def new_aside(path: str | os.PathLike[str]) -> Path:
+    """Make an empty file beside `path`, for libraries that write files themselves; `put_in_place` gives it the name.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written.
+    """
+    target = Path(path)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
+        os.close(handle)
+    except OSError as error:
+        raise _not_writable(target, error) from error
+    return Path(name)
+
+
+def put_in_place(aside: Path, path: str | os.PathLike[str]) -> Path:
+    """Give a finished file that `new_aside` made the name `path`, and the rights of an ordinary new file.
+
+    Raises
+    ------
+    InputError
+        It cannot be renamed.
+    """
+    target = Path(path)
+    try:
+        aside.chmod(0o666 & ~_umask())  # mkstemp makes the file private
+        aside.replace(target)
+    except OSError as error:
+        raise _not_writable(target, error) from error
     return target
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
+from naibu.io.atomic import new_aside, put_in_place
 
 VTK_TYPES = {"line": 3, "triangle": 5, "tetra": 10, "hexahedron": 12, "tetra10": 24}
 _ROWS = "naibu"  # group of tables beside VTK's own
@@ -46,13 +46,8 @@ class SeriesFile:
             The folder cannot be written.
         """
         target = Path(path)
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
-            os.close(handle)
-        except OSError as error:
-            raise InputError(f"{target}: cannot be written ({error.strerror or error}); choose a folder you may write to") from error
-        series = cls(target, Path(name), mesh, h5py.File(name, "w"))
+        aside = new_aside(target)
+        series = cls(target, aside, mesh, h5py.File(aside, "w"))
         root = series.file.create_group("VTKHDF")
         _write_static(root, mesh)
         _begin_steps(root)
@@ -68,22 +63,18 @@ class SeriesFile:
             There is no such file, it is damaged, has fewer steps, or holds another mesh.
         """
         target = Path(path)
+        aside = new_aside(target)
         try:
-            handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
-            os.close(handle)
+            shutil.copyfile(target, aside)
         except OSError as error:
-            raise InputError(f"{target}: cannot be written ({error.strerror or error}); choose a folder you may write to") from error
-        try:
-            shutil.copyfile(target, name)
-        except OSError as error:
-            Path(name).unlink(missing_ok=True)
+            aside.unlink(missing_ok=True)
             raise InputError(f"{target}: cannot be read ({error.strerror or error}); begin the series anew") from error
         try:
-            series = cls(target, Path(name), mesh, h5py.File(name, "r+"))
+            series = cls(target, aside, mesh, h5py.File(aside, "r+"))
             root = series.file["VTKHDF"]
             known, same = int(root["Steps"].attrs["NSteps"]), np.array_equal(root["Connectivity"][:], mesh.cells.ravel())
         except (OSError, KeyError) as error:
-            Path(name).unlink(missing_ok=True)
+            aside.unlink(missing_ok=True)
             raise InputError(f"{target}: is damaged ({error}); begin the series anew") from error
         if known < steps or not same:
             series.discard()
@@ -170,14 +161,9 @@ class SeriesFile:
         """
         try:
             self.file.close()
-            # the temporary file is private; the result gets the rights of any new file
-            mask = os.umask(0)
-            os.umask(mask)
-            self.aside.chmod(0o666 & ~mask)
-            self.aside.replace(self.target)
         except OSError as error:
             raise InputError(f"{self.target}: cannot be written ({error}); free some space or choose another folder") from error
-        return self.target
+        return put_in_place(self.aside, self.target)
 
     def discard(self) -> None:
         """Close and remove what was not finished."""

@@ -5,8 +5,6 @@ The file holds a dataset ``values`` (nz, ny, nx) with the attributes ``spacing_m
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
+from naibu.io.atomic import new_aside, put_in_place
 from naibu.io.image_formats.geometry import ReadOptions, content, volume_with_axes
 
 BLOCK = 64
@@ -48,8 +47,7 @@ def read_box(path: Path, low: ArrayLike, high: ArrayLike, options: ReadOptions) 
 
 def write(path: Path, values: NDArray[Any], grid: Volume, *, compressed: bool) -> Path:
     """Write grey values (nz, ny, nx), or vectors (nz, ny, nx, 3), that stand on the grid of a volume, in blocks of 64 voxels an edge."""
-    handle, aside = tempfile.mkstemp(dir=_folder(path), prefix=f".{path.name}.", suffix=".part")
-    os.close(handle)
+    aside = new_aside(path)
     try:
         with h5py.File(aside, "w") as file:
             chunks = tuple(min(n, BLOCK) for n in values.shape[:3]) + values.shape[3:]
@@ -57,24 +55,11 @@ def write(path: Path, values: NDArray[Any], grid: Volume, *, compressed: bool) -
             stored = file.create_dataset("values", data=values, chunks=chunks, **packed)
             stored.attrs["spacing_mm"], stored.attrs["origin_mm"] = grid.spacing_mm, grid.origin_mm
             stored.attrs["direction"] = grid.direction
-        # the temporary file is private; the result gets the rights of any new file
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(aside, 0o666 & ~mask)
-        os.replace(aside, path)
+        return put_in_place(aside, path)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error}); free some space or choose another folder") from error
     finally:
-        Path(aside).unlink(missing_ok=True)
-    return path
-
-
-def _folder(path: Path) -> Path:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose a folder you may write to") from error
-    return path.parent
+        aside.unlink(missing_ok=True)
 
 
 @contextmanager
