@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from naibu.core.errors import InputError
 from naibu.mechanics.lattice import Array, Integers, Lattice
 from naibu.mechanics.lattice_contact_kernels import PASSES, contact_steps
-from naibu.mechanics.lattice_stepping import HeldNodes, LatticeEngine, LatticeState, aligned, checked_velocity, require_numbers
+from naibu.mechanics.lattice_stepping import HeldNodes, LatticeEngine, LatticeState, checked_velocity, require_numbers
 from naibu.mechanics.rigid_pushers import KINDS, Pusher
+from naibu.mechanics.simd import aligned
 
 SNAP = 0.25  # a point nearer to a line of masses than this share of the spacing stands on it (equation 5 of the ICAT 2007 paper)
 _TOUCH_MM = 1e-6

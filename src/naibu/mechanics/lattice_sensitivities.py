@@ -25,12 +25,11 @@ from naibu.mechanics.lattice_stepping import (
     HeldNodes,
     LatticeEngine,
     LatticeState,
-    aligned,
     checked_velocity,
     require_held,
     require_numbers,
 )
-from naibu.mechanics.simd import WIDTH, inverse_root, load, splat, store
+from naibu.mechanics.simd import WIDTH, aligned, inverse_root, load, splat, store
 
 _FAST = {"contract", "nsz"}
 _STEP = 1e-5  # share of a parameter, for the central differences of the coefficients of a step

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from contextlib import nullcontext
 from dataclasses import dataclass
 from threading import Lock
@@ -19,7 +20,7 @@ _SHARED = Lock()
 
 
 @dataclass(slots=True, eq=False)
-class Stepper:
+class Stepper(ABC):
     """A state on its way.
 
     Attributes
@@ -35,19 +36,20 @@ class Stepper:
     extension: Any
     length: Any
 
+    @abstractmethod
     def hold(self, entries: tuple[Any, ...], bodies: int) -> None:
         """Hold masses from now on: node, direction, weight and body of every held component."""
-        raise NotImplementedError
 
+    @abstractmethod
     def advance(self, velocity: Array, reaction: Array, *, alone: bool = False) -> tuple[int, int]:
         """Take steps and fill the reactions, (steps, bodies, 3) both; return iterations and how often rotation was held back.
 
         If `alone`, no helper is asked.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def close(self) -> None:
-        """Send helpers away."""
+        """Send helpers away, if there are any."""
 
 
 @dataclass(slots=True, eq=False)
@@ -121,6 +123,9 @@ class ImplicitStepper(Stepper):
                 blocks, tables, state, self.mass, self.external, work, inner, self.held, velocity, self.step, solver, reaction
             )
         return found
+
+    def close(self) -> None:
+        """There are no helpers to send away."""
 
 
 def own_copy(arrays: Any) -> Any:

@@ -15,8 +15,7 @@ from naibu.mechanics.lattice import Array, Integers, Lattice, LatticeParameters,
 from naibu.mechanics.lattice_blocks import Blocks, explicit_coefficients, explicit_kernel, implicit_kernel
 from naibu.mechanics.lattice_stepper import ExplicitStepper, ImplicitStepper, Stepper, own_copy
 from naibu.mechanics.lattice_team import MOST_PARTS
-from naibu.mechanics.simd import WIDTH
-from naibu.mechanics.simd import aligned as aligned
+from naibu.mechanics.simd import WIDTH, aligned
 
 Method = Literal["implicit", "euler", "symplectic_euler"]
 THREADED_FROM = 20_000  # elements; below, one thread is faster than two that wait for each other
@@ -184,10 +183,7 @@ class LatticeEngine:
         pad = -(-lattice.n_nodes // WIDTH) * WIDTH + WIDTH
         mass = aligned((pad,), kind)
         mass[: lattice.n_nodes] = lattice.node_mass
-        if method == "implicit":
-            kernel = implicit_kernel(lattice, parameters, step, blocks, mass)
-        else:
-            kernel = explicit_kernel(parameters, step, blocks, mass, min(threads, MOST_PARTS), method == "euler")
+        kernel = _kernel(lattice, parameters, step, method, blocks, mass, threads)
         return cls(lattice, parameters, float(step), method, blocks, float(tolerance), threads, kernel, mass)
 
     def rest(self) -> LatticeState:
@@ -333,6 +329,14 @@ class LatticeEngine:
             )
 
 
+def _kernel(
+    lattice: Lattice, parameters: LatticeParameters, step: float, method: Method, blocks: Blocks, mass: Any, threads: int
+) -> tuple[Any, ...]:
+    if method == "implicit":
+        return implicit_kernel(lattice, parameters, step, blocks, mass)
+    return explicit_kernel(parameters, step, blocks, mass, min(threads, MOST_PARTS), method == "euler")
+
+
 def _check(
     lattice: Lattice, parameters: LatticeParameters, step: float, method: str, precision: str, tolerance: float, threads: int | None
 ) -> None:
@@ -436,9 +440,5 @@ def with_parameters(engine: LatticeEngine, parameters: LatticeParameters) -> Lat
     """
     precision: Literal["double", "single"] = "single" if engine.mass.dtype == np.float32 else "double"
     _check(engine.lattice, parameters, engine.step, engine.method, precision, engine.tolerance, engine.threads)
-    if engine.method == "implicit":
-        kernel = implicit_kernel(engine.lattice, parameters, engine.step, engine.blocks, engine.mass)
-    else:
-        threads = min(engine.threads, MOST_PARTS)
-        kernel = explicit_kernel(parameters, engine.step, engine.blocks, engine.mass, threads, engine.method == "euler")
+    kernel = _kernel(engine.lattice, parameters, engine.step, engine.method, engine.blocks, engine.mass, engine.threads)
     return replace(engine, parameters=parameters, kernel=kernel)
