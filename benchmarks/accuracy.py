@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import naibu
-from naibu.identification.calibration import Calibration
+from naibu.identification.from_markers.calibration import Calibration
 
 CUBES = ("ct_two_material_1", "ct_two_material_2", "ct_two_material_3")
 

@@ -11,12 +11,13 @@ import time
 
 import numpy as np
 
-from naibu.identification.calibration import Knowledge, calibrate
-from naibu.identification.model import CalibratedModel
-from naibu.identification.names import poisson_ratio, young_modulus
-from naibu.identification.specimen import ModelSettings
-from naibu.identification.trial import NoiseModel
-from naibu.validation.phantoms import Scanner, two_gels, virtual_specimen
+from naibu.identification.from_markers.calibration import calibrate
+from naibu.identification.from_markers.known_materials import Knowledge
+from naibu.identification.from_markers.observations import NoiseModel
+from naibu.identification.from_markers.parameter_names import poisson_ratio, young_modulus
+from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.prediction.calibrated_model import CalibratedModel
+from naibu.validation.specimens.marker_phantoms import Scanner, two_gels, virtual_specimen
 
 NOISE_MM = 0.15
 

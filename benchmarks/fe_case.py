@@ -10,12 +10,13 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from naibu.core.mesh import Mesh
-from naibu.mechanics.linear_solvers import Factorization, LinearSolver, PardisoSolver, SuperLUSolver
-from naibu.mechanics.materials import lame_parameters
-from naibu.mechanics.newton import constrained
-from naibu.mechanics.supports import Prescribed
-from naibu.meshing.generation import box
-from naibu.meshing.splitting import to_tetra
+from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
+from naibu.mechanics.linear_algebra.block_matrix import constrained
+from naibu.mechanics.linear_algebra.direct import PardisoSolver, SuperLUSolver
+from naibu.mechanics.linear_algebra.protocols import Factorization, LinearSolver
+from naibu.meshing.element_conversion import to_tetra
+from naibu.meshing.primitives import box
 
 Array = NDArray[np.float64]
 SIDE, DEPTH, RADIUS = 60.0, 15.0, 15.0

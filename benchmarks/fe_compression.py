@@ -11,12 +11,12 @@ import numpy as np
 from fe_case import POISSON, SOFT, STEPS, STIFF, TOLERANCE, Case, Result, pardiso, prescribed
 from fe_driver import JAX_FEM, Peer, main
 
-from naibu.mechanics.assembly import Assembler
-from naibu.mechanics.elements import elements
-from naibu.mechanics.linear_solvers import MultigridSolver
-from naibu.mechanics.materials import material
-from naibu.mechanics.newton import Problem, SolverSettings
-from naibu.mechanics.statics import solve
+from naibu.mechanics.finite_elements.assembly import Assembler
+from naibu.mechanics.finite_elements.elements import elements
+from naibu.mechanics.finite_elements.hyperelasticity import material
+from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
+from naibu.mechanics.finite_strain.statics import solve
+from naibu.mechanics.linear_algebra.multigrid import MultigridSolver
 
 
 def run_naibu(case: Case, *, load_steps: int | None = STEPS, solver: str = "default") -> Result:

@@ -13,8 +13,8 @@ from fe_case import Case, Result, pardiso, prescribed
 from fe_driver import JAX_FEM, Peer, main
 from fe_linear_peers import LOWERED
 
-from naibu.mechanics.linear_elasticity import LinearBody
-from naibu.mechanics.newton import constrained
+from naibu.mechanics.linear_algebra.block_matrix import constrained
+from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 
 
 def run_naibu(case: Case) -> Result:

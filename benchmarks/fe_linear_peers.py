@@ -16,7 +16,7 @@ import fe_peers
 import numpy as np
 from fe_case import POISSON, SIDE, SOFT, STIFF, Array, Case, Cholesky, Result, largest_residual, prescribed
 
-from naibu.mechanics.newton import constrained
+from naibu.mechanics.linear_algebra.block_matrix import constrained
 
 LOWERED = 3.0  # mm
 

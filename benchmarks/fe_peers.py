@@ -18,7 +18,7 @@ import numpy as np
 import scipy.sparse as sp
 from fe_case import DEPTH, SIDE, STEPS, TOLERANCE, Array, Case, Cholesky, Result, largest_residual, newton, prescribed
 
-from naibu.mechanics.newton import constrained
+from naibu.mechanics.linear_algebra.block_matrix import constrained
 
 
 @functools.cache

@@ -21,19 +21,19 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from naibu.core.field import Field
+from naibu.core.displacement_field import Field
 from naibu.core.mesh import Mesh
-from naibu.identification.field_matching import FieldEstimate, identify_field
-from naibu.identification.field_sensitivity import logarithms, young_and_poisson
-from naibu.identification.field_trial import FieldTrial, Zones
-from naibu.identification.regularization import cell_volumes
-from naibu.identification.uncertainty import cramer_rao_bound
-from naibu.mechanics.linear_elasticity import LinearBody
-from naibu.mechanics.materials import lame_parameters
-from naibu.mechanics.supports import Prescribed
-from naibu.meshing.generation import box
-from naibu.meshing.location import interpolation_operator
-from naibu.reproduction.report_cubes import LAYERS, PushedBody, cube
+from naibu.identification.from_fields.estimate import FieldEstimate, identify_field
+from naibu.identification.from_fields.load_cases import FieldTrial, Zones
+from naibu.identification.from_fields.regularization import cell_volumes
+from naibu.identification.from_fields.sensitivities import logarithms, young_and_poisson
+from naibu.identification.from_fields.uncertainty import cramer_rao_bound
+from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
+from naibu.mechanics.small_strain.linear_elasticity import LinearBody
+from naibu.meshing.point_location import interpolation_operator
+from naibu.meshing.primitives import box
+from naibu.reproduction.chapter3.bodies import LAYERS, PushedBody, cube
 
 Array = NDArray[np.float64]
 _TOP = np.stack([np.tile(np.linspace(0.0, 40.0, 5), 5), np.repeat(np.linspace(0.0, 40.0, 5), 5)], axis=1)

@@ -22,9 +22,10 @@ import numba
 import numpy as np
 import warp
 
-from naibu.mechanics.lattice import Lattice, box_mask, classic_lattice, lattice_parameters
-from naibu.mechanics.lattice_gpu import WarpLatticeEngine
-from naibu.mechanics.lattice_stepping import HeldNodes, LatticeEngine, Motion, explicit_step_limit
+from naibu.mechanics.lattices.cpu.engine import LatticeEngine
+from naibu.mechanics.lattices.gpu.engine import WarpLatticeEngine
+from naibu.mechanics.lattices.model.lattice import Lattice, box_mask, classic_lattice, lattice_parameters
+from naibu.mechanics.lattices.model.state import HeldNodes, Motion, explicit_step_limit
 
 SIDE_MM, MASS_KG = 80.0, 0.63
 GENTLE = (0.03, 0.002, 0.003)  # K, C1, C2 at 9^3 masses

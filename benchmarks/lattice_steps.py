@@ -21,12 +21,13 @@ from collections.abc import Callable
 import numba
 import numpy as np
 
-from naibu.mechanics.lattice import Lattice, LatticeParameters, box_mask, classic_lattice, lattice_parameters
-from naibu.mechanics.lattice_adjoint import push_gradient, recorded_push
-from naibu.mechanics.lattice_blocks import explicit_coefficients
-from naibu.mechanics.lattice_session import LatticeSession
-from naibu.mechanics.lattice_stepping import HeldNodes, LatticeEngine
-from naibu.mechanics.octree_lattice import octree_lattice
+from naibu.mechanics.lattices.cpu.engine import LatticeEngine
+from naibu.mechanics.lattices.model.coefficients import explicit_coefficients
+from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters, box_mask, classic_lattice, lattice_parameters
+from naibu.mechanics.lattices.model.octree import octree_lattice
+from naibu.mechanics.lattices.model.state import HeldNodes
+from naibu.mechanics.lattices.simulation.adjoint import push_gradient, recorded_push
+from naibu.mechanics.lattices.simulation.session import LatticeSession
 
 SIDE_MM, MASS_KG, STEP_S = 80.0, 0.63, 2e-3
 GENTLE = (0.03, 0.002, 0.003)  # K, C1, C2 for which explicit steps of 2 ms are stable

@@ -21,12 +21,14 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
-from naibu.mechanics.lattice import Lattice, box_mask, classic_lattice, lattice_parameters
-from naibu.mechanics.lattice_stepping import HeldNodes, LatticeEngine
-from naibu.mechanics.linear_solvers import Factorization, direct_solver
-from naibu.mechanics.octree_lattice import octree_cubes, octree_lattice
-from naibu.mechanics.octree_response import lengthening
-from naibu.mechanics.octree_scaling import OctreeGrid
+from naibu.mechanics.lattices.cpu.engine import LatticeEngine
+from naibu.mechanics.lattices.model.lattice import Lattice, box_mask, classic_lattice, lattice_parameters
+from naibu.mechanics.lattices.model.octree import octree_cubes, octree_lattice
+from naibu.mechanics.lattices.model.octree_compliance_correction import lengthening
+from naibu.mechanics.lattices.model.octree_energy_scaling import OctreeGrid
+from naibu.mechanics.lattices.model.state import HeldNodes
+from naibu.mechanics.linear_algebra.direct import direct_solver
+from naibu.mechanics.linear_algebra.protocols import Factorization
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -18,11 +18,11 @@ import time
 import numpy as np
 
 from naibu.core.errors import ConvergenceError
-from naibu.mechanics.dynamics import Series, explicit_step_limit, simulate
-from naibu.mechanics.linear_elasticity import LinearBody
-from naibu.mechanics.moving_supports import Path, Support
-from naibu.mechanics.rheology import Rheology, three_element
-from naibu.meshing.generation import box
+from naibu.mechanics.small_strain.dynamics import Series, explicit_step_limit, simulate
+from naibu.mechanics.small_strain.linear_elasticity import LinearBody
+from naibu.mechanics.small_strain.prescribed_motion import Path, Support
+from naibu.mechanics.small_strain.rheology import Rheology, three_element
+from naibu.meshing.primitives import box
 
 SIDE_MM, CELLS, DENSITY = 50.0, 10, 1.1e-6
 SPAN_S, STEPS, COARSE, WHOLE = 0.5, 1000, 50, 20_000

@@ -10,7 +10,7 @@ from itertools import combinations
 import numpy as np
 
 from naibu import datasets
-from naibu.validation.same_block import block_match
+from naibu.validation.specimens.specimen_matching import block_match
 
 
 def half(number: int, upper: bool) -> np.ndarray:

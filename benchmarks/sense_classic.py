@@ -23,20 +23,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 
+from naibu.core.displacement_field import Field
 from naibu.core.errors import MissingDependencyError
-from naibu.core.field import Field
 from naibu.core.volume import Volume
-from naibu.imaging.block_matching import block_matching
-from naibu.imaging.bone_mask import bone_mask
-from naibu.imaging.dense import DenseDisplacement, dense_from_sparse, sparse_displacement, triangulated
-from naibu.imaging.evaluation import end_point_error, folded_share, intensity_rms
-from naibu.imaging.features import interest_points
-from naibu.imaging.hybrid import hybrid_flow
-from naibu.imaging.matching import Candidates, candidate_matches
-from naibu.imaging.optical_flow import AS_REPORTED, horn_schunck, lucas_kanade
-from naibu.imaging.relaxation import STRENGTHS, relaxed
-from naibu.imaging.resampling import positions, resampled_to_grid
-from naibu.imaging.rigid import RigidMotion, register_rigid
+from naibu.imaging.dense_matching.block_matching import block_matching
+from naibu.imaging.dense_matching.hybrid import hybrid_flow
+from naibu.imaging.dense_matching.optical_flow import AS_REPORTED, horn_schunck, lucas_kanade
+from naibu.imaging.displacement.accuracy import end_point_error, intensity_rms
+from naibu.imaging.displacement.dense import DenseDisplacement
+from naibu.imaging.displacement.strain import folded_share
+from naibu.imaging.feature_matching.correlation_matching import Candidates, candidate_matches
+from naibu.imaging.feature_matching.harris import interest_points
+from naibu.imaging.feature_matching.relaxation_labelling import STRENGTHS, relaxed
+from naibu.imaging.feature_matching.scattered_interpolation import dense_from_sparse, sparse_displacement, triangulated
+from naibu.imaging.preprocessing.bone_mask import bone_mask
+from naibu.imaging.preprocessing.resampling import positions, resampled_to_grid
+from naibu.imaging.preprocessing.rigid_registration import RigidMotion, register_rigid
 
 Array = NDArray[Any]
 T = TypeVar("T")

@@ -23,11 +23,11 @@ from scipy.spatial import cKDTree
 
 from naibu import datasets
 from naibu.core.volume import Volume
-from naibu.imaging.marker_linking import link_markers
-from naibu.imaging.marker_sequence import track_sequence
-from naibu.imaging.marker_tracking import track_markers
+from naibu.imaging.markers.point_matching import link_markers
+from naibu.imaging.markers.sequence_tracking import track_sequence
+from naibu.imaging.markers.tracking import track_markers
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "imaging"))
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "helpers"))
 from marker_scenes import Cloud, particle_cloud, ultrasound
 
 T = TypeVar("T")

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from naibu.core.volume import Volume
-from naibu.imaging.correlated_displacement import CorrelatedDisplacement
-from naibu.imaging.volume_correlation import CorrelationSettings, correlate_volumes
+from naibu.imaging.volume_correlation.correlate import CorrelationSettings, correlate_volumes
+from naibu.imaging.volume_correlation.result import CorrelatedDisplacement
 
 Array = NDArray[Any]
 TISSUES = {

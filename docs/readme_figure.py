@@ -11,8 +11,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from naibu.viewer.payload import Scene
-from naibu.viewer.reading import report_from_json
+from naibu.viewer.result_page.payload import Scene
+from naibu.viewer.result_page.reading import report_from_json
 
 TITLES = {
     "ct_two_material_1": "bar on hard over soft",

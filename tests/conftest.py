@@ -1,22 +1,12 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from virtual_press import COARSE, KNOWN, virtual_press, write_press
+from virtual_press import COARSE, KNOWN, Press, virtual_press, write_press
 
-from naibu import workflow
-
-
-@dataclass(frozen=True)
-class Press:
-    """A virtual experiment with two loaded states as a folder, and what was identified from the first of them."""
-
-    folder: Path
-    results: Path
-    identification: workflow.Identification
+from naibu.workflows import identify
 
 
 @pytest.fixture(scope="session")
@@ -24,7 +14,7 @@ def press(tmp_path_factory: pytest.TempPathFactory) -> Press:
     root = tmp_path_factory.mktemp("press")
     folder = write_press(root / "press", virtual_press(), ("pressed", "pressed_more"))
     results = root / "results"
-    found = workflow.identify(folder, known=KNOWN, settings=COARSE, states={"press": ["pressed"]}, out=results)
+    found = identify.identify(folder, known=KNOWN, settings=COARSE, states={"press": ["pressed"]}, out=results)
     return Press(folder, results, found)
 
 

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from naibu.io import experiment_schema
-from naibu.io.experiments import read_experiment
-from naibu.io.state_csv import OPTIONAL, REQUIRED, STATUSES
-from naibu.mechanics.materials import LAWS
+from naibu.io.experiment_folder import schema
+from naibu.io.experiment_folder.reader import read_experiment
+from naibu.io.experiment_folder.state_csv import OPTIONAL, REQUIRED, STATUSES
+from naibu.mechanics.finite_elements.hyperelasticity import LAWS
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 PAGE = (DOCS / "experiment_folder.rst").read_text(encoding="utf-8")
-TABLES = {name: getattr(experiment_schema, name) for name in dir(experiment_schema) if name.endswith("Table") and not name.startswith("_")}
+TABLES = {name: getattr(schema, name) for name in dir(schema) if name.endswith("Table") and not name.startswith("_")}
 # read from families of keys, for which the page gives examples
 FAMILIES = {"rows_of_layers": "rows_layer_1", "values": "E_hardness_5_Pa"}
 
@@ -29,7 +29,7 @@ def block(language: str, number: int = 0) -> str:
 
 @pytest.mark.parametrize("name", [*TABLES, "Meta"])
 def test_every_key_is_told_in_the_page(name: str) -> None:
-    model = TABLES.get(name, experiment_schema.Meta)
+    model = TABLES.get(name, schema.Meta)
     headings = {"coordinates", "object", "markers", "layer", "loading", "scanner", "gel", "state"} if name == "Meta" else set()
     for key, field in model.model_fields.items():
         told = FAMILIES.get(key, key)

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from naibu.io import study_schema
-from naibu.lattice_setup import NAMED
+from naibu.io import lattice_study_schema
+from naibu.workflows.lattice_study import NAMED
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "simulating.rst").read_text(encoding="utf-8")
-TABLES = [name for name in dir(study_schema) if name.endswith("Table") and not name.startswith("_")]
+TABLES = [name for name in dir(lattice_study_schema) if name.endswith("Table") and not name.startswith("_")]
 
 
 def block(language: str) -> str:
@@ -26,7 +26,7 @@ def test_every_key_is_told_in_the_page(name: str) -> None:
     key = name.removesuffix("Table").lower()
     heading = "[[pusher]]" if key == "pusher" else f"[{key}]"
     assert f"``{heading}``" in PAGE
-    for field, told in getattr(study_schema, name).model_fields.items():
+    for field, told in getattr(lattice_study_schema, name).model_fields.items():
         assert f"**{field}**" in PAGE if told.is_required() else re.search(rf"\*\*{field}\*\*|``{field}\b", PAGE), f"{heading} {field}"
 
 

@@ -9,19 +9,21 @@ the sides bulge, and what force the plate needs, depends on the friction between
 # %%
 # A block and its materials
 # -------------------------
-# `naibu.meshing.generation.box` puts element faces on the boundary between the layers. Moduli are in kPa. Both gels are nearly
+# `naibu.meshing.primitives.box` puts element faces on the boundary between the layers. Moduli are in kPa. Both gels are nearly
 # incompressible, as real gels are.
 import matplotlib.pyplot as plt
 import numpy as np
 
-from naibu.mechanics.assembly import Assembler, block_pattern
-from naibu.mechanics.contact import Contact, plane
-from naibu.mechanics.elements import elements
-from naibu.mechanics.materials import material
-from naibu.mechanics.newton import Problem
-from naibu.mechanics.statics import Solution, solve
-from naibu.mechanics.supports import Friction, Prescribed, rigid_contact
-from naibu.meshing.generation import box
+from naibu.mechanics.contact.contact_surfaces import Friction, rigid_contact
+from naibu.mechanics.contact.penalty_contact import Contact, plane
+from naibu.mechanics.finite_elements.assembly import Assembler
+from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.elements import elements
+from naibu.mechanics.finite_elements.hyperelasticity import material
+from naibu.mechanics.finite_strain.problem import Problem
+from naibu.mechanics.finite_strain.statics import Solution, solve
+from naibu.mechanics.linear_algebra.block_matrix import block_pattern
+from naibu.meshing.primitives import box
 from naibu.meshing.surface import boundary_faces
 
 SIDE_MM, PRESSED_MM = 60.0, 45.0

@@ -9,18 +9,19 @@ average the change of volume (the default, ``"mean_dilatation"``) do not, and th
 # %%
 # A material of your own
 # ----------------------
-# Give Young's modulus (kPa) and Poisson's ratio at small strain. `naibu.mechanics.materials.LAWS` lists the laws; for laws with more
-# parameters, ``shape`` sets what the two moduli leave open.
+# Give Young's modulus (kPa) and Poisson's ratio at small strain. `naibu.mechanics.finite_elements.hyperelasticity.LAWS` lists the laws;
+# for laws with more parameters, ``shape`` sets what the two moduli leave open.
 import matplotlib.pyplot as plt
 import numpy as np
 
-from naibu.mechanics.assembly import Assembler, block_pattern
-from naibu.mechanics.elements import Formulation, elements
-from naibu.mechanics.materials import LAWS, material
-from naibu.mechanics.newton import Problem
-from naibu.mechanics.statics import solve
-from naibu.mechanics.supports import Prescribed
-from naibu.meshing.generation import box
+from naibu.mechanics.finite_elements.assembly import Assembler
+from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.elements import Formulation, elements
+from naibu.mechanics.finite_elements.hyperelasticity import LAWS, material
+from naibu.mechanics.finite_strain.problem import Problem
+from naibu.mechanics.finite_strain.statics import solve
+from naibu.mechanics.linear_algebra.block_matrix import block_pattern
+from naibu.meshing.primitives import box
 from naibu.meshing.surface import side_nodes
 
 for law in LAWS.values():

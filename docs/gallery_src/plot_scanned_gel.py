@@ -17,11 +17,11 @@ from scipy.spatial import cKDTree
 
 import naibu
 from naibu.core.experiment import Loading
-from naibu.identification.specimen import ModelSettings
-from naibu.imaging.marker_tracking import track_markers
-from naibu.io.tables import write_experiment_folder
-from naibu.validation.phantoms import box_experiment, virtual_specimen
-from naibu.validation.scanned_experiments import scanned_states
+from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.imaging.markers.tracking import track_markers
+from naibu.io.marker_tables import write_experiment_folder
+from naibu.validation.scanners.experiments import scanned_states
+from naibu.validation.specimens.marker_phantoms import box_experiment, virtual_specimen
 
 HEIGHTS = {"pressed": 35.0, "pressed_more": 32.0}
 TRUTH = {

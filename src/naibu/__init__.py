@@ -5,19 +5,18 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from naibu.core.kernel_cache import use_kernel_cache
+from naibu._version import __version__
 
 if TYPE_CHECKING:
     from naibu import datasets
-    from naibu.workflow import compare, identify, load_experiment, predict, report
+    from naibu.workflows.identify import compare, identify, load_experiment, predict, report
 
-__version__ = "0.1.0"
 __all__ = ["__version__", "compare", "datasets", "identify", "load_experiment", "predict", "report"]
 
-use_kernel_cache()  # before anything imports Numba
-
 # loaded when first used, by name, so that `import naibu` stays light
-_MODULES = {"datasets": "naibu.datasets"} | dict.fromkeys(("compare", "identify", "load_experiment", "predict", "report"), "naibu.workflow")
+_MODULES = {"datasets": "naibu.datasets"} | dict.fromkeys(
+    ("compare", "identify", "load_experiment", "predict", "report"), "naibu.workflows.identify"
+)
 
 
 def __getattr__(name: str) -> object:

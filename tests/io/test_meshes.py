@@ -11,7 +11,7 @@ import pytest
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.io.meshes import read_mesh, read_surface
-from naibu.io.results import write_vtu
+from naibu.io.vtk_files import write_vtu
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], dtype=float)
 TETRA = np.array([[0, 1, 2, 3], [1, 2, 3, 4]])

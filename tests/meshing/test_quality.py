@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
-from naibu.meshing.generation import box, cylinder
+from naibu.meshing.element_conversion import to_quadratic, to_tetra
+from naibu.meshing.primitives import box, cylinder
 from naibu.meshing.quality import aspect_ratios, check, duplicate_points, min_jacobians, scaled_jacobians, signed_volumes, unused_nodes
-from naibu.meshing.splitting import to_quadratic, to_tetra
 
 REGULAR = np.array([[1, 1, 1], [-1, 1, -1], [1, -1, -1], [-1, -1, 1]], dtype=float)
 MESHES = {

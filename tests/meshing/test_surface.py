@@ -5,10 +5,10 @@ import pytest
 
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
-from naibu.meshing.generation import box, cylinder, half_ellipsoid
+from naibu.meshing.element_conversion import to_quadratic, to_tetra
 from naibu.meshing.interfaces import split_at_plane
+from naibu.meshing.primitives import box, cylinder, half_ellipsoid
 from naibu.meshing.quality import check, duplicate_points, signed_volumes
-from naibu.meshing.splitting import to_quadratic, to_tetra
 from naibu.meshing.surface import (
     boundary_faces,
     boundary_nodes,

@@ -1,4 +1,4 @@
-// Scenes as naibu/viewer/packing.py writes them -> typed arrays in mm.
+// Scenes as naibu/viewer/result_page/packing.py writes them -> typed arrays in mm.
 
 /** base64 of gzip of JSON -> object. */
 export async function inflate(base64) {

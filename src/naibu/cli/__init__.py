@@ -8,8 +8,8 @@ from cyclopts import CycloptsError
 
 from naibu.cli import experiments, imaging, studies  # noqa: F401  they bring their verbs
 from naibu.cli.console import BAD_INPUT, INTERRUPTED, NO_SOLUTION, app, errors, fail, print_table
+from naibu.cli.installation import doctor_rows, healthy
 from naibu.core.errors import ConvergenceError, NaibuError
-from naibu.doctor import doctor_rows, healthy
 
 
 @app.command

@@ -25,12 +25,12 @@ from rich.progress import (
 )
 from rich.table import Table
 
-import naibu
+from naibu._version import __version__
 
 app = App(
     name="naibu",
     help="Find the mechanical parameters of soft objects from what was measured inside them.",
-    version=naibu.__version__,
+    version=__version__,
     default_parameter=Parameter(negative_iterable=()),
 )
 WIDTH_OF_FILES = 160  # where the output is no terminal

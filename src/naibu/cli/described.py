@@ -40,7 +40,7 @@ class PairOptions:
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """As `naibu.sense_runs.read_pair` takes them."""
+        """As `naibu.workflows.sense.read_pair` takes them."""
         return {"mask": self.mask, "spacing_mm": self.spacing, "truth": self.truth, "check_points": self.check_points}
 
 
@@ -70,7 +70,7 @@ class ObjectOptions:
     stated_mm: list[str] | None = None
 
     def described(self, size_mm: tuple[float, float, float]) -> dict[str, Any]:
-        """Return shape, loading, layers and stated_mm, as `naibu.io.tables.write_experiment_folder` takes them.
+        """Return shape, loading, layers and stated_mm, as `naibu.io.marker_tables.write_experiment_folder` takes them.
 
         Raises
         ------

@@ -17,8 +17,8 @@ from naibu.core.errors import InputError
 
 # other parts are imported where they are used: --help answers at once, and doctor also runs where numpy itself is broken
 if TYPE_CHECKING:
-    from naibu.identification.specimen import ModelSettings
-    from naibu.workflow import Identification
+    from naibu.identification.from_markers.specimen_model import ModelSettings
+    from naibu.workflows.identify import Identification
 
 DEMO = ("ct_two_material_1", "ct_two_material_2", "ct_two_material_3")
 DEMO_KNOWN = "hardness 5=222 kPa"  # mean of the report's compression tests, Table 3.4
@@ -83,7 +83,7 @@ def identify(
     resume
         Continue an interrupted search in the same folder.
     """
-    from naibu.identification.specimen import ModelSettings
+    from naibu.identification.from_markers.specimen_model import ModelSettings
 
     settings = ModelSettings(law=law, contact=contact, joined=joined, element_size_mm=element_size_mm, pixel_scale=pixel_scale)
     states = _states(experiments, state or [])
@@ -113,11 +113,11 @@ def _identify(
     cross_validate: bool = False,
     resume: bool = True,
 ) -> None:
-    from naibu import workflow
+    from naibu.workflows import identify
 
     began = time.perf_counter()
     with progress_lines() as progress:
-        result = workflow.identify(
+        result = identify.identify(
             list(experiments), known=known, states=states, settings=settings, out=out, cross_validate=cross_validate, resume=resume,
             progress=progress,
         )  # fmt: skip
@@ -130,7 +130,7 @@ def _identify(
 
 def _show(result: Identification) -> None:
     """Print what was assumed, how well the markers fit, and the parameters."""
-    from naibu.presentation import accuracy_table, parameter_rows, shared_names, undetermined
+    from naibu.workflows.report_content import accuracy_table, parameter_rows, shared_names, undetermined
 
     calibration, model = result.calibration, result.model
     experiments = {t.specimen.experiment.name: t.specimen.experiment for t in calibration.trials}
@@ -174,10 +174,10 @@ def predict(
     out
         Folder for predicted.csv, summary.json, predicted.html and files for ParaView; may be that of the model.
     """
-    from naibu import workflow
-    from naibu.presentation import accuracy
+    from naibu.workflows import identify
+    from naibu.workflows.report_content import accuracy
 
-    result = workflow.predict(model, experiment, state=state, height_mm=height_mm, heights_from_markers=heights_from_markers, out=out)
+    result = identify.predict(model, experiment, state=state, height_mm=height_mm, heights_from_markers=heights_from_markers, out=out)
     for note in (*result.specimen.experiment.loading.assumed, *result.notes):
         say(note, "dim")
     if result.registered:
@@ -217,9 +217,9 @@ def compare(
     out
         Folder for comparison.json; models that it holds already are not repeated.
     """
-    from naibu import workflow
-    from naibu.identification.specimen import ModelSettings
-    from naibu.presentation import comparison_table
+    from naibu.identification.from_markers.specimen_model import ModelSettings
+    from naibu.workflows import identify
+    from naibu.workflows.report_content import comparison_table
 
     laws: list[Law] = law or ["neo_hookean", "mooney_rivlin"]
     contacts: list[ContactModel] = contact or ["coulomb", "stick"]
@@ -229,7 +229,7 @@ def compare(
         for one, two, three in product(laws, contacts, joints)
     ]
     with progress_lines() as progress:
-        rows = workflow.compare(experiments, candidates=candidates, known=known or (), out=out, progress=progress)
+        rows = identify.compare(experiments, candidates=candidates, known=known or (), out=out, progress=progress)
     table = comparison_table(rows)
     print_table(table.title, table.columns, table.rows)
     say(table.note, "dim")
@@ -244,9 +244,9 @@ def report(folder: Path) -> None:
     folder
         Where 'naibu identify' or 'naibu predict' wrote its results.
     """
-    from naibu import workflow
+    from naibu.workflows import identify
 
-    for page in workflow.report(folder):
+    for page in identify.report(folder):
         say(f"Report: {page}")
 
 
@@ -287,7 +287,7 @@ def import_tables(
     z_step_mm
         Step of the heights, such as the distance of slices.
     """
-    from naibu.io.tables import import_markers, write_experiment_folder
+    from naibu.io.marker_tables import import_markers, write_experiment_folder
 
     about = (described or ObjectOptions()).described(size_mm)
     names = [path.stem for path in loaded]

@@ -37,7 +37,7 @@ def sense(
     out
         Folder for displacement.mha, standard_deviation.mha, displacement.vtu, field.npz, sense.json and report.html.
     """
-    from naibu.sense_runs import read_pair, sense_pair
+    from naibu.workflows.sense import read_pair, sense_pair
 
     with stages() as tell:
         scans = read_pair(before, after, **(pair or PairOptions()).arguments)
@@ -68,9 +68,9 @@ def compare_methods(
     out
         Folder for methods.html and methods.json.
     """
-    from naibu.imaging.methods import METHODS
-    from naibu.method_comparison import compare_methods as compared
-    from naibu.sense_runs import read_pair
+    from naibu.imaging.measure_displacement import METHODS
+    from naibu.workflows.compare_methods import compare_methods as compared
+    from naibu.workflows.sense import read_pair
 
     with stages() as tell:
         scans = read_pair(before, after, **(pair or PairOptions()).arguments)
@@ -119,7 +119,7 @@ def track(
     out
         Folder to make: the experiment, with tracking.html and tracking.json beside its tables.
     """
-    from naibu.track_runs import ObjectDescription, track_files
+    from naibu.workflows.track import ObjectDescription, track_files
 
     options = described or ObjectOptions()
     description = None
@@ -174,7 +174,7 @@ def track_sequence(
     out
         Folder for tracks.csv, tracks.html and tracks.json.
     """
-    from naibu.sequence_runs import track_sequence_file
+    from naibu.workflows.track_sequence import track_sequence_file
 
     with stages() as tell:
         tell("following markers")

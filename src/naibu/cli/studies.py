@@ -30,8 +30,8 @@ def reproduce(chapter: ChapterName, *, out: Path = Path("naibu-reproduction"), s
     seed
         Of all random numbers.
     """
-    from naibu.pages.page import write_chapter
     from naibu.reproduction.chapters import CHAPTERS
+    from naibu.viewer.chapter_page import write_chapter
 
     began = time.perf_counter()
     with errors.status("starting"):
@@ -62,8 +62,8 @@ def simulate(study: str = "", *, out: Path = Path("naibu-simulation"), resume: b
     example
         Print the file of a lattice study, to begin your own: naibu simulate --example > my_study.toml
     """
-    from naibu.lattice_setup import NAMED, TEMPLATE, study_text
-    from naibu.study_runs import SLUGS, SQUARES_TOGETHER, simulate_study
+    from naibu.workflows.lattice_study import NAMED, TEMPLATE, study_text
+    from naibu.workflows.simulate_study import SLUGS, SQUARES_TOGETHER, simulate_study
 
     if example:
         sys.stdout.write(study_text(study or TEMPLATE))
@@ -85,7 +85,7 @@ def simulate(study: str = "", *, out: Path = Path("naibu-simulation"), resume: b
 
 
 def _simulate_lattice(study: str, out: Path, resume: bool) -> None:
-    from naibu.lattice_runs import simulate_lattice
+    from naibu.workflows.simulate_lattice import simulate_lattice
 
     began = time.perf_counter()
     with stopped_gently() as stopping, progress_bar(f"computing {study}") as told:

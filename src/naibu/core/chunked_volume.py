@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,9 +30,9 @@ class ChunkedVolume:
     """
 
     values: Any
-    spacing_mm: Array
-    origin_mm: Array
-    direction: Array
+    spacing_mm: FloatArray
+    origin_mm: FloatArray
+    direction: FloatArray
 
     @classmethod
     def from_array(

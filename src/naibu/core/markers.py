@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.errors import InputError
 
 
@@ -24,9 +25,9 @@ class Markers:
         False for markers that must not be used in a fit or an accuracy figure (``suspect``).
     """
 
-    ids: NDArray[np.int64]
-    points: NDArray[np.float64]
-    trusted: NDArray[np.bool_]
+    ids: IntArray
+    points: FloatArray
+    trusted: BoolArray
 
     @classmethod
     def from_arrays(cls, ids: ArrayLike, points: ArrayLike, trusted: ArrayLike | None = None) -> Markers:
@@ -53,7 +54,7 @@ class Markers:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def aligned(self, ids: NDArray[np.int64]) -> NDArray[np.float64]:
+    def aligned(self, ids: IntArray) -> FloatArray:
         """Return trusted positions (len(ids), 3) in the order of `ids`; NaN where a marker is absent or not trusted."""
         out = np.full((len(ids), 3), np.nan)
         where = np.searchsorted(self.ids, ids)

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 
 NODES_PER_CELL = {"line": 2, "triangle": 3, "tetra": 4, "tetra10": 10, "hexahedron": 8}
@@ -33,10 +34,10 @@ class Mesh:
         Name of every region, usually its material.
     """
 
-    points: NDArray[np.float64]
-    cells: NDArray[np.int64]
+    points: FloatArray
+    cells: IntArray
     cell_type: str
-    regions: NDArray[np.int64]
+    regions: IntArray
     region_names: tuple[str, ...]
 
     @classmethod
@@ -92,7 +93,7 @@ class Mesh:
         """Number of cells."""
         return len(self.cells)
 
-    def moved(self, displacement: NDArray[np.float64]) -> Mesh:
+    def moved(self, displacement: FloatArray) -> Mesh:
         """Return the mesh with every node moved by `displacement` (n, d), mm."""
         if displacement.shape != self.points.shape:
             raise InputError(f"displacement must have shape {self.points.shape}, not {displacement.shape}")

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 
 MAX_POISSON_RATIO = 0.4995  # beyond it a solid is incompressible for all that displacements can tell
@@ -108,14 +108,14 @@ class ParameterSet:
         """Parameters that are sought."""
         return tuple(p for p in self.parameters if not p.fixed)
 
-    def values(self, inner: NDArray[np.float64] | None = None) -> dict[str, float]:
+    def values(self, inner: FloatArray | None = None) -> dict[str, float]:
         """Return all physical values; free ones taken from the optimiser's vector (in the order of `free`) where it is given."""
         out = {p.name: p.value for p in self.parameters}
         if inner is not None:
             out |= {p.name: p.physical(float(x)) for p, x in zip(self.free, inner, strict=True)}
         return out
 
-    def start(self) -> NDArray[np.float64]:
+    def start(self) -> FloatArray:
         """Return the optimiser's vector of the present values."""
         return np.array([p.inner(p.value) for p in self.free])
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from naibu.core.arrays import AnyArray, FloatArray
 from naibu.core.errors import InputError
 
-Array = NDArray[np.float64]
 NEARLY = 1e-4  # of a direction cosine, or of a voxel
 
 
@@ -30,10 +29,10 @@ class Volume:
         Columns are the unit vectors along which x, y and z indices grow.
     """
 
-    values: NDArray[Any]
-    spacing_mm: Array
-    origin_mm: Array
-    direction: Array
+    values: AnyArray
+    spacing_mm: FloatArray
+    origin_mm: FloatArray
+    direction: FloatArray
 
     @classmethod
     def from_array(
@@ -70,11 +69,11 @@ class Volume:
         nz, ny, nx = self.values.shape
         return int(nz), int(ny), int(nx)
 
-    def to_physical(self, index: ArrayLike) -> Array:
+    def to_physical(self, index: ArrayLike) -> FloatArray:
         """Return positions (..., 3), mm, of continuous indices (..., 3) in the order x, y, z."""
         return np.asarray((np.asarray(index, dtype=float) * self.spacing_mm) @ self.direction.T + self.origin_mm)
 
-    def to_index(self, points_mm: ArrayLike) -> Array:
+    def to_index(self, points_mm: ArrayLike) -> FloatArray:
         """Return continuous indices (..., 3) in the order x, y, z of positions (..., 3), mm."""
         return np.asarray(((np.asarray(points_mm, dtype=float) - self.origin_mm) @ self.direction) / self.spacing_mm)
 

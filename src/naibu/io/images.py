@@ -12,15 +12,15 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from naibu.core.arrays import FloatArray
 from naibu.core.chunked_volume import ChunkedVolume
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.io.image_formats import dicom, hdf5, metaimage, nifti, nrrd, tiff, zarr_store
 from naibu.io.image_formats.geometry import ReadOptions
 
-Array = NDArray[np.float64]
 _Handler = TypeVar("_Handler")
 VOLUME_READERS: dict[str, Callable[[Path, ReadOptions], Volume]] = {
     **dict.fromkeys((".mha", ".mhd"), metaimage.read),
@@ -39,7 +39,7 @@ VOLUME_WRITERS: dict[str, Callable[..., Path]] = {
     **dict.fromkeys((".h5", ".hdf5"), hdf5.write),
     ".zarr": zarr_store.write,
 }
-_VECTOR_READERS: dict[str, Callable[[Path, ReadOptions], tuple[Array, Volume]]] = {
+_VECTOR_READERS: dict[str, Callable[[Path, ReadOptions], tuple[FloatArray, Volume]]] = {
     **dict.fromkeys((".mha", ".mhd"), metaimage.read_vectors),
     **dict.fromkeys((".nrrd", ".nhdr"), nrrd.read_vectors),
 }
@@ -121,7 +121,7 @@ def write_volume(path: str | os.PathLike[str], volume: Volume, *, compressed: bo
     return _of(VOLUME_WRITERS, Path(path), "write")(Path(path), volume.values, volume, compressed=compressed)
 
 
-def read_displacement(path: str | os.PathLike[str]) -> tuple[Array, Volume]:
+def read_displacement(path: str | os.PathLike[str]) -> tuple[FloatArray, Volume]:
     """Read a displacement field on the voxels of a volume.
 
     Parameters
@@ -191,7 +191,7 @@ def read_volume_box(path: str | os.PathLike[str], low: ArrayLike, high: ArrayLik
 
 
 def open_volume(path: str | os.PathLike[str]) -> ChunkedVolume:
-    """Open a volume that need not fit into memory; only what is sliced is read (see `naibu.imaging.chunked`).
+    """Open a volume that need not fit into memory; only what is sliced is read (see `naibu.imaging.out_of_core`).
 
     Parameters
     ----------

@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.io.mesh_formats import msh, obj, ply, stl, vrml, vtu
 
 _Reader = TypeVar("_Reader")
-_SurfaceArrays = tuple[NDArray[np.float64], NDArray[np.int64]]
+_SurfaceArrays = tuple[FloatArray, IntArray]
 
 MESH_READERS: dict[str, Callable[[str, bytes], Mesh]] = {".vtu": vtu.read, ".msh": msh.read}
 SURFACE_READERS: dict[str, Callable[[str, bytes], _SurfaceArrays]] = {
@@ -38,8 +38,8 @@ class Surface(NamedTuple):
         Point numbers, counterclockwise seen from outside where the file keeps to that.
     """
 
-    points: NDArray[np.float64]
-    triangles: NDArray[np.int64]
+    points: FloatArray
+    triangles: IntArray
 
 
 def read_mesh(path: str | os.PathLike[str], *, unit_mm: float = 1.0) -> Mesh:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from naibu.core.arrays import IntArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 
 
-def split_at_plane(mesh: Mesh, z_mm: float, *, tolerance_mm: float | None = None) -> tuple[Mesh, NDArray[np.int64]]:
+def split_at_plane(mesh: Mesh, z_mm: float, *, tolerance_mm: float | None = None) -> tuple[Mesh, IntArray]:
     """Cut a mesh along a horizontal plane of nodes, so that what lies above has nodes of its own.
 
     Parameters

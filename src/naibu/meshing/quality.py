@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 
@@ -24,7 +24,7 @@ _TETRA_POINTS = np.vstack([np.full((1, 4), 0.25), np.full((4, 4), 1 / 6) + np.ey
 _TETRA_WEIGHTS = np.array([-0.8, 0.45, 0.45, 0.45, 0.45])
 
 
-def signed_volumes(mesh: Mesh) -> NDArray[np.float64]:
+def signed_volumes(mesh: Mesh) -> FloatArray:
     """Return the volume (m,) of every cell, mm^3, exact for its shape functions; negative where the cell is turned inside out."""
     if mesh.cell_type == "tetra":
         p = mesh.points[mesh.cells]
@@ -34,7 +34,7 @@ def signed_volumes(mesh: Mesh) -> NDArray[np.float64]:
     return np.asarray(_hex_jacobians(mesh, _HEX_SIGNS / np.sqrt(3.0)).sum(axis=1), dtype=np.float64)
 
 
-def min_jacobians(mesh: Mesh) -> NDArray[np.float64]:
+def min_jacobians(mesh: Mesh) -> FloatArray:
     """Return the smallest Jacobian determinant (m,) found in every cell (corners and integration points), mm^3."""
     if mesh.cell_type == "tetra":
         return 6 * signed_volumes(mesh)
@@ -43,7 +43,7 @@ def min_jacobians(mesh: Mesh) -> NDArray[np.float64]:
     return np.asarray(_hex_jacobians(mesh, np.vstack([_HEX_SIGNS, _HEX_SIGNS / np.sqrt(3.0)])).min(axis=1))
 
 
-def scaled_jacobians(mesh: Mesh) -> NDArray[np.float64]:
+def scaled_jacobians(mesh: Mesh) -> FloatArray:
     """Return the scaled Jacobian (m,) of every cell: 1 is a cube or a regular tetrahedron, 0 a flat cell, negative an inverted one.
 
     The least triple product of the unit edges at a corner [1]_, times the square root of 2 for tetrahedra. Quadratic tetrahedra are
@@ -63,7 +63,7 @@ def scaled_jacobians(mesh: Mesh) -> NDArray[np.float64]:
     return np.asarray(scaled.min(axis=1) * (np.sqrt(2.0) if kind == "tetra" else 1.0))
 
 
-def aspect_ratios(mesh: Mesh) -> NDArray[np.float64]:
+def aspect_ratios(mesh: Mesh) -> FloatArray:
     """Return the longest edge over the shortest (m,) of every cell; infinite where an edge has no length."""
     kind, corners = _linear_part(mesh)
     ends = mesh.points[corners][:, _EDGES[kind]]
@@ -79,14 +79,14 @@ def mean_edge_length(mesh: Mesh) -> float:
     return float(np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2).mean())
 
 
-def unused_nodes(mesh: Mesh) -> NDArray[np.int64]:
+def unused_nodes(mesh: Mesh) -> IntArray:
     """Return the numbers (k,) of the nodes that no cell uses; each would make a stiffness matrix singular."""
     used = np.zeros(mesh.n_points, dtype=bool)
     used[mesh.cells] = True
     return np.flatnonzero(~used).astype(np.int64)
 
 
-def duplicate_points(mesh: Mesh, *, tolerance_mm: float | None = None) -> NDArray[np.int64]:
+def duplicate_points(mesh: Mesh, *, tolerance_mm: float | None = None) -> IntArray:
     """Return the pairs (k, 2) of nodes that lie within `tolerance_mm` of each other (default: 1e-9 of the diagonal of the mesh).
 
     Sliding interfaces have them on purpose; elsewhere they are a crack.
@@ -125,19 +125,19 @@ def check(mesh: Mesh, *, min_scaled_jacobian: float = 1e-6) -> None:
         raise InputError(f"no cell uses node {int(unused[0])} ({len(unused)} such nodes); remove the nodes that belong to no cell")
 
 
-def _linear_part(mesh: Mesh) -> tuple[str, NDArray[np.int64]]:
+def _linear_part(mesh: Mesh) -> tuple[str, IntArray]:
     """Return the kind of the straight cell, and its corners (m, 4 | 8)."""
     return ("tetra", mesh.cells[:, :4]) if mesh.cell_type == "tetra10" else (mesh.cell_type, mesh.cells)
 
 
-def _hex_jacobians(mesh: Mesh, at: NDArray[np.float64]) -> NDArray[np.float64]:
+def _hex_jacobians(mesh: Mesh, at: FloatArray) -> FloatArray:
     """Return the Jacobian determinants (m, q) of trilinear cells at reference points `at` (q, 3) in [-1, 1]^3."""
     factors = 1 + at[:, None, :] * _HEX_SIGNS
     gradients = np.stack([_HEX_SIGNS[:, i] * factors[:, :, (i + 1) % 3] * factors[:, :, (i + 2) % 3] / 8 for i in range(3)], axis=2)
     return np.asarray(np.linalg.det(np.einsum("qni,cnx->cqix", gradients, mesh.points[mesh.cells], optimize=True)), dtype=np.float64)
 
 
-def _tetra10_jacobians(mesh: Mesh, at: NDArray[np.float64]) -> NDArray[np.float64]:
+def _tetra10_jacobians(mesh: Mesh, at: FloatArray) -> FloatArray:
     """Return the Jacobian determinants (m, q) of quadratic tetrahedra at barycentric points `at` (q, 4)."""
     corner = at[:, :, None] * 4 - 1
     by_corner = corner * np.eye(4)

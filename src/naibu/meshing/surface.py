@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 
@@ -33,8 +34,8 @@ class Boundary(NamedTuple):
         The cell that each face belongs to.
     """
 
-    faces: NDArray[np.int64]
-    cells: NDArray[np.int64]
+    faces: IntArray
+    cells: IntArray
 
 
 def boundary_faces(mesh: Mesh) -> Boundary:
@@ -48,7 +49,7 @@ def boundary_faces(mesh: Mesh) -> Boundary:
     return faces_of_cells(mesh.cells, mesh.cell_type)
 
 
-def faces_of_cells(cells: NDArray[np.int64], cell_type: str) -> Boundary:
+def faces_of_cells(cells: IntArray, cell_type: str) -> Boundary:
     """Return the boundary of bare cells (m, k); see `boundary_faces`."""
     local = CELL_FACES[cell_type]
     faces = cells[:, local].reshape(-1, local.shape[1])
@@ -64,15 +65,15 @@ def faces_of_cells(cells: NDArray[np.int64], cell_type: str) -> Boundary:
     return Boundary(faces[single], (single // len(local)).astype(np.int64))
 
 
-def boundary_nodes(mesh: Mesh) -> NDArray[np.int64]:
+def boundary_nodes(mesh: Mesh) -> IntArray:
     """Return the sorted numbers (n,) of the nodes on the boundary."""
     return np.unique(boundary_faces(mesh).faces)
 
 
-def triangles_of_faces(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+def triangles_of_faces(faces: IntArray) -> IntArray:
     """Split faces (f, 3 | 4 | 6) into triangles (t, 3) of the same orientation.
 
-    Quadrilaterals are cut by the diagonal of their lowest node, like `naibu.meshing.splitting.split_hexahedra` does, and quadratic
+    Quadrilaterals are cut by the diagonal of their lowest node, like `naibu.meshing.element_conversion.split_hexahedra` does, and quadratic
     triangles into four.
     """
     if faces.shape[1] == 3:
@@ -83,7 +84,7 @@ def triangles_of_faces(faces: NDArray[np.int64]) -> NDArray[np.int64]:
     return turned[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
-def face_normals(points: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+def face_normals(points: FloatArray, faces: IntArray) -> FloatArray:
     """Return the area vector (f, 3), mm^2, of faces (f, 3 | 4 | 6): it points outwards and its length is the area of a plane face."""
     p = points[faces]
     if faces.shape[1] == 4:
@@ -91,7 +92,7 @@ def face_normals(points: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArr
     return 0.5 * np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
 
 
-def node_areas(mesh: Mesh, faces: NDArray[np.int64] | None = None) -> NDArray[np.float64]:
+def node_areas(mesh: Mesh, faces: IntArray | None = None) -> FloatArray:
     r"""Return the tributary area of every node, :math:`\int N_i \, dA`.
 
     A uniform pressure loads node i by pressure times this area.
@@ -118,7 +119,7 @@ def node_areas(mesh: Mesh, faces: NDArray[np.int64] | None = None) -> NDArray[np
     return np.asarray(np.bincount(faces.ravel(), weights=shares.ravel(), minlength=mesh.n_points), dtype=np.float64)
 
 
-def nodes_on_plane(mesh: Mesh, point_mm: ArrayLike, normal: ArrayLike, *, tolerance_mm: float | None = None) -> NDArray[np.int64]:
+def nodes_on_plane(mesh: Mesh, point_mm: ArrayLike, normal: ArrayLike, *, tolerance_mm: float | None = None) -> IntArray:
     """Return the numbers of the nodes on a plane.
 
     Parameters
@@ -147,7 +148,7 @@ def nodes_on_plane(mesh: Mesh, point_mm: ArrayLike, normal: ArrayLike, *, tolera
     return np.flatnonzero(np.abs(distance) <= limit).astype(np.int64)
 
 
-def side_nodes(mesh: Mesh, side: str, *, tolerance_mm: float | None = None) -> NDArray[np.int64]:
+def side_nodes(mesh: Mesh, side: str, *, tolerance_mm: float | None = None) -> IntArray:
     """Return the nodes at one end of the mesh: ``"z-"`` are those of least z, ``"x+"`` those of greatest x.
 
     Parameters
@@ -171,7 +172,7 @@ def side_nodes(mesh: Mesh, side: str, *, tolerance_mm: float | None = None) -> N
     return nodes_on_plane(mesh, extreme, np.eye(3)[axis], tolerance_mm=tolerance_mm)
 
 
-def faces_towards(mesh: Mesh, direction: ArrayLike, *, max_angle_deg: float = 45.0) -> NDArray[np.int64]:
+def faces_towards(mesh: Mesh, direction: ArrayLike, *, max_angle_deg: float = 45.0) -> IntArray:
     """Return the boundary faces (f, k) whose outward normal is within `max_angle_deg` of `direction` (3,).
 
     Raises
@@ -182,11 +183,11 @@ def faces_towards(mesh: Mesh, direction: ArrayLike, *, max_angle_deg: float = 45
     faces = boundary_faces(mesh).faces
     normals = face_normals(mesh.points, faces)
     cosine = (normals @ _unit(direction)) / np.linalg.norm(normals, axis=1)
-    towards: NDArray[np.bool_] = cosine >= np.cos(np.radians(max_angle_deg)) - 1e-12
+    towards: BoolArray = cosine >= np.cos(np.radians(max_angle_deg)) - 1e-12
     return faces[towards]
 
 
-def faces_among(mesh: Mesh, nodes: ArrayLike) -> NDArray[np.int64]:
+def faces_among(mesh: Mesh, nodes: ArrayLike) -> IntArray:
     """Return the boundary faces (f, k) all of whose nodes are in `nodes` (n,)."""
     chosen = np.zeros(mesh.n_points, dtype=bool)
     chosen[np.asarray(nodes, dtype=np.int64)] = True
@@ -194,7 +195,7 @@ def faces_among(mesh: Mesh, nodes: ArrayLike) -> NDArray[np.int64]:
     return faces[chosen[faces].all(axis=1)]
 
 
-def _unit(vector: ArrayLike) -> NDArray[np.float64]:
+def _unit(vector: ArrayLike) -> FloatArray:
     """Return a direction of length one."""
     array = np.asarray(vector, dtype=np.float64)
     length = float(np.linalg.norm(array))
@@ -203,7 +204,7 @@ def _unit(vector: ArrayLike) -> NDArray[np.float64]:
     return array / length
 
 
-def _quad_shares(p: NDArray[np.float64]) -> NDArray[np.float64]:
+def _quad_shares(p: FloatArray) -> FloatArray:
     """Return the integral (f, 4) of each bilinear shape function over quadrilaterals p (f, 4, 3), by 2 x 2 Gauss points."""
     signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=np.float64)
     shares = np.zeros(p.shape[:2])

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from naibu.pages.chapter import Chapter
-from naibu.reproduction.chapter1 import chapter1
-from naibu.reproduction.chapter2 import chapter2
-from naibu.reproduction.chapter3 import chapter3
-from naibu.reproduction.chapter4_cube import chapter4_cube
-from naibu.reproduction.chapter4_lattice import chapter4_lattice
-from naibu.reproduction.chapter4_octree import chapter4_octree
+from naibu.reproduction.chapter1.tables import chapter1
+from naibu.reproduction.chapter2.tables import chapter2
+from naibu.reproduction.chapter3.tables import chapter3
+from naibu.reproduction.chapter4.cube import chapter4_cube
+from naibu.reproduction.chapter4.lattice import chapter4_lattice
+from naibu.reproduction.chapter4.octree import chapter4_octree
+from naibu.viewer.chapter import Chapter
 
 CHAPTERS: dict[str, Callable[[int], Chapter]] = {
     "ch1": chapter1,

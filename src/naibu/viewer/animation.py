@@ -9,8 +9,8 @@ from html import escape
 from importlib.resources import files
 
 import numpy as np
-from numpy.typing import NDArray
 
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 
 STEPS = 32_000  # of a 16-bit number that the page stores, from the smallest to the largest value
@@ -37,14 +37,14 @@ class MovingBody:
     """
 
     title: str
-    points: NDArray[np.float64]
-    triangles: NDArray[np.int64]
-    displacement: NDArray[np.float64]
-    values: NDArray[np.float64]
-    marks: tuple[tuple[str, NDArray[np.float64]], ...] = ()
+    points: FloatArray
+    triangles: IntArray
+    displacement: FloatArray
+    values: FloatArray
+    marks: tuple[tuple[str, FloatArray], ...] = ()
 
 
-def animation_html(title: str, times_s: NDArray[np.float64], bodies: tuple[MovingBody, ...], value_name: str, note: str = "") -> str:
+def animation_html(title: str, times_s: FloatArray, bodies: tuple[MovingBody, ...], value_name: str, note: str = "") -> str:
     """Return the page.
 
     Parameters
@@ -101,5 +101,5 @@ def _packed(body: MovingBody, low: float, high: float) -> dict[str, object]:
     }
 
 
-def _base64(values: NDArray[np.float64]) -> str:
+def _base64(values: FloatArray) -> str:
     return base64.b64encode(np.round(np.nan_to_num(values)).astype("<i2").tobytes()).decode()

@@ -10,13 +10,13 @@ from dataclasses import dataclass, field, replace
 from html import escape
 
 import numpy as np
-from numpy.typing import NDArray
 
+from naibu.core.arrays import FloatArray, Int16Array, IntArray
 from naibu.core.errors import InputError
-from naibu.viewer.document import POLICY, asset
-from naibu.viewer.figures import ticks_between
-from naibu.viewer.payload import FloatArray, IntArray, Table
-from naibu.viewer.tables import plain_table, provenance_table
+from naibu.viewer.result_page.document import POLICY, asset
+from naibu.viewer.result_page.figures import ticks_between
+from naibu.viewer.result_page.payload import Table
+from naibu.viewer.result_page.tables import plain_table, provenance_table
 
 STEPS = 4000  # whole multiples from no displacement to the largest
 LEVELS = 255  # of colours
@@ -194,7 +194,7 @@ def _packed(page: MotionPage) -> dict[str, object]:
     }
 
 
-def _differences(rows: NDArray[np.int16]) -> bytes:
+def _differences(rows: Int16Array) -> bytes:
     """Return second differences down the rows, which are small as motions are smooth: all low bytes, then all high bytes."""
     out = rows.copy()
     out[1:] = rows[1:] - rows[:-1]  # wraps around, as the sums will

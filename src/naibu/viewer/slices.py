@@ -11,13 +11,12 @@ from html import escape
 from importlib.resources import files
 
 import numpy as np
-from numpy.typing import NDArray
 
+from naibu.core.arrays import AnyFloatArray
 from naibu.core.errors import InputError
-from naibu.viewer.payload import Table
-from naibu.viewer.tables import plain_table
+from naibu.viewer.result_page.payload import Table
+from naibu.viewer.result_page.tables import plain_table
 
-Array = NDArray[np.floating]
 GREYS = 255
 LEVELS = 254  # of an overlay; 255 says that nothing is known
 FEW_VOXELS = 1_500_000
@@ -38,7 +37,7 @@ class Overlay:
     """
 
     name: str
-    values: Array
+    values: AnyFloatArray
     middle: float | None = None
 
 
@@ -68,9 +67,9 @@ class SliceView:
 
     title: str
     sentences: Sequence[str]
-    spacing_mm: Array
-    images: Sequence[tuple[str, Array]]
-    displacement: Array
+    spacing_mm: AnyFloatArray
+    images: Sequence[tuple[str, AnyFloatArray]]
+    displacement: AnyFloatArray
     overlays: Sequence[Overlay]
     tables: Sequence[Table] = ()
     difference: tuple[tuple[str, int, int], ...] = ()
@@ -108,7 +107,7 @@ def slices_html(view: SliceView) -> str:
     return template.replace("$TITLE", escape(view.title)).replace("$WORDS", words).replace("$TABLES", tables).replace("$DATA", data)
 
 
-def _stride(shape: tuple[int, ...], spacing: Array) -> list[int]:
+def _stride(shape: tuple[int, ...], spacing: AnyFloatArray) -> list[int]:
     """Every how many voxels along x, y, z: finer axes are thinned first."""
     size, every = np.array(shape[::-1]), np.ones(3, dtype=int)
     while np.prod(-(-size // every)) > FEW_VOXELS:
@@ -116,7 +115,7 @@ def _stride(shape: tuple[int, ...], spacing: Array) -> list[int]:
     return [int(k) for k in every]
 
 
-def _images(images: Sequence[tuple[str, Array]]) -> list[dict[str, object]]:
+def _images(images: Sequence[tuple[str, AnyFloatArray]]) -> list[dict[str, object]]:
     """On the grey scale of the first one; what is not known is black."""
     known = images[0][1][np.isfinite(images[0][1])]
     low, high = (float(q) for q in np.percentile(known, (0.2, 99.8)))
@@ -127,7 +126,7 @@ def _images(images: Sequence[tuple[str, Array]]) -> list[dict[str, object]]:
     ]
 
 
-def _overlay(overlay: Overlay, values: Array) -> dict[str, object]:
+def _overlay(overlay: Overlay, values: AnyFloatArray) -> dict[str, object]:
     known = np.asarray(np.isfinite(values))
     low, high = (float(q) for q in np.percentile(values[known], (0.5, 99.5))) if known.any() else (0.0, 1.0)
     if overlay.middle is not None:
@@ -140,7 +139,7 @@ def _overlay(overlay: Overlay, values: Array) -> dict[str, object]:
     return {"name": overlay.name, "low": low, "high": low + span, "diverging": overlay.middle is not None, "data": _packed(levels)}
 
 
-def _arrows(displacement: Array) -> dict[str, object]:
+def _arrows(displacement: AnyFloatArray) -> dict[str, object]:
     """Whole multiples of a length; -32768 where nothing is known."""
     known = np.asarray(np.isfinite(displacement).all(axis=-1))
     largest = float(np.abs(displacement[known]).max()) if known.any() else 1.0
@@ -149,7 +148,7 @@ def _arrows(displacement: Array) -> dict[str, object]:
     return {"quantum": quantum, "data": _zipped(np.ascontiguousarray(whole).tobytes())}
 
 
-def _packed(values: Array) -> str:
+def _packed(values: AnyFloatArray) -> str:
     return _zipped(np.ascontiguousarray(np.round(values).astype(np.uint8)).tobytes())
 
 

@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from naibu.core.arrays import AnyArray, FloatArray
 from naibu.core.errors import InputError
 from naibu.core.optional_packages import optional_package
 from naibu.core.volume import Volume
 from naibu.io.image_formats.geometry import ReadOptions, no_colours, volume_with_axes
 
-Array = NDArray[np.float64]
 # scanners round positions to some micrometres
 EVEN, ALIGNED = 0.02, 2e-3
 
@@ -33,9 +32,9 @@ class _Slice:
     description: str
     size: tuple[int, int]
     samples: int
-    position: Array
-    axes: Array
-    pixel_mm: Array
+    position: FloatArray
+    axes: FloatArray
+    pixel_mm: FloatArray
     apart_mm: float | None
     rescale: tuple[float, float]
 
@@ -177,7 +176,7 @@ def _sorted_stack(source: str, slices: list[_Slice]) -> list[_Slice]:
     return sorted(slices, key=lambda s: float(s.position @ normal))
 
 
-def _step(source: str, slices: list[_Slice]) -> Array:
+def _step(source: str, slices: list[_Slice]) -> FloatArray:
     """Return the step (3,), mm, from one slice to the next."""
     first = slices[0]
     normal = np.cross(*first.axes)
@@ -203,9 +202,9 @@ def _step(source: str, slices: list[_Slice]) -> Array:
     return np.asarray(total / (len(slices) - 1))
 
 
-def _values(pydicom: Any, source: str, slices: list[_Slice]) -> NDArray[Any]:
+def _values(pydicom: Any, source: str, slices: list[_Slice]) -> AnyArray:
     """Return the stored values (nz, ny, nx)."""
-    pages: dict[Path, NDArray[Any]] = {}
+    pages: dict[Path, AnyArray] = {}
     planes = []
     for s in slices:
         if s.file not in pages:

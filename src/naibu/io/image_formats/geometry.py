@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from naibu.core.arrays import AnyArray, FloatArray
 from naibu.core.errors import InputError
 from naibu.core.volume import NEARLY, Volume
 
-Array = NDArray[np.float64]
 MM_PER_UNIT = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "nm": 1e-6, "inch": 25.4, "in": 25.4}
 _LONG_NAMES = {
     "meter": "m",
@@ -47,7 +47,7 @@ class ReadOptions(NamedTuple):
     """
 
     unit_mm: float | None = None
-    spacing_mm: Array | None = None
+    spacing_mm: FloatArray | None = None
     series: str | None = None
     rescaled: bool = False
 
@@ -109,7 +109,7 @@ def volume_with_axes(source: str, values: ArrayLike, origin: ArrayLike, axes: Ar
         raise InputError(f"{source}: {error}") from error
 
 
-def nearest_rotation(direction: Array) -> Array:
+def nearest_rotation(direction: FloatArray) -> FloatArray:
     """Return the orthonormal axes (3, 3) nearest to axes that were rounded in a file; exact ones stay exact."""
     if np.abs(direction.T @ direction - np.eye(3)).max() < 1e-12:
         return direction
@@ -117,7 +117,7 @@ def nearest_rotation(direction: Array) -> Array:
     return np.asarray(u @ vt)
 
 
-def three_axes(source: str, values: NDArray[Any]) -> NDArray[Any]:
+def three_axes(source: str, values: AnyArray) -> AnyArray:
     """Return values (nz, ny, nx) of an array whose further leading axes have length one; a plane becomes one slice.
 
     Raises

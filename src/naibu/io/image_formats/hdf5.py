@@ -12,11 +12,12 @@ from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from naibu.core.arrays import AnyArray
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
-from naibu.io.atomic import new_aside, put_in_place
+from naibu.io.files.atomic import new_aside, put_in_place
 from naibu.io.image_formats.geometry import ReadOptions, content, volume_with_axes
 
 BLOCK = 64
@@ -45,7 +46,7 @@ def read_box(path: Path, low: ArrayLike, high: ArrayLike, options: ReadOptions) 
         return _volume(path, stored, tuple(a.tolist()), tuple(b.tolist()), options)
 
 
-def write(path: Path, values: NDArray[Any], grid: Volume, *, compressed: bool) -> Path:
+def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Path:
     """Write grey values (nz, ny, nx), or vectors (nz, ny, nx, 3), that stand on the grid of a volume, in blocks of 64 voxels an edge."""
     aside = new_aside(path)
     try:

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from naibu.core.arrays import AnyArray, FloatArray
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
-from naibu.io.atomic import write_atomically
+from naibu.io.files.atomic import write_atomically
 from naibu.io.image_formats.geometry import ReadOptions, content, no_colours, three_axes, unit_length, volume_with_axes
 
 _TYPES = {
@@ -42,7 +42,7 @@ def read(path: Path, options: ReadOptions) -> Volume:
     return _with_geometry(path, header, values, options)
 
 
-def read_vectors(path: Path, options: ReadOptions) -> tuple[NDArray[np.float64], Volume]:
+def read_vectors(path: Path, options: ReadOptions) -> tuple[FloatArray, Volume]:
     """Read vectors (nz, ny, nx, 3) and the grid they stand on, whose values tell where they are finite."""
     header, values = _parts(path)
     if int(header.get("ElementNumberOfChannels", "1")) != 3 or values.ndim != 4:
@@ -52,7 +52,7 @@ def read_vectors(path: Path, options: ReadOptions) -> tuple[NDArray[np.float64],
     return vectors, grid
 
 
-def write(path: Path, values: NDArray[Any], grid: Volume, *, compressed: bool) -> Path:
+def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Path:
     """Write values (nz, ny, nx), or vectors (nz, ny, nx, 3), that stand on the grid of a volume."""
     stored = values.astype(np.uint8) if values.dtype == bool else values
     stored = stored.astype(np.float32) if stored.dtype == np.float16 else stored
@@ -86,11 +86,11 @@ def write(path: Path, values: NDArray[Any], grid: Volume, *, compressed: bool) -
     return write_atomically(path, text.encode() + data)
 
 
-def _numbers(values: NDArray[np.float64]) -> str:
+def _numbers(values: FloatArray) -> str:
     return " ".join(repr(float(v)) for v in values)
 
 
-def _parts(path: Path) -> tuple[dict[str, str], NDArray[Any]]:
+def _parts(path: Path) -> tuple[dict[str, str], AnyArray]:
     """Return the header of a file and its values, (nz, ny, nx) or (nz, ny, nx, channels)."""
     raw = content(path)
     header, end = _header(path.name, raw)
@@ -123,7 +123,7 @@ def _header(source: str, raw: bytes) -> tuple[dict[str, str], int]:
     return header, at
 
 
-def _values(path: Path, header: dict[str, str], rest: bytes, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+def _values(path: Path, header: dict[str, str], rest: bytes, dtype: np.dtype[Any], shape: tuple[int, ...]) -> AnyArray:
     """Return the values that follow the header, or stand in the files it names."""
     named = header["ElementDataFile"]
     if "%" in named:
@@ -148,7 +148,7 @@ def _values(path: Path, header: dict[str, str], rest: bytes, dtype: np.dtype[Any
     return _counted(path.name, there.astype(dtype), n).reshape(shape)
 
 
-def _counted(source: str, values: NDArray[Any], n: int) -> NDArray[Any]:
+def _counted(source: str, values: AnyArray, n: int) -> AnyArray:
     if len(values) != n:
         raise InputError(f"{source}: holds {len(values)} of {n} values: the file was cut off; copy it again")
     return values
@@ -158,7 +158,7 @@ def _true(text: str | None) -> bool:
     return text is not None and text.strip().lower() in ("true", "1", "t")
 
 
-def _with_geometry(path: Path, header: dict[str, str], values: NDArray[Any], options: ReadOptions) -> Volume:
+def _with_geometry(path: Path, header: dict[str, str], values: AnyArray, options: ReadOptions) -> Volume:
     n = int(header["NDims"])
     place = next((header[key] for key in ("Offset", "Origin", "Position") if key in header), None)
     turn = next((header[key] for key in ("TransformMatrix", "Rotation", "Orientation") if key in header), None)

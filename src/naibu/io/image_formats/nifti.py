@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import gzip
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from naibu.core.arrays import AnyArray
 from naibu.core.errors import InputError
 from naibu.core.optional_packages import optional_package
 from naibu.core.volume import Volume
-from naibu.io.atomic import write_atomically
+from naibu.io.files.atomic import write_atomically
 from naibu.io.image_formats.geometry import FLIP_RAS, ReadOptions, content, three_axes, unit_length, volume_with_axes
 
 _STORED = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
@@ -40,7 +39,7 @@ def read(path: Path, options: ReadOptions) -> Volume:
     return volume_with_axes(path.name, values, FLIP_RAS @ affine[:3, 3], FLIP_RAS @ affine[:3, :3], unit)
 
 
-def write(path: Path, values: NDArray[Any], grid: Volume, *, compressed: bool) -> Path:
+def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Path:
     """Write grey values (nz, ny, nx) that stand on the grid of a volume; the ending of the name tells whether they are compressed."""
     nibabel = optional_package("nibabel", f"{path.name}: writing NIfTI files")
     stored = values.astype(np.uint8) if values.dtype == bool else values

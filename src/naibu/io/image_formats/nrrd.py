@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from naibu.core.arrays import AnyArray, FloatArray
 from naibu.core.errors import InputError
 from naibu.core.optional_packages import optional_package
 from naibu.core.volume import Volume
-from naibu.io.atomic import write_atomically
+from naibu.io.files.atomic import write_atomically
 from naibu.io.image_formats.geometry import FLIP_RAS, ReadOptions, content, three_axes, unit_length, volume_with_axes
 
 _TO_LPS = {
@@ -40,7 +40,7 @@ def read(path: Path, options: ReadOptions) -> Volume:
     return _with_geometry(path, header, three_axes(path.name, keep.T), spatial, options)
 
 
-def read_vectors(path: Path, options: ReadOptions) -> tuple[NDArray[np.float64], Volume]:
+def read_vectors(path: Path, options: ReadOptions) -> tuple[FloatArray, Volume]:
     """Read vectors (nz, ny, nx, 3) and the grid they stand on, whose values tell where they are finite."""
     values, header = _loaded(path)
     spatial = _spatial_axes(path.name, header, values.ndim)
@@ -52,7 +52,7 @@ def read_vectors(path: Path, options: ReadOptions) -> tuple[NDArray[np.float64],
     return vectors @ turn.T, grid
 
 
-def write(path: Path, values: NDArray[Any], grid: Volume, *, compressed: bool) -> Path:
+def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Path:
     """Write values (nz, ny, nx), or vectors (nz, ny, nx, 3), that stand on the grid of a volume."""
     nrrd = optional_package("nrrd", f"{path.name}: writing NRRD files", "pynrrd")
     if path.suffix.lower() != ".nrrd":
@@ -77,7 +77,7 @@ def write(path: Path, values: NDArray[Any], grid: Volume, *, compressed: bool) -
         Path(aside).unlink(missing_ok=True)
 
 
-def _loaded(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
+def _loaded(path: Path) -> tuple[AnyArray, dict[str, Any]]:
     nrrd = optional_package("nrrd", f"{path.name}: reading NRRD files", "pynrrd")
     if not path.is_file():
         content(path)
@@ -100,7 +100,7 @@ def _spatial_axes(source: str, header: dict[str, Any], n: int) -> list[int]:
     return [a for a, kind in enumerate(kinds) if kind in ("domain", "space", "???", "none")]
 
 
-def _with_geometry(path: Path, header: dict[str, Any], values: NDArray[Any], spatial: list[int], options: ReadOptions) -> Volume:
+def _with_geometry(path: Path, header: dict[str, Any], values: AnyArray, spatial: list[int], options: ReadOptions) -> Volume:
     n = len(spatial)
     space = str(header.get("space", "")).lower()
     if space not in _TO_LPS:

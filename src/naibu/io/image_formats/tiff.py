@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from naibu.core.arrays import AnyArray
 from naibu.core.errors import InputError
 from naibu.core.optional_packages import optional_package
 from naibu.core.volume import Volume
-from naibu.io.atomic import write_atomically
+from naibu.io.files.atomic import write_atomically
 from naibu.io.image_formats.geometry import MM_PER_UNIT, ReadOptions, content, no_colours, three_axes, unit_length, volume_with_axes
 
 _ENDINGS = (".tif", ".tiff")
@@ -44,7 +44,7 @@ def read(path: Path, options: ReadOptions) -> Volume:
     return volume_with_axes(path.name, values, stated["origin"], steps, options.unit_mm or 1.0)
 
 
-def write(path: Path, values: NDArray[Any], grid: Volume, *, compressed: bool) -> Path:
+def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Path:
     """Write grey values (nz, ny, nx); the geometry goes along as JSON in the description, where `read` finds it."""
     tifffile = optional_package("tifffile", f"{path.name}: writing TIFF files")
     if values.ndim != 3:
@@ -95,7 +95,7 @@ def slices_of_folder(folder: Path) -> list[Path]:
     return [files[i] for i in order]
 
 
-def _loaded(tifffile: Any, path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
+def _loaded(tifffile: Any, path: Path) -> tuple[AnyArray, dict[str, Any]]:
     """Return the values of a file and what it says of the distance of its voxels."""
     if not path.is_file():
         content(path)

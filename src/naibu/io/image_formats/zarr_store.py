@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from naibu.core.arrays import AnyArray
 from naibu.core.chunked_volume import ChunkedVolume
 from naibu.core.errors import InputError
 from naibu.core.optional_packages import optional_package
@@ -95,7 +96,7 @@ def create_chunked(
     Returns
     -------
     zarr.Array
-        To be assigned to by slices, for example by `naibu.imaging.chunked.stored`.
+        To be assigned to by slices, for example by `naibu.imaging.out_of_core.stored`.
     """
     zarr = _zarr()
     try:
@@ -111,7 +112,7 @@ def create_chunked(
     return group.create_array("values", shape=shape, chunks=chunks, dtype=np.dtype(dtype))
 
 
-def write(path: Path, values: NDArray[Any], grid: Volume, *, compressed: bool) -> Path:
+def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Path:
     """Write grey values (nz, ny, nx), or vectors (nz, ny, nx, 3); chunks are always packed, without loss.
 
     An old store is replaced when the new one is complete.
@@ -135,7 +136,7 @@ def write(path: Path, values: NDArray[Any], grid: Volume, *, compressed: bool) -
     return path
 
 
-def _part(path: Path, stored: ChunkedVolume, low: NDArray[Any], high: NDArray[Any]) -> Volume:
+def _part(path: Path, stored: ChunkedVolume, low: AnyArray, high: AnyArray) -> Volume:
     box = tuple(slice(int(a), int(b)) for a, b in zip(low[::-1], high[::-1], strict=True))
     axes = stored.direction * stored.spacing_mm
     return volume_with_axes(path.name, np.asarray(stored.values[box]), stored.origin_mm + axes @ low.astype(float), axes, 1.0)

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import NODES_PER_CELL, Mesh
 
@@ -32,11 +32,11 @@ class Block(NamedTuple):
     """
 
     kind: str
-    cells: NDArray[np.int64]
-    tags: NDArray[np.int64]
+    cells: IntArray
+    tags: IntArray
 
 
-def volume_mesh(source: str, points: NDArray[np.float64], blocks: Sequence[Block], names: Mapping[int, str]) -> Mesh:
+def volume_mesh(source: str, points: FloatArray, blocks: Sequence[Block], names: Mapping[int, str]) -> Mesh:
     """Gather the volume cells of a file into one mesh; points that none of them uses are left out.
 
     Parameters
@@ -78,7 +78,7 @@ def volume_mesh(source: str, points: NDArray[np.float64], blocks: Sequence[Block
     return Mesh.from_arrays(points, cells, kinds[0], regions=regions.ravel(), region_names=region_names)
 
 
-def fan_triangles(corners: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
+def fan_triangles(corners: IntArray, counts: IntArray) -> IntArray:
     """Cut polygons into triangles (t, 3) that share each polygon's first corner.
 
     Parameters
@@ -95,7 +95,7 @@ def fan_triangles(corners: NDArray[np.int64], counts: NDArray[np.int64]) -> NDAr
     return np.stack([corners[first], corners[first + step + 1], corners[first + step + 2]], axis=1).astype(np.int64)
 
 
-def numbers(source: str, what: str, text: bytes | str) -> NDArray[np.float64]:
+def numbers(source: str, what: str, text: bytes | str) -> FloatArray:
     """Return the numbers in a piece of text, naming the file and the piece if one is not a number."""
     tokens = text.split()
     try:

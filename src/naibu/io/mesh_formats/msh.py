@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.io.mesh_formats.assembly import Block, numbers, volume_mesh
@@ -33,7 +34,7 @@ class _Stream:
 
     source: str
     section: str
-    tokens: NDArray[np.float64] | None
+    tokens: FloatArray | None
     data: bytes
     order: str
     position: int = 0
@@ -51,15 +52,15 @@ class _Stream:
             raise InputError(f"{self.source}: section ${self.section} is cut off; write the file again")
         return values
 
-    def ints(self, count: int) -> NDArray[np.int64]:
+    def ints(self, count: int) -> IntArray:
         """Return the next `count` ints (4 bytes in binary)."""
         return self.taken("i4", count).astype(np.int64)
 
-    def sizes(self, count: int) -> NDArray[np.int64]:
+    def sizes(self, count: int) -> IntArray:
         """Return the next `count` sizes (8 bytes in binary)."""
         return self.taken("u8", count).astype(np.int64)
 
-    def floats(self, count: int) -> NDArray[np.float64]:
+    def floats(self, count: int) -> FloatArray:
         """Return the next `count` doubles."""
         return self.taken("f8", count).astype(np.float64)
 
@@ -138,7 +139,7 @@ def _physical_of_volumes(stream: _Stream) -> dict[int, int]:
     return physical
 
 
-def _nodes_41(stream: _Stream) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _nodes_41(stream: _Stream) -> tuple[IntArray, FloatArray]:
     """Return the tags (n,) and positions (n, 3) of the nodes."""
     tags, points = [np.zeros(0, dtype=np.int64)], [np.zeros((0, 3))]
     for _ in range(int(stream.sizes(4)[0])):
@@ -174,7 +175,7 @@ def _read_2(source: str, data: bytes) -> Mesh:
     return volume_mesh(source, table[:, 1:], blocks, _physical_names(source, data))
 
 
-def _element_starts(source: str, flat: NDArray[np.int64]) -> NDArray[np.int64]:
+def _element_starts(source: str, flat: IntArray) -> IntArray:
     """Return where every element starts: rows differ in length, so each can only be found from the one before."""
     tokens = flat.tolist()
     starts, at = [], 1
@@ -194,16 +195,16 @@ def _kind(source: str, code: int) -> tuple[str, int]:
     return _KINDS[code]
 
 
-def _block(kind: str, cells: NDArray[np.int64], tags: NDArray[np.int64]) -> Block:
+def _block(kind: str, cells: IntArray, tags: IntArray) -> Block:
     """Return a block of cells in VTK order."""
     return Block(kind, cells[:, _TETRA10_TO_VTK] if kind == "tetra10" else cells, tags)
 
 
-def _indices(source: str, tags: NDArray[np.int64], named: NDArray[np.int64]) -> NDArray[np.int64]:
+def _indices(source: str, tags: IntArray, named: IntArray) -> IntArray:
     """Return the row of every named node tag."""
     order = np.argsort(tags, kind="stable")
     at = np.searchsorted(tags, named, sorter=order).clip(max=len(tags) - 1)
-    rows: NDArray[np.int64] = order[at] if len(tags) else at
+    rows: IntArray = order[at] if len(tags) else at
     if len(tags) == 0 or (tags[rows] != named).any():
         missing = named[tags[rows] != named] if len(tags) else named.ravel()
         raise InputError(f"{source}: elements name node {int(missing[0])}, which section $Nodes does not have; write the file again")

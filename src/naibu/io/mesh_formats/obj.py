@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.io.mesh_formats.assembly import fan_triangles, numbers
 
 
-def read(source: str, data: bytes) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def read(source: str, data: bytes) -> tuple[FloatArray, IntArray]:
     """Read points (n, 3) and triangles (t, 3); polygons are cut into fans.
 
     Parameters

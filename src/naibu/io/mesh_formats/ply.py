@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.io.mesh_formats.assembly import fan_triangles, numbers
 
@@ -34,7 +35,7 @@ class _Element(NamedTuple):
     properties: list[_Property]
 
 
-def read(source: str, data: bytes) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def read(source: str, data: bytes) -> tuple[FloatArray, IntArray]:
     """Read points (n, 3) and triangles (t, 3); polygons are cut into fans.
 
     Parameters
@@ -136,7 +137,7 @@ def _uneven_rows(element: _Element, body: bytes, at: int, order: str) -> tuple[d
     return {name: np.concatenate(values) for name, values in parts.items() if values}, at
 
 
-def _text_rows(element: _Element, tokens: NDArray[np.float64], at: int) -> tuple[dict[str, NDArray[np.generic]], int]:
+def _text_rows(element: _Element, tokens: FloatArray, at: int) -> tuple[dict[str, NDArray[np.generic]], int]:
     """Return the columns of a text table that starts at token `at`, and where it ends."""
     if element.rows and (even := _even_rows(element, tokens, at)) is not None:
         return even
@@ -153,7 +154,7 @@ def _text_rows(element: _Element, tokens: NDArray[np.float64], at: int) -> tuple
     return {name: np.concatenate(values) for name, values in parts.items()}, at
 
 
-def _even_rows(element: _Element, tokens: NDArray[np.float64], at: int) -> tuple[dict[str, NDArray[np.generic]], int] | None:
+def _even_rows(element: _Element, tokens: FloatArray, at: int) -> tuple[dict[str, NDArray[np.generic]], int] | None:
     """Return the columns of a text table and where it ends, or None where its lists differ in length."""
     slices, width = dict[str, slice](), 0
     for p in element.properties:

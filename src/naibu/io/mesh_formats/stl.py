@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 
 import numpy as np
-from numpy.typing import NDArray
 
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.io.mesh_formats.assembly import numbers
 
@@ -14,7 +14,7 @@ _HEADER = 84
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
-def read(source: str, data: bytes) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def read(source: str, data: bytes) -> tuple[FloatArray, IntArray]:
     """Read points (n, 3) and triangles (t, 3); corners at exactly the same place become one point.
 
     Parameters
@@ -44,7 +44,7 @@ def read(source: str, data: bytes) -> tuple[NDArray[np.float64], NDArray[np.int6
     return points, index.reshape(-1, 3).astype(np.int64)
 
 
-def _ascii_corners(source: str, data: bytes) -> NDArray[np.float64]:
+def _ascii_corners(source: str, data: bytes) -> FloatArray:
     """Return the corners (3 t, 3) of an ascii file."""
     rows = re.findall(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", data)
     corners = numbers(source, "a vertex", b" ".join(token for row in rows for token in row)).reshape(-1, 3)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 
 import numpy as np
-from numpy.typing import NDArray
 
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.io.mesh_formats.assembly import fan_triangles, numbers
 
@@ -15,7 +15,7 @@ _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _IDENTITY = {"translation": [0.0, 0.0, 0.0], "scale": [1.0, 1.0, 1.0], "rotation": None}
 
 
-def read(source: str, data: bytes) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def read(source: str, data: bytes) -> tuple[FloatArray, IntArray]:
     """Read points (n, 3) and triangles (t, 3); polygons are cut into fans.
 
     Parameters
@@ -47,7 +47,7 @@ def read(source: str, data: bytes) -> tuple[NDArray[np.float64], NDArray[np.int6
     return np.concatenate(points), np.concatenate(triangles)
 
 
-def _face_set(source: str, text: str, start: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _face_set(source: str, text: str, start: int) -> tuple[FloatArray, IntArray]:
     """Return points and triangles of the IndexedFaceSet that starts at a character."""
     end = text.find("IndexedFaceSet", start + 1)
     own = text[start : end if end > 0 else len(text)]

@@ -18,6 +18,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.io.mesh_formats.assembly import Block, numbers, volume_mesh
@@ -122,7 +123,7 @@ def _blocks(file: _File, piece: Element, shift: int) -> list[Block]:
     return blocks
 
 
-def _tags(file: _File, piece: Element, n: int) -> NDArray[np.int64]:
+def _tags(file: _File, piece: Element, n: int) -> IntArray:
     """Return the region number of every cell of a piece, zero where the file tells none."""
     own = {element.get("Name"): element for element in piece.iterfind("CellData/DataArray")}
     name = next((name for name in _REGION_ARRAYS if name in own), None)
@@ -143,7 +144,7 @@ def _names(file: _File) -> dict[int, str]:
     return {}
 
 
-def _array(file: _File, element: Element | None, what: str) -> NDArray[np.float64] | NDArray[np.int64]:
+def _array(file: _File, element: Element | None, what: str) -> FloatArray | IntArray:
     """Return the values of one DataArray, in one row."""
     if element is None:
         raise InputError(f"{file.source}: has no array {what}; write it again")
@@ -153,7 +154,7 @@ def _array(file: _File, element: Element | None, what: str) -> NDArray[np.float6
     return _bytes_of(file, element, np.dtype(file.order + _DTYPES[kind]), what)
 
 
-def _bytes_of(file: _File, element: Element, dtype: np.dtype[np.generic], what: str) -> NDArray[np.float64]:
+def _bytes_of(file: _File, element: Element, dtype: np.dtype[np.generic], what: str) -> FloatArray:
     """Return the values of an array wherever and however they are stored."""
     form = element.get("format", "ascii")
     if form == "ascii":

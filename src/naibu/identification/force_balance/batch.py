@@ -1,0 +1,272 @@
+"""Batch identification from measured fields: the balance of all nodes of all trials at once (spec I3; report 3.3.3, equation 3.34).
+
+One linear system for lambda and mu of every zone. With fewer equations than unknowns - the report's one push - the solution of minimum norm
+fulfils every balance and need not be near the truth: `BalanceEstimate.determined` tells which moduli the equations fix. Noise enters the
+matrix too, which least squares does not know: moduli come out too low (errors in variables). `whitened_balance` mends that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from naibu.core.arrays import BoolArray, FloatArray
+from naibu.core.errors import InputError
+from naibu.core.mesh import Mesh
+from naibu.core.status import Status
+from naibu.identification.force_balance.equations import TrialBalance, require_scale, trial_balances
+from naibu.identification.from_fields.load_cases import FieldTrial, Zones
+from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
+from naibu.mechanics.finite_elements.modulus_derivatives import SimplexLaw
+
+BalanceMethod = Literal["least_squares", "minimum_norm", "bounded"]
+MOST_UNKNOWNS = 4000  # a dense decomposition of more would take minutes and gigabytes
+MOST_ACTIVE = 100  # unknowns up to which the exact method of active bounds is used, which takes a step for each
+RANK_TOLERANCE = 1e-9  # of the largest singular value; displacements of a direct solver are good to about 1e-12
+LOOSE = 1e-5  # part of a determined unknown that may lie in the null space
+CONTRADICTION = 3.0  # a trial fits alone this many times better than with the others ...
+UNEXPLAINED = 0.2  # ... which leave this share of its known forces unbalanced
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BalanceEstimate:
+    """Moduli of the zones from force balance.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The zones.
+    lame_lambda, shear_modulus : ndarray, shape (count,)
+        kPa; NaN where a method could not reach a zone.
+    covariance : ndarray, shape (2 count, 2 count), or None
+        Of all lambda, then all mu, kPa^2; only weighted methods know it.
+    determined : ndarray, shape (count, 2), bool
+        Whether the equations fix lambda and mu of a zone, or leave them to the choice of a solution.
+    equations, unknowns, rank : int
+        Balances that hold an unknown modulus, moduli sought, and how many combinations of them the balances fix.
+    singular_values : ndarray
+        Of the system, mm^2, the largest first; of the whitened system, 1/kPa.
+    residual : float
+        Norm of the unbalanced force over that of the known forces.
+    sweeps : int
+        Linear systems solved.
+    status : Status
+        How the search ended.
+    chi_squared : float
+        Of the displacements that would balance, in units of the noise; NaN where a method does not weigh by it.
+    degrees_of_freedom : int
+        Equations less unknowns.
+    """
+
+    names: tuple[str, ...]
+    lame_lambda: FloatArray
+    shear_modulus: FloatArray
+    covariance: FloatArray | None
+    determined: BoolArray
+    equations: int
+    unknowns: int
+    rank: int
+    singular_values: FloatArray
+    residual: float
+    sweeps: int = 1
+    status: Status = Status.CONVERGED
+    chi_squared: float = np.nan
+    degrees_of_freedom: int = 0
+
+    @property
+    def young_modulus(self) -> FloatArray:
+        """Young's modulus of every zone (count,), kPa; no elastic solid where it is not positive."""
+        lame, mu = self.lame_lambda, self.shear_modulus
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(mu * (3.0 * lame + 2.0 * mu) / (lame + mu))
+
+    @property
+    def poisson_ratio(self) -> FloatArray:
+        """Poisson's ratio of every zone (count,); no elastic solid outside (-1, 0.5)."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(self.lame_lambda / (2.0 * (self.lame_lambda + self.shear_modulus)))
+
+    @property
+    def admissible(self) -> BoolArray:
+        """Zones whose moduli an elastic solid can have (count,): positive shear and bulk modulus."""
+        return np.asarray((self.shear_modulus > 0.0) & (self.lame_lambda + 2.0 / 3.0 * self.shear_modulus > 0.0))
+
+    @property
+    def standard_deviation(self) -> FloatArray:
+        """Standard deviations (count, 2) of lambda and mu, kPa; NaN where the method knows none."""
+        if self.covariance is None:
+            return np.full((len(self.names), 2), np.nan)
+        return np.asarray(np.sqrt(np.diag(self.covariance)).reshape(2, -1).T, dtype=np.float64)
+
+    @property
+    def engineering_deviation(self) -> FloatArray:
+        """Standard deviations (count, 2) of Young's modulus, kPa, and Poisson's ratio, to first order; NaN where the method knows none."""
+        lame, mu = self.lame_lambda, self.shear_modulus
+        if self.covariance is None:
+            return np.full((len(lame), 2), np.nan)
+        k = np.arange(len(lame))
+        joint = np.stack([self.covariance[k, k], self.covariance[k, k + len(k)], self.covariance[k + len(k), k + len(k)]])
+        square = (lame + mu) ** 2
+        of_young = np.stack([mu**2, 3.0 * lame**2 + 4.0 * lame * mu + 2.0 * mu**2]) / square
+        of_poisson = np.stack([0.5 * mu, -0.5 * lame]) / square
+        variances = [s[0] ** 2 * joint[0] + 2.0 * s[0] * s[1] * joint[1] + s[1] ** 2 * joint[2] for s in (of_young, of_poisson)]
+        return np.asarray(np.sqrt(np.stack(variances, axis=1)), dtype=np.float64)
+
+
+def field_balance(
+    mesh: Mesh,
+    trials: Sequence[FieldTrial],
+    zones: Zones,
+    *,
+    method: BalanceMethod = "least_squares",
+    law: SimplexLaw = "linear",
+    thickness_mm: float = 1.0,
+    about: tuple[float, float] | None = None,
+    rank_tolerance: float = RANK_TOLERANCE,
+) -> BalanceEstimate:
+    """Identify the moduli of all zones from the balance of all nodes (spec I3).
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Lines, triangles (plane strain) or linear tetrahedra.
+    trials : sequence of FieldTrial
+        One push or several.
+    zones : Zones
+        What is known and what is sought.
+    method : {"least_squares", "minimum_norm", "bounded"}
+        ``"least_squares"`` asks that the equations fix every modulus; ``"minimum_norm"`` takes, of all solutions of least squares, the
+        smallest; ``"bounded"`` keeps lambda and mu from being negative.
+    law : {"linear", "neo_hookean", "saint_venant_kirchhoff"}
+        The balance is linear in the moduli for all of them.
+    thickness_mm : float
+        Of triangles; matters where forces are known.
+    about : (float, float), optional
+        Young's modulus, kPa, and Poisson's ratio: ``"minimum_norm"`` then finds the solution nearest to them. Zero moduli by default.
+    rank_tolerance : float
+        Singular values below this share of the largest count as zero.
+
+    Raises
+    ------
+    InputError
+        Nothing known to compare with, too few or dependent equations for ``"least_squares"``, trials that contradict each other, or data
+        that do not fit (see `trial_balances`).
+
+    Notes
+    -----
+    Every trial counts with the size of its forces: a push twice as deep has four times the weight in the sum of squares.
+    """
+    if method not in get_args(BalanceMethod):
+        raise InputError(f"method {method!r} is not known; use one of {', '.join(get_args(BalanceMethod))}")
+    if about is not None and method != "minimum_norm":
+        raise InputError(f"`about` chooses among solutions of minimum norm; method {method!r} has no use for it")
+    balances = trial_balances(mesh, trials, zones, law=law, thickness_mm=thickness_mm)
+    parts = [_informative(balance) for balance in balances]
+    matrix, right = _stacked(parts)
+    require_scale(balances, right)
+    _require_columns(matrix, zones)
+    left, singular, rows = np.linalg.svd(matrix, full_matrices=False)
+    rank = int((singular > rank_tolerance * singular[0]).sum())
+    determined = _determined(rows[:rank])
+    if method == "least_squares":
+        _require_rank(rank, matrix.shape, determined, zones, len(trials))
+    if method == "bounded":
+        solution = _bounded(matrix, right)
+    else:
+        start = np.repeat(lame_parameters(*about), zones.count) if about is not None else np.zeros(matrix.shape[1])
+        solution = start + rows[:rank].T @ ((left[:, :rank].T @ (right - matrix @ start)) / singular[:rank])
+    misfit = matrix @ solution - right
+    _require_agreement([balance.name for balance in balances], parts, misfit)
+    lame, mu = solution.reshape(2, -1)
+    residual = float(np.linalg.norm(misfit) / np.linalg.norm(right))
+    flags = determined.reshape(2, -1).T
+    return BalanceEstimate(zones.names, lame, mu, None, flags, len(right), matrix.shape[1], rank, singular, residual)
+
+
+def _informative(balance: TrialBalance) -> tuple[FloatArray, FloatArray]:
+    """Dense equations of a trial that hold an unknown."""
+    if 2 * balance.zones.count > MOST_UNKNOWNS:
+        raise InputError(
+            f"{2 * balance.zones.count} unknown moduli are too many for force balance (at most {MOST_UNKNOWNS}): join cells to zones, or "
+            "match displacements with regularization"
+        )
+    matrix, right = balance.columns()
+    tells = balance.tells
+    return matrix[tells].toarray(), right[tells]
+
+
+def _stacked(parts: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
+    return np.vstack([matrix for matrix, _ in parts]), np.concatenate([right for _, right in parts])
+
+
+def _bounded(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Non-negative least squares with columns scaled to one length."""
+    length = np.linalg.norm(matrix, axis=0)
+    method: Literal["bvls", "trf"] = "bvls" if matrix.shape[1] <= MOST_ACTIVE else "trf"
+    return np.asarray(lsq_linear(matrix / length, right, bounds=(0.0, np.inf), method=method, tol=1e-12).x / length)
+
+
+def _determined(basis: FloatArray) -> BoolArray:
+    """Unknowns that lie in the space spanned by orthonormal rows (r, u)."""
+    return np.asarray(1.0 - np.einsum("ru,ru->u", basis, basis) < LOOSE**2)
+
+
+def _require_columns(matrix: FloatArray, zones: Zones) -> None:
+    """Refuse zones that no equation holds."""
+    empty = np.asarray(np.abs(matrix).sum(axis=0).reshape(2, -1).sum(axis=0) == 0.0)
+    if empty.any():
+        raise InputError(
+            f"{_listed(zones.names, empty)} appear in no balance: no node there has data around it and is free of unknown forces; give "
+            "data there, or count these cells to a neighbouring zone"
+        )
+
+
+def _require_rank(rank: int, shape: tuple[int, ...], determined: BoolArray, zones: Zones, n_trials: int) -> None:
+    """Refuse systems that leave a modulus open."""
+    equations, unknowns = shape
+    if rank == unknowns:
+        return
+    remedy = "add trials that push differently, join cells to zones, or take method='minimum_norm'"
+    if equations < unknowns:
+        trials = "1 trial gives" if n_trials == 1 else f"{n_trials} trials give"
+        raise InputError(f"{trials} {equations} equations for {unknowns} unknown moduli; {remedy}")
+    open_zones = np.asarray(~determined.reshape(2, -1).all(axis=0), dtype=bool)
+    raise InputError(
+        f"{equations} equations fix only {rank} of {unknowns} combinations of the moduli; open are those of "
+        f"{_listed(zones.names, open_zones)}: {remedy}"
+    )
+
+
+def _listed(names: Sequence[str], chosen: BoolArray) -> str:
+    picked = [repr(name) for name, keep in zip(names, chosen, strict=True) if keep]
+    return ", ".join(picked[:3]) + (f" and {len(picked) - 3} more zones" if len(picked) > 3 else "")
+
+
+def _require_agreement(names: Sequence[str], parts: Sequence[tuple[FloatArray, FloatArray]], misfit: FloatArray) -> None:
+    """Refuse trials each of which makes sense alone, but not together."""
+    start, together, alone = 0, [], []
+    for _, right in parts:
+        scale = max(float(np.linalg.norm(right)), 1e-300)
+        together.append(float(np.linalg.norm(misfit[start : start + len(right)])) / scale)
+        start += len(right)
+    if len(parts) < 2 or max(together) < UNEXPLAINED:
+        return
+    for (matrix, right), share in zip(parts, together, strict=True):
+        if not right.any():
+            alone.append(share)
+            continue
+        found = np.linalg.lstsq(matrix, right, rcond=RANK_TOLERANCE)[0]
+        alone.append(float(np.linalg.norm(matrix @ found - right) / np.linalg.norm(right)))
+    # a trial with more unknowns than equations fits alone whatever it is: then only complete failure counts
+    spare = all(len(right) > matrix.shape[1] for matrix, right in parts)
+    worst = int(np.argmax(together))
+    if (spare and together[worst] > CONTRADICTION * max(alone)) or (together[worst] > 0.98 and max(alone) < 0.1):
+        raise InputError(
+            f"the trials {', '.join(map(repr, names))} contradict each other: alone they leave {100.0 * max(alone):.2g} % of the known "
+            f"forces unbalanced, together {100.0 * together[worst]:.0f} % of those of {names[worst]!r}; check the order of the fields, "
+            "their frames and units, which nodes are loaded, and the forces"
+        )

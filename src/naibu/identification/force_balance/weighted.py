@@ -1,0 +1,266 @@
+"""Force balance weighted by what noise in the displacement does to it: maximum likelihood, without the bias of least squares (spec I6).
+
+The true displacement x of a trial obeys ``c(x, p) = A(x) p - b(x) = 0`` at the nodes in balance, and the measured one scatters about it
+with covariance Sigma. Linearised about a state (x, p) of the search, with the tangent T of c,
+
+    r + A dp,   r = c(x, p) + T (measured - x),   S = T Sigma T^T,
+
+is what dp has to make small in the norm of S^-1; the displacement then moves to ``measured - Sigma T^T S^-1 (r + A dp)``, where the forces
+balance. This is the Gauss-Helmert model of least squares with conditions (Mikhail & Ackermann 1976). Because A is taken at the balanced
+displacement and not at the measured one, noise does not pull the moduli down; because all forces of a residual are brought back to the
+displacements that made them, stiff and soft cells count alike. Displacements of loaded nodes enter Sigma as all others do: an unknown
+motion of the boundary is estimated along with the moduli. A sweep factorizes S once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.optimize import lsq_linear
+
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import ConvergenceError, InputError
+from naibu.core.mesh import Mesh
+from naibu.core.status import Status
+from naibu.identification.force_balance.batch import BalanceEstimate, field_balance
+from naibu.identification.force_balance.equations import TrialBalance, trial_balances
+from naibu.identification.from_fields.load_cases import FieldTrial, Zones
+from naibu.mechanics.finite_elements.modulus_derivatives import SimplexLaw
+from naibu.mechanics.linear_algebra.direct import direct_solver
+
+FLOOR, CEILING = 1e-4, 1e6  # bounds of the moduli, in units of the known shear modulus; lambda may fall to zero
+SOFTEST_START = 0.02  # the search starts from no smaller shear modulus, in the same unit, and from lambda >= mu: noise pulls both down
+OPEN = 1e-12  # eigenvalue of the scaled information below which a combination of moduli is open
+SHORTEST_STEP = 2.0**-10
+LEVEL = 1e-7  # rise of the objective that counts as none: at finite strain it depends a little on where it is linearised
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sweep:
+    """The linearised problem at moduli p and displacements x.
+
+    Attributes
+    ----------
+    objective : float
+        ``r S^-1 r``: chi squared where the covariance of the data is known.
+    information, gradient : ndarray, shape (u, u) and (u,)
+        ``A^T S^-1 A``, 1/kPa^2, and ``A^T S^-1 r``, 1/kPa.
+    pulls : tuple of (ndarray, ndarray), shapes (n, d) and (n, d, u)
+        ``Sigma T^T S^-1 r``, mm, and ``Sigma T^T S^-1 A``, mm/kPa, of every trial.
+    """
+
+    objective: float
+    information: FloatArray
+    gradient: FloatArray
+    pulls: tuple[tuple[FloatArray, FloatArray], ...]
+
+    def displacements(self, balances: Sequence[TrialBalance], step: FloatArray) -> tuple[FloatArray, ...]:
+        """Return the balanced displacement (n, d), mm, of every trial after a step (u,), kPa, of the moduli."""
+        return tuple(b.field.displacement - residual - moduli @ step for b, (residual, moduli) in zip(balances, self.pulls, strict=True))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Search:
+    """What all sweeps share: equations, covariance (n d, n d) of the nodes' displacement, mm^2, and bounds (u,) of the moduli, kPa."""
+
+    balances: tuple[TrialBalance, ...]
+    covariances: tuple[sp.csr_matrix, ...]
+    lower: FloatArray
+    upper: FloatArray
+
+    def swept(self, moduli: FloatArray, displacements: Sequence[FloatArray]) -> _Sweep:
+        """Linearise all trials, with one factorization each."""
+        u = len(moduli)
+        objective, information, gradient, pulls = 0.0, np.zeros((u, u)), np.zeros(u), []
+        for balance, covariance, x in zip(self.balances, self.covariances, displacements, strict=True):
+            matrix, right = balance.columns(x)
+            tangent = balance.tangent(x, moduli)
+            residual = matrix @ moduli - right + tangent @ (balance.field.displacement - x).ravel()
+            spread = covariance @ tangent.T
+            sides = np.column_stack([residual, matrix.toarray()])
+            weighted = _solved(balance.name, sp.csr_matrix(tangent @ spread), sides)
+            products = sides.T @ weighted
+            objective += float(products[0, 0])
+            gradient += products[1:, 0]
+            information += products[1:, 1:]
+            pull = np.asarray(spread @ weighted).reshape(*x.shape, u + 1)
+            pulls.append((pull[..., 0], pull[..., 1:]))
+        return _Sweep(objective, 0.5 * (information + information.T), gradient, tuple(pulls))
+
+    def tried(self, sweep: _Sweep, moduli: FloatArray, step: FloatArray) -> _Sweep | None:
+        """Return the sweep after a step, or None where the objective rises or a cell turns inside out."""
+        try:
+            new = self.swept(moduli + step, sweep.displacements(self.balances, step))
+        except InputError:
+            return None
+        return new if new.objective <= sweep.objective * (1.0 + LEVEL) + 1e-20 else None
+
+    def step(self, sweep: _Sweep, moduli: FloatArray) -> FloatArray:
+        """Return the change (u,), kPa, that minimises the linearised objective within the bounds."""
+        scale = 1.0 / np.sqrt(np.diag(sweep.information))
+        values, vectors = np.linalg.eigh(sweep.information * np.outer(scale, scale))
+        if not values[0] > OPEN:
+            zones = self.balances[0].zones
+            worst = int(np.argmax(np.abs(vectors[:, 0]))) % zones.count
+            raise InputError(
+                f"{sum(len(b.rows) for b in self.balances)} equations leave a combination of the {len(moduli)} moduli open, which holds "
+                f"zone {zones.names[worst]!r}; add trials that push differently, or join cells to zones"
+            )
+        root = np.sqrt(values)[:, None] * vectors.T
+        target = -(vectors.T @ (scale * sweep.gradient)) / np.sqrt(values)
+        free = scale * (vectors @ (target / np.sqrt(values)))
+        if ((moduli + free >= self.lower) & (moduli + free <= self.upper)).all():
+            return np.asarray(free)
+        bounds = ((self.lower - moduli) / scale, (self.upper - moduli) / scale)
+        return np.asarray(scale * lsq_linear(root, target, bounds=bounds, method="bvls", tol=1e-12).x)
+
+
+def whitened_balance(
+    mesh: Mesh,
+    trials: Sequence[FieldTrial],
+    zones: Zones,
+    *,
+    law: SimplexLaw = "linear",
+    thickness_mm: float = 1.0,
+    interpolation_sd_mm: float = 0.0,
+    start: tuple[FloatArray, FloatArray] | None = None,
+    max_sweeps: int = 50,
+    tolerance: float = 1e-6,
+) -> BalanceEstimate:
+    """Identify the moduli of all zones from balance weighted by the noise of the displacement.
+
+    Parameters
+    ----------
+    mesh, trials, zones, law, thickness_mm
+        As for `naibu.identification.force_balance.batch.field_balance`. If the covariance of all fields is zero, all nodes are given one
+        and the same unknown variance.
+    interpolation_sd_mm : float
+        Standard deviation, mm, of what linear interpolation adds at nodes between the points of a field.
+    start : tuple of ndarray, shape (count,)
+        First lambda and mu of the zones, kPa; by default from non-negative least squares.
+    max_sweeps : int
+        Linearisations; each factorizes one matrix a trial.
+    tolerance : float
+        The search ends when a step would change no modulus by more than this share of the largest of its zone.
+
+    Returns
+    -------
+    BalanceEstimate
+        With the covariance, kPa^2: the inverse information, which is the Cramer-Rao bound at the estimate; scaled by the misfit where the
+        variance of the data was not given. `equations` counts those without an unknown too: they smooth the displacement.
+
+    Raises
+    ------
+    InputError
+        Moduli that the data leave open, nodes that share their data (see `interpolation_sd_mm`), or as for `field_balance`.
+    """
+    balances = trial_balances(mesh, trials, zones, law=law, thickness_mm=thickness_mm)
+    covariances, known_noise = _covariances(balances, interpolation_sd_mm)
+    least = field_balance(mesh, trials, zones, method="bounded", law=law, thickness_mm=thickness_mm)
+    size = _unit(zones, least)
+    lower = np.repeat([0.0, FLOOR * size], zones.count)
+    search = _Search(balances, covariances, lower, np.full(len(lower), CEILING * size))
+    moduli = _start(least, size) if start is None else np.concatenate([np.asarray(part, dtype=float) for part in start])
+    if moduli.shape != lower.shape or not ((moduli >= lower) & (moduli <= search.upper)).all():
+        raise InputError(f"the start must be {zones.count} positive lambda and as many mu, kPa, not {start}")
+    return _estimate(balances, *_descended(search, moduli, max_sweeps, tolerance), known_noise)
+
+
+def _unit(zones: Zones, least: BalanceEstimate) -> float:
+    """Mean known shear modulus, kPa, or that of the first guess where nothing is known."""
+    known = zones.known_mu[np.isfinite(zones.known_mu)]
+    return float(known.mean()) if len(known) else max(float(least.shear_modulus.mean()), 1e-12)
+
+
+def _start(least: BalanceEstimate, size: float) -> FloatArray:
+    mu = np.maximum(least.shear_modulus, SOFTEST_START * size)
+    return np.asarray(np.minimum(np.concatenate([np.maximum(least.lame_lambda, mu), mu]), 0.1 * CEILING * size))
+
+
+def _descended(search: _Search, moduli: FloatArray, max_sweeps: int, tolerance: float) -> tuple[_Sweep, FloatArray, int, Status]:
+    """Gauss-Newton with step halving; returns the last sweep, its moduli, the number of sweeps and how it ended."""
+    sweep = search.swept(moduli, [balance.field.displacement for balance in search.balances])
+    # gradient and objective hold at displacements that balance, to which the measured ones are brought first
+    sweep, count, fresh = search.swept(moduli, sweep.displacements(search.balances, np.zeros_like(moduli))), 2, True
+    while True:
+        step, length = search.step(sweep, moduli), 1.0
+        largest = np.tile(np.abs(moduli.reshape(2, -1)).max(axis=0), 2)
+        if (np.abs(step) <= tolerance * largest).all():
+            return sweep, moduli, count, Status.CONVERGED
+        new = None
+        while new is None and length > SHORTEST_STEP and count < max_sweeps:
+            count += 1
+            new = search.tried(sweep, moduli, length * step)
+            length *= 1.0 if new is not None else 0.5
+        if new is not None:
+            sweep, moduli, fresh = new, moduli + length * step, False
+        elif not fresh and count < max_sweeps:
+            sweep, count, fresh = search.swept(moduli, sweep.displacements(search.balances, np.zeros_like(moduli))), count + 1, True
+        else:
+            return sweep, moduli, count, Status.ITERATION_LIMIT
+
+
+def _covariances(balances: Sequence[TrialBalance], interpolation_sd_mm: float) -> tuple[tuple[sp.csr_matrix, ...], bool]:
+    """Covariance of the nodes of every trial, and whether the data came with one."""
+    if not (np.isfinite(interpolation_sd_mm) and interpolation_sd_mm >= 0.0):
+        raise InputError(f"interpolation_sd_mm must be a number >= 0, not {interpolation_sd_mm:g}")
+    given = [balance.field.covariance.nnz > 0 and bool(balance.field.covariance.diagonal().any()) for balance in balances]
+    if any(given) and not all(given):
+        without = ", ".join(repr(b.name) for b, has in zip(balances, given, strict=True) if not has)
+        raise InputError(f"the fields of {without} come without standard deviations, the others with; give sd_mm to all fields or to none")
+    out = []
+    for balance, has in zip(balances, given, strict=True):
+        d = balance.body.dimension
+        spread = sp.kron(balance.field.weights, sp.identity(d), format="csr")
+        covariance = balance.field.covariance if has else spread @ spread.T
+        extra = np.repeat(np.where(balance.field.interpolated, interpolation_sd_mm**2, 0.0), d)
+        if interpolation_sd_mm == 0.0 and len(balance.rows) > d * (np.diff(balance.field.weights.tocsc().indptr) > 0).sum():
+            raise _shared(balance.name)
+        out.append(sp.csr_matrix(covariance + sp.diags(extra)))
+    return tuple(out), all(given)
+
+
+def _solved(trial: str, matrix: sp.csr_matrix, sides: FloatArray) -> FloatArray:
+    """Solve with the covariance of the residual, scaled to a unit diagonal."""
+    diagonal = matrix.diagonal()
+    if not (diagonal > 0.0).all():
+        raise _shared(trial)
+    scale = 1.0 / np.sqrt(diagonal)
+    scaled = sp.bsr_matrix(sp.diags(scale) @ matrix @ sp.diags(scale), blocksize=(1, 1))
+    scaled.sort_indices()
+    try:
+        return np.asarray(scale[:, None] * direct_solver(scaled, symmetric=True).factorize(scaled).solve(scale[:, None] * sides))
+    except ConvergenceError as error:
+        raise _shared(trial) from error
+
+
+def _shared(trial: str) -> InputError:
+    return InputError(
+        f"trial {trial!r}: the noise of the balances is singular, for nodes share the data of the same points, or have no noise of their "
+        "own; make the points the nodes of the mesh, or give interpolation_sd_mm, or standard deviations > 0"
+    )
+
+
+def _estimate(
+    balances: Sequence[TrialBalance], sweep: _Sweep, moduli: FloatArray, count: int, status: Status, known_noise: bool
+) -> BalanceEstimate:
+    zones = balances[0].zones
+    equations = sum(len(balance.rows) for balance in balances)
+    freedom = equations - len(moduli)
+    covariance: FloatArray = np.asarray(np.linalg.inv(sweep.information), dtype=np.float64)
+    if not known_noise:
+        covariance = covariance * (sweep.objective / freedom if freedom > 0 else np.nan)
+    squares = np.zeros(2)
+    for balance in balances:
+        matrix, right = balance.columns()
+        tells = balance.tells
+        squares += [float(np.sum((matrix @ moduli - right)[tells] ** 2)), float(np.sum(right[tells] ** 2))]
+    singular = np.asarray(np.sqrt(np.linalg.eigvalsh(sweep.information)[::-1].clip(0.0)), dtype=np.float64)
+    lame, mu = moduli.reshape(2, -1)
+    return BalanceEstimate(
+        zones.names, lame, mu, covariance, np.ones((zones.count, 2), dtype=bool), equations, len(moduli), len(moduli), singular,
+        float(np.sqrt(squares[0] / squares[1])), count, status, sweep.objective, freedom,
+    )  # fmt: skip

@@ -1,0 +1,298 @@
+"""Moduli from measured displacement fields: the whole recipe, from a homogeneous start to regions with standard errors (spec I6).
+
+The estimate is that of maximum likelihood: moduli p and the displacement of the loaded nodes, where forces are unknown, minimise::
+
+    sum_t |S_t^-1/2 (H_t u_t - d_t)|^2 / 2 + w R(p),    with u_t in equilibrium at all other nodes,
+
+by Gauss-Newton with exact derivatives: explicit where zones are few, by adjoints and conjugate gradients where they are many.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import InputError
+from naibu.core.mesh import Mesh
+from naibu.core.status import Status
+from naibu.identification.from_fields.forward_model import LawName
+from naibu.identification.from_fields.gauss_newton import (
+    Bounds,
+    Found,
+    Objective,
+    SearchSettings,
+    StepRule,
+    exact_step,
+    first_point,
+    search,
+)
+from naibu.identification.from_fields.load_cases import KNOWN, FieldTrial, Zones
+from naibu.identification.from_fields.regularization import Regularization, RegularizationName, ZoneGraph, regularization
+from naibu.identification.from_fields.regularization_weight import WeightChoice, WeightRule, WeightTrial, choose_weight
+from naibu.identification.from_fields.segmentation import EXPLICIT, Segmentation, segment
+from naibu.identification.from_fields.sensitivities import FieldModel, Point, logarithms, moduli_of, young_and_poisson
+from naibu.identification.from_fields.truncated_newton import truncated_step
+from naibu.identification.from_fields.uncertainty import Uncertainty, information_at, report, resolution, resolution_report
+
+FEW = 12  # zones up to which no penalty is needed by default
+START_POISSON_RATIO = 0.4
+SEARCH_AT_WEIGHT = SearchSettings(max_iterations=15, tolerance=1e-3)
+UNEXPLAINED = 3.0  # standard deviations of chi squared by which regions may fit worse than the regularised field
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FieldEstimate:
+    """Moduli found from measured fields.
+
+    Attributes
+    ----------
+    mesh : Mesh
+        The model.
+    zones : Zones
+        Zones of the result: those given, or the regions that were found.
+    theta : ndarray, shape (2 count,)
+        ln mu, then ln(kappa / mu) of the zones; kPa.
+    states : tuple of ndarray, shape (n, d)
+        Displacement of every trial under the result, mm.
+    chi_squared, degrees_of_freedom : float
+        Misfit in units of the stated noise, and what noise alone would leave on average.
+    uncertainty : Uncertainty or None
+        Of theta; None where zones are too many to invert.
+    weights : WeightChoice or None
+        The weights of the penalty that were tried.
+    regularized : tuple of ndarray, shape (count of the given zones,), or None
+        Young's modulus, kPa, and Poisson's ratio under the penalty, before regions were made of them.
+    resolution : ndarray, shape (2 count of the given zones,), or None
+        See `naibu.identification.from_fields.uncertainty.resolution`.
+    segmentation : Segmentation or None
+        The regions, also where they were not taken as the result.
+    status : Status
+        How the last search ended.
+    steps : tuple of str
+        What was done, a sentence a step.
+    identifiability : tuple of str
+        Which moduli the measurements determine, in words.
+    """
+
+    mesh: Mesh
+    zones: Zones
+    theta: FloatArray
+    states: tuple[FloatArray, ...]
+    chi_squared: float
+    degrees_of_freedom: float
+    uncertainty: Uncertainty | None
+    weights: WeightChoice | None
+    regularized: tuple[FloatArray, FloatArray] | None
+    resolution: FloatArray | None
+    segmentation: Segmentation | None
+    status: Status
+    steps: tuple[str, ...]
+    identifiability: tuple[str, ...]
+
+    @property
+    def young_modulus(self) -> FloatArray:
+        """Young's modulus of every zone (count,), kPa."""
+        return young_and_poisson(self.theta)[0]
+
+    @property
+    def poisson_ratio(self) -> FloatArray:
+        """Poisson's ratio of every zone (count,)."""
+        return young_and_poisson(self.theta)[1]
+
+    def lame_of_cells(self) -> tuple[FloatArray, FloatArray]:
+        """Return lambda and mu of every cell (m,), kPa, known ones included."""
+        return moduli_of(self.zones, self.theta)
+
+    @property
+    def noise_factor(self) -> float:
+        """Root mean square misfit in units of the stated noise: above 1 the model or the noise is not as stated."""
+        return float(np.sqrt(self.chi_squared / max(self.degrees_of_freedom, 1.0)))
+
+
+def identify_field(
+    mesh: Mesh,
+    trials: Sequence[FieldTrial],
+    zones: Zones,
+    *,
+    law: LawName = "linear",
+    regularization: RegularizationName | Literal["automatic"] | None = "automatic",
+    weight: WeightRule | float = "discrepancy",
+    segmented: bool = True,
+    bounds: Bounds | None = None,
+    start: tuple[FloatArray, FloatArray] | None = None,
+    progress: Progress | None = None,
+) -> FieldEstimate:
+    """Find the moduli of zones from displacement fields measured in one or more trials, no force being known.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Simplices; independent of the points of measurement.
+    trials : sequence of FieldTrial
+        Pushes of the body, the loaded components of its nodes, and what was measured.
+    zones : Zones
+        Known cells, and which cells share a pair of unknown moduli; `Zones.of(..., each_cell=True)` where nothing is known of regions.
+    law : {"linear", "neo_hookean"}
+        Small strain, or compressible neo-Hookean at finite strain (linear tetrahedra).
+    regularization : {"automatic", "total_variation", "laplacian"} or None
+        Penalty on jumps between neighbouring zones. Automatic is total variation for more than `FEW` zones, none for fewer.
+    weight : {"discrepancy", "l_curve"} or float
+        How much the penalty weighs (see `naibu.identification.from_fields.regularization_weight.choose_weight`).
+    segmented : bool
+        Whether to make regions of what was found under total variation, and to fit these without the penalty. The result are the regions
+        if they explain the measurements, the regularised field otherwise.
+    bounds : Bounds, optional
+        Of the moduli.
+    start : tuple of ndarray, shape (count,), optional
+        lambda and mu of the zones, kPa, to start from; by default those of a homogeneous body that fits best.
+    progress : callable, optional
+        ``progress(text)`` is told every step.
+
+    Raises
+    ------
+    InputError
+        No trial, zones of another mesh, or options that are not known.
+    ConvergenceError
+        No equilibrium at the start, or a measured field that does not fix how the loaded nodes move.
+    """
+    if not trials:
+        raise InputError("give at least one trial")
+    if len(zones.of_cell) != mesh.n_cells:
+        raise InputError(f"the zones are of a mesh of {len(zones.of_cell)} cells, this mesh has {mesh.n_cells}")
+    recipe = _Recipe(FieldModel(mesh, trials, zones, law), bounds or Bounds(), [], progress)
+    automatic: RegularizationName | None = "total_variation" if zones.count > FEW else None
+    name = automatic if regularization == "automatic" else regularization
+    point = recipe.start(start)
+    return recipe.free(point) if name is None else recipe.regularized(point, name, weight, segmented)
+
+
+@dataclass(slots=True, eq=False)
+class _Recipe:
+    """The steps of an identification, told as they are made."""
+
+    model: FieldModel
+    bounds: Bounds
+    steps: list[str]
+    progress: Progress | None
+
+    def tell(self, text: str) -> None:
+        """Keep a step, and pass it on."""
+        self.steps.append(text)
+        if self.progress is not None:
+            self.progress(text)
+
+    def start(self, given: tuple[FloatArray, FloatArray] | None) -> Point:
+        """Return where to begin: the given moduli, or those of the homogeneous body that fits best."""
+        objective = Objective(bounds=self.bounds)
+        if given is not None:
+            return first_point(self.model, objective.clipped(logarithms(*(np.asarray(g, dtype=float) for g in given))))
+        zones = self.model.zones
+        one = Zones(np.where(zones.of_cell == KNOWN, KNOWN, 0), ("body",), zones.known_lambda, zones.known_mu)
+        homogeneous = self.model.with_zones(one)
+        known = zones.known_mu[zones.of_cell == KNOWN]
+        shear = float(np.exp(np.log(known).mean())) if len(known) else 1.0
+        ratio = 2.0 * (1.0 + START_POISSON_RATIO) / (3.0 * (1.0 - 2.0 * START_POISSON_RATIO))
+        first = first_point(homogeneous, objective.clipped(np.log([shear, ratio])))
+        found = search(homogeneous, first, objective, SearchSettings(tolerance=1e-3))
+        young, poisson = young_and_poisson(found.point.theta)
+        self.tell(
+            f"homogeneous start: Young's modulus {young[0]:.4g} kPa, Poisson's ratio {poisson[0]:.3f}, "
+            f"misfit {found.point.misfit:.4g} (noise alone: {self.model.n_free:.4g})"
+        )
+        return self.model.evaluate(np.repeat(found.point.theta, zones.count), found.point.states)
+
+    def free(self, point: Point) -> FieldEstimate:
+        """Fit the zones without a penalty."""
+        found = search(self.model, point, Objective(bounds=self.bounds))
+        self.tell(
+            f"fit of {self.model.zones.count} zones without penalty: misfit {found.point.misfit:.4g} after {found.iterations} iterations"
+        )
+        return self._estimate(self.model, found.point, found.status)
+
+    def regularized(self, point: Point, name: RegularizationName, weight: WeightRule | float, segmented: bool) -> FieldEstimate:
+        """Fit under a penalty of automatic weight, and make regions of it."""
+        graph = ZoneGraph.of(self.model.mesh, self.model.zones)
+        penalty = regularization(name, graph)
+        choice = self._weight(point, penalty, graph, weight)
+        found = choice.taken.found
+        objective = Objective(penalty, choice.taken.weight, self.bounds)
+        at = self.model.linearised(self.model.evaluate(found.point.theta, found.point.states))
+        resolved = resolution(at, objective, explicit=self._explicit())
+        estimate = self._under_penalty(found, choice, resolved)
+        if name != "total_variation" or not segmented:
+            return estimate
+        regions = segment(self.model, graph, at.point, choice.taken.weight, self.bounds, self.progress)
+        return self._with_regions(estimate, regions)
+
+    def _explicit(self) -> bool:
+        return self.model.zones.count <= EXPLICIT
+
+    def _weight(self, point: Point, penalty: Regularization, graph: ZoneGraph, rule: WeightRule | float) -> WeightChoice:
+        step: StepRule = exact_step if self._explicit() else truncated_step
+
+        def solve(weight: float, start: Found | None) -> WeightTrial:
+            at = point if start is None else start.point
+            first = self.model.evaluate(at.theta, at.states)
+            found = search(self.model, first, Objective(penalty, weight, self.bounds), SEARCH_AT_WEIGHT, rule=step)
+            done = WeightTrial(weight, found, found.point.misfit, penalty.value(found.point.theta))
+            self.tell(
+                f"{penalty.name} of weight {weight:.3g}: misfit {done.misfit:.4g} (noise alone: {self.model.n_free:.4g}), "
+                f"penalty {done.penalty:.4g}, {found.iterations} iterations"
+            )
+            return done
+
+        # a jump of 1 across the body would cost as much as a sixth of what the homogeneous body leaves unexplained
+        first = 0.5 * point.misfit / (6.0 * float(graph.volume.sum()) ** ((self.model.mesh.dimension - 1) / self.model.mesh.dimension))
+        choice = choose_weight(solve, first, self.model.n_free, rule)
+        self.tell(choice.reason)
+        return choice
+
+    def _under_penalty(self, found: Found, choice: WeightChoice, resolved: FloatArray) -> FieldEstimate:
+        """Return the regularised field as an estimate."""
+        mesh, zones = self.model.mesh, self.model.zones
+        unknown = np.flatnonzero(zones.of_cell != KNOWN)
+        of_zone = zones.of_cell[unknown]
+        middles = mesh.points[mesh.cells[unknown]].mean(axis=1)
+        centres = np.stack([np.bincount(of_zone, x, zones.count) for x in middles.T], axis=1)
+        words = resolution_report(zones, centres / np.bincount(of_zone, minlength=zones.count)[:, None], resolved)
+        point = found.point
+        return FieldEstimate(
+            mesh, zones, point.theta, point.states, point.misfit, self.model.n_free - float(resolved.sum()), None, choice,
+            young_and_poisson(point.theta), resolved, None, found.status, tuple(self.steps), words,
+        )  # fmt: skip
+
+    def _with_regions(self, field: FieldEstimate, regions: Segmentation) -> FieldEstimate:
+        """Return the regions as the result if they explain the measurements, else the field under the penalty."""
+        target = self.model.n_free
+        limit = max(field.chi_squared, target) + UNEXPLAINED * float(np.sqrt(2.0 * target))
+        misfit, count = regions.point.misfit, regions.zones.count
+        self.tell(
+            f"{regions.clusters} clusters made {count} regions ({regions.moved} zones changed sides): misfit {misfit:.4g} without penalty"
+        )
+        if misfit > limit:
+            self.tell(f"the regions leave more unexplained than noise would ({limit:.4g}): the regularised field is the result")
+            return replace(field, segmentation=regions, steps=tuple(self.steps))
+        model = self.model.with_zones(regions.zones)
+        sharp = self._estimate(model, model.evaluate(regions.point.theta, regions.point.states), Status.CONVERGED)
+        return replace(
+            sharp, weights=field.weights, regularized=field.regularized, resolution=field.resolution, segmentation=regions,
+            identifiability=(*sharp.identifiability, *field.identifiability),
+        )  # fmt: skip
+
+    def _estimate(self, model: FieldModel, point: Point, status: Status) -> FieldEstimate:
+        """Return moduli that were fitted without a penalty, with their standard errors."""
+        information = information_at(model, point)
+        freedom = model.n_free - 2.0 * model.zones.count
+        exact = all(o.exact for o in model.observed)
+        factor = 1.0 if exact or freedom <= 0.0 else max(1.0, float(np.sqrt(point.misfit / freedom)))
+        uncertainty = Uncertainty.of(information, factor)
+        words = report(model.zones, point.theta, uncertainty)
+        return FieldEstimate(
+            model.mesh, model.zones, point.theta, point.states, point.misfit, freedom, uncertainty, None, None, None, None, status,
+            tuple(self.steps), words,
+        )  # fmt: skip

@@ -1,0 +1,106 @@
+"""How accurate moduli will be before anything is measured: expected covariance and systematic error of a planned experiment (spec I6)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import InputError
+from naibu.core.mesh import Mesh
+from naibu.identification.from_fields.forward_model import LawName
+from naibu.identification.from_fields.gauss_newton import Objective, SearchSettings, first_point, search
+from naibu.identification.from_fields.load_cases import FieldTrial, Zones
+from naibu.identification.from_fields.sensitivities import FieldModel, logarithms, young_and_poisson
+from naibu.identification.from_fields.uncertainty import Uncertainty, information_at
+from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
+
+_TO_THE_END = SearchSettings(max_iterations=40, tolerance=1e-10)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Accuracy:
+    """What an experiment will tell about the moduli of its zones.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The zones.
+    young_modulus_sd : ndarray, shape (k,)
+        Standard deviation of Young's modulus as a share of it.
+    poisson_ratio_sd : ndarray, shape (k,)
+        Standard deviation of Poisson's ratio.
+    young_modulus_bias, poisson_ratio_bias : ndarray, shape (k,)
+        What would be wrong without any noise: relative error of Young's modulus, and error of Poisson's ratio.
+    """
+
+    names: tuple[str, ...]
+    young_modulus_sd: FloatArray
+    poisson_ratio_sd: FloatArray
+    young_modulus_bias: FloatArray
+    poisson_ratio_bias: FloatArray
+
+    @property
+    def young_modulus_error(self) -> FloatArray:
+        """Expected root mean square relative error (k,) of Young's modulus: noise and systematic error together."""
+        return np.hypot(self.young_modulus_sd, self.young_modulus_bias)
+
+    @property
+    def poisson_ratio_error(self) -> FloatArray:
+        """Expected root mean square error (k,) of Poisson's ratio."""
+        return np.hypot(self.poisson_ratio_sd, self.poisson_ratio_bias)
+
+
+def expected_accuracy(
+    mesh: Mesh,
+    trials: Sequence[FieldTrial],
+    zones: Zones,
+    *,
+    young_modulus: ArrayLike,
+    poisson_ratio: ArrayLike,
+    law: LawName = "linear",
+) -> Accuracy:
+    """Return how accurately displacement matching will find the moduli of the zones.
+
+    The covariance is the inverse of the Fisher information (the Cramer-Rao bound) at the true moduli, the unknown displacement of the
+    loaded nodes estimated along with them. The systematic error is what matching finds in the trials' fields as they are, which should
+    be simulated without noise, best on a finer mesh than `mesh`; fields simulated on `mesh` itself have none.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        On which the moduli will be sought.
+    trials : sequence of FieldTrial
+        Planned pushes with simulated fields without noise, whose covariance is that of the measurement to come.
+    zones : Zones
+        What is known and what is sought.
+    young_modulus, poisson_ratio : array_like, shape (k,)
+        True moduli of the zones, kPa.
+    law : {"linear", "neo_hookean"}
+        Law of the material.
+
+    Raises
+    ------
+    InputError
+        Fields without noise, another number of moduli than of zones, or an experiment that leaves a modulus undetermined.
+    """
+    young, poisson = np.asarray(young_modulus, dtype=float), np.asarray(poisson_ratio, dtype=float)
+    if young.shape != (zones.count,) or poisson.shape != (zones.count,):
+        raise InputError(f"give Young's modulus and Poisson's ratio of the {zones.count} zones, not {young.shape} and {poisson.shape}")
+    for trial in trials:
+        if not (trial.field.standard_deviation[trial.field.valid] > 0.0).all():
+            raise InputError(f"trial {trial.name!r}: a planned measurement needs the standard deviation it will have, sd_mm > 0")
+    lame, shear = np.array([lame_parameters(e, nu) for e, nu in zip(young, poisson, strict=True)]).T
+    model = FieldModel(mesh, trials, zones, law)
+    truth = logarithms(lame, shear)
+    start = first_point(model, truth)
+    found = Uncertainty.of(information_at(model, start))
+    for zone, sd in zip(zones.names, found.standard_deviations().reshape(2, -1).T, strict=True):
+        if not np.isfinite(sd).all():
+            raise InputError(f"the experiment does not determine the moduli of {zone!r}: measure or push more")
+    of_young, of_poisson = found.of_young_and_poisson(truth)
+    e, nu = young_and_poisson(search(model, start, Objective(), _TO_THE_END).point.theta)
+    return Accuracy(zones.names, of_young, of_poisson, e / young - 1.0, nu - poisson)

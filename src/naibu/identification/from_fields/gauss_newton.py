@@ -1,0 +1,209 @@
+"""Gauss-Newton over moduli and the displacement of loaded nodes together, within bounds, with or without a penalty (spec I6)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import scipy.linalg as sl
+import scipy.sparse as sp
+
+from naibu.core.arrays import BoolArray, FloatArray
+from naibu.core.errors import ConvergenceError, InputError
+from naibu.core.parameters import MAX_POISSON_RATIO
+from naibu.core.status import Status
+from naibu.identification.from_fields.regularization import Regularization
+from naibu.identification.from_fields.sensitivities import FieldModel, Linearised, Point
+
+LONGEST_STEP = 1.0  # of a logarithm of a modulus in one iteration
+SHORTEST_SHARE = 1e-3  # of a step, below which the search ends
+NEGLIGIBLE = 1e-9  # by how much a step must promise to lower half of chi squared to be worth taking
+ANCHOR = 1e-9  # of the Hessian's largest diagonal entry, on every modulus: what neither data nor penalty determine stays where it is
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """Between which the moduli of all zones are sought.
+
+    Attributes
+    ----------
+    shear_modulus : tuple of float
+        Least and greatest shear modulus, kPa.
+    poisson_ratio : tuple of float
+        Least and greatest Poisson's ratio, within (-1, 0.4995].
+    """
+
+    shear_modulus: tuple[float, float] = (0.0, np.inf)
+    poisson_ratio: tuple[float, float] = (-0.9, MAX_POISSON_RATIO)
+
+    def __post_init__(self) -> None:
+        (low, high), (least, most) = self.shear_modulus, self.poisson_ratio
+        if not 0.0 <= low < high:
+            raise InputError(f"bounds of the shear modulus must increase and not be negative, not {low:g} to {high:g} kPa")
+        if not -1.0 < least < most <= MAX_POISSON_RATIO:
+            raise InputError(f"bounds of Poisson's ratio must increase within (-1, {MAX_POISSON_RATIO}], not {least:g} to {most:g}")
+
+    def box(self, count: int) -> tuple[FloatArray, FloatArray]:
+        """Return the lower and upper bounds of theta (2 count,)."""
+        with np.errstate(divide="ignore"):
+            shear = np.log(np.array(self.shear_modulus))
+        nu = np.array(self.poisson_ratio)
+        ratio = np.log(2.0 * (1.0 + nu) / (3.0 * (1.0 - 2.0 * nu)))
+        both = np.stack([np.repeat([shear[k], ratio[k]], count) for k in range(2)])
+        return both[0], both[1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Objective:
+    """Half of the misfit and the weak prior of the loaded nodes, plus `weight` times a penalty, within bounds."""
+
+    penalty: Regularization | None = None
+    weight: float = 0.0
+    bounds: Bounds = field(default_factory=Bounds)
+
+    def value(self, point: Point) -> float:
+        """Return the objective at a point."""
+        return 0.5 * (point.misfit + point.prior) + (0.0 if self.penalty is None else self.weight * self.penalty.value(point.theta))
+
+    def slope(self, theta: FloatArray) -> FloatArray:
+        """Return the gradient (2 count,) of the penalty."""
+        return np.zeros_like(theta) if self.penalty is None else self.weight * self.penalty.gradient(theta)
+
+    def curvature(self, theta: FloatArray) -> sp.csr_matrix:
+        """Return the Hessian (2 count, 2 count) of the penalty."""
+        return sp.csr_matrix((len(theta), len(theta))) if self.penalty is None else (self.weight * self.penalty.hessian(theta)).tocsr()
+
+    def clipped(self, theta: FloatArray) -> FloatArray:
+        """Return theta moved into the bounds."""
+        low, high = self.bounds.box(len(theta) // 2)
+        return np.clip(theta, low, high)
+
+    def free(self, theta: FloatArray, gradient: FloatArray) -> BoolArray:
+        """Return which logarithms are inside their bounds or lead back from them."""
+        low, high = self.bounds.box(len(theta) // 2)
+        return ~(((theta <= low) & (gradient > 0.0)) | ((theta >= high) & (gradient < 0.0)))
+
+
+@dataclass(frozen=True, slots=True)
+class SearchSettings:
+    """When a search ends.
+
+    Attributes
+    ----------
+    max_iterations : int
+        Gauss-Newton iterations.
+    tolerance : float
+        The search ends when a step promises to lower the objective by less than this share of it.
+    """
+
+    max_iterations: int = 30
+    tolerance: float = 1e-7
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """A step of the moduli (2 count,) and of the loaded components (n_b,), mm, and by how much it should lower the objective."""
+
+    theta: FloatArray
+    loaded: list[FloatArray]
+    promise: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """End of a search: where, the objective there, how it ended, and after how many iterations."""
+
+    point: Point
+    objective: float
+    status: Status
+    iterations: int
+
+
+StepRule = Callable[[Linearised, Objective], Step]
+
+
+def first_point(model: FieldModel, theta: FloatArray) -> Point:
+    """Return the point at these moduli at which the loaded components suit the measurements, by small strain first.
+
+    Raises
+    ------
+    ConvergenceError
+        The measured field does not fix how the loaded nodes move, or a body of finite strain cannot follow.
+    """
+    small = model if model.law.linear else model.with_law("linear")
+    at = small.linearised(small.evaluate(theta, [np.zeros_like(model.mesh.points)] * len(model.observed)))
+    step = at.loaded_solved([-g[:, None] for g in at.gradient()[1]])
+    moved = at.forward(None, step)
+    states = [u + du.reshape(u.shape) for u, du in zip(at.point.states, moved, strict=True)]
+    return model.evaluate(theta, states if model.law.linear else model.from_rest(theta, states))
+
+
+def exact_step(at: Linearised, objective: Objective) -> Step:
+    """Return the Gauss-Newton step from the explicit Hessian of all moduli, the loaded components eliminated."""
+    theta = at.point.theta
+    data = at.concentrated(np.eye(len(theta)))
+    hessian = data.hessian + objective.curvature(theta).toarray()
+    hessian[np.diag_indices_from(hessian)] += ANCHOR * float(np.diag(hessian).max())
+    gradient = data.gradient + objective.slope(theta)
+    free = objective.free(theta, gradient)
+    step = np.zeros_like(theta)
+    try:
+        step[free] = -sl.cho_solve(sl.cho_factor(hessian[np.ix_(free, free)]), gradient[free])
+    except np.linalg.LinAlgError as error:
+        raise ConvergenceError("the measured fields tell nothing of some moduli; measure more points, or join zones") from error
+    step *= min(1.0, LONGEST_STEP / max(float(np.abs(step).max()), 1e-300))
+    promise = -float(gradient @ step + 0.5 * step @ hessian @ step)
+    loaded = 0.5 * sum(float(r @ p) for r, p in zip(data.offset, at.gradient()[1], strict=True))
+    return Step(step, data.loaded(step), promise + loaded)
+
+
+def search(
+    model: FieldModel, start: Point, objective: Objective, settings: SearchSettings | None = None, *, rule: StepRule = exact_step
+) -> Found:
+    """Lower the objective from a start until steps promise little.
+
+    Parameters
+    ----------
+    model : FieldModel
+        Trials and zones.
+    start : Point
+        Where to begin; it must be the model's last evaluation.
+    objective : Objective
+        What to lower.
+    settings : SearchSettings, optional
+        When to end.
+    rule : callable
+        Finds a step at a linearisation: `exact_step`, or `truncated_step` of `field_matching_many` where zones are many.
+    """
+    chosen = settings or SearchSettings()
+    point, value = start, objective.value(start)
+    for iteration in range(chosen.max_iterations):
+        at = model.linearised(point)
+        step = rule(at, objective)
+        if step.promise <= chosen.tolerance * value + NEGLIGIBLE:
+            return Found(point, value, Status.CONVERGED, iteration)
+        found = _line_search(at, step, objective, value)
+        if found is None:
+            return Found(model.evaluate(point.theta, point.states), value, Status.CONVERGED, iteration)
+        point, value = found
+    return Found(point, value, Status.ITERATION_LIMIT, chosen.max_iterations)
+
+
+def _line_search(at: Linearised, step: Step, objective: Objective, value: float) -> tuple[Point, float] | None:
+    """Return the first point along the step, halved again and again, at which the objective falls; None where it never does."""
+    point = at.point
+    moved = at.forward(step.theta[:, None], [b[:, None] for b in step.loaded])
+    share = 1.0
+    while share >= SHORTEST_SHARE:
+        guesses = [u + share * du.reshape(u.shape) for u, du in zip(point.states, moved, strict=True)]
+        try:
+            found = at.model.evaluate(objective.clipped(point.theta + share * step.theta), guesses)
+        except ConvergenceError:  # moduli or motions that a body of finite strain cannot follow
+            share *= 0.5
+            continue
+        new = objective.value(found)
+        if new <= value - 1e-4 * share * step.promise:
+            return found, new
+        share *= 0.5
+    return None

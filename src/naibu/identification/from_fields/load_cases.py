@@ -1,0 +1,133 @@
+"""Pushes of one body whose inner displacement was measured as a field, and the zones of cells whose moduli are sought (spec I1)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from naibu.core.arrays import BoolArray, FloatArray, IntArray
+from naibu.core.displacement_field import Field
+from naibu.core.errors import InputError
+from naibu.core.mesh import Mesh
+from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
+
+KNOWN = -1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FieldTrial:
+    """One push.
+
+    Attributes
+    ----------
+    name : str
+        For messages.
+    field : Field
+        Measured displacement, at any points inside the body.
+    loaded : ndarray, shape (n, d), bool
+        Components of the model's nodes at which forces act that nobody measured - floor, plates, clamps: balance says nothing there.
+    external_force : ndarray, shape (n, d)
+        Known forces on the nodes (weight, a measured push), mN.
+    """
+
+    name: str
+    field: Field
+    loaded: BoolArray
+    external_force: FloatArray
+
+    @classmethod
+    def of(cls, name: str, field: Field, mesh: Mesh, *, loaded: ArrayLike, external_force: ArrayLike | None = None) -> FieldTrial:
+        """Check and make a trial; `loaded` is a mask (n, d) of components or (n,) of nodes.
+
+        Raises
+        ------
+        InputError
+            Shapes that do not fit the mesh, a force that is not finite, or a field without a valid point.
+        """
+        shape = mesh.points.shape
+        mask = np.asarray(loaded, dtype=bool)
+        mask = np.repeat(mask[:, None], shape[1], axis=1) if mask.ndim == 1 else mask.copy()
+        force = np.zeros(shape) if external_force is None else np.array(external_force, dtype=float)
+        if mask.shape != shape or force.shape != shape:
+            raise InputError(f"trial {name!r}: loaded and external_force must be for {shape[0]} nodes, not {mask.shape} and {force.shape}")
+        if not np.isfinite(force).all():
+            raise InputError(f"trial {name!r}: external_force must be finite, mN")
+        if field.points.shape[1] != shape[1]:
+            raise InputError(f"trial {name!r}: the field has {field.points.shape[1]} coordinates, the mesh {shape[1]}")
+        if not field.valid.any():
+            raise InputError(f"trial {name!r}: the field has no valid point")
+        return cls(name, field, mask, force)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Zones:
+    """Which cells share one pair of unknown moduli, and which are known.
+
+    Attributes
+    ----------
+    of_cell : ndarray, shape (m,), int64
+        Zone of every cell, -1 where its moduli are known.
+    names : tuple of str
+        Name of every zone.
+    known_lambda, known_mu : ndarray, shape (m,)
+        Lame parameters of the known cells, kPa; NaN elsewhere.
+    """
+
+    of_cell: IntArray
+    names: tuple[str, ...]
+    known_lambda: FloatArray
+    known_mu: FloatArray
+
+    @classmethod
+    def of(cls, mesh: Mesh, *, known: Mapping[str, tuple[float, float]], each_cell: bool | Sequence[str] = False) -> Zones:
+        """Make one zone of every region that is not known, or of every cell of it.
+
+        Parameters
+        ----------
+        mesh : Mesh
+            The model.
+        known : mapping
+            Young's modulus, kPa, and Poisson's ratio of the known regions; empty where a known force gives the scale.
+        each_cell : bool or sequence of str
+            Whether every cell (of these regions) is a zone of its own.
+
+        Raises
+        ------
+        InputError
+            A region that the mesh lacks, nothing unknown, or moduli that no elastic solid has.
+        """
+        for name in [*known, *(each_cell if not isinstance(each_cell, bool) else ())]:
+            if name not in mesh.region_names:
+                raise InputError(f"region {name!r} does not exist; the mesh has {', '.join(mesh.region_names)}")
+        of_cell = np.full(mesh.n_cells, KNOWN, dtype=np.int64)
+        lame, shear = np.full(mesh.n_cells, np.nan), np.full(mesh.n_cells, np.nan)
+        names: list[str] = []
+        for index, region in enumerate(mesh.region_names):
+            cells = np.flatnonzero(mesh.regions == index)
+            if region in known:
+                lame[cells], shear[cells] = lame_parameters(*known[region])
+            elif each_cell if isinstance(each_cell, bool) else region in each_cell:
+                of_cell[cells] = len(names) + np.arange(len(cells))
+                names += [f"{region}: cell {c}" for c in cells]
+            elif len(cells):
+                of_cell[cells] = len(names)
+                names.append(region)
+        if not names:
+            raise InputError("every region is known: leave out of `known` what is to be identified")
+        return cls(of_cell, tuple(names), lame, shear)
+
+    @property
+    def count(self) -> int:
+        """Number of unknown zones."""
+        return len(self.names)
+
+    def per_cell(self, lame_lambda: ArrayLike, shear_modulus: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return lambda and mu of every cell (m,), kPa, from those of the zones (count,)."""
+        unknown = self.of_cell != KNOWN
+        out = self.known_lambda.copy(), self.known_mu.copy()
+        for full, given in zip(out, (lame_lambda, shear_modulus), strict=True):
+            full[unknown] = np.asarray(given, dtype=float)[self.of_cell[unknown]]
+        return out

@@ -1,0 +1,370 @@
+"""From a field of moduli found under total variation to regions of one material each, refitted without the penalty (spec I6).
+
+Total variation finds where materials meet but shrinks their contrast. So zones of like moduli are gathered into clusters; clusters are
+merged for as long as a criterion of Bayes' kind says that the measurements do not tell them apart; cells at borders change sides where
+that lowers the objective; and the moduli of what remains are fitted to the measurements alone.
+
+The objective of a partition is half of chi squared, plus the weight of total variation times that of the partition (of no more than a
+clear jump), plus for each region the logarithms of the number of measurements (its two moduli) and of cells (where it is): BIC extended
+to sets of candidates [1]_.
+
+References
+----------
+.. [1] J. Chen and Z. Chen, Extended Bayesian information criteria for model selection with large model spaces, Biometrika 95:759, 2008.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
+
+from naibu.core.arrays import FloatArray, IntArray
+from naibu.identification.from_fields.gauss_newton import Bounds, Objective, SearchSettings, search
+from naibu.identification.from_fields.load_cases import KNOWN, Zones
+from naibu.identification.from_fields.regularization import BULK_SHARE, ZoneGraph
+from naibu.identification.from_fields.sensitivities import Concentrated, FieldModel, Point
+
+CLUSTERS = (20, 8)  # to begin with, one after the other: the better end counts
+LIKE = 0.005  # difference of logarithms of moduli between neighbours that belong together at once
+CLEAR = 0.25  # jump of logarithms beyond which a border counts no more when regions are merged: noise and errors of models seldom make such
+PRIOR_SD = 1.0  # of the logarithms about the clusters' means while merging: of what the data do not tell
+ROUNDS = 8
+ROUGHLY = SearchSettings(max_iterations=12, tolerance=1e-5)  # while the regions may still change
+EXPLICIT = 500  # zones up to which cells at borders may change sides: it takes the whole Hessian
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Segmentation:
+    """Regions and their moduli.
+
+    Attributes
+    ----------
+    of_zone : ndarray, shape (count,), int64
+        Region of every zone, numbered by falling volume.
+    zones : Zones
+        The regions as zones of the mesh.
+    point : Point
+        The fit of their moduli to the measurements alone.
+    clusters : int
+        Number of clusters at the beginning.
+    moved : int
+        Zones that changed sides at borders.
+    """
+
+    of_zone: IntArray
+    zones: Zones
+    point: Point
+    clusters: int
+    moved: int
+
+
+def joined(zones: Zones, of_zone: IntArray) -> Zones:
+    """Return zones made of others: `of_zone` (count,) is the new number of each."""
+    unknown = zones.of_cell != KNOWN
+    of_cell = zones.of_cell.copy()
+    of_cell[unknown] = of_zone[of_cell[unknown]]
+    names = tuple(f"segment {i + 1}" for i in range(int(of_zone.max()) + 1))
+    return Zones(of_cell, names, zones.known_lambda, zones.known_mu)
+
+
+def clusters(graph: ZoneGraph, theta: FloatArray, most: int) -> IntArray:
+    """Gather touching zones of like moduli into at most `most` clusters (if the zones hang together), by Ward's criterion.
+
+    Parameters
+    ----------
+    graph : ZoneGraph
+        Zones and faces between them.
+    theta : ndarray, shape (2 count,)
+        ln mu, then ln(kappa / mu), of all zones.
+    most : int
+        Number of clusters.
+
+    Returns
+    -------
+    ndarray, shape (count,), int64
+        Cluster of every zone.
+    """
+    features = theta.reshape(2, -1).T * [1.0, BULK_SHARE]
+    a, b = graph.pairs.T
+    same = np.linalg.norm(features[a] - features[b], axis=1) < LIKE
+    links = sp.coo_matrix((np.ones(int(same.sum())), (a[same], b[same])), shape=(graph.count, graph.count))
+    _, label = connected_components(links, directed=False)
+    volume = np.bincount(label, graph.volume).astype(float)
+    means = np.stack([np.bincount(label, graph.volume * f) / volume for f in features.T], axis=1)
+    pairs = np.unique(np.sort(label[graph.pairs], axis=1), axis=0)
+    return np.asarray(_ward(pairs[pairs[:, 0] != pairs[:, 1]], means, volume, most)[label], dtype=np.int64)
+
+
+def _ward(pairs: IntArray, means: FloatArray, volume: FloatArray, most: int) -> IntArray:
+    """Merge the touching pair whose union varies least about its mean, again and again; returns the cluster of every item."""
+    mean, weight = [tuple(m) for m in means], volume.tolist()
+    near: list[set[int]] = [set() for _ in weight]
+    for i, j in pairs.tolist():
+        near[i].add(j)
+        near[j].add(i)
+
+    def cost(i: int, j: int) -> float:
+        squared = sum((p - q) ** 2 for p, q in zip(mean[i], mean[j], strict=True))
+        return float(weight[i] * weight[j] / (weight[i] + weight[j]) * squared)
+
+    heap = [(cost(i, j), i, j, 0, 0) for i, j in pairs.tolist()]
+    heapq.heapify(heap)
+    version, owner, left = [0] * len(weight), list(range(len(weight))), len(weight)
+    while left > most and heap:
+        _, i, j, of_i, of_j = heapq.heappop(heap)
+        if version[i] != of_i or version[j] != of_j:
+            continue
+        total = weight[i] + weight[j]
+        mean[i] = tuple((weight[i] * p + weight[j] * q) / total for p, q in zip(mean[i], mean[j], strict=True))
+        weight[i] = total
+        version[i] += 1
+        version[j] = -1
+        owner[j] = i
+        for k in near[j] - {i}:
+            near[k].discard(j)
+            near[k].add(i)
+        near[i] = (near[i] | near[j]) - {i, j}
+        for k in near[i]:
+            heapq.heappush(heap, (cost(i, k), i, k, version[i], version[k]))
+        left -= 1
+    for i in range(len(owner)):
+        while owner[i] != owner[owner[i]]:
+            owner[i] = owner[owner[i]]
+    return np.unique(owner, return_inverse=True)[1].astype(np.int64)
+
+
+def merged(quadratic: Concentrated, theta: FloatArray, area: FloatArray, weight: float, charge: float) -> tuple[IntArray, FloatArray]:
+    """Merge clusters while that lowers the objective, all other moduli adapting at once.
+
+    Parameters
+    ----------
+    quadratic : Concentrated
+        Half of chi squared about `theta`.
+    theta : ndarray, shape (2 k,)
+        Logarithms of the clusters' moduli there.
+    area : ndarray, shape (k, k)
+        Of the faces between clusters, mm^2.
+    weight : float
+        Of total variation, 1/mm^2.
+    charge : float
+        What a region costs.
+
+    Returns
+    -------
+    labels : ndarray, shape (k,), int64
+        Region of every cluster.
+    theta : ndarray, shape (2 regions,)
+        Logarithms of the regions' moduli.
+    """
+    k = len(theta) // 2
+    hessian = quadratic.hessian + np.eye(2 * k) / PRIOR_SD**2
+    right = hessian @ theta - quadratic.gradient
+    gather = np.eye(k)
+    while True:
+        both = np.kron(np.eye(2), gather)
+        covariance = np.linalg.inv(both.T @ hessian @ both)
+        best = covariance @ (both.T @ right)
+        gains = _gains_of_merging(best, covariance, gather.T @ area @ gather, weight) + charge
+        if gains.size == 1 or not gains.max() > 0.0:
+            return gather.argmax(axis=1).astype(np.int64), best
+        i, j = sorted(np.unravel_index(int(np.argmax(gains)), gains.shape))
+        gather[:, i] += gather[:, j]
+        gather = np.delete(gather, j, axis=1)
+
+
+def _gains_of_merging(theta: FloatArray, covariance: FloatArray, area: FloatArray, weight: float) -> FloatArray:
+    """Return by how much the objective falls when two regions become one (r, r); minus infinity on the diagonal."""
+    r = len(area)
+    jump = theta.reshape(2, r)[:, :, None] - theta.reshape(2, r)[:, None, :]
+    blocks = covariance.reshape(2, r, 2, r).transpose(1, 3, 0, 2)  # (r, r, 2, 2)
+    own = blocks[np.arange(r), np.arange(r)]
+    of_jump = own[:, None] + own[None, :] - blocks - np.swapaxes(blocks, 2, 3)
+    of_jump[np.arange(r), np.arange(r)] = np.eye(2)
+    loss = 0.5 * np.einsum("aij,ijab,bij->ij", jump, np.linalg.inv(of_jump), jump)
+    gains = weight * area * jump_costs(jump) - loss
+    gains[np.arange(r), np.arange(r)] = -np.inf
+    return np.asarray(gains)
+
+
+def areas_between(graph: ZoneGraph, labels: IntArray) -> FloatArray:
+    """Return the area of the faces between regions (k, k), mm^2."""
+    k = int(labels.max()) + 1
+    out = np.zeros((k, k))
+    np.add.at(out, tuple(labels[graph.pairs].T), graph.area)
+    out = out + out.T
+    out[np.arange(k), np.arange(k)] = 0.0
+    return out
+
+
+def border_moves(graph: ZoneGraph, labels: IntArray, theta: FloatArray, quadratic: Concentrated, weight: float) -> tuple[IntArray, int]:
+    """Let zones at borders change sides, one at a time, the one that lowers the objective most first.
+
+    Parameters
+    ----------
+    graph : ZoneGraph
+        Zones and faces between them.
+    labels : ndarray, shape (count,), int64
+        Region of every zone.
+    theta : ndarray, shape (2 regions,)
+        Logarithms of the regions' moduli, which stay.
+    quadratic : Concentrated
+        Half of chi squared in the logarithms of all zones, about these moduli.
+    weight : float
+        Of total variation, 1/mm^2.
+
+    Returns
+    -------
+    labels : ndarray, shape (count,), int64
+        Region of every zone.
+    moves : int
+        How many changed.
+    """
+    n, labels = graph.count, labels.copy()
+    values = theta.reshape(2, -1)
+    jumps = np.hypot(values[0][:, None] - values[0], BULK_SHARE * (values[1][:, None] - values[1]))
+    hessian = quadratic.hessian.reshape(2, n, 2, n)
+    own = hessian[:, np.arange(n), :, np.arange(n)]  # (n, 2, 2)
+    gradient = quadratic.gradient.reshape(2, n).copy()
+    half = sp.csr_matrix((graph.area, tuple(graph.pairs.T)), shape=(n, n))
+    touching = (half + half.T).tocsr()
+    for moves in range(4 * n):
+        step = values[:, None, :] - values[:, labels][:, :, None]  # (2, n, regions)
+        of_data = np.einsum("in,inr->nr", gradient, step) + 0.5 * np.einsum("inr,nij,jnr->nr", step, own, step)
+        beside = touching @ np.eye(values.shape[1])[labels]  # area that every zone shares with every region
+        of_borders = beside @ jumps.T - np.take_along_axis(beside @ jumps.T, labels[:, None], axis=1)
+        change = np.where(beside > 0.0, of_data + weight * of_borders, 0.0)
+        zone, region = np.unravel_index(int(np.argmin(change)), change.shape)
+        if not change[zone, region] < -1e-6:
+            return labels, moves
+        gradient += np.einsum("inj,j->in", hessian[:, :, :, zone], step[:, zone, region])
+        labels[zone] = region
+    return labels, 4 * n
+
+
+def segment(
+    model: FieldModel, graph: ZoneGraph, start: Point, weight: float, bounds: Bounds, progress: Callable[[str], None] | None = None
+) -> Segmentation:
+    """Find regions in a field of moduli that was found under total variation of some weight, and fit them without it.
+
+    Parameters
+    ----------
+    model : FieldModel
+        Trials, and the zones whose moduli vary freely.
+    graph : ZoneGraph
+        Of these zones.
+    start : Point
+        Their moduli under total variation.
+    weight : float
+        Of total variation, 1/mm^2.
+    bounds : Bounds
+        Of the moduli.
+    progress : callable, optional
+        Told what is being done.
+    """
+    criterion = Criterion.of(model, graph, start, weight)
+    found: list[tuple[float, IntArray, Point, int]] = []
+    for most in CLUSTERS:
+        labels, point, moved = _from_clusters(model, criterion, start, bounds, most)
+        found.append((criterion.value(labels, point), labels, point, moved))
+        if progress is not None:
+            progress(f"{most} clusters made {int(labels.max()) + 1} regions, misfit {point.misfit:.4g}")
+    _, labels, point, moved = min(found, key=lambda f: f[0])
+    order = np.argsort(-np.bincount(labels, graph.volume), kind="stable")
+    labels = np.argsort(order)[labels]
+    zones = joined(model.zones, labels)
+    regions = model.with_zones(zones)
+    point = regions.evaluate(point.theta.reshape(2, -1)[:, order].ravel(), point.states)
+    point = search(regions, point, Objective(bounds=bounds)).point
+    return Segmentation(labels, zones, point, max(CLUSTERS), moved)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Criterion:
+    """What a partition costs.
+
+    Attributes
+    ----------
+    graph : ZoneGraph
+        The zones that are parted.
+    weight : float
+        Of total variation, 1/mm^2.
+    charge : float
+        Of every region.
+    scale : float
+        By how much the misfit under total variation is above that of noise alone: errors of the model, by which all misfits are divided.
+    """
+
+    graph: ZoneGraph
+    weight: float
+    charge: float
+    scale: float
+
+    @classmethod
+    def of(cls, model: FieldModel, graph: ZoneGraph, start: Point, weight: float) -> Criterion:
+        """Return the criterion for zones whose moduli under total variation are known."""
+        scale = max(1.0, start.misfit / model.n_free)
+        return cls(graph, weight / scale, float(np.log(model.n_free) + np.log(graph.count)), scale)
+
+    def value(self, labels: IntArray, point: Point) -> float:
+        """Return the cost of regions with fitted moduli."""
+        area = areas_between(self.graph, labels)
+        values = point.theta.reshape(2, -1)
+        borders = float(np.sum(area * jump_costs(values[:, :, None] - values[:, None, :]))) / 2.0
+        return float(0.5 * point.misfit / self.scale + self.weight * borders + self.charge * len(area))
+
+
+def jump_costs(jump: FloatArray) -> FloatArray:
+    """Return what jumps (2, ...) of the logarithms cost an area: their length, up to that of a clear one."""
+    return np.asarray(np.minimum(np.hypot(jump[0], BULK_SHARE * jump[1]), CLEAR))
+
+
+def _from_clusters(model: FieldModel, criterion: Criterion, start: Point, bounds: Bounds, most: int) -> tuple[IntArray, Point, int]:
+    """Merge clusters, fit regions and mend their borders until nothing changes; returns regions, their fit, and how many zones moved."""
+    graph = criterion.graph
+    labels = clusters(graph, start.theta, most)
+    volume = np.bincount(labels, graph.volume)
+    theta = np.concatenate([np.bincount(labels, graph.volume * t) / volume for t in start.theta.reshape(2, -1)])
+    point, moved = model.with_zones(joined(model.zones, labels)).evaluate(theta, start.states), 0
+    for _ in range(ROUNDS):
+        fitted = model.with_zones(joined(model.zones, labels))
+        quadratic = _scaled(fitted.linearised(point).concentrated(np.eye(len(point.theta))), criterion.scale)
+        united, theta = merged(quadratic, point.theta, areas_between(graph, labels), criterion.weight, criterion.charge)
+        before, labels = int(labels.max()), united[labels]
+        labels, point = _refitted(model, labels, theta, point, bounds)
+        changed = 0
+        if graph.count <= EXPLICIT and int(labels.max()) > 0:
+            labels, point, changed = _with_better_borders(model, criterion, labels, point, bounds)
+        moved += changed
+        if not changed and before == int(labels.max()):
+            break
+    return labels, point, moved
+
+
+def _scaled(quadratic: Concentrated, scale: float) -> Concentrated:
+    return replace(quadratic, hessian=quadratic.hessian / scale, gradient=quadratic.gradient / scale)
+
+
+def _refitted(model: FieldModel, labels: IntArray, theta: FloatArray, near: Point, bounds: Bounds) -> tuple[IntArray, Point]:
+    """Fit the moduli of regions to the measurements alone; regions that have no zone any more are left out."""
+    kept, labels = np.unique(labels, return_inverse=True)
+    regions = model.with_zones(joined(model.zones, labels))
+    objective = Objective(bounds=bounds)
+    start = regions.evaluate(objective.clipped(theta.reshape(2, -1)[:, kept].ravel()), near.states)
+    return labels.astype(np.int64), search(regions, start, objective, ROUGHLY).point
+
+
+def _with_better_borders(
+    model: FieldModel, criterion: Criterion, labels: IntArray, point: Point, bounds: Bounds
+) -> tuple[IntArray, Point, int]:
+    everywhere = model.evaluate(point.theta.reshape(2, -1)[:, labels].ravel(), point.states)
+    quadratic = _scaled(model.linearised(everywhere).concentrated(np.eye(2 * criterion.graph.count)), criterion.scale)
+    found, moves = border_moves(criterion.graph, labels, point.theta, quadratic, criterion.weight)
+    if not moves:
+        return labels, point, 0
+    labels, point = _refitted(model, found, point.theta, point, bounds)
+    return labels, point, moves

@@ -1,0 +1,439 @@
+"""Derivatives of the states of all trials, forwards and adjoint, and the information about moduli once the loaded nodes are estimated too.
+
+The unknowns of the search are theta = (ln mu of all zones, ln(kappa / mu) of all zones) and the displacement b_t of the loaded components
+of every trial. Every real theta is admissible. With the factorized tangent of a trial,
+
+    du_F = -K_FF^-1 (C dtheta + K_FB db),    du_B = db,
+
+where the columns of C are the nodal forces of a relative change of one modulus (forces are linear in the moduli, whatever the law). The
+adjoint takes one solve with the same factor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import scipy.linalg as sl
+import scipy.sparse as sp
+
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import ConvergenceError
+from naibu.core.mesh import Mesh
+from naibu.identification.from_fields.forward_model import FieldLaw, LawName, Observed, Solvers, equilibrium, field_law, loaded_from_rest
+from naibu.identification.from_fields.load_cases import KNOWN, FieldTrial, Zones
+from naibu.mechanics.linear_algebra.protocols import Factorization
+
+BLOCK = 256  # right-hand sides solved together
+REFRESHED = 400  # loaded components up to which their Hessian is made anew at every point
+BOUNDARY_TOLERANCE = 1e-5
+BOUNDARY_ITERATIONS = 200
+
+
+def moduli_of(zones: Zones, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return lambda and mu of every cell (m,), kPa, from ln mu, then ln(kappa / mu), of all zones (2 count,)."""
+    shear, ratio = np.exp(theta.reshape(2, -1))
+    return zones.per_cell(shear * (ratio - 2.0 / 3.0), shear)
+
+
+def logarithms(lame: FloatArray, shear: FloatArray) -> FloatArray:
+    """Return ln mu, then ln(kappa / mu) (2 k,), of Lame parameters (k,), kPa."""
+    return np.asarray(np.log(np.concatenate([shear, lame / shear + 2.0 / 3.0])))
+
+
+def young_and_poisson(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return Young's modulus (k,), kPa, and Poisson's ratio (k,) from ln mu, then ln(kappa / mu) (2 k,)."""
+    shear, ratio = np.exp(theta.reshape(2, -1))
+    return 9.0 * ratio * shear / (3.0 * ratio + 1.0), (3.0 * ratio - 2.0) / (6.0 * ratio + 2.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Point:
+    """A point of the search with its states.
+
+    Attributes
+    ----------
+    theta : ndarray, shape (2 count,)
+        ln mu, then ln(kappa / mu), of all zones; moduli in kPa.
+    states : tuple of ndarray, shape (n, d)
+        Displacement of every trial in equilibrium, mm; those of the loaded components are unknowns of the search.
+    factors : tuple of Factorization
+        Factorized tangent of every trial; valid until the next evaluation.
+    misfit : float
+        Sum of squares of the whitened differences from the measurements.
+    prior : float
+        Sum of squares of the weak prior on the loaded components.
+    """
+
+    theta: FloatArray
+    states: tuple[FloatArray, ...]
+    factors: tuple[Factorization, ...]
+    misfit: float
+    prior: float
+
+
+class FieldModel:
+    """All trials of a body, evaluated and linearised at points of the search."""
+
+    def __init__(self, mesh: Mesh, trials: Sequence[FieldTrial], zones: Zones, law: LawName = "linear") -> None:
+        self.mesh, self.zones = mesh, zones
+        self.law: FieldLaw = field_law(mesh, law)
+        self.observed = tuple(Observed.of(mesh, trial) for trial in trials)
+        self.solvers = Solvers(self.law, mesh.points)
+        self.boundary: list[BoundaryPreconditioner | None] = [None] * len(self.observed)
+        self.informed: list[float | None] = [None] * len(self.observed)
+
+    @property
+    def n_data(self) -> int:
+        """Number of measured components."""
+        return sum(len(o.data) for o in self.observed)
+
+    def with_zones(self, zones: Zones) -> FieldModel:
+        """Return the model of the same trials with other zones; solvers and preconditioners are shared."""
+        out = object.__new__(FieldModel)
+        out.__dict__.update(self.__dict__)
+        out.zones = zones
+        return out
+
+    def with_law(self, law: LawName) -> FieldModel:
+        """Return the model of the same trials under another law."""
+        out = object.__new__(FieldModel)
+        out.__dict__.update(self.__dict__)
+        out.law = field_law(self.mesh, law)
+        out.solvers = Solvers(out.law, self.mesh.points)
+        out.boundary, out.informed = [None] * len(self.observed), [None] * len(self.observed)
+        return out
+
+    @property
+    def n_free(self) -> float:
+        """Number of measured components less the number of loaded ones that they determine: what is left to tell of moduli.
+
+        Before a first point was found, as if all loaded components were determined.
+        """
+        return self.n_data - sum(len(o.loaded) if i is None else i for o, i in zip(self.observed, self.informed, strict=True))
+
+    def evaluate(self, theta: FloatArray, guesses: Sequence[FloatArray]) -> Point:
+        """Find the equilibrium of all trials; `guesses` (n, d), mm, hold the displacement of the loaded components, and help elsewhere.
+
+        Raises
+        ------
+        ConvergenceError
+            A trial finds no equilibrium.
+        """
+        lame, shear = moduli_of(self.zones, theta)
+        if not (np.isfinite(lame).all() and np.isfinite(shear).all()):
+            raise ConvergenceError("moduli are beyond all bounds")
+        states, factors = self._states(lame, shear, guesses)
+        misfit = sum(float(np.sum(o.residual(u) ** 2)) for o, u in zip(self.observed, states, strict=True))
+        prior = sum(float(b @ (o.prior @ b)) for o, b in zip(self.observed, map(self._loaded, self.observed, states), strict=True))
+        return Point(theta, tuple(states), tuple(factors), misfit, prior)
+
+    @staticmethod
+    def _loaded(observed: Observed, u: FloatArray) -> FloatArray:
+        return u.ravel()[observed.loaded]
+
+    def _states(self, lame: FloatArray, shear: FloatArray, guesses: Sequence[FloatArray]) -> tuple[list[FloatArray], list[Factorization]]:
+        states, factors = [], []
+        shared: dict[bytes, Factorization] = {}
+        for t, (o, guess) in enumerate(zip(self.observed, guesses, strict=True)):
+            key = np.packbits(o.trial.loaded).tobytes()
+            if self.law.linear and key in shared:  # one matrix for all trials that are loaded at the same places
+                residual = self.law.forces(lame, shear, guess) - o.trial.external_force
+                residual[o.trial.loaded] = 0.0
+                u, factor = guess - shared[key].solve(residual.ravel()).reshape(guess.shape), shared[key]
+            else:
+                u, factor = equilibrium(self.law, self.solvers, lame, shear, o.trial, guess, b"" if self.law.linear else b"%d" % t)
+                shared[key] = factor
+            states.append(u)
+            factors.append(factor)
+        return states, factors
+
+    def from_rest(self, theta: FloatArray, moved: Sequence[FloatArray]) -> list[FloatArray]:
+        """Return states (n, d), mm, reached in load steps, for displacements of the loaded components (n, d)."""
+        lame, shear = moduli_of(self.zones, theta)
+        pairs = zip(self.observed, moved, strict=True)
+        return [loaded_from_rest(self.law, self.mesh.points, lame, shear, o.trial, u) for o, u in pairs]
+
+    def linearised(self, point: Point) -> Linearised:
+        """Linearise all trials at a point."""
+        lame, shear = moduli_of(self.zones, point.theta)
+        for t, o in enumerate(self.observed):
+            if len(o.loaded) <= REFRESHED:
+                self.boundary[t] = None
+        columns = [modulus_columns(self.law, self.zones, lame, shear, u) for u in point.states]
+        stiffness: list[sp.bsr_matrix] = []
+        for u in point.states:
+            stiffness.append(stiffness[0] if self.law.linear and stiffness else self.law.stiffness(lame, shear, u))
+        return Linearised(self, point, columns, stiffness)
+
+
+def modulus_columns(law: FieldLaw, zones: Zones, lame: FloatArray, shear: FloatArray, u: FloatArray) -> sp.csr_matrix:
+    """Return the nodal forces (n d, 2 count), mN, of a relative change of mu at constant kappa / mu, then of kappa, of every zone."""
+    body = law.simplices
+    unit_lame, unit_shear = law.unit_forces(u)
+    _, k, d = unit_lame.shape
+    unknown = zones.of_cell != KNOWN
+    of_bulk = (lame + 2.0 / 3.0 * shear)[unknown, None, None] * unit_lame[unknown]
+    of_both = lame[unknown, None, None] * unit_lame[unknown] + shear[unknown, None, None] * unit_shear[unknown]
+    rows = ((body.cells[unknown] * d)[:, :, None] + np.arange(d)).ravel()
+    columns = np.repeat(zones.of_cell[unknown], k * d)
+    index = np.concatenate([rows, rows]), np.concatenate([columns, columns + zones.count])
+    return sp.csr_matrix((np.concatenate([of_both.ravel(), of_bulk.ravel()]), index), shape=(body.n_points * d, 2 * zones.count))
+
+
+@dataclass(slots=True, eq=False)
+class Linearised:
+    """The trials' displacement as a linear function of changes of the unknowns, at one point of the search."""
+
+    model: FieldModel
+    point: Point
+    columns: list[sp.csr_matrix]
+    stiffness: list[sp.bsr_matrix]
+    _transposed: list[sp.csr_matrix] = field(default_factory=list)
+    _border: list[sp.csr_matrix] = field(default_factory=list)
+    _gradient: tuple[FloatArray, list[FloatArray]] | None = None
+
+    def __post_init__(self) -> None:
+        self._transposed = [c.T.tocsr() for c in self.columns]
+        rows: dict[tuple[int, bytes], sp.csr_matrix] = {}
+        for o, matrix in zip(self.model.observed, self.stiffness, strict=True):
+            key = id(matrix), o.loaded.tobytes()
+            if key not in rows:
+                rows[key] = matrix.tocsr()[o.loaded]
+            self._border.append(rows[key])
+
+    def border(self, t: int) -> sp.csr_matrix:
+        """Return the rows (n_b, n d) of the stiffness of trial `t`, mN/mm, that belong to its loaded components; also its columns."""
+        return self._border[t]
+
+    def solved(self, right: list[FloatArray]) -> list[FloatArray]:
+        """Solve with the tangents of all trials, right-hand sides (n d, r) of trials that share a factor together."""
+        groups: dict[int, list[int]] = {}
+        for t, factor in enumerate(self.point.factors):
+            groups.setdefault(id(factor), []).append(t)
+        out: list[FloatArray] = [np.empty(0)] * len(right)
+        for members in groups.values():
+            factor = self.point.factors[members[0]]
+            widths = np.cumsum([0] + [right[t].shape[1] for t in members])
+            x = _in_blocks(factor, np.concatenate([right[t] for t in members], axis=1))
+            for t, a, b in zip(members, widths[:-1], widths[1:], strict=True):
+                out[t] = x[:, a:b]
+        return out
+
+    def forward(self, theta: FloatArray | None, loaded: Sequence[FloatArray] | None) -> list[FloatArray]:
+        """Return the change of every trial's displacement (n d, r), mm, for changes of theta (2 count, r) and of b_t (n_b, r)."""
+        right = []
+        for t, o in enumerate(self.model.observed):
+            b = None if loaded is None else loaded[t]
+            force = 0.0 if b is None else self._border[t].T @ b
+            if theta is not None:
+                force = force + self.columns[t] @ theta
+            force = -np.asarray(force)
+            force[o.loaded] = 0.0
+            right.append(force)
+        moved = self.solved(right)
+        for t, o in enumerate(self.model.observed):
+            moved[t][o.loaded] = 0.0 if loaded is None else loaded[t]
+        return moved
+
+    def adjoint(self, gradients: list[FloatArray]) -> tuple[FloatArray, list[FloatArray]]:
+        """Return what `forward` transposed makes of (n d, r) of every trial: (2 count, r) and a list of (n_b, r)."""
+        right = [g.copy() for g in gradients]
+        for o, g in zip(self.model.observed, right, strict=True):
+            g[o.loaded] = 0.0
+        theta, loaded = np.zeros((2 * self.model.zones.count, gradients[0].shape[1])), []
+        for t, w in enumerate(self.solved(right)):
+            o = self.model.observed[t]
+            w[o.loaded] = 0.0
+            theta -= self._transposed[t] @ w
+            loaded.append(gradients[t][o.loaded] - self._border[t] @ w)
+        return theta, loaded
+
+    def gradient(self) -> tuple[FloatArray, list[FloatArray]]:
+        """Return the gradient of half the misfit and prior: (2 count,) and a list of (n_b,)."""
+        if self._gradient is None:
+            model = self.model
+            pulls = [(o.operator.T @ o.residual(u))[:, None] for o, u in zip(model.observed, self.point.states, strict=True)]
+            theta, loaded = self.adjoint(pulls)
+            prior = [o.prior @ u.ravel()[o.loaded] for o, u in zip(model.observed, self.point.states, strict=True)]
+            self._gradient = theta[:, 0], [b[:, 0] + p for b, p in zip(loaded, prior, strict=True)]
+        return self._gradient
+
+    def product(self, theta: FloatArray, loaded: Sequence[FloatArray]) -> tuple[FloatArray, list[FloatArray]]:
+        """Return the Gauss-Newton Hessian of half the misfit and prior times a vector; parts (2 count, r) and (n_b, r) as in `forward`."""
+        moved = self.forward(theta, loaded)
+        out, at_loaded = self.adjoint([o.operator.T @ (o.operator @ u) for o, u in zip(self.model.observed, moved, strict=True)])
+        return out, [a + o.prior @ b for a, o, b in zip(at_loaded, self.model.observed, loaded, strict=True)]
+
+    def preconditioned(self, loaded: Sequence[FloatArray]) -> list[FloatArray]:
+        """Return about what the inverse of the Hessian of the loaded components makes of (n_b, r) of every trial."""
+        made = [self.boundary(t) for t in range(len(loaded))]
+        groups: dict[int, list[int]] = {}
+        for t, one in enumerate(made):
+            groups.setdefault(id(one.factor), []).append(t)
+        out: list[FloatArray] = [np.empty(0)] * len(loaded)
+        for members in groups.values():
+            solved = made[members[0]].unscaled(np.concatenate([loaded[t] for t in members], axis=1))
+            for t, x in zip(members, np.split(solved, np.cumsum([loaded[t].shape[1] for t in members])[:-1], axis=1), strict=True):
+                out[t] = x / made[t].scale
+        return out
+
+    def boundary(self, t: int) -> BoundaryPreconditioner:
+        """Return the preconditioner of the loaded components of trial `t`, made on first use and kept."""
+        made = self.model.boundary
+        found = made[t]
+        if found is None:
+            twin = next((s for s in range(t) if made[s] is not None and _alike(self.model.observed[s], self.model.observed[t])), None)
+            shared = None if twin is None else made[twin]
+            found = BoundaryPreconditioner.of(self, t) if shared is None or twin is None else shared.scaled(self.model.observed, twin, t)
+            made[t], self.model.informed[t] = found, found.informed
+        return found
+
+    def loaded_solved(self, right: Sequence[FloatArray]) -> list[FloatArray]:
+        """Solve with the Hessian of the loaded components: (n_b, r) of every trial, by preconditioned conjugate gradients."""
+
+        def product(loaded: list[FloatArray]) -> list[FloatArray]:
+            moved = self.forward(None, loaded)
+            pulled = [o.operator.T @ (o.operator @ u) for o, u in zip(self.model.observed, moved, strict=True)]
+            return [a + o.prior @ b for a, o, b in zip(self.adjoint(pulled)[1], self.model.observed, loaded, strict=True)]
+
+        return _conjugate_gradients(product, self.preconditioned, list(right))
+
+    def concentrated(self, basis: FloatArray) -> Concentrated:
+        """Return half the misfit as a quadratic in changes of theta along `basis` (2 count, k), minimised over the loaded components."""
+        moved = self.forward(basis, None)
+        pulls = [o.operator.T @ (o.operator @ u) for o, u in zip(self.model.observed, moved, strict=True)]
+        theta, loaded = self.gradient()
+        cross = self.adjoint(pulls)[1]
+        solved = self.loaded_solved([np.column_stack([c, g]) for c, g in zip(cross, loaded, strict=True)])
+        response = [x[:, :-1] for x in solved]
+        hessian = sum(u.T @ p - c.T @ x for u, p, c, x in zip(moved, pulls, cross, response, strict=True))
+        gradient = basis.T @ theta - sum(x.T @ g for x, g in zip(response, loaded, strict=True))
+        return Concentrated(np.asarray(0.5 * (hessian + hessian.T)), np.asarray(gradient), response, [x[:, -1] for x in solved])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Concentrated:
+    """Half the misfit as a quadratic in k directions of the moduli, minimised over the displacement of the loaded components.
+
+    Attributes
+    ----------
+    hessian : ndarray, shape (k, k)
+        The Fisher information of the moduli, what the unknown forces cost taken off.
+    gradient : ndarray, shape (k,)
+        Gradient.
+    response : list of ndarray, shape (n_b, k)
+        By how much the loaded components follow, with a minus sign, mm.
+    offset : list of ndarray, shape (n_b,)
+        How far they are from their best place now, mm.
+    """
+
+    hessian: FloatArray
+    gradient: FloatArray
+    response: list[FloatArray]
+    offset: list[FloatArray]
+
+    def loaded(self, step: FloatArray) -> list[FloatArray]:
+        """Return the change of the loaded components (n_b,) of every trial, mm, that goes with a step (k,)."""
+        return [-(x @ step) - r for x, r in zip(self.response, self.offset, strict=True)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoundaryPreconditioner:
+    """The Hessian of the loaded components of one trial at one point of the search, factorized; it changes little with the moduli.
+
+    Attributes
+    ----------
+    factor : tuple
+        Cholesky factor (n_b, n_b), 1/mm^2, as SciPy's.
+    informed : float
+        Number of loaded components that the measurements, rather than the prior, determine.
+    scale : float
+        Of the Hessian against the factor's.
+    """
+
+    factor: tuple[FloatArray, bool]
+    informed: float
+    scale: float = 1.0
+
+    @classmethod
+    def of(cls, at: Linearised, t: int) -> BoundaryPreconditioner:
+        """Make it from the response to every loaded component."""
+        o = at.model.observed[t]
+        factor, border, n_b = at.point.factors[t], at.border(t), len(o.loaded)
+        hessian = np.empty((n_b, n_b))
+        for start in range(0, n_b, BLOCK):
+            stop = min(start + BLOCK, n_b)
+            force = border[start:stop].T.toarray()
+            force[o.loaded] = 0.0
+            moved = -factor.solve(force)
+            moved[o.loaded[start:stop], np.arange(stop - start)] = 1.0
+            pull = np.asarray(o.operator.T @ (o.operator @ moved))
+            inner = pull.copy()
+            inner[o.loaded] = 0.0
+            answer = factor.solve(inner)
+            answer[o.loaded] = 0.0
+            hessian[:, start:stop] = pull[o.loaded] - border @ answer
+        hessian = 0.5 * (hessian + hessian.T)
+        full = hessian + o.prior.toarray()
+        try:
+            cholesky = sl.cho_factor(full, overwrite_a=False)
+        except np.linalg.LinAlgError as error:
+            raise ConvergenceError(
+                f"trial {o.trial.name!r}: the measured field does not fix how the loaded nodes move as a whole"
+            ) from error
+        informed = n_b - float(np.sum(o.prior.multiply(sl.cho_solve(cholesky, np.eye(n_b)))))
+        return cls(cholesky, informed)
+
+    def scaled(self, observed: Sequence[Observed], source: int, target: int) -> BoundaryPreconditioner:
+        """Return the preconditioner of a trial `target` whose measurements differ from those of `source` in accuracy alone."""
+        ratio = (observed[source].noise_mm / observed[target].noise_mm) ** 2
+        return BoundaryPreconditioner(self.factor, self.informed, self.scale * ratio)
+
+    def unscaled(self, b: FloatArray) -> FloatArray:
+        """Return the solution (n_b, r) with the factor, before it is divided by `scale`."""
+        return np.asarray(sl.cho_solve(self.factor, b, check_finite=False))  # the check would cost as much as the solution
+
+
+def _alike(one: Observed, other: Observed) -> bool:
+    """Whether two trials are measured at the same points and loaded at the same places, and differ in accuracy alone."""
+    same = one.operator.shape == other.operator.shape and np.array_equal(one.loaded, other.loaded)
+    if not same or not np.array_equal(one.operator.indices, other.operator.indices):
+        return False
+    return bool(np.allclose(one.operator.data * one.noise_mm, other.operator.data * other.noise_mm, rtol=1e-6, atol=0.0))
+
+
+def _in_blocks(factor: Factorization, right: FloatArray) -> FloatArray:
+    if right.shape[1] <= BLOCK:
+        return factor.solve(right)
+    return np.concatenate([factor.solve(right[:, a : a + BLOCK]) for a in range(0, right.shape[1], BLOCK)], axis=1)
+
+
+def _conjugate_gradients(
+    product: Callable[[list[FloatArray]], list[FloatArray]],
+    precondition: Callable[[list[FloatArray]], list[FloatArray]],
+    right: list[FloatArray],
+) -> list[FloatArray]:
+    """Solve independent systems of several trials, every column by its own iteration, all advanced together."""
+
+    def dot(a: list[FloatArray], b: list[FloatArray]) -> list[FloatArray]:
+        return [np.einsum("ij,ij->j", p, q) for p, q in zip(a, b, strict=True)]
+
+    x, r = [np.zeros_like(b) for b in right], [b.copy() for b in right]
+    target = [BOUNDARY_TOLERANCE * np.linalg.norm(b, axis=0) for b in right]
+    p, rz = [np.zeros_like(b) for b in right], [np.ones(b.shape[1]) for b in right]
+    for iteration in range(BOUNDARY_ITERATIONS):
+        if all((np.linalg.norm(a, axis=0) <= limit).all() for a, limit in zip(r, target, strict=True)):
+            return x
+        z = precondition(r)
+        new = dot(r, z)
+        for t in range(len(p)):
+            p[t] = z[t] + p[t] * (new[t] / np.maximum(rz[t], 1e-300) if iteration else 0.0)
+        q = product(p)
+        for t, curvature in enumerate(dot(p, q)):
+            alpha = new[t] / np.where(curvature > 0.0, curvature, np.inf)
+            x[t] += alpha * p[t]
+            r[t] -= alpha * q[t]
+        rz = new
+    raise ConvergenceError(f"the displacement of the loaded nodes did not converge in {BOUNDARY_ITERATIONS} conjugate gradient iterations")

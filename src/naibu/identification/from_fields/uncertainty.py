@@ -1,0 +1,192 @@
+"""How well moduli are determined: covariance, Cramer-Rao bound, resolution, and what of it to tell a reader (spec I6)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as sl
+
+from naibu.core.arrays import BoolArray, FloatArray
+from naibu.core.mesh import Mesh
+from naibu.identification.from_fields.forward_model import LawName
+from naibu.identification.from_fields.gauss_newton import Objective
+from naibu.identification.from_fields.load_cases import FieldTrial, Zones
+from naibu.identification.from_fields.sensitivities import FieldModel, Linearised, Point, logarithms, young_and_poisson
+from naibu.identification.from_fields.truncated_newton import RegularizedSystem, conjugate_gradients
+
+UNKNOWN_BELOW = 1e-12  # share of the largest eigenvalue of the information below which a combination is not determined at all
+PROBES = 24
+WELL, POORLY = 0.1, 0.5  # standard deviations of a logarithm of a modulus that are called well and poorly determined
+POISSON_POORLY = 0.1
+RESOLVED = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Uncertainty:
+    """What the measurements say about the moduli of k zones.
+
+    Attributes
+    ----------
+    information : ndarray, shape (2 k, 2 k)
+        Fisher information of ln mu, then ln(kappa / mu), the displacement of loaded nodes estimated as well.
+    covariance : ndarray, shape (2 k, 2 k)
+        Its inverse; infinite on the diagonal where a modulus is not determined.
+    """
+
+    information: FloatArray
+    covariance: FloatArray
+
+    @classmethod
+    def of(cls, information: FloatArray, noise_factor: float = 1.0) -> Uncertainty:
+        """Invert an information matrix, for noise that is `noise_factor` times what was stated."""
+        scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+        values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+        lost = values <= UNKNOWN_BELOW * max(float(values[-1]), 1e-300)
+        vectors = vectors / scale[:, None]
+        kept = vectors[:, ~lost]
+        covariance = kept / values[~lost] @ kept.T
+        shared = (np.abs(vectors[:, lost] * scale[:, None]) > 1e-6).any(axis=1)
+        covariance[shared, shared] = np.inf
+        return cls(information / noise_factor**2, covariance * noise_factor**2)
+
+    def standard_deviations(self) -> FloatArray:
+        """Return those of ln mu, then ln(kappa / mu) (2 k,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def of_young_and_poisson(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the standard deviations of ln E (k,) and of Poisson's ratio (k,)."""
+        k = len(theta) // 2
+        of_young, of_poisson = young_and_poisson_slopes(theta)
+        blocks = np.stack([[self.covariance[i * k + np.arange(k), j * k + np.arange(k)] for j in range(2)] for i in range(2)])
+        lost = ~np.isfinite(blocks).all(axis=(0, 1))
+        blocks[:, :, lost] = 0.0
+        young, poisson = (np.sqrt(np.maximum(np.einsum("ik,ijk,jk->k", s, blocks, s), 0.0)) for s in (of_young, of_poisson))
+        return np.where(lost, np.inf, young), np.where(lost, np.inf, poisson)
+
+
+def young_and_poisson_slopes(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the derivatives of ln E and of Poisson's ratio with respect to ln mu and ln(kappa / mu), (2, k) each."""
+    ratio = np.exp(theta.reshape(2, -1)[1])
+    ones = np.ones_like(ratio)
+    return np.stack([ones, 1.0 / (3.0 * ratio + 1.0)]), np.stack([0.0 * ones, 9.0 * ratio / (2.0 * (3.0 * ratio + 1.0) ** 2)])
+
+
+def cramer_rao_bound(
+    mesh: Mesh,
+    trials: Sequence[FieldTrial],
+    zones: Zones,
+    lame_lambda: FloatArray,
+    shear_modulus: FloatArray,
+    states: Sequence[FloatArray],
+    *,
+    law: LawName = "linear",
+) -> Uncertainty:
+    """Return what no unbiased estimate can beat at true moduli and displacements, the motion of loaded nodes being unknown.
+
+    Parameters
+    ----------
+    mesh, trials, zones, law
+        As for `identify_field`; of the trials the points, covariances and loaded components count, not the measurements.
+    lame_lambda, shear_modulus : ndarray, shape (count,)
+        True moduli of the zones, kPa.
+    states : sequence of ndarray, shape (n, d)
+        True displacement of every trial, mm.
+    """
+    model = FieldModel(mesh, trials, zones, law)
+    point = model.evaluate(logarithms(lame_lambda, shear_modulus), states)
+    return Uncertainty.of(information_at(model, point))
+
+
+def information_at(model: FieldModel, point: Point) -> FloatArray:
+    """Return the Fisher information (2 count, 2 count) of the logarithms of all zones' moduli at a point, which must be evaluated last."""
+    return model.linearised(point).concentrated(np.eye(2 * model.zones.count)).hessian
+
+
+def resolution(at: Linearised, objective: Objective, *, explicit: bool, probes: int = PROBES, seed: int = 0) -> FloatArray:
+    """Return by how much an estimate under a penalty follows the truth, for every logarithm (2 count,): 1 is all, 0 not at all.
+
+    It is the diagonal of ``(A + P)^-1 A`` with the information A and the penalty's Hessian P: exact from explicit matrices, else its
+    estimate from products with random signs [1]_, which scatters about the truth (and beyond 0 and 1), less so its sum.
+
+    References
+    ----------
+    .. [1] C. Bekas, E. Kokiopoulou, Y. Saad, An estimator for the diagonal of a matrix, Applied Numerical Mathematics 57:1214, 2007.
+    """
+    curvature = objective.curvature(at.point.theta)
+    size = curvature.shape[0]
+    if explicit:
+        data = at.concentrated(np.eye(size)).hessian
+        total = data + curvature.toarray() + 1e-9 * float(np.diag(data).max()) * np.eye(size)
+        return np.asarray(np.diag(sl.solve(total, data, assume_a="pos")))
+    system = RegularizedSystem(at, curvature)
+    rng = np.random.default_rng(seed)
+    signs = rng.choice([-1.0, 1.0], size=(probes, size)).T
+    # (A + P)^-1 A s = s - (A + P)^-1 P s, the loaded components following
+    right = [curvature @ signs, *(np.zeros((len(o.loaded), probes)) for o in at.model.observed)]
+    lost = conjugate_gradients(system.product, system.preconditioned, right, 1e-2, 200)[0][0]
+    return np.asarray((signs * (signs - lost)).mean(axis=1))
+
+
+def report(zones: Zones, theta: FloatArray, found: Uncertainty) -> tuple[str, ...]:
+    """Say in words how well every zone's moduli are determined, and which combination is determined worst."""
+    young, poisson = young_and_poisson(theta)
+    of_young, of_poisson = found.of_young_and_poisson(theta)
+    lines = [_sentence(*row) for row in zip(zones.names, young, of_young, poisson, of_poisson, strict=True)]
+    return (*lines, _worst(zones, found))
+
+
+def _sentence(name: str, young: float, of_young: float, poisson: float, of_poisson: float) -> str:
+    if not np.isfinite(of_young):
+        return f"{name}: the measurements do not determine its moduli."
+    how = "well" if of_young < WELL else "roughly" if of_young < POORLY else "poorly"
+    text = f"{name}: Young's modulus {young:.4g} kPa is {how} determined (standard error {100 * of_young:.2g} %)"
+    if of_poisson > POISSON_POORLY:
+        return text + f"; Poisson's ratio {poisson:.3f} is not (standard error {of_poisson:.2g}): take it from elsewhere."
+    return text + f", Poisson's ratio {poisson:.3f} within {of_poisson:.2g}."
+
+
+def _worst(zones: Zones, found: Uncertainty) -> str:
+    values, vectors = np.linalg.eigh(found.information)
+    worst = vectors[:, 0] / np.abs(vectors[:, 0]).max()
+    k = zones.count
+    names = [f"mu of {n}" for n in zones.names] + [f"kappa / mu of {n}" for n in zones.names]
+    parts = [i for i in np.argsort(-np.abs(worst)) if abs(worst[i]) > 0.2][:4]
+    towards = ", ".join(f"{names[i]} {'up' if worst[i] * worst[parts[0]] > 0 else 'down'}" for i in parts)
+    sd = 1.0 / np.sqrt(max(float(values[0]), 1e-300)) * float(np.abs(vectors[:, 0]).max())
+    several = "together " if len(parts) > 1 else ""
+    much = f"by {100 * sd:.2g} %" if sd < 1.0 else f"{np.exp(min(sd, 300.0)):.2g} times"
+    return f"Least determined among {2 * k} numbers: {towards}; {several}{much} before the measurements object."
+
+
+def resolution_report(zones: Zones, centres: FloatArray, resolved: FloatArray) -> tuple[str, ...]:
+    """Say in words which of many zones (centres (count, d), mm) the measurements resolve, and in which modulus.
+
+    Parameters
+    ----------
+    zones : Zones
+        The zones whose moduli varied freely.
+    centres : ndarray, shape (count, d)
+        Where they are, mm.
+    resolved : ndarray, shape (2 count,)
+        Resolution of ln mu, then ln(kappa / mu).
+    """
+    lines = []
+    for what, r in zip(("shear modulus", "ratio of bulk to shear modulus"), resolved.reshape(2, -1), strict=True):
+        low = r < RESOLVED
+        lines.append(
+            f"{what}: {100 * (1 - low.mean()):.0f} % of {zones.count} elements are resolved one by one (resolution above {RESOLVED:g}); "
+            f"the measurements determine {r.sum():.0f} numbers in all, the rest follows neighbours."
+        )
+        if low.any() and not low.all():
+            where = [
+                f"{axis} {a:.3g} to {b:.3g}" for axis, a, b in zip("xyz", *np.quantile(centres[low], [0.1, 0.9], axis=0), strict=False)
+            ]
+            lines.append(f"  least resolved: {_named(zones, r, low)}; most of them at {', '.join(where)} mm.")
+    return tuple(lines)
+
+
+def _named(zones: Zones, r: FloatArray, low: BoolArray) -> str:
+    order = np.argsort(r)[: min(3, int(low.sum()))]
+    return ", ".join(f"{zones.names[i]} ({r[i]:.2g})" for i in order)

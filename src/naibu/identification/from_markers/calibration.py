@@ -1,0 +1,217 @@
+"""From experiments to a calibrated model: which parameters there are, what is known of them beforehand, and what the data say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from naibu.core.errors import InputError
+from naibu.core.experiment import Experiment, Layer, State
+from naibu.core.parameters import Parameter, ParameterSet
+from naibu.identification.from_markers.gauss_newton import Match, Matcher, MatchingSettings
+from naibu.identification.from_markers.initial_guess import force_balance
+from naibu.identification.from_markers.known_materials import Knowledge
+from naibu.identification.from_markers.observations import Nearby, NoiseModel, Trial
+from naibu.identification.from_markers.parameter_names import (
+    SHAPE_NAMES,
+    base_offset,
+    batch_stiffness,
+    friction,
+    joint_friction,
+    opening,
+    pixel_scale,
+    poisson_ratio,
+    shape_parameter,
+    straight_base,
+    young_modulus,
+)
+from naibu.identification.from_markers.specimen_model import ModelSettings, Specimen, specimen
+
+REFERENCE_MODULUS_KPA = 200.0  # of the known region when only ratios are sought
+START_POISSON_RATIO = 0.49
+START_FRICTION = 0.2
+START_SPRING = 30.0  # kPa/mm
+PIXEL_SCALE_SD = 0.005  # a size printed with two digits, 0.29 mm for 0.293
+BATCH_SD = 0.3  # of ln(stiffness) between batches: the report's samples of one gel scatter by 0.2 (Table 3.4)
+TRUSTED_RATIO = (0.05, 20.0)  # of an unknown modulus to the known ones; force balance is not believed beyond
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """The trials of a calibration and the match found for them."""
+
+    trials: tuple[Trial, ...]
+    match: Match
+    settings: ModelSettings
+    noise: NoiseModel
+    knowledge: Knowledge
+
+    @property
+    def nearby(self) -> dict[str, Nearby]:
+        """The solved trials by label, for other searches to start from."""
+        return {trial.label: Nearby(fit, self.match.parameters) for trial, fit in zip(self.trials, self.match.fits, strict=True)}
+
+
+def calibrate(
+    experiments: Sequence[Experiment],
+    *,
+    knowledge: Knowledge | None = None,
+    states: Mapping[str, Sequence[str]] | None = None,
+    settings: ModelSettings | None = None,
+    noise: NoiseModel | None = None,
+    search: MatchingSettings | None = None,
+    start: Mapping[str, float] | None = None,
+    nearby: Mapping[str, Nearby] | None = None,
+    callback: Callable[[int, float, Mapping[str, float]], None] | None = None,
+) -> Calibration:
+    """Identify materials, friction and boundary conditions from all loaded states of some experiments jointly.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+        With three-dimensional markers.
+    knowledge : Knowledge, optional
+        Materials with known modulus; by default the first one found stands for the scale, and the others' moduli are ratios to it.
+    states : mapping, optional
+        States to use, by experiment; all measured ones by default.
+    settings : ModelSettings, optional
+        Law, contact, mesh.
+    noise : NoiseModel, optional
+        Of the measurement.
+    search : MatchingSettings, optional
+        Iterations and tolerance.
+    start : mapping, optional
+        Physical values to start from, by name; priors keep their centres.
+    nearby : mapping, optional
+        Solutions near the start, by the labels of their trials (`Calibration.nearby`); they save time.
+    callback : callable, optional
+        ``callback(iteration, objective, values)`` after every step.
+
+    Raises
+    ------
+    InputError
+        No experiment, no measured loaded state, a known material that no experiment contains, or data that cannot be used.
+    ConvergenceError
+        A trial cannot be solved at the starting values.
+    """
+    if not experiments:
+        raise InputError("no experiments are given; name at least one folder or bundled dataset")
+    chosen, measured = settings or ModelSettings(), noise or NoiseModel()
+    specimens = [specimen(e, chosen) for e in experiments]
+    used = {e.name: tuple((states or {}).get(e.name, [s.name for s in e.loaded_states])) for e in experiments}
+    trials = tuple(Trial.of(s, name, measured) for s in specimens for name in used[s.experiment.name])
+    if not trials:
+        raise InputError(f"no loaded state with measured positions in {', '.join(e.name for e in experiments)}")
+    known = knowledge or _first_material(experiments)
+    parameters = initial_parameters(specimens, used, known)
+    begin = dict(start or {}) or _start_from_force_balance(experiments, known, used)
+    match = Matcher(trials, parameters, search or MatchingSettings()).run(callback, start=begin, nearby=nearby)
+    return Calibration(trials, match, chosen, measured, known)
+
+
+def _first_material(experiments: Sequence[Experiment]) -> Knowledge:
+    return Knowledge({experiments[0].materials[0]: REFERENCE_MODULUS_KPA}, scale_is_absolute=False)
+
+
+def _start_from_force_balance(
+    experiments: Sequence[Experiment], knowledge: Knowledge, states: Mapping[str, Sequence[str]]
+) -> dict[str, float]:
+    """Young's moduli, by parameter, from the force balance between markers, where it gives sensible ones; a start needs no more."""
+    try:
+        found = force_balance(experiments, knowledge, states)
+    except (InputError, np.linalg.LinAlgError):
+        return {}
+    reference = float(np.mean(list(knowledge.young_moduli.values())))
+    low, high = TRUSTED_RATIO
+    return {young_modulus(name): e for name, (e, _) in found.items() if low < e / reference < high}
+
+
+def initial_parameters(specimens: Sequence[Specimen], states: Mapping[str, Sequence[str]], knowledge: Knowledge) -> ParameterSet:
+    """Return all parameters of the trials with their starting values and priors.
+
+    Raises
+    ------
+    InputError
+        A known material that no experiment contains.
+    """
+    found: dict[str, Parameter] = {}
+    materials = [m for s in specimens for m in s.experiment.materials]
+    for name in knowledge.young_moduli:
+        if name not in materials:
+            raise InputError(f"known material {name!r} is in none of the experiments; they contain {', '.join(sorted(set(materials)))}")
+    reference = float(np.mean(list(knowledge.young_moduli.values()) or [REFERENCE_MODULUS_KPA]))
+    for p in _batch_parameters([layer for s in specimens for layer in s.experiment.layers if layer.batch], knowledge):
+        found[p.name] = p
+    for s in specimens:
+        for p in _material_parameters(s, knowledge, reference) + _friction_parameters(s):
+            if p.name not in found or (found[p.name].fixed and not p.fixed):  # free wherever one experiment can tell it
+                found[p.name] = p
+        offset = base_offset(s.experiment)
+        found.setdefault(offset, Parameter(offset, 0.0, "mm", prior_sd=0.5))
+        if s.settings.pixel_scale == "sought":
+            found.setdefault(name := pixel_scale(s.experiment), Parameter(name, s.experiment.xy_scale, "", prior_sd=PIXEL_SCALE_SD))
+        if s.has_unknown_base:
+            below = straight_base(s.experiment)
+            found.setdefault(below, Parameter(below, 0.1 * s.experiment.height_mm, "mm", prior_sd=0.4 * s.experiment.height_mm))
+        for name in s.shift_names:
+            found.setdefault(name, Parameter(name, 0.0, "mm", prior_sd=1.0))
+        for state in states[s.experiment.name]:
+            for p in state_parameters(s.experiment, s.experiment.state(state)):
+                found[p.name] = p
+    return ParameterSet.of(found.values())
+
+
+def _material_parameters(s: Specimen, knowledge: Knowledge, reference: float) -> list[Parameter]:
+    out = []
+    for m in s.experiment.materials:
+        given = knowledge.young_moduli.get(m)
+        # without a known material in the body its modulus cannot be told from displacements: one body of one material has no scale
+        alone = len(s.experiment.materials) == 1 and given is None
+        out.append(Parameter(young_modulus(m), given or reference, "kPa", "log", prior_sd=2.0, fixed=given is not None or alone))
+        out.append(Parameter(poisson_ratio(m), START_POISSON_RATIO, "", "incompressibility", prior_sd=1.0))
+        out += [Parameter(shape_parameter(m, k), 0.0, "", prior_sd=0.3) for k in SHAPE_NAMES.get(s.settings.law, ())]
+    return out
+
+
+def _batch_parameters(layers: Sequence[Layer], knowledge: Knowledge) -> list[Parameter]:
+    """Stiffness of every batch relative to the one from which the known material's modulus is taken, the topmost that holds some."""
+    order = [layer.batch for layer in layers if layer.material in knowledge.young_moduli][::-1] + [layer.batch for layer in layers]
+    return [
+        Parameter(batch_stiffness(batch), 1.0, "", "log", prior_sd=BATCH_SD, fixed=number == 0)
+        for number, batch in enumerate(dict.fromkeys(order))
+    ]
+
+
+def _friction_parameters(s: Specimen) -> list[Parameter]:
+    """Friction of the layers that touch the base and the indenter, and of joints that may slide."""
+    out = []
+    experiment, model = s.experiment, s.settings
+    if model.contact != "stick":
+        value, unit = (START_FRICTION, "") if model.contact == "coulomb" else (START_SPRING, "kPa/mm")
+        loading = experiment.loading
+        touching = [(experiment.layers[0].material, loading.base_material), (experiment.layers[-1].material, loading.counter_material)]
+        if loading.kind == "side_plates":
+            touching += [(layer.material, loading.counter_material) for layer in experiment.layers]
+        # an object that only its weight holds down does not feel the table's friction; a large one would jam it
+        loose = [(m, loading.base_material) for m, _ in touching] if loading.kind == "side_plates" else []
+        for pair in dict.fromkeys(touching):
+            out.append(Parameter(friction(*pair), value, unit, "log", prior_sd=1.0, fixed=pair in loose))
+    if model.joined == "sliding":
+        out += [Parameter(joint_friction(experiment, h), 0.5, "", "log", prior_sd=1.0) for h in experiment.joined_at_mm]
+    return out
+
+
+def state_parameters(experiment: Experiment, state: State) -> list[Parameter]:
+    """Parameters of the boundary conditions of one state, with their priors: opening, tilt of a plate, offset of a bar."""
+    prefix = f"{experiment.name}/{state.name}"
+    full = experiment.full_opening_mm
+    start = state.estimated_mm or state.stated_mm or 0.7 * full
+    out = [Parameter(opening(experiment, state.name), float(start), "mm", prior_sd=5.0)]
+    if experiment.loading.kind != "side_plates":
+        out += [Parameter(f"{prefix}: tilt_{axis}", 0.0, "rad", prior_sd=0.01) for axis in "xy"]
+    if experiment.loading.kind == "bar":
+        out.append(Parameter(f"{prefix}: bar_offset", 0.0, "mm", prior_sd=1.0))
+        out.append(Parameter(f"{prefix}: bar_yaw", 0.0, "rad", prior_sd=0.02))
+    return out

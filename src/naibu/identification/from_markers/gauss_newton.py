@@ -1,0 +1,365 @@
+"""Identification by matching measured marker positions: Gauss-Newton on whitened residuals with exact sensitivities.
+
+Unknowns are the parameters of the materials and of friction, shared by all experiments; the boundary conditions of every state; where the
+base lies below the markers; and the rigid pose of the object in every loaded scan. All are estimated together, so that the covariance
+of the materials' parameters includes what the nuisances cost.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import ConvergenceError, InputError
+from naibu.core.parameters import Parameter, ParameterSet
+from naibu.core.rigid_transform import Pose, registration
+from naibu.core.status import Status
+from naibu.identification.from_markers.observations import Nearby, Trial, TrialFit
+from naibu.identification.from_markers.parameter_names import pixel_scale
+from naibu.identification.from_markers.specimen_model import Specimen
+from naibu.mechanics.finite_strain.newton import Newton
+from naibu.mechanics.finite_strain.problem import SolverSettings
+from naibu.mechanics.finite_strain.sensitivities import sensitivities
+from naibu.mechanics.finite_strain.statics import Hint, Solution, solve
+from naibu.mechanics.linear_algebra.direct import use_one_thread
+from naibu.mechanics.linear_algebra.protocols import LinearSolver
+
+WIDEST_STEP = 3.0  # of an unknown on a linear scale: mm for positions
+UNEVEN = 0.01  # points that slip over an edge make the objective uneven; a step that promises less than this and fails ends the search
+ROUGH = 0.1  # a search is rough while a step may lower the objective by more than this share
+_PATH = SolverSettings(first_step=0.02, largest_step=0.15, tolerance=1e-6)
+
+
+@dataclass(frozen=True, slots=True)
+class MatchingSettings:
+    """How to search.
+
+    Attributes
+    ----------
+    max_iterations : int
+        Gauss-Newton iterations.
+    tolerance : float
+        The search ends when a step would change the objective by less than this (in units of chi squared).
+    huber : float
+        Residuals beyond this many standard deviations count linearly.
+    """
+
+    max_iterations: int = 25
+    tolerance: float = 3e-2
+    huber: float = 3.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Match:
+    """Result of a search.
+
+    Attributes
+    ----------
+    parameters : ParameterSet
+        With the estimated values.
+    covariance : ndarray, shape (p, p)
+        Of the free parameters on the optimiser's scale, poses marginalised, scaled by the misfit where it exceeds the noise.
+    fits : tuple of TrialFit
+        One for each trial.
+    chi_squared, degrees_of_freedom : float
+        Noise-normalised sum of squares of the data, and number of data minus effective number of parameters.
+    information : ndarray, shape (p, p)
+        What the data alone (without priors) say about the free parameters.
+    status : Status
+    history : tuple of float
+        Objective after every iteration.
+    """
+
+    parameters: ParameterSet
+    covariance: FloatArray
+    fits: tuple[TrialFit, ...]
+    chi_squared: float
+    degrees_of_freedom: float
+    information: FloatArray
+    status: Status
+    history: tuple[float, ...]
+
+    @property
+    def noise_factor(self) -> float:
+        """Root mean square residual in units of the stated noise."""
+        return float(np.sqrt(self.chi_squared / max(self.degrees_of_freedom, 1.0)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NormalEquations:
+    """The objective and its linearisation over the free parameters and the poses.
+
+    Attributes
+    ----------
+    hessian : ndarray, shape (s, s)
+        Of half of the objective, by Gauss and Newton.
+    gradient : ndarray, shape (s,)
+        Direction of steepest descent of half of the objective.
+    objective : float
+        Robust sum of squares, priors included.
+    data : ndarray, shape (s, s)
+        The data's part of `hessian`.
+    bend : ndarray, shape (s,)
+        What the curvature of the optimiser's scales adds to the diagonal of the Hessian where it stabilises: without it a modulus or a
+        Poisson's ratio that the data push to the end of its scale swings to and fro.
+    """
+
+    hessian: FloatArray
+    gradient: FloatArray
+    objective: float
+    data: FloatArray
+    bend: FloatArray
+
+
+@dataclass(slots=True, eq=False)
+class Matcher:
+    """Trials and parameters, evaluated with warm starts along the search."""
+
+    trials: Sequence[Trial]
+    parameters: ParameterSet
+    settings: MatchingSettings = field(default_factory=MatchingSettings)
+    _solvers: dict[int, LinearSolver | None] = field(default_factory=dict)
+
+    def evaluate(
+        self, values: Mapping[str, float], nearby: Sequence[Nearby | None] = (), poses: Sequence[Pose | None] = ()
+    ) -> list[TrialFit]:
+        """Solve all trials at `values`; solutions `nearby` help, and `poses` stand in for those that register the markers best.
+
+        Raises
+        ------
+        ConvergenceError
+            A trial cannot be solved at these values.
+        """
+
+        def one(i: int) -> TrialFit:
+            near = nearby[i] if nearby else None
+            return self._evaluate_one(i, values, near.hints(values) if near is not None else [], poses[i] if poses else None)
+
+        if len(self.trials) == 1:
+            return [one(0)]
+        with ThreadPoolExecutor(min(len(self.trials), os.cpu_count() or 1), initializer=use_one_thread) as pool:
+            return list(pool.map(one, range(len(self.trials))))
+
+    def _evaluate_one(self, index: int, values: Mapping[str, float], hints: Sequence[Hint], pose: Pose | None) -> TrialFit:
+        trial = self.trials[index]
+        problem = trial.specimen.problem(values, trial.state)
+        try:
+            solution = solve(problem, settings=_PATH, solver=self._solvers.get(index), hints=hints)
+        except ConvergenceError as error:
+            raise ConvergenceError(f"{trial.label}: {error}") from error
+        newton = Newton(problem, _PATH, self._solvers.get(index))
+        path = self._path_derivatives(trial, values, solution, newton)
+        self._solvers[index] = newton.solver
+        return self._observed(trial, values, solution, path, pose)
+
+    def _path_derivatives(self, trial: Trial, values: Mapping[str, float], solution: Solution, newton: Newton) -> tuple[FloatArray, ...]:
+        """Derivatives (n, 3, p) of every state on the path with respect to the physical values of the free parameters."""
+        free = self.parameters.free
+        directions, owner = [], []
+        for k, parameter in enumerate(free):
+            found = trial.specimen.direction(parameter.name, values, trial.state)
+            directions += found
+            owner += [k] * len(found)
+        gather = np.zeros((len(directions), len(free)))
+        gather[np.arange(len(owner)), owner] = 1.0
+        raw = sensitivities(newton.problem, solution.states, directions, newton=newton)
+        return tuple(d @ gather for d in raw)
+
+    def _observed(
+        self, trial: Trial, values: Mapping[str, float], solution: Solution, path: tuple[FloatArray, ...], pose: Pose | None
+    ) -> TrialFit:
+        specimen = trial.specimen.reshaped(values)
+        u = specimen.observation @ solution.displacement
+        gradient = specimen.deformation_gradient(solution.displacement)
+        moved = specimen.marker_points + u
+        enlargement = specimen.enlargement(values)
+        if pose is None:
+            pose = _first_pose(specimen, moved, trial.measured * enlargement)
+        placed = pose.applied(moved)
+        predicted = placed / enlargement  # residuals stay in the file's millimetres: a smaller scale must not make them smaller
+        turned = np.einsum("ij,kjl->kil", pose.rotation, gradient)
+        rotated = specimen.placement.rotation.T  # noise of the free scan, turned into the object's frame
+        both = np.einsum("kij,jl->kil", turned, rotated)
+        sd = np.sqrt(trial.sd**2 + np.einsum("kil,kl->ki", both**2, trial.free_sd**2))
+        du = path[-1]
+        n_free = du.shape[2]
+        at_markers = np.stack([specimen.observation @ du[:, i, :] for i in range(3)], axis=1) if n_free else np.zeros((len(u), 3, 0))
+        for k, parameter in enumerate(self.parameters.free):
+            if (motion := trial.specimen.marker_motion(parameter.name, values)) is not None:
+                at_markers[:, :, k] += np.einsum("kij,kj->ki", gradient, motion)
+            if (shift := trial.specimen.shift(parameter.name, values)) is not None:  # the nodes move past the markers, which stay
+                at_markers[:, :, k] -= np.einsum("kij,kj->ki", gradient - np.eye(3), specimen.observation @ shift)
+        jacobian = np.einsum("ij,kjp->kip", pose.rotation, at_markers)
+        for k, parameter in enumerate(self.parameters.free):
+            if parameter.name == pixel_scale(specimen.experiment):
+                jacobian[:, :2, k] -= placed[:, :2] / values[parameter.name]
+        jacobian /= enlargement[:, None]
+        arm = placed - pose.position
+        pose_jacobian = np.zeros((len(u), 3, 6))
+        pose_jacobian[:, :, :3] = np.eye(3)
+        for axis in range(3):
+            pose_jacobian[:, :, 3 + axis] = np.cross(np.eye(3)[axis], arm)
+        pose_jacobian /= enlargement[:, None]
+        return TrialFit(solution, pose, predicted, trial.measured - predicted, sd, jacobian, pose_jacobian, path)
+
+    def normal_equations(self, fits: Sequence[TrialFit], inner: FloatArray) -> NormalEquations:
+        """Linearise the objective at some fits of the trials and the free parameters that gave them, on the optimiser's scale."""
+        free = self.parameters.free
+        p, size = len(free), len(free) + 6 * len(fits)
+        slope = np.array([q.slope(q.physical(x)) for q, x in zip(free, inner, strict=True)])
+        hessian, gradient, objective = np.zeros((size, size)), np.zeros(size), 0.0
+        for t, fit in enumerate(fits):
+            seen = np.isfinite(fit.residual)
+            r = (fit.residual / fit.sd)[seen]
+            j = np.zeros((seen.sum(), size))
+            j[:, :p] = (fit.jacobian * slope / fit.sd[:, :, None])[seen]
+            j[:, p + 6 * t : p + 6 * t + 6] = (fit.pose_jacobian / fit.sd[:, :, None])[seen]
+            c = self.settings.huber
+            weight = np.minimum(1.0, c / np.maximum(np.abs(r), 1e-300))
+            hessian += j.T @ (weight[:, None] * j)
+            gradient += j.T @ (weight * r)
+            objective += float(np.where(np.abs(r) <= c, r * r, 2.0 * c * np.abs(r) - c * c).sum())
+        data = hessian.copy()
+        bend = np.zeros(size)
+        bend[:p] = np.maximum(-gradient[:p] * [q.bend for q in free], 0.0)
+        for k, q in enumerate(free):
+            if np.isfinite(q.prior_sd):
+                deviation = (inner[k] - q.inner(q.value)) / q.prior_sd
+                hessian[k, k] += 1.0 / q.prior_sd**2
+                gradient[k] -= deviation / q.prior_sd
+                objective += deviation**2
+        return NormalEquations(hessian, gradient, objective, data, bend)
+
+    def run(
+        self,
+        callback: Callable[[int, float, Mapping[str, float]], None] | None = None,
+        *,
+        start: Mapping[str, float] | None = None,
+        nearby: Mapping[str, Nearby] | None = None,
+    ) -> Match:
+        """Search for the parameters; `callback(iteration, objective, values)` is called after every accepted step.
+
+        The search starts from the parameters' own values, or from those in `start`; solutions `nearby`, by the trials' labels, help.
+
+        Raises
+        ------
+        ConvergenceError
+            A trial cannot be solved at the starting values.
+        """
+        free = self.parameters.free
+        inner = np.array([p.inner((start or {}).get(p.name, p.value)) for p in free])
+        fits = self.evaluate(self.parameters.values(inner), [(nearby or {}).get(t.label) for t in self.trials])
+        now = self.normal_equations(fits, inner)
+        history, damping, rough, status = [now.objective], 1e-3, True, Status.ITERATION_LIMIT
+        try:
+            for iteration in range(self.settings.max_iterations):
+                hessian = now.hessian + np.diag(now.bend)
+                step = _bounded_step(hessian + damping * np.diag(np.diag(hessian) + 1e-12), now.gradient, _limits(free, rough))
+                expected = float(2.0 * now.gradient @ step - step @ hessian @ step)
+                if rough and expected < ROUGH * now.objective:
+                    rough = False
+                    continue
+                if expected < self.settings.tolerance * max(1.0, 0.01 * now.objective):
+                    status = Status.CONVERGED
+                    break
+                found = self._try(inner, step, fits, now.objective)
+                if found is None:
+                    if expected < UNEVEN * now.objective:
+                        status = Status.CONVERGED
+                        break
+                    damping = max(10.0 * damping, 0.05)
+                    if damping > 1e6:
+                        break
+                    continue
+                gained = now.objective - found[2].objective
+                inner, fits, now = found
+                damping = max(damping / 10.0, 1e-8)
+                history.append(now.objective)
+                if callback is not None:
+                    callback(iteration, now.objective, self.parameters.values(inner))
+                if gained < 2.0 * self.settings.tolerance * max(1.0, 0.01 * now.objective):
+                    status = Status.CONVERGED
+                    break
+        except KeyboardInterrupt:
+            status = Status.INTERRUPTED
+        return self._match(inner, fits, status, history)
+
+    def _try(
+        self, inner: FloatArray, step: FloatArray, fits: list[TrialFit], objective: float
+    ) -> tuple[FloatArray, list[TrialFit], NormalEquations] | None:
+        """Evaluate a step; None where it does not lower the objective or a trial cannot be solved."""
+        free = self.parameters.free
+        moved = inner + step[: len(free)]
+        old, new = self.parameters.values(inner), self.parameters.values(moved)
+        here = self.parameters.with_values({q.name: old[q.name] for q in free})
+        poses = [f.pose.moved(step[len(free) + 6 * t : len(free) + 6 * t + 6]) for t, f in enumerate(fits)]
+        try:
+            found = self.evaluate(new, [Nearby(f, here) for f in fits], poses)
+        except (ConvergenceError, InputError):  # InputError: a step that moves markers out of the object
+            return None
+        equations = self.normal_equations(found, moved)
+        return (moved, found, equations) if equations.objective < objective else None
+
+    def _match(self, inner: FloatArray, fits: list[TrialFit], status: Status, history: list[float]) -> Match:
+        free = self.parameters.free
+        p = len(free)
+        equations = self.normal_equations(fits, inner)
+        hessian, data = equations.hessian, equations.data
+        chi_squared = float(sum(np.nansum((f.residual / f.sd) ** 2) for f in fits))
+        n_data = int(sum(np.isfinite(f.residual).sum() for f in fits))
+        effective = float(np.trace(np.linalg.solve(hessian, data)))
+        dof = n_data - effective
+        factor = max(1.0, chi_squared / max(dof, 1.0))
+        covariance = np.asarray(np.linalg.inv(hessian)[:p, :p] * factor, dtype=np.float64)
+        information = data[:p, :p] - data[:p, p:] @ np.linalg.solve(data[p:, p:], data[p:, :p])
+        values = self.parameters.values(inner)
+        return Match(
+            self.parameters.with_values({q.name: values[q.name] for q in free}),
+            covariance,
+            tuple(fits),
+            chi_squared,
+            dof,
+            information,
+            status,
+            tuple(history),
+        )
+
+
+def _limits(free: Sequence[Parameter], rough: bool) -> FloatArray:
+    """Largest change of each free parameter in one step, on the optimiser's scale: what would be a surprise is approached slowly.
+
+    While the search is `rough`, whatever is nearly known beforehand (tilts, offsets) rests, lest it makes up for a wrong height.
+    """
+    limits = np.array([{"log": 1.0, "incompressibility": 1.5}.get(q.scale, min(q.prior_sd, WIDEST_STEP)) for q in free])
+    nearly_known = np.array([q.scale == "linear" and q.prior_sd < WIDEST_STEP for q in free])
+    return np.where(nearly_known & rough, 0.0, limits)
+
+
+def _bounded_step(hessian: FloatArray, gradient: FloatArray, limits: FloatArray) -> FloatArray:
+    """Minimise the quadratic model with the first unknowns within +-`limits`: those that would go further stay at their limit."""
+    step = np.zeros(len(gradient))
+    loose = np.ones(len(gradient), dtype=bool)
+    bound = np.concatenate([limits, np.full(len(gradient) - len(limits), np.inf)])
+    while loose.any():
+        rest = gradient[loose] - hessian[np.ix_(loose, ~loose)] @ step[~loose]
+        step[loose] = np.linalg.solve(hessian[np.ix_(loose, loose)], rest)
+        over = loose & (np.abs(step) > bound)
+        if not over.any():
+            break
+        step[over] = np.sign(step[over]) * bound[over]
+        loose &= ~over
+    return step
+
+
+def _first_pose(specimen: Specimen, points: FloatArray, measured: FloatArray) -> Pose:
+    """Pose that brings `points` to the `measured` ones; without data that of the free scan."""
+    if np.isfinite(measured).all(axis=1).sum() >= 4:
+        return registration(points, measured)
+    place = specimen.placement
+    centre = points.mean(axis=0)
+    return Pose(place.rotation, centre, place.rotation @ centre + place.origin)

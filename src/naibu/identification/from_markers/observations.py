@@ -1,0 +1,136 @@
+"""Measured states as the matching sees them, and as a set of parameters explains them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import InputError
+from naibu.core.parameters import ParameterSet
+from naibu.core.rigid_transform import Pose
+from naibu.identification.from_markers.marker_grid import FILLED_SD_MM
+from naibu.identification.from_markers.specimen_model import Specimen
+from naibu.mechanics.finite_strain.statics import Hint, Solution
+
+HINT_SPACING = 0.05  # of the load, between states that the next evaluation starts from
+FAR_MM = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseModel:
+    """Standard deviation of a measured coordinate, mm: placing of the marker's centre, and quantisation to pixels and slices."""
+
+    placing_mm: float = 0.1
+
+    def standard_deviation(self, xy_step_mm: float, z_step_mm: float) -> FloatArray:
+        """Return the standard deviation (3,) along x, y, z, mm."""
+        steps = np.array([xy_step_mm, xy_step_mm, z_step_mm])
+        return np.sqrt(self.placing_mm**2 + steps**2 / 12.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trial:
+    """One measured state of a specimen.
+
+    Attributes
+    ----------
+    specimen : Specimen
+        The meshed experiment.
+    state : str
+        Name of the state.
+    measured : ndarray, shape (k, 3)
+        Positions in the scan's frame, true mm; NaN where missing.
+    sd : ndarray, shape (3,)
+        Standard deviation of a measured coordinate of the loaded state, mm.
+    free_sd : ndarray, shape (k, 3)
+        That of the free state; larger where a coordinate was completed from the lattice.
+    """
+
+    specimen: Specimen
+    state: str
+    measured: FloatArray
+    sd: FloatArray
+    free_sd: FloatArray
+
+    @property
+    def label(self) -> str:
+        """``experiment/state``."""
+        return f"{self.specimen.experiment.name}/{self.state}"
+
+    @classmethod
+    def of(cls, specimen: Specimen, state: str, noise: NoiseModel) -> Trial:
+        """Gather the measured positions (true mm in the scan's frame) of a state, in the order of the specimen's markers.
+
+        Raises
+        ------
+        InputError
+            The state has no positions, or fewer than four markers in common with the free state.
+        """
+        experiment = specimen.experiment
+        markers = experiment.state(state).markers
+        if markers is None:
+            raise InputError(f"{experiment.name}/{state} has no measured positions; give its file or leave the state out")
+        measured = markers.aligned(specimen.marker_ids) * specimen.placement.scale
+        if np.isfinite(measured).any(axis=1).sum() < 4:
+            raise InputError(f"{experiment.name}/{state} shares fewer than 4 trusted markers with the free state")
+        sd = noise.standard_deviation(experiment.xy_step_mm, experiment.z_step_mm)
+        return cls(specimen, state, measured, sd, np.where(specimen.marker_filled, FILLED_SD_MM, sd))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrialFit:
+    """A trial at one set of parameters.
+
+    Attributes
+    ----------
+    predicted : ndarray, shape (k, 3)
+        Predicted positions in the scan's frame, true mm.
+    residual : ndarray, shape (k, 3)
+        Measured minus predicted, mm; NaN where not measured.
+    sd : ndarray, shape (k, 3)
+        Standard deviation of the residual from noise in both states, mm.
+    jacobian : ndarray, shape (k, 3, p)
+        Derivatives of `predicted` with respect to the physical values of the free parameters.
+    pose_jacobian : ndarray, shape (k, 3, 6)
+        Derivatives with respect to the pose.
+    """
+
+    solution: Solution
+    pose: Pose
+    predicted: FloatArray
+    residual: FloatArray
+    sd: FloatArray
+    jacobian: FloatArray
+    pose_jacobian: FloatArray
+    path: tuple[FloatArray, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Nearby:
+    """A solved trial, to start from: its fit, and the parameters with the values that gave it."""
+
+    fit: TrialFit
+    parameters: ParameterSet
+
+    def hints(self, values: Mapping[str, float]) -> list[Hint]:
+        """Where the states of its path lie at other `values`."""
+        change = np.array([values.get(q.name, q.value) - q.value for q in self.parameters.free])
+        return _hints(self.fit, change)
+
+
+def _hints(previous: TrialFit, change: FloatArray) -> list[Hint]:
+    """Where the states of a path lie after a small `change` of the parameters; of states close together one is enough.
+
+    After a large change the path is better followed anew: a poor guess costs more iterations than none.
+    """
+    out: list[Hint] = []
+    if np.abs(previous.path[-1] @ change).max() > FAR_MM:
+        return out
+    states = previous.solution.states
+    for state, derivative in zip(states[1:], previous.path[1:], strict=True):
+        if state.load == 1.0 or state.load - (out[-1][0] if out else 0.0) > HINT_SPACING:
+            out.append((state.load, state.displacement + derivative @ change))
+    return out

@@ -1,0 +1,1 @@
+"""Viscoelastic parameters from displacement histories."""

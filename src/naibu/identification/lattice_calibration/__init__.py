@@ -1,0 +1,1 @@
+"""Parameters of mass-spring-dashpot lattices from captured shapes and forces."""

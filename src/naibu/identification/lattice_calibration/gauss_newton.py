@@ -1,0 +1,429 @@
+"""Parameters of a lattice from captured shapes and forces, by Gauss and Newton with exact derivatives (spec L6).
+
+The residuals are the signed distances of captured points from the computed surface, and computed minus measured forces, both in units of
+their noise: their sum of squares is chi-squared, and what the report weighs by hand, shape against force, needs no weight. The report's own
+indices S_shape and S_force are sums of absolute values; `indices` returns them, and `lattice_search` minimises them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.errors import ConvergenceError, InputError
+from naibu.identification.lattice_calibration.forward_model import SAMPLE_S, Capture, PushedLattice, PushMode, Reproduced, averaged
+from naibu.identification.lattice_calibration.shape_distance import closest_points, force_difference
+from naibu.identification.lattice_calibration.unknowns import UNITS, LatticeUnknowns, identifiability
+from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
+
+Index = Literal["shape", "force", "joint"]
+Window = Literal["keep", "contact"]
+
+PRIOR_SD = 1.2  # of the logarithm of every parameter around its start: as wide as the report's ranges, a factor of 60 in all
+LONGEST = 1.0  # change of a logarithm in one iteration
+FARTHEST = 0.2  # of the points at which the covariance is looked at, from the estimate
+POLISHING = 9  # fine runs, at most
+FINE_ITERATIONS = 8  # with derivatives of fine steps, at most; they start next to the minimum, and take what is left of it
+SETTLED = 0.05  # decrease of chi-squared that is not worth another iteration
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trial:
+    """A capture and the lattice that is to reproduce it, with coarse and with fine steps."""
+
+    capture: Capture
+    coarse: PushedLattice
+    fine: PushedLattice
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationProblem:
+    """What is sought, from what.
+
+    Attributes
+    ----------
+    unknowns : LatticeUnknowns
+        Parameters.
+    trials : tuple of Trial
+        Captured pushings.
+    index : str
+        ``"shape"``, ``"force"`` or ``"joint"``: what counts.
+    window : str
+        Forces that count: all of the ``"contact"``, or those while the pushers ``"keep"`` still, as in the report's S_force.
+    window_s : float
+        Forces are averaged over this time, s, which is also the coarse step.
+    excess : tuple of float
+        Factors of the noise of points and forces, for laws that do not fit to within it.
+    """
+
+    unknowns: LatticeUnknowns
+    trials: tuple[Trial, ...]
+    index: Index
+    window: Window
+    window_s: float
+    excess: tuple[float, float] = (1.0, 1.0)
+
+    @classmethod
+    def of(
+        cls,
+        lattice: Lattice,
+        captures: Sequence[Capture],
+        unknowns: LatticeUnknowns | None = None,
+        *,
+        index: Index = "joint",
+        mode: PushMode = "displacement",
+        window: Window = "contact",
+        step: float = SAMPLE_S,
+        window_s: float = 10 * SAMPLE_S,
+    ) -> CalibrationProblem:
+        """Set up the calibration of a lattice.
+
+        Parameters
+        ----------
+        lattice : Lattice
+            The model of the object at rest.
+        captures : sequence of Capture
+            One or more.
+        unknowns : LatticeUnknowns
+            By default K, C1 and C2 of every class: nine.
+        index, mode, window
+            What counts, how the virtual object is pushed, and which forces count.
+        step, window_s : float
+            Fine step, and coarse step over which forces are averaged, s.
+
+        Raises
+        ------
+        InputError
+            No capture, an unknown index or window, or steps that do not divide the times.
+        """
+        if not captures:
+            raise InputError("there is no capture to calibrate on; give at least one")
+        if index not in ("shape", "force", "joint") or window not in ("keep", "contact"):
+            raise InputError(f"the index is 'shape', 'force' or 'joint', the window 'keep' or 'contact', not {index!r} and {window!r}")
+        made = []
+        for capture in captures:
+            coarse, fine = (
+                PushedLattice.of(lattice, capture.pushing, mode, step=step, long_step=s, force=capture.force) for s in (window_s, step)
+            )
+            made.append(Trial(capture, coarse, fine))
+        return cls(unknowns or LatticeUnknowns.of(lattice), tuple(made), index, window, float(window_s))
+
+    def weighed(self, trial: Trial, found: Reproduced, step: float) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
+        """Return residuals and derivatives (count,), (count, p) of points and of forces in units of their noise, none that do not count."""
+        return self._shape_rows(trial, found), self._force_rows(trial, found, step)
+
+    def _shape_rows(self, trial: Trial, found: Reproduced) -> tuple[FloatArray, FloatArray]:
+        p = len(found.positions_change)
+        if self.index == "force":
+            return np.zeros(0), np.zeros((0, p))
+        sd, hull = trial.capture.point_sd_mm * self.excess[0], trial.coarse.hull
+        rows, slopes = [], []
+        for k, points in enumerate(trial.capture.points):
+            near = closest_points(points, hull, found.positions[k])
+            rows.append(near.signed / sd)
+            corners = hull.triangles[near.triangle]
+            moved = (found.positions_change[:, k][:, corners] * near.weights[:, :, None]).sum(axis=2)
+            slopes.append(-(moved * near.direction).sum(axis=2).T / sd)
+        return np.concatenate(rows), np.concatenate(slopes)
+
+    def _force_rows(self, trial: Trial, found: Reproduced, step: float) -> tuple[FloatArray, FloatArray]:
+        p = len(found.force_change)
+        if self.index == "shape":
+            return np.zeros(0), np.zeros((0, p))
+        count, each = round(self.window_s / SAMPLE_S), round(self.window_s / step)
+        sd = trial.capture.force_sd_mn * self.excess[1] / np.sqrt(count)
+        since = round(trial.capture.pushing.push_s / self.window_s) if self.window == "keep" else 0
+        lack = averaged(found.force, each) - averaged(trial.capture.force, count)
+        slopes = np.stack([averaged(f, each) for f in found.force_change]) if p else np.zeros((0, *lack.shape))
+        return lack[since:].ravel() / sd, slopes[:, since:].reshape(p, lack[since:].size).T / sd
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LatticeEstimate:
+    """Calibrated parameters.
+
+    Attributes
+    ----------
+    unknowns : LatticeUnknowns
+        What was sought.
+    values : ndarray, shape (p,)
+        mN/mm and mN s/mm.
+    covariance : ndarray, shape (p, p)
+        Of their logarithms; weak priors around the start included. The widest of those at the estimate and at the ends of the interval of
+        its least determined combination, along which the data's information changes.
+    information : ndarray, shape (p, p)
+        What the data alone tell.
+    noise_factor : tuple of float
+        Root mean square residual of points and of forces in units of the stated noise; NaN where they did not count.
+    iterations, runs : int
+        Gauss-Newton iterations, and simulated pushings; one with derivatives counts as 1 + p.
+    undetermined : tuple of str
+        In words, the combinations that the data do not determine.
+    """
+
+    unknowns: LatticeUnknowns
+    values: FloatArray
+    covariance: FloatArray
+    information: FloatArray
+    noise_factor: tuple[float, float]
+    iterations: int
+    runs: int
+    undetermined: tuple[str, ...]
+
+    def parameters(self) -> LatticeParameters:
+        """Return the parameters of all elements."""
+        return self.unknowns.parameters(self.values)
+
+    def intervals(self) -> FloatArray:
+        """Return the 95 % intervals (p, 2) of all values."""
+        half = 1.96 * np.sqrt(np.diag(self.covariance))
+        return np.stack([self.values * np.exp(-half), self.values * np.exp(half)], axis=1)
+
+    def sentences(self) -> tuple[str, ...]:
+        """Say in words what was found, and what the data do not determine."""
+        lines = []
+        for name, value, (low, high) in zip(self.unknowns.names, self.values, self.intervals(), strict=True):
+            lines.append(f"{name}: {value:.4g} {UNITS[name.split()[0]]} (95 % between {low:.4g} and {high:.4g})")
+        return (*lines, *self.undetermined)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Point:
+    theta: FloatArray
+    residual: tuple[FloatArray, FloatArray]
+    slopes: tuple[FloatArray, FloatArray]
+
+    @property
+    def information(self) -> FloatArray:
+        return np.asarray(sum(j.T @ j for j in self.slopes))
+
+    def gradient(self, residual: tuple[FloatArray, FloatArray] | None = None) -> FloatArray:
+        return np.asarray(sum(j.T @ r for j, r in zip(self.slopes, residual or self.residual, strict=True)))
+
+
+Evaluate = Callable[..., _Point]
+
+
+def evaluated(
+    problem: CalibrationProblem,
+    theta: FloatArray,
+    *,
+    derivatives: bool = True,
+    fine: bool = False,
+    threads: int = 2,
+    executor: Executor | None = None,
+) -> _Point:
+    """Return residuals, and their derivatives by the logarithms theta (p,); directions are shared among threads, or what executes them."""
+    values = np.exp(theta)
+    parameters, changes = problem.unknowns.parameters(values), problem.unknowns.changes(values) if derivatives else ()
+    parts = [changes[k::threads] for k in range(min(threads, len(changes)))] or [()]
+    order = np.concatenate([np.arange(len(changes))[k::threads] for k in range(len(parts))]).astype(np.int64)
+    rows: list[tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]] = []
+    with ThreadPoolExecutor(threads) if executor is None else nullcontext(executor) as pool:
+        runs = [[pool.submit((t.fine if fine else t.coarse).run, parameters, part) for part in parts] for t in problem.trials]
+        for trial, jobs in zip(problem.trials, runs, strict=True):
+            found = _joined([job.result() for job in jobs], order)
+            rows.append(problem.weighed(trial, found, (trial.fine if fine else trial.coarse).long_step))
+    residual = [np.concatenate([row[k][0] for row in rows]) for k in range(2)]
+    slopes = [np.concatenate([row[k][1] for row in rows]) for k in range(2)]
+    return _Point(theta, (residual[0], residual[1]), (slopes[0], slopes[1]))
+
+
+def _joined(parts: list[Reproduced], order: IntArray) -> Reproduced:
+    back = np.argsort(order)
+    positions, forces = (np.concatenate([getattr(p, name) for p in parts])[back] for name in ("positions_change", "force_change"))
+    return replace(parts[0], positions_change=positions, force_change=forces)
+
+
+def calibrate_lattice(
+    problem: CalibrationProblem,
+    start: ArrayLike | Mapping[str, float],
+    *,
+    prior_sd: float = PRIOR_SD,
+    max_iterations: int = 40,
+    reweigh: bool = True,
+    threads: int = 2,
+    executor: Executor | None = None,
+) -> LatticeEstimate:
+    """Return the parameters that reproduce captures best, with their covariance.
+
+    Iterations take steps that are long but after changes of motion; then residuals of fine steps throughout are brought to their minimum,
+    by the same derivatives, or by those of fine steps where that fails. Where the law does not reproduce points or forces to within their
+    noise, the noise is taken as that much larger, each for itself, and the search goes on: neither then outweighs the other by being
+    measured more precisely than the model can tell.
+
+    Parameters
+    ----------
+    problem : CalibrationProblem
+        What is sought.
+    start : array_like or mapping
+        Rough guess: all values, or a mapping by name or by kind (``{"K": 50.0, "C1": 20.0, "C2": 50.0}``), mN/mm and mN s/mm.
+    prior_sd : float
+        Standard deviation of the logarithms around the start, so that what the data do not determine stays there.
+    max_iterations : int
+        Of the coarse iterations with one size of the noise.
+    reweigh : bool
+        Whether the noise is enlarged to the misfit.
+    threads : int
+        Into how many parts the derivatives of every capture are shared; by default as many threads compute them.
+    executor : concurrent.futures.Executor
+        Computes the parts instead: a ``ProcessPoolExecutor``, or ``client.get_executor()`` of a `dask.distributed.Client`.
+
+    Raises
+    ------
+    InputError
+        A start that is not positive.
+    ConvergenceError
+        The iterations did not settle.
+    """
+    at = partial(evaluated, threads=threads, executor=executor)
+    theta = np.log(problem.unknowns.vector(start))
+    centre, runs, count = theta.copy(), 0, 0
+    here, used = problem, 0
+    for _ in range(3 if reweigh else 1):
+        point, used = _descend(here, theta, centre, prior_sd, max_iterations, at)
+        count, theta = count + used, point.theta
+        factors = _noise_factors(here, point)
+        if not reweigh or max(abs(np.log(max(f, 1.0) / e)) for f, e in zip(factors, here.excess, strict=True)) < 0.05:
+            break
+        here = replace(here, excess=(max(factors[0], 1.0), max(factors[1], 1.0)))
+    runs, each = count * (1 + len(theta)), 1 + len(theta)
+    point, polished, settled = _polished(here, point, centre, prior_sd, at)
+    runs += polished + (polished - 1) * each
+    if not settled:  # coarse derivatives do not lead there
+        point, used = _descend(here, point.theta, centre, prior_sd, FINE_ITERATIONS, at, fine=True)
+        count, runs = count + used, runs + used * each
+    information = point.information
+    covariance, extra = _widest(here, point, prior_sd, at)
+    runs += extra * each
+    factors = _noise_factors(here, point)
+    shown = tuple(f if len(r) else np.nan for f, r in zip(factors, point.residual, strict=True))
+    return LatticeEstimate(
+        problem.unknowns, np.exp(point.theta), covariance, information, (shown[0], shown[1]), count, runs * len(problem.trials),
+        identifiability(problem.unknowns.names, information),
+    )  # fmt: skip
+
+
+def _widest(problem: CalibrationProblem, point: _Point, prior_sd: float, at: Evaluate) -> tuple[FloatArray, int]:
+    """Return the covariance at the estimate, or at an end of the 95 % interval of its least determined combination if it is wider there.
+
+    What the data tell of the weakest combination changes by tens of per cent along its own interval. Returns the runs, too.
+    """
+    prior = np.eye(len(point.theta)) / prior_sd**2
+    here = np.asarray(np.linalg.inv(point.information + prior), dtype=np.float64)
+    values, vectors = np.linalg.eigh(here)
+    reach = min(1.96 * float(np.sqrt(values[-1])), FARTHEST)
+    found = [here]
+    for side in (-1.0, 1.0):
+        end = at(problem, point.theta + side * reach * vectors[:, -1])
+        found.append(np.asarray(np.linalg.inv(end.information + prior), dtype=np.float64))
+    return max(found, key=lambda c: float(np.trace(c))), 2
+
+
+def _noise_factors(problem: CalibrationProblem, point: _Point) -> tuple[float, float]:
+    rms = [float(np.sqrt((r**2).mean())) if len(r) else 0.0 for r in point.residual]
+    return rms[0] * problem.excess[0], rms[1] * problem.excess[1]
+
+
+def _cost(point: _Point, centre: FloatArray, prior_sd: float) -> float:
+    return float(sum((r**2).sum() for r in point.residual)) + float((((point.theta - centre) / prior_sd) ** 2).sum())
+
+
+def _descend(
+    problem: CalibrationProblem, theta: FloatArray, centre: FloatArray, prior_sd: float, most: int, at: Evaluate, *, fine: bool = False
+) -> tuple[_Point, int]:
+    """Iterate by Gauss and Newton; a step that does not help is shortened. Returns the last point and the iterations."""
+    point, damping = at(problem, theta, fine=fine), 0.0
+    cost, used = _cost(point, centre, prior_sd), 1
+    while used < most:
+        hessian = point.information + np.eye(len(theta)) / prior_sd**2
+        slope = point.gradient() + (point.theta - centre) / prior_sd**2
+        step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), slope)
+        if -slope @ step < SETTLED:
+            return point, used
+        step *= min(1.0, LONGEST / np.abs(step).max())
+        trial = at(problem, point.theta + step, fine=fine)
+        used += 1
+        if (new := _cost(trial, centre, prior_sd)) < cost:
+            settled = cost - new < SETTLED + (1e-6 if fine else 1e-5) * cost
+            point, cost, damping = trial, new, 0.3 * damping if damping > 1e-4 else 0.0
+            if settled:
+                return point, used
+        else:
+            damping = max(10.0 * damping, 1e-3)
+            if damping > 1e6:
+                return point, used
+    if fine:
+        return point, used
+    raise ConvergenceError(
+        f"the calibration did not settle within {used} iterations (chi-squared {cost:.6g}); allow more (max_iterations), or start "
+        "nearer: it is at "
+        + ", ".join(f"{name} {value:.3g}" for name, value in zip(problem.unknowns.names, np.exp(point.theta), strict=True))
+    )
+
+
+def _polished(problem: CalibrationProblem, point: _Point, centre: FloatArray, prior_sd: float, at: Evaluate) -> tuple[_Point, int, bool]:
+    """Move on to the minimum of residuals of fine steps by derivatives of coarse ones; return it, the runs, and whether it settled."""
+
+    def fine(theta: FloatArray, slopes: tuple[FloatArray, FloatArray] | None = None) -> _Point:
+        residual = at(problem, theta, derivatives=False, fine=True).residual
+        return _Point(theta, residual, slopes or at(problem, theta).slopes)
+
+    best, damping = fine(point.theta, point.slopes), 0.0
+    cost = _cost(best, centre, prior_sd)
+    for count in range(1, POLISHING):
+        hessian = best.information + np.eye(len(best.theta)) / prior_sd**2
+        slope = best.gradient() + (best.theta - centre) / prior_sd**2
+        step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), slope)
+        if -slope @ step < SETTLED:
+            return best, count, True
+        trial = fine(best.theta + step * min(1.0, LONGEST / np.abs(step).max()))
+        if (new := _cost(trial, centre, prior_sd)) < cost:
+            best, cost, damping = trial, new, 0.3 * damping
+        else:
+            damping = max(10.0 * damping, 1e-3)
+    return best, POLISHING, False
+
+
+@dataclass(frozen=True, slots=True)
+class ReportIndices:
+    """The report's measures of one pushing.
+
+    Attributes
+    ----------
+    shape_mm : tuple of float
+        S_shape at every capture, mm.
+    points : tuple of int
+        Captured points.
+    large : tuple of int
+        Points that are 2.5 mm or more away.
+    force_mn : float
+        S_force over the samples while the pushers keep still, mN, sum over the sensors.
+    samples : int
+        Their number, for one sensor.
+    """
+
+    shape_mm: tuple[float, ...]
+    points: tuple[int, ...]
+    large: tuple[int, ...]
+    force_mn: float
+    samples: int
+
+
+def indices(capture: Capture, pushed: PushedLattice, parameters: LatticeParameters, *, large_mm: float = 2.5) -> ReportIndices:
+    """Return S_shape and S_force of a lattice against a capture; distances below the sensor's error are not counted in S_shape."""
+    found, since = pushed.run(parameters), round(capture.pushing.push_s / SAMPLE_S)
+    repeated = np.repeat(found.force, round(pushed.long_step / SAMPLE_S), axis=0)
+    distances = [np.abs(closest_points(p, pushed.hull, x).signed) for p, x in zip(capture.points, found.positions, strict=True)]
+    shape = tuple(float(d[d >= capture.point_sd_mm].sum()) for d in distances)
+    large = tuple(int((d >= large_mm).sum()) for d in distances)
+    force, _ = force_difference(capture.force[since:], repeated[since:])
+    return ReportIndices(shape, tuple(len(d) for d in distances), large, force, len(repeated) - since)

@@ -1,0 +1,1 @@
+"""Material tests: uniaxial compression and tension, and strain from markers."""

@@ -1,0 +1,233 @@
+"""Which model to believe: prediction of experiments that were left out, and laws and contacts side by side."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from naibu.core.errors import ConvergenceError, InputError
+from naibu.core.experiment import Experiment
+from naibu.core.status import Status
+from naibu.identification.from_markers.calibration import Calibration, calibrate
+from naibu.identification.from_markers.gauss_newton import MatchingSettings
+from naibu.identification.from_markers.known_materials import Knowledge
+from naibu.identification.from_markers.observations import NoiseModel
+from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.prediction.calibrated_model import CalibratedModel
+from naibu.identification.prediction.prediction import Prediction, predict, rms
+from naibu.mechanics.linear_algebra.direct import use_one_thread
+
+Callback = Callable[[str, int, float], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LeftOut:
+    """A state predicted by a model that has not seen its experiment.
+
+    Attributes
+    ----------
+    experiment, state : str
+        Names.
+    rms_mm : float
+        Root mean square distance over the complete markers, mm.
+    rms_xyz : tuple of float
+        The same along x, y and z.
+    marker_count : int
+        Number of complete markers.
+    prediction : Prediction
+        Positions, uncertainty and assumptions.
+    """
+
+    experiment: str
+    state: str
+    rms_mm: float
+    rms_xyz: tuple[float, float, float]
+    marker_count: int
+    prediction: Prediction
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelRow:
+    """One candidate model.
+
+    Attributes
+    ----------
+    settings : ModelSettings
+        Law, contact, joints.
+    noise_factor, chi_squared : float
+        Misfit in units of the noise; its noise-normalised sum of squares. NaN where the model failed.
+    parameter_count : int
+        Free parameters, poses included.
+    bic : float
+        Bayesian information criterion ``n ln(chi_squared / n) + k ln n`` (Schwarz 1978), the level of noise estimated; less is better.
+    left_out_mm : float
+        Root mean square distance over all markers of the experiments left out one by one, mm; NaN where there is but one experiment.
+    problem : str
+        Why there is no result, or why to take it with care; empty when all went well.
+    """
+
+    settings: ModelSettings
+    noise_factor: float
+    chi_squared: float
+    parameter_count: int
+    bic: float
+    left_out_mm: float
+    problem: str
+
+
+def leave_one_out(
+    experiments: Sequence[Experiment],
+    *,
+    knowledge: Knowledge | None = None,
+    settings: ModelSettings | None = None,
+    noise: NoiseModel | None = None,
+    search: MatchingSettings | None = None,
+    reference: Calibration | None = None,
+    callback: Callback | None = None,
+) -> list[LeftOut]:
+    """Predict all loaded states of every experiment with a model calibrated on the others.
+
+    Of the predicted state only the heights of its lowest and highest marker layers are used, and the rigid pose of its scan.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+        Two at least.
+    knowledge, settings, noise, search : optional
+        As for `calibrate`.
+    reference : Calibration, optional
+        The calibration on all experiments: the others start from its solutions, which saves time.
+    callback : callable, optional
+        ``callback(left_out, iteration, objective)`` after every step of a calibration; calls come from several threads.
+
+    Raises
+    ------
+    InputError
+        Fewer than two experiments, or others that do not contain a material which the one left out needs.
+    ConvergenceError
+        A trial cannot be solved.
+    KeyboardInterrupt
+        The user stopped one of the calibrations.
+    """
+    if len(experiments) < 2:
+        raise InputError(f"leaving one out needs at least 2 experiments, not {len(experiments)}")
+    start = None if reference is None else reference.match.parameters.values()
+    nearby = {} if reference is None else reference.nearby
+    stop = threading.Event()
+
+    def without(left: Experiment) -> list[LeftOut]:
+        others = [e for e in experiments if e is not left]
+        found = calibrate(
+            others, knowledge=_applicable(knowledge, others), settings=settings, noise=noise, search=search, start=start, nearby=nearby,
+            callback=_reporting(callback, left.name, stop),
+        )  # fmt: skip
+        if found.match.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+        model = CalibratedModel.of(found)
+        return [
+            _left_out(predict(model, left, state.name, heights_from_markers=True, nearby=nearby.get(f"{left.name}/{state.name}")))
+            for state in left.loaded_states
+        ]
+
+    with ThreadPoolExecutor(min(len(experiments), os.cpu_count() or 1), initializer=use_one_thread) as pool:
+        turns = [pool.submit(without, left) for left in experiments]
+        try:
+            return [row for turn in turns for row in turn.result()]
+        except BaseException:
+            stop.set()
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _applicable(knowledge: Knowledge | None, experiments: Sequence[Experiment]) -> Knowledge | None:
+    """What is known of materials that the experiments contain; None where nothing is."""
+    if knowledge is None:
+        return None
+    materials = {m for e in experiments for m in e.materials}
+    known = {m: e for m, e in knowledge.young_moduli.items() if m in materials}
+    return Knowledge(known, knowledge.scale_is_absolute) if known else None
+
+
+def _reporting(
+    callback: Callback | None, name: str, stop: threading.Event | None = None
+) -> Callable[[int, float, Mapping[str, float]], None]:
+    """Report a calibration's steps under a name, and end it where it was stopped from another thread."""
+
+    def report(iteration: int, objective: float, values: Mapping[str, float]) -> None:
+        if stop is not None and stop.is_set():
+            raise KeyboardInterrupt
+        if callback is not None:
+            callback(name, iteration, objective)
+
+    return report
+
+
+def _left_out(p: Prediction) -> LeftOut:
+    x, y, z = (rms(p.residual, [axis]) for axis in range(3))
+    count = int(np.isfinite(p.residual).all(axis=1).sum())
+    return LeftOut(p.specimen.experiment.name, p.state, rms(p.residual), (x, y, z), count, p)
+
+
+def pooled_rms(rows: Sequence[LeftOut]) -> float:
+    """Return the root mean square distance over the markers of several states, mm."""
+    counts = np.array([r.marker_count for r in rows], dtype=float)
+    return float(np.sqrt((counts * np.array([r.rms_mm for r in rows]) ** 2).sum() / counts.sum()))
+
+
+def compare_models(
+    experiments: Sequence[Experiment],
+    candidates: Sequence[ModelSettings],
+    *,
+    knowledge: Knowledge | None = None,
+    noise: NoiseModel | None = None,
+    search: MatchingSettings | None = None,
+    callback: Callback | None = None,
+) -> list[ModelRow]:
+    """Calibrate every candidate on all experiments, and predict each experiment from the others; one row a candidate, in their order.
+
+    A candidate that cannot be solved gets a row that says so.
+
+    Raises
+    ------
+    InputError
+        Experiments that cannot be used.
+    KeyboardInterrupt
+        The user stopped one of the calibrations.
+    """
+    rows = []
+    for settings in candidates:
+        try:
+            found = calibrate(
+                experiments, knowledge=knowledge, settings=settings, noise=noise, search=search,
+                callback=_reporting(callback, "none"),
+            )  # fmt: skip
+        except ConvergenceError as error:
+            rows.append(ModelRow(settings, np.nan, np.nan, 0, np.nan, np.nan, str(error)))
+            continue
+        if found.match.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+        left_out, problem = np.nan, "" if found.match.status.ok else found.match.status.value
+        if len(experiments) > 1:
+            try:
+                left_out = pooled_rms(
+                    leave_one_out(
+                        experiments, knowledge=knowledge, settings=settings, noise=noise, search=search, reference=found, callback=callback
+                    )
+                )
+            except ConvergenceError as error:
+                problem = f"with an experiment left out: {error}"
+        rows.append(_row(settings, found, left_out, problem))
+    return rows
+
+
+def _row(settings: ModelSettings, found: Calibration, left_out: float, problem: str) -> ModelRow:
+    match = found.match
+    n = sum(int(np.isfinite(f.residual).sum()) for f in match.fits)
+    k = len(match.parameters.free) + 6 * len(match.fits)
+    bic = n * float(np.log(match.chi_squared / n)) + k * float(np.log(n))
+    return ModelRow(settings, match.noise_factor, match.chi_squared, k, bic, left_out, problem)

@@ -1,0 +1,1 @@
+"""Displacement voxel by voxel: block matching, optical flow, and both combined."""

@@ -1,0 +1,1 @@
+"""Feature points: detection, matching by correlation and relaxation labelling, interpolation between them."""

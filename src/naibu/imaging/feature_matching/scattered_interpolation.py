@@ -1,0 +1,162 @@
+"""From displacements at points to one at every voxel, by Delaunay simplices (spec S6)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import Delaunay, QhullError, cKDTree
+
+from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.displacement_field import Field
+from naibu.core.errors import InputError
+from naibu.core.volume import Volume
+from naibu.imaging.displacement.dense import DenseDisplacement
+from naibu.imaging.feature_matching._delaunay_kernels import fill_simplices
+from naibu.imaging.feature_matching.relaxation_labelling import PotentialMatches
+from naibu.imaging.preprocessing.resampling import positions
+from naibu.imaging.preprocessing.rigid_registration import RigidMotion
+
+Outside = Literal["nan", "nearest", "affine"]
+# of the mean simplex: flatter ones are rounding, and their voxels belong to neighbours
+FLAT = 1e-9
+
+
+def sparse_displacement(matches: PotentialMatches, rigid: RigidMotion | None = None, *, rotation_only: bool = False) -> Field:
+    """Return the displacement of matched points (spec S6).
+
+    Parameters
+    ----------
+    matches : PotentialMatches
+        Pairs of points.
+    rigid : RigidMotion, optional
+        The points then stand in the registered frame, ``R x1 + tau``, and what the rigid motion does is no displacement. By default
+        they stand where they were before, and the displacement is the whole ``x2 - x1``.
+    rotation_only : bool
+        Take out the rotation and keep the translation, as (1.25) of the report does: points at ``R x1``.
+
+    Returns
+    -------
+    Field
+        ``u = x2 - (R x1 + tau)`` at the points; the report's ``D = R x1 + tau - x2`` points the other way.
+
+    Raises
+    ------
+    InputError
+        `rotation_only` without a rigid motion.
+    """
+    if rigid is None:
+        if rotation_only:
+            raise InputError("rotation_only takes the rotation out of the displacement: give the rigid motion")
+        return Field.from_arrays(matches.initial_mm, matches.deformed_mm - matches.initial_mm)
+    start = matches.initial_mm @ rigid.rotation.T if rotation_only else rigid.moved(matches.initial_mm)
+    return Field.from_arrays(start, matches.deformed_mm - start)
+
+
+def elevation_angle(vectors: ArrayLike) -> FloatArray:
+    """Return the angle (n,), rad, of displacements (n, 3) to the plane of x and z: ``asin(u_y / |u|)``; zero where nothing moves."""
+    u = np.asarray(vectors, dtype=float)
+    length = np.linalg.norm(u, axis=1)
+    return np.asarray(np.arcsin(np.clip(np.divide(u[:, 1], length, out=np.zeros(len(u)), where=length > 0), -1.0, 1.0)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Triangulation:
+    """Delaunay simplices of the points of a field.
+
+    Attributes
+    ----------
+    points_mm : ndarray, shape (n, 3)
+        Points, mm.
+    simplices : ndarray, shape (m, d + 1), int64
+        Tetrahedra, or triangles where all points lie in the one slice of a volume.
+    """
+
+    points_mm: FloatArray
+    simplices: IntArray
+
+
+def triangulated(points_mm: ArrayLike, grid: Volume) -> Triangulation:
+    """Return the Delaunay tetrahedra of points (n, 3), mm, or triangles where the grid is one slice.
+
+    Raises
+    ------
+    InputError
+        Too few points, or points that span no simplex.
+    """
+    p = np.asarray(points_mm, dtype=float)
+    d = 2 if grid.shape[0] == 1 else 3
+    what = "triangle" if d == 2 else "tetrahedron"
+    if len(p) < d + 1:
+        raise InputError(f"{len(p)} points make no {what}: {d + 1} matches or more are needed; loosen the thresholds of the matching")
+    index = grid.to_index(p)[:, :d] * grid.spacing_mm[:d]
+    try:
+        cells = Delaunay(index).simplices
+    except QhullError as error:
+        raise InputError(f"the {len(p)} points span no {what}: they lie in one {'line' if d == 2 else 'plane'}") from error
+    return Triangulation(p, np.asarray(cells, dtype=np.int64))
+
+
+def dense_from_sparse(field: Field, grid: Volume, *, outside: Outside = "nan") -> DenseDisplacement:
+    """Return the displacement at every voxel, linear in the Delaunay simplices of the points of a field (spec S6, 1.11, 1.12, 1.27).
+
+    Parameters
+    ----------
+    field : Field
+        Displacement at points, mm; points without data are left out.
+    grid : Volume
+        Voxels where it is wanted; a volume of one slice is an image, with triangles.
+    outside : {"nan", "nearest", "affine"}
+        At voxels outside the hull of the points: nothing, the displacement of the nearest point, or the affine motion that fits all points
+        best. `valid` is true inside the hull only.
+
+    Returns
+    -------
+    DenseDisplacement
+        Its quality is 1 inside the hull.
+
+    Raises
+    ------
+    InputError
+        Points that span no simplex, an unknown choice, or a hull without a voxel in it.
+    """
+    if outside not in ("nan", "nearest", "affine"):
+        raise InputError(f"outside must be 'nan', 'nearest' or 'affine', not {outside!r}")
+    # Qhull would leave out all but one point of a place without saying which
+    p, u = _one_a_place(field.points[field.valid], field.vectors[field.valid])
+    net = triangulated(p, grid)
+    d = net.simplices.shape[1] - 1
+    index = grid.to_index(p)[:, :d]
+    corners = index[net.simplices]
+    edges = corners[:, 1:] - corners[:, :1]
+    measures = np.abs(np.linalg.det(edges))
+    real = measures > FLAT * measures.mean()
+    corners, cells = corners[real], net.simplices[real]
+    inverses = np.swapaxes(np.linalg.inv(edges[real]), 1, 2)
+    vectors, inside = np.full((*grid.shape, 3), np.nan), np.zeros(grid.shape, dtype=bool)
+    fill_simplices(np.ascontiguousarray(corners), np.ascontiguousarray(inverses), u[cells], vectors, inside)
+    if not inside.any():
+        raise InputError("no voxel of the grid lies among the points: are points and grid in one frame, in mm?")
+    if outside != "nan":
+        places = positions(grid)[~inside]
+        vectors[~inside] = u[cKDTree(p).query(places)[1]] if outside == "nearest" else _affine(p, u, places)
+    return DenseDisplacement(vectors, inside, np.where(inside, 1.0, np.nan))
+
+
+def _one_a_place(points: FloatArray, vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return points without duplicates, with the mean of their vectors."""
+    unique, where = np.unique(points, axis=0, return_inverse=True)
+    if len(unique) == len(points):
+        return points, vectors
+    count = np.bincount(where.ravel())
+    return unique, np.stack([np.bincount(where.ravel(), v) / count for v in vectors.T], axis=1)
+
+
+def _affine(points: FloatArray, vectors: FloatArray, places: FloatArray) -> FloatArray:
+    """Return the affine function that fits vectors at points best, at other places."""
+    middle = points.mean(axis=0)
+    columns = np.column_stack([np.ones(len(points)), points - middle])
+    found = np.linalg.lstsq(columns, vectors, rcond=None)[0]
+    return np.asarray(np.column_stack([np.ones(len(places)), places - middle]) @ found)

@@ -1,0 +1,1 @@
+"""Fiducial markers and particles: detection, localisation, matching between states, tracking in sequences."""

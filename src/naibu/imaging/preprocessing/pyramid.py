@@ -1,0 +1,109 @@
+"""Coarse copies of a pair of volumes, and displacements carried from one grid to the next finer one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from naibu.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from naibu.imaging.preprocessing._interpolation_kernels import refine
+from naibu.imaging.preprocessing.filters import smoothed
+
+# voxels along an axis below which it is not halved again
+SMALLEST = 12
+# the Gaussian that takes out what every second voxel cannot hold
+BLUR = 0.8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Level:
+    """A pair of volumes on one grid.
+
+    Attributes
+    ----------
+    reference, deformed : ndarray, shape (nz, ny, nx), float32
+        Grey values.
+    wanted : ndarray, shape (nz, ny, nx), bool
+        Voxels that count.
+    spacing_mm : ndarray, shape (3,)
+        Distance of voxels along x, y, z, mm.
+    factor : ndarray, shape (3,), int64
+        How much finer the level below is, 1 or 2 along x, y, z; 1 at the finest.
+    """
+
+    reference: Float32Array
+    deformed: Float32Array
+    wanted: BoolArray
+    spacing_mm: FloatArray
+    factor: IntArray
+
+
+def pyramid(reference: Float32Array, deformed: Float32Array, wanted: BoolArray, spacing_mm: FloatArray, levels: int | None) -> list[Level]:
+    """Return levels from coarse to fine.
+
+    Every level halves the axes whose voxels are not much longer than the shortest, so that thick slices are left alone until the pixels
+    in them have caught up. Voxel 0 stays in its place.
+
+    Parameters
+    ----------
+    reference, deformed : ndarray, shape (nz, ny, nx), float32
+        Grey values.
+    wanted : ndarray, shape (nz, ny, nx), bool
+        Voxels that count.
+    spacing_mm : ndarray, shape (3,)
+        Distance of voxels along x, y, z, mm.
+    levels : int, optional
+        How many; by default until an axis would have less than 12 voxels.
+    """
+    found = [Level(reference, deformed, wanted, np.asarray(spacing_mm, dtype=float), np.ones(3, dtype=np.int64))]
+    while levels is None or len(found) < levels:
+        fine = found[-1]
+        size = np.array(fine.reference.shape[::-1])
+        active = size > 1
+        near = fine.spacing_mm < 1.5 * fine.spacing_mm[active].min()
+        factor = np.where(active & near & (size >= 2 * SMALLEST), 2, 1)
+        if (factor == 1).all():
+            break
+        pick = tuple(slice(None, None, int(f)) for f in factor[::-1])
+        blur = np.where(factor == 2, BLUR, 0.0)
+        share = ndimage.maximum_filter(fine.wanted, tuple(int(2 * f - 1) for f in factor[::-1]))
+        found.append(
+            Level(
+                np.ascontiguousarray(smoothed_known(fine.reference, blur)[pick]),
+                np.ascontiguousarray(smoothed_known(fine.deformed, blur)[pick]),
+                np.ascontiguousarray(share[pick]),
+                fine.spacing_mm * factor,
+                factor,
+            )
+        )
+    return found[::-1]
+
+
+def smoothed_known(values: Float32Array, sigma: FloatArray) -> Float32Array:
+    """Return smoothed values where most of the Gaussian falls on known ones; NaN elsewhere."""
+    known = np.isfinite(values)
+    if known.all():
+        return smoothed(values, sigma)
+    share = smoothed(known.astype(np.float32), sigma)
+    total = smoothed(np.where(known, values, np.float32(0.0)), sigma)
+    return np.where(share > 0.5, total / np.maximum(share, 0.5), np.float32(np.nan))
+
+
+def refined(displacement: Float32Array, coarse: Level, fine: Level) -> Float32Array:
+    """Return a displacement (3, nz, ny, nx), mm, on the grid of the next finer level."""
+    out = np.empty((3, *fine.reference.shape), dtype=np.float32)
+    refine(displacement, coarse.factor, np.ones(3), out)
+    return out
+
+
+def coarsened(displacement: Float32Array, levels: list[Level]) -> Float32Array:
+    """Return a displacement (3, nz, ny, nx), mm, of the finest level on the grid of the coarsest."""
+    out = displacement
+    for level in levels[:0:-1]:
+        above = levels[[id(v) for v in levels].index(id(level)) - 1]
+        blur = np.where(above.factor == 2, BLUR, 0.0)
+        pick = tuple(slice(None, None, int(f)) for f in above.factor[::-1])
+        out = np.stack([smoothed(component, blur)[pick] for component in out])
+    return np.ascontiguousarray(out, dtype=np.float32)

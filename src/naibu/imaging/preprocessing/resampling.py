@@ -1,0 +1,284 @@
+"""Volumes on other grids: slices put between, other spacings, warped by a displacement, cropped and masked (spec S1)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import ndimage
+
+from naibu.core.arrays import AnyArray, BoolArray, FloatArray
+from naibu.core.errors import InputError
+from naibu.core.volume import Volume
+from naibu.imaging.preprocessing._interpolation_kernels import EDGE, sample, sample_affine
+from naibu.imaging.preprocessing.filters import smoothed
+
+Interpolation = Literal["linear", "cubic"]
+
+
+def with_slices_between(volume: Volume, count: int = 1) -> Volume:
+    """Return a volume with slices interpolated linearly into every gap between slices (spec S1, equation 3.37).
+
+    Parameters
+    ----------
+    volume : Volume
+        At least two slices.
+    count : int
+        Slices in every gap: 1 halves their distance, as the report does with its slices 2 mm apart.
+
+    Returns
+    -------
+    Volume
+        ``(nz - 1) (count + 1) + 1`` slices of real numbers; every measured slice is among them unchanged.
+
+    Raises
+    ------
+    InputError
+        Less than two slices, or a count below one.
+
+    Notes
+    -----
+    ``I_a = (1 - a) I_k + a I_{k+1}`` with ``a = d_k / (d_k + d_{k+1})``, the distances to the slices before and after.
+    """
+    if count < 1:
+        raise InputError(f"{count} slices cannot be put between two; give 1 or more")
+    return with_slices(volume, (volume.shape[0] - 1) * (count + 1) + 1)
+
+
+def with_slices(volume: Volume, n: int) -> Volume:
+    """Return a volume with `n` evenly spaced slices from the first to the last, interpolated linearly (spec S1, equation 3.37).
+
+    Raises
+    ------
+    InputError
+        Less than two slices, before or after.
+    """
+    nz = volume.shape[0]
+    if nz < 2 or n < 2:
+        raise InputError(f"slices are interpolated between two or more, and {n} from {nz} are asked for")
+    at = np.arange(n) * ((nz - 1) / (n - 1))
+    below = np.minimum(at.astype(int), nz - 2)
+    kind = _real(volume.values)
+    weight = (at - below).astype(kind)[:, None, None]
+    values = volume.values[below] * (1 - weight) + volume.values[below + 1] * weight
+    spacing = volume.spacing_mm * [1.0, 1.0, (nz - 1) / (n - 1)]
+    return replace(volume, values=values.astype(kind), spacing_mm=spacing)
+
+
+def resampled_to_spacing(
+    volume: Volume, spacing_mm: ArrayLike, *, interpolation: Interpolation = "linear", averaged: bool = True
+) -> Volume:
+    """Return a volume with another distance of voxels; the first voxel keeps its place.
+
+    Parameters
+    ----------
+    volume : Volume
+        Voxels.
+    spacing_mm : float or array_like, shape (3,)
+        Distance of voxels along x, y, z, mm.
+    interpolation : {"linear", "cubic"}
+        Between voxels: straight, or by cubic B-splines.
+    averaged : bool
+        Whether a Gaussian takes out first what a coarser grid cannot hold.
+
+    Raises
+    ------
+    InputError
+        A spacing that is not positive.
+    """
+    step = np.broadcast_to(np.asarray(spacing_mm, dtype=float), 3).copy()
+    if not (np.isfinite(step).all() and (step > 0.0).all()):
+        raise InputError(f"spacing_mm must be positive, not {step.tolist()}")
+    size = np.array(volume.shape[::-1])
+    ratio = step / volume.spacing_mm
+    n = np.floor((size - 1) / ratio + 1e-6).astype(int) + 1
+    source = volume
+    if averaged and (ratio > 1.0).any():
+        blur = 0.5 * np.sqrt(np.maximum(ratio**2 - 1.0, 0.0))
+        source = volume.with_values(smoothed(np.asarray(volume.values, dtype=np.float32), blur).astype(_real(volume.values)))
+    grid = replace(volume, values=np.zeros(tuple(n[::-1]), dtype=bool), spacing_mm=step)
+    return resampled_to_grid(source, grid, interpolation=interpolation)
+
+
+def resampled_to_grid(
+    volume: Volume,
+    grid: Volume,
+    *,
+    through: Callable[[FloatArray], FloatArray] | None = None,
+    interpolation: Interpolation = "linear",
+    outside: float = np.nan,
+) -> Volume:
+    """Return the values of a volume at the voxels of another.
+
+    Parameters
+    ----------
+    volume : Volume
+        Where values come from.
+    grid : Volume
+        Where values are wanted.
+    through : callable, optional
+        Affine map of positions (n, 3) of the grid, mm, to positions in the volume: the `moved` of a rigid motion brings a deformed
+        volume back to the frame of the reference.
+    interpolation : {"linear", "cubic"}
+        Between voxels: straight, or by cubic B-splines.
+    outside : float
+        Value of voxels that lie outside the volume. NaN, which files of whole numbers cannot hold, stands for unknown and is understood
+        by block matching and optical flow: a zero would be an edge to them.
+
+    Returns
+    -------
+    Volume
+        Real numbers.
+
+    Raises
+    ------
+    InputError
+        No voxel of the grid lies inside the volume.
+    """
+    matrix, shift = _index_map(volume, grid, through)
+    kind = _real(volume.values)
+    out: AnyArray = np.empty(grid.shape, dtype=kind)
+    if interpolation == "linear":
+        sample_affine(np.ascontiguousarray(volume.values, dtype=kind), matrix, shift, out)
+        inside = ~np.isnan(out)
+    else:
+        flip = [2, 1, 0]
+        ndimage.affine_transform(
+            np.asarray(volume.values, dtype=float),
+            matrix[flip][:, flip],
+            shift[flip],
+            output_shape=grid.shape,
+            order=3,
+            mode="mirror",
+            output=out,
+        )
+        inside = covered(volume, grid, through=through)
+    if not inside.any():
+        raise InputError("the volumes do not overlap: no voxel of the grid lies inside the other volume; check their origins and units")
+    out[~inside] = outside
+    return replace(grid, values=out)
+
+
+def covered(volume: Volume, grid: Volume, *, through: Callable[[FloatArray], FloatArray] | None = None) -> BoolArray:
+    """Return which voxels (nz, ny, nx) of a grid lie inside a volume, where `through` has carried them (see `resampled_to_grid`)."""
+    matrix, shift = _index_map(volume, grid, through)
+    axes = np.meshgrid(*(np.arange(n, dtype=float) for n in grid.shape), indexing="ij", sparse=True)
+    inside = np.ones(grid.shape, dtype=bool)
+    for row, offset, n in zip(matrix, shift, volume.shape[::-1], strict=True):
+        at = row[0] * axes[2] + row[1] * axes[1] + row[2] * axes[0] + offset
+        inside &= (at >= -EDGE) & (at <= n - 1 + EDGE)
+    return inside
+
+
+def sampled(volume: Volume, points_mm: ArrayLike, *, interpolation: Interpolation = "linear", outside: float = np.nan) -> FloatArray:
+    """Return the values (...) of a volume at positions (..., 3), mm; `outside` where there are none."""
+    index = volume.to_index(points_mm)
+    flat = np.ascontiguousarray(index.reshape(-1, 3))
+    if interpolation == "linear":
+        out = np.empty(len(flat))
+        sample(np.ascontiguousarray(volume.values, dtype=_real(volume.values)), flat, out)
+        inside = np.isfinite(out)
+    else:
+        out = ndimage.map_coordinates(np.asarray(volume.values, dtype=float), flat.T[::-1], order=3, mode="mirror")
+        inside = np.asarray(((flat >= -EDGE) & (flat <= np.array(volume.shape[::-1]) - 1 + EDGE)).all(axis=1))
+    return np.where(inside, out, outside).reshape(index.shape[:-1])
+
+
+def warped(
+    volume: Volume, displacement: ArrayLike, grid: Volume, *, interpolation: Interpolation = "linear", outside: float = np.nan
+) -> AnyArray:
+    """Return the values (nz, ny, nx) of a volume at ``x + u(x)``, x the voxels of a grid.
+
+    With the deformed volume and the displacement of the reference this is the deformed volume carried back, which looks like the
+    reference where the displacement is right.
+
+    Parameters
+    ----------
+    volume : Volume
+        Where values come from.
+    displacement : array_like, shape (nz, ny, nx, 3)
+        Displacement u along x, y, z at the voxels of the grid, mm; NaN where there is none.
+    grid : Volume
+        Where the displacement stands.
+    interpolation : {"linear", "cubic"}
+        Between voxels: straight, or by cubic B-splines.
+    outside : float
+        Value of voxels whose place lies outside the volume, or that have no displacement.
+
+    Raises
+    ------
+    InputError
+        A displacement of another shape than the grid.
+    """
+    u = np.asarray(displacement, dtype=float)
+    if u.shape != (*grid.shape, 3):
+        raise InputError(f"displacement must have shape {(*grid.shape, 3)} (z, y, x, component), mm, not {u.shape}")
+    places = positions(grid)
+    places += u
+    return sampled(volume, places, interpolation=interpolation, outside=outside)
+
+
+def positions(grid: Volume) -> FloatArray:
+    """Return the centres (nz, ny, nx, 3) of all voxels, mm."""
+    nz, ny, nx = grid.shape
+    index = np.empty((nz, ny, nx, 3))
+    index[..., 0], index[..., 1], index[..., 2] = np.arange(nx), np.arange(ny)[:, None], np.arange(nz)[:, None, None]
+    return grid.to_physical(index)
+
+
+def masked(volume: Volume, mask: ArrayLike, fill: float = 0.0) -> Volume:
+    """Return a volume with `fill` where the mask (nz, ny, nx) is false.
+
+    Raises
+    ------
+    InputError
+        A mask of another shape, or an empty one.
+    """
+    inside = require_mask(mask, volume)
+    return volume.with_values(np.where(inside, volume.values, np.asarray(fill, dtype=volume.values.dtype)))
+
+
+def cropped_to_mask(volume: Volume, mask: ArrayLike, margin_mm: float = 0.0) -> Volume:
+    """Return the smallest box of voxels around a mask (nz, ny, nx), with a margin, mm.
+
+    Raises
+    ------
+    InputError
+        A mask of another shape, or an empty one.
+    """
+    inside = np.argwhere(require_mask(mask, volume))[:, ::-1]
+    margin = np.ceil(margin_mm / volume.spacing_mm - 1e-9).astype(int)
+    low, high = inside.min(axis=0) - margin, inside.max(axis=0) + 1 + margin
+    return volume.cropped(np.maximum(low, 0), np.minimum(high, volume.shape[::-1]))
+
+
+def require_mask(mask: ArrayLike, volume: Volume) -> BoolArray:
+    """Return a mask (nz, ny, nx) of a volume.
+
+    Raises
+    ------
+    InputError
+        A mask of another shape, or an empty one.
+    """
+    inside = np.asarray(mask, dtype=bool)
+    if inside.shape != volume.shape:
+        raise InputError(f"the mask must have shape {volume.shape} (z, y, x), not {inside.shape}")
+    if not inside.any():
+        raise InputError("the mask is empty: no voxel is to be looked at; check its threshold or its file")
+    return inside
+
+
+def _index_map(volume: Volume, grid: Volume, through: Callable[[FloatArray], FloatArray] | None) -> tuple[FloatArray, FloatArray]:
+    """Return the affine map from indices of a grid to indices of a volume, both along x, y, z."""
+    corners = grid.to_physical(np.vstack([np.zeros(3), np.eye(3)]))
+    index = volume.to_index(corners if through is None else through(corners))
+    return np.ascontiguousarray((index[1:] - index[0]).T), index[0]
+
+
+def _real(values: AnyArray) -> type[np.floating]:
+    """Return the type of real numbers that holds grey values exactly."""
+    single = values.dtype in (np.float32, np.float16) or (values.dtype.kind in "biu" and values.dtype.itemsize <= 2)
+    return np.float32 if single else np.float64

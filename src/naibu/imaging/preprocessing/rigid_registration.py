@@ -1,0 +1,380 @@
+"""Rigid motion: from corresponding points in closed form (spec S2), or from grey values inside a mask."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import ndimage
+
+from naibu.core.arrays import BoolArray, FloatArray, IntArray
+from naibu.core.errors import InputError
+from naibu.core.optional_packages import optional_package
+from naibu.core.volume import Volume
+from naibu.imaging.preprocessing.resampling import covered, positions, require_mask, resampled_to_grid
+
+# of the largest extent of the points: narrower ones leave a rotation open
+NARROW = 1e-6
+HISTOGRAM_BINS = 32
+
+
+class NotRigidWarning(UserWarning):
+    """What was taken for a rigid body moved in another way."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigidMotion:
+    """A rigid motion ``x' = R x + tau``.
+
+    Attributes
+    ----------
+    rotation : ndarray, shape (d, d)
+        R.
+    translation : ndarray, shape (d,)
+        tau, mm.
+    residuals_mm : ndarray, shape (n,)
+        How far each point, or each part of the mask, ends from where it was found, mm; empty where nothing was measured.
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+    residuals_mm: FloatArray
+
+    @classmethod
+    def from_matrix(cls, matrix: ArrayLike) -> RigidMotion:
+        """Return the motion of a homogeneous matrix (d + 1, d + 1), mm.
+
+        Raises
+        ------
+        InputError
+            A matrix that is not rigid.
+        """
+        m = np.asarray(matrix, dtype=float)
+        d = len(m) - 1
+        if m.shape not in ((3, 3), (4, 4)) or np.abs(m[:d, :d].T @ m[:d, :d] - np.eye(d)).max() > 1e-6 or np.linalg.det(m[:d, :d]) < 0:
+            raise InputError(f"the matrix of a rigid motion must be (4, 4) or (3, 3) with a rotation in it, not {m.tolist()}")
+        return cls(m[:d, :d].copy(), m[:d, d].copy(), np.zeros(0))
+
+    @classmethod
+    def identity(cls, dimension: int = 3) -> RigidMotion:
+        """Return no motion."""
+        return cls(np.eye(dimension), np.zeros(dimension), np.zeros(0))
+
+    @property
+    def rms_mm(self) -> float:
+        """Root mean square of the residuals, mm; NaN where there are none."""
+        return float(np.sqrt(np.mean(self.residuals_mm**2))) if len(self.residuals_mm) else float("nan")
+
+    @property
+    def angle_deg(self) -> float:
+        """Angle of the rotation, degrees."""
+        d = len(self.rotation)
+        if d == 2:
+            return float(np.degrees(abs(np.arctan2(self.rotation[1, 0], self.rotation[0, 0]))))
+        sine = 0.5 * np.linalg.norm((self.rotation - self.rotation.T)[[2, 0, 1], [1, 2, 0]])
+        return float(np.degrees(np.arctan2(sine, 0.5 * (np.trace(self.rotation) - 1.0))))
+
+    def moved(self, points_mm: ArrayLike) -> FloatArray:
+        """Return where positions (..., d), mm, are carried."""
+        return np.asarray(np.asarray(points_mm, dtype=float) @ self.rotation.T + self.translation)
+
+    def inverse(self) -> RigidMotion:
+        """Return the motion back; (3.36) of the report is written that way."""
+        return RigidMotion(self.rotation.T, -self.rotation.T @ self.translation, self.residuals_mm)
+
+    def displacement(self, grid: Volume) -> FloatArray:
+        """Return the displacement (nz, ny, nx, 3), mm, of all voxels of a grid."""
+        return self.after(np.zeros((*grid.shape, 3)), grid)
+
+    def after(self, displacement: ArrayLike, grid: Volume) -> FloatArray:
+        """Return the whole displacement where the rigid motion follows another.
+
+        Parameters
+        ----------
+        displacement : array_like, shape (nz, ny, nx, 3)
+            Displacement v, mm, measured against the deformed volume brought back by this motion (`resampled_to_grid` with `through=moved`).
+        grid : Volume
+            Where it stands.
+
+        Returns
+        -------
+        ndarray, shape (nz, ny, nx, 3)
+            ``R (x + v) + tau - x``, mm.
+        """
+        places = positions(grid)
+        return np.asarray(self.moved(places + np.asarray(displacement, dtype=float)) - places)
+
+
+def rigid_from_points(initial: ArrayLike, deformed: ArrayLike, *, rigid_within_mm: float | None = None) -> RigidMotion:
+    """Return the rigid motion that carries points best onto their counterparts, in closed form (spec S2, Horn 1987).
+
+    Parameters
+    ----------
+    initial, deformed : array_like, shape (n, d)
+        The same points before and after, mm, d = 2 or 3; n of at least 3.
+    rigid_within_mm : float, optional
+        Warn where the root mean square of the residuals exceeds this, mm: the points are then not on one rigid body.
+
+    Returns
+    -------
+    RigidMotion
+        With the residual of every point.
+
+    Raises
+    ------
+    InputError
+        Fewer than three points, points in one place or, in space, on one line, or shapes that do not fit.
+
+    Warns
+    -----
+    NotRigidWarning
+        The residual exceeds `rigid_within_mm`.
+
+    Notes
+    -----
+    In space the rotation is the unit quaternion that belongs to the largest eigenvalue of Horn's 4 x 4 matrix, in a plane the angle of
+    (3.36). ``tau = mean(x') - R mean(x)``; the report's (8) shows the opposite sign.
+
+    References
+    ----------
+    B. K. P. Horn: Closed-form solution of absolute orientation using unit quaternions. J. Opt. Soc. Am. A 4 (1987) 629-642.
+    """
+    x, y = np.asarray(initial, dtype=float), np.asarray(deformed, dtype=float)
+    if x.ndim != 2 or x.shape != y.shape or x.shape[1] not in (2, 3):
+        raise InputError(f"corresponding points must have one shape (n, 2) or (n, 3), not {x.shape} and {y.shape}")
+    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+        raise InputError("corresponding points must be finite; leave out those that were not found")
+    if len(x) < 3:
+        raise InputError(f"a rigid motion is found from three points or more, not from {len(x)}")
+    middle_x, middle_y = x.mean(axis=0), y.mean(axis=0)
+    for points, name in ((x - middle_x, "initial"), (y - middle_y, "deformed")):
+        _require_spread(points, name)
+    m = (x - middle_x).T @ (y - middle_y)
+    rotation = _rotation_from_quaternion(_best_quaternion(m)) if x.shape[1] == 3 else _plane_rotation(m)
+    translation = middle_y - rotation @ middle_x
+    residuals = np.linalg.norm(x @ rotation.T + translation - y, axis=1)
+    motion = RigidMotion(rotation, translation, residuals)
+    _warn_unless_rigid(motion, rigid_within_mm, "point")
+    return motion
+
+
+def _require_spread(centred: FloatArray, name: str) -> None:
+    extents = np.linalg.svd(centred, compute_uv=False)
+    if not extents[0] > 0.0:
+        raise InputError(f"all {name} points are in one place: choose points that are apart")
+    if centred.shape[1] == 3 and extents[1] < NARROW * extents[0]:
+        raise InputError(f"all {name} points lie on one line, which leaves the rotation about it open: choose one beside it")
+
+
+def _best_quaternion(m: FloatArray) -> FloatArray:
+    """Return the unit quaternion (q0, qx, qy, qz) of Horn's matrix B of ``M = sum x y^T``."""
+    a = m - m.T
+    delta = np.array([a[1, 2], a[2, 0], a[0, 1]])
+    b = np.empty((4, 4))
+    b[0, 0], b[0, 1:], b[1:, 0] = np.trace(m), delta, delta
+    b[1:, 1:] = m + m.T - np.trace(m) * np.eye(3)
+    return np.asarray(np.linalg.eigh(b)[1][:, -1])
+
+
+def _rotation_from_quaternion(q: FloatArray) -> FloatArray:
+    w, x, y, z = q
+    return np.array(
+        [
+            [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (y * x + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+            [2 * (z * x - w * y), 2 * (z * y + w * x), w * w - x * x - y * y + z * z],
+        ]
+    )
+
+
+def _plane_rotation(m: FloatArray) -> FloatArray:
+    angle = np.arctan2(m[0, 1] - m[1, 0], m[0, 0] + m[1, 1])
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def _warn_unless_rigid(motion: RigidMotion, within_mm: float | None, what: str) -> None:
+    if within_mm is not None and motion.rms_mm > within_mm:
+        worst = int(np.argmax(motion.residuals_mm))
+        warnings.warn(
+            f"what was taken for rigid is not: {motion.rms_mm:.3f} mm remain (root mean square) where {within_mm:g} mm are allowed, most "
+            f"at {what} {worst} with {motion.residuals_mm[worst]:.3f} mm; check the correspondence or the mask",
+            NotRigidWarning,
+            stacklevel=3,
+        )
+
+
+def register_rigid(
+    reference: Volume,
+    deformed: Volume,
+    mask: ArrayLike,
+    *,
+    start: RigidMotion | None = None,
+    levels: int = 3,
+    widening_mm: float = 6.0,
+    sampling: float = 0.5,
+    seed: int = 1,
+    rigid_within_mm: float | None = None,
+) -> RigidMotion:
+    """Return the rigid motion that fits the grey values inside a mask, by SimpleITK (spec S2).
+
+    Parameters
+    ----------
+    reference, deformed : Volume
+        Before and after; their grids may differ.
+    mask : array_like, shape (nz, ny, nx)
+        Voxels of the reference that move rigidly, as from `naibu.imaging.preprocessing.bone_mask.bone_mask`; it should reach a little over
+        the bone, for its edge holds most of the contrast.
+    start : RigidMotion, optional
+        First guess; by default the centres of grey mass are brought together.
+    levels : int
+        Grids, each twice as coarse as the next, that are gone through from coarse to fine.
+    widening_mm : float
+        On coarse grids the mask reaches further by ``widening_mm (2^level - 1)``, mm: what surrounds a bone guides it from afar.
+    sampling : float
+        Share of the mask's voxels that the metric looks at.
+    seed : int
+        Of that sample.
+    rigid_within_mm : float, optional
+        Warn where parts of the mask move by more than this against the motion found, mm (root mean square); by default half the largest
+        spacing.
+
+    Returns
+    -------
+    RigidMotion
+        Its residuals are the leftover motions of eight parts of the mask.
+
+    Raises
+    ------
+    InputError
+        An empty mask, or volumes that do not overlap.
+    MissingDependencyError
+        SimpleITK is not installed.
+
+    Warns
+    -----
+    NotRigidWarning
+        The bone is not rigid, or the registration failed.
+    """
+    sitk = optional_package("SimpleITK", "rigid registration of grey values", "naibu[imaging]")
+    inside = require_mask(mask, reference)
+    fixed, moving = (_image(sitk, v.with_values(np.asarray(v.values, dtype=np.float32))) for v in (reference, deformed))
+    transform = _start(sitk, fixed, moving, reference, inside, start)
+    away = ndimage.distance_transform_edt(~inside, sampling=reference.spacing_mm[::-1])
+    for level in range(levels)[::-1]:
+        # far from the answer a bone alone attracts no one: begin with what is about it
+        near = away <= widening_mm * (2**level - 1)
+        method = _method(sitk, level, float(reference.spacing_mm.min()), sampling, seed)
+        method.SetMetricFixedMask(_image(sitk, reference.with_values(near.astype(np.uint8))))
+        method.SetInitialTransform(transform, inPlace=True)
+        try:
+            method.Execute(fixed, moving)
+        except RuntimeError as error:
+            reason = str(error).strip().splitlines()[-1]
+            raise InputError(f"rigid registration failed ({reason}); do the volumes overlap? give a start or a larger mask") from error
+    motion = _motion(transform)
+    found = RigidMotion(motion.rotation, motion.translation, leftover_motion(reference, deformed, inside, motion))
+    _warn_unless_rigid(found, float(reference.spacing_mm.max()) / 2 if rigid_within_mm is None else rigid_within_mm, "part")
+    return found
+
+
+def _method(sitk: Any, level: int, spacing_mm: float, sampling: float, seed: int) -> Any:
+    """Return the registration on a grid coarser by ``2^level``."""
+    method = sitk.ImageRegistrationMethod()
+    method.SetMetricAsMattesMutualInformation(HISTOGRAM_BINS)
+    method.SetMetricSamplingStrategy(method.RANDOM if sampling < 1.0 else method.NONE)
+    method.SetMetricSamplingPercentage(min(sampling, 1.0), seed)
+    method.SetInterpolator(sitk.sitkLinear)
+    method.SetOptimizerAsRegularStepGradientDescent(
+        learningRate=1.0, minStep=1e-4, numberOfIterations=200, gradientMagnitudeTolerance=1e-8, relaxationFactor=0.6
+    )
+    method.SetOptimizerScalesFromPhysicalShift()
+    method.SetShrinkFactorsPerLevel([2**level])
+    method.SetSmoothingSigmasPerLevel([0.5 * (2**level - 1) * spacing_mm])
+    method.SmoothingSigmasAreSpecifiedInPhysicalUnitsOn()
+    return method
+
+
+def leftover_motion(reference: Volume, deformed: Volume, mask: ArrayLike, motion: RigidMotion, parts: int = 8) -> FloatArray:
+    """Return how far parts of a mask move against a rigid motion (parts,), mm, by least squares on the grey values of each.
+
+    Parameters
+    ----------
+    reference, deformed : Volume
+        Before and after.
+    mask : array_like, shape (nz, ny, nx)
+        Voxels of the reference that should move rigidly.
+    motion : RigidMotion
+        Motion found.
+    parts : int
+        The mask is halved along its longest extent until there are so many; a power of two.
+    """
+    inside = require_mask(mask, reference)
+    back = resampled_to_grid(deformed, reference, through=motion.moved)
+    inside = inside & covered(deformed, reference, through=motion.moved)
+    active = [a for a in range(3) if reference.shape[2 - a] > 1]
+    grey = np.asarray(reference.values, dtype=float)
+    slopes = np.stack([np.gradient(0.5 * (grey + back.values), reference.spacing_mm[a], axis=2 - a)[inside] for a in active], axis=1)
+    # at the edge of what the deformed volume covers differences are not known
+    known = np.isfinite(slopes).all(axis=1)
+    inside[inside], slopes = known, slopes[known]
+    change = (back.values - grey)[inside]
+    left = []
+    for part in _halved(positions(reference)[inside], np.arange(len(change)), parts):
+        # a change of gain between the scans is no motion
+        columns = np.column_stack([slopes[part], np.ones(len(part)), grey[inside][part]])
+        left.append(_sure_length(columns, -change[part], len(active)) if len(part) > 20 else 0.0)
+    return np.array(left)
+
+
+def _sure_length(columns: FloatArray, right: FloatArray, d: int) -> float:
+    """Return the length of the first d unknowns of a least-squares problem, without the directions that its noise may explain."""
+    normal = np.linalg.pinv(columns.T @ columns, rcond=1e-10)
+    solution = normal @ (columns.T @ right)
+    # what is left is alike at neighbouring voxels: it counts as one in eight
+    variance = 8.0 * float(np.mean((columns @ solution - right) ** 2))
+    spread, directions = np.linalg.eigh(normal[:d, :d])
+    along = directions.T @ solution[:d]
+    return float(np.linalg.norm(along[np.abs(along) > 2.0 * np.sqrt(variance * np.maximum(spread, 0.0))]))
+
+
+def _halved(points: FloatArray, which: IntArray, parts: int) -> list[IntArray]:
+    if parts <= 1 or len(which) < 20:
+        return [which]
+    centred = points[which] - points[which].mean(axis=0)
+    along = centred @ np.linalg.eigh(centred.T @ centred)[1][:, -1]
+    order = which[np.argsort(along, kind="stable")]
+    half = len(order) // 2
+    return _halved(points, order[:half], parts // 2) + _halved(points, order[half:], parts // 2)
+
+
+def _image(sitk: Any, volume: Volume) -> Any:
+    image = sitk.GetImageFromArray(volume.values)
+    image.SetSpacing(volume.spacing_mm.tolist())
+    image.SetOrigin(volume.origin_mm.tolist())
+    image.SetDirection(volume.direction.ravel().tolist())
+    return image
+
+
+def _start(sitk: Any, fixed: Any, moving: Any, reference: Volume, mask: BoolArray, start: RigidMotion | None) -> Any:
+    """Return the first guess, turning about the middle of the mask."""
+    transform = sitk.VersorRigid3DTransform()
+    centre = positions(reference)[mask].mean(axis=0)
+    if start is None:
+        # SimpleITK cannot centre on a mask: only the translation of its guess is used
+        guess = sitk.CenteredTransformInitializer(
+            fixed, moving, sitk.VersorRigid3DTransform(), sitk.CenteredTransformInitializerFilter.MOMENTS
+        )
+        start = _motion(sitk.VersorRigid3DTransform(guess))
+    transform.SetCenter(centre.tolist())
+    transform.SetMatrix(start.rotation.ravel().tolist(), 1e-6)
+    transform.SetTranslation((start.moved(centre) - centre).tolist())
+    return transform
+
+
+def _motion(transform: Any) -> RigidMotion:
+    rotation = np.array(transform.GetMatrix()).reshape(3, 3)
+    centre = np.array(transform.GetCenter())
+    return RigidMotion(rotation, np.array(transform.GetTranslation()) + centre - rotation @ centre, np.zeros(0))

@@ -1,0 +1,1 @@
+"""Global digital volume correlation (DVC) on cubic B-splines, with covariance."""

@@ -1,0 +1,401 @@
+# mypy: disallow-untyped-decorators=False
+"""Numba kernels of the normal equations on a grid of cubic B-splines, behind `naibu.imaging.volume_correlation.normal_equations`.
+
+Cells lie in rows along x. Rows of one colour share no node, so that threads write to no common place and every sum keeps its order.
+The matrix A (n, 3, 1029) has 343 blocks of 3 x 3 a node: those to the nodes at most three apart along every axis.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import prange
+
+from naibu._numba.compilation import njit
+from naibu.core.arrays import AnyArray
+
+F = np.float32
+CHUNKS = 64
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _moments(
+    products: AnyArray,
+    force: AnyArray,
+    which: AnyArray,
+    box: AnyArray,
+    wx: AnyArray,
+    wy: AnyArray,
+    wz: AnyArray,
+    m1: AnyArray,
+    m2: AnyArray,
+    m3: AnyArray,
+    f1: AnyArray,
+    f2: AnyArray,
+    load: AnyArray,
+) -> bool:
+    """Fill m3 (10, 10, 10, 6) with the sums over voxels of a cell of pairs of weights times products; add forces to load (64, 3)."""
+    found = False
+    m3[:] = F(0)
+    for z in range(box[4], box[5]):
+        m2[:] = F(0)
+        f2[:] = F(0)
+        in_slice = False
+        for y in range(box[2], box[3]):
+            if not _line(products, force, which, z, y, box, wx, m1, f1):
+                continue
+            in_slice = True
+            m = 0
+            for a in range(4):
+                for b in range(a, 4):
+                    w = wy[y, a] * wy[y, b]
+                    for q in range(10):
+                        for k in range(6):
+                            m2[m, q, k] += w * m1[q, k]
+                    m += 1
+                for q in range(4):
+                    for k in range(3):
+                        f2[a, q, k] += wy[y, a] * f1[q, k]
+        if not in_slice:
+            continue
+        found = True
+        m = 0
+        for a in range(4):
+            for b in range(a, 4):
+                w = wz[z, a] * wz[z, b]
+                for p in range(10):
+                    for q in range(10):
+                        for k in range(6):
+                            m3[m, p, q, k] += w * m2[p, q, k]
+                m += 1
+            for q in range(16):
+                for k in range(3):
+                    load[16 * a + q, k] += wz[z, a] * f2[q >> 2, q & 3, k]
+    return found
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _line(
+    products: AnyArray, force: AnyArray, which: AnyArray, z: int, y: int, box: AnyArray, wx: AnyArray, m1: AnyArray, f1: AnyArray
+) -> bool:
+    found = False
+    for x in range(box[0], box[1]):
+        p = which[z, y, x]
+        if p < 0:
+            continue
+        if not found:
+            m1[:] = F(0)
+            f1[:] = F(0)
+            found = True
+        m = 0
+        for a in range(4):
+            for b in range(a, 4):
+                w = wx[x, a] * wx[x, b]
+                for k in range(6):
+                    m1[m, k] += w * products[p, k]
+                m += 1
+            for k in range(3):
+                f1[a, k] += wx[x, a] * force[p, k]
+    return found
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _cofactor(local: AnyArray, slopes: AnyArray, q: int, cof: AnyArray) -> Any:
+    """Fill cof (3, 3) with the cofactors of I + grad u at a Gauss point, and return its determinant."""
+    j = np.empty((3, 3), F)
+    for i in range(3):
+        for k in range(3):
+            s = F(1) if i == k else F(0)
+            for a in range(64):
+                s += local[a, i] * slopes[q, k, a]
+            j[i, k] = s
+    for i in range(3):
+        i1, i2 = (i + 1) % 3, (i + 2) % 3
+        for k in range(3):
+            k1, k2 = (k + 1) % 3, (k + 2) % 3
+            cof[i, k] = j[i1, k1] * j[i2, k2] - j[i1, k2] * j[i2, k1]
+    return j[0, 0] * cof[0, 0] + j[0, 1] * cof[0, 1] + j[0, 2] * cof[0, 2]
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _volume_slopes(local: AnyArray, slopes: AnyArray, ratio: Any, weight: Any, load: AnyArray, v: AnyArray, cof: AnyArray) -> Any:
+    """Fill v (8, 192) with the derivatives of det(I + grad u) at the Gauss points times sqrt(weight), and add to load (64, 3).
+
+    Returns the sum of (J - ratio)^2.
+    """
+    total, root = F(0), F(np.sqrt(weight))
+    for q in range(slopes.shape[0]):
+        e = _cofactor(local, slopes, q, cof) - ratio
+        total += e * e
+        for a in range(64):
+            for i in range(3):
+                t = root * (cof[i, 0] * slopes[q, 0, a] + cof[i, 1] * slopes[q, 1, a] + cof[i, 2] * slopes[q, 2, a])
+                v[q, 3 * a + i] = t
+                load[a, i] -= root * t * e
+    return total
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _bent(local: AnyArray, stiffness: AnyArray, weight: AnyArray, load: AnyArray, energy: AnyArray) -> None:
+    """Add the bending forces of a cell to its load, and fill energy (3,) per unit weight."""
+    energy[:] = F(0)
+    for a in range(64):
+        s0, s1, s2 = F(0), F(0), F(0)
+        for b in range(64):
+            k = stiffness[a, b]
+            s0 += k * local[b, 0]
+            s1 += k * local[b, 1]
+            s2 += k * local[b, 2]
+        load[a, 0] -= weight[0] * s0
+        load[a, 1] -= weight[1] * s1
+        load[a, 2] -= weight[2] * s2
+        energy[0] += local[a, 0] * s0
+        energy[1] += local[a, 1] * s1
+        energy[2] += local[a, 2] * s2
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _row(
+    a: int, stiffness: AnyArray, weight: AnyArray, m3: AnyArray, pairs: AnyArray, with_data: bool, v: AnyArray, swells: bool, row: AnyArray
+) -> None:
+    """Fill row (3, 192) with the matrix of a cell for its coefficient a."""
+    for b in range(64):
+        k = stiffness[a, b]
+        k0, k1, k2 = weight[0] * k, weight[1] * k, weight[2] * k
+        if with_data:
+            q = pairs[a, b]
+            m = m3[q // 100, (q // 10) % 10, q % 10]
+            row[0, 3 * b], row[0, 3 * b + 1], row[0, 3 * b + 2] = k0 + m[0], m[1], m[2]
+            row[1, 3 * b], row[1, 3 * b + 1], row[1, 3 * b + 2] = m[1], k1 + m[3], m[4]
+            row[2, 3 * b], row[2, 3 * b + 1], row[2, 3 * b + 2] = m[2], m[4], k2 + m[5]
+        else:
+            row[0, 3 * b], row[0, 3 * b + 1], row[0, 3 * b + 2] = k0, F(0), F(0)
+            row[1, 3 * b], row[1, 3 * b + 1], row[1, 3 * b + 2] = F(0), k1, F(0)
+            row[2, 3 * b], row[2, 3 * b + 1], row[2, 3 * b + 2] = F(0), F(0), k2
+    if swells:
+        for i in range(3):
+            r = row[i]
+            for q in range(0, 8, 4):
+                t0, t1, t2, t3 = v[q, 3 * a + i], v[q + 1, 3 * a + i], v[q + 2, 3 * a + i], v[q + 3, 3 * a + i]
+                for b in range(192):
+                    r[b] += t0 * v[q, b] + t1 * v[q + 1, b] + t2 * v[q + 2, b] + t3 * v[q + 3, b]
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _gather(c: AnyArray, cell: AnyArray, local: AnyArray) -> None:
+    """Fill local (64, 3) with the coefficients of a cell, relative to one of them: single precision then loses nothing."""
+    z, y, x = cell[2], cell[3], cell[4]
+    for a in range(64):
+        for i in range(3):
+            local[a, i] = c[z + (a >> 4), y + ((a >> 2) & 3), x + (a & 3), i] - c[z + 1, y + 1, x + 1, i]
+
+
+@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
+def assemble(
+    big: AnyArray,
+    right: AnyArray,
+    tasks: AnyArray,
+    cells: AnyArray,
+    slot: AnyArray,
+    c: AnyArray,
+    products: AnyArray,
+    force: AnyArray,
+    which: AnyArray,
+    starts: Any,
+    weights: Any,
+    bending: AnyArray,
+    stiffness: AnyArray,
+    volume: AnyArray,
+    slopes: AnyArray,
+    ratio: float,
+    pairs: AnyArray,
+    bent: AnyArray,
+    swollen: AnyArray,
+) -> None:
+    """Add data, bending and change of volume of all cells to big and right; fill bent (m, 3) and swollen (m,) with energies per weight."""
+    for colour in range(len(tasks) - 1):
+        for task in prange(tasks[colour], tasks[colour + 1]):
+            m1, m2, m3 = np.empty((10, 6), F), np.empty((10, 10, 6), F), np.empty((10, 10, 10, 6), F)
+            f1, f2, load, local = np.empty((4, 3), F), np.empty((4, 4, 3), F), np.empty((64, 3), F), np.empty((64, 3), F)
+            row, v, cof, box = np.empty((3, 192), F), np.empty((8, 192), F), np.empty((3, 3), F), np.empty(6, np.int64)
+            for m in range(cells[task, 0], cells[task, 1]):
+                cell = cells[m]
+                for a in range(3):
+                    box[2 * a], box[2 * a + 1] = starts[a][cell[4 - a]], starts[a][cell[4 - a] + 1]
+                _gather(c, cell, local)
+                load[:] = F(0)
+                found = _moments(products, force, which, box, weights[0], weights[1], weights[2], m1, m2, m3, f1, f2, load)
+                _bent(local, stiffness, bending[m], load, bent[m])
+                if volume[m] > 0:
+                    swollen[m] = _volume_slopes(local, slopes, F(ratio), volume[m], load, v, cof)
+                for a in range(64):
+                    _row(a, stiffness, bending[m], m3, pairs, found, v, volume[m] > 0, row)
+                    az, ay, ax = a >> 4, (a >> 2) & 3, a & 3
+                    n = slot[cell[2] + az, cell[3] + ay, cell[4] + ax]
+                    for i in range(3):
+                        right[n, i] += load[a, i]
+                        for bb in range(16):
+                            o = 3 * (((bb >> 2) - az + 3) * 49 + ((bb & 3) - ay + 3) * 7 + (3 - ax))
+                            for b in range(12):
+                                big[n, i, o + b] += row[i, 12 * bb + b]
+
+
+@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
+def product(big: AnyArray, neighbours: AnyArray, x: AnyArray, y: AnyArray) -> None:
+    """Fill y (n, 3) with A x; x (n + 1, 3) ends in zeros, where neighbours (n, 343) point that there are not."""
+    n = big.shape[0]
+    for t in prange(CHUNKS):
+        near = np.empty(1029, F)
+        for p in range(t * n // CHUNKS, (t + 1) * n // CHUNKS):
+            for o in range(343):
+                q = neighbours[p, o]
+                near[3 * o], near[3 * o + 1], near[3 * o + 2] = x[q, 0], x[q, 1], x[q, 2]
+            s0, s1, s2 = F(0), F(0), F(0)
+            for o in range(1029):
+                s0 += big[p, 0, o] * near[o]
+                s1 += big[p, 1, o] * near[o]
+                s2 += big[p, 2, o] * near[o]
+            y[p, 0], y[p, 1], y[p, 2] = s0, s1, s2
+
+
+@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
+def products_of_many(big: AnyArray, neighbours: AnyArray, x: AnyArray, y: AnyArray) -> None:
+    """Fill y (n, 3, s) with A x of s vectors at once; x (n + 1, 3, s)."""
+    n, samples = big.shape[0], x.shape[2]
+    for t in prange(CHUNKS):
+        sums = np.empty((3, samples), F)
+        for p in range(t * n // CHUNKS, (t + 1) * n // CHUNKS):
+            sums[:] = F(0)
+            for o in range(343):
+                q = neighbours[p, o]
+                if q == n:
+                    continue
+                for j in range(3):
+                    a0, a1, a2 = big[p, 0, 3 * o + j], big[p, 1, 3 * o + j], big[p, 2, 3 * o + j]
+                    for s in range(samples):
+                        v = x[q, j, s]
+                        sums[0, s] += a0 * v
+                        sums[1, s] += a1 * v
+                        sums[2, s] += a2 * v
+            y[p] = sums
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _add_forces(
+    forces: AnyArray, which: AnyArray, box: AnyArray, wx: AnyArray, wy: AnyArray, wz: AnyArray, f1: AnyArray, f2: AnyArray, load: AnyArray
+) -> None:
+    """Add the forces (voxels, 3, s) in a cell to load (64, 3, s)."""
+    samples = forces.shape[2]
+    for z in range(box[4], box[5]):
+        f2[:] = F(0)
+        for y in range(box[2], box[3]):
+            f1[:] = F(0)
+            for x in range(box[0], box[1]):
+                p = which[z, y, x]
+                if p >= 0:
+                    for a in range(4):
+                        for k in range(3):
+                            for s in range(samples):
+                                f1[a, k, s] += wx[x, a] * forces[p, k, s]
+            for a in range(4):
+                for q in range(4):
+                    for k in range(3):
+                        for s in range(samples):
+                            f2[4 * a + q, k, s] += wy[y, a] * f1[q, k, s]
+        for a in range(4):
+            for q in range(16):
+                for k in range(3):
+                    for s in range(samples):
+                        load[16 * a + q, k, s] += wz[z, a] * f2[q, k, s]
+
+
+@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
+def add_noise(
+    loads: AnyArray,
+    tasks: AnyArray,
+    cells: AnyArray,
+    slot: AnyArray,
+    c: AnyArray,
+    forces: AnyArray,
+    which: AnyArray,
+    starts: Any,
+    weights: Any,
+    bends: AnyArray,
+    volume: AnyArray,
+    slopes: AnyArray,
+    swells: AnyArray,
+) -> None:
+    """Add random data and random priors to loads (n, 3, s).
+
+    forces (voxels, 3, s): of random residuals; bends (m, 3, 64, s): random loads of bending; swells (m, 8, s): random changes of volume.
+    """
+    samples = loads.shape[2]
+    for colour in range(len(tasks) - 1):
+        for task in prange(tasks[colour], tasks[colour + 1]):
+            f1, f2, load = np.empty((4, 3, samples), F), np.empty((16, 3, samples), F), np.empty((64, 3, samples), F)
+            local, cof, box = np.empty((64, 3), F), np.empty((3, 3), F), np.empty(6, np.int64)
+            for m in range(cells[task, 0], cells[task, 1]):
+                cell = cells[m]
+                for a in range(3):
+                    box[2 * a], box[2 * a + 1] = starts[a][cell[4 - a]], starts[a][cell[4 - a] + 1]
+                for a in range(64):
+                    for i in range(3):
+                        for s in range(samples):
+                            load[a, i, s] = bends[m, i, a, s]
+                _add_forces(forces, which, box, weights[0], weights[1], weights[2], f1, f2, load)
+                if volume[m] > 0:
+                    _gather(c, cell, local)
+                    for q in range(slopes.shape[0]):
+                        _cofactor(local, slopes, q, cof)
+                        t = F(np.sqrt(volume[m]))
+                        for a in range(64):
+                            for i in range(3):
+                                w = t * (cof[i, 0] * slopes[q, 0, a] + cof[i, 1] * slopes[q, 1, a] + cof[i, 2] * slopes[q, 2, a])
+                                for s in range(samples):
+                                    load[a, i, s] += w * swells[m, q, s]
+                for a in range(64):
+                    n = slot[cell[2] + (a >> 4), cell[3] + ((a >> 2) & 3), cell[4] + (a & 3)]
+                    for i in range(3):
+                        for s in range(samples):
+                            loads[n, i, s] += load[a, i, s]
+
+
+@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
+def sample_energies(
+    x: AnyArray, cells: AnyArray, slot: AnyArray, c: AnyArray, stiffness: AnyArray, slopes: AnyArray, bent: AnyArray, swollen: AnyArray
+) -> None:
+    """Fill the mean over samples x (n + 1, 3, s) of bending per cell (m, 3) and of squared linearised change of volume (m,)."""
+    samples = x.shape[2]
+    for m in prange(len(cells)):
+        cell = cells[m]
+        local, xl, cof, d = np.empty((64, 3), F), np.empty((3, 64, samples), F), np.empty((3, 3), F), np.empty(samples, F)
+        _gather(c, cell, local)
+        for a in range(64):
+            n = slot[cell[2] + (a >> 4), cell[3] + ((a >> 2) & 3), cell[4] + (a & 3)]
+            for i in range(3):
+                for s in range(samples):
+                    xl[i, a, s] = x[n, i, s]
+        for i in range(3):
+            e = F(0)
+            for a in range(64):
+                d[:] = F(0)
+                for b in range(64):
+                    k = stiffness[a, b]
+                    for s in range(samples):
+                        d[s] += k * xl[i, b, s]
+                for s in range(samples):
+                    e += d[s] * xl[i, a, s]
+            bent[m, i] = e / samples
+        e = F(0)
+        for q in range(slopes.shape[0]):
+            _cofactor(local, slopes, q, cof)
+            d[:] = F(0)
+            for i in range(3):
+                for a in range(64):
+                    w = cof[i, 0] * slopes[q, 0, a] + cof[i, 1] * slopes[q, 1, a] + cof[i, 2] * slopes[q, 2, a]
+                    for s in range(samples):
+                        d[s] += w * xl[i, a, s]
+            for s in range(samples):
+                e += d[s] * d[s]
+        swollen[m] = e / samples

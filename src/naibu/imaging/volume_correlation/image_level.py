@@ -1,0 +1,121 @@
+"""Two scans at one resolution, as volume correlation compares them: voxels of the object, their slopes, and the gain between the scans."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import linalg, ndimage
+
+from naibu.core.arrays import BoolArray, Float32Array, FloatArray
+from naibu.imaging.volume_correlation._warp_kernels import OUTSIDE, gain_normal_equations, gain_values, sample_spline
+
+MARGIN = 12  # voxels about the object that are kept of the reference
+GAIN_RANGE = (0.2, 5.0)
+# prior scatter of the gain, of itself, and of the offset, of the scatter of the grey values
+GAIN_SCATTER = 0.1
+ENOUGH = 30000  # voxels for one gain
+
+
+class ImageLevel:
+    """Both scans smoothed and thinned out, with the voxels of the object in a list.
+
+    Attributes
+    ----------
+    spacing : ndarray, shape (3,)
+        Distance of voxels, mm.
+    low, high : ndarray, shape (3,), int
+        Box of the object along z, y, x.
+    mask : ndarray, bool
+        The object in its box.
+    number : ndarray, int32
+        Place of every voxel of the box in the list, -1 outside the object.
+    index : ndarray, shape (n, 3), float32
+        Indices x, y, z of the listed voxels.
+    grey : ndarray, shape (n,), float32
+        Their grey values in the reference.
+    slope : ndarray, shape (n, 3), float32
+        Slopes of the reference, per mm.
+    deformed : ndarray, float32
+        Spline coefficients of the deformed scan, padded.
+    runs : ndarray, shape (m, 5), int64
+        Lines of voxels: z, y, first x, x after the last, all in the box, and place in the list.
+    """
+
+    def __init__(
+        self, reference: Float32Array, deformed: Float32Array, mask: BoolArray, spacing: FloatArray, stride: ArrayLike, sigma: float
+    ) -> None:
+        every = np.asarray(stride, dtype=int)[::-1]
+        thin = tuple(slice(None, None, int(s)) for s in every)
+        coarse = mask[thin]
+        where = np.argwhere(coarse)
+        self.low, self.high = where.min(axis=0), where.max(axis=0) + 1
+        self.spacing = spacing * every[::-1]
+        box = tuple(slice(int(a), int(b)) for a, b in zip(self.low, self.high, strict=True))
+        near_low = np.maximum(self.low * every - MARGIN * every, 0) // every * every
+        near = tuple(slice(int(a), int(b)) for a, b in zip(near_low, self.high * every + MARGIN * every, strict=True))
+        with ThreadPoolExecutor(2) as pool:
+            jobs = [pool.submit(_thinned, v, sigma * every, thin) for v in (reference[near], deformed)]
+            (before, before_spline), (_, self.deformed) = (job.result() for job in jobs)
+        shift = near_low // every
+        inner = tuple(slice(int(a), int(b)) for a, b in zip(self.low - shift, self.high - shift, strict=True))
+        self.mask = coarse[box]
+        self.number = np.full(self.mask.shape, -1, dtype=np.int32)
+        at = np.argwhere(self.mask)
+        self.number[self.mask] = np.arange(len(at))
+        self.index = np.ascontiguousarray((at + self.low)[:, ::-1]).astype(np.float32)
+        self.grey = np.ascontiguousarray(before[inner][self.mask])
+        value, slope = np.empty(len(at), np.float32), np.empty((len(at), 3), np.float32)
+        sample_spline(before_spline, self.index - shift[::-1].astype(np.float32), value, slope)
+        self.slope = slope / self.spacing.astype(np.float32)
+        edges = np.diff(np.pad(self.mask.astype(np.int8), ((0, 0), (0, 0), (1, 1))), axis=2)
+        first, last = np.argwhere(edges == 1), np.argwhere(edges == -1)
+        self.runs = np.column_stack([first, last[:, 2], self.number[tuple(first.T)]]).astype(np.int64)
+
+    @property
+    def axes_mm(self) -> list[FloatArray]:
+        """Coordinates of the voxels of the box along x, y, z, mm."""
+        return [np.arange(self.low[2 - a], self.high[2 - a]) * self.spacing[a] for a in range(3)]
+
+
+def _thinned(values: Float32Array, sigma: FloatArray, thin: tuple[slice, ...]) -> tuple[Float32Array, Float32Array]:
+    smooth = ndimage.gaussian_filter(values, sigma, mode="nearest", truncate=3.0)[thin]
+    spline = ndimage.spline_filter(smooth, 3, output=np.float32, mode="mirror")
+    return smooth, np.pad(spline, ((1, 2),) * 3, mode="reflect")
+
+
+class GainMap:
+    """Gain and offset that bring the deformed scan to the grey values of the reference, trilinear on a coarse lattice."""
+
+    def __init__(self, level: ImageLevel, cell_mm: float) -> None:
+        self.level = level
+        size = (level.high - level.low)[::-1]
+        self.n = np.maximum(2, np.round(size * level.spacing / cell_mm).astype(np.int64) + 1)
+        self.low, self.step = level.low[::-1].astype(float), np.maximum(size - 1, 1) / (self.n - 1)
+
+    def everywhere(self, value: Float32Array, weight: Float32Array) -> tuple[float, float, float]:
+        """Return one gain and offset for all, and the scatter of the grey values."""
+        some = slice(None, None, max(1, len(value) // ENOUGH))
+        ok = value[some] > 0.9 * OUTSIDE
+        f, g, w = (np.asarray(v[some][ok], dtype=float) for v in (self.level.grey, value, weight))
+        total = max(float(w.sum()), 1e-30)
+        mean_f, mean_g = float(w @ f) / total, float(w @ g) / total
+        spread, wanted = float(w @ (g - mean_g) ** 2), float(w @ (f - mean_f) ** 2)
+        # the ratio of scatters: what a regression finds is too small while the scans are not yet in register
+        gain = float(np.clip(np.sqrt(wanted / max(spread, 1e-30)), *GAIN_RANGE))
+        return gain, mean_f - gain * mean_g, float(np.sqrt(spread / total))
+
+    def local(self, value: Float32Array, weight: Float32Array, variance: float) -> tuple[Float32Array, Float32Array]:
+        """Return gain and offset (n,) at the listed voxels, the most probable ones given the residual's variance."""
+        gain, offset, spread = self.everywhere(value, weight)
+        n = int(np.prod(self.n))
+        left, right = np.zeros((2, 2 * n, 2 * n)), np.zeros((2, 2 * n))
+        gain_normal_equations(self.level.grey, value, weight, self.level.index, self.low, self.step, self.n, left, right)
+        matrix, load = left.sum(axis=0) / variance, right.sum(axis=0) / variance
+        first = np.tile([gain, offset], n)
+        prior = np.tile([(GAIN_SCATTER * gain) ** -2, (GAIN_SCATTER * gain * max(spread, 1e-30)) ** -2], n)
+        solution = first + linalg.solve(matrix + np.diag(prior), load - matrix @ first, assume_a="pos")
+        a, b = np.empty(len(value), np.float32), np.empty(len(value), np.float32)
+        gain_values(solution, self.level.index, self.low, self.step, self.n, a, b)
+        return a, b

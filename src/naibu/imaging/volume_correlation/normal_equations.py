@@ -1,0 +1,202 @@
+"""The normal equations of volume correlation: their assembly, solution, and random samples of what the data leave open."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from naibu.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from naibu.imaging.volume_correlation._spline_kernels import add_noise, assemble, product, products_of_many, sample_energies
+from naibu.imaging.volume_correlation._warp_kernels import warp_voxels
+from naibu.imaging.volume_correlation.image_level import ImageLevel
+from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable
+
+INSIDE = 0.5  # share of a cell that must lie in the object for its volume to be watched
+REACH = 7
+APART = 3
+
+
+class SplineSystem:
+    """Equations for the coefficients of a grid of splines, from the voxels of a level.
+
+    Only cells with voxels of the object count, and only coefficients those see are unknown.
+
+    Attributes
+    ----------
+    level, grid : ImageLevel, SplineGrid
+        Voxels and cells.
+    active : ndarray, shape (NZ, NY, NX), bool
+        Which coefficients are unknown; n of them.
+    cells : ndarray, shape (m, 5), int64
+        First and last cell of the task of that number, and z, y, x of the cell.
+    share : ndarray, shape (m,)
+        Share of the cell that lies in the object.
+    bent, swollen : ndarray, shape (m, 3) and (m,)
+        Energies of the field per unit weight, after `assembled`.
+    ratio : float
+        Volume after to volume before, from which changes of volume count.
+    """
+
+    def __init__(self, level: ImageLevel, grid: SplineGrid, ratio: float = 1.0) -> None:
+        self.ratio = ratio
+        self.level, self.grid = level, grid
+        tables = [[grid.table(a, level.axes_mm[a], d) for d in (0, 1)] for a in range(3)]
+        self.cell_of = tuple(t[0][0] for t in tables)
+        self.weights = tuple(np.ascontiguousarray(t[0][1], dtype=np.float32) for t in tables)
+        self.slopes = tuple(np.ascontiguousarray(t[1][1], dtype=np.float32) for t in tables)
+        self.starts = tuple(np.searchsorted(c, np.arange(n + 1)).astype(np.int64) for c, n in zip(self.cell_of, grid.cells, strict=True))
+        self._order_cells()
+        self._number_nodes()
+        bending = grid.bending()
+        values, vectors = np.linalg.eigh(bending)
+        self.stiffness, self.root = bending.astype(np.float32), (vectors * np.sqrt(np.maximum(values, 0))).astype(np.float32)
+        self.gauss = grid.gauss_slopes().astype(np.float32)
+        self.pairs = _pair_numbers()
+        # weight of the volume of a Gauss point, mm^3, where the cell lies in the object
+        self.watched = np.where(self.share > INSIDE, np.prod(grid.step_mm) / 8, 0.0)
+        self.matrix = np.empty((self.n, 3, 3 * REACH**3), np.float32)
+        self.bent, self.swollen = np.zeros((len(self.cells), 3), np.float32), np.zeros(len(self.cells), np.float32)
+
+    @property
+    def inner(self) -> BoolArray:
+        """Which cells (m,) lie in the object; all where none does by more than a half."""
+        inside = self.share > INSIDE
+        return inside if inside.any() else np.ones_like(inside)
+
+    @property
+    def n(self) -> int:
+        """Number of nodes with unknown coefficients."""
+        return len(self.nodes[0])
+
+    def _order_cells(self) -> None:
+        inside = []
+        for cell, n in zip(self.cell_of, self.grid.cells, strict=True):
+            one = np.zeros((int(n), len(cell)))
+            one[cell, np.arange(len(cell))] = 1
+            inside.append(one)
+        count = separable(inside, self.level.mask.astype(float))
+        z, y, x = np.nonzero(count > 0)
+        # columns of APART x APART cells are tasks; every other column shares no node
+        tall, wide = z // APART, y // APART
+        colour = (tall % 2) * 2 + wide % 2
+        order = np.lexsort((x, y, z, wide, tall, colour))
+        z, y, x, colour = z[order], y[order], x[order], colour[order]
+        key = np.stack([colour, tall[order], wide[order]])
+        first = np.flatnonzero(np.r_[True, (np.diff(key, axis=1) != 0).any(axis=0)])
+        self.tasks = np.searchsorted(colour[first], np.arange(5)).astype(np.int64)
+        self.cells = np.zeros((len(z), 5), np.int64)
+        self.cells[: len(first), 0], self.cells[: len(first), 1] = first, np.r_[first[1:], len(z)]
+        self.cells[:, 2], self.cells[:, 3], self.cells[:, 4] = z, y, x
+        self.share = count[z, y, x] * np.prod(self.level.spacing / self.grid.step_mm)
+
+    def _number_nodes(self) -> None:
+        self.active = np.zeros(self.grid.shape, dtype=bool)
+        z, y, x = self.cells[:, 2:].T
+        for a in range(64):
+            self.active[z + (a >> 4), y + ((a >> 2) & 3), x + (a & 3)] = True
+        self.nodes = np.nonzero(self.active)
+        n = len(self.nodes[0])
+        self.slot = np.full(self.active.shape, -1, np.int64)
+        self.slot[self.active] = np.arange(n)
+        wide = np.full(tuple(s + 6 for s in self.active.shape), n, np.int32)
+        wide[3:-3, 3:-3, 3:-3][self.active] = np.arange(n)
+        z, y, x = self.nodes
+        self.neighbours = np.empty((n, REACH**3), np.int32)
+        for o in range(REACH**3):
+            self.neighbours[:, o] = wide[z + o // 49, y + (o // 7) % 7, x + o % 7]
+
+    def at_middles(self, coefficients: Float32Array) -> FloatArray:
+        """Return the field (k, 3) of coefficients (n, 3) in the middles of the cells that lie in the object."""
+        full = np.zeros((*self.active.shape, 3))
+        full[self.active] = coefficients
+        return self.grid.values(full, self.grid.origin_mm + (self.cells[self.inner][:, :1:-1] + 0.5) * self.grid.step_mm)
+
+    def warped(self, c: FloatArray, value: Float32Array, reference_slope: Float32Array, slope: Float32Array, move: Float32Array) -> None:
+        """Fill what the voxels see where coefficients c (NZ, NY, NX, 3), mm, move them: see `warp_voxels`."""
+        level = self.level
+        warp_voxels(
+            c.astype(np.float32), level.runs, self.cell_of, self.weights, self.slopes, level.low[::-1].astype(np.float32),
+            (1 / level.spacing).astype(np.float32), level.deformed, level.slope, value, reference_slope, slope, move,
+        )  # fmt: skip
+
+    def assembled(
+        self, c: FloatArray, products: Float32Array, force: Float32Array, bending: FloatArray, volume: FloatArray
+    ) -> Float32Array:
+        """Make the matrix, and return the right side (n, 3), at coefficients c; bending (m, 3) and volume (m,) are weights of the cells."""
+        self.matrix[:] = 0
+        right = np.zeros((self.n, 3), np.float32)
+        self.bent[:], self.swollen[:] = 0, 0
+        assemble(
+            self.matrix, right, self.tasks, self.cells, self.slot, c.astype(np.float32), products, force, self.level.number, self.starts,
+            self.weights, bending.astype(np.float32), self.stiffness, volume.astype(np.float32), self.gauss, self.ratio, self.pairs,
+            self.bent, self.swollen,
+        )  # fmt: skip
+        middle = 3 * (REACH**3 // 2)
+        self.inverse = np.linalg.inv(self.matrix[:, :, middle : middle + 3].astype(float)).astype(np.float32)
+        return right
+
+    def solved(self, load: Float32Array, tolerance: float, most: int = 100) -> tuple[Float32Array, int]:
+        """Return A^-1 load (n, 3) by conjugate gradients, preconditioned by the blocks of the nodes, and the number of iterations."""
+        x, steps = self.solved_many(load[:, :, None], tolerance, most)
+        return x[:, :, 0], steps
+
+    def solved_many(self, loads: Float32Array, tolerance: float, most: int = 100) -> tuple[Float32Array, int]:
+        """Return A^-1 loads (n, 3, s), all at once, and the number of iterations."""
+        n, single = self.n, loads.shape[2] == 1
+        x, r = np.zeros_like(loads), loads.copy()
+        p, ap = np.zeros((n + 1, *loads.shape[1:]), np.float32), np.empty_like(loads)
+        z = self.inverse @ r
+        p[:n] = z
+        rz = first = _dot(r, z)
+        steps = 0
+        while steps < most:
+            steps += 1
+            if single:
+                product(self.matrix, self.neighbours, p[:, :, 0], ap[:, :, 0])
+            else:
+                products_of_many(self.matrix, self.neighbours, p, ap)
+            alpha = (rz / np.maximum(_dot(p[:n], ap), 1e-30)).astype(np.float32)
+            x += alpha * p[:n]
+            r -= alpha * ap
+            z = self.inverse @ r
+            new = _dot(r, z)
+            if (new <= tolerance**2 * first).all():
+                break
+            p[:n] *= (new / np.maximum(rz, 1e-30)).astype(np.float32)
+            p[:n] += z
+            rz = new
+        return x, steps
+
+    def noise_loads(
+        self, c: FloatArray, forces: Float32Array, bending: FloatArray, volume: FloatArray, rng: np.random.Generator
+    ) -> Float32Array:
+        """Return loads (n, 3, s) of random residuals, given as forces (voxels, 3, s), and of random draws from the priors."""
+        count, m = forces.shape[2], len(self.cells)
+        loads = np.zeros((self.n, 3, count), np.float32)
+        drawn = rng.standard_normal((m, 3, 64, count), dtype=np.float32) * np.sqrt(bending)[:, :, None, None].astype(np.float32)
+        add_noise(
+            loads, self.tasks, self.cells, self.slot, c.astype(np.float32), forces, self.level.number, self.starts, self.weights,
+            np.matmul(self.root, drawn), volume.astype(np.float32), self.gauss, rng.standard_normal((m, 8, count), dtype=np.float32),
+        )  # fmt: skip
+        return loads
+
+    def energies(self, samples: Float32Array, c: FloatArray) -> tuple[Float32Array, Float32Array]:
+        """Return the mean energies (m, 3) and (m,), as `bent` and `swollen`, of samples (n, 3, s) about coefficients c."""
+        bent, swollen = np.zeros_like(self.bent), np.zeros_like(self.swollen)
+        x = np.concatenate([samples, np.zeros((1, *samples.shape[1:]), np.float32)])
+        sample_energies(x, self.cells, self.slot, c.astype(np.float32), self.stiffness, self.gauss, bent, swollen)
+        return bent, swollen
+
+
+def _dot(a: Float32Array, b: Float32Array) -> FloatArray:
+    return np.asarray(np.einsum("nis,nis->s", a, b, dtype=np.float64))
+
+
+def _pair_numbers() -> IntArray:
+    """Return for every two splines of a cell the three digits that number their pairs along z, y, x."""
+    one = np.zeros((4, 4), np.int64)
+    upper = np.triu_indices(4)
+    one[upper] = np.arange(10)
+    one = np.maximum(one, one.T)
+    a = np.arange(64)
+    z, y, x = a >> 4, (a >> 2) & 3, a & 3
+    return np.asarray(one[z[:, None], z] * 100 + one[y[:, None], y] * 10 + one[x[:, None], x])

@@ -1,0 +1,320 @@
+"""What volume correlation returns: a displacement with its gradient, its covariance, and where it holds (spec S7, S8)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import ndimage
+
+from naibu.core.arrays import BoolArray, Float32Array, FloatArray, Int32Array, IntArray
+from naibu.core.displacement_field import Field
+from naibu.core.errors import InputError
+from naibu.core.volume import Volume
+from naibu.imaging.preprocessing.resampling import positions
+from naibu.imaging.volume_correlation.gauss_newton import Correlation
+from naibu.imaging.volume_correlation.rigid_inclusions import BodyMotion
+from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable
+
+VOXELS_A_CELL = 6
+# cells: few samples of neighbours are worth more samples of one
+SHARED = 0.7
+STILL = 0.1  # voxels
+# displacement that is missed, of the root mean square second derivative times the square of what is resolved
+UNRESOLVED = 0.055
+SQUARE = 151 / 315  # sum of the squares of a spline along an axis
+LEAST_SHARE = 0.003  # the data of so little are not asked: seven cells is as far as a field is believed to be smooth
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CorrelatedDisplacement:
+    """Displacement between two scans by volume correlation.
+
+    Attributes
+    ----------
+    vectors : ndarray, shape (nz, ny, nx, 3)
+        Displacement along x, y, z, mm: the material at x is found at x + u(x); NaN where it is not valid.
+    valid : ndarray, shape (nz, ny, nx), bool
+        The object, where it lies in the deformed scan after its motion.
+    volume : Volume
+        Geometry of the reference.
+    grid : SplineGrid
+        Where the coefficients stand, along the axes of the volume.
+    coefficients : ndarray, shape (NZ, NY, NX, 3)
+        Of the splines, mm along the axes of the volume.
+    cell_covariance : ndarray, shape (CZ, CY, CX, 3, 3)
+        Covariance of the displacement in every cell of the grid, mm^2 along x, y, z; NaN where there is no object.
+    bending, swelling : ndarray, shape (CZ, CY, CX, 3), and float
+        Weights that were used: of squared second derivatives per component, 1/mm along the axes of the volume, and of squared change of
+        volume, 1/mm^3; NaN where there is no object.
+    noise : float
+        Standard deviation of the residual, grey values of the reference.
+    gain, offset : ndarray, shape (nz, ny, nx)
+        Which bring the deformed scan to the reference; NaN where it is not valid.
+    converged : ndarray, shape (CZ, CY, CX), bool
+        Whether the last step moved a cell of the grid by less than a tenth of a voxel; true where there is no object.
+    bodies : ndarray, shape (nz, ny, nx), int32
+        Number of the rigid body of a voxel, 0 in soft matter.
+    motions : tuple of BodyMotion
+        How the bodies move: their voxels have this displacement, its gradient and its covariance, not those of the splines.
+    status : str
+        How the iterations ended, and where they did not.
+    """
+
+    vectors: FloatArray
+    valid: BoolArray
+    volume: Volume
+    grid: SplineGrid
+    coefficients: FloatArray
+    cell_covariance: FloatArray
+    bending: FloatArray
+    swelling: float
+    noise: float
+    gain: FloatArray
+    offset: FloatArray
+    converged: BoolArray
+    bodies: Int32Array
+    motions: tuple[BodyMotion, ...]
+    status: str
+
+    @property
+    def unconverged_mm(self) -> FloatArray:
+        """Middles (n, 3), mm, of the cells that were still moving."""
+        return _middles_mm(self.grid, self.volume, ~self.converged)
+
+    def gradient(self) -> FloatArray:
+        """Return du_i/dx_j (nz, ny, nx, 3, 3) at the voxels, from the splines, along the axes of space; NaN where it is not valid."""
+        axes = [np.arange(n) * s for n, s in zip(self.volume.shape[::-1], self.volume.spacing_mm, strict=True)]
+        plain = [self.grid.matrix(a, axes[a]) for a in range(3)]
+        out = np.empty((*self.volume.shape, 3, 3))
+        for j in range(3):
+            matrices = list(plain)
+            matrices[j] = self.grid.matrix(j, axes[j], 1)
+            out[..., j] = separable(matrices, self.coefficients)
+        r = self.volume.direction
+        if not np.array_equal(r, np.eye(3)):
+            out = r @ out @ r.T
+        for motion in self.motions:
+            out[self.bodies == motion.number] = r @ (motion.rotation - np.eye(3)) @ r.T
+        out[~self.valid] = np.nan
+        return out
+
+    def displacement_at(self, points_mm: ArrayLike) -> FloatArray:
+        """Return the displacement (n, 3), mm, at positions (n, 3), mm; NaN further than a cell from the object."""
+        local = self._local(points_mm)
+        out = self.grid.values(self.coefficients, local)
+        out[~np.isfinite(self._cells_at(local)[:, 0, 0])] = np.nan
+        for motion, here in self._in_bodies(local):
+            out[here] = motion.displacement(local[here])
+        return np.asarray(out @ self.volume.direction.T)
+
+    def covariance_at(self, points_mm: ArrayLike) -> FloatArray:
+        """Return the covariance (n, 3, 3), mm^2, at positions (n, 3), mm: linear between the middles of cells; NaN away from the object.
+
+        Errors of points less than about two cells apart are correlated.
+        """
+        return self._covariance(self._local(points_mm))
+
+    def covariance(self) -> Float32Array:
+        """Return the covariance (nz, ny, nx, 3, 3), mm^2, at the voxels; NaN where it is not valid."""
+        out = np.full((*self.volume.shape, 3, 3), np.nan, np.float32)
+        out[self.valid] = self._covariance(np.argwhere(self.valid)[:, ::-1] * self.volume.spacing_mm)
+        return out
+
+    def field(self, *, step: int | tuple[int, int, int] | None = None) -> Field:
+        """Return points with displacement and covariance, as identification takes them.
+
+        Parameters
+        ----------
+        step : int or tuple of int, optional
+            Every `step`-th voxel along x, y, z; by default one about every cell of the grid, so that errors of neighbours have little in
+            common.
+
+        Raises
+        ------
+        InputError
+            A step below one, or steps that leave no point.
+        """
+        if step is None:
+            every = np.maximum(np.round(self.grid.step_mm / self.volume.spacing_mm), 1).astype(int)
+        else:
+            every = np.broadcast_to(np.asarray(step, dtype=int), 3)
+        if (every < 1).any():
+            raise InputError(f"step must be 1 or more voxels, not {step}")
+        # start in the middle of the first step, so that both ends are treated alike
+        some = np.zeros(self.valid.shape, dtype=bool)
+        some[tuple(slice(int(e) // 2, None, int(e)) for e in every[::-1])] = True
+        some &= self.valid
+        if not some.any():
+            raise InputError(f"no voxel of the object is left at every {every.tolist()}-th voxel; give a smaller step")
+        points = positions(self.volume)[some]
+        return Field.from_arrays(points, self.vectors[some], covariance=self.covariance_at(points))
+
+    def _local(self, points_mm: ArrayLike) -> FloatArray:
+        return self.volume.to_index(points_mm) * self.volume.spacing_mm
+
+    def _in_bodies(self, local_mm: FloatArray) -> Iterator[tuple[BodyMotion, BoolArray]]:
+        if not self.motions:
+            return
+        at = np.rint(local_mm / self.volume.spacing_mm).astype(int)
+        size = np.array(self.volume.shape[::-1])
+        x, y, z = np.clip(at, 0, size - 1).T
+        number = np.where(((at >= 0) & (at < size)).all(axis=1), self.bodies[z, y, x], 0)
+        for motion in self.motions:
+            yield motion, number == motion.number
+
+    def _covariance(self, local_mm: FloatArray) -> FloatArray:
+        out, r = self._cells_at(local_mm), self.volume.direction
+        for motion, here in self._in_bodies(local_mm):
+            out[here] = r @ motion.displacement_covariance(local_mm[here]) @ r.T
+        return out
+
+    def _cells_at(self, local_mm: FloatArray) -> FloatArray:
+        """Interpolate the covariance of cells, among those that have one."""
+        n = np.array(self.cell_covariance.shape[2::-1])
+        t = (local_mm - self.grid.origin_mm) / self.grid.step_mm - 0.5
+        low = np.floor(t).astype(int)
+        out, total = np.zeros((len(t), 3, 3)), np.zeros(len(t))
+        known = np.isfinite(self.cell_covariance[..., 0, 0])
+        filled = np.where(known[..., None, None], self.cell_covariance, 0.0)
+        for q in range(8):
+            bit = np.array([q & 1, (q >> 1) & 1, q >> 2])
+            at = low + bit
+            inside = ((at >= 0) & (at < n)).all(axis=1)
+            x, y, z = np.clip(at, 0, n - 1).T
+            w = np.where(inside & known[z, y, x], np.maximum(np.prod(np.where(bit, t - low, 1 - (t - low)), axis=1), 1e-9), 0.0)
+            out += w[:, None, None] * filled[z, y, x]
+            total += w
+        out[total > 0] /= total[total > 0, None, None]
+        out[total == 0] = np.nan
+        return out
+
+
+def collected(
+    volume: Volume, mask: BoolArray, fit: Correlation, c: FloatArray, samples: Float32Array, bending: FloatArray, swelling: float
+) -> CorrelatedDisplacement:
+    """Return the result of a fit at full resolution; `samples` (n, 3, s) are random coefficients about c (behind volume correlation)."""
+    system, level = fit.system, fit.level
+    box = tuple(slice(int(a), int(b)) for a, b in zip(level.low, level.high, strict=True))
+    valid = np.zeros(volume.shape, dtype=bool)
+    inside = level.mask.copy()
+    inside[level.mask] = fit.seen
+    valid[box] = inside
+    axes = [np.arange(n) * s for n, s in zip(volume.shape[::-1], volume.spacing_mm, strict=True)]
+    vectors = separable([system.grid.matrix(a, axes[a]) for a in range(3)], c)
+    bodies = np.zeros(volume.shape, np.int32)
+    motions = tuple(body.motion for body in fit.bodies)
+    for body, motion in zip(fit.bodies, motions, strict=True):
+        x, y, z = level.index[body.voxels].astype(int).T
+        bodies[z, y, x] = body.number
+        vectors[z, y, x] = motion.displacement(body.points)
+    if not np.array_equal(volume.direction, np.eye(3)):
+        vectors = vectors @ volume.direction.T
+    vectors[~valid] = np.nan
+    maps = [np.full(volume.shape, np.nan) for _ in range(2)]
+    for full, listed in zip(maps, (fit.gain, fit.offset), strict=True):
+        full[valid] = listed[fit.seen]
+    covariance = _per_cell(
+        system.grid, fit, sampled_covariance(fit, samples) + _unresolved(fit, c, samples, bending)[:, None, None] * np.eye(3)
+    )
+    converged = np.ones(tuple(int(n) for n in system.grid.cells[::-1]), dtype=bool)
+    still = np.linalg.norm(system.at_middles(fit.last_step), axis=1) <= STILL * np.prod(level.spacing) ** (1 / 3)
+    converged[tuple(system.cells[system.inner, 2:].T)] = still
+    return CorrelatedDisplacement(
+        vectors, valid, volume, system.grid, c, volume.direction @ covariance @ volume.direction.T, _per_cell(system.grid, fit, bending),
+        swelling, fit.scatter, maps[0], maps[1], converged, bodies, motions, _status(system.grid, volume, converged),
+    )  # fmt: skip
+
+
+def sampled_covariance(fit: Correlation, samples: Float32Array) -> FloatArray:
+    """Return the mean covariance (m, 3, 3), mm^2 along the axes of the volume, of the voxels of every cell.
+
+    Parameters
+    ----------
+    fit : Correlation
+        The fit.
+    samples : ndarray, shape (n, 3, s)
+        Random coefficients about those of the fit, mm.
+    """
+    system = fit.system
+    cells, at = _some_voxels(fit)
+    full = np.zeros((*system.active.shape, *samples.shape[1:]), np.float32)
+    full[system.active] = samples
+    moves = system.grid.values(full, fit.level.index[at] * fit.level.spacing)
+    each = np.einsum("nis,njs->nij", moves, moves) / samples.shape[2]
+    total, count = np.zeros((len(system.cells), 3, 3)), np.bincount(cells, minlength=len(system.cells))
+    np.add.at(total, cells, each)
+    dense = np.zeros((*(int(n) for n in system.grid.cells[::-1]), 10))
+    z, y, x = system.cells[:, 2:].T
+    # a cell counts as much as it holds of the object: what little a rim cell holds is near its neighbours
+    dense[z, y, x, 0] = np.maximum(count, 1e-6)
+    dense[z, y, x, 1:] = total.reshape(-1, 9)
+    wide = ndimage.gaussian_filter(dense, (SHARED, SHARED, SHARED, 0), mode="constant", truncate=3.0)[z, y, x]
+    return np.asarray((wide[:, 1:] / wide[:, :1]).reshape(-1, 3, 3))
+
+
+def _unresolved(fit: Correlation, c: FloatArray, samples: Float32Array, bending: FloatArray) -> FloatArray:
+    """Return the variance (m,), mm^2, of what the field does not follow, being finer than the data resolve.
+
+    Notes
+    -----
+    Where the data make up a share s of the stiffness of a coefficient, theirs and that of bending, they resolve lengths of about
+    ``h s^(-1/3)``. What is finer is missed: the second derivative of the field, as likely as the samples say, times the square of that
+    length.
+    """
+    system = fit.system
+    h = float(np.prod(system.grid.step_mm) ** (1 / 3))
+    likely = (system.bent + system.energies(samples, c)[0]).astype(float).mean(axis=1) / h**3
+    cell, _ = cells_of_voxels(fit)
+    known = np.bincount(cell, fit.products[:, [0, 3, 5]].sum(axis=1) / 3, minlength=len(system.cells))
+    dense = np.zeros((*(int(n) for n in system.grid.cells[::-1]), 2))
+    at = tuple(system.cells[:, 2:].T)
+    dense[at] = np.stack([SQUARE**3 * known, bending.mean(axis=1) * float(np.trace(system.stiffness))], axis=-1)
+    wide = ndimage.gaussian_filter(dense, (SHARED, SHARED, SHARED, 0), mode="constant", truncate=3.0)[at]
+    share = np.clip(wide[:, 0] / wide.sum(axis=1), LEAST_SHARE, 1.0)
+    return np.asarray((UNRESOLVED * h**2) ** 2 * share ** (-4 / 3) * likely)
+
+
+def cells_of_voxels(fit: Correlation) -> tuple[IntArray, IntArray]:
+    """Return the cell of every listed voxel (n,), and the number of voxels of every cell (m,)."""
+    system, level = fit.system, fit.level
+    where = (level.index.astype(np.int64) - level.low[::-1]).T
+    number = np.full(tuple(int(n) for n in system.grid.cells[::-1]), -1, np.int64)
+    number[tuple(system.cells[:, 2:].T)] = np.arange(len(system.cells))
+    of = number[tuple(system.cell_of[a][where[a]] for a in (2, 1, 0))]
+    return of, np.bincount(of, minlength=len(system.cells))
+
+
+def _some_voxels(fit: Correlation) -> tuple[IntArray, IntArray]:
+    """Return cells and listed voxels, a few of them spread over every cell."""
+    of, count = cells_of_voxels(fit)
+    order = np.argsort(of, kind="stable")
+    first = np.cumsum(count) - count
+    rank = np.arange(len(of)) - first[of[order]]
+    # voxels in the middles of so many equal stretches of the cell's list
+    n = np.minimum(count, VOXELS_A_CELL)[of[order]]
+    size = count[of[order]]
+    chosen = (rank * n) // size != ((rank - 1) * n) // size
+    return of[order][chosen], order[chosen]
+
+
+def _per_cell(grid: SplineGrid, fit: Correlation, values: FloatArray) -> FloatArray:
+    out = np.full((*(int(n) for n in grid.cells[::-1]), *values.shape[1:]), np.nan)
+    out[tuple(fit.system.cells[:, 2:].T)] = values
+    return out
+
+
+def _middles_mm(grid: SplineGrid, volume: Volume, which: BoolArray) -> FloatArray:
+    """Return the middles (n, 3), mm, of some cells."""
+    local = grid.origin_mm + (np.argwhere(which)[:, ::-1] + 0.5) * grid.step_mm
+    return volume.to_physical(local / volume.spacing_mm)
+
+
+def _status(grid: SplineGrid, volume: Volume, converged: BoolArray) -> str:
+    if converged.all():
+        return "converged: no cell moved by more than a tenth of a voxel in the last step"
+    at = _middles_mm(grid, volume, ~converged)
+    low, high = np.round(at.min(axis=0), 1).tolist(), np.round(at.max(axis=0), 1).tolist()
+    return f"{len(at)} cells were still moving in the last step, between {low} and {high} mm: see unconverged_mm"

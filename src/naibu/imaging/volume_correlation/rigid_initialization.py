@@ -1,0 +1,128 @@
+"""The rigid motion from which volume correlation starts: Gauss-Newton on grey values, from several first guesses (spec S2)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy import fft
+from scipy.spatial.transform import Rotation
+
+from naibu.core.arrays import BoolArray, Float32Array, FloatArray
+from naibu.imaging.volume_correlation._warp_kernels import OUTSIDE, sample_spline
+from naibu.imaging.volume_correlation.image_level import ImageLevel
+
+TURN = np.deg2rad(10.0)
+FIRST_STEPS, LAST_STEPS = 6, 30
+ROBUST = 2.0  # multiples of the scatter
+# how strongly the shift is held where it was guessed, of what the grey values say: along a limb they may say little
+HELD = 0.1
+HELD_SHAPE = 0.1  # the same for an affine motion, of the outline's
+BEST = 3  # guesses that are followed to the end
+
+
+class RigidStart:
+    """Rigid motion of the listed voxels of a level: x to ``R (x - middle) + middle + t``, mm along the axes of the volume."""
+
+    def __init__(self, level: ImageLevel) -> None:
+        self.level = level
+        self.points = level.index.astype(float) * level.spacing
+        self.middle = self.points.mean(axis=0)
+        self.value, self.slope = np.empty(len(self.points), np.float32), np.empty((len(self.points), 3), np.float32)
+
+    def found(self, shifts: list[FloatArray]) -> tuple[FloatArray, FloatArray, float]:
+        """Return rotation (3, 3), translation (3,), mm, about the first voxel, and likeness, from guesses of the shift (3,), mm."""
+        tried = []
+        for rotation, shift in _guesses(shifts):
+            motion = self._improved(rotation, shift, shift, FIRST_STEPS)
+            tried.append((self.likeness(*motion), *motion, shift))
+        tried.sort(key=lambda t: -t[0])
+        ended = [self._improved(r, t, guess, LAST_STEPS) for _, r, t, guess in tried[:BEST]]
+        rotation, shift = max(ended, key=lambda m: self.likeness(*m))
+        return rotation, shift + self.middle - rotation @ self.middle, self.likeness(rotation, shift)
+
+    def stretched(self, linear: FloatArray, shift: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        """Return matrix (3, 3) and translation (3,), mm, of the affine motion found from a first one, and its likeness."""
+        level, arm = self.level, self.points - self.middle
+        size, first = np.sqrt((arm**2).mean(axis=0)) + level.spacing, (linear, shift)
+        for _ in range(LAST_STEPS):
+            self._sample(linear, shift)
+            seen, r, weight, gain = self._residual()
+            if seen.sum() < 20:
+                break
+            pull = 0.5 * (gain * self.slope / level.spacing + level.slope @ np.linalg.inv(linear))
+            arms = (pull[:, :, None] * np.concatenate([arm / size, np.ones((len(arm), 1))], axis=1)[:, None, :]).reshape(len(arm), 12)
+            matrix, load = (arms * weight[:, None]).T @ arms, arms.T @ (weight * r)
+            held = HELD_SHAPE * np.trace(matrix) / 12 + 1e-30
+            gone = np.concatenate([(linear - first[0]) * size, (shift - first[1])[:, None]], axis=1).ravel()
+            d = np.linalg.solve(matrix + held * np.eye(12), load - held * gone)
+            d = (d * min(1.0, level.spacing.mean() / max(float(np.abs(d).max()), 1e-30))).reshape(3, 4)
+            linear, shift = linear + d[:, :3] / size, shift + d[:, 3]
+            if np.abs(d).max() < 0.01 * level.spacing.mean():
+                break
+        return linear, shift + self.middle - linear @ self.middle, self.likeness(linear, shift)
+
+    def _residual(self) -> tuple[BoolArray, FloatArray, FloatArray, float]:
+        """Return which voxels are seen, their residuals (n,), robust weights (n,), and the gain."""
+        seen = self.value > 0.9 * OUTSIDE
+        f, g = self.level.grey.astype(float), np.where(seen, self.value, 0.0).astype(float)
+        if seen.sum() < 10:
+            return seen, f, np.zeros(len(f)), 1.0
+        f, g = f - f[seen].mean(), g - g[seen].mean()
+        # a negative gain would make the motion flee from where grey values agree
+        gain = max(float(f[seen] @ g[seen]) / max(float(g[seen] @ g[seen]), 1e-30), 0.1)
+        r = np.where(seen, f - gain * g, 0.0)
+        scatter = 1.4826 * float(np.median(np.abs(r[seen])))
+        return seen, r, np.where(seen, 1 / (1 + (r / max(ROBUST * scatter, 1e-30)) ** 2) ** 2, 0.0), gain
+
+    def likeness(self, rotation: FloatArray, shift: FloatArray) -> float:
+        """Return the correlation of the grey values, less where voxels have left the scan."""
+        self._sample(rotation, shift)
+        seen = self.value > 0.9 * OUTSIDE
+        if seen.sum() < 10:
+            return -1.0
+        f, g = self.level.grey[seen].astype(float), self.value[seen].astype(float)
+        f, g = f - f.mean(), g - g.mean()
+        return float(f @ g / np.sqrt(max(float((f @ f) * (g @ g)), 1e-30)) * seen.mean())
+
+    def _sample(self, rotation: FloatArray, shift: FloatArray) -> FloatArray:
+        arm = (self.points - self.middle) @ rotation.T
+        sample_spline(self.level.deformed, ((arm + self.middle + shift) / self.level.spacing).astype(np.float32), self.value, self.slope)
+        return np.asarray(arm)
+
+    def _improved(self, rotation: FloatArray, shift: FloatArray, guess: FloatArray, steps: int) -> tuple[FloatArray, FloatArray]:
+        level = self.level
+        for _ in range(steps):
+            arm = self._sample(rotation, shift)
+            seen, r, weight, gain = self._residual()
+            if seen.sum() < 10:
+                break
+            pull = 0.5 * (gain * self.slope / level.spacing + level.slope @ rotation.T)
+            arms = np.concatenate([np.cross(arm, pull), pull], axis=1)
+            matrix, load = (arms * weight[:, None]).T @ arms, arms.T @ (weight * r)
+            held = HELD * np.trace(matrix[3:, 3:]) / 3
+            matrix[3:, 3:] += held * np.eye(3)
+            load[3:] -= held * (shift - guess)
+            d = np.linalg.solve(matrix + 1e-6 * np.diag(np.diag(matrix)) + 1e-30 * np.eye(6), load)
+            d *= min(1.0, 2 * level.spacing.mean() / max(float(np.abs(d[3:]).max()), 1e-30), TURN / max(float(np.abs(d[:3]).max()), 1e-30))
+            rotation, shift = Rotation.from_rotvec(d[:3]).as_matrix() @ rotation, shift + d[3:]
+            if np.abs(d[3:]).max() < 5e-3 * level.spacing.mean() and np.abs(d[:3]).max() < 1e-4:
+                break
+        return rotation, shift
+
+
+def _guesses(shifts: list[FloatArray]) -> Iterator[tuple[FloatArray, FloatArray]]:
+    for shift in shifts:
+        yield np.eye(3), shift
+        for axis in range(3):
+            for sign in (-1.0, 1.0):
+                yield Rotation.from_rotvec(sign * TURN * np.eye(3)[axis]).as_matrix(), shift
+
+
+def correlated_shift(reference: Float32Array, deformed: Float32Array, spacing: FloatArray) -> FloatArray:
+    """Return the shift (3,), mm along x, y, z, at which two volumes (nz, ny, nx) correlate best, by Fourier transform."""
+    shape = [fft.next_fast_len(2 * n, real=True) for n in reference.shape]
+    a, b = (fft.rfftn(v - v.mean(), shape) for v in (reference, deformed))
+    likeness = fft.irfftn(np.conj(a) * b, shape)
+    peak = np.unravel_index(int(np.argmax(likeness)), likeness.shape)
+    return np.array([(p if p < n // 2 else p - n) * s for p, n, s in zip(peak[::-1], shape[::-1], spacing, strict=True)], dtype=float)

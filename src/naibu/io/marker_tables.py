@@ -1,0 +1,379 @@
+"""Bring marker tables of other programs in, and write naibu's own."""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import io
+import json
+import math
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from naibu.core.errors import InputError, MissingDependencyError
+from naibu.core.experiment import Axis, Layer, Loading, Shape
+from naibu.core.markers import Markers
+from naibu.io.experiment_folder.reader import META_FILE, read_experiment
+from naibu.io.experiment_folder.state_csv import COORDINATES, OPTIONAL, REQUIRED, STATUSES, is_trusted
+from naibu.io.files.atomic import write_atomically
+
+MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "in": 25.4, "inch": 25.4}
+_UNIT = re.compile(r"(?:[\s_,/]+|[\s_]*[\[(]\s*)(mm|cm|m|um|µm|μm|inch|in)\s*[\])]?$", re.IGNORECASE)
+_PLACE = r"(?:pos(?:ition)?|coord(?:inate)?|centroid|cent(?:er|re))?"
+_NAMES = {
+    "marker": re.compile(r"(?=.)(?:marker|point|bead|particle|track)?[\s_]*(?:no\.?|nr\.?|number|id|label|index|#)?", re.IGNORECASE),
+    **{f"{a}_mm": re.compile(rf"{_PLACE}[\s_.-]*{a}[\s_.-]*{_PLACE}", re.IGNORECASE) for a in "xyz"},
+    "status": re.compile("status"),
+    "note": re.compile("note"),
+}
+_ABSENT = ("", "nan", "na", "n/a", "-", "--", "none", "null")
+_HEADER_WITHIN = 20
+
+
+def import_markers(
+    path: str | os.PathLike[str],
+    columns: Mapping[str, str] | None = None,
+    *,
+    unit: str | None = None,
+    delimiter: str | None = None,
+    sheet: str | None = None,
+) -> Markers:
+    """Read markers from a table that another program wrote.
+
+    Parameters
+    ----------
+    path : path-like
+        Text with commas, semicolons or tabs between its cells (decimal commas are understood), or an Excel file (.xlsx).
+        Lines above the header are skipped.
+    columns : mapping, optional
+        Which column holds what, for example ``{"marker": "No.", "x_mm": "X [mm]", "y_mm": "Y [mm]", "z_mm": "Z [mm]"}``; ``"status"`` and
+        ``"note"`` may be named too, and ``"z_mm"`` left out for markers in one plane. By default the obvious columns are taken.
+    unit : str, optional
+        Unit of the coordinates: mm, cm, m, um or inch. By default that in the column's name (``x_cm``, ``X [cm]``), else mm.
+    delimiter : str, optional
+        What separates cells; by default a tab, a semicolon or a comma, whichever cuts the first lines evenly.
+    sheet : str, optional
+        Sheet of an Excel file; by default the active one.
+
+    Returns
+    -------
+    Markers
+        Positions in mm, shape (n, 3); NaN where a cell is blank.
+
+    Raises
+    ------
+    InputError
+        The file, a column, a unit or a cell cannot be used; the message names it and the mend.
+    MissingDependencyError
+        An Excel file, and openpyxl is not installed.
+    """
+    source = Path(path)
+    rows = _excel_rows(source, sheet) if source.suffix.lower() == ".xlsx" else _text_rows(source, delimiter)
+    start, where = _located(source, rows, columns)
+    header = rows[start][1]
+    body = [(line, row + [""] * (len(header) - len(row))) for line, row in rows[start + 1 :]]
+    if not body:
+        raise InputError(f"{source}: no rows follow the header {', '.join(header)}; a table needs one row for each marker")
+    factors = {name: _factor(source, header[at], unit) for name, at in where.items() if name in COORDINATES}
+    mark = _decimal_mark(row[where[name]] for _, row in body for name in factors)
+    ids = [_label(f"{source}: line {line}, column {header[where['marker']]!r}", row[where["marker"]]) for line, row in body]
+    points = np.full((len(body), 3), math.nan)
+    for name, factor in factors.items():
+        values = [_number(f"{source}: line {line}, column {header[where[name]]!r}", row[where[name]], mark) for line, row in body]
+        # rounding removes the dust of the conversion (1.1 cm would be 11.000000000000002 mm), far below any measurement
+        points[:, COORDINATES.index(name)] = np.round(np.array(values) * factor, 9)
+    trusted = [_trusted(source, line, row, where) for line, row in body]
+    try:
+        return Markers.from_arrays(ids, points, trusted)
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from error
+
+
+def write_markers(path: str | os.PathLike[str], markers: Markers) -> Path:
+    """Write markers as naibu's own table ``marker,x_mm,y_mm,z_mm,status,note``; the file appears whole or not at all.
+
+    Raises
+    ------
+    InputError
+        The file cannot be written.
+    """
+    # where no marker has a z, the markers lie in one plane and z is not missing
+    dimensions = 2 if np.isnan(markers.points[:, 2]).all() else 3
+    stream = io.StringIO(newline="")
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(REQUIRED + OPTIONAL)
+    for marker, point, trusted in zip(markers.ids, markers.points, markers.trusted, strict=True):
+        whole = bool(np.isfinite(point[:dimensions]).all())
+        status = ("ok" if trusted else "suspect") if whole else "missing"
+        note = "" if whole or trusted else "the coordinates given are suspect"
+        writer.writerow([int(marker), *("NaN" if math.isnan(v) else f"{v:.12g}" for v in point), status, note])
+    return write_atomically(path, stream.getvalue())
+
+
+def write_experiment_folder(
+    folder: str | os.PathLike[str],
+    initial: Markers,
+    states: Mapping[str, Markers],
+    *,
+    title: str,
+    shape: Shape,
+    loading: Loading,
+    source: str = "",
+    layers: Sequence[Layer] = (),
+    joined_at_mm: Sequence[float] = (),
+    stated_mm: Mapping[str, float] | None = None,
+    up_axis: Axis = "z",
+    spacing_mm: float | None = None,
+    xy_step_mm: float | None = None,
+    z_step_mm: float | None = None,
+) -> Path:
+    """Write an experiment folder that `read_experiment` reads: `meta.toml` and one table for each state.
+
+    Parameters
+    ----------
+    folder : path-like
+        Folder to make; it must not exist, or be empty.
+    initial : Markers
+        The free state.
+    states : mapping of str to Markers
+        The loaded states by name, in order.
+    title, source : str
+        What was measured, and where the numbers come from.
+    shape, loading, layers, joined_at_mm, up_axis
+        As in `naibu.core.experiment.Experiment`.
+    stated_mm : mapping of str to float, optional
+        Height of the plate or bar above the base, or distance of the side plates, mm, by name of the state.
+    spacing_mm, xy_step_mm, z_step_mm : float, optional
+        Spacing of the marker lattice and steps of the coordinates, mm.
+
+    Returns
+    -------
+    Path
+        `folder`.
+
+    Raises
+    ------
+    InputError
+        The folder is in use, or what was given does not make a valid experiment; nothing is left behind then.
+    """
+    target = Path(folder)
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise InputError(f"{target}: exists and is not an empty folder; choose a new name, or remove it first")
+    key = "width_stated_mm" if loading.kind == "side_plates" else "height_stated_mm"
+    heights = dict(stated_mm or {})
+    for name in heights:
+        if name not in states:
+            raise InputError(
+                f"stated_mm names the state {name!r}, but the loaded states are {', '.join(states) or 'none'}; correct the name"
+            )
+    size: dict[str, object] = {"shape": shape.kind, "size_mm": list(shape.size_mm)}
+    text = _document(
+        {"title": title, "source": source, "dimensions": 2 if np.isnan(initial.points[:, 2]).all() else 3, "units": "mm"},
+        ("[coordinates]", {"up_axis": up_axis, "xy_step_mm": xy_step_mm, "z_step_mm": z_step_mm}),
+        ("[object]", size | {"size_axes": ["x", "y", "z"], "joined_at_mm": list(joined_at_mm)}),
+        ("[markers]", {"nominal_spacing_mm": spacing_mm}),
+        *(("[[layer]]", _layer_table(la)) for la in layers),
+        ("[loading]", _loading_table(loading)),
+        ("[[state]]", {"name": "initial", "what": "free", "file": "initial.csv"}),
+        *(("[[state]]", {"name": name, "file": f"{name}.csv", key: heights.get(name)}) for name in states),
+    )
+    _place_checked(target, text, {"initial": initial, **states})
+    return target
+
+
+def _layer_table(layer: Layer) -> dict[str, object]:
+    table: dict[str, object] = {"material": layer.material, "from_base_mm": [layer.from_base_mm, layer.to_base_mm]}
+    return table | ({"batch": layer.batch} if layer.batch else {})
+
+
+def _loading_table(loading: Loading) -> dict[str, object]:
+    table: dict[str, object] = {"kind": loading.kind, "bar_width_mm": loading.bar_width_mm}
+    if loading.kind in ("bar", "side_plates"):
+        table["bar_axis"] = loading.bar_axis
+    return table | {"counter_material": loading.counter_material, "base_material": loading.base_material}
+
+
+def _document(top: Mapping[str, object], *tables: tuple[str, Mapping[str, object]]) -> str:
+    """Return TOML text; keys whose value is None are left out."""
+    blocks = [("", top), *tables]
+    # a JSON string, number or list of these is TOML too
+    lines = ((head, [f"{k} = {json.dumps(v, ensure_ascii=False)}" for k, v in table.items() if v is not None]) for head, table in blocks)
+    return "\n".join("\n".join([*([head] if head else []), *pairs, ""]) for head, pairs in lines)
+
+
+def _place_checked(target: Path, meta: str, states: Mapping[str, Markers]) -> None:
+    """Write into a folder aside, read it back, and only then give it its name."""
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        aside = Path(tempfile.mkdtemp(dir=target.parent, prefix=f".{target.name}."))
+    except OSError as error:
+        raise InputError(f"{target}: cannot be made ({error.strerror}); choose a folder you may write to") from error
+    try:
+        write_atomically(aside / META_FILE, meta)
+        for name, markers in states.items():
+            write_markers(aside / f"{name}.csv", markers)
+        read_experiment(aside)
+        aside.chmod(0o755)
+        aside.replace(target)
+    except InputError as error:
+        raise InputError(str(error).replace(str(aside), str(target))) from error
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+def _text_rows(path: Path, delimiter: str | None) -> list[tuple[int, list[str]]]:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give the path of a CSV, TSV or .xlsx table") from error
+    if b"\0" in content[:4096] and not content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise InputError(f"{path}: is not a text table; save it as CSV, or as .xlsx")
+    text = _decoded(content)
+    if delimiter is not None and len(delimiter) != 1:
+        raise InputError(f"delimiter = {delimiter!r} must be one character, for example ';'")
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter or _delimiter(text))
+    try:
+        return _filled(path, ((reader.line_num, row) for row in reader))
+    except csv.Error as error:
+        raise InputError(f"{path}: line {reader.line_num} is not readable ({error}); look for an unclosed quotation mark") from error
+
+
+def _delimiter(text: str) -> str:
+    """Return the mark that cuts most of the first lines into the same number of cells; where two do, the one rarer within cells."""
+    lines = text.splitlines()[:_HEADER_WITHIN]
+
+    def agreement(mark: str) -> int:
+        counts = [len(row) for row in csv.reader(lines, delimiter=mark)]
+        return max((counts.count(n) for n in set(counts) if n > 1), default=0)
+
+    return max("\t;,", key=agreement)
+
+
+def _decoded(content: bytes) -> str:
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return content.decode("utf-16")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        # older Western spreadsheets; only names of columns and notes can hold such letters
+        return content.decode("latin-1")
+
+
+def _excel_rows(path: Path, sheet: str | None) -> list[tuple[int, list[str]]]:
+    try:
+        import openpyxl
+    except ImportError as error:
+        raise MissingDependencyError(f'{path}: reading Excel files needs openpyxl; run: pip install "naibu[excel]"') from error
+    try:
+        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
+    # openpyxl raises whatever its zip and XML readers meet
+    except Exception as error:
+        raise InputError(
+            f"{path}: cannot be read as .xlsx ({error}); open it in a spreadsheet program and save it again, or as CSV"
+        ) from error
+    try:
+        if sheet is not None and sheet not in book.sheetnames:
+            raise InputError(f"{path}: there is no sheet {sheet!r}; it has {', '.join(book.sheetnames)}")
+        page = book[sheet] if sheet is not None else book.active
+        cells = ((n, ["" if v is None else str(v) for v in row]) for n, row in enumerate(page.iter_rows(values_only=True), start=1))
+        return _filled(path, cells)
+    finally:
+        book.close()
+
+
+def _filled(path: Path, rows: Iterable[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
+    kept = [(line, [cell.strip() for cell in row]) for line, row in rows if any(cell.strip() for cell in row)]
+    if not kept:
+        raise InputError(f"{path}: the table is empty; it needs a header and one row for each marker")
+    return kept
+
+
+def _located(path: Path, rows: list[tuple[int, list[str]]], columns: Mapping[str, str] | None) -> tuple[int, dict[str, int]]:
+    """Return the number of the header among `rows`, and at which cell each of naibu's columns stands."""
+    for name in columns or {}:
+        if name not in REQUIRED + OPTIONAL:
+            raise InputError(f"columns names {name!r}; use {', '.join(REQUIRED + OPTIONAL)}")
+    wanted = REQUIRED if columns is None else ("marker", "x_mm", "y_mm", *columns)
+    for at, (_, row) in enumerate(rows[:_HEADER_WITHIN]):
+        where = _guessed(path, row) if columns is None else {n: row.index(c) for n, c in columns.items() if c in row}
+        if all(name in where for name in wanted):
+            return at, where
+    header = rows[0][1]
+    if columns is None:
+        raise InputError(
+            f"{path}: cannot tell which columns hold marker number, x, y and z among {', '.join(header)}; "
+            'name them: columns={"marker": ..., "x_mm": ..., "y_mm": ..., "z_mm": ...}'
+        )
+    absent = next((n for n in wanted if n not in columns), None)
+    if absent:
+        raise InputError(f"columns does not name {absent!r}; add which column of {path} holds it")
+    lost = next((c for c in columns.values() if c not in header), next(iter(columns.values())))
+    close = difflib.get_close_matches(lost, header, n=1)
+    mend = f"did you mean {close[0]!r}?" if close else f"it has {', '.join(header)}"
+    raise InputError(f"{path}: there is no column {lost!r}; {mend}")
+
+
+def _guessed(path: Path, header: list[str]) -> dict[str, int]:
+    found: dict[str, int] = {}
+    for at, cell in enumerate(header):
+        plain = _UNIT.sub("", cell).strip()
+        for name, pattern in _NAMES.items():
+            if not pattern.fullmatch(cell if name == "marker" else plain):
+                continue
+            if name in found:
+                raise InputError(
+                    f"{path}: both {header[found[name]]!r} and {cell!r} may be {name!r}; say which: columns={{{name!r}: {cell!r}, ...}}"
+                )
+            found[name] = at
+    return found
+
+
+def _factor(path: Path, column: str, unit: str | None) -> float:
+    found = _UNIT.search(column)
+    named = found[1].lower() if found else None
+    if unit is not None and unit not in MM_PER_UNIT:
+        raise InputError(f"unit = {unit!r} is not known; use one of {', '.join(dict.fromkeys(MM_PER_UNIT))}")
+    if unit and named and MM_PER_UNIT[unit] != MM_PER_UNIT[named]:
+        raise InputError(f"{path}: column {column!r} says {named}, but unit = {unit!r}; leave unit out, or correct the column's name")
+    return MM_PER_UNIT[unit or named or "mm"]
+
+
+def _decimal_mark(cells: Iterable[str]) -> str:
+    """Return what stands before the decimals: a comma where commas occur and no cell has a point but as thousands mark."""
+    seen = [c for c in cells if "," in c or "." in c]
+    return "," if any("," in c for c in seen) and all(c.rfind(",") > c.rfind(".") for c in seen) else "."
+
+
+def _number(where: str, text: str, mark: str) -> float:
+    if text.lower() in _ABSENT:
+        return math.nan
+    # typographic minus, and blanks between thousands
+    plain = re.sub(r"[\s\u00a0\u202f]", "", text).replace("\u2212", "-")
+    other = "." if mark == "," else ","
+    if re.fullmatch(rf"[+-]?\d{{1,3}}(\{other}\d{{3}})+(\{mark}\d*)?", plain):
+        plain = plain.replace(other, "")
+    plain = plain.replace(mark, ".")
+    if not re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", plain):
+        raise InputError(f"{where} = {text!r} is not a number (the table's decimal mark is {mark!r}); correct it, or leave the cell blank")
+    return float(plain)
+
+
+def _label(where: str, text: str) -> int:
+    # spreadsheets store whole numbers as 1.0
+    found = re.fullmatch(r"(\d{1,18})(?:[.,]0*)?", text)
+    if not found:
+        raise InputError(f"{where} = {text!r} is not a whole number; every row needs its marker's number")
+    return int(found[1])
+
+
+def _trusted(path: Path, line: int, row: list[str], where: Mapping[str, int]) -> bool:
+    status = row[where["status"]].lower() if "status" in where else ""
+    if status and status not in STATUSES:
+        raise InputError(f"{path}: line {line} has the status {status!r}; use {', '.join(STATUSES)}, or name the columns without status")
+    return is_trusted(status, row[where["note"]] if "note" in where else "")

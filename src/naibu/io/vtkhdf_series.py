@@ -1,0 +1,262 @@
+"""Series of results on one mesh, as a VTKHDF file that grows while a computation runs."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from naibu.core.arrays import AnyArray, FloatArray
+from naibu.core.errors import InputError
+from naibu.core.mesh import Mesh
+from naibu.io.files.atomic import new_aside, put_in_place
+
+VTK_TYPES = {"line": 3, "triangle": 5, "tetra": 10, "hexahedron": 12, "tetra10": 24}
+_ROWS = "naibu"  # group of tables beside VTK's own
+_CHUNK = 512  # rows of short tables
+_CHUNK_BYTES = 16_384
+
+
+@dataclass(eq=False)
+class SeriesFile:
+    """A VTKHDF file under a name of its own until it is finished; an old file of the final name stays untouched until then.
+
+    Used as a context, it removes what was not finished.
+    """
+
+    target: Path
+    aside: Path
+    mesh: Mesh
+    file: h5py.File
+
+    @classmethod
+    def begun(cls, path: str | os.PathLike[str], mesh: Mesh) -> SeriesFile:
+        """Begin a series on a mesh.
+
+        Raises
+        ------
+        InputError
+            The folder cannot be written.
+        """
+        target = Path(path)
+        aside = new_aside(target)
+        series = cls(target, aside, mesh, h5py.File(aside, "w"))
+        root = series.file.create_group("VTKHDF")
+        _write_static(root, mesh)
+        _begin_steps(root)
+        return series
+
+    @classmethod
+    def continued(cls, path: str | os.PathLike[str], mesh: Mesh, steps: int) -> SeriesFile:
+        """Continue a finished series behind its first steps; the file keeps its name and content until the new one is finished.
+
+        Raises
+        ------
+        InputError
+            There is no such file, it is damaged, has fewer steps, or holds another mesh.
+        """
+        target = Path(path)
+        aside = new_aside(target)
+        try:
+            shutil.copyfile(target, aside)
+        except OSError as error:
+            aside.unlink(missing_ok=True)
+            raise InputError(f"{target}: cannot be read ({error.strerror or error}); begin the series anew") from error
+        try:
+            series = cls(target, aside, mesh, h5py.File(aside, "r+"))
+            root = series.file["VTKHDF"]
+            known, same = int(root["Steps"].attrs["NSteps"]), np.array_equal(root["Connectivity"][:], mesh.cells.ravel())
+        except (OSError, KeyError) as error:
+            aside.unlink(missing_ok=True)
+            raise InputError(f"{target}: is damaged ({error}); begin the series anew") from error
+        if known < steps or not same:
+            series.discard()
+            raise InputError(
+                f"{target}: holds {known} steps{'' if same else ' on another mesh'}, not the {steps} to go on from; begin anew"
+            )
+        series.truncate(steps)
+        return series
+
+    @property
+    def steps(self) -> int:
+        """Number of whole steps."""
+        return int(self.file["VTKHDF/Steps"].attrs["NSteps"])
+
+    def append(
+        self, time: float, point_data: Mapping[str, ArrayLike] | None = None, cell_data: Mapping[str, ArrayLike] | None = None
+    ) -> None:
+        """Append a step: values of points (n,), (n, d) or (n, d, d), and of cells (m, ...), the same names and shapes in every step.
+
+        Raises
+        ------
+        InputError
+            Names or shapes that VTK does not know or that differ from those of the first step, or a full disk.
+        """
+        root = self.file["VTKHDF"]
+        steps, count = root["Steps"], self.steps
+        try:
+            for where, data in (("PointData", point_data or {}), ("CellData", cell_data or {})):
+                for name, values in data.items():
+                    self._append_values(where, name, values, count)
+                    _put(steps[f"{where}Offsets"], name, count, np.int64(count * self._length(where)))
+            for name in ("PartOffsets", "PointOffsets", "NumberOfParts"):
+                _put(steps, name, count, np.int64(name == "NumberOfParts"))
+            for name in ("CellOffsets", "ConnectivityIdOffsets"):
+                _put(steps, name, count, np.zeros(1, np.int64))
+            _put(steps["CellDataOffsets"], "region", count, np.int64(0))
+            _put(steps, "Values", count, np.float64(time))
+            steps.attrs["NSteps"] = np.int64(count + 1)  # last: a step counts when all of it is there
+        except OSError as error:
+            raise InputError(f"{self.target}: cannot be written ({error}); free some space or choose another folder") from error
+
+    def append_rows(self, name: str, rows: ArrayLike, first: int) -> None:
+        """Put rows (k, ...) of a table beside VTK's own data at row `first`."""
+        values = np.asarray(rows)
+        group = self.file.require_group(_ROWS)
+        if name not in group:
+            chunk = (_CHUNK, *values.shape[1:])
+            group.create_dataset(name, (0, *values.shape[1:]), values.dtype, maxshape=(None, *values.shape[1:]), chunks=chunk)
+        group[name].resize(first + len(values), axis=0)
+        group[name][first:] = values
+
+    def rows(self, name: str) -> AnyArray:
+        """Return a table that `append_rows` filled."""
+        return np.asarray(self.file[f"{_ROWS}/{name}"][:])
+
+    def values(self, name: str, step: int) -> AnyArray:
+        """Return the values of the points in a step."""
+        n = self.mesh.n_points
+        return np.asarray(self.file[f"VTKHDF/PointData/{name}"][step * n : (step + 1) * n])
+
+    def times(self) -> FloatArray:
+        """Return the times of all steps, s."""
+        return np.asarray(self.file["VTKHDF/Steps/Values"][: self.steps])
+
+    def truncate(self, steps: int) -> None:
+        """Drop all that follows the first steps."""
+        root = self.file["VTKHDF"]
+        root["Steps"].attrs["NSteps"] = np.int64(steps)
+        for name in ("PartOffsets", "PointOffsets", "NumberOfParts", "CellOffsets", "ConnectivityIdOffsets", "Values"):
+            root[f"Steps/{name}"].resize(steps, axis=0)
+        for where in ("PointData", "CellData"):
+            for name, offsets in root[f"Steps/{where}Offsets"].items():
+                offsets.resize(steps, axis=0)
+                if (where, name) != ("CellData", "region"):
+                    root[where][name].resize(steps * self._length(where), axis=0)
+
+    def finish(self) -> Path:
+        """Close the file and give it its name.
+
+        Raises
+        ------
+        InputError
+            It cannot be written.
+        """
+        try:
+            self.file.close()
+        except OSError as error:
+            raise InputError(f"{self.target}: cannot be written ({error}); free some space or choose another folder") from error
+        return put_in_place(self.aside, self.target)
+
+    def discard(self) -> None:
+        """Close and remove what was not finished."""
+        if self.file:
+            self.file.close()
+        self.aside.unlink(missing_ok=True)
+
+    def __enter__(self) -> SeriesFile:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.discard()
+
+    def _length(self, where: str) -> int:
+        return self.mesh.n_points if where == "PointData" else self.mesh.n_cells
+
+    def _append_values(self, where: str, name: str, values: ArrayLike, step: int) -> None:
+        if not name or "/" in name or (where == "CellData" and name == "region"):
+            raise InputError(f"array name {name!r} cannot be used in a VTKHDF file; take another one without '/'")
+        group, n = self.file["VTKHDF"][where], self._length(where)
+        own = in_space(self.mesh, numbers(name, values, n, "points" if where == "PointData" else "cells"))
+        if name not in group:
+            if step:
+                raise InputError(f"{name!r} is not in the steps before; give the same arrays in all")
+            rows = n * max(1, _CHUNK_BYTES // own.nbytes)  # small steps share a chunk
+            group.create_dataset(name, (0, *own.shape[1:]), own.dtype, maxshape=(None, *own.shape[1:]), chunks=(rows, *own.shape[1:]))
+        known = group[name].shape[1:]
+        if own.shape[1:] != known:
+            raise InputError(f"{name!r} has shape {own.shape} in step {step}, but {(n, *known)} in step 0; give the same shape in all")
+        group[name].resize((step + 1) * n, axis=0)
+        group[name][step * n :] = own
+
+
+def numbers(name: str, values: ArrayLike, n: int, what: str) -> NDArray[np.generic]:
+    """Return values as (n,) or (n, d) numbers that VTK knows.
+
+    Raises
+    ------
+    InputError
+        Another number of rows, or no real numbers.
+    """
+    array = np.asarray(values)
+    if array.ndim not in (1, 2, 3) or len(array) != n:
+        raise InputError(f"{name!r} has shape {array.shape}, but the mesh has {n} {what}; give one row for each")
+    if array.dtype == bool:
+        array = array.astype(np.uint8)
+    if array.dtype.kind not in "iuf":
+        raise InputError(f"{name!r} is of type {array.dtype}; give real numbers")
+    if array.dtype.kind == "f" and array.dtype.itemsize not in (4, 8):
+        array = array.astype(np.float64)
+    return array.reshape(n, -1) if array.ndim == 3 else array
+
+
+def in_space(mesh: Mesh, vectors: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Return vectors of a plane or a line with the components that VTK, which knows only space, wants besides."""
+    missing = 3 - mesh.dimension
+    if missing == 0 or vectors.ndim != 2 or vectors.shape[1] != mesh.dimension:
+        return vectors
+    return np.pad(vectors, ((0, 0), (0, missing)))
+
+
+def _write_static(root: h5py.Group, mesh: Mesh) -> None:
+    """Write the grid, which all steps share."""
+    n, k = mesh.cells.shape
+    root.attrs["Version"] = np.array([2, 0], dtype=np.int64)
+    # VTK's reader wants a string of fixed length here, not h5py's default.
+    root.attrs["Type"] = np.bytes_("UnstructuredGrid")
+    root["NumberOfPoints"] = np.array([mesh.n_points], dtype=np.int64)
+    root["NumberOfCells"] = np.array([n], dtype=np.int64)
+    root["NumberOfConnectivityIds"] = np.array([n * k], dtype=np.int64)
+    root["Points"] = in_space(mesh, mesh.points)
+    root["Connectivity"] = mesh.cells.ravel()
+    root["Offsets"] = np.arange(0, n * k + 1, k, dtype=np.int64)
+    root["Types"] = np.full(n, VTK_TYPES[mesh.cell_type], dtype=np.uint8)
+    root.create_group("PointData")
+    root.create_group("CellData")["region"] = mesh.regions
+    # An attribute, not field data: VTK 9.7's reader crashed on UTF-8 strings there.
+    root.attrs["region_names"] = list(mesh.region_names)
+
+
+def _begin_steps(root: h5py.Group) -> None:
+    """Make the empty tables of times, and of offsets that send every step to the one grid."""
+    group = root.create_group("Steps")
+    group.attrs["NSteps"] = np.int64(0)
+    group.create_group("PointDataOffsets")
+    group.create_group("CellDataOffsets")
+
+
+def _put(group: h5py.Group, name: str, at: int, value: Any) -> None:
+    """Put a row into a table that grows."""
+    row = np.asarray(value)
+    if name not in group:
+        group.create_dataset(name, (0, *row.shape), row.dtype, maxshape=(None, *row.shape), chunks=(_CHUNK, *row.shape))
+    group[name].resize(at + 1, axis=0)
+    group[name][at] = row

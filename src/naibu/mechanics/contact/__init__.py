@@ -1,0 +1,1 @@
+"""Unilateral contact with rigid indenters, with friction, for continua and lattices."""

@@ -1,0 +1,309 @@
+"""Contact of a surface with rigid bodies, and of two blocks that lie on each other: unilateral or bonded, with friction.
+
+Contact is evaluated at points, each a fixed combination of nodes: quadrature points of boundary faces against a rigid body, or pairs
+of nodes on an interface between blocks. Per unit of area of the free state the body presses with
+``p = k_n <-g>`` (a C1 ramp; or ``-k_n g`` where bonded) and rubs with ``t``, the elastic slip law with Coulomb's limit:
+``t = k_t P (y - a)``, scaled back to ``|t| = mu p`` where it exceeds that; `a` is the anchor of the point, carried from one load step to
+the next. Large k_t and mu stick; finite k_t with mu = inf are tangential springs; mu = 0 slips freely.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from naibu._numba.compilation import njit
+from naibu.core.arrays import FloatArray, Int32Array, IntArray
+from naibu.core.errors import InputError
+from naibu.core.rotation import rotation_matrix
+from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
+
+PLANE, BAR = 0, 1
+RAMP_MM = 0.01  # width of the rounded start of the contact pressure
+STICK = 1e3  # a friction coefficient that never slips in practice
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigidSurface:
+    """The surface of a rigid body, in a frame that moves with the body.
+
+    Attributes
+    ----------
+    kind : int
+        `PLANE` or `BAR`.
+    normal : ndarray, shape (3,)
+        Out of the body, towards the soft object: of the plane, or of the bar's face.
+    lateral : ndarray, shape (3,)
+        Across the bar (unused for a plane).
+    half_width, corner_radius : float
+        Of the bar, mm.
+    """
+
+    kind: int
+    normal: FloatArray
+    lateral: FloatArray
+    half_width: float = 0.0
+    corner_radius: float = 0.0
+
+    def packed(self) -> FloatArray:
+        """Return the eight numbers that the kernels read."""
+        return np.concatenate([self.normal, self.lateral, [self.half_width, self.corner_radius]])
+
+
+def plane(normal: tuple[float, float, float]) -> RigidSurface:
+    """Return a flat surface with outward `normal` (any length but 0)."""
+    n = np.asarray(normal, dtype=float)
+    if not np.linalg.norm(n) > 0.0:
+        raise InputError("the normal of a plane must not be zero")
+    return RigidSurface(PLANE, n / np.linalg.norm(n), np.zeros(3))
+
+
+def bar(axis: str, width_mm: float, *, corner_radius_mm: float = 1.0) -> RigidSurface:
+    """Return a bar with its face downwards, lying along ``"x"`` or ``"y"``, with rounded edges.
+
+    Raises
+    ------
+    InputError
+        The corner radius is not between 0 and half of the width.
+    """
+    if not 0.0 < corner_radius_mm <= 0.5 * width_mm:
+        raise InputError(f"the bar's corner radius must lie between 0 and half of its width {width_mm:g} mm, not {corner_radius_mm:g} mm")
+    lateral = np.array([0.0, 1.0, 0.0]) if axis == "x" else np.array([1.0, 0.0, 0.0])
+    return RigidSurface(BAR, np.array([0.0, 0.0, -1.0]), lateral, 0.5 * width_mm, corner_radius_mm)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contact:
+    """Contact points against one body that moves on a straight path.
+
+    Attributes
+    ----------
+    name : str
+        Name of the body, under which its reaction is returned.
+    nodes : ndarray, shape (p, k), int64
+        Nodes of every contact point.
+    shape : ndarray, shape (p, k)
+        Their coefficients: the point lies at ``sum_a shape[a] x[nodes[a]]``.
+    rest : ndarray, shape (p, 3)
+        Position of the point in the free state, mm (for a pair of nodes: their difference).
+    area : ndarray, shape (p,)
+        Area of the free state that a point stands for, mm2.
+    surface : RigidSurface
+        The body's surface.
+    start, stop : ndarray, shape (3,)
+        Where the body's reference point is at the beginning and at the end of loading, mm.
+    rotation : ndarray, shape (3, 3)
+        Orientation of the body at the beginning.
+    normal_stiffness : float
+        kPa/mm.
+    tangential_stiffness, friction_coefficient : ndarray, shape (p,)
+        kPa/mm, and Coulomb's coefficient.
+    bonded : bool
+        Whether the body also holds the point back.
+    tilt : ndarray, shape (3,), optional
+        Rotation vector, rad, by which the body turns about its reference point, in proportion to the load. A plate that tilts as it
+        presses touches flat at first, where one tilted from the beginning would let the body rock on an edge.
+    """
+
+    name: str
+    nodes: IntArray
+    shape: FloatArray
+    rest: FloatArray
+    area: FloatArray
+    surface: RigidSurface
+    start: FloatArray
+    stop: FloatArray
+    rotation: FloatArray
+    normal_stiffness: float
+    tangential_stiffness: FloatArray
+    friction_coefficient: FloatArray
+    bonded: bool = False
+    tilt: FloatArray | None = None
+
+    def orientation(self, load: float) -> FloatArray:
+        """Return the body's orientation (3, 3) at the fraction `load` of the path."""
+        return self.rotation if self.tilt is None else rotation_matrix(load * self.tilt) @ self.rotation
+
+    def with_path(self, start: FloatArray, stop: FloatArray) -> Contact:
+        """Return the contact with another path of the body."""
+        return replace(self, start=np.asarray(start, dtype=float), stop=np.asarray(stop, dtype=float))
+
+    def local(self, displacement: FloatArray, load: float) -> FloatArray:
+        """Return positions (p, 3) of the points in the body's frame, at the fraction `load` of the path."""
+        moved = self.rest + np.einsum("pk,pki->pi", self.shape, displacement[self.nodes])
+        return np.asarray((moved - (self.start + load * (self.stop - self.start))) @ self.orientation(load))
+
+    def anchors_at_rest(self) -> FloatArray:
+        """Return anchors (p, 3) for the beginning of loading, in the body's frame."""
+        return (self.rest - self.start) @ self.rotation
+
+    def evaluate(self, displacement: FloatArray, anchors: FloatArray, load: float, *, curvature: bool = True) -> ContactResponse:
+        """Evaluate tractions and their derivatives at every point.
+
+        Without the `curvature` of the body the stiffness lacks what lets a pressed point slip off an edge by itself: it is not the
+        derivative of the force then, but keeps equilibrium iterations from circling there.
+        """
+        y = self.local(displacement, load)
+        n = len(y)
+        vectors, matrices = np.zeros((3, n, 3)), np.zeros((3, n, 3, 3))
+        response = ContactResponse(self.orientation(load), y, np.empty(n), *vectors, *matrices)
+        _tractions(
+            self.surface.kind, self.surface.packed(), y, anchors, self.normal_stiffness, self.tangential_stiffness,
+            self.friction_coefficient, self.bonded, float(curvature), response.gap, response.force, response.tangential,
+            response.slip_direction, response.stiffness, response.tangential_stiffness, response.anchor_stiffness,
+        )  # fmt: skip
+        for field in (response.force, response.stiffness, response.anchor_stiffness, response.slip_direction):
+            field *= self.area.reshape((-1,) + (1,) * (field.ndim - 1))
+        return response
+
+    def scattered(self, force: FloatArray, n_points: int, orientation: FloatArray) -> FloatArray:
+        """Return nodal forces (n, 3) of point forces (p, 3) given in the frame of a body of this `orientation`."""
+        world = force @ orientation.T
+        out = np.empty((n_points, 3))
+        for i in range(3):
+            out[:, i] = np.bincount(self.nodes.ravel(), (self.shape * world[:, i : i + 1]).ravel(), minlength=n_points)
+        return out
+
+    def add_stiffness(self, response: ContactResponse, pattern: BlockPattern, positions: Int32Array, blocks: FloatArray) -> None:
+        """Add the negative derivative of the contact forces to the tangent `blocks`; `positions` from ``pattern.positions(nodes)``."""
+        world = np.einsum("ij,pjk,lk->pil", response.orientation, response.stiffness, response.orientation)
+        _scatter_blocks(positions, self.shape, world, blocks)
+
+    def next_anchors(self, response: ContactResponse) -> FloatArray:
+        """Return the anchors (p, 3) with which the next load step starts: where the elastic slip is that of the present traction."""
+        return response.local - response.tangential / self.tangential_stiffness[:, None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ContactResponse:
+    """What a body does at every contact point, in the body's frame.
+
+    Attributes
+    ----------
+    orientation : ndarray, shape (3, 3)
+        Of the body.
+    local : ndarray, shape (p, 3)
+        Positions, mm.
+    gap : ndarray, shape (p,)
+        Distance to the body, mm; negative where the penalty lets the point penetrate.
+    force : ndarray, shape (p, 3)
+        Force on the soft object, mN.
+    tangential : ndarray, shape (p, 3)
+        Friction traction t, kPa (the force holds ``-t`` times the area).
+    slip_direction : ndarray, shape (p, 3)
+        Derivative of the force with respect to the friction coefficient, mN; zero where the point sticks.
+    stiffness : ndarray, shape (p, 3, 3)
+        Minus the derivative of the force with respect to the position, mN/mm.
+    tangential_stiffness : ndarray, shape (p, 3, 3)
+        Derivative of the friction traction with respect to the position, kPa/mm.
+    anchor_stiffness : ndarray, shape (p, 3, 3)
+        Derivative of the force with respect to the anchor, mN/mm.
+    """
+
+    orientation: FloatArray
+    local: FloatArray
+    gap: FloatArray
+    force: FloatArray
+    tangential: FloatArray
+    slip_direction: FloatArray
+    stiffness: FloatArray
+    tangential_stiffness: FloatArray
+    anchor_stiffness: FloatArray
+
+
+@njit(cache=True)
+def _gap(kind, s, y, n, h):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Signed distance of `y` to the surface; puts its gradient into `n` and its second derivative into `h`."""
+    h[:] = 0.0
+    down = y[0] * s[0] + y[1] * s[1] + y[2] * s[2]
+    if kind == PLANE:
+        n[:] = s[:3]
+        return down
+    across = y[0] * s[3] + y[1] * s[4] + y[2] * s[5]
+    side = 1.0 if across >= 0.0 else -1.0
+    radius = s[7]
+    d1, d2 = side * across - (s[6] - radius), down + radius
+    if d1 > 0.0 and d2 > 0.0:
+        distance = np.sqrt(d1 * d1 + d2 * d2)
+        for i in range(3):
+            n[i] = (d1 * side * s[3 + i] + d2 * s[i]) / distance
+        for i in range(3):
+            for j in range(3):
+                h[i, j] = (s[i] * s[j] + s[3 + i] * s[3 + j] - n[i] * n[j]) / distance
+        return distance - radius
+    if d1 > d2:
+        for i in range(3):
+            n[i] = side * s[3 + i]
+        return d1 - radius
+    n[:] = s[:3]
+    return d2 - radius
+
+
+@njit(cache=True, nogil=True)
+def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
+    kind, s, y, anchors, k_n, k_t, mu, bonded, curvature, gap, force, tangential, slip, stiffness, tangential_stiffness, anchor_stiffness
+):
+    """Tractions of all points and their derivatives (per unit of area); see the module's text for the law."""
+    n, e = np.empty(3), np.empty(3)
+    h, d_trial = np.empty((3, 3)), np.empty((3, 3))
+    for q in range(len(y)):
+        g = _gap(kind, s, y[q], n, h)
+        gap[q] = g
+        if bonded:
+            p, dp = -k_n * g, -k_n
+        elif g >= 0.0:
+            continue
+        elif g > -RAMP_MM:
+            p, dp = 0.5 * k_n * g * g / RAMP_MM, k_n * g / RAMP_MM
+        else:
+            p, dp = -k_n * (g + 0.5 * RAMP_MM), -k_n
+        along = 0.0
+        for i in range(3):
+            along += n[i] * (y[q, i] - anchors[q, i])
+        size = 0.0
+        for i in range(3):
+            e[i] = k_t[q] * (y[q, i] - anchors[q, i] - along * n[i])
+            size += e[i] * e[i]
+        size = np.sqrt(size)
+        # derivative of the trial traction: k_t (P - along H - n (H (y - a))^T)
+        for i in range(3):
+            for j in range(3):
+                hd = 0.0
+                for m in range(3):
+                    hd += h[j, m] * (y[q, m] - anchors[q, m])
+                d_trial[i, j] = k_t[q] * ((1.0 if i == j else 0.0) - n[i] * n[j] - along * h[i, j] - n[i] * hd)
+        sliding = not bonded and size > mu[q] * p
+        ratio = mu[q] * p / size if sliding else 1.0
+        for i in range(3):
+            tangential[q, i] = ratio * e[i]
+            force[q, i] = p * n[i] - ratio * e[i]
+        for i in range(3):
+            for j in range(3):
+                dt = d_trial[i, j]
+                da = k_t[q] * ((1.0 if i == j else 0.0) - n[i] * n[j])
+                if sliding:
+                    projected, projected_a = dt, da
+                    for m in range(3):
+                        projected -= e[i] * e[m] / (size * size) * d_trial[m, j]
+                        projected_a -= e[i] * e[m] / (size * size) * k_t[q] * ((1.0 if m == j else 0.0) - n[m] * n[j])
+                    dt = ratio * projected + mu[q] * dp * n[j] * e[i] / size
+                    da = ratio * projected_a
+                tangential_stiffness[q, i, j] = dt
+                stiffness[q, i, j] = dt - dp * n[i] * n[j] - curvature * p * h[i, j]
+                anchor_stiffness[q, i, j] = da
+            if sliding:
+                slip[q, i] = -p * e[i] / size
+
+
+@njit(cache=True, nogil=True)
+def _scatter_blocks(positions, shape, stiffness, blocks):  # type: ignore[no-untyped-def]  # pragma: no cover
+    n, k = shape.shape
+    for q in range(n):
+        for a in range(k):
+            for b in range(k):
+                w = shape[q, a] * shape[q, b]
+                block = blocks[positions[q, a, b]]
+                for i in range(3):
+                    for j in range(3):
+                        block[i, j] += w * stiffness[q, i, j]

@@ -1,0 +1,1 @@
+"""Static equilibrium and viscoelastic motion at finite strain, with exact sensitivities."""

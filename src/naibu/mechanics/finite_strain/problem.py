@@ -1,0 +1,75 @@
+"""A static problem at finite strain: what is solved, and how."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from naibu.core.arrays import FloatArray, Int32Array
+from naibu.mechanics.contact.penalty_contact import PLANE, Contact
+from naibu.mechanics.finite_elements.assembly import Assembler
+from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+
+
+@dataclass(frozen=True, slots=True)
+class SolverSettings:
+    """How to follow the load path.
+
+    Attributes
+    ----------
+    first_step, largest_step, smallest_step : float
+        Fractions of the whole load.
+    tolerance : float
+        Newton's method ends when the residual force has fallen below this fraction of the contact and support forces.
+    max_iterations : int
+        Newton iterations of one load step before it is halved.
+    anchor_stiffness : float
+        Weak springs to the ground on every node, as a fraction of the mean diagonal of the tangent; they only keep a body that nothing
+        holds yet from drifting.
+    """
+
+    first_step: float = 0.05
+    largest_step: float = 0.12
+    smallest_step: float = 1e-3
+    tolerance: float = 1e-7
+    max_iterations: int = 16
+    anchor_stiffness: float = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """A body, what it is made of, what holds and presses it.
+
+    Attributes
+    ----------
+    points : ndarray, shape (n, 3)
+        Nodes in the free state, mm.
+    assembler : Assembler
+        Elements and materials; its pattern must hold the contacts' couplings (`block_pattern` with their nodes).
+    contacts : tuple of Contact
+        Rigid bodies and interfaces.
+    prescribed : Prescribed
+        Given displacements.
+    external_force : ndarray, shape (n, 3)
+        Dead load, mN, present from the beginning (weight).
+    """
+
+    points: FloatArray
+    assembler: Assembler
+    contacts: tuple[Contact, ...]
+    prescribed: Prescribed
+    external_force: FloatArray
+    _positions: tuple[Int32Array, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        if not self._positions and self.contacts:
+            object.__setattr__(self, "_positions", tuple(self.assembler.pattern.positions(c.nodes) for c in self.contacts))
+
+    @property
+    def unsymmetric(self) -> bool:
+        """Whether Coulomb friction makes the tangent unsymmetric."""
+        curved = any(c.surface.kind != PLANE for c in self.contacts)  # friction turns with the normal
+        return curved or any(not c.bonded and float(c.friction_coefficient.min()) < 100.0 for c in self.contacts)
+
+    def with_changes(self, *, assembler: Assembler | None = None, contacts: tuple[Contact, ...] | None = None) -> Problem:
+        """Return the problem with other parameters or bodies (same nodes)."""
+        return replace(self, assembler=assembler or self.assembler, contacts=contacts if contacts is not None else self.contacts)

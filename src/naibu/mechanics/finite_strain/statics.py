@@ -1,0 +1,184 @@
+"""Quasi-static equilibrium at finite strain: the load is followed in steps that adapt to how hard they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import ConvergenceError, InputError
+from naibu.core.status import Status
+from naibu.mechanics.finite_strain.newton import Newton
+from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
+from naibu.mechanics.linear_algebra.protocols import LinearSolver
+
+USUAL_ITERATIONS = 5.0  # of a load step of the right length
+Hint = tuple[float, FloatArray]  # a fraction of the load, and about where the nodes are then (n, 3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadState:
+    """Equilibrium at one fraction of the load: displacement (n, 3) mm, and the contact anchors with which the next step starts."""
+
+    load: float
+    displacement: FloatArray
+    anchors: tuple[FloatArray, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """Equilibrium states along the load path.
+
+    Attributes
+    ----------
+    states : tuple of LoadState
+        The free state, then every converged step; the last one is at full load if `status` is converged.
+    status : Status
+        How the solve ended.
+    reactions : dict
+        Force (3,), mN, of every rigid body on the soft one at the last state, and ``"prescribed"`` for the held nodes.
+    iterations : int
+        Newton iterations in all.
+    residual : float
+        Relative residual force of the last state.
+    penetration_mm : float
+        Deepest penetration of a rigid body at the last state.
+    linear_solver : str
+        The solver that was used.
+    """
+
+    states: tuple[LoadState, ...]
+    status: Status
+    reactions: dict[str, FloatArray]
+    iterations: int
+    residual: float
+    penetration_mm: float
+    linear_solver: str
+
+    @property
+    def displacement(self) -> FloatArray:
+        """Displacement (n, 3), mm, of the last state."""
+        return self.states[-1].displacement
+
+
+def solve(
+    problem: Problem,
+    *,
+    settings: SolverSettings | None = None,
+    throw: bool = True,
+    callback: Callable[[float], None] | None = None,
+    solver: LinearSolver | None = None,
+    hints: Sequence[Hint] = (),
+) -> Solution:
+    """Follow the load from the free state to its end.
+
+    Parameters
+    ----------
+    problem : Problem
+        Body, materials, supports.
+    settings : SolverSettings, optional
+        Steps and tolerances.
+    throw : bool
+        Whether to raise when the end is not reached, or to return what was reached with its status.
+    callback : callable, optional
+        Called with the fraction of the load after every step, for progress.
+    solver : LinearSolver, optional
+        A linear solver for the problem's pattern; chosen automatically by default.
+    hints : sequence of (load, displacement)
+        States (n, 3), mm, of a similar problem at increasing loads up to 1: the path then stops at these loads and starts from them.
+
+    Raises
+    ------
+    ConvergenceError
+        The end of the load was not reached (only with `throw`).
+    InputError
+        A displacement that is not finite was prescribed.
+    """
+    chosen = settings or SolverSettings()
+    if not np.isfinite(problem.external_force).all():
+        raise InputError("external forces must be finite numbers")
+    newton = Newton(problem, chosen, solver)
+    first = LoadState(0.0, np.zeros_like(problem.points), tuple(c.anchors_at_rest() for c in problem.contacts))
+    states, residual = [first], 0.0
+    step, ceiling = 1.0 if hints else chosen.first_step, 1.0 if hints else chosen.largest_step
+    while states[-1].load < 1.0 - 1e-12:
+        last = states[-1]
+        passed = next((h for h in reversed(hints) if h[0] <= last.load + 1e-9), None)
+        ahead = next((h for h in hints if h[0] > last.load + 1e-9), None)
+        load = min(1.0 if ahead is None else ahead[0], last.load + step)
+        found = None
+        for guess in _guesses(states, load, passed, ahead):
+            before = newton.iterations
+            found = newton.solve(guess, last.anchors, load)
+            if found is not None:
+                break
+        if found is None and load - last.load < chosen.first_step:
+            found = newton.relax(last.displacement, last.anchors, load)
+        if found is None:
+            step = 0.5 * (load - last.load)
+            ceiling = 1.6 * step
+            if step < chosen.smallest_step:
+                return finished(newton, states, residual, Status.SINGULAR if newton.drifts else Status.STEP_TOO_SMALL, throw)
+            continue
+        residual = found[1]
+        states.append(advanced(problem, found[0], last.anchors, load))
+        if hints:
+            step = min(1.0, 2.0 * step)
+        else:
+            ceiling = min(chosen.largest_step, 1.25 * ceiling)
+            step = min(ceiling, step * _growth(newton.iterations - before))
+        if callback is not None:
+            callback(load)
+    return finished(newton, states, residual, Status.CONVERGED, throw)
+
+
+def _growth(iterations: int) -> float:
+    """Factor for the next load step after one that took this many Newton iterations: failed steps cost more than short ones."""
+    return float(np.clip(np.sqrt(USUAL_ITERATIONS / max(iterations, 1)), 0.6, 1.5))
+
+
+def _guesses(states: list[LoadState], load: float, before: Hint | None, ahead: Hint | None) -> list[FloatArray]:
+    """Displacements to start from at `load`: what the hints around it say, then the path extrapolated through its last states."""
+    out, last = [], states[-1]
+    if ahead is not None:
+        missed = last.displacement - before[1] if before is not None and before[0] == last.load else 0.0
+        share = (load - last.load) / (ahead[0] - last.load)
+        out.append(ahead[1] + missed if share == 1.0 else last.displacement + share * (ahead[1] + missed - last.displacement))
+    if len(states) > 2 or not out:
+        known = states[-3:] if len(states) > 3 else states[-2:]
+        guess = np.zeros_like(last.displacement)
+        for state in known:
+            others = [other.load for other in known if other is not state]
+            guess += float(np.prod([(load - other) / (state.load - other) for other in others])) * state.displacement
+        out.append(guess)
+    return out
+
+
+def advanced(problem: Problem, u: FloatArray, anchors: tuple[FloatArray, ...], load: float) -> LoadState:
+    """Return the converged state `u` with the anchors for the next step."""
+    moved = tuple(c.next_anchors(c.evaluate(u, a, load)) for c, a in zip(problem.contacts, anchors, strict=True))
+    return LoadState(load, u, moved)
+
+
+def finished(newton: Newton, states: list[LoadState], residual: float, status: Status, throw: bool) -> Solution:
+    """Return the solution that ends with the last of `states`, with its reactions; raises a `ConvergenceError` if asked to."""
+    if throw and not status.ok:
+        raise ConvergenceError(f"stopped at {100 * states[-1].load:.1f} % of the load. {status.value}")
+    problem, last = newton.problem, states[-1]
+    reactions: dict[str, FloatArray] = {}
+    penetration = 0.0
+    contact = np.zeros_like(last.displacement)
+    anchors = states[-2].anchors if len(states) > 1 else last.anchors
+    for c, a in zip(problem.contacts, anchors, strict=True):
+        response = c.evaluate(last.displacement, a, last.load)
+        nodal = c.scattered(response.force, len(contact), response.orientation)
+        contact += nodal
+        reactions[c.name] = (response.force @ response.orientation.T).sum(axis=0)
+        penetration = max(penetration, float(-response.gap.min()))
+    internal = problem.assembler.forces(last.displacement)[1]
+    held = problem.prescribed.held
+    reactions["prescribed"] = np.where(held, internal - contact - problem.external_force, 0.0).sum(axis=0)
+    name = newton.solver.name if newton.solver is not None else "none"
+    return Solution(tuple(states), status, reactions, newton.iterations, residual, penetration, name)

@@ -1,0 +1,292 @@
+"""Lattices in motion: states, held masses, and engines that take many steps in one call (spec L1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike
+
+from naibu.core.arrays import AnyFloatArray, FloatArray
+from naibu.core.errors import ConvergenceError, InputError
+from naibu.mechanics.lattices.cpu._simd import WIDTH, aligned
+from naibu.mechanics.lattices.cpu._thread_pool import MOST_PARTS
+from naibu.mechanics.lattices.cpu.element_blocks import Blocks, explicit_kernel, implicit_kernel
+from naibu.mechanics.lattices.cpu.stepper import ExplicitStepper, ImplicitStepper, Stepper, own_copy
+from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters, require_positive
+from naibu.mechanics.lattices.model.state import (
+    STEP_S,
+    HeldNodes,
+    LatticeState,
+    Method,
+    Motion,
+    checked_velocity,
+    explicit_step_limit,
+    require_held,
+    require_numbers,
+)
+
+THREADED_FROM = 20_000  # elements; below, one thread is faster than two that wait for each other
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LatticeEngine:
+    """A lattice prepared for steps of one length by one method.
+
+    Attributes
+    ----------
+    lattice : Lattice
+        Masses and elements.
+    parameters : LatticeParameters
+        Of the elements.
+    step : float
+        s.
+    method : str
+        ``"implicit"`` (default, stable for all parameters), ``"euler"`` (the report's explicit method) or ``"symplectic_euler"``
+        (explicit; positions move by the new velocity, and the tension follows the extension that the old one leads to).
+    blocks : Blocks
+        Where elements are stored.
+    tolerance : float
+        Of the implicit solver, relative to the residual that the old velocity leaves.
+    threads : int
+        Threads of the explicit steps.
+    """
+
+    lattice: Lattice
+    parameters: LatticeParameters
+    step: float
+    method: Method
+    blocks: Blocks
+    tolerance: float
+    threads: int
+    kernel: tuple[Any, ...]
+    mass: AnyFloatArray
+
+    @classmethod
+    def of(
+        cls,
+        lattice: Lattice,
+        parameters: LatticeParameters,
+        *,
+        step: float = STEP_S,
+        method: Method = "implicit",
+        precision: Literal["double", "single"] = "double",
+        tolerance: float = 1e-2,
+        threads: int | None = None,
+    ) -> LatticeEngine:
+        """Prepare a lattice.
+
+        Parameters
+        ----------
+        lattice, parameters : Lattice, LatticeParameters
+            What moves.
+        step : float
+            s.
+        method, precision : str
+            See the attributes; explicit steps in single precision take half the time.
+        tolerance : float
+            Of the implicit solver: 0.01 changes displacements by some 1e-5, forces by 2e-5 of their size. Stability does not depend on it.
+        threads : int
+            Of explicit steps; by default those of Numba from 20 000 elements, else one.
+
+        Raises
+        ------
+        InputError
+            A step, tolerance or number of threads that is not positive, parameters of another lattice, an unknown method or precision, or
+            single precision with the implicit method.
+        """
+        _check(lattice, parameters, step, method, precision, tolerance, threads)
+        kind = np.float32 if precision == "single" else np.float64
+        blocks = Blocks.of(lattice)
+        if threads is None:
+            threads = numba.get_num_threads() if method != "implicit" and lattice.n_elements >= THREADED_FROM else 1
+        pad = -(-lattice.n_nodes // WIDTH) * WIDTH + WIDTH
+        mass = aligned((pad,), kind)
+        mass[: lattice.n_nodes] = lattice.node_mass
+        kernel = _kernel(lattice, parameters, step, method, blocks, mass, threads)
+        return cls(lattice, parameters, float(step), method, blocks, float(tolerance), threads, kernel, mass)
+
+    def rest(self) -> LatticeState:
+        """Return the lattice at rest, without any force."""
+        return LatticeState(self.lattice.points.copy(), np.zeros_like(self.lattice.points), np.zeros(self.lattice.n_elements))
+
+    def run(
+        self,
+        state: LatticeState,
+        steps: int,
+        held: HeldNodes | None = None,
+        velocity: ArrayLike = 0.0,
+        external_force: ArrayLike | None = None,
+    ) -> Motion:
+        """Take steps.
+
+        Parameters
+        ----------
+        state : LatticeState
+            Where they begin; unchanged.
+        steps : int
+            How many.
+        held : HeldNodes
+            Masses that bodies move.
+        velocity : array_like
+            Velocity of the bodies, mm/s, broadcast to (steps, bodies, 3).
+        external_force : array_like
+            Forces on the masses that do not change, mN, broadcast to (n, 3).
+
+        Raises
+        ------
+        InputError
+            Shapes that do not fit, or NaN.
+        ConvergenceError
+            The explicit method blew up.
+        """
+        held = held or HeldNodes.none()
+        bodies = int(held.body.max(initial=-1)) + 1
+        path = checked_velocity(velocity, steps, bodies)
+        stepper = self.stepper(state, external_force, shared=True)
+        require_held(held, self.lattice.n_nodes)
+        reaction = np.zeros(path.shape)
+        stepper.hold((held.node, held.direction, held.weight, held.body), path.shape[1])
+        iterations, held_back = stepper.advance(path, reaction)
+        stepper.close()
+        self.check(stepper, steps)
+        return Motion(self.state(stepper), reaction, iterations / max(steps, 1), held_back)
+
+    def stepper(self, state: LatticeState, external_force: ArrayLike | None = None, *, shared: bool) -> Stepper:
+        """Return what takes steps from a state on; if `shared`, with the engine's working arrays, which serve one at a time.
+
+        Raises
+        ------
+        InputError
+            Arrays of other shapes, or NaN.
+        """
+        x, v, y = self.stored(state)
+        external = aligned((0,), x.dtype)
+        if external_force is not None:
+            force = np.broadcast_to(np.asarray(external_force, dtype=float), self.lattice.points.shape)
+            require_numbers(force, "external_force")
+            external = self.by_component(force, x.dtype)
+        if self.method != "implicit":
+            return ExplicitStepper(x, v, y, None, self.kernel, external, self.step, self.method == "euler")
+        blocks, tables, work, inner = self.kernel
+        own = (blocks, tables, work, inner) if shared else (blocks, tables, own_copy(work), own_copy(inner))
+        return ImplicitStepper(x, v, y, self.stored_lengths(state), own, shared, external, self.step, self.mass, self.tolerance)
+
+    def energy(self, state: LatticeState) -> float:
+        """Return kinetic energy plus that of the springs, mN mm; free of supports and forces it never grows."""
+        kinetic = 0.5 * float((self.lattice.node_mass * (state.velocity**2).sum(axis=1)).sum())
+        return kinetic + 0.5 * float((self.parameters.stiffness * state.extension**2).sum())
+
+    def stored(self, state: LatticeState) -> tuple[Any, Any, Any]:
+        """Return position, velocity (3 pad,) and extension (8 nb,) as the kernels hold them, copied.
+
+        Raises
+        ------
+        InputError
+            Arrays of other shapes, or NaN.
+        """
+        n, m = self.lattice.n_nodes, self.lattice.n_elements
+        for name, array, shape in (
+            ("position", state.position, (n, 3)),
+            ("velocity", state.velocity, (n, 3)),
+            ("extension", state.extension, (m,)),
+        ):
+            if np.shape(array) != shape:
+                raise InputError(f"the {name} of the state has shape {np.shape(array)}, the lattice needs {shape}")
+            require_numbers(np.asarray(array), f"the {name} of the state")
+        kind = self.mass.dtype
+        y = aligned((WIDTH * self.blocks.n_blocks,), kind)
+        y[self.blocks.lane] = state.extension
+        return self.by_component(state.position, kind), self.by_component(state.velocity, kind), y
+
+    def stored_lengths(self, state: LatticeState) -> Any:
+        """Return the lengths that the extensions followed (8 nb,), as kernels hold them."""
+        known = state.length
+        if known is None:
+            i, j = self.lattice.elements.T
+            known = np.linalg.norm(state.position[j] - state.position[i], axis=1)
+        if np.shape(known) != (self.lattice.n_elements,):
+            raise InputError(f"the length of the state has shape {np.shape(known)}, the lattice has {self.lattice.n_elements} elements")
+        lengths = aligned((WIDTH * self.blocks.n_blocks,), float)
+        lengths[self.blocks.lane] = known
+        return lengths
+
+    def read(self, x: Any, v: Any, y: Any) -> LatticeState:
+        """Return the state that arrays of the kernels hold."""
+        n = self.lattice.n_nodes
+        position, velocity = (np.ascontiguousarray(a.reshape(3, -1)[:, :n].T, dtype=np.float64) for a in (x, v))
+        return LatticeState(position, velocity, y[self.blocks.lane].astype(np.float64))
+
+    def by_component(self, values: FloatArray, kind: Any) -> Any:
+        """Return values of the masses (n, 3) as kernels hold them, (3 pad,)."""
+        result = aligned((3 * len(self.mass),), kind)
+        result.reshape(3, -1)[:, : len(values)] = values.T
+        return result
+
+    def state(self, stepper: Stepper) -> LatticeState:
+        """Return a copy of the state that a stepper has reached."""
+        found = self.read(stepper.position, stepper.velocity, stepper.extension)
+        return found if stepper.length is None else replace(found, length=stepper.length[self.blocks.lane])
+
+    def check(self, stepper: Stepper, steps: int) -> None:
+        """Check that explicit steps did not blow up; the implicit ones cannot.
+
+        Raises
+        ------
+        ConvergenceError
+            They did.
+        """
+        if self.method == "implicit":
+            return
+        n, points = self.lattice.n_nodes, self.lattice.points
+        reach = 1e3 * (np.ptp(points, axis=0).max() + self.lattice.spacing_mm)
+        moved = np.abs(stepper.position.reshape(3, -1)[:, :n] - points.T).max()
+        if not (np.isfinite(stepper.velocity).all() and moved < reach):
+            limit = explicit_step_limit(self.lattice, self.parameters)
+            raise ConvergenceError(
+                f"the explicit steps of {self.step:g} s blew up within {steps} steps; the springs and dampers allow about {limit:.2g} s: "
+                "take shorter steps, or method='implicit', which is stable for all parameters"
+            )
+
+
+def _kernel(
+    lattice: Lattice, parameters: LatticeParameters, step: float, method: Method, blocks: Blocks, mass: Any, threads: int
+) -> tuple[Any, ...]:
+    if method == "implicit":
+        return implicit_kernel(lattice, parameters, step, blocks, mass)
+    return explicit_kernel(parameters, step, blocks, mass, min(threads, MOST_PARTS), method == "euler")
+
+
+def _check(
+    lattice: Lattice, parameters: LatticeParameters, step: float, method: str, precision: str, tolerance: float, threads: int | None
+) -> None:
+    require_positive(step, "the step", "s")
+    require_positive(tolerance, "the tolerance", "")
+    if tolerance >= 1.0:
+        raise InputError(f"the tolerance is a share of the residual and must be below 1, not {tolerance:g}")
+    if len(parameters.stiffness) != lattice.n_elements:
+        raise InputError(f"there are parameters for {len(parameters.stiffness)} elements, the lattice has {lattice.n_elements}")
+    if method not in ("implicit", "euler", "symplectic_euler"):
+        raise InputError(f"methods are 'implicit', 'euler' and 'symplectic_euler', not {method!r}")
+    if precision not in ("double", "single"):
+        raise InputError(f"precision is 'double' or 'single', not {precision!r}")
+    if precision == "single" and method == "implicit":
+        raise InputError("the implicit method solves in single precision already; give precision='double', or an explicit method")
+    if threads is not None and threads < 1:
+        raise InputError(f"the number of threads must be positive, not {threads}")
+
+
+def with_parameters(engine: LatticeEngine, parameters: LatticeParameters) -> LatticeEngine:
+    """Return the engine for other parameters of the same lattice.
+
+    Raises
+    ------
+    InputError
+        Parameters of another lattice.
+    """
+    precision: Literal["double", "single"] = "single" if engine.mass.dtype == np.float32 else "double"
+    _check(engine.lattice, parameters, engine.step, engine.method, precision, engine.tolerance, engine.threads)
+    kernel = _kernel(engine.lattice, parameters, engine.step, engine.method, engine.blocks, engine.mass, engine.threads)
+    return replace(engine, parameters=parameters, kernel=kernel)

@@ -1,0 +1,141 @@
+"""What takes the steps of a lattice, with its state as the kernels hold it; `LatticeEngine.run` and `LatticeSession` share it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from contextlib import nullcontext
+from dataclasses import dataclass
+from threading import Lock
+from typing import Any
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray
+from naibu.mechanics.lattices.cpu._explicit_kernels import explicit_steps, help_explicit
+from naibu.mechanics.lattices.cpu._implicit_kernels import implicit_steps
+from naibu.mechanics.lattices.cpu._thread_pool import PARTS, REST, STOP, dismiss, lend, new_control
+
+MOST_ITERATIONS = 20_000
+_SHARED = Lock()
+
+
+@dataclass(slots=True, eq=False)
+class Stepper(ABC):
+    """A state on its way.
+
+    Attributes
+    ----------
+    position, velocity : ndarray, shape (3 pad,)
+        x, y and z of all masses one after the other, mm and mm/s.
+    extension, length : ndarray, shape (8 nb,)
+        Of the elements, as blocks store them, mm; explicit methods leave the lengths alone.
+    """
+
+    position: Any
+    velocity: Any
+    extension: Any
+    length: Any
+
+    @abstractmethod
+    def hold(self, entries: tuple[Any, ...], bodies: int) -> None:
+        """Hold masses from now on: node, direction, weight and body of every held component."""
+
+    @abstractmethod
+    def advance(self, velocity: FloatArray, reaction: FloatArray, *, alone: bool = False) -> tuple[int, int]:
+        """Take steps and fill the reactions, (steps, bodies, 3) both; return iterations and how often rotation was held back.
+
+        If `alone`, no helper is asked.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Send helpers away, if there are any."""
+
+
+@dataclass(slots=True, eq=False)
+class ExplicitStepper(Stepper):
+    """Explicit steps, in parts that helpers can take."""
+
+    kernel: tuple[Any, ...]
+    external: Any
+    step: float
+    forward: bool
+    control: Any = None
+    data: tuple[Any, ...] = ()
+
+    def hold(self, entries: tuple[Any, ...], bodies: int) -> None:
+        """Hold masses from now on."""
+        self.close()
+        blocks, tables, masses, parts = self.kernel
+        count = len(parts[0]) - 1
+        order = np.argsort(entries[0], kind="stable")
+        held = tuple(np.ascontiguousarray(values[order]) for values in entries)
+        mine = np.searchsorted(held[0], parts[1])
+        kind = self.position.dtype.type
+        driven = (np.zeros((bodies, 3)), np.zeros((count, bodies, 3)))
+        state, how = (self.position, self.velocity, self.extension), (kind(self.step), self.forward)
+        forces = np.zeros((count, len(self.position)), kind)
+        self.data = (blocks, (*parts, mine), tables, state, masses, self.external, held, driven, forces, how)
+        self.control = new_control(count)
+        if count > 1:  # returns at once, compiled, lest helpers compile while steps wait
+            dismiss(self.control)
+            help_explicit(self.control, self.data)
+
+    def advance(self, velocity: FloatArray, reaction: FloatArray, *, alone: bool = False) -> tuple[int, int]:
+        """Take steps and fill the reactions."""
+        if self.control[STOP]:  # closed in between; helpers may still be on their way out
+            self.control = new_control(int(self.control[PARTS]))
+        if alone:
+            self.control[REST] = max(self.control[REST], len(velocity))
+        lend(help_explicit, self.control, self.data)
+        explicit_steps(self.control, self.data, velocity, reaction)
+        return 0, 0
+
+    def close(self) -> None:
+        """Send helpers away."""
+        if self.control is not None:
+            dismiss(self.control)
+
+
+@dataclass(slots=True, eq=False)
+class ImplicitStepper(Stepper):
+    """Implicit steps; the working arrays in `kernel` are its own, unless it is `shared` with others, who wait for one another."""
+
+    kernel: tuple[Any, ...]
+    shared: bool
+    external: Any
+    step: float
+    mass: Any
+    tolerance: float
+    held: tuple[Any, ...] = ()
+
+    def hold(self, entries: tuple[Any, ...], bodies: int) -> None:
+        """Hold masses from now on."""
+        self.held = entries
+
+    def advance(self, velocity: FloatArray, reaction: FloatArray, *, alone: bool = False) -> tuple[int, int]:
+        """Take steps and fill the reactions."""
+        blocks, tables, work, inner = self.kernel
+        state, solver = (self.position, self.velocity, self.extension, self.length), (self.tolerance, MOST_ITERATIONS)
+        reaction[:] = 0.0
+        with _SHARED if self.shared else nullcontext():
+            found: tuple[int, int] = implicit_steps(
+                blocks, tables, state, self.mass, self.external, work, inner, self.held, velocity, self.step, solver, reaction
+            )
+        return found
+
+    def close(self) -> None:
+        """There are no helpers to send away."""
+
+
+def own_copy(arrays: Any) -> Any:
+    """Return a copy of working arrays in tuples, aligned as they are."""
+    if isinstance(arrays, tuple):
+        return tuple(own_copy(one) for one in arrays)
+    if isinstance(arrays, np.ndarray):
+        raw = np.zeros(arrays.nbytes + 64, dtype=np.uint8)
+        start = -raw.ctypes.data % 64
+        result = raw[start : start + arrays.nbytes].view(arrays.dtype).reshape(arrays.shape)
+        result[...] = arrays
+        return result
+    return arrays

@@ -1,0 +1,1 @@
+"""The engine of lattices on a graphics processor (NVIDIA Warp)."""

@@ -1,0 +1,179 @@
+"""The state of a lattice, what is prescribed of it, and the largest stable explicit step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.errors import InputError
+from naibu.mechanics.lattices.model.coefficients import explicit_coefficients
+from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
+
+Method = Literal["implicit", "euler", "symplectic_euler"]
+STEP_S = 2e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LatticeState:
+    """What changes while a lattice moves.
+
+    Attributes
+    ----------
+    position : ndarray, shape (n, 3)
+        mm.
+    velocity : ndarray, shape (n, 3)
+        mm/s.
+    extension : ndarray, shape (m,)
+        How much longer than at rest the Voigt part of every element is, y = Z - a L, mm.
+    length : ndarray, shape (m,)
+        Lengths of the elements that the extensions have followed so far, mm; by default the distances of the masses. They lag behind where
+        the implicit method held back what rotation adds, and catch up.
+    """
+
+    position: FloatArray
+    velocity: FloatArray
+    extension: FloatArray
+    length: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldNodes:
+    """Components of masses that move as rigid bodies do.
+
+    Attributes
+    ----------
+    node : ndarray, shape (h,), int64
+        Masses; one occurs once for each direction in which it is held.
+    direction : ndarray, shape (h, 3)
+        Unit vectors, orthogonal where they belong to one mass.
+    weight : ndarray, shape (h,)
+        Share of the body's velocity that the mass takes on.
+    body : ndarray, shape (h,), int64
+        Number of the body.
+    """
+
+    node: IntArray
+    direction: FloatArray
+    weight: FloatArray
+    body: IntArray
+
+    @classmethod
+    def none(cls) -> HeldNodes:
+        """Hold nothing."""
+        return cls(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
+
+    @classmethod
+    def of(cls, nodes: ArrayLike, body: int = 0, *, axes: Sequence[int] = (0, 1, 2), weight: ArrayLike = 1.0) -> HeldNodes:
+        """Hold masses along axes of the frame by a body, with a weight, or one a mass."""
+        chosen = np.atleast_1d(np.asarray(nodes, dtype=np.int64))
+        share = np.broadcast_to(np.asarray(weight, dtype=float), chosen.shape)
+        k = len(axes)
+        return cls(
+            np.repeat(chosen, k), np.tile(np.eye(3)[list(axes)], (len(chosen), 1)), np.repeat(share, k), np.full(k * len(chosen), body)
+        )
+
+    def __add__(self, other: HeldNodes) -> HeldNodes:
+        """Hold what either holds."""
+        pairs = ((getattr(self, name), getattr(other, name)) for name in ("node", "direction", "weight", "body"))
+        return HeldNodes(*(np.concatenate(pair) for pair in pairs))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """What a run of steps gave.
+
+    Attributes
+    ----------
+    state : LatticeState
+        After the last step.
+    reaction : ndarray, shape (steps, bodies, 3)
+        Forces that the bodies exert on the lattice, mN: with them its momentum balances.
+    iterations : float
+        Mean number of iterations of the solver in a step.
+    held_back : int
+        Steps in which the stretching by rotation was held back so that the energy does not grow; other than zero for steps of large turns.
+    """
+
+    state: LatticeState
+    reaction: FloatArray
+    iterations: float = 0.0
+    held_back: int = 0
+
+
+def checked_velocity(velocity: ArrayLike, steps: int, bodies: int) -> FloatArray:
+    """Return velocities of bodies (steps, bodies, 3), mm/s.
+
+    Raises
+    ------
+    InputError
+        No number of steps, values that cannot be broadcast, or NaN.
+    """
+    if steps < 0:
+        raise InputError(f"the number of steps must not be negative, not {steps}")
+    given = np.asarray(velocity, dtype=float)
+    bodies = max(bodies, given.shape[-2] if given.ndim >= 2 else 0)
+    try:
+        path = np.array(np.broadcast_to(given, (steps, bodies, 3)))
+    except ValueError:
+        raise InputError(
+            f"velocities of shape {given.shape} do not fit {steps} steps of {bodies} bodies: give (steps, bodies, 3)"
+        ) from None
+    require_numbers(path, "velocity")
+    return path
+
+
+def require_numbers(values: FloatArray, what: str) -> None:
+    """Check that all values are finite.
+
+    Raises
+    ------
+    InputError
+        Some are not; the message counts them.
+    """
+    wrong = ~np.isfinite(values)
+    if wrong.any():
+        at = tuple(int(k) for k in np.argwhere(wrong)[0])
+        raise InputError(f"{what} holds {int(wrong.sum())} NaN or infinite values, the first at {at}; leave them out or fill them")
+
+
+def require_held(held: HeldNodes, n_nodes: int) -> None:
+    """Check held masses.
+
+    Raises
+    ------
+    InputError
+        A mass that is not there, directions that are not of unit length, or two that are not orthogonal at one mass.
+    """
+    if not len(held.node):
+        return
+    if held.node.min() < 0 or held.node.max() >= n_nodes:
+        raise InputError(f"held masses have the numbers {held.node.min()} to {held.node.max()}, the lattice has 0 to {n_nodes - 1}")
+    require_numbers(held.direction, "the direction of held masses")
+    if np.abs(np.linalg.norm(held.direction, axis=1) - 1.0).max() > 1e-6:
+        raise InputError("the directions of held masses must be of unit length; divide them by their norm")
+    order = np.argsort(held.node, kind="stable")
+    node, direction = held.node[order], held.direction[order]
+    for apart in range(1, min(4, len(node))):
+        together = node[apart:] == node[:-apart]
+        cosine = np.abs((direction[apart:] * direction[:-apart]).sum(axis=1))[together]
+        if len(cosine) and cosine.max() > 1e-6:
+            bad = int(node[apart:][together][int(np.argmax(cosine))])
+            raise InputError(f"mass {bad} is held twice in directions that are not orthogonal; hold each component by one body only")
+
+
+def explicit_step_limit(lattice: Lattice, parameters: LatticeParameters) -> float:
+    """Return a step, s, up to which explicit steps are stable for small motions; a bound, reached within about a factor of two.
+
+    From Gershgorin's bound of the damping and of the stiffness of all elements at a mass, and the elements' own times (C1 + C2) / K.
+    """
+    a, b, _, g = explicit_coefficients(parameters)
+    ends = lattice.elements.ravel()
+    damping, stiffness = (np.bincount(ends, np.repeat(2.0 * c, 2)) / lattice.node_mass for c in (a, b))
+    fastest = 0.5 * damping.max() + np.sqrt(0.25 * damping.max() ** 2 + stiffness.max())
+    slowest = float(g.max())
+    return float(2.0 / max(fastest, slowest, 1e-300))

@@ -1,0 +1,1 @@
+"""Simulations with lattices: sessions, contact with indenters, loading histories, and their derivatives."""

@@ -1,0 +1,324 @@
+"""Implicit steps of a lattice in contact with rigid bodies: which masses stick, slide or leave is settled within every step (spec L5).
+
+Friction on a sliding mass is ``mu_k N`` against the velocity v at which it slides. In a pass it is taken as a drag, ``-w v`` with
+``w = mu_k N / |v|`` of the pass before, which adds to the matrix what keeps it positive: it can slow a mass down, never turn it round, and
+no force outside the cone is left behind whenever the passes end.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from naibu._numba.compilation import njit
+from naibu.mechanics.contact.rigid_indenters import surface_gap
+from naibu.mechanics.lattices.cpu._coarse_kernels import begin
+from naibu.mechanics.lattices.cpu._implicit_kernels import add_momenta, advance, new_velocity
+
+FREE, STICK, SLIDE = range(3)
+PASSES = 20
+REFINED = 4  # times that the drag of a mass is found anew within a step
+AGREED = 0.01  # relative error of the friction at which a step is settled
+
+
+@njit(cache=True)
+def _look(shapes, places, x, candidates, pad, near):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set near (c, bodies, 4) to normals and gaps of candidates at x from bodies at `places`."""
+    kinds, axes, sizes = shapes
+    d = np.empty(3)
+    for c in range(len(candidates)):
+        for k in range(len(kinds)):
+            for a in range(3):
+                d[a] = x[a * pad + candidates[c]] - places[k, a]
+            surface_gap(kinds[k], axes[k], sizes[k], d, near[c, k])
+
+
+@njit(cache=True)
+def _constraints(candidates, mode, near, velocity, step, held):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Write what holds the touching masses to held and return how many entries there are.
+
+    `near` are normals and gaps of the masses before, from the bodies after the step. A mass
+    takes the normal of each body that it touches, made orthogonal to those before it, and what is left where it sticks.
+    """
+    node, direction, speed, body = held
+    count = 0
+    t = np.empty(3)
+    for c in range(len(candidates)):
+        begin, sticks = count, -1
+        for k in range(mode.shape[1]):
+            if mode[c, k] == FREE:
+                continue
+            if mode[c, k] == STICK and sticks < 0:
+                sticks = k
+            if count - begin == 3:
+                continue
+            goal = -near[c, k, 3] / step
+            for a in range(3):
+                t[a] = near[c, k, a]
+            for h in range(begin, count):
+                along = direction[h, 0] * t[0] + direction[h, 1] * t[1] + direction[h, 2] * t[2]
+                goal -= along * speed[h]
+                for a in range(3):
+                    t[a] -= along * direction[h, a]
+            length = np.sqrt(t[0] ** 2 + t[1] ** 2 + t[2] ** 2)
+            if length > 0.1:
+                node[count], speed[count], body[count] = candidates[c], goal / length, k
+                for a in range(3):
+                    direction[count, a] = t[a] / length
+                count += 1
+        if sticks >= 0:
+            count = _complete(candidates[c], sticks, velocity[sticks], begin, count, held)
+    return count
+
+
+@njit(cache=True)
+def _complete(mass, k, velocity, begin, count, held):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add to the directions begin to count the ones that are orthogonal to them, in which the mass moves with body k."""
+    node, direction, speed, body = held
+    t = np.empty(3)
+    while count - begin < 3:
+        best = 0.0
+        for axis in range(3):
+            left = 1.0
+            for h in range(begin, count):
+                left -= direction[h, axis] ** 2
+            if left > best:
+                best, chosen = left, axis
+        for a in range(3):
+            t[a] = 1.0 if a == chosen else 0.0
+        for h in range(begin, count):
+            along = direction[h, chosen]
+            for a in range(3):
+                t[a] -= along * direction[h, a]
+        length = np.sqrt(t[0] ** 2 + t[1] ** 2 + t[2] ** 2)
+        node[count], body[count], speed[count] = mass, k, 0.0
+        for a in range(3):
+            direction[count, a] = t[a] / length
+            speed[count] += direction[count, a] * velocity[a]
+        count += 1
+    return count
+
+
+@njit(cache=True)
+def _forces(held, count, candidates, row, r, pad, step, near, force):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set force (c, bodies, 3) to what the bodies exert on held masses, mN, from the residual r."""
+    node, direction, _, body = held
+    force[:] = 0.0
+    for h in range(count):
+        i = node[h]
+        along = -(direction[h, 0] * r[i] + direction[h, 1] * r[pad + i] + direction[h, 2] * r[2 * pad + i]) / step
+        for a in range(3):
+            force[row[i], body[h], a] += along * direction[h, a]
+
+
+@njit(cache=True)
+def _slip(v, velocity, normal, i, pad, slip):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set slip to the velocity at which mass i slides over a body, mm/s, and return its size."""
+    away = 0.0
+    for a in range(3):
+        slip[a] = v[a * pad + i] - velocity[a]
+        away += slip[a] * normal[a]
+    for a in range(3):
+        slip[a] -= away * normal[a]
+    return np.sqrt(slip[0] ** 2 + slip[1] ** 2 + slip[2] ** 2)
+
+
+@njit(cache=True)
+def _begin(mode, friction, near, sliding, drag, v, candidates, velocity, pad, slow):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Let masses that hardly slide stick, and give the others the drag that makes the friction of the step before."""
+    slip = np.empty(3)
+    drag[:] = 0.0
+    for c in range(mode.shape[0]):
+        for k in range(mode.shape[1]):
+            if mode[c, k] != SLIDE or friction[k, 0] == 0.0:
+                continue
+            speed = _slip(v, velocity[k], near[c, k], candidates[c], pad, slip)
+            if speed < slow:
+                mode[c, k] = STICK
+            else:
+                drag[c, k] = np.sqrt((sliding[c, k] ** 2).sum()) / speed
+            sliding[c, k, :] = 0.0
+
+
+@njit(cache=True)
+def _load(candidates, mass, smoother, drag, sliding, velocity, step, pad, heavy, light, smooth, right):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add drags and friction that is given as a force to the masses of the matrix, its smoother and the right side."""
+    for c in range(len(candidates)):
+        i = candidates[c]
+        added = 0.0
+        for k in range(drag.shape[1]):
+            added += step * drag[c, k]
+            for a in range(3):
+                right[a * pad + i] += step * (drag[c, k] * velocity[k, a] + sliding[c, k, a])
+        heavy[i] = mass[i] + added
+        light[i] = heavy[i]
+        smooth[i] = 1.0 / (1.0 / smoother[i] + added)
+
+
+@njit(cache=True)
+def _dragged(candidates, mode, drag, sliding, near, velocity, v, pad, force, applied):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set applied (c, bodies, 3) to the friction on sliding masses, and give the normal part of the drag to `force`."""
+    slip = np.empty(3)
+    for c in range(mode.shape[0]):
+        i = candidates[c]
+        for k in range(mode.shape[1]):
+            applied[c, k, :] = sliding[c, k]
+            if drag[c, k] == 0.0:
+                continue
+            _slip(v, velocity[k], near[c, k], i, pad, slip)
+            for a in range(3):
+                applied[c, k, a] -= drag[c, k] * slip[a]
+                force[c, k, a] += drag[c, k] * (velocity[k, a] - v[a * pad + i] + slip[a])
+
+
+@njit(cache=True)
+def _judge(modes, seen, friction, v, candidates, velocity, pad, bounds):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Change modes that the solution contradicts, and the drag of sliding masses; return how many changed.
+
+    `modes` are mode, friction that is given as a force, drag, the limits mu_k N (the mean of passes: alone they swing), and how often a
+    mass began to touch in this step and had its drag changed, which ends circles; `seen` are `near`, gaps after the step, forces and
+    friction; `bounds` the depth that counts as none, mm, and the speed, mm/s, below which friction is a drag.
+    """
+    mode, sliding, drag, limits, switched = modes
+    near, after, force, applied = seen
+    deep, slow = bounds
+    changed = 0
+    slip = np.empty(3)
+    for c in range(mode.shape[0]):
+        i = candidates[c]
+        for k in range(mode.shape[1]):
+            if mode[c, k] == FREE:
+                if after[c, k, 3] < -deep and switched[c, k, 0] < 3:
+                    moving = _slip(v, velocity[k], after[c, k], i, pad, slip) > slow
+                    mode[c, k] = SLIDE if moving or friction[k, 0] == 0.0 else STICK
+                    switched[c, k, 0] += 1
+                    changed += 1
+                continue
+            press = 0.0
+            for a in range(3):
+                press += force[c, k, a] * near[c, k, a]
+            if press < 0.0:
+                mode[c, k] = FREE
+                sliding[c, k, :], drag[c, k], limits[c, k] = 0.0, 0.0, 0.0
+                changed += 1
+                continue
+            if friction[k, 0] == 0.0:
+                continue
+            if mode[c, k] == STICK:
+                tangential = 0.0
+                for a in range(3):
+                    tangential += (force[c, k, a] - press * near[c, k, a]) ** 2
+                tangential = np.sqrt(tangential)
+                if tangential > friction[k, 0] * press * (1.0 + AGREED):
+                    mode[c, k] = SLIDE
+                    changed += 1
+                    for a in range(3):
+                        sliding[c, k, a] = friction[k, 1] * press * (force[c, k, a] - press * near[c, k, a]) / tangential
+                continue
+            limits[c, k] = friction[k, 1] * press if limits[c, k] == 0.0 else 0.5 * (limits[c, k] + friction[k, 1] * press)
+            speed, limit = _slip(v, velocity[k], near[c, k], i, pad, slip), limits[c, k]
+            new = limit / max(speed, slow)
+            size = np.sqrt((applied[c, k] ** 2).sum())
+            wrong = abs(new * speed - size) > AGREED * limit
+            if (wrong or (sliding[c, k] != 0.0).any()) and switched[c, k, 1] < REFINED:
+                sliding[c, k, :], drag[c, k] = 0.0, new
+                switched[c, k, 1] += 1
+                changed += 1
+    return changed
+
+
+@njit(cache=True)
+def _pull_off(touched, mode, pull, near, velocity, v, mass, candidates, step, pad, right, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add the impulses of pull-off to `right`: on masses that touched a body and leave it slowly, never more than stops them."""
+    for c in range(mode.shape[0]):
+        i = candidates[c]
+        for k in range(mode.shape[1]):
+            if not touched[c, k] or mode[c, k] != FREE or near[c, k, 3] < 0.0:
+                continue
+            rate = 0.0
+            for a in range(3):
+                rate += near[c, k, a] * (v[a * pad + i] - velocity[k, a])
+            if 0.0 < rate < pull[k, 2]:
+                force = min(pull[k, 0] * near[c, k, 3] + pull[k, 1] * rate, mass[i] * rate / step)
+                for a in range(3):
+                    right[a * pad + i] -= step * force * near[c, k, a]
+                    reaction[k, a] -= force * near[c, k, a]
+
+
+@njit(cache=True)
+def _settle(engine, held, modes, seen, shapes, places, friction, candidates, base, masses, velocity, most, slow):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Solve a step until its contacts agree with the solution; return iterations, passes, what the solver lost, and whether they agree.
+
+    `engine` are what `new_velocity` takes; `base` the right side without friction (3 pad,); `masses` those of the lattice, its smoother
+    and, for the matrix, all of them with drags.
+    """
+    blocks, tables, x, v, y, right, work, inner, step, solver = engine
+    node, direction, speed, body = held
+    mode, sliding, drag, _, _ = modes
+    near, after, force, applied = seen
+    mass, smoother, heavy = masses
+    pad, iterations, lost = len(mass), 0, 0.0
+    moved, row = np.empty_like(x), np.zeros(pad, np.int64)
+    for m in range(len(candidates)):
+        row[candidates[m]] = m
+    for attempt in range(most):
+        right[:] = base
+        _load(candidates, mass, smoother, drag, sliding, velocity, step, pad, heavy, inner[2], inner[3], right)
+        count = _constraints(candidates, mode, near, velocity, step, held)
+        now = (node[:count], direction[:count], speed[:count], body[:count])
+        done, lost = new_velocity(blocks, tables, x, v, y, heavy, right, work, inner, now, step, solver)
+        iterations += done
+        _forces(now, count, candidates, row, work[1], pad, step, near, force)
+        _dragged(candidates, mode, drag, sliding, near, velocity, v, pad, force, applied)
+        for i in range(len(x)):
+            moved[i] = x[i] + step * v[i]
+        _look(shapes, places, moved, candidates, pad, after)
+        if _judge(modes, seen, friction, v, candidates, velocity, pad, (1e-9, slow)) == 0:
+            return iterations, attempt + 1, lost, True
+    return iterations, most, lost, False
+
+
+@njit(cache=True)
+def contact_steps(blocks, tables, x, v, y, lengths, mass, external, work, inner, bodies, memory, velocity, step, solver, reaction, limit):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Take len(velocity) steps in contact; x, v, y, lengths, `memory` and places are changed, reaction (steps, bodies, 3) is filled.
+
+    `bodies` are shapes (kinds, axes, sizes), places (bodies, 3), friction (bodies, 2), pull-off (bodies, 3) and the masses that may touch;
+    `memory` mode (c, bodies), friction of sliding masses (c, bodies, 3) and whether they ever touched (c, bodies); `limit` the most passes
+    and the speed, mm/s, below which masses stick. Returns iterations, passes and the steps whose contacts did not settle.
+    """
+    shapes, places, friction, pull, candidates = bodies
+    mode, sliding, touched = memory
+    most, slow = limit
+    pad, c, k = len(mass), len(candidates), len(places)
+    near, force, applied = np.zeros((c, k, 4)), np.zeros((c, k, 3)), np.zeros((c, k, 3))
+    held = (np.zeros(3 * c, np.int64), np.zeros((3 * c, 3)), np.zeros(3 * c), np.zeros(3 * c, np.int64))
+    right, before, base, drag = np.zeros_like(x), np.zeros_like(x), np.zeros_like(x), np.zeros((c, k))
+    heavy, smoother = mass.copy(), inner[3].copy()
+    iterations, passes, unsettled = 0, 0, 0
+    begin(inner[8])
+    for n in range(len(velocity)):
+        before[:] = v
+        base[:] = 0.0
+        for i in range(len(external)):
+            base[i] = step * external[i]
+        places += step * velocity[n]
+        _look(shapes, places, x, candidates, pad, near)  # gaps of the old masses from the new bodies
+        _pull_off(touched, mode, pull, near, velocity[n], v, mass, candidates, step, pad, base, reaction[n])
+        add_momenta(mass, v, 1.0, base)
+        _begin(mode, friction, near, sliding, drag, v, candidates, velocity[n], pad, slow)
+        modes = (mode, sliding, drag, np.zeros((c, k)), np.zeros((c, k, 2), np.int64))
+        seen, solved = (near, np.zeros_like(near), force, applied), (blocks, tables, x, v, y, right, work, inner, step, solver)
+        masses = (mass, smoother, heavy)
+        done, tries, lost, agreed = _settle(
+            solved, held, modes, seen, shapes, places, friction, candidates, base, masses, velocity[n], most, slow
+        )
+        iterations, passes, unsettled = iterations + done, passes + tries, unsettled + (not agreed)
+        for m in range(c):
+            for q in range(k):
+                for a in range(3):
+                    reaction[n, q, a] += force[m, q, a] + applied[m, q, a]
+                    sliding[m, q, a] = applied[m, q, a] if mode[m, q] == SLIDE else 0.0
+                touched[m, q] |= mode[m, q] != FREE
+        advance(blocks, tables, x, v, before, y, lengths, mass, work[0], step, lost)
+    for m in candidates:  # the engine's own, as they were
+        inner[2][m], inner[3][m] = mass[m], smoother[m]
+    return iterations, passes, unsettled

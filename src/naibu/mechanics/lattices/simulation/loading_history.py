@@ -1,0 +1,379 @@
+"""Studies of lattices: bodies that push by a programme, computed frame by frame so that a run can stop and go on (spec L4, L5)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.errors import InputError
+from naibu.mechanics.contact.rigid_indenters import Pusher
+from naibu.mechanics.lattices.cpu.engine import LatticeEngine
+from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
+from naibu.mechanics.lattices.model.state import HeldNodes, LatticeState, Method
+from naibu.mechanics.lattices.simulation.contact import ContactState, begin_contact, push, push_by_force
+
+_TOUCH_MM = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drive:
+    """A force that moves a guided body.
+
+    Attributes
+    ----------
+    times, force : ndarray, shape (k,)
+        Force along the direction, mN, linear between the times, s, and constant behind the last one.
+    direction : ndarray, shape (3,)
+        In which the body is guided.
+    mass_kg : float
+        Of the body.
+    """
+
+    times: FloatArray
+    force: FloatArray
+    direction: FloatArray
+    mass_kg: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StudyBody:
+    """A rigid body with its programme.
+
+    Attributes
+    ----------
+    name : str
+        For tables and messages.
+    pusher : Pusher
+        Shape, place at the start, friction and pull-off.
+    times, offset : ndarray, shape (k,) and (k, 3)
+        Displacement of the body, mm, linear between the times, s, and constant behind the last one.
+    drive : Drive, optional
+        Force that moves it instead; one body of a study at most, and the others then stand still.
+    glued_until_s : float, optional
+        Masses that touch it at the start move with it until then, s, and are free of it afterwards; infinite for ever. None for contact.
+    """
+
+    name: str
+    pusher: Pusher
+    times: FloatArray
+    offset: FloatArray
+    drive: Drive | None = None
+    glued_until_s: float | None = None
+
+    def moved(self, times: FloatArray) -> FloatArray:
+        """Return the displacement (k, 3), mm, at times (k,), s."""
+        return np.stack([np.interp(times, self.times, self.offset[:, a]) for a in range(3)], axis=1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LatticeStudy:
+    """What is computed.
+
+    Attributes
+    ----------
+    lattice, parameters : Lattice, LatticeParameters
+        The object.
+    bodies : tuple of StudyBody
+        Either all glued, or all in contact.
+    step_s : float
+        s.
+    frames : int
+        Kept frames behind the first one, which is the rest.
+    samples : int
+        Samples of the forces in a frame.
+    sample_steps : int
+        Steps in a sample.
+    method : str
+        Of `naibu.mechanics.lattices.cpu.engine.LatticeEngine`.
+    tolerance : float
+        Of the implicit solver.
+    external_force : ndarray, shape (n, 3), optional
+        On the masses, mN, such as their weight.
+    """
+
+    lattice: Lattice
+    parameters: LatticeParameters
+    bodies: tuple[StudyBody, ...]
+    step_s: float
+    frames: int
+    samples: int = 1
+    sample_steps: int = 1
+    method: Method = "implicit"
+    tolerance: float = 1e-3
+    external_force: FloatArray | None = None
+
+    @property
+    def sample_s(self) -> float:
+        """Duration of a sample of the forces, s."""
+        return self.sample_steps * self.step_s
+
+    @property
+    def frame_s(self) -> float:
+        """Time between frames, s."""
+        return self.samples * self.sample_s
+
+    @property
+    def glued(self) -> bool:
+        """Whether masses are glued to the bodies, rather than in contact with them."""
+        return any(body.glued_until_s is not None for body in self.bodies) or not self.bodies
+
+    @property
+    def driven(self) -> int | None:
+        """Number of the body that a force drives."""
+        return next((k for k, body in enumerate(self.bodies) if body.drive is not None), None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StudyState:
+    """All that a study needs to go on behind a frame.
+
+    Attributes
+    ----------
+    frame : int
+        The frame.
+    lattice : LatticeState
+        Masses and elements.
+    contact : ContactState, optional
+        Of bodies in contact.
+    speed : float
+        Of the driven body, mm/s.
+    places : ndarray, shape (bodies, 3)
+        Centres of the bodies, mm.
+    work : ndarray, shape (bodies,)
+        Work of the bodies on the object since the start, mN mm.
+    external_work : float
+        Likewise of the external force.
+    unsettled : int
+        Steps so far whose contacts did not settle.
+    """
+
+    frame: int
+    lattice: LatticeState
+    contact: ContactState | None
+    speed: float
+    places: FloatArray
+    work: FloatArray
+    external_work: float
+    unsettled: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StudyFrame:
+    """A frame of a study.
+
+    Attributes
+    ----------
+    time : float
+        s.
+    state : StudyState
+        All of it.
+    kinetic, spring : float
+        Energies, mN mm.
+    momentum : ndarray, shape (3,)
+        kg mm/s.
+    sample_times : ndarray, shape (s,)
+        Ends of the samples since the frame before, s.
+    force : ndarray, shape (s, bodies, 3)
+        Of the bodies on the object, mN: means over the samples. Force times duration is the impulse.
+    """
+
+    time: float
+    state: StudyState
+    kinetic: float
+    spring: float
+    momentum: FloatArray
+    sample_times: FloatArray
+    force: FloatArray
+
+
+def glued_nodes(lattice: Lattice, bodies: tuple[StudyBody, ...]) -> tuple[IntArray, ...]:
+    """Return the masses that are glued to every body: those on its surface at the start, and on no earlier body's.
+
+    Raises
+    ------
+    InputError
+        A body that touches no mass, or starts inside the object.
+    """
+    free = np.ones(lattice.n_nodes, dtype=bool)
+    found = []
+    for body in bodies:
+        begin_contact(lattice, [body.pusher])
+        touched = np.abs(body.pusher.gap(lattice.points)) < _TOUCH_MM
+        if not touched.any():
+            nearest = float(body.pusher.gap(lattice.points).min())
+            raise InputError(
+                f"{body.name} touches no mass, the nearest is {nearest:.4g} mm away: a body can be glued to what it touches at the start"
+            )
+        found.append(np.flatnonzero(touched & free))
+        free &= ~touched
+    return tuple(found)
+
+
+def check_study(study: LatticeStudy) -> None:
+    """Check that a study can be run.
+
+    Raises
+    ------
+    InputError
+        Bodies both glued and in contact, contact by an explicit method, several driven bodies, or other bodies that move beside a driven
+        one; bodies that start inside the object, or are glued to nothing.
+    """
+    if study.glued:
+        loose = [body.name for body in study.bodies if body.glued_until_s is None]
+        if loose:
+            raise InputError(f"{', '.join(loose)} cannot be in contact while other bodies are glued: glue all, or none")
+        glued_nodes(study.lattice, study.bodies)
+        return
+    if study.method != "implicit":
+        raise InputError(f"contact with friction needs method 'implicit', not {study.method!r}; or glue the bodies")
+    driven = [body for body in study.bodies if body.drive is not None]
+    if len(driven) > 1:
+        raise InputError(f"{', '.join(b.name for b in driven)} are all driven by forces; one can be")
+    moving = [body.name for body in study.bodies if body.drive is None and np.abs(body.offset).max(initial=0.0) > 0.0]
+    if driven and moving:
+        raise InputError(f"{', '.join(moving)} cannot move while {driven[0].name} is driven by a force")
+    begin_contact(study.lattice, [body.pusher for body in study.bodies])
+
+
+def begin_study(study: LatticeStudy) -> StudyState:
+    """Return a study at rest.
+
+    Raises
+    ------
+    InputError
+        What `check_study` refuses.
+    """
+    check_study(study)
+    pushers = [body.pusher for body in study.bodies]
+    state = LatticeState(study.lattice.points.copy(), np.zeros_like(study.lattice.points), np.zeros(study.lattice.n_elements))
+    contact = None if study.glued else begin_contact(study.lattice, pushers)
+    places = np.array([p.centre for p in pushers], dtype=float).reshape(-1, 3)
+    return StudyState(0, state, contact, 0.0, places, np.zeros(len(pushers)), 0.0, 0)
+
+
+def run_study(study: LatticeStudy, start: StudyState | None = None) -> Iterator[StudyFrame]:
+    """Compute a study frame by frame; nothing is kept of the frames that were yielded.
+
+    Parameters
+    ----------
+    study : LatticeStudy
+        What is computed.
+    start : StudyState
+        Of the last frame of an earlier run, which then goes on exactly as if it had not stopped. By default the run begins at rest, and
+        yields that as its first frame.
+
+    Raises
+    ------
+    InputError
+        What `check_study` refuses.
+    ConvergenceError
+        An explicit method blew up.
+    """
+    engine = LatticeEngine.of(study.lattice, study.parameters, step=study.step_s, method=study.method, tolerance=study.tolerance)
+    state = start
+    if state is None:
+        state = begin_study(study)
+        yield _frame(study, engine, state, np.zeros((0, len(study.bodies), 3)))
+    advance = _Glued.of(study, engine).advance if study.glued else _Touching(study, engine).advance
+    while state.frame < study.frames:
+        forces = []
+        for sample in range(study.samples):
+            state, force = advance(state, (state.frame * study.samples + sample) * study.sample_steps)
+            forces.append(force)
+        state = replace(state, frame=state.frame + 1)
+        yield _frame(study, engine, state, np.array(forces).reshape(study.samples, len(study.bodies), 3))
+
+
+def _frame(study: LatticeStudy, engine: LatticeEngine, state: StudyState, force: FloatArray) -> StudyFrame:
+    lattice, mass = state.lattice, study.lattice.node_mass
+    kinetic = 0.5 * float(mass @ (lattice.velocity**2).sum(axis=1))
+    first = max(state.frame - 1, 0) * study.samples
+    times = np.asarray(study.sample_s * np.arange(first + 1, first + 1 + len(force)), dtype=np.float64)
+    return StudyFrame(state.frame * study.frame_s, state, kinetic, engine.energy(lattice) - kinetic, mass @ lattice.velocity, times, force)
+
+
+def _velocities(study: LatticeStudy, first: int) -> FloatArray:
+    """Return the velocities (steps, bodies, 3), mm/s, of the steps of a sample."""
+    ends = np.asarray(study.step_s * np.arange(first, first + study.sample_steps + 1), dtype=np.float64)
+    return np.stack([np.diff(body.moved(ends), axis=0) / study.step_s for body in study.bodies], axis=1)
+
+
+def _external_work(study: LatticeStudy, before: LatticeState, after: LatticeState) -> float:
+    return 0.0 if study.external_force is None else float((study.external_force * (after.position - before.position)).sum())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Glued:
+    """Steps of masses that bodies hold."""
+
+    study: LatticeStudy
+    engine: LatticeEngine
+    held: tuple[HeldNodes, ...]
+    until: IntArray
+
+    @classmethod
+    def of(cls, study: LatticeStudy, engine: LatticeEngine) -> _Glued:
+        nodes = glued_nodes(study.lattice, study.bodies)
+        ends = [body.glued_until_s for body in study.bodies]
+        never = np.iinfo(np.int64).max
+        until = np.array([never if end is None or np.isinf(end) else round(end / study.step_s) for end in ends], dtype=np.int64)
+        return cls(study, engine, tuple(HeldNodes.of(mine, k) for k, mine in enumerate(nodes)), until)
+
+    def advance(self, state: StudyState, first: int) -> tuple[StudyState, FloatArray]:
+        """Take the steps of a sample, in pieces between which bodies let go."""
+        study, last = self.study, first + self.study.sample_steps
+        bodies = len(study.bodies)
+        stops = [first, *sorted({int(u) for u in self.until if first < u < last}), last]
+        lattice, work, impulse = state.lattice, state.work.copy(), np.zeros((bodies, 3))
+        path = _velocities(study, first) if bodies else np.zeros((study.sample_steps, 0, 3))
+        for begin, end in pairwise(stops):
+            held = HeldNodes.none()
+            for mine, until in zip(self.held, self.until, strict=True):
+                held = held + mine if until > begin else held
+            own = path[begin - first : end - first]
+            motion = self.engine.run(lattice, end - begin, held, own, study.external_force)
+            lattice = motion.state
+            work += study.step_s * (motion.reaction * own).sum(axis=(0, 2))
+            impulse += study.step_s * motion.reaction.sum(axis=0)
+        moved = [body.moved(np.array([study.step_s * last]))[0] + body.pusher.centre for body in study.bodies]
+        external = state.external_work + _external_work(study, state.lattice, lattice)
+        places = np.array(moved).reshape(-1, 3)
+        return StudyState(state.frame, lattice, None, 0.0, places, work, external, 0), impulse / study.sample_s
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Touching:
+    """Steps in contact."""
+
+    study: LatticeStudy
+    engine: LatticeEngine
+
+    def advance(self, state: StudyState, first: int) -> tuple[StudyState, FloatArray]:
+        """Take the steps of a sample."""
+        study, driven = self.study, self.study.driven
+        pushers = [body.pusher for body in study.bodies]
+        speed = state.speed
+        if driven is None:
+            motion = push(
+                self.engine, state.lattice, pushers, _velocities(study, first), contact=state.contact, external_force=study.external_force
+            )
+        else:
+            drive = study.bodies[driven].drive
+            assert drive is not None
+            ends = study.step_s * np.arange(first + 1, first + study.sample_steps + 1)
+            direction = drive.direction / np.linalg.norm(drive.direction)
+            motion = push_by_force(
+                self.engine, state.lattice, pushers, np.interp(ends, drive.times, drive.force), driven=driven, direction=direction,
+                pusher_mass=drive.mass_kg, speed=speed, contact=state.contact, external_force=study.external_force,
+            )  # fmt: skip
+            speed = float(motion.speed[-1, driven] @ direction)
+        work = state.work + study.step_s * (motion.reaction * motion.speed).sum(axis=(0, 2))
+        external = state.external_work + _external_work(study, state.lattice, motion.state)
+        after = StudyState(
+            state.frame, motion.state, motion.contact, speed, motion.contact.places, work, external, state.unsettled + motion.unsettled
+        )
+        return after, motion.reaction.mean(axis=0)

@@ -1,0 +1,97 @@
+"""Sparse matrices of 3 x 3 blocks: their pattern from a mesh, and prescribed rows and columns taken out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+
+from naibu._numba.compilation import njit
+from naibu.core.arrays import BoolArray, FloatArray, Int32Array, IntArray
+
+
+def constrained(matrix: sp.bsr_matrix, held: BoolArray, anchor_stiffness: float = 0.0) -> sp.bsr_matrix:
+    """Return `matrix` with held rows and columns replaced by a scaled identity, and weak springs on the diagonal.
+
+    Changes the blocks of `matrix` in place.
+    """
+    _constrain(matrix.indptr, matrix.indices, matrix.data, held, anchor_stiffness)
+    return matrix
+
+
+@njit(cache=True)
+def _constrain(indptr, indices, blocks, held, anchor_stiffness):  # type: ignore[no-untyped-def]  # pragma: no cover
+    n, d = held.shape
+    mean = 0.0
+    for i in range(n):
+        for at in range(indptr[i], indptr[i + 1]):
+            if indices[at] == i:
+                for a in range(d):
+                    mean += blocks[at, a, a] / (d * n)
+    for i in range(n):
+        for at in range(indptr[i], indptr[i + 1]):
+            j = indices[at]
+            for a in range(d):
+                for b in range(d):
+                    if held[i, a] or held[j, b]:
+                        blocks[at, a, b] = mean if (i == j and a == b) else 0.0
+                    elif i == j and a == b:
+                        blocks[at, a, b] += anchor_stiffness * mean
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BlockPattern:
+    """Sparsity of a matrix of d x d blocks, one row of blocks a node.
+
+    Attributes
+    ----------
+    indptr, indices : ndarray, int32
+        Compressed rows of blocks; columns are sorted within a row.
+    """
+
+    indptr: Int32Array
+    indices: Int32Array
+
+    @property
+    def n_points(self) -> int:
+        """Number of rows of blocks."""
+        return len(self.indptr) - 1
+
+    @property
+    def n_blocks(self) -> int:
+        """Number of stored blocks."""
+        return len(self.indices)
+
+    def matrix(self, blocks: FloatArray) -> sp.bsr_matrix:
+        """Return the matrix whose blocks are `blocks` (n_blocks, d, d)."""
+        n = blocks.shape[1] * self.n_points
+        return sp.bsr_matrix((blocks, self.indices, self.indptr), shape=(n, n))
+
+    def positions(self, connectivity: IntArray) -> Int32Array:
+        """Return (m, k, k): where the block of local nodes (a, b) of every group is stored."""
+        return np.asarray(_block_positions(self.indptr, self.indices, connectivity))
+
+
+def block_pattern(n_points: int, *connectivities: IntArray) -> BlockPattern:
+    """Return the pattern in which all nodes of a group couple, for several tables of groups (m, k)."""
+    incidence = []
+    for table in connectivities:
+        rows = np.repeat(np.arange(len(table)), table.shape[1])
+        incidence.append(sp.csr_matrix((np.ones(table.size, dtype=np.int8), (rows, table.ravel())), shape=(len(table), n_points)))
+    stacked = sp.vstack(incidence, format="csr").astype(bool)
+    graph = (stacked.T @ stacked + sp.identity(n_points, dtype=bool, format="csr")).tocsr()
+    graph.sort_indices()
+    return BlockPattern(graph.indptr.astype(np.int32), graph.indices.astype(np.int32))
+
+
+@njit(cache=True)
+def _block_positions(indptr, indices, connectivity):  # type: ignore[no-untyped-def]  # pragma: no cover
+    m, k = connectivity.shape
+    out = np.empty((m, k, k), np.int32)
+    for e in range(m):
+        for a in range(k):
+            start, stop = indptr[connectivity[e, a]], indptr[connectivity[e, a] + 1]
+            for b in range(k):
+                out[e, a, b] = start + np.searchsorted(indices[start:stop], connectivity[e, b])
+    return out

@@ -1,0 +1,169 @@
+"""Direct solvers: PARDISO where MKL is installed, else SuperLU."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+from numpy.typing import NDArray
+
+from naibu.core.arrays import AnyFloatArray, FloatArray
+from naibu.core.errors import ConvergenceError, InputError
+from naibu.mechanics.linear_algebra.protocols import Factorization, LinearSolver
+
+
+@functools.cache
+def pardiso_library() -> ctypes.CDLL | None:
+    """Return the oneMKL runtime library if its wheel is installed, else None."""
+    os.environ.setdefault("KMP_BLOCKTIME", "0")  # idle threads sleep at once instead of spinning beside Numba's
+    names = ("libmkl_rt.so.3", "libmkl_rt.so.2", "libmkl_rt.so.1", "libmkl_rt.2.dylib", "mkl_rt.3.dll", "mkl_rt.2.dll")
+    folders = [Path(sys.prefix) / "lib", Path(sys.prefix) / "Library" / "bin"]
+    try:  # wherever pip put it: a user's own site, a base environment below a virtual one
+        files = metadata.files("mkl") or []
+        folders += [Path(str(file.locate())).resolve().parent for file in files if file.name in names]
+    except metadata.PackageNotFoundError:
+        pass
+    for path in (folder / name for folder in folders for name in names):
+        if path.exists():
+            try:
+                return ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
+            except OSError:
+                continue
+    return None
+
+
+def use_one_thread() -> None:
+    """Let the direct solver use one thread when called from the present one; for problems solved side by side."""
+    library = pardiso_library()
+    if library is not None:
+        library.MKL_Set_Num_Threads_Local(1)
+
+
+class PardisoSolver:
+    """Supernodal factorization by oneMKL PARDISO; the analysis of the pattern is kept between factorizations."""
+
+    name = "PARDISO (oneMKL)"
+
+    def __init__(self, matrix: sp.bsr_matrix, *, symmetric: bool, single_precision: bool = False) -> None:
+        library = pardiso_library()
+        if library is None:
+            raise InputError('PARDISO is not installed; run: pip install "naibu[fast]"')
+        self._library = library
+        self._symmetric = symmetric
+        marked = sp.bsr_matrix(
+            (np.arange(1.0, matrix.data.size + 1.0).reshape(matrix.data.shape), matrix.indices, matrix.indptr), shape=matrix.shape
+        ).tocsr()
+        pattern = (sp.triu(marked, format="csr") if symmetric else marked).sorted_indices()
+        self._take = pattern.data.astype(np.int64) - 1
+        self._ia = pattern.indptr.astype(np.int32)
+        self._ja = pattern.indices.astype(np.int32)
+        self._n = matrix.shape[0]
+        self._type = 2 if symmetric else 1
+        self._float = np.float32 if single_precision else np.float64
+        self._handle = np.zeros(64, dtype=np.int64)
+        self._parameters = np.zeros(64, dtype=np.int32)
+        self._set_parameters()
+        self._values = np.zeros(len(self._ja), dtype=self._float)
+        self._analysed = False
+
+    def _set_parameters(self) -> None:
+        iparm = self._parameters
+        iparm[:] = 0
+        iparm[0] = 1  # no defaults
+        iparm[1] = 2  # METIS ordering
+        iparm[9] = 13 if self._type in (1, 11) else 8  # pivot perturbation 10^-k
+        iparm[27] = int(self._float is np.float32)
+        iparm[34] = 1  # indices count from 0
+
+    def factorize(self, matrix: sp.bsr_matrix) -> PardisoSolver:
+        """Factorize the values of `matrix`; the factorization stays valid until the next call.
+
+        Raises
+        ------
+        ConvergenceError
+            The matrix is singular.
+        """
+        self._values = matrix.data.ravel()[self._take].astype(self._float, copy=False)
+        empty: AnyFloatArray = np.zeros(1, dtype=self._float)
+        if not self._analysed:
+            self._call(11, empty, empty, 1)
+            self._analysed = True
+        error = self._call(22, empty, empty, 1)
+        if error == -4 and self._type == 2:  # not positive definite: an indefinite factorization serves
+            self._release()
+            self._type = -2
+            self._set_parameters()
+            self._call(11, empty, empty, 1)
+            error = self._call(22, empty, empty, 1)
+        perturbed = int(self._parameters[13])  # vanishing pivots, which PARDISO replaces by tiny ones without a word
+        if error != 0 or perturbed:
+            what = f"PARDISO error {error}, {perturbed} vanishing pivots"
+            raise ConvergenceError(f"the linear system is singular ({what}): is every body held against rigid motion?")
+        return self
+
+    def solve(self, b: FloatArray) -> FloatArray:
+        """Return x for b of shape (n,) or (n, r)."""
+        columns = 1 if b.ndim == 1 else b.shape[1]
+        rhs: AnyFloatArray = np.asarray(b, dtype=self._float, order="F")
+        x: AnyFloatArray = np.zeros(rhs.shape, dtype=self._float, order="F")
+        error = self._call(33, rhs, x, columns)
+        if error != 0:
+            raise ConvergenceError(f"PARDISO could not solve the linear system (error {error})")
+        return np.asarray(x, dtype=np.float64)
+
+    def _call(self, phase: int, b: AnyFloatArray, x: AnyFloatArray, columns: int) -> int:
+        def integer(value: int) -> ctypes._CArgObject:
+            return ctypes.byref(ctypes.c_int32(value))
+
+        def pointer(array: NDArray[np.generic]) -> ctypes.c_void_p:
+            return array.ctypes.data_as(ctypes.c_void_p)
+
+        error = ctypes.c_int32(0)
+        self._library.pardiso(
+            pointer(self._handle), integer(1), integer(1), integer(self._type), integer(phase), integer(self._n),
+            pointer(self._values), pointer(self._ia), pointer(self._ja), None, integer(columns), pointer(self._parameters),
+            integer(0), pointer(b), pointer(x), ctypes.byref(error),
+        )  # fmt: skip
+        return error.value
+
+    def _release(self) -> None:
+        if self._analysed:
+            self._call(-1, np.zeros(1), np.zeros(1), 1)
+            self._handle[:] = 0
+
+    def __del__(self) -> None:
+        if getattr(self, "_library", None) is not None and hasattr(self, "_analysed") and not sys.is_finalizing():
+            self._release()
+
+
+class SuperLUSolver:
+    """SciPy's SuperLU in symmetric mode; needs nothing but SciPy."""
+
+    name = "SuperLU (SciPy)"
+
+    def factorize(self, matrix: sp.bsr_matrix) -> Factorization:
+        """Factorize `matrix`.
+
+        Raises
+        ------
+        ConvergenceError
+            The matrix is singular.
+        """
+        try:
+            return spla.splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=1e-3, options={"SymmetricMode": True})
+        except RuntimeError as error:
+            raise ConvergenceError(f"the linear system is singular ({error}): is every body held against rigid motion?") from error
+
+
+def direct_solver(matrix: sp.bsr_matrix, *, symmetric: bool) -> LinearSolver:
+    """Return the fastest direct solver that is installed, for the pattern of `matrix`."""
+    if pardiso_library() is not None:
+        return PardisoSolver(matrix, symmetric=symmetric)
+    return SuperLUSolver()

@@ -1,0 +1,347 @@
+"""Steps in time of rheological bodies: implicit ones with one factorization a step size, and Runge-Kutta (spec M4).
+
+Every implicit method takes a step of the internal strain exactly for a constant strain rate (an exponential, see
+`naibu.mechanics.small_strain.rheology`), so what is left to solve is ``(M / h + K) v = ...`` with one stiffness K for all steps of one
+length: it is factorized once, and a step is a pass over the cells and a back-substitution for each stage.
+
+``"sdirk2"``, the default
+    Two stages of backward Euler of length ``g h``, ``g = 1 - 1/sqrt(2)``, the second from where the first points to [1]_. Second order;
+    no energy is made at any step length, and what is too fast for the steps is damped out. (For internal strains advanced by the method's
+    own rational function this is von Neumann's theorem on A-stable methods; for the exponential it is tested on random mixtures.)
+``"backward_euler"``
+    First order; the same stability, more damping.
+``"generalized_alpha"``
+    Second order, with the damping of fast modes as an argument [2]_; stable, but a start or a jump that the steps do not resolve
+    overshoots in energy. Needs inertia.
+``"rk4"`` and ``"rkf45"``
+    As in the report: Runge-Kutta of fourth order with the given step, and Runge-Kutta-Fehlberg, which chooses its own. Both are explicit:
+    their steps must be short for the stiffest cell (`naibu.mechanics.small_strain.dynamics.explicit_step_limit`).
+
+References
+----------
+.. [1] R. Alexander, "Diagonally implicit Runge-Kutta methods for stiff O.D.E.'s", SIAM J. Numer. Anal. 14, 1977.
+.. [2] J. Chung and G. M. Hulbert, "A time integration algorithm for structural dynamics with improved numerical dissipation: the
+   generalized-alpha method", J. Appl. Mech. 60, 1993.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray
+from naibu.mechanics.finite_elements.linear_simplices import Simplices
+from naibu.mechanics.linear_algebra.block_matrix import constrained
+from naibu.mechanics.linear_algebra.direct import direct_solver
+from naibu.mechanics.linear_algebra.protocols import Factorization
+from naibu.mechanics.linear_algebra.solver_selection import DIRECT_LIMIT, choose_solver
+from naibu.mechanics.small_strain._rheology_kernels import advanced, stage_forces
+from naibu.mechanics.small_strain.constraint_stabilization import Stabilization
+from naibu.mechanics.small_strain.linear_elasticity import LinearBody, require_held
+from naibu.mechanics.small_strain.mass_matrix import Mass
+from naibu.mechanics.small_strain.prescribed_motion import Guide
+from naibu.mechanics.small_strain.rheology import CellRheology, FlowCoefficients, StepCoefficients
+
+STAGE = 1.0 - np.sqrt(0.5)
+INSTANT = 1e-8  # of a step: how long a jump of a body without inertia takes
+KEPT = 8  # factorizations
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionState:
+    """All that the future of a body depends on, and the forces that hold it.
+
+    Attributes
+    ----------
+    time : float
+        s.
+    displacement, velocity : ndarray, shape (n, d)
+        mm and mm/s.
+    trace, strain : ndarray, shape (m,) and (m, d, d)
+        Strain of the Voigt parts: trace for the lambda part, tensor for the mu part.
+    reaction : ndarray, shape (n, d)
+        Forces of the supports on the body, mN.
+    work : float
+        Of supports and loads so far, mN mm.
+    """
+
+    time: float
+    displacement: FloatArray
+    velocity: FloatArray
+    trace: FloatArray
+    strain: FloatArray
+    reaction: FloatArray
+    work: float
+
+    @classmethod
+    def at_rest(cls, body: Simplices, time: float = 0.0) -> MotionState:
+        """Return the free shape."""
+        zero, d = np.zeros((body.n_points, body.dimension)), body.dimension
+        return cls(time, zero, zero, np.zeros(body.n_cells), np.zeros((body.n_cells, d, d)), zero, 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Phase:
+    """The equations while the same supports act.
+
+    Attributes
+    ----------
+    body : LinearBody
+        Geometry.
+    law : CellRheology
+        Materials.
+    flow : FlowCoefficients
+        Their internal equation.
+    mass : Mass or None
+        Inertia; None for a body that is in equilibrium at any time.
+    load : callable
+        From a time, s, to the forces on the nodes (n, d), mN.
+    guide : Guide
+        Where the held components go.
+    stabilization : Stabilization or None
+        How supports are kept; None: exactly, their components are eliminated.
+    """
+
+    body: LinearBody
+    law: CellRheology
+    flow: FlowCoefficients
+    mass: Mass | None
+    load: Callable[[float], FloatArray]
+    guide: Guide
+    stabilization: Stabilization | None
+
+    def momentum(self, velocity: FloatArray) -> FloatArray:
+        """Return the momentum (n, d), zero where there is no inertia."""
+        return np.zeros_like(velocity) if self.mass is None else self.mass.apply(velocity)
+
+    def held_acceleration(self, time: float, side: int, displacement: FloatArray, velocity: FloatArray) -> FloatArray:
+        """Return the acceleration (n, d), mm/s^2, of the held components; meaningless elsewhere."""
+        second = self.guide.acceleration(time)
+        if self.stabilization is None:
+            return second
+        gap, gap_rate = displacement - self.guide.displacement(time), velocity - self.guide.velocity(time, side)
+        return self.stabilization.acceleration(gap, gap_rate, second)
+
+
+class Factorizations:
+    """Factorized step matrices by held components and step length; the latest few are kept.
+
+    Attributes
+    ----------
+    made : int
+        How many there have been.
+    """
+
+    def __init__(self) -> None:
+        self.made = 0
+        self._kept: OrderedDict[tuple[bytes, str], Factorization] = OrderedDict()
+        self._steps: OrderedDict[str, StepCoefficients] = OrderedDict()
+
+    def over(self, law: CellRheology, step_s: float) -> StepCoefficients:
+        """Return what a step does to the internal strain; computed once for steps of one length."""
+        key = f"{step_s:.10g}"
+        if key not in self._steps:
+            self._steps[key] = law.over(step_s)
+            if len(self._steps) > 3 * KEPT:
+                self._steps.popitem(last=False)
+        return self._steps[key]
+
+    def of(self, phase: Phase, name: str, moduli: FloatArray, mass_factor: float) -> Factorization:
+        """Return that of ``K(moduli) + mass_factor M`` with the held components taken out.
+
+        Raises
+        ------
+        InputError
+            A body without inertia that can move freely.
+        """
+        held = phase.guide.held
+        key = held.tobytes(), name
+        if key in self._kept:
+            self._kept.move_to_end(key)
+            return self._kept[key]
+        matrix = phase.body.stiffness(moduli[:, 0], moduli[:, 1])
+        if phase.mass is None:
+            require_held(phase.body.points, held)
+        else:
+            phase.mass.add_to(matrix, mass_factor)
+        matrix = constrained(matrix, held)
+        if matrix.shape[0] > DIRECT_LIMIT and phase.body.points.shape[1] == 3:
+            solver = choose_solver(matrix, phase.body.points, held.ravel(), symmetric=True)
+        else:
+            solver = direct_solver(matrix, symmetric=True)
+        self.made += 1
+        self._kept[key] = solver.factorize(matrix)
+        while len(self._kept) > KEPT:
+            self._kept.popitem(last=False)
+        return self._kept[key]
+
+
+class Integrator(ABC):
+    """A method; `begin` is called where supports or loads change abruptly, then `step` as often as needed."""
+
+    name = ""
+    needs_inertia = False
+
+    def __init__(self) -> None:
+        self.factorizations = Factorizations()
+        self.steps = 0
+
+    def begin(self, phase: Phase, state: MotionState, step_s: float, changed: bool) -> MotionState:
+        """Return the state just after an event.
+
+        Held nodes take on the speed of their supports, by an impulse. `changed` tells of supports or loads that changed, not only their
+        speed.
+        """
+        if phase.mass is None or phase.stabilization is not None:
+            return state
+        held = phase.guide.held
+        change = np.where(held, phase.guide.velocity(state.time, 1) - state.velocity, 0.0)
+        if not change.any():
+            return state
+        velocity = state.velocity + phase.mass.accelerations(np.zeros_like(change), held, change)
+        before, after = (0.5 * float((v * phase.mass.apply(v)).sum()) for v in (state.velocity, velocity))
+        return replace(state, velocity=velocity, work=state.work + after - before)
+
+    def told(self, state: MotionState) -> None:  # noqa: B027 - most have nothing to remember
+        """Take note that the series keeps this state."""
+
+    @abstractmethod
+    def step(self, phase: Phase, state: MotionState, until: float) -> MotionState:
+        """Return the state at the time `until`, s."""
+
+
+class Staged(Integrator):
+    """What the methods made of backward-Euler stages share."""
+
+    def begin(self, phase: Phase, state: MotionState, step_s: float, changed: bool) -> MotionState:
+        """Return the state just after an event; a body without inertia whose supports or loads changed jumps to its new equilibrium."""
+        if phase.mass is not None or not changed:
+            return super().begin(phase, state, step_s, changed)
+        instant, held, load = INSTANT * step_s, phase.guide.held, phase.load(state.time)
+        known = (phase.guide.displacement(state.time) - state.displacement) / instant
+        if not (known[held].any() or state.reaction.any() or load.any() or state.strain.any()):
+            return state
+        start = state.displacement, np.zeros_like(state.velocity), state.trace, state.strain
+        self._aimed(phase, instant)
+        velocity, trace, strain, reaction, _ = self._stage(phase, start, instant, state.time, known)
+        moved = instant * velocity
+        mean = np.where(held, 0.5 * (state.reaction + reaction), 0.0) + load
+        work = state.work + float((moved * mean).sum())
+        return _ended(phase, state.time, state.displacement + moved, state.velocity, trace, strain, reaction, work)
+
+    def _aimed(self, phase: Phase, span: float) -> None:
+        """Take note that what is held reaches its path within this time, s."""
+
+    def _stage(
+        self,
+        phase: Phase,
+        start: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+        h: float,
+        until: float,
+        known: FloatArray,
+        ahead: StepCoefficients | None = None,
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
+        """Return velocity, internal strain (over `ahead`, if given, instead of h), reaction and power of a stage."""
+        _, before, trace, strain = start
+        held, over = phase.guide.held, self.factorizations.over(phase.law, h)
+        body, load = phase.body.simplices, phase.load(until)
+        guess = np.where(held, known, before)
+        residual = phase.momentum(guess - before) / h + stage_forces(body, over, guess, trace, strain) - load
+        residual[held] = 0.0
+        velocity = guess - self._factor(phase, h).solve(residual.ravel()).reshape(guess.shape)
+        force, new_trace, new_strain = advanced(body, over, velocity, trace, strain, ahead)
+        acceleration = (velocity - before) / h
+        reaction = np.where(held, phase.momentum(acceleration) + force - load, 0.0)
+        power = float((velocity * (reaction + load)).sum())
+        if ahead is None and phase.stabilization is None and phase.mass is not None:
+            reaction = np.where(held, phase.mass.apply(_on_path(phase, until, acceleration)) + force - load, 0.0)
+        return velocity, new_trace, new_strain, reaction, power
+
+    def _factor(self, phase: Phase, h: float) -> Factorization:
+        return self.factorizations.of(phase, f"stage {h:.8g}", self.factorizations.over(phase.law, h).effective, 1.0 / h)
+
+
+class BackwardEuler(Staged):
+    """One stage a step."""
+
+    name = "backward_euler"
+
+    def step(self, phase: Phase, state: MotionState, until: float) -> MotionState:
+        """Return the state at `until`."""
+        h = until - state.time
+        start = state.displacement, state.velocity, state.trace, state.strain
+        if phase.stabilization is None:
+            known = (phase.guide.displacement(until) - state.displacement) / h
+        else:
+            known = _stabilized(phase, phase.stabilization, start, h, until)
+        self._aimed(phase, h)
+        velocity, trace, strain, reaction, power = self._stage(phase, start, h, until, known)
+        self.steps += 1
+        return _ended(phase, until, state.displacement + h * velocity, velocity, trace, strain, reaction, state.work + h * power)
+
+
+class Sdirk2(Staged):
+    """Two backward-Euler stages a step."""
+
+    name = "sdirk2"
+
+    def step(self, phase: Phase, state: MotionState, until: float) -> MotionState:
+        """Return the state at `until`."""
+        h, exact = until - state.time, phase.stabilization is None
+        first, rest, middle = STAGE * h, (1.0 - STAGE) * h, state.time + STAGE * h
+        start = state.displacement, state.velocity, state.trace, state.strain
+        known = second = np.zeros_like(state.displacement)
+        if exact:  # stage velocities whose quadrature is the path, and that are those of a path of constant acceleration
+            mean = (phase.guide.displacement(until) - state.displacement) / h
+            change = phase.guide.velocity(until, -1) - phase.guide.velocity(state.time, 1)
+            known, second = mean + (STAGE - 0.5) * change, mean + 0.5 * change
+        elif phase.stabilization is not None:
+            known = _stabilized(phase, phase.stabilization, start, first, middle)
+        ahead = self.factorizations.over(phase.law, rest)
+        self._aimed(phase, h)
+        velocity, trace, strain, _, power = self._stage(phase, start, first, middle, known, ahead)
+        extrapolated = state.velocity + rest / first * (velocity - state.velocity)
+        work = state.work + rest * power
+        start = state.displacement + rest * velocity, extrapolated, trace, strain
+        if phase.stabilization is not None:
+            second = _stabilized(phase, phase.stabilization, start, first, until)
+        velocity, trace, strain, reaction, power = self._stage(phase, start, first, until, second)
+        self.steps += 1
+        return _ended(phase, until, start[0] + first * velocity, velocity, trace, strain, reaction, work + first * power)
+
+
+def _stabilized(phase: Phase, rule: Stabilization, start: tuple[FloatArray, ...], h: float, until: float) -> FloatArray:
+    guide = phase.guide
+    path = guide.displacement(until), guide.velocity(until, -1), guide.acceleration(until)
+    return rule.stage_velocity((start[0], start[1]), h, path)
+
+
+def _on_path(phase: Phase, time: float, acceleration: FloatArray) -> FloatArray:
+    """Return accelerations (n, d) with those of held nodes made those of their path, and the free ones what this makes of them.
+
+    Stage velocities on a path are good to second order, their quotients are not.
+    """
+    held = phase.guide.held
+    wrong = np.where(held, phase.guide.acceleration(time) - acceleration, 0.0)
+    if phase.mass is None or not wrong.any():
+        return acceleration
+    return acceleration + phase.mass.accelerations(np.zeros_like(wrong), held, wrong)
+
+
+def _ended(
+    phase: Phase,
+    time: float,
+    displacement: FloatArray,
+    velocity: FloatArray,
+    trace: FloatArray,
+    strain: FloatArray,
+    reaction: FloatArray,
+    work: float,
+) -> MotionState:
+    if phase.stabilization is None:  # no drift by rounding
+        displacement = np.where(phase.guide.held, phase.guide.displacement(time), displacement)
+    return MotionState(time, displacement, velocity, trace, strain, reaction, work)

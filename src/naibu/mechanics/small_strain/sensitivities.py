@@ -1,0 +1,273 @@
+"""Derivatives of a motion with respect to moduli and viscosities, by the linearised steps of the default method (spec M2, M4, I6).
+
+A step solves ``K v = ...``; its derivative along a change of the materials solves the same system, ``K v' = ...``, with another right side.
+So all derivatives together cost one factorization, as the motion does, and some passes over the cells for each; they are exact for
+the computed motion, not only for its limit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import InputError
+from naibu.mechanics.finite_elements.linear_simplices import Simplices
+from naibu.mechanics.small_strain._rheology_kernels import advanced, stage_forces
+from naibu.mechanics.small_strain.dynamics import Load, Series, driven
+from naibu.mechanics.small_strain.implicit_integrators import STAGE, MotionState, Phase, Sdirk2
+from naibu.mechanics.small_strain.linear_elasticity import LinearBody
+from naibu.mechanics.small_strain.prescribed_motion import Support
+from naibu.mechanics.small_strain.rheology import CellRheology, Rheology, StepCoefficients
+
+NAMES = {"young_modulus": "elastic", "voigt_viscosity": "voigt", "series_viscosity": "series"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MaterialChange:
+    """A direction in the space of materials: rates of change of the tables of `CellRheology`.
+
+    Attributes
+    ----------
+    elastic, voigt, series : ndarray, shape (m, 2)
+        Change of the lambda and mu parts of E, C1 and C2 for a unit of the parameter; zero where C2 is infinite.
+    """
+
+    elastic: FloatArray
+    voigt: FloatArray
+    series: FloatArray
+
+    @classmethod
+    def relative(cls, law: CellRheology, name: str, cells: ArrayLike | None = None) -> MaterialChange:
+        """Return the direction of the logarithm of a parameter, in all cells or in those of a mask (m,) or a list of numbers.
+
+        Parameters
+        ----------
+        law : CellRheology
+            The materials about which is differentiated.
+        name : {"young_modulus", "voigt_viscosity", "series_viscosity"}
+            Which parameter; its Poisson ratio is kept.
+        cells : array_like, optional
+            Where.
+
+        Raises
+        ------
+        InputError
+            Another name, or a mask that does not fit.
+        """
+        if name not in NAMES:
+            raise InputError(f"derivatives are with respect to {', '.join(NAMES)}, not {name!r}")
+        chosen = np.zeros(len(law.elastic), dtype=bool)
+        where = np.ones_like(chosen) if cells is None else np.asarray(cells)
+        if where.dtype == bool and where.shape != chosen.shape:
+            raise InputError(f"a mask of cells must have shape {chosen.shape}, not {where.shape}")
+        chosen[where] = True
+        part = getattr(law, NAMES[name])
+        parts = {key: np.zeros_like(law.elastic) for key in NAMES.values()}
+        parts[NAMES[name]] = np.where(chosen[:, None] & np.isfinite(part), part, 0.0)
+        return cls(**parts)
+
+    @classmethod
+    def between(cls, lower: CellRheology, upper: CellRheology, width: float) -> MaterialChange:
+        """Return the direction from one table to another nearby, over the difference `width` of any parameter that tells them apart.
+
+        Differences of tables cost nothing beside those of motions: so a Poisson ratio, a ramp of moduli or any other parametrisation is
+        differentiated.
+
+        Raises
+        ------
+        InputError
+            Tables for different numbers of cells, no width, or a damper that only one of them has.
+        """
+        if len(lower.elastic) != len(upper.elastic) or width == 0.0 or not np.isfinite(width):
+            raise InputError(f"a direction needs two tables for the same cells and a width, not {width:g}")
+        if (np.isposinf(lower.series) != np.isposinf(upper.series)).any():
+            raise InputError("a damper without flow has no neighbours: leave C2 infinite in both tables, or finite")
+        with np.errstate(invalid="ignore"):
+            series = np.where(np.isposinf(lower.series), 0.0, (upper.series - lower.series) / width)
+        return cls((upper.elastic - lower.elastic) / width, (upper.voigt - lower.voigt) / width, series)
+
+    def over(self, law: CellRheology, step_s: float) -> StepCoefficients:
+        """Return the rate of change of `CellRheology.over`."""
+        total, flows = law.voigt + law.series, np.isfinite(law.series) & (law.voigt + law.series != 0.0)
+        share, x, now = law.share, law.relaxation_rate * step_s, law.over(step_s)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            of_share = np.where(flows, (self.series * law.voigt - law.series * self.voigt) / total**2, 0.0)
+            of_rate = np.where(flows, (self.elastic - law.relaxation_rate * (self.voigt + self.series)) / total, 0.0)
+            mean = np.where(x == 0.0, 1.0, -np.expm1(-x) / x)
+            slope = np.where(x < 1e-4, -0.5 + x / 3.0, (now.decay - mean) / x)
+        return StepCoefficients(
+            decay=-step_s * of_rate * now.decay,
+            gain=step_s * (of_share * mean + share * slope * step_s * of_rate),
+            spring=of_share * law.elastic + share * self.elastic,
+            dashpot=self.voigt * share + law.voigt * of_share,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeriesDerivatives:
+    """Derivatives of a series, one for each direction.
+
+    Attributes
+    ----------
+    displacement, reaction : ndarray, shape (p, k, n, d)
+        mm and mN for a unit of each parameter.
+    """
+
+    displacement: FloatArray
+    reaction: FloatArray
+
+    def force(self, support: Support) -> FloatArray:
+        """Return the derivatives (p, k, d) of the force of a support while it acts, mN."""
+        axes = range(self.reaction.shape[3]) if support.axes is None else support.axes
+        out = np.zeros((*self.reaction.shape[:2], self.reaction.shape[3]))
+        out[..., list(axes)] = self.reaction[:, :, support.nodes].sum(axis=2)[..., list(axes)]
+        return out
+
+
+def simulate_with_derivatives(
+    body: LinearBody,
+    materials: Rheology | CellRheology,
+    density: ArrayLike | None,
+    supports: Sequence[Support],
+    times: ArrayLike,
+    directions: Sequence[MaterialChange],
+    *,
+    step: float | None = None,
+    mass: str = "lumped",
+    load: ArrayLike | Load | None = None,
+    breaks: Sequence[float] = (),
+) -> tuple[Series, SeriesDerivatives]:
+    """Move a body through time by ``"sdirk2"`` from its free shape, and differentiate the motion along changes of its materials.
+
+    Parameters
+    ----------
+    directions : sequence of MaterialChange
+        The parameters; `MaterialChange.relative` makes the common ones. The others are those of `simulate`.
+
+    Raises
+    ------
+    InputError
+        No direction, one for another body, or a support whose path is relative.
+    """
+    m = body.simplices.n_cells
+    if not directions or any(table.shape != (m, 2) for d in directions for table in (d.elastic, d.voigt, d.series)):
+        raise InputError(f"derivatives need one or more directions with tables of shape {(m, 2)}")
+    if any(support.relative for support in supports):
+        raise InputError("derivatives are for supports whose paths count from the free shape; give them without relative=True")
+    integrator = _Linearised(body.simplices, directions)
+    series = driven(integrator, body, materials, density, supports, times, step=step, mass=mass, load=load, breaks=breaks)
+    displacement, reaction = (np.stack(kept, axis=1) for kept in (integrator.displacements, integrator.reactions))
+    return series, SeriesDerivatives(displacement, reaction)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Tangent:
+    """Derivatives (p, ...) of a state: displacement, velocity, internal strain, reaction."""
+
+    displacement: FloatArray
+    velocity: FloatArray
+    trace: FloatArray
+    strain: FloatArray
+    reaction: FloatArray
+
+
+class _Linearised(Sdirk2):
+    """The default method, which carries the derivatives of its state along."""
+
+    def __init__(self, body: Simplices, directions: Sequence[MaterialChange]) -> None:
+        super().__init__()
+        self.directions = directions
+        p, m, d = len(directions), body.n_cells, body.dimension
+        zero = np.zeros((p, body.n_points, d))
+        self.tangent = _Tangent(zero, zero, np.zeros((p, m)), np.zeros((p, m, d, d)), zero)
+        self.displacements: list[FloatArray] = []
+        self.reactions: list[FloatArray] = []
+        self._held_rate = zero
+        self._changes: dict[str, list[StepCoefficients]] = {}
+
+    def told(self, state: MotionState) -> None:
+        """Keep the derivatives of a state that the series keeps."""
+        self.displacements.append(self.tangent.displacement)
+        self.reactions.append(self.tangent.reaction)
+
+    def begin(self, phase: Phase, state: MotionState, step_s: float, changed: bool) -> MotionState:
+        """Return the state after an event; the speed of what is held no longer depends on the materials."""
+        kept = self.tangent.velocity
+        after = super().begin(phase, state, step_s, changed)
+        if phase.mass is None:
+            velocity = kept
+        else:
+            wrong = np.where(phase.guide.held, -kept, 0.0)
+            inertia, zero = phase.mass, np.zeros(kept.shape[1:])
+            velocity = np.array([v + inertia.accelerations(zero, phase.guide.held, w) for v, w in zip(kept, wrong, strict=True)])
+        self.tangent = replace(self.tangent, velocity=velocity)
+        return after
+
+    def _aimed(self, phase: Phase, span: float) -> None:
+        """What is held shall end on its path, wherever the materials had let it go."""
+        self._held_rate = np.where(phase.guide.held, -self.tangent.displacement / span, 0.0)
+
+    def _stage(
+        self,
+        phase: Phase,
+        start: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+        h: float,
+        until: float,
+        known: FloatArray,
+        ahead: StepCoefficients | None = None,
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
+        """Take the stage, then its derivatives: those of the same equation, with what the change of its coefficients adds."""
+        done = super()._stage(phase, start, h, until, known, ahead)
+        body, over, rest = phase.body.simplices, self.factorizations.over(phase.law, h), h * (1.0 - STAGE) / STAGE
+        last, span = (over, h) if ahead is None else (ahead, rest)
+        velocity, internal, t = done[0], start[2:], self.tangent
+        changes, later = self._changed(phase, h), self._changed(phase, span)
+        guess = np.where(phase.guide.held, self._held_rate, t.velocity)
+        direct = [stage_forces(body, _of_change(over, change), velocity, *internal) for change in changes]
+        residual = self._residual(phase, over, guess, h, direct)
+        free = np.where(phase.guide.held, 0.0, residual)
+        found = self._factor(phase, h).solve(np.ascontiguousarray(free.reshape(len(free), -1).T))
+        rate = guess - found.T.reshape(guess.shape)
+        ends = [advanced(body, last, v, e, f) for v, e, f in zip(rate, t.trace, t.strain, strict=True)]
+        added = [advanced(body, change, velocity, *internal) for change in later]
+        self.tangent = _Tangent(
+            t.displacement + span * rate,
+            t.velocity + (1.0 if ahead is None else rest / h) * (rate - t.velocity),
+            np.array([e[1] + a[1] for e, a in zip(ends, added, strict=True)]),
+            np.array([e[2] + a[2] for e, a in zip(ends, added, strict=True)]),
+            self._reaction(phase, over, rate, h, direct) if ahead is None else t.reaction,
+        )
+        return done
+
+    def _residual(self, phase: Phase, over: StepCoefficients, rate: FloatArray, h: float, direct: list[FloatArray]) -> FloatArray:
+        t, body = self.tangent, phase.body.simplices
+        parts = zip(rate, t.velocity, t.trace, t.strain, direct, strict=True)
+        return np.array([phase.momentum(v - before) / h + stage_forces(body, over, v, e, f) + extra for v, before, e, f, extra in parts])
+
+    def _reaction(self, phase: Phase, over: StepCoefficients, rate: FloatArray, h: float, direct: list[FloatArray]) -> FloatArray:
+        out, held = self._residual(phase, over, rate, h, direct), phase.guide.held
+        if phase.mass is not None:  # as for the motion: the path's acceleration, which does not depend on the materials
+            for i, acceleration in enumerate((rate - self.tangent.velocity) / h):
+                wrong = np.where(held, -acceleration, 0.0)
+                out[i] += phase.mass.apply(phase.mass.accelerations(np.zeros_like(wrong), held, wrong))
+        return np.where(held, out, 0.0)
+
+    def _changed(self, phase: Phase, step_s: float) -> list[StepCoefficients]:
+        key = f"{step_s:.10g}"
+        if key not in self._changes:
+            self._changes[key] = [direction.over(phase.law, step_s) for direction in self.directions]
+        return self._changes[key]
+
+
+def _of_change(now: StepCoefficients, change: StepCoefficients) -> StepCoefficients:
+    """Return coefficients whose stage forces are what a change of the coefficients adds at the same velocity and internal strain."""
+    return StepCoefficients(
+        decay=change.spring * now.decay + now.spring * change.decay,
+        gain=np.zeros_like(now.gain),
+        spring=np.ones_like(now.spring),
+        dashpot=change.dashpot + change.spring * now.gain + now.spring * change.gain,
+    )

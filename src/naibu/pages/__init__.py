@@ -1,1 +1,0 @@
-"""Pages of tables and figures: what is on them, and how they become HTML and JSON."""

@@ -1,0 +1,1 @@
+"""Chapter 1: measuring the motion inside an object."""

@@ -1,0 +1,119 @@
+"""What five ultrasound markers tell about the agar, and what they cannot (spec M5): identified, with intervals, and in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from naibu.core.arrays import FloatArray
+from naibu.core.parameters import MAX_POISSON_RATIO
+from naibu.identification.from_motion.rheology import MotionTrial, identify_motion, rheology_parameters
+from naibu.mechanics.small_strain.prescribed_motion import Path, Support
+from naibu.mechanics.small_strain.rheology import elastic
+from naibu.reproduction.chapter2.simulations import AGAR, AGAR_PUSH_MM, AGAR_SIZE_MM, WEIGHT_MM, agar_block_3d
+from naibu.viewer.chapter import Cell, Section, Table
+
+STEP_MM = 0.5  # of the printed coordinates
+PLACING_MM = 0.3  # of the middle of a blurred echo
+SD_MM = float(np.hypot(PLACING_MM, STEP_MM / np.sqrt(6.0)))  # of a displacement: two readings, each rounded
+WEIGHT_N, WATCHED_S = 4.9, 6.0
+START = np.array([np.log(0.5 - 0.4), 0.0, AGAR_PUSH_MM])
+SPAN = np.array([1.5, 10.0, 4.0])  # standard deviation of what is assumed before: of ln(0.5 - nu), shift, depth
+REFERENCE_KPA = 10.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AgarFit:
+    """Poisson's ratio, shift of the weight to the left and depth, mm: estimates (3,), ends of the 95 % intervals (3,), and what is left."""
+
+    estimate: FloatArray
+    low: FloatArray
+    high: FloatArray
+    rms_mm: float
+    young_modulus: float
+
+
+def agar_section(trials: Mapping[str, tuple[FloatArray, FloatArray]], *, cell_mm: float = 5.0) -> Section:
+    """Identify the agar from the first positions and the displacements (5, 2), mm, of each trial, on cells of `cell_mm`."""
+    fits = {name: fitted(*readings, cell_mm) for name, readings in trials.items()}
+    rows: list[tuple[Cell, ...]] = []
+    for k, (what, unit) in enumerate((("Poisson's ratio", ""), ("weight left of the middle", "mm"), ("depth under the weight", "mm"))):
+        cells = [v for fit in fits.values() for v in (float(fit.estimate[k]), f"{fit.low[k]:.3g} to {fit.high[k]:.3g}")]
+        rows.append((f"{what}, {unit}" if unit else what, *cells))
+    rows.append(("stiffness 6 s after the push, kPa", *[v for fit in fits.values() for v in (fit.young_modulus, None)]))
+    rows.append(("residual RMS of a coordinate, mm", *[v for fit in fits.values() for v in (fit.rms_mm, None)]))
+    columns = ("", *[text for name in fits for text in (f"{name}: estimate", f"{name}: 95 %")])
+    name = next(iter(trials))
+    sentences = told_by_histories(trials[name], fits[name], cell_mm)
+    text = (
+        f"Three-dimensional block under a round weight, cells of {cell_mm:g} mm, small strain. Poisson's ratio, the place of the weight "
+        f"over the markers and its depth are sought together; a displacement is known to {SD_MM:.2f} mm. The weight of {WEIGHT_N:g} N "
+        "then gives the stiffness that the agar has left at the end, whatever its law.",
+        "What the two states of a trial say of E, C1 and C2, with the force of the weight as the only force known: " + " ".join(sentences),
+        "A history of the markers after the weight is taken off would tell C1 / E and C2 / E, and with the weight all three: "
+        "see naibu.identification.from_motion.rheology.",
+    )
+    note = "At strains of 25 % the linear law itself is wrong by more than the readings: the intervals hold for the model as it is."
+    table = Table("Agar", "Identified from the markers of Table 2.1.", columns, tuple(rows), note)
+    return Section("What the ultrasound markers tell about the agar", text, (table,))
+
+
+def fitted(start: FloatArray, displacement: FloatArray, cell_mm: float) -> AgarFit:
+    """Fit one trial by least squares, with the wide assumptions `SPAN`."""
+
+    def residuals(x: FloatArray) -> FloatArray:
+        return np.concatenate([((_modelled(x, start, cell_mm)[0] - displacement) / SD_MM).ravel(), (x - START) / SPAN])
+
+    lowest = np.log(0.5 - MAX_POISSON_RATIO)
+    found = least_squares(residuals, START, x_scale=SPAN, bounds=([lowest, -15.0, 0.5], [np.log(0.5), 15.0, 15.0]))
+    data, slopes = found.fun[: displacement.size], np.asarray(found.jac)
+    excess = max(1.0, float(np.sqrt(data @ data / (displacement.size - 3))))
+    jacobian = np.vstack([slopes[: displacement.size] / excess, slopes[displacement.size :]])
+    half = 1.96 * np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
+    ends = np.sort([_physical(found.x - half), _physical(found.x + half)], axis=0)
+    force = _modelled(found.x, start, cell_mm)[1]
+    return AgarFit(
+        _physical(found.x), ends[0], ends[1], float(SD_MM * np.sqrt(data @ data / displacement.size)), REFERENCE_KPA * WEIGHT_N / force
+    )
+
+
+def told_by_histories(readings: tuple[FloatArray, FloatArray], fit: AgarFit, cell_mm: float) -> tuple[str, ...]:
+    """Return what the rest state before and the state at the end leave undetermined of E, C1, C2 and Poisson's ratio, in words."""
+    start, displacement = readings
+    _, shift, depth = fit.estimate
+    study = agar_block_3d(cell_mm=cell_mm, push_s=1.0, watched_s=WATCHED_S)
+    top = study.mesh.points
+    under = np.flatnonzero((top[:, 2] > AGAR_SIZE_MM[2] - 1e-9) & (np.hypot(top[:, 0], top[:, 1]) <= 0.5 * WEIGHT_MM + 1e-9))
+    path = Path.through([0.0, 1.0], [(0.0, 0.0, 0.0), (0.0, 0.0, -float(depth))])
+    supports = [Support("floor", np.flatnonzero(top[:, 2] < 1e-9)), Support("weight", under, path=path)]
+    u = np.full((2, len(start), 3), np.nan)
+    u[0], u[1, :, 0], u[1, :, 2] = 0.0, displacement[:, 0], displacement[:, 1]
+    force = np.full((2, 3), np.nan)
+    force[1, 2] = -1e3 * WEIGHT_N
+    points = _in_block(start, float(shift))
+    trial = MotionTrial.of(
+        "agar", study.mesh, supports, [0.0, WATCHED_S], points, u, sd_mm=SD_MM, force={"weight": force}, force_sd_mn=50.0, step_s=1.0
+    )
+    return identify_motion([trial], rheology_parameters({"body": AGAR})).undetermined
+
+
+def _modelled(x: FloatArray, start: FloatArray, cell_mm: float) -> tuple[FloatArray, float]:
+    """Displacement (k, 2), mm, at points of the section y = 0, and the force on the weight, N, of an elastic block of 10 kPa."""
+    nu, shift, depth = _physical(x)
+    study = agar_block_3d(material=elastic(REFERENCE_KPA, float(nu)), cell_mm=cell_mm, watched_s=2.0)
+    points = _in_block(start, float(shift))
+    factor = depth / AGAR_PUSH_MM
+    moved = factor * study.displacement_at(points, 2.0)[:, [0, 2]]
+    return moved, -float(factor * study.series.force("weight")[-1, 2]) * 1e-3
+
+
+def _in_block(start: FloatArray, shift: float) -> FloatArray:
+    """Markers (k, 3), mm, in the axes of the block under its weight; the report puts the middle marker at x = 0."""
+    return np.column_stack([start[:, 0] + shift, np.zeros(len(start)), start[:, 1]])
+
+
+def _physical(x: FloatArray) -> FloatArray:
+    return np.array([0.5 - np.exp(x[0]), x[1], x[2]])

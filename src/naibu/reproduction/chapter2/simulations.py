@@ -1,0 +1,258 @@
+"""The simulations of the report's chapter 2, each by its name: three squares pushed and released, and the blocks of agar (spec M5).
+
+What the report prints is the default of a parameter; what it leaves open - the size of the squares, how deep and how wide they are pushed,
+how fast the agar is - is a parameter too, and `ASSUMED` says what was taken for it. The squares' numbers are printed without units: they
+are taken as mm, kPa, kPa s and kg/mm^3, and any other consistent system gives the same motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import InputError
+from naibu.core.mesh import Mesh
+from naibu.mechanics.small_strain.dynamics import Series, simulate
+from naibu.mechanics.small_strain.linear_elasticity import LinearBody
+from naibu.mechanics.small_strain.prescribed_motion import Path, Support
+from naibu.mechanics.small_strain.rheology import Rheology, elastic, maxwell, three_element
+from naibu.meshing.primitives import box
+from naibu.meshing.structured_2d import rectangle
+
+SQUARES: Mapping[str, Rheology] = MappingProxyType(
+    {
+        "elastic square": elastic(10.0, 0.35),
+        "viscoplastic square": maxwell(90.0, 50.0, 0.35),
+        "rheological square": three_element(30.0, 200.0, 500.0, 0.35),
+    }
+)
+PHASES_S = (10.0, 20.0, 30.0)  # pushed until, held until, watched until
+AGAR = three_element(10.0, 100.0, 300.0, 0.35)  # 0.01e6 N/m^2, 0.1e6 and 0.3e6 N s/m^2
+AGAR_SIZE_MM = (75.0, 75.0, 30.0)  # x, z, height
+AGAR_MASS_KG = 0.2
+AGAR_PUSH_MM = 7.5
+WEIGHT_MM = 40.0
+MR_SIZE_MM = (55.0, 25.0)  # x, height
+NAMES = (*SQUARES, "agar block", "agar block, 3-D", "agar under a bar")
+ASSUMED = MappingProxyType(
+    {
+        "side of the squares": "1, and 10 x 10 cells with diagonals in turn: no size is printed",
+        "push of the squares": "0.2 of the side, on the middle fifth of the top, which sticks: neither is printed",
+        "agar, push": "1 s, then held; no effect on the shape at rest",
+        "agar, weight and floor": "stick, as for the squares ('fixed on the floor'); variants are shown",
+        "agar under a bar": "plane strain; strip of 15 mm; base at y = 4 mm, middle at x = 25 mm of the table's axes",
+    }
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Study:
+    """A simulation that was run.
+
+    Attributes
+    ----------
+    name : str
+        One of `NAMES`.
+    mesh : Mesh
+        The body, mm.
+    material : Rheology
+        kPa and kPa s.
+    series : Series
+        Its motion.
+    middle_top : int
+        The node in the middle of the pushed face.
+    """
+
+    name: str
+    mesh: Mesh
+    material: Rheology
+    series: Series
+    middle_top: int
+
+    def displacement_at(self, points: ArrayLike, time_s: float) -> FloatArray:
+        """Return the displacement (k, d), mm, at points (k, d), mm, of the free body, at the stored time nearest to `time_s`.
+
+        Raises
+        ------
+        InputError
+            A point outside the body.
+        """
+        wanted, mesh = np.asarray(points, dtype=float), self.mesh
+        corners = mesh.points[mesh.cells]
+        inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1])
+        out = np.empty_like(wanted)
+        u = self.series.displacement[int(np.argmin(np.abs(self.series.times - time_s)))]
+        for i, point in enumerate(wanted):
+            inner = np.einsum("md,mdk->mk", point - corners[:, 0], inverse)
+            weights = np.hstack([1.0 - inner.sum(axis=1, keepdims=True), inner])
+            cell = int(np.argmax(weights.min(axis=1)))
+            if weights[cell].min() < -1e-9:
+                raise InputError(f"point {point.tolist()} lies outside the body of the study {self.name!r}")
+            out[i] = weights[cell] @ u[mesh.cells[cell]]
+        return out
+
+
+def pushed_square(
+    name: str,
+    *,
+    side_mm: float = 1.0,
+    divisions: int = 10,
+    push_mm: float = 0.2,
+    pushed_share: float = 0.2,
+    density: float | None = 6.4,
+    step_s: float = 0.05,
+    method: str = "sdirk2",
+) -> Study:
+    """Push the middle of a square's top down for 10 s, hold it for 10 s, and watch it for 10 s more (figures 1 to 3 of the paper).
+
+    Parameters
+    ----------
+    name : str
+        ``"elastic square"``, ``"viscoplastic square"`` or ``"rheological square"``.
+    side_mm, divisions : float and int
+        Size, and cells along a side.
+    push_mm, pushed_share : float
+        How deep, and on which share of the top.
+    density : float or None
+        As printed; None leaves inertia out.
+    step_s : float
+        Step, and time between stored states.
+    method : str
+        Of `simulate`.
+
+    Raises
+    ------
+    InputError
+        Another name.
+    """
+    if name not in SQUARES:
+        raise InputError(f"there is no square called {name!r}; there are {', '.join(SQUARES)}")
+    mesh = rectangle((side_mm, side_mm), (divisions, divisions))
+    x, y = mesh.points.T
+    top = np.flatnonzero((y > side_mm * (1.0 - 1e-9)) & (np.abs(x) <= side_mm * (0.5 * pushed_share + 1e-9)))
+    path = Path.through([0.0, PHASES_S[0]], [(0.0, 0.0), (0.0, -push_mm)])
+    supports = [Support("floor", np.flatnonzero(y == 0.0)), Support("pusher", top, path=path, end_s=PHASES_S[1])]
+    times = np.linspace(0.0, PHASES_S[2], round(PHASES_S[2] / step_s) + 1)
+    series = simulate(LinearBody.of(mesh), SQUARES[name], density, supports, times, method=method)
+    return Study(name, mesh, SQUARES[name], series, _nearest(mesh, (0.0, side_mm)))
+
+
+def agar_block(
+    *,
+    shifted_cells: float = 0.0,
+    material: Rheology = AGAR,
+    weight_sticks: bool = True,
+    floor_sticks: bool = True,
+    push_s: float = 1.0,
+    watched_s: float = 6.0,
+    step_s: float = 0.1,
+) -> Study:
+    """Push the agar block down by 7.5 mm under the weight of 40 mm, in plane strain on the report's mesh of 30 x 12 cells of 2.5 mm.
+
+    Parameters
+    ----------
+    shifted_cells : float
+        How many cells the weight lies left of the middle.
+    material : Rheology
+        As printed by default.
+    weight_sticks, floor_sticks : bool
+        Whether the weight, and the floor, hold the block sideways too.
+    push_s, watched_s, step_s : float
+        Duration of the push, of the whole, and of a step.
+    """
+    width, depth, height = AGAR_SIZE_MM
+    mesh = rectangle((width, height), (30, 12))
+    x, y = mesh.points.T
+    middle = -shifted_cells * width / 30
+    top = np.flatnonzero((y == height) & (np.abs(x - middle) <= 0.5 * WEIGHT_MM + 1e-9))
+    path = Path.through([0.0, push_s], [(0.0, 0.0), (0.0, -AGAR_PUSH_MM)])
+    supports = [
+        Support("floor", np.flatnonzero(y == 0.0), axes=None if floor_sticks else (1,)),
+        Support("weight", top, axes=None if weight_sticks else (1,), path=path),
+    ]
+    if not (weight_sticks or floor_sticks):
+        supports.append(Support("middle", np.array([_nearest(mesh, (0.0, 0.0))]), axes=(0,)))
+    density = AGAR_MASS_KG / (width * depth * height)
+    body = LinearBody.of(mesh, thickness_mm=depth)
+    times = np.linspace(0.0, watched_s, round(watched_s / step_s) + 1)
+    series = simulate(body, material, density, supports, times)
+    return Study("agar block", mesh, material, series, _nearest(mesh, (middle, height)))
+
+
+def agar_block_3d(
+    *, shift_mm: float = 0.0, material: Rheology = AGAR, cell_mm: float = 3.75, push_s: float = 1.0, watched_s: float = 6.0
+) -> Study:
+    """Push the whole block, 75 x 75 x 30 mm, under the round weight that it was: beyond the report, which computed a plane.
+
+    Parameters
+    ----------
+    shift_mm : float
+        How far the weight lies left of the middle.
+    material : Rheology
+        As printed by default.
+    cell_mm : float
+        Size of the cells that are cut into six tetrahedra each.
+    push_s, watched_s : float
+        Duration of the push and of the whole. Inertia is left out.
+    """
+    width, depth, height = AGAR_SIZE_MM
+    mesh = box((width, depth, height), [max(2, round(size / cell_mm)) for size in AGAR_SIZE_MM], cell_type="tetra")
+    x, y, z = mesh.points.T
+    top = np.flatnonzero((z > height - 1e-9) & (np.hypot(x + shift_mm, y) <= 0.5 * WEIGHT_MM + 1e-9))
+    path = Path.through([0.0, push_s], [(0.0, 0.0, 0.0), (0.0, 0.0, -AGAR_PUSH_MM)])
+    supports = [Support("floor", np.flatnonzero(z < 1e-9)), Support("weight", top, path=path)]
+    series = simulate(LinearBody.of(mesh), material, None, supports, [0.0, push_s, watched_s], step=0.5)
+    return Study("agar block, 3-D", mesh, material, series, _nearest(mesh, (-shift_mm, 0.0, height)))
+
+
+def agar_under_bar(*, push_mm: float = 1.0, strip_mm: float = 15.0, material: Rheology = AGAR, cell_mm: float = 2.5) -> Study:
+    """Push the cross-section of the MR block under the bar, in plane strain; displacements are in proportion to `push_mm`.
+
+    Parameters
+    ----------
+    push_mm : float
+        How deep; the report does not state it.
+    strip_mm : float
+        Width on which the round bar touches.
+    material : Rheology
+        As printed for the block of section 2.4, the same agar.
+    cell_mm : float
+        Size of the cells.
+    """
+    width, height = MR_SIZE_MM
+    mesh = rectangle((width, height), (round(width / cell_mm), round(height / cell_mm)))
+    x, y = mesh.points.T
+    top = np.flatnonzero((y == height) & (np.abs(x) <= 0.5 * strip_mm + 1e-9))
+    path = Path.through([0.0, 1.0], [(0.0, 0.0), (0.0, -push_mm)])
+    supports = [Support("floor", np.flatnonzero(y == 0.0)), Support("bar", top, path=path)]
+    series = simulate(LinearBody.of(mesh), material, None, supports, [0.0, 1.0], step=0.5)
+    return Study("agar under a bar", mesh, material, series, _nearest(mesh, (0.0, height)))
+
+
+def run(name: str) -> Study:
+    """Run a study with its defaults.
+
+    Raises
+    ------
+    InputError
+        There is no study of this name.
+    """
+    if name in SQUARES:
+        return pushed_square(name)
+    others: Mapping[str, Callable[[], Study]] = {
+        "agar block": agar_block,
+        "agar block, 3-D": agar_block_3d,
+        "agar under a bar": agar_under_bar,
+    }
+    if name not in others:
+        raise InputError(f"there is no study called {name!r}; there are {', '.join(NAMES)}")
+    return others[name]()
+
+
+def _nearest(mesh: Mesh, point: ArrayLike) -> int:
+    return int(np.argmin(np.linalg.norm(mesh.points - np.asarray(point, dtype=float), axis=1)))

@@ -1,0 +1,316 @@
+"""Tables 3.4 and 3.5 of the report: the gels' moduli from compression tests and from strains in CT images (spec S9).
+
+The report prints no readings of its tests, only their results. What can be reproduced is what follows from those: the means and how sure
+they are, the effect that could make the specimens of one gel differ, and, for Poisson's ratio, what the markers inside the same gels say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from naibu import datasets
+from naibu.core.arrays import FloatArray, IntArray
+from naibu.identification.material_testing.uniaxial import Specimen, poisson_ratio, specimen_mean
+from naibu.reproduction.chapter3.poisson_readings import (
+    GELS,
+    PIXEL_MM,
+    PLATE_STATES,
+    READING_SD,
+    SIDE_MM,
+    held_block,
+    marker_ratios,
+    pairs_that_fit,
+    readings,
+)
+from naibu.viewer.chapter import Cell, Figure, Section, Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
+
+VOLUME_SPREAD = 0.03  # of the markers' volume ratios about 1
+Spread = Callable[[FloatArray, "Specimens", float], FloatArray]  # moduli of the specimens' gels, specimens, parameter -> apparent moduli
+USUAL_STRAIN = 0.1  # at which a compression test of a gel reads its modulus; the report does not state its own
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Specimens:
+    """The cylinders of Table 3.4: gel (number), shape factor, area over height (mm), height (mm), printed modulus (kPa); (6,) each."""
+
+    gel: IntArray
+    shape_factor: FloatArray
+    area_over_height: FloatArray
+    height: FloatArray
+    printed: FloatArray
+
+
+CHANCE, HELD, COMPLIANCE, SLACK = (
+    "nothing but chance",
+    "faces held by the plates, 1 + 2 S^2 (Gent and Lindley 1959)",
+    "compliance of the machine, mm/mN",
+    "slack counted as strain, mm at a strain of 10 %",
+)
+_SPREAD: dict[str, tuple[Spread, bool]] = {
+    CHANCE: (lambda e, s, p: e, False),
+    HELD: (lambda e, s, p: e * (1.0 + 2.0 * s.shape_factor**2), False),
+    COMPLIANCE: (lambda e, s, p: e / (1.0 + e * p * s.area_over_height), True),
+    SLACK: (lambda e, s, p: e / (1.0 + p / (USUAL_STRAIN * s.height)), True),
+}
+
+
+def printed_table(number: str) -> tuple[tuple[str, ...], list[list[Any]]]:
+    """Return columns and rows of one of the report's tables (`naibu.datasets.paper_tables`), as printed."""
+    table = next(t for t in datasets.paper_tables()["tables"] if t["id"] == number)
+    return tuple(table["columns"]), table["rows"]
+
+
+def table_3_4() -> Section:
+    """Return Table 3.4: Young's moduli of the gels from compression tests, printed and ours, and what could make the specimens differ."""
+    _, rows = printed_table("3.4")
+    cells: list[tuple[Cell, ...]] = []
+    for gel in dict.fromkeys(r[0] for r in rows):
+        own = [r for r in rows if r[0] == gel]
+        mean = specimen_mean([r[3] * 1e-3 for r in own])
+        for row in own:
+            specimen = Specimen.cylinder(row[1], row[2])
+            corrected = row[3] * 1e-3 / specimen.bonded_stiffening
+            cells.append((gel, row[1], row[2], row[3] * 1e-3, round(specimen.shape_factor, 3), round(corrected, 1), None, None, None, None))
+        held = specimen_mean([r[3] * 1e-3 / Specimen.cylinder(r[1], r[2]).bonded_stiffening for r in own])
+        low, high = mean.interval
+        cells.append(
+            (gel, None, None, None, None, round(held.mean, 1), own[0][4] * 1e-3, round(mean.mean, 1), round(mean.standard_error, 1),
+             f"{low:.0f} to {high:.0f}")
+        )  # fmt: skip
+    columns = (
+        "gel", "diameter (mm)", "height (mm)", "E, paper (kPa)", "shape factor S", "E if the faces were held, ours (kPa)",
+        "mean, paper (kPa)", "mean, ours (kPa)", "standard error (kPa)", "95 % interval (kPa)",
+    )  # fmt: skip
+    note = (
+        "Means are those of the three specimens. Interval: Student's t with 2 degrees of freedom. The corrected column divides by "
+        "1 + 2 S^2, as if the plates had held the faces."
+    )
+    tables = (
+        Table("Table 3.4", "Young's modulus of the gels from compression tests of three cylinders each.", columns, tuple(cells), note),
+        _spread_table(rows),
+    )
+    return Section("Table 3.4: Young's modulus from compression tests", _spread_text(tables[1]), tables)
+
+
+def _specimens(rows: list[list[Any]]) -> Specimens:
+    gels = list(dict.fromkeys(r[0] for r in rows))
+    made = [Specimen.cylinder(r[1], r[2]) for r in rows]
+    return Specimens(
+        np.array([gels.index(r[0]) for r in rows]), np.array([m.shape_factor for m in made]), np.array([m.area / m.height for m in made]),
+        np.array([m.height for m in made], dtype=float), np.array([r[3] for r in rows]) * 1e-3,
+    )  # fmt: skip
+
+
+def explained_spread(specimens: Specimens, effect: str) -> tuple[tuple[float, float], float | None, float]:
+    """Fit two moduli, kPa, and the effect's parameter, if it has one, to the printed moduli: returns both and the scatter left (relative).
+
+    Least squares of the logarithms, per degree of freedom.
+    """
+    model, has_parameter = _SPREAD[effect]
+
+    def residual(x: FloatArray) -> FloatArray:
+        parameter = float(np.exp(x[2])) if has_parameter else 0.0
+        return np.asarray(np.log(model(np.exp(x[:2])[specimens.gel], specimens, parameter) / specimens.printed))
+
+    starts = [-12.0, -8.0, -4.0, 0.0] if has_parameter else [0.0]
+    fits = [least_squares(residual, np.r_[np.log([200.0, 100.0]), start][: 2 + has_parameter]) for start in starts]
+    best = min(fits, key=lambda fit: float(fit.cost))
+    scatter = float(np.sqrt(2.0 * best.cost / (len(specimens.gel) - 2 - has_parameter)))
+    moduli = float(np.exp(best.x[0])), float(np.exp(best.x[1]))
+    return moduli, float(np.exp(best.x[2])) if has_parameter else None, scatter
+
+
+def _spread_table(rows: list[list[Any]]) -> Table:
+    """How well one shared effect explains the six moduli: two moduli, and at most one more number, for six values."""
+    cells: list[tuple[Cell, ...]] = []
+    for effect in _SPREAD:
+        moduli, parameter, scatter = explained_spread(_specimens(rows), effect)
+        shown = None if parameter is None else float(f"{parameter:.2g}")
+        cells.append((effect, *(round(e, 0) for e in moduli), shown, round(100.0 * scatter, 1)))
+    columns = (
+        "what would make them differ",
+        *(f"E of {g} (kPa)" for g in dict.fromkeys(r[0] for r in rows)),
+        "size of it",
+        "scatter left (%)",
+    )
+    note = "Least squares of ln E, scatter per degree of freedom. Six values bear no finer judgement than which effect goes the right way."
+    return Table("Spread of Table 3.4", "Effects that could make specimens of one gel differ.", columns, tuple(cells), note)
+
+
+def _spread_text(table: Table) -> tuple[str, ...]:
+    by_name = {str(row[0]): row for row in table.rows}
+    left = {name: float(str(row[-1])) for name, row in by_name.items()}
+    slack, compliance = by_name[SLACK][-2], float(str(by_name[COMPLIANCE][-2]))
+    return (
+        "The report gives neither the readings nor the range of strain nor the friction at the plates. Within each gel the lowest "
+        "specimen has the lowest modulus. Plates that hold the faces would do the opposite - they make low specimens look stiffer - and "
+        f"the correction for it takes the scatter from {left[CHANCE]:.0f} to {left[HELD]:.0f} %. Slack or a machine's compliance counted "
+        f"as strain goes the right way and leaves {left[SLACK]:.0f} and {left[COMPLIANCE]:.0f} %, but it would take {slack} mm of slack or "
+        f"{1e3 * compliance:.2g} mm/N of compliance, and moduli far above the printed ones. Specimens cast at different times may as well "
+        "differ. The readings would tell: naibu.identification.material_testing.uniaxial.compression_test estimates the slack from them.",
+    )
+
+
+def table_3_5(*, divisions: int = 6) -> Section:
+    """Return Table 3.5: Poisson's ratios, printed and ours, and every explanation of their difference that can be put to numbers.
+
+    Parameters
+    ----------
+    divisions : int
+        Cells along the side of the computed block whose faces are held.
+    """
+    _, rows = printed_table("3.5")
+    printed = {row[0]: (-float(row[1]), float(row[2]), float(row[3])) for row in rows}
+    tables = (_ratio_table(printed), _definition_table(printed), _candidate_table(printed, divisions), _volume_table(printed, divisions))
+    caption = "Transversal strain of every layer of markers under a plate, and what the report prints for the gels."
+    figures = (Figure("Widening of the marker layers", caption, _draw_widening),)
+    return Section("Table 3.5: Poisson's ratio from CT images", _ratio_text(printed, tables), tables, figures)
+
+
+def _ratio_table(printed: dict[str, tuple[float, float, float]]) -> Table:
+    cells: list[tuple[Cell, ...]] = []
+    for gel, (along, across, value) in printed.items():
+        given = [poisson_ratio(along, across, definition=d).value for d in ("engineering", "hencky")]
+        found = poisson_ratio(along, across)
+        cells.append(
+            (gel, "report, Table 3.5", -along, across, value, *(round(v, 3) for v in given), None, round(found.volume_ratio, 3), None)
+        )
+    for source in marker_ratios():
+        r, along, across = source.ratio, source.longitudinal, source.transversal
+        small = poisson_ratio(along, across, definition="engineering").value
+        cells.append(
+            (source.gel, f"markers, {source.label}", round(-along, 3), round(across, 3), None, round(small, 3), round(r.value, 3),
+             round(r.standard_error, 3), round(r.volume_ratio, 3), round(r.volume_ratio_standard_error, 3))
+        )  # fmt: skip
+    columns = (
+        "gel", "source", "longitudinal strain", "transversal strain", "nu, paper", "nu, ratio of strains", "nu, Hencky", "standard error",
+        "volume ratio J", "standard error of J",
+    )  # fmt: skip
+    note = (
+        "Shortening is positive, as the report prints it. 0.10 / 0.32 is 0.31; 0.33 is printed. Markers: local affine maps, 0.15 mm for "
+        "each coordinate. nu (Hencky) = (1 - ln J / ln l) / 2; the gel of the plate cube is not stated."
+    )
+    return Table("Table 3.5", "Poisson's ratio of the gels.", columns, tuple(cells), note)
+
+
+_STRETCH: dict[str, Callable[[float], float]] = {
+    "over the free length": lambda e: 1.0 + e,
+    "logarithmic (Hencky)": lambda e: float(np.exp(e)),
+    "Green-Lagrange": lambda e: float(np.sqrt(1.0 + 2.0 * e)),
+    "over the deformed length": lambda e: 1.0 / (1.0 - e),
+    "Euler-Almansi": lambda e: float(1.0 / np.sqrt(1.0 - 2.0 * e)),
+}
+
+
+def _definition_table(printed: dict[str, tuple[float, float, float]]) -> Table:
+    cells: list[tuple[Cell, ...]] = []
+    for name, stretch in _STRETCH.items():
+        volumes = [stretch(along) * stretch(across) ** 2 for along, across, _ in printed.values()]
+        cells.append((name, *(round(v, 3) for v in volumes)))
+    columns = ("strain, if it was read as", *(f"J of {gel}" for gel in printed))
+    note = f"A definition would explain the table if both volume ratios were those of the markers, 1.00 within {VOLUME_SPREAD:g}."
+    return Table("Strain measures", "Volume ratios that the printed strains imply.", columns, tuple(cells), note)
+
+
+def _candidate_table(printed: dict[str, tuple[float, float, float]], divisions: int) -> Table:
+    cells: list[tuple[Cell, ...]] = []
+    for name, pairs in _candidates(printed, divisions).items():
+        row: list[Cell] = [name]
+        distances = []
+        for gel in GELS:
+            along, across = pairs[gel]
+            distances.append(float(np.hypot(along - printed[gel][0], across - printed[gel][1])) / READING_SD)
+            row += [round(-along, 3), round(across, 3), round(-across / along, 2)]
+        cells.append((*row, *(round(d, 1) for d in distances)))
+    columns = (
+        "reading", *(f"{what}, {gel}" for gel in GELS for what in ("longitudinal", "transversal", "nu")),
+        *(f"distance from printed, {gel} (sd)" for gel in GELS),
+    )  # fmt: skip
+    note = f"Markers of ct_two_material_2, the experiment of chapter 3.6. One standard deviation of a reading is taken as {READING_SD:g}."
+    return Table(
+        "Candidate readings", "Strains that a reader of the images could have taken, beside the printed ones.", columns, tuple(cells), note
+    )
+
+
+def _candidates(printed: dict[str, tuple[float, float, float]], divisions: int) -> dict[str, dict[str, tuple[float, float]]]:
+    """For every candidate, longitudinal and transversal strain of both gels."""
+    seen = readings("ct_two_material_2", "deformed")
+    lateral = {gel: {k: v for k, v in seen.transversal.items() if gel in k} for gel in GELS}
+    own = {gel: float(np.mean(list(lateral[gel].values()))) for gel in GELS}
+    least = {gel: min(lateral[gel].values()) for gel in GELS}
+    along = {gel: next(v for k, v in seen.longitudinal.items() if gel in k) for gel in GELS}
+    stack, stated = seen.longitudinal["all layers"], seen.longitudinal["stated height"]
+    held = {gel: held_block(-printed[gel][0], 0.49, divisions) for gel in GELS}
+    free = {gel: float((1.0 + printed[gel][0]) ** -0.5) - 1.0 for gel in GELS}
+    out = {
+        "the gel's own layers": {g: (along[g], own[g]) for g in GELS},
+        "shortening of the whole stack, the gel's widening": {g: (stack, own[g]) for g in GELS},
+        "shortening of the whole stack, widening of the gel's layer nearest to plate or table": {g: (stack, least[g]) for g in GELS},
+        "shortening from the stated height, the gel's widening": {g: (stated, own[g]) for g in GELS},
+        "volume kept, sides free": {g: (printed[g][0], free[g]) for g in GELS},
+        "volume kept, one side of two read": {g: (printed[g][0], 0.5 * free[g]) for g in GELS},
+    }
+    for name, height in (("middle", 0.5), ("one sixth of the height above a face", 1 / 6), ("one twelfth above a face", 1 / 12)):
+        key = f"computed block, nu 0.49, faces held, read in the {name}" if height == 0.5 else f"computed block, faces held, read {name}"
+        out[key] = {g: (printed[g][0], held[g].transversal_at(height)) for g in GELS}
+    return out
+
+
+def _volume_table(printed: dict[str, tuple[float, float, float]], divisions: int) -> Table:
+    cells: list[tuple[Cell, ...]] = []
+    for gel, (along, _, value) in printed.items():
+        for nu, whose in ((value, "printed"), (0.49, "0.49")):
+            block = held_block(-along, nu, divisions)
+            cells.append((gel, whose, nu, -along, round(block.volume_ratio, 3), round(block.transversal_at(0.5), 3)))
+    columns = ("gel", "which nu", "nu", "longitudinal strain", "volume ratio of the block", "transversal strain in the middle")
+    note = "Cube with held faces, law neo_hookean, hexahedra with shared dilatation."
+    return Table("Volume under the printed ratio", "What markers would show if the printed ratio held.", columns, tuple(cells), note)
+
+
+def _ratio_text(printed: dict[str, tuple[float, float, float]], tables: Sequence[Table]) -> tuple[str, ...]:
+    volumes = [source.ratio.volume_ratio for source in marker_ratios()]
+    lost = [1.0 - (1.0 + a) * (1.0 + t) ** 2 for a, t, _ in printed.values()]
+    pixels = [((1.0 + a) ** -0.5 - 1.0 - t) * SIDE_MM / PIXEL_MM for a, t, _ in printed.values()]
+    counts = pairs_that_fit(list(printed.values()))
+    distances = {str(row[0]): tuple(float(str(d)) for d in row[-len(GELS) :]) for row in tables[2].rows}
+    nearest = min(distances, key=lambda name: max(distances[name]))
+    kept = [str(row[0]) for row in tables[1].rows if all(abs(float(str(v)) - 1.0) <= VOLUME_SPREAD for v in row[1:])]
+    held = [float(str(row[4])) for row in tables[3].rows if row[1] != "printed"]
+    measure = (
+        f"read as {' or '.join(kept)}, both printed pairs keep the volume" if kept else "under none do both printed pairs keep the volume"
+    )
+    return (
+        f"The printed strains mean that the gels lost {100 * lost[0]:.0f} and {100 * lost[1]:.0f} % of their volume. The markers inside "
+        f"the same gels, in the same kind of images, say {min(volumes):.2f} to {max(volumes):.2f} times the free volume.",
+        f"Resolution: were the volume kept, the width of the {SIDE_MM:.0f} mm cube would have been misread by {pixels[0]:.0f} and "
+        f"{pixels[1]:.0f} pixels. Strain measure: {measure}. Held faces: they hold the widening back near plate and table only, and at "
+        f"nu = 0.49 leave {min(held):.2f} to {max(held):.2f} of the volume (last table).",
+        f"Other readings: of all {counts.tried} pairs of a longitudinal and a transversal strain between marker layers of the bundled "
+        f"plate experiments, {counts.fitting[0]} lie within two standard deviations of the printed pair of {GELS[0]} and "
+        f"{counts.fitting[1]} of that of {GELS[1]}. Of the candidates in the third table the one nearest to both is '{nearest}': "
+        f"{distances[nearest][0]:g} and {distances[nearest][1]:g} standard deviations away.",
+        "So the printed ratios are no property of the gels. How the strains were read is not recorded, and none of these candidates is "
+        "proven by its closeness; a ratio of two strains is Poisson's ratio only at small strain and where the sides are free, and the "
+        "change of volume between markers needs neither.",
+    )
+
+
+def _draw_widening(canvas: Canvas) -> None:
+    """Transversal strain of the marker layers over their height, beside the printed values."""
+    axes = canvas.add_subplot()
+    _, rows = printed_table("3.5")
+    for (name, state), marker in zip(PLATE_STATES, "os^v", strict=True):
+        seen = readings(name, state)
+        axes.plot(list(seen.transversal.values()), datasets.load(name).nominal_heights_mm, marker + "-", label=f"{name}, {state}")
+    for row, style in zip(rows, (":", "--"), strict=True):
+        axes.axvline(row[2], color="0.3", linestyle=style, label=f"Table 3.5, {row[0]}")
+    axes.set(xlabel="transversal strain", ylabel="height of the marker layer above the base (mm)", xlim=(0.0, None))
+    axes.legend(fontsize=8)

@@ -1,0 +1,117 @@
+"""The eight patterns (a) to (h) of pushing, calibrating and evaluating a lattice of dough, on the virtual twin (spec L6)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from naibu.identification.lattice_calibration.forward_model import Capture, PushedLattice, PushMode
+from naibu.identification.lattice_calibration.gauss_newton import (
+    CalibrationProblem,
+    Index,
+    LatticeEstimate,
+    ReportIndices,
+    calibrate_lattice,
+    indices,
+)
+from naibu.mechanics.lattices.model.lattice import Lattice
+from naibu.validation.specimens.lattice_twin import FIRST, SECOND, Law, dough_lattice, dough_twin
+
+START = {"K": 40.0, "C1": 30.0, "C2": 50.0}  # mN/mm and mN s/mm: the rough guess of all calibrations
+
+Key = tuple[int, PushMode, Index]  # which pushing, how the virtual dough is pushed, and what counts
+
+
+@dataclass(frozen=True, slots=True)
+class Pattern:
+    """One pattern: the pushing that it is evaluated on and how that is done, and the calibration whose parameters it takes."""
+
+    letter: str
+    pushing: int
+    mode: PushMode
+    calibration: Key
+
+
+PATTERNS = (
+    Pattern("a", 0, "displacement", (0, "displacement", "shape")),
+    Pattern("b", 0, "displacement", (0, "displacement", "force")),
+    Pattern("c", 0, "force", (0, "force", "shape")),
+    Pattern("d", 0, "force", (0, "force", "force")),
+    Pattern("e", 1, "displacement", (1, "displacement", "shape")),
+    Pattern("f", 1, "force", (1, "force", "force")),
+    Pattern("g", 1, "displacement", (0, "displacement", "shape")),
+    Pattern("h", 1, "force", (0, "force", "force")),
+)
+JOINT = (
+    Pattern("joint 1", 0, "displacement", (0, "displacement", "joint")),
+    Pattern("joint 2", 1, "displacement", (1, "displacement", "joint")),
+    Pattern("joint 1 on 2", 1, "displacement", (0, "displacement", "joint")),
+)
+RIVALS = (  # the report's two sets by displacement, on either pushing
+    Pattern("force 1", 0, "displacement", (0, "displacement", "force")),
+    Pattern("force 2", 1, "displacement", (1, "displacement", "force")),
+    Pattern("force 1 on 2", 1, "displacement", (0, "displacement", "force")),
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatternStudy:
+    """All calibrations, and what each pattern gives.
+
+    Attributes
+    ----------
+    lattice : Lattice
+        The model.
+    captures : tuple of Capture
+        First and second pushing.
+    estimates : dict
+        By pushing, mode and index.
+    found : dict
+        Indices of every pattern by its letter or name.
+    """
+
+    lattice: Lattice
+    captures: tuple[Capture, ...]
+    estimates: dict[Key, LatticeEstimate]
+    found: dict[str, ReportIndices]
+
+
+def pattern_study(seed: int = 0, *, law: Law = "finer", spacing_mm: float = 10.0, points: int = 2800) -> PatternStudy:
+    """Calibrate on either pushing by displacement and by force, on shape, on force and on both, and evaluate all patterns.
+
+    Parameters
+    ----------
+    seed : int
+        Of the twin's noise.
+    law : str
+        The twin's: see `naibu.validation.specimens.lattice_twin.dough_twin`.
+    spacing_mm : float
+        Between the masses of the model, mm.
+    points : int
+        Captured points.
+    """
+    twin = dough_twin((FIRST, SECOND), law=law, spacing_mm=spacing_mm, seed=seed, points=points)
+    lattice = dough_lattice(spacing_mm)
+    estimates: dict[Key, LatticeEstimate] = {}
+    found = {}
+    for pattern in (*PATTERNS, *JOINT, *RIVALS):
+        if pattern.calibration not in estimates:
+            estimates[pattern.calibration] = calibrated(lattice, twin.captures, pattern.calibration)
+        capture = twin.captures[pattern.pushing]
+        pushed = PushedLattice.of(lattice, capture.pushing, pattern.mode, force=capture.force)
+        found[pattern.letter] = indices(capture, pushed, estimates[pattern.calibration].parameters())
+    return PatternStudy(lattice, twin.captures, estimates, found)
+
+
+def calibrated(lattice: Lattice, captures: tuple[Capture, ...], key: Key) -> LatticeEstimate:
+    """Return one calibration; forces count while the pushers keep still, as in the report."""
+    number, mode, index = key
+    problem = CalibrationProblem.of(lattice, [captures[number]], index=index, mode=mode, window="keep")
+    scale = lattice.spacing_mm / 10.0
+    return calibrate_lattice(problem, {name: value * scale for name, value in START.items()}, max_iterations=80)
+
+
+def with_spread(estimate: LatticeEstimate, k: int) -> str:
+    """Return a parameter's value, and the factor by which its 95 % interval reaches up and down."""
+    return f"{estimate.values[k]:.3g} (x/÷ {np.exp(1.96 * np.sqrt(estimate.covariance[k, k])):.2g})"

@@ -1,0 +1,281 @@
+"""What a report shows, as plain frozen records of arrays, text and numbers.
+
+Lengths are in mm. Residual means predicted minus measured position, everywhere.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from types import MappingProxyType
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.errors import InputError
+
+Cell = str | float | int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A plate or bar drawn as an upright box: centre and half its extent along x, y, z, mm."""
+
+    centre_mm: tuple[float, float, float]
+    half_size_mm: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """The model at one load.
+
+    Attributes
+    ----------
+    label : str
+        What the reader sees beside the slider, e.g. ``"plate at 43.2 mm"``.
+    load_mm : float
+        How far the load has come, mm.
+    surface : ndarray, shape (n, 3)
+        Predicted nodes of the outer surface, mm.
+    markers : ndarray, shape (k, 3)
+        Predicted markers, mm.
+    indenters : tuple of Box
+        Plates or bar at this load; the same number, in the same order, in every step.
+    """
+
+    label: str
+    load_mm: float
+    surface: FloatArray
+    markers: FloatArray
+    indenters: tuple[Box, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """One measured state of one experiment as the 3-D view shows it.
+
+    Attributes
+    ----------
+    name : str
+        Key of the scene, unique in a report.
+    experiment, state : str
+        What the reader sees in the selector.
+    faces : ndarray, shape (f, 3), int
+        Triangles of the object's outer surface, wound outwards.
+    free_surface : ndarray, shape (n, 3)
+        Surface nodes in the free state, mm.
+    steps : tuple of Step
+        From free to fully loaded; the last one is compared with `measured`.
+    marker_ids : ndarray, shape (k,), int
+        Labels.
+    initial_markers : ndarray, shape (k, 3)
+        Markers in the free state, mm.
+    measured : ndarray, shape (k, 3)
+        Markers measured in the loaded state, mm; NaN where a coordinate is not known.
+    sd_mm : ndarray, shape (k,)
+        Standard deviation of a residual along one axis that noise alone would give, mm.
+    layer : ndarray, shape (k,), int
+        Number of the marker layer, 0 for the lowest.
+    role : str
+        In a word or two whether the state was used, e.g. ``"fitted"`` or ``"predicted unseen"``.
+    """
+
+    name: str
+    experiment: str
+    state: str
+    faces: IntArray
+    free_surface: FloatArray
+    steps: tuple[Step, ...]
+    marker_ids: IntArray
+    initial_markers: FloatArray
+    measured: FloatArray
+    sd_mm: FloatArray
+    layer: IntArray
+    role: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.steps:
+            raise InputError(f"scene {self.name!r} has no steps; give at least the fully loaded one")
+        n, k = len(self.free_surface), len(self.marker_ids)
+        self._check_shapes(n, k)
+        if len(self.faces) and (self.faces.min() < 0 or self.faces.max() >= n):
+            raise InputError(
+                f"scene {self.name!r}: faces name nodes {self.faces.min()} to {self.faces.max()}, the surface has 0 to {n - 1}"
+            )
+        if not np.isfinite(self.free_surface).all() or not all(np.isfinite(s.surface).all() for s in self.steps):
+            raise InputError(f"scene {self.name!r}: every surface coordinate must be a finite number of mm")
+        if not np.isfinite(self.initial_markers).all() or not all(np.isfinite(s.markers).all() for s in self.steps):
+            raise InputError(
+                f"scene {self.name!r}: predicted and initial markers must be finite; leave out markers that cannot be predicted"
+            )
+        if len({len(s.indenters) for s in self.steps}) > 1:
+            raise InputError(f"scene {self.name!r}: every step must have the same number of indenters")
+
+    def _check_shapes(self, n: int, k: int) -> None:
+        shapes = {
+            "faces": (self.faces, (len(self.faces), 3)),
+            "free_surface": (self.free_surface, (n, 3)),
+            "initial_markers": (self.initial_markers, (k, 3)),
+            "measured": (self.measured, (k, 3)),
+            "sd_mm": (self.sd_mm, (k,)),
+            "layer": (self.layer, (k,)),
+        }
+        for i, step in enumerate(self.steps):
+            shapes[f"steps[{i}].surface"] = (step.surface, (n, 3))
+            shapes[f"steps[{i}].markers"] = (step.markers, (k, 3))
+        for name, (array, shape) in shapes.items():
+            if np.shape(array) != shape:
+                raise InputError(f"scene {self.name!r}: {name} must have shape {shape}, not {np.shape(array)}")
+
+    @property
+    def label(self) -> str:
+        """Experiment and state in one line."""
+        return " · ".join(part for part in (self.experiment, self.state) if part) or self.name
+
+    @property
+    def residual_mm(self) -> FloatArray:
+        """Predicted minus measured position at full load, shape (k, 3), mm; NaN where not measured."""
+        return np.asarray(self.steps[-1].markers - self.measured, dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table as the reader sees it; units belong into the column names. None and NaN show as a dash."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        for i, row in enumerate(self.rows):
+            if len(row) != len(self.columns):
+                raise InputError(f"table {self.title!r}: row {i} has {len(row)} cells, there are {len(self.columns)} columns")
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterRow:
+    """An estimated parameter with its 95 % interval; an infinite or NaN bound means that the data do not bound it."""
+
+    name: str
+    label: str
+    estimate: float
+    lower: float
+    upper: float
+    unit: str
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correlation:
+    """Correlation of the parameter estimates: names (p) and matrix (p, p)."""
+
+    names: tuple[str, ...]
+    matrix: FloatArray
+
+    def __post_init__(self) -> None:
+        p = len(self.names)
+        if np.shape(self.matrix) != (p, p):
+            raise InputError(f"a correlation of {p} parameters needs a ({p}, {p}) matrix, not {np.shape(self.matrix)}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ResidualSet:
+    """Residuals of one state for the plots by marker layer.
+
+    Attributes
+    ----------
+    title : str
+        Heading of the plots.
+    residual_mm : ndarray, shape (k, 3)
+        Predicted minus measured, mm; NaN where not measured.
+    sd_mm : ndarray, shape (k,)
+        Standard deviation along one axis that noise alone would give, mm.
+    layer : ndarray, shape (k,), int
+        Marker layer, 0 for the lowest.
+    """
+
+    title: str
+    residual_mm: FloatArray
+    sd_mm: FloatArray
+    layer: IntArray
+
+    @classmethod
+    def from_scene(cls, scene: Scene) -> ResidualSet:
+        """Return the residuals of a scene at full load."""
+        title = f"{scene.label} ({scene.role})" if scene.role else scene.label
+        return cls(title, scene.residual_mm, scene.sd_mm, scene.layer)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Report:
+    """Everything on one result page, in the order a reader meets it.
+
+    Attributes
+    ----------
+    title : str
+        Heading of the page.
+    headline : tuple of str
+        The result in plain sentences; the first is set larger.
+    scenes : tuple of Scene
+        States for the 3-D view; also give the RMS bars under the headline.
+    accuracy : Table or None
+        Experiment, state, markers, RMS along x, y, z and in 3-D, in mm and in units of the noise, and the baselines.
+    residuals : tuple of ResidualSet
+        Plots by layer.
+    parameters : tuple of ParameterRow
+        Estimates with intervals; rows of one unit share a scale.
+    correlation : Correlation or None
+        Of the estimates.
+    undetermined : tuple of str
+        What the data cannot tell, one sentence each.
+    tables : tuple of Table
+        Further tables, e.g. the comparison of models.
+    provenance : mapping
+        Version, settings, hashes of the inputs, seed; mappings may nest.
+    """
+
+    title: str
+    headline: tuple[str, ...]
+    scenes: tuple[Scene, ...] = ()
+    accuracy: Table | None = None
+    residuals: tuple[ResidualSet, ...] = ()
+    parameters: tuple[ParameterRow, ...] = ()
+    correlation: Correlation | None = None
+    undetermined: tuple[str, ...] = ()
+    tables: tuple[Table, ...] = ()
+    provenance: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+
+
+def jsonable(value: object, digits: int = 6) -> object:
+    """Turn records, arrays and mappings into what JSON knows.
+
+    Parameters
+    ----------
+    value : object
+        A record of this module, or anything made of mappings, sequences, arrays, numbers, text and None.
+    digits : int
+        Significant digits kept of a float.
+
+    Returns
+    -------
+    object
+        NaN and infinities have become None; anything unknown its text.
+    """
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: jsonable(getattr(value, f.name), digits) for f in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): jsonable(entry, digits) for key, entry in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return jsonable(value.tolist(), digits)
+    if isinstance(value, list | tuple | set | frozenset):
+        return [jsonable(entry, digits) for entry in value]
+    if isinstance(value, float):
+        return float(f"{value:.{digits}g}") if np.isfinite(value) else None
+    return value if value is None or isinstance(value, str | bool | int) else str(value)
+
+
+def report_json(report: Report, digits: int = 6) -> str:
+    """Return the whole report as JSON text, e.g. to store it beside the page."""
+    return json.dumps(jsonable(report, digits), allow_nan=False, ensure_ascii=False)

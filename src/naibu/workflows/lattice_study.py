@@ -1,0 +1,330 @@
+"""From the file of a study to the lattice and the bodies that are computed; the studies that naibu brings along."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.ndimage
+
+from naibu._version import __version__
+from naibu.core.arrays import BoolArray, FloatArray
+from naibu.core.errors import InputError
+from naibu.core.mesh import Mesh
+from naibu.core.volume import Volume
+from naibu.io.files.provenance import sha256
+from naibu.io.images import read_volume
+from naibu.io.lattice_study_schema import FloorTable, ObjectTable, PusherTable, StudyFile, load_study
+from naibu.mechanics.contact.rigid_indenters import Pusher, plane, pusher_box, pusher_cylinder, pusher_sphere
+from naibu.mechanics.lattices.model.hexahedra import lattice_mesh
+from naibu.mechanics.lattices.model.lattice import CLASSES, Lattice, box_mask, classic_lattice, lattice_parameters
+from naibu.mechanics.lattices.model.octree import octree_lattice
+from naibu.mechanics.lattices.simulation.contact import begin_contact
+from naibu.mechanics.lattices.simulation.loading_history import Drive, LatticeStudy, StudyBody, check_study
+
+OCTREES = ("octree-0", "octree-1", "octree-2")
+BASES = ("cube-pushing", "dough-first-pushing", "dough-second-pushing", "dough-pressed-by-sphere", "dough-pushed-over-floor")
+VARIED = BASES[:3]  # those that have octree variants
+NAMED = tuple(name + variant for name in BASES for variant in ("", *(f"-{kind}" for kind in OCTREES if name in VARIED)))
+TEMPLATE = "dough-pressed-by-sphere"
+_MOST_CELLS = 20_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PreparedStudy:
+    """A study with what its files are made from.
+
+    Attributes
+    ----------
+    name : str
+        Of the files.
+    title : str
+        Heading.
+    source : str
+        File or name that it was asked by.
+    settings : StudyFile
+        What the file says.
+    study : LatticeStudy
+        What is computed.
+    mesh : Mesh
+        The cubes of the lattice, as hexahedra.
+    inputs : dict
+        SHA-256 of every file that was read.
+    fingerprint : str
+        SHA-256 of settings and inputs; results of equal ones continue each other.
+    """
+
+    name: str
+    title: str
+    source: str
+    settings: StudyFile
+    study: LatticeStudy
+    mesh: Mesh
+    inputs: dict[str, str]
+    fingerprint: str
+
+
+def study_text(name: str) -> str:
+    """Return the file of a study that naibu brings along.
+
+    Raises
+    ------
+    InputError
+        There is no such study.
+    """
+    if name not in NAMED:
+        raise InputError(f"there is no lattice study {name!r}; choose one of {', '.join(NAMED)}, or give a file STUDY.toml")
+    base = next(b for b in BASES if name == b or name.removeprefix(f"{b}-") in OCTREES)
+    text = (files("naibu") / "datasets" / "studies" / f"{base}.toml").read_text(encoding="utf-8")
+    if name == base:
+        return text
+    kind = name.removeprefix(f"{base}-")
+    return text.replace('kind = "classic"', f'kind = "{kind}"').replace('"  # title', f', {kind.replace("-", " type ")}"  # title')
+
+
+def prepared_study(source: str | os.PathLike[str]) -> PreparedStudy:
+    """Read and check a study.
+
+    Parameters
+    ----------
+    source : str or path-like
+        Name of a study in `NAMED`, or a file.
+
+    Raises
+    ------
+    InputError
+        No such study or file; a key or value that cannot be; an empty mask, or one in pieces; a pusher that starts inside the object.
+        The message names the file, the field, its value and the mend.
+    """
+    path = Path(source)
+    if str(source) in NAMED:
+        content, folder, name = study_text(str(source)).encode(), Path(), str(source)
+    else:
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise InputError(
+                f"{path}: cannot be read ({error.strerror or error}); give a file STUDY.toml, or one of the studies {', '.join(NAMED)}"
+            ) from error
+        folder, name = path.parent, path.stem
+    settings = load_study(path, content)
+    mask, inputs = _mask(path, folder, settings)
+    study = _study(path, settings, mask)
+    said = json.dumps([settings.model_dump(mode="json"), inputs, __version__], sort_keys=True)
+    inputs = {path.name: hashlib.sha256(content).hexdigest(), **inputs}
+    fingerprint = hashlib.sha256(said.encode()).hexdigest()
+    title = settings.title or name.replace("-", " ").replace("_", " ").capitalize()
+    return PreparedStudy(name, title, str(source), settings, study, lattice_mesh(study.lattice), inputs, fingerprint)
+
+
+def _mask(path: Path, folder: Path, settings: StudyFile) -> tuple[BoolArray, dict[str, str]]:
+    """Return the voxels of the object, and the hashes of files that they come from."""
+    table, spacing = settings.object, settings.lattice.spacing_mm
+    if table.size_mm is not None or table.cells is not None:
+        x, y, z = table.cells if table.cells is not None else [round(edge / spacing) for edge in table.size_mm or ()]
+        if x * y * z > _MOST_CELLS:
+            raise InputError(f"{path}: [object] {x} x {y} x {z} voxels are more than {_MOST_CELLS}; choose a larger spacing_mm")
+        return box_mask((x, y, z)), {}
+    assert table.labels is not None
+    file = folder / table.labels
+    volume = _label_volume(path, file, table)
+    chosen = np.isin(volume.values, table.label) if table.label else volume.values != 0
+    if not chosen.any():
+        present = ", ".join(f"{v:g}" for v in np.unique(volume.values)[:8])
+        asked = f"label = {table.label}" if table.label else "labels other than 0"
+        raise InputError(f"{path}: [object] {asked}: {file} holds no such voxel; its labels are {present}")
+    mask = resampled_mask(chosen, np.asarray(volume.spacing_mm), spacing)
+    if not mask.any():
+        raise InputError(
+            f"{path}: [lattice] spacing_mm = {spacing:g}: no voxel of that edge is half filled by the labels of {file}; make it less"
+        )
+    pieces, count = scipy.ndimage.label(mask, structure=np.ones((3, 3, 3)))
+    if count > 1 and table.largest_piece:
+        mask = pieces == 1 + int(np.argmax(np.bincount(pieces.ravel())[1:]))
+    elif count > 1:
+        sizes = sorted(np.bincount(pieces.ravel())[1:].tolist(), reverse=True)
+        raise InputError(
+            f"{path}: [object] labels = {table.labels!r}: the object falls into {count} pieces of {', '.join(map(str, sizes[:5]))} voxels; "
+            "write largest_piece = true to keep the largest, or choose other labels or a smaller spacing_mm"
+        )
+    inside = np.argwhere(mask)
+    (a, b, c), (d, e, f) = inside.min(axis=0), inside.max(axis=0) + 1
+    return mask[a:d, b:e, c:f], {Path(table.labels).name: sha256(file)}
+
+
+def _label_volume(path: Path, file: Path, table: ObjectTable) -> Volume:
+    """Read labels; an array of NumPy has the axes x, y, z."""
+    place = f"{path}: [object] labels = {table.labels!r}"
+    if file.suffix != ".npy":
+        try:
+            return read_volume(file, spacing_mm=table.voxel_mm)
+        except InputError as error:
+            raise InputError(f"{place}: {error}") from error
+    if table.voxel_mm is None:
+        raise InputError(f"{place}: an array does not tell its voxels; add voxel_mm = [1.0, 1.0, 1.0]")
+    try:
+        values = np.load(file, allow_pickle=False)
+        return Volume.from_array(np.asarray(values).T, spacing_mm=table.voxel_mm)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{place}: {error}; save the labels by numpy.save, with the axes x, y, z") from error
+
+
+def resampled_mask(voxels: BoolArray, voxel_mm: FloatArray, spacing_mm: float) -> BoolArray:
+    """Return which cubes of an edge are at least half filled by voxels (nz, ny, nx); the cubes have the axes (x, y, z) and begin with them.
+
+    Parameters
+    ----------
+    voxels : ndarray, shape (nz, ny, nx), bool
+        In the object.
+    voxel_mm : ndarray, shape (3,)
+        Edges of a voxel along x, y, z, mm.
+    spacing_mm : float
+        Edge of a cube, mm.
+    """
+    used = np.argwhere(voxels.T)
+    low, high = used.min(axis=0), used.max(axis=0) + 1
+    share = voxels.T[tuple(slice(a, b) for a, b in zip(low, high, strict=True))].astype(np.float32)
+    for axis in range(3):  # shares of slabs, one axis after the other
+        edges = voxel_mm[axis] * np.arange(share.shape[axis] + 1)
+        count = int(np.ceil(edges[-1] / spacing_mm - 1e-6))
+        filled = np.concatenate([np.zeros((1, *np.delete(share.shape, axis))), np.cumsum(np.moveaxis(share, axis, 0), axis=0)])
+        cuts = np.minimum(spacing_mm * np.arange(count + 1) / voxel_mm[axis], len(edges) - 1.0)
+        below = np.minimum(cuts.astype(np.int64), len(edges) - 2)
+        part = (cuts - below).reshape(-1, *[1] * (share.ndim - 1))
+        integral = filled[below] * (1.0 - part) + filled[below + 1] * part
+        share = np.moveaxis(np.diff(integral, axis=0) * voxel_mm[axis] / spacing_mm, 0, axis)
+    return np.asarray(share >= 0.5 - 1e-6)
+
+
+def _study(path: Path, settings: StudyFile, mask: BoolArray) -> LatticeStudy:
+    simulation = settings.simulation
+    lattice = _lattice(path, settings, mask)
+    p = settings.parameters
+    try:
+        parameters = lattice_parameters(lattice, p.K, p.C1, p.C2)
+    except InputError as error:
+        raise InputError(f"{path}: [parameters] {error}") from error
+    samples = round(settings.output.every_s / settings.sample_s)
+    gravity = simulation.gravity_mm_per_s2
+    study = LatticeStudy(
+        lattice,
+        parameters,
+        _bodies(path, settings, lattice),
+        simulation.step_s,
+        round(simulation.duration_s / settings.output.every_s),
+        samples,
+        round(settings.sample_s / simulation.step_s),
+        simulation.method,
+        simulation.tolerance,
+        np.outer(lattice.node_mass, [0.0, 0.0, -gravity]) if gravity else None,
+    )
+    try:
+        check_study(study)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return study
+
+
+def _lattice(path: Path, settings: StudyFile, mask: BoolArray) -> Lattice:
+    table, body = settings.lattice, settings.object
+    amount: Mapping[str, Any] = (
+        {"total_mass_kg": 1e-3 * body.mass_g} if body.mass_g is not None else {"density": 1e-6 * (body.density_g_per_cm3 or 0.0)}
+    )
+    try:
+        if table.kind == "classic":
+            return classic_lattice(mask, table.spacing_mm, lumping=table.masses, **amount)
+        ratios = class_ratios(settings.parameters.K)
+        return octree_lattice(mask, table.spacing_mm, int(table.kind[-1]), lumping=table.masses, class_stiffness=ratios, **amount)
+    except InputError as error:
+        raise InputError(f"{path}: [lattice] {error}") from error
+
+
+def class_ratios(stiffness: float | Mapping[str, Any]) -> tuple[float, ...]:
+    """Return what the factors of an octree need to know of K: those of short, normal and long elements, of the core where zones differ.
+
+    Where they are alike, or one is 0, the factors are those of equal ones.
+    """
+
+    def of_core(given: Any) -> Any:
+        return given.get("core", given) if isinstance(given, Mapping) else given
+
+    by_class = of_core(stiffness)
+    ratios = tuple(of_core(by_class.get(name)) for name in CLASSES) if isinstance(by_class, Mapping) else ()
+    return ratios if ratios and all(isinstance(ratio, float) and ratio > 0.0 for ratio in ratios) else (1.0, 1.0, 1.0)
+
+
+def _bodies(path: Path, settings: StudyFile, lattice: Lattice) -> tuple[StudyBody, ...]:
+    bodies = [] if settings.floor is None else [_floor(settings.floor, lattice)]
+    for k, table in enumerate(settings.pusher):
+        body = _pusher(table, k, settings.simulation.duration_s)
+        try:
+            begin_contact(lattice, [body.pusher])
+        except InputError as error:
+            told = re.sub(r"^body 0, an? \w+, ", "the pusher ", str(error))
+            raise InputError(f"{path}: [[pusher]] number {k + 1} centre_mm = {table.centre_mm}: {told}") from error
+        bodies.append(body)
+    names = [body.name for body in bodies]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice:
+        raise InputError(f"{path}: [[pusher]] name = {twice!r} is given twice; give every pusher a name of its own ('floor' is the floor)")
+    return tuple(bodies)
+
+
+def _surface(table: FloorTable | PusherTable) -> dict[str, float]:
+    return {
+        "static_friction": table.static_friction,
+        "kinetic_friction": table.static_friction if table.kinetic_friction is None else table.kinetic_friction,
+        "pull_stiffness": table.pull_stiffness_mN_per_mm,
+        "pull_damping": table.pull_damping_mN_s_per_mm,
+        "pull_speed": table.pull_speed_mm_per_s,
+    }
+
+
+def _floor(table: FloorTable, lattice: Lattice) -> StudyBody:
+    low, high = lattice.points.min(axis=0), lattice.points.max(axis=0)
+    middle = 0.5 * (low + high)
+    ground = plane((middle[0], middle[1], low[2]), **_surface(table))
+    return StudyBody("floor", ground, np.zeros(1), np.zeros((1, 3)), glued_until_s=np.inf if table.contact == "sticking" else None)
+
+
+def _pusher(table: PusherTable, k: int, duration_s: float) -> StudyBody:
+    times, offset = _programme(table, duration_s)
+    drive = None
+    if table.force is not None:
+        force = np.array(table.force)
+        drive = Drive(force[:, 0], force[:, 1], np.array(table.direction), 1e-3 * (table.mass_g or 0.0))
+    until = None
+    if table.contact == "glued":
+        until = np.inf if table.until_s is None else table.until_s
+    return StudyBody(table.name or f"pusher {k + 1}", _rigid(table), times, offset, drive, until)
+
+
+def _rigid(table: PusherTable) -> Pusher:
+    surface = _surface(table)
+    if table.shape == "box":
+        return pusher_box(table.centre_mm, table.size_mm or (), **surface)
+    if table.shape == "sphere":
+        return pusher_sphere(table.centre_mm, table.radius_mm or 0.0, **surface)
+    return pusher_cylinder(table.centre_mm, table.radius_mm or 0.0, table.length_mm or 0.0, table.axis, **surface)
+
+
+def _programme(table: PusherTable, duration_s: float) -> tuple[FloatArray, FloatArray]:
+    """Return times (k,), s, and displacements (k, 3), mm, of a pusher."""
+    if table.path:
+        rows = np.array(table.path)
+        return rows[:, 0], rows[:, 1:]
+    if not table.velocity:
+        return np.zeros(1), np.zeros((1, 3))
+    rows = np.array(table.velocity)
+    rows = rows[rows[:, 0] < duration_s]
+    times = np.append(rows[:, 0], duration_s)
+    moved = np.cumsum(rows[:, 1:] * np.diff(times)[:, None], axis=0)
+    return times, np.concatenate([np.zeros((1, 3)), moved])

@@ -1,0 +1,296 @@
+"""Turn calibrations and predictions into the records that a report shows. Here residuals are predicted minus measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray
+from naibu.core.parameters import Parameter
+from naibu.identification.from_markers.calibration import Calibration
+from naibu.identification.from_markers.observations import Trial, TrialFit
+from naibu.identification.from_markers.specimen_model import Specimen
+from naibu.identification.prediction.calibrated_model import CalibratedModel
+from naibu.identification.prediction.cross_validation import LeftOut, ModelRow
+from naibu.identification.prediction.prediction import Prediction, marker_layers
+from naibu.meshing.surface import boundary_faces, triangles_of_faces
+from naibu.viewer.result_page.payload import Box, Cell, Correlation, ParameterRow, Report, ResidualSet, Scene, Step, Table
+
+_ACCURACY_COLUMNS = ("experiment/state", "markers", "x mm", "y mm", "z mm", "3-D mm", "in noise units")
+
+
+@dataclass(frozen=True, slots=True)
+class Accuracy:
+    """How far predicted markers lie from measured ones.
+
+    Attributes
+    ----------
+    markers : int
+        Number of markers measured completely in both states; no others count.
+    x, y, z, total : float
+        Root mean square along the axes, and of the distance, mm; NaN without markers.
+    noise_units : float
+        Root mean square in units of the noise.
+    """
+
+    markers: int
+    x: float
+    y: float
+    z: float
+    total: float
+    noise_units: float
+
+
+def accuracy(specimen: Specimen, fit: TrialFit, residual: FloatArray | None = None) -> Accuracy:
+    """Return the accuracy of a fit; of another `residual` (k, 3), mm, where the fit itself is not registered to the measured markers."""
+    r = fit.residual if residual is None else residual
+    whole = np.isfinite(r).all(axis=1) & ~np.any(specimen.marker_filled, axis=1)
+    if not whole.any():
+        return Accuracy(0, *([np.nan] * 5))
+    squared = r[whole] ** 2
+    x, y, z = np.sqrt(squared.mean(axis=0)).tolist()
+    noise_units = np.sqrt((squared / fit.sd[whole] ** 2).mean())
+    return Accuracy(int(whole.sum()), x, y, z, float(np.sqrt(squared.sum(axis=1).mean())), float(noise_units))
+
+
+def accuracy_table(calibration: Calibration, baselines: Mapping[str, Mapping[str, float]], left_out: Sequence[LeftOut] = ()) -> Table:
+    """Return RMS of every trial, of its prediction when left out, and of simple baselines."""
+    names = list(dict.fromkeys(k for row in baselines.values() for k in row))
+    unseen = {f"{r.experiment}/{r.state}": r.rms_mm for r in left_out}
+    rows = []
+    for trial, fit in zip(calibration.trials, calibration.match.fits, strict=True):
+        compared = baselines.get(trial.label, {})
+        extra = ([unseen.get(trial.label)] if unseen else []) + [compared.get(n) for n in names]
+        rows.append((*_accuracy_row(trial.label, accuracy(trial.specimen, fit)), *(None if v is None else round(v, 3) for v in extra)))
+    columns = (*_ACCURACY_COLUMNS, *(["left out mm"] if unseen else []), *(f"{n} mm" for n in names))
+    note = "Root mean square over markers measured completely in both states."
+    if unseen:
+        note += " Left out: the other experiments identified the parameters."
+    if names:
+        note += " What comes last are distances in 3-D that simple descriptions leave."
+    return Table("Measured against predicted markers", columns, tuple(rows), note)
+
+
+def comparison_table(rows: Sequence[ModelRow]) -> Table:
+    """Return candidate models side by side, in their order."""
+    best = min((r.bic for r in rows if np.isfinite(r.bic)), default=np.nan)
+    columns = ("law", "contact", "joints", "in noise units", "parameters", "BIC above best", "left out, 3-D mm", "trouble")
+    cells: list[tuple[Cell, ...]] = []
+    for r in rows:
+        figures = (r.noise_factor, r.bic - best, r.left_out_mm)
+        noise, above, left_out = (round(v, 3) if np.isfinite(v) else None for v in figures)
+        cells.append((r.settings.law, r.settings.contact, r.settings.joined, noise, r.parameter_count, above, left_out, r.problem))
+    note = (
+        "BIC: Bayesian information criterion, misfit with a penalty for parameters; differences above 10 are decisive. "
+        "Left out: over all markers of the experiments, each predicted from the others."
+    )
+    return Table("Models compared", columns, tuple(cells), note)
+
+
+def _accuracy_row(label: str, a: Accuracy) -> tuple[Cell, ...]:
+    return (label, a.markers, *(round(v, 3) for v in (a.x, a.y, a.z, a.total, a.noise_units)))
+
+
+def scene(specimen: Specimen, state: str, fit: TrialFit, measured: FloatArray, values: Mapping[str, float], role: str) -> Scene:
+    """Return one state for the 3-D view, in the object's frame.
+
+    Parameters
+    ----------
+    specimen : Specimen
+        The meshed experiment.
+    state : str
+        Name of the state.
+    fit : TrialFit
+        Its solution.
+    measured : ndarray, shape (k, 3)
+        Measured markers in the object's frame, mm; NaN where not measured.
+    values : mapping
+        Physical values of all parameters.
+    role : str
+        Whether the state was fitted or predicted.
+    """
+    boundary = boundary_faces(specimen.mesh)
+    nodes, local = np.unique(boundary.faces, return_inverse=True)
+    faces = triangles_of_faces(local.reshape(boundary.faces.shape))
+    steps = []
+    paths = specimen.indenter_paths(values, state)
+    body, experiment = specimen.reshaped(values), specimen.experiment
+    for s in fit.solution.states:
+        markers = body.marker_points + body.observation @ s.displacement
+        boxes = tuple(_box(specimen, start + s.load * (stop - start), normal) for start, stop, normal in paths)
+        travel = float(max(np.linalg.norm(stop - start) for start, stop, _ in paths))
+        label = f"{100 * s.load:.0f} % of the load" if s.load < 1.0 else "full load"
+        steps.append(Step(label, s.load * travel, body.mesh.points[nodes] + s.displacement[nodes], markers, boxes))
+    layer = marker_layers(specimen.marker_points[:, 2], experiment.nominal_spacing_mm)
+    sd = np.sqrt((fit.sd**2).mean(axis=1))
+    # a marker whose free place was completed from the lattice counts in no figure of accuracy, here neither
+    shown = np.where(np.any(specimen.marker_filled, axis=1)[:, None], np.nan, measured)
+    return Scene(
+        f"{experiment.name}/{state}", experiment.name, state, faces, body.mesh.points[nodes], tuple(steps), body.marker_ids,
+        body.marker_points, shown, sd, layer, role,
+    )  # fmt: skip
+
+
+def _box(specimen: Specimen, position: FloatArray, normal: FloatArray) -> Box:
+    """A slab whose face touches the object, drawn for a plate or bar."""
+    size = 0.5 * np.array(specimen.experiment.shape.size_mm) + 4.0
+    half = size.copy()
+    axis = int(np.argmax(np.abs(normal)))
+    half[axis] = 2.0
+    loading = specimen.experiment.loading
+    if loading.kind == "bar" and loading.bar_width_mm:
+        half["xy".index("x" if loading.bar_axis == "y" else "y")] = loading.bar_width_mm / 2.0
+        half[2] = 5.0
+    centre = position - normal * half[axis]
+    if axis != 2:
+        centre = centre + np.array([0.0, 0.0, size[2] - 4.0])
+    (x, y, z), (a, b, c) = centre.tolist(), half.tolist()
+    return Box((x, y, z), (a, b, c))
+
+
+def trial_scene(trial: Trial, fit: TrialFit, values: Mapping[str, float], role: str = "fitted") -> Scene:
+    """Return a fitted trial for the 3-D view."""
+    measured = fit.pose.undone(trial.measured * trial.specimen.enlargement(values))
+    return scene(trial.specimen, trial.state, fit, measured, values, role)
+
+
+def prediction_scene(prediction: Prediction, role: str = "predicted unseen") -> Scene:
+    """Return a prediction for the 3-D view."""
+    p = prediction
+    return scene(p.specimen, p.state, p.fit, p.measured_in_object, p.values, role)
+
+
+def shared_names(model: CalibratedModel) -> tuple[str, ...]:
+    """Return the names of the free parameters of materials and friction, which hold beyond the experiments used."""
+    own = {label.partition("/")[0] for label in model.trials}
+    return tuple(p.name for p in model.parameters.free if p.name.partition(":")[0].partition("/")[0] not in own)
+
+
+def parameter_rows(model: CalibratedModel, names: Sequence[str]) -> tuple[ParameterRow, ...]:
+    """Return estimates with 95 % intervals, given values with a note."""
+    rows = []
+    for p in model.parameters:
+        if p.name in names or (p.fixed and p.name.endswith("young_modulus")):
+            low, high = model.interval(p.name)
+            note = "" if not p.fixed else ("given" if model.knowledge.scale_is_absolute else "sets the scale: moduli are ratios to it")
+            rows.append(ParameterRow(p.name, p.name.replace("_", " "), p.value, low, high, p.unit, note))
+    return tuple(rows)
+
+
+def undetermined(model: CalibratedModel, names: Sequence[str]) -> tuple[str, ...]:
+    """Say in words what the data cannot tell about the parameters `names`."""
+    out = []
+    if not model.knowledge.scale_is_absolute:
+        out.append("Displacements alone do not give the absolute stiffness: the moduli are ratios to the material that sets the scale.")
+    by_name: dict[str, Parameter] = {p.name: p for p in model.parameters}
+    for name in names:
+        p, sd = by_name[name], model.standard_deviation(name)
+        low, high = model.interval(name)
+        if name.endswith("poisson_ratio") and high > 0.499:
+            out.append(f"{name}: at least {low:.3f}; the data cannot tell it from incompressible.")
+        elif np.isfinite(p.prior_sd) and sd > 0.6 * p.prior_sd:
+            out.append(f"{name}: the data hardly narrow it down; {p.value:.3g} {p.unit}".rstrip() + " is close to what was assumed before.")
+        elif name.endswith("friction") and high > 4.0 * p.value:
+            out.append(f"{name}: anything above {low:.2g} looks the same, because the surfaces do not slip.")
+    if len(names) > 1:
+        correlation = model.correlation(names)
+        for i, j in zip(*np.where(np.triu(np.abs(correlation), 1) > 0.9), strict=True):
+            out.append(f"{names[i]} and {names[j]} are determined only together (correlation {correlation[i, j]:+.2f}).")
+    return tuple(out)
+
+
+def build_report(
+    calibration: Calibration, model: CalibratedModel, baselines: Mapping[str, Mapping[str, float]], left_out: Sequence[LeftOut] = ()
+) -> Report:
+    """Gather everything that a calibration's page shows."""
+    names, values = shared_names(model), model.parameters.values()
+    scenes = tuple(trial_scene(t, f, values) for t, f in zip(calibration.trials, calibration.match.fits, strict=True))
+    assumed = dict.fromkeys(f"{t.specimen.experiment.name}: {s}" for t in calibration.trials for s in t.specimen.experiment.loading.assumed)
+    return Report(
+        title="Calibration of " + ", ".join(dict.fromkeys(t.specimen.experiment.name for t in calibration.trials)),
+        headline=_calibration_headline(calibration, model, left_out),
+        scenes=scenes,
+        accuracy=accuracy_table(calibration, baselines, left_out),
+        residuals=tuple(ResidualSet.from_scene(s) for s in scenes),
+        parameters=parameter_rows(model, names),
+        correlation=_correlation(model, names),
+        undetermined=undetermined(model, names),
+        tables=(_boundary_table(model, names), *_assumptions(tuple(assumed))),
+        provenance=model.provenance,
+    )
+
+
+def _calibration_headline(calibration: Calibration, model: CalibratedModel, left_out: Sequence[LeftOut]) -> tuple[str, ...]:
+    found = [accuracy(t.specimen, f).total for t, f in zip(calibration.trials, calibration.match.fits, strict=True)]
+    states = f"{len(found)} loaded states" if len(found) > 1 else "one loaded state"
+    out = [
+        f"One set of parameters predicts the markers of {states} to {np.nanmax(found):.2f} mm{' or better' * (len(found) > 1)} (RMS, 3-D)."
+    ]
+    if left_out:
+        out.append(f"Predicted from the other experiments, they lie within {max(r.rms_mm for r in left_out):.2f} mm.")
+    out.append(f"Residuals are {model.noise_factor:.2f} times the stated measurement noise. {calibration.match.status.value}")
+    return tuple(out)
+
+
+def _correlation(model: CalibratedModel, names: Sequence[str]) -> Correlation | None:
+    return Correlation(tuple(names), model.correlation(names)) if len(names) > 1 else None
+
+
+def _boundary_table(model: CalibratedModel, names: Sequence[str]) -> Table:
+    rows: list[tuple[Cell, ...]] = []
+    for p in model.parameters.free:
+        if p.name not in names:
+            low, high = model.interval(p.name)
+            rows.append((p.name, _short(p.value), _short(low), _short(high), p.unit))
+    return Table("Boundary conditions, found with the rest", ("parameter", "estimate", "95 % from", "to", "unit"), tuple(rows))
+
+
+def _assumptions(sentences: Sequence[str]) -> tuple[Table, ...]:
+    """A table of what was assumed; none where nothing was."""
+    return (Table("Assumptions", ("what was not told, and what was taken instead",), tuple((s,) for s in sentences)),) if sentences else ()
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.4g}")
+
+
+def prediction_report(model: CalibratedModel, prediction: Prediction) -> Report:
+    """Gather everything that a prediction's page shows."""
+    p, names = prediction, shared_names(model)
+    label = f"{p.specimen.experiment.name}/{p.state}"
+    view = prediction_scene(p, "also used to identify" if label in model.trials else "predicted unseen")
+    table = Table("Measured against predicted markers", _ACCURACY_COLUMNS, (_accuracy_row(label, accuracy(p.specimen, p.fit, p.residual)),))
+    return Report(
+        title=f"Prediction of {label}",
+        headline=_prediction_headline(p),
+        scenes=(view,),
+        accuracy=table if p.registered else None,
+        residuals=(ResidualSet.from_scene(view),) if p.registered else (),
+        parameters=parameter_rows(model, names),
+        correlation=_correlation(model, names),
+        undetermined=undetermined(model, names),
+        tables=(_used_table(model, p), *_assumptions((*p.specimen.experiment.loading.assumed, *p.notes))),
+        provenance=model.provenance,
+    )
+
+
+def _prediction_headline(p: Prediction) -> tuple[str, ...]:
+    what = {"side_plates": "side plates {} mm apart", "bar": "the bar {} mm above the base"}.get(
+        p.specimen.experiment.loading.kind, "the plate {} mm above the base"
+    )
+    place, label = what.format(f"{p.opening_mm:.2f}"), f"{p.specimen.experiment.name}/{p.state}"
+    spread = f"The stated standard deviation of a predicted coordinate is {np.median(p.sd_mm):.2f} mm (median over the markers)."
+    if not p.registered:
+        return (f"{len(p.points)} markers of {label} are predicted, with {place}; no measured positions are there to compare.", spread)
+    a = accuracy(p.specimen, p.fit, p.residual)
+    lead = f"The markers of {label} are predicted to {a.total:.2f} mm (RMS, 3-D), with {place}."
+    return (lead, f"Residuals are {a.noise_units:.2f} times the stated measurement noise, after a rigid registration of the scan.", spread)
+
+
+def _used_table(model: CalibratedModel, p: Prediction) -> Table:
+    """Values that the prediction used and the model did not estimate for it."""
+    known = model.parameters.values()
+    rows = tuple((name, _short(value)) for name, value in p.values.items() if name not in known or not np.isclose(known[name], value))
+    return Table("Boundary conditions and other values used (mm, rad, kPa)", ("parameter", "value"), rows)

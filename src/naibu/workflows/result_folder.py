@@ -1,0 +1,276 @@
+"""The files of a result folder: written whole, in an order that loses nothing, and read back with clear words where they are damaged."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from naibu.core.errors import InputError
+from naibu.identification.from_markers.calibration import Calibration
+from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.prediction.calibrated_model import CalibratedModel
+from naibu.identification.prediction.cross_validation import LeftOut, ModelRow
+from naibu.identification.prediction.prediction import Prediction, rms
+from naibu.io.files.atomic import write_atomically
+from naibu.io.vtk_files import write_vtkhdf_series, write_vtu
+from naibu.mechanics.finite_strain.statics import Solution
+from naibu.viewer.result_page.page import report_html
+from naibu.viewer.result_page.payload import Report, jsonable, report_json
+from naibu.viewer.result_page.reading import report_from_json
+from naibu.workflows.report_content import Accuracy, accuracy, build_report, prediction_report
+
+MODEL_FILE, CHECKPOINT_FILE, RESIDUALS_FILE = "model.json", "checkpoint.json", "residuals.csv"
+IDENTIFICATION_FILE, COMPARISON_FILE, REPORT_STEM = "identification.json", "comparison.json", "report"
+# a prediction may share the folder of the model it was made with, so nothing but its own files bears these names
+PREDICTED_FILE, SUMMARY_FILE, PREDICTED_STEM = "predicted.csv", "summary.json", "predicted"
+Baselines = Mapping[str, Mapping[str, float]]
+
+
+def result_folder(out: str | os.PathLike[str]) -> Path:
+    """Make a folder for results where it is not there, and see that it can be written to before anything is computed.
+
+    Raises
+    ------
+    InputError
+        It cannot be made, or not be written to.
+    """
+    folder = Path(out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        reason = "a file stands in its way" if isinstance(error, FileExistsError | NotADirectoryError) else error.strerror
+        raise InputError(f"{folder}: cannot be used as a folder for results ({reason}); choose another with --out") from error
+    return folder
+
+
+def read_model(path: str | os.PathLike[str]) -> CalibratedModel:
+    """Read a ``model.json``, or the one in a folder.
+
+    Raises
+    ------
+    InputError
+        No such file, or not a model.
+    """
+    file = Path(path)
+    file = file / MODEL_FILE if file.is_dir() else file
+    mend = f"name the {MODEL_FILE} that 'naibu identify' wrote, or its folder"
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror}); {mend}") from error
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: is not JSON ({error}); {mend}") from error
+    if not isinstance(data, dict):
+        raise InputError(f"{file}: holds a {type(data).__name__}, not a model; {mend}")
+    try:
+        return CalibratedModel.from_dict(data)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
+
+
+def read_checkpoint(folder: Path, provenance: Mapping[str, Any]) -> dict[str, float] | None:
+    """Return the values of an interrupted search with the same inputs and settings, if there are any."""
+    try:
+        data = json.loads((folder / CHECKPOINT_FILE).read_text(encoding="utf-8"))
+        same = data["provenance"] == json.loads(json.dumps(provenance))
+        return {str(name): float(value) for name, value in data["values"].items()} if same else None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        # without a usable checkpoint the search begins anew
+        return None
+
+
+def write_checkpoint(folder: Path, provenance: Mapping[str, Any], values: Mapping[str, float]) -> None:
+    """Keep the best values so far."""
+    write_atomically(folder / CHECKPOINT_FILE, json.dumps({"provenance": provenance, "values": dict(values)}))
+
+
+def read_comparison(folder: Path, provenance: Mapping[str, Any]) -> ModelRow | None:
+    """Return what a folder holds of a candidate model with the same inputs and settings, if there is anything."""
+    for entry in _compared(folder):
+        if entry["provenance"] == json.loads(json.dumps(provenance)):
+            figures: dict[str, Any] = {name: math.nan if value is None else value for name, value in entry["result"].items()}
+            return ModelRow(ModelSettings(**entry["provenance"]["settings"]), **figures)
+    return None
+
+
+def write_comparison(folder: Path, provenance: Mapping[str, Any], row: ModelRow) -> None:
+    """Add a candidate model to the folder's comparison."""
+    figures = {k: v for k, v in asdict(row).items() if k != "settings"}
+    entry = {"provenance": provenance, "result": {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in figures.items()}}
+    write_atomically(folder / COMPARISON_FILE, _text([*_compared(folder), entry]))
+
+
+def _compared(folder: Path) -> list[dict[str, Any]]:
+    """Entries of the folder's comparison, none where there is no file."""
+    file = folder / COMPARISON_FILE
+    if not file.exists():
+        return []
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{file} cannot be read ({error}); delete it, or choose another folder with --out") from error
+    if not isinstance(data, list) or not all(isinstance(entry, dict) and {"provenance", "result"} <= entry.keys() for entry in data):
+        raise InputError(f"{file} is not a comparison of models; delete it, or choose another folder with --out")
+    return data
+
+
+def write_identification(
+    folder: Path, calibration: Calibration, model: CalibratedModel, baselines: Baselines, left_out: Sequence[LeftOut]
+) -> None:
+    """Write model, summary, residuals, report and one file for ParaView for each state, the model first."""
+    write_atomically(folder / MODEL_FILE, _text(model.to_dict()))
+    write_atomically(folder / RESIDUALS_FILE, _residual_csv(calibration))
+    write_atomically(folder / IDENTIFICATION_FILE, _text(_identification_summary(calibration, model, baselines, left_out)))
+    values = model.parameters.values()
+    for trial, fit in zip(calibration.trials, calibration.match.fits, strict=True):
+        series = folder / f"{trial.label.replace('/', '_')}.vtkhdf"
+        states = fit.solution.states
+        mesh = trial.specimen.reshaped(values).mesh
+        write_vtkhdf_series(series, mesh, [s.load for s in states], {"displacement_mm": [s.displacement for s in states]})
+    _write_report(folder, REPORT_STEM, build_report(calibration, model, baselines, left_out))
+
+
+def _identification_summary(
+    calibration: Calibration, model: CalibratedModel, baselines: Baselines, left_out: Sequence[LeftOut]
+) -> dict[str, Any]:
+    trials = {}
+    for trial, fit in zip(calibration.trials, calibration.match.fits, strict=True):
+        trials[trial.label] = _figures(accuracy(trial.specimen, fit)) | {
+            "baselines_rms_3d_mm": dict(baselines.get(trial.label, {})),
+            "linear_solver": fit.solution.linear_solver,
+            "reactions_mN": _reactions(fit.solution),
+        }
+    rows = {f"{r.experiment}/{r.state}": {"rms_3d_mm": r.rms_mm, "markers": r.marker_count} for r in left_out}
+    found = {p.name: {"estimate": p.value, "from": low, "to": high, "unit": p.unit} for p, low, high in _intervals(model)}
+    return {
+        "status": calibration.match.status.name,
+        "message": calibration.match.status.value,
+        "noise_factor": model.noise_factor,
+        "trials": trials,
+        "left_out": rows,
+        "parameters_95": found,
+        "provenance": dict(model.provenance),
+    }
+
+
+def _intervals(model: CalibratedModel) -> list[tuple[Any, float, float]]:
+    return [(p, *model.interval(p.name)) for p in model.parameters]
+
+
+def _figures(a: Accuracy) -> dict[str, float | int]:
+    return {
+        "markers": a.markers,
+        "rms_x_mm": a.x,
+        "rms_y_mm": a.y,
+        "rms_z_mm": a.z,
+        "rms_3d_mm": a.total,
+        "rms_noise_units": a.noise_units,
+    }
+
+
+def _reactions(solution: Solution) -> dict[str, list[float]]:
+    return {name: np.asarray(force).tolist() for name, force in solution.reactions.items()}
+
+
+def _text(data: object) -> str:
+    """JSON of numbers at full precision, with null for what is not finite."""
+    return json.dumps(jsonable(data, 17), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def _residual_csv(calibration: Calibration) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    axes = [f"residual_{a}_mm" for a in "xyz"] + [f"sd_{a}_mm" for a in "xyz"]
+    writer.writerow(["experiment", "state", "marker", *axes, "initial_completed"])
+    for trial, fit in zip(calibration.trials, calibration.match.fits, strict=True):
+        for i, marker in enumerate(trial.specimen.marker_ids):
+            # a file, like the page, tells predicted minus measured
+            numbers = [_number(v, 4) for v in (*-fit.residual[i], *fit.sd[i])]
+            writer.writerow(
+                [trial.specimen.experiment.name, trial.state, int(marker), *numbers, int(trial.specimen.marker_filled[i].any())]
+            )
+    return text.getvalue()
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if np.isfinite(value) else "NaN"
+
+
+def write_prediction(folder: Path, model: CalibratedModel, prediction: Prediction) -> None:
+    """Write predicted positions, summary, report and files for ParaView."""
+    p = prediction
+    write_atomically(folder / PREDICTED_FILE, _predicted_csv(p))
+    summary = {
+        "experiment": p.specimen.experiment.name,
+        "state": p.state,
+        "used_to_identify": f"{p.specimen.experiment.name}/{p.state}" in model.trials,
+        "opening_mm": p.opening_mm,
+        "registered_to_measured": p.registered,
+        **_figures(accuracy(p.specimen, p.fit, p.residual)),
+        "rms_3d_mm_with_completed": rms(p.residual) if p.registered else None,
+        "median_sd_mm": float(np.median(p.sd_mm)),
+        "notes": [*p.specimen.experiment.loading.assumed, *p.notes],
+        "linear_solver": p.fit.solution.linear_solver,
+        "reactions_mN": _reactions(p.fit.solution),
+        "inputs": {p.specimen.experiment.name: dict(p.specimen.experiment.input_hashes)},
+        "provenance": dict(model.provenance),
+    }
+    write_atomically(folder / SUMMARY_FILE, _text(summary))
+    states, mesh = p.fit.solution.states, p.specimen.reshaped(p.values).mesh
+    write_vtu(folder / f"{PREDICTED_STEM}.vtu", mesh, {"displacement_mm": states[-1].displacement}, {})
+    path = folder / f"{PREDICTED_STEM}.vtkhdf"
+    write_vtkhdf_series(path, mesh, [s.load for s in states], {"displacement_mm": [s.displacement for s in states]})
+    _write_report(folder, PREDICTED_STEM, prediction_report(model, p))
+
+
+def _predicted_csv(p: Prediction) -> str:
+    """A row for every marker of the free state; NaN where its place in the free state is not known, or not trusted."""
+    rows = {int(i): (*point, sd) for i, point, sd in zip(p.specimen.marker_ids, p.points, p.sd_mm, strict=True)}
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["marker", "x_mm", "y_mm", "z_mm", "sd_mm"])
+    for marker in p.specimen.experiment.initial.ids:
+        writer.writerow([int(marker), *(_number(v, 3) for v in rows.get(int(marker), [np.nan] * 4))])
+    return text.getvalue()
+
+
+def _write_report(folder: Path, stem: str, report: Report) -> None:
+    """Store what the page shows, and write the page from that, so that it can be written again alike."""
+    text = report_json(report)
+    write_atomically(folder / f"{stem}.json", text)
+    write_atomically(folder / f"{stem}.html", report_html(report_from_json(text)))
+
+
+def rewrite_reports(folder: Path) -> list[Path]:
+    """Write the pages of the results in a folder anew from what was stored, and return their paths.
+
+    Raises
+    ------
+    InputError
+        No stored report, or a damaged one.
+    """
+    pages = []
+    for stored in (folder / f"{stem}.json" for stem in (REPORT_STEM, PREDICTED_STEM)):
+        if not stored.is_file():
+            continue
+        try:
+            page = report_html(report_from_json(stored.read_text(encoding="utf-8")))
+        except (OSError, UnicodeDecodeError, InputError) as error:
+            raise InputError(f"{stored}: {error}; run the command that made it again") from error
+        pages.append(write_atomically(stored.with_suffix(".html"), page))
+    if not pages:
+        stored_as = f"{REPORT_STEM}.json or {PREDICTED_STEM}.json"
+        raise InputError(f"{folder}: holds no results ({stored_as}); name a folder that 'naibu identify' or 'naibu predict' wrote")
+    return pages

@@ -1,0 +1,301 @@
+"""Run studies of lattices and keep them: a series for ParaView that grows while it runs, numbers, an animated page, and where to go on."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+
+from naibu._version import __version__
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import ConvergenceError, InputError
+from naibu.io.files.atomic import write_atomically
+from naibu.io.vtkhdf_series import SeriesFile
+from naibu.mechanics.contact.rigid_indenters import KINDS
+from naibu.mechanics.lattices.model.state import LatticeState
+from naibu.mechanics.lattices.model.surface import hull_of
+from naibu.mechanics.lattices.simulation.contact import ContactState
+from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy, StudyFrame, StudyState, run_study
+from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, motion_html
+from naibu.viewer.result_page.payload import Table
+from naibu.workflows.lattice_study import PreparedStudy, prepared_study
+from naibu.workflows.result_folder import result_folder
+
+Tell = Callable[[int, int], None]
+PAGE_BYTES = 3_000_000
+PAGE_FRAMES, PAGE_POINTS = 200, 2_000_000
+ARRAYS = {"displacement": "displacement_mm", "velocity": "velocity_mm_per_s", "stretch": "stretch"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LatticeRun:
+    """What a run left.
+
+    Attributes
+    ----------
+    files : tuple of Path
+        Page, series and numbers, and, where it was interrupted, the state to go on from.
+    frames, of : int
+        Frames behind the first one that are kept, and that were asked for.
+    """
+
+    files: tuple[Path, ...]
+    frames: int
+    of: int
+
+    @property
+    def finished(self) -> bool:
+        """Whether all frames are there."""
+        return self.frames == self.of
+
+
+def simulate_lattice(
+    source: str | os.PathLike[str], out: str | os.PathLike[str], *, resume: bool = False, tell: Tell | None = None
+) -> LatticeRun:
+    """Run a study, and write ``NAME.html``, ``NAME.vtkhdf`` and ``NAME.json``; an interruption keeps the frames computed so far.
+
+    The memory needed does not grow with the number of frames.
+
+    Parameters
+    ----------
+    source : str or path-like
+        Name of a study in `naibu.workflows.lattice_study.NAMED`, or a file.
+    out : path-like
+        Folder for the files.
+    resume : bool
+        Whether an interrupted run goes on; the result is the same as if it had not been interrupted.
+    tell : callable
+        Told the frames that are kept, and how many there will be.
+
+    Returns
+    -------
+    LatticeRun
+        Of a run that Ctrl-C stopped, too; it then holds ``NAME.checkpoint.npz``.
+
+    Raises
+    ------
+    InputError
+        What `naibu.workflows.lattice_study.prepared_study` refuses, a folder that cannot be written, or nothing to resume.
+    ConvergenceError
+        An explicit method blew up; the frames before are kept.
+    """
+    prepared = prepared_study(source)
+    folder = result_folder(out)
+    checkpoint = folder / f"{prepared.name}.checkpoint.npz"
+    path = folder / f"{prepared.name}.vtkhdf"
+    start = _read_checkpoint(checkpoint, prepared) if resume else None
+    series = SeriesFile.begun(path, prepared.mesh) if start is None else SeriesFile.continued(path, prepared.mesh, start.frame + 1)
+    with series:
+        state, stopped = _computed(prepared, series, start, tell)
+        if state is None:
+            raise stopped or KeyboardInterrupt
+        series.truncate(state.frame + 1)  # what an interruption left of the next one
+        files = _written(prepared, series, state, folder)
+        series.finish()
+    if state.frame == prepared.study.frames:
+        checkpoint.unlink(missing_ok=True)
+    else:
+        write_atomically(checkpoint, _packed(state, prepared.fingerprint))
+        files = (*files, checkpoint)
+    if stopped is not None and not isinstance(stopped, KeyboardInterrupt):
+        raise type(stopped)(f"{stopped} The first {state.frame * prepared.study.frame_s:g} s are kept in {path}.") from stopped
+    return LatticeRun(files, state.frame, prepared.study.frames)
+
+
+def _computed(
+    prepared: PreparedStudy, series: SeriesFile, start: StudyState | None, tell: Tell | None
+) -> tuple[StudyState | None, BaseException | None]:
+    """Append frames; return the last whole one, and what stopped the run before its end."""
+    state = start
+    try:
+        for frame in run_study(prepared.study, start):
+            _append(series, prepared, frame)
+            state = frame.state
+            if tell is not None:
+                tell(state.frame, prepared.study.frames)
+    except (KeyboardInterrupt, ConvergenceError) as error:
+        return state, error
+    return state, None
+
+
+def _append(series: SeriesFile, prepared: PreparedStudy, frame: StudyFrame) -> None:
+    lattice, state = prepared.study.lattice, frame.state
+    moved = state.lattice.position - lattice.points
+    values = {"displacement": moved, "velocity": state.lattice.velocity, "stretch": mean_stretch(prepared.study, state.lattice.position)}
+    kept = {"displacement", *prepared.settings.output.quantities}
+    first = max(state.frame - 1, 0) * prepared.study.samples
+    series.append_rows("force_time_s", frame.sample_times, first)
+    series.append_rows("force_mN", frame.force, first)
+    series.append_rows("place_mm", state.places[None], state.frame)
+    energies = [frame.kinetic, frame.spring, state.external_work, *state.work]
+    series.append_rows("energy_mN_mm", np.array([energies]), state.frame)
+    series.append_rows("momentum_kg_mm_per_s", frame.momentum[None], state.frame)
+    series.append(frame.time, {ARRAYS[q]: v.astype(np.float32) for q, v in values.items() if q in kept})
+
+
+def mean_stretch(study: LatticeStudy, position: FloatArray) -> FloatArray:
+    """Return how much longer than at rest the elements at every mass are on average (n,), as a share of their length."""
+    lattice = study.lattice
+    i, j = lattice.elements.T
+    rest = lattice.lengths
+    strain = np.linalg.norm(position[j] - position[i], axis=1) / rest - 1.0
+    ends = np.concatenate([i, j])
+    sums = np.bincount(ends, np.concatenate([strain, strain]), minlength=lattice.n_nodes)
+    return np.asarray(sums / np.maximum(np.bincount(ends, minlength=lattice.n_nodes), 1))
+
+
+def _written(prepared: PreparedStudy, series: SeriesFile, state: StudyState, folder: Path) -> tuple[Path, ...]:
+    """Write numbers and page of the frames in the series."""
+    numbers = _numbers(prepared, series, state)
+    told = write_atomically(folder / f"{prepared.name}.json", json.dumps(numbers, indent=1) + "\n")
+    page = write_atomically(folder / f"{prepared.name}.html", motion_html(_page(prepared, series, state), PAGE_BYTES))
+    return page, series.target, told
+
+
+def _numbers(prepared: PreparedStudy, series: SeriesFile, state: StudyState) -> dict[str, Any]:
+    study = prepared.study
+    count = state.frame * study.samples
+    force, energy = series.rows("force_mN")[:count], series.rows("energy_mN_mm")[: state.frame + 1]
+    names = [body.name for body in study.bodies]
+    places = series.rows("place_mm")[: state.frame + 1]
+    return {
+        "study": prepared.title,
+        "naibu": __version__,
+        "source": prepared.source,
+        "finished": state.frame == study.frames,
+        "settings": _plain(prepared.settings.model_dump(mode="python", exclude_none=True)),
+        "inputs_sha256": prepared.inputs,
+        "fingerprint": prepared.fingerprint,
+        "units": "mm, kg, s, mN, mN mm",
+        "masses": study.lattice.n_nodes,
+        "elements": study.lattice.n_elements,
+        "mass_kg": study.lattice.total_mass,
+        "steps_whose_contacts_did_not_settle": state.unsettled,
+        "times_s": series.times()[: state.frame + 1].tolist(),
+        "kinetic_mN_mm": energy[:, 0].tolist(),
+        "springs_mN_mm": energy[:, 1].tolist(),
+        "work_of_external_force_mN_mm": energy[:, 2].tolist(),
+        "work_mN_mm": {name: energy[:, 3 + k].tolist() for k, name in enumerate(names)},
+        "momentum_kg_mm_per_s": series.rows("momentum_kg_mm_per_s")[: state.frame + 1].tolist(),
+        "places_mm": {name: places[:, k].tolist() for k, name in enumerate(names)},
+        "force_times_s": series.rows("force_time_s")[:count].tolist(),
+        "forces_mN": {name: force[:, k].tolist() for k, name in enumerate(names)},
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Return settings as JSON knows them."""
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(inner) for inner in value]
+    return "infinite" if isinstance(value, float) and np.isinf(value) else value
+
+
+def _page(prepared: PreparedStudy, series: SeriesFile, state: StudyState) -> MotionPage:
+    study = prepared.study
+    triangles = hull_of(study.lattice).triangles
+    nodes, faces = np.unique(triangles, return_inverse=True)
+    most = max(2, min(PAGE_FRAMES, PAGE_POINTS // len(nodes)))
+    frames = np.unique(np.linspace(0, state.frame, min(most, state.frame + 1)).round().astype(int))
+    moved = np.stack([series.values(ARRAYS["displacement"], int(k))[nodes] for k in frames]).astype(float)
+    fields = [ColourField("displacement, mm", np.linalg.norm(moved, axis=2))]
+    if "stretch" in prepared.settings.output.quantities:
+        stretch = np.stack([series.values(ARRAYS["stretch"], int(k))[nodes] for k in frames]).astype(float)
+        fields.append(ColourField("mean stretch of the elements, %", 100.0 * stretch, two_sided=True))
+    bodies = [RigidShape(b.name, KINDS[b.pusher.kind], np.asarray(b.pusher.size), np.asarray(b.pusher.axes)) for b in study.bodies]
+    count = state.frame * study.samples
+    force = series.rows("force_mN")[:count]
+    places = series.rows("place_mm")[frames].reshape(len(frames), len(bodies), 3)
+    times = series.times()[frames]
+    provenance = {
+        "naibu": __version__,
+        "source": prepared.source,
+        "SHA-256": prepared.inputs,
+        "settings": _plain(prepared.settings.model_dump(mode="python", exclude_none=True)),
+    }
+    return MotionPage(
+        prepared.title, _sentences(prepared, state, force), times, faces.reshape(-1, 3), study.lattice.points[nodes], moved, fields, bodies,
+        places, series.rows("force_time_s")[:count], force, _tables(prepared, force, moved, times), provenance,
+    )  # fmt: skip
+
+
+def _sentences(prepared: PreparedStudy, state: StudyState, force: FloatArray) -> list[str]:
+    study = prepared.study
+    lattice = study.lattice
+    found = [
+        f"{lattice.n_nodes} masses, {1e3 * lattice.total_mass:.4g} g in all, joined by {lattice.n_elements} elements of a spring and "
+        f"two dampers; {study.frames * study.frame_s:g} s in steps of {1e3 * study.step_s:g} ms."
+    ]
+    if state.frame < study.frames:
+        found.append(f"The run was interrupted: this is the part until {state.frame * study.frame_s:g} s.")
+    idle = [b.name for k, b in enumerate(study.bodies) if not np.abs(force[:, k]).any()]
+    if idle and state.frame == study.frames:
+        found.append(f"Never touched the object: {', '.join(idle)}.")
+    return found
+
+
+def _tables(prepared: PreparedStudy, force: FloatArray, moved: FloatArray, times: FloatArray) -> list[Table]:
+    largest = np.linalg.norm(moved, axis=2).max(axis=1)
+    rows: list[tuple[str, float | None, float | None]] = [
+        ("largest displacement of the surface, mm", float(largest.max()), float(times[int(np.argmax(largest))])),
+        ("largest displacement of the surface at the end, mm", float(largest[-1]), float(times[-1])),
+    ]
+    for k, body in enumerate(prepared.study.bodies):
+        size = np.linalg.norm(force[:, k], axis=1)
+        if len(size):
+            at = prepared.study.sample_s * (int(np.argmax(size)) + 1)
+            rows.append((f"largest force of {body.name}, mN", float(size.max()), float(at) if size.max() > 0.0 else None))
+    return [Table("Largest values", ("what", "value", "at, s"), tuple(rows))]
+
+
+def _packed(state: StudyState, fingerprint: str) -> bytes:
+    """Return a state as an .npz file."""
+    lattice, contact = state.lattice, state.contact
+    arrays: dict[str, Any] = {
+        "fingerprint": np.array(fingerprint),
+        "frame": np.array(state.frame),
+        "position": lattice.position,
+        "velocity": lattice.velocity,
+        "extension": lattice.extension,
+        "places": state.places,
+        "work": state.work,
+        "numbers": np.array([state.speed, state.external_work, float(state.unsettled)]),
+    }
+    if lattice.length is not None:
+        arrays["length"] = lattice.length
+    if contact is not None:
+        arrays |= {f"contact_{name}": getattr(contact, name) for name in ("nodes", "mode", "friction", "touched", "places")}
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)
+    return stream.getvalue()
+
+
+def _read_checkpoint(path: Path, prepared: PreparedStudy) -> StudyState:
+    if not path.is_file():
+        raise InputError(f"{path}: is not there, so that there is nothing to resume; run without --resume")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            data = {name: file[name] for name in file.files}
+        same = str(data["fingerprint"]) == prepared.fingerprint
+        contact = None
+        if "contact_nodes" in data:
+            contact = ContactState(*(data[f"contact_{name}"] for name in ("nodes", "mode", "friction", "touched", "places")))
+        lattice = LatticeState(data["position"], data["velocity"], data["extension"], data.get("length"))
+        speed, external_work, unsettled = data["numbers"].tolist()
+        state = StudyState(int(data["frame"]), lattice, contact, speed, data["places"], data["work"], external_work, int(unsettled))
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        raise InputError(f"{path}: is damaged ({error}); run without --resume") from error
+    if not same:
+        raise InputError(
+            f"{path}: was kept with other settings, inputs or another version of naibu than {prepared.source} now; put them back, or run "
+            "without --resume"
+        )
+    return state

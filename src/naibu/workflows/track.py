@@ -1,0 +1,187 @@
+"""Follow markers from scans to an experiment folder, with a page that shows what was found, linked and rejected."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from naibu.core.errors import InputError
+from naibu.core.experiment import Layer, Loading, Shape
+from naibu.imaging.markers.detection import Polarity
+from naibu.imaging.markers.tracking import TrackedMarkers, track_markers
+from naibu.io.files.provenance import input_record
+from naibu.io.images import read_volume
+from naibu.io.marker_tables import write_experiment_folder, write_markers
+from naibu.viewer.chapter import Cell, Chapter, Figure, Section, Table
+from naibu.viewer.chapter_page import write_chapter
+from naibu.workflows.result_folder import result_folder
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Canvas
+
+ENDINGS = (".nii.gz", ".ome.tif", ".ome.tiff")
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectDescription:
+    """What the experiment folder says of the object beside its markers; see `naibu.core.experiment.Experiment`."""
+
+    shape: Shape
+    loading: Loading
+    layers: tuple[Layer, ...] = ()
+    stated_mm: Mapping[str, float] | None = None
+    title: str = "Markers followed through scans"
+
+
+@dataclass(frozen=True, slots=True)
+class TrackRun:
+    """Markers, what became of them in every state, and the files."""
+
+    tracked: TrackedMarkers
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    page: Path
+    files: tuple[Path, ...]
+
+
+def track_files(
+    scans: Sequence[str | os.PathLike[str]],
+    *,
+    out: str | os.PathLike[str],
+    diameter_mm: float,
+    thickness_mm: float | None = None,
+    polarity: Polarity = "auto",
+    count: int | None = None,
+    mask: str | os.PathLike[str] | None = None,
+    spacing_mm: Sequence[float] | None = None,
+    description: ObjectDescription | None = None,
+) -> TrackRun:
+    """Find equal markers in scans of several states, link them, and write an experiment folder.
+
+    Parameters
+    ----------
+    scans : sequence of path-like
+        Volumes of the states, the free one first, then in the order in which they were reached.
+    out : path-like
+        Folder to make: an experiment folder where a description is given, the tables of the states alone otherwise; beside them the page
+        ``tracking.html`` and the numbers ``tracking.json``.
+    diameter_mm, thickness_mm, polarity, count
+        See `naibu.imaging.markers.detection.detect_markers`.
+    mask : path-like, optional
+        Volume on the grid of every scan, not zero where markers may lie.
+    spacing_mm : sequence of float, optional
+        Distance of voxels along x, y, z, mm, for files that do not say.
+    description : ObjectDescription, optional
+        Shape, loading and layers.
+
+    Raises
+    ------
+    InputError
+        Scans that cannot be read, two of one name, markers that cannot be found or linked, or a folder that is in use.
+    """
+    target = Path(out)
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise InputError(f"{target}: exists and is not an empty folder; choose a new name with --out, or remove it first")
+    names = _states(scans)
+    volumes = [read_volume(path, spacing_mm=spacing_mm) for path in scans]
+    masks = None
+    if mask is not None:
+        where = read_volume(mask, spacing_mm=spacing_mm)
+        for path, volume in zip(scans, volumes, strict=True):
+            if not where.same_grid(volume):
+                raise InputError(f"{Path(mask).name} does not lie on the grid of {Path(path).name}; resample the mask, or leave it out")
+        masks = [where.values != 0] * len(volumes)
+    tracked = track_markers(
+        volumes, diameter_mm=diameter_mm, thickness_mm=thickness_mm, polarity=polarity, count=count, masks=masks, names=names
+    )
+    files = _written(target, tracked, description)
+    columns, rows = _table(tracked)
+    settings: dict[str, Cell] = {"diameter, mm": diameter_mm, "thickness, mm": thickness_mm, "polarity": tracked.found[0].polarity}
+    settings |= input_record({**{f"scan of {name}": scan for name, scan in zip(names, scans, strict=True)}, "mask": mask})
+    page, numbers = write_chapter(Chapter("tracking", "Markers followed", (_section(tracked, columns, rows),), settings), target)
+    return TrackRun(tracked, columns, rows, page, (*files, numbers))
+
+
+def _states(scans: Sequence[str | os.PathLike[str]]) -> list[str]:
+    """Names of the states: the first is ``initial``, the others bear the names of their files."""
+    names = ["initial"]
+    for scan in scans[1:]:
+        name = Path(scan).name
+        ending = next((e for e in ENDINGS if name.lower().endswith(e)), Path(scan).suffix)
+        names.append(name[: len(name) - len(ending)] or name)
+    if len(set(names)) < len(names):
+        raise InputError(f"two scans would both be the state {max(names, key=names.count)!r}; rename one")
+    return names
+
+
+def _written(target: Path, tracked: TrackedMarkers, description: ObjectDescription | None) -> list[Path]:
+    if description is None:
+        result_folder(target)
+        return [write_markers(target / f"{n}.csv", m) for n, m in zip(tracked.names, tracked.markers, strict=True)]
+    d, (xy_step, z_step) = description, tracked.steps_mm
+    write_experiment_folder(
+        target, tracked.markers[0], tracked.states, title=d.title, shape=d.shape, loading=d.loading, layers=d.layers, stated_mm=d.stated_mm,
+        xy_step_mm=xy_step, z_step_mm=z_step,
+    )  # fmt: skip
+    return [target / "meta.toml", *(target / f"{n}.csv" for n in tracked.names)]
+
+
+def _table(tracked: TrackedMarkers) -> tuple[tuple[str, ...], tuple[tuple[Cell, ...], ...]]:
+    columns = ("state", "found", "linked", "of these in doubt", "missing", "rejected", "standard deviation x, y, z (median), mm")
+    rows: list[tuple[Cell, ...]] = []
+    for s, name in enumerate(tracked.names):
+        flags, found = tracked.flags[s], tracked.found[s]
+        known = flags != "missing"
+        sd = np.nanmedian(tracked.sd_mm[s][known], axis=0)
+        rejected = "; ".join(f"{n} {why}" for why, n in Counter(r.reason for r in found.rejected).most_common(3))
+        told = f"{len(found.rejected)}: {rejected}" if rejected else "0"
+        doubtful, missing = int((flags == "suspect").sum()), int((~known).sum())
+        rows.append((name, len(found), int(known.sum()), doubtful, missing, told, ", ".join(f"{v:.3f}" for v in sd)))
+    return columns, tuple(rows)
+
+
+def _section(tracked: TrackedMarkers, columns: tuple[str, ...], rows: tuple[tuple[Cell, ...], ...]) -> Section:
+    words = (
+        f"{len(tracked.ids)} markers of the free state were found again in at least one other state. A link is in doubt where it is less "
+        "probable than one half, or where the marker departs from the smooth motion of its neighbours; such markers are not used by an "
+        "identification.",
+    )
+    table = Table("Markers", "found in every scan, and linked to the free state", columns, rows)
+    return Section("Markers", words, (table,), tuple(_figure(tracked, s) for s in range(1, len(tracked.names))))
+
+
+def _figure(tracked: TrackedMarkers, s: int) -> Figure:
+    before, after, flags = tracked.points[0], tracked.points[s], tracked.flags[s]
+
+    def draw(canvas: Canvas) -> None:
+        for axis, (a, b) in zip(canvas.subplots(1, 3), ((0, 2), (1, 2), (0, 1)), strict=True):
+            _projection(axis, before, after, flags, a, b)
+        canvas.axes[0].legend(loc="upper left", bbox_to_anchor=(0.0, -0.18), ncols=4, frameon=False)
+
+    caption = "Arrows from where the markers were to where they are; seen along y, x and z."
+    return Figure(f"State {tracked.names[s]}", caption, draw, (10.5, 4.2))
+
+
+def _projection(axis: Axes, before: np.ndarray, after: np.ndarray, flags: np.ndarray, a: int, b: int) -> None:
+    for flag, colour, label in (("ok", "#2a788e", "linked"), ("suspect", "#d95f02", "in doubt")):
+        some = flags == flag
+        if not some.any():
+            continue
+        p, q = before[some], after[some]
+        axis.quiver(
+            p[:, a], p[:, b], (q - p)[:, a], (q - p)[:, b], angles="xy", scale_units="xy", scale=1.0, width=0.004, color=colour, label=label
+        )
+    lost = flags == "missing"
+    if lost.any():
+        axis.plot(before[lost, a], before[lost, b], "x", color="#7f7f7f", ms=4, label="not found")
+    # arrows do not widen the axes
+    both = np.concatenate([before, after])
+    axis.plot(both[:, a], both[:, b], ".", ms=0.1, alpha=0.0)
+    axis.set(xlabel=f"{'xyz'[a]}, mm", ylabel=f"{'xyz'[b]}, mm", aspect="equal")

@@ -1,0 +1,142 @@
+"""Covariance, resolution and words against closed forms, explicit matrices and repeated estimates."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from naibu.identification.from_fields.gauss_newton import Objective, first_point
+from naibu.identification.from_fields.load_cases import Zones
+from naibu.identification.from_fields.regularization import Laplacian, ZoneGraph
+from naibu.identification.from_fields.sensitivities import FieldModel, Linearised, logarithms, young_and_poisson
+from naibu.identification.from_fields.uncertainty import (
+    Uncertainty,
+    cramer_rao_bound,
+    information_at,
+    report,
+    resolution,
+    resolution_report,
+    young_and_poisson_slopes,
+)
+from naibu.reproduction.chapter3.bodies import LAYERS, PushedBody, cube
+
+PRESS, SHEAR = (0.0, 0.0, -10.0), (7.0, 0.0, -7.0)
+
+
+def bound(body: PushedBody, zones: Zones, sd_mm: float) -> Uncertainty:
+    lame, shear = body.moduli
+    first = [int(np.flatnonzero(zones.of_cell == z)[0]) for z in range(zones.count)]
+    states = [body.displacement(p) for p in body.pushes]
+    return cramer_rao_bound(body.mesh, body.trials(sd_mm=sd_mm), zones, lame[first], shear[first], states)
+
+
+def linearised(body: PushedBody, zones: Zones) -> Linearised:
+    model = FieldModel(body.mesh, body.trials(sd_mm=0.1), zones)
+    lame, shear = body.moduli
+    first = [int(np.flatnonzero(zones.of_cell == z)[0]) for z in range(zones.count)]
+    return model.linearised(first_point(model, logarithms(lame[first], shear[first])))
+
+
+def test_slopes_of_youngs_modulus_and_poissons_ratio() -> None:
+    rng = np.random.default_rng(0)
+    theta, h = np.concatenate([rng.normal(0.0, 1.0, 5), rng.normal(1.5, 0.7, 5)]), 1e-6
+    of_young, of_poisson = young_and_poisson_slopes(theta)
+    for k in range(2):
+        step = np.concatenate([np.full(5, h * (k == 0)), np.full(5, h * (k == 1))])
+        (e1, n1), (e0, n0) = young_and_poisson(theta + step), young_and_poisson(theta - step)
+        assert of_young[k] == pytest.approx(np.log(e1 / e0) / (2 * h), abs=1e-8)
+        assert of_poisson[k] == pytest.approx((n1 - n0) / (2 * h), abs=1e-8)
+
+
+def test_standard_errors_are_proportional_to_noise_and_fall_with_trials() -> None:
+    one, two = cube(LAYERS, pushes=(PRESS,)), cube(LAYERS, pushes=(PRESS, PRESS))
+    small, large, twice = (bound(b, b.zones(), sd).standard_deviations() for b, sd in ((one, 0.01), (one, 0.1), (two, 0.1)))
+    assert large == pytest.approx(10.0 * small, rel=1e-3)
+    assert twice == pytest.approx(large / np.sqrt(2.0), rel=1e-3)
+
+
+def test_information_is_whitened_force_balance_where_every_node_is_measured() -> None:
+    """With one measurement a component of noise s: C^T (s^2 K_F K_F^T)^-1 C, the rows being the balances of the nodes without loads."""
+    body = cube(LAYERS)
+    zones = body.zones()
+    at = linearised(body, zones)
+    free = ~np.repeat(body.held, 3)
+    stiffness, columns = at.stiffness[0].toarray()[free], at.columns[0].toarray()[free]
+    expected = columns.T @ np.linalg.solve(0.1**2 * stiffness @ stiffness.T, columns)
+    assert at.concentrated(np.eye(4)).hessian == pytest.approx(expected, rel=1e-3)  # the weak prior on loaded nodes
+
+
+def test_every_prior_knowledge_lowers_the_bound() -> None:
+    """Telling that two layers share nothing costs: the bound of a layer is above that with the other one known."""
+    body = cube(LAYERS)
+    both = bound(body, body.zones(), 0.1)
+    alone = Uncertainty.of(both.information[np.ix_([0, 2], [0, 2])])
+    assert (both.standard_deviations()[[0, 2]] > alone.standard_deviations()).all()
+
+
+def test_what_is_not_determined_is_infinite_and_said() -> None:
+    """One trial, a pair of moduli for each of 192 elements: 384 numbers from at most 150 balances that touch them."""
+    body = cube(LAYERS)
+    zones = body.zones(each_cell=True)
+    at = linearised(body, zones)
+    information = at.concentrated(np.eye(384)).hessian
+    values = np.linalg.eigvalsh(information)
+    assert (values > 1e-9 * values[-1]).sum() == 150
+    found = Uncertainty.of(information)
+    assert not np.isfinite(found.standard_deviations()).all()
+    words = report(zones, at.point.theta, found)
+    assert len(words) == 193 and sum("do not determine" in w for w in words) > 100
+
+
+def test_words_follow_the_numbers() -> None:
+    zones = Zones(np.array([0, 1]), ("muscle", "fat"), np.full(2, np.nan), np.full(2, np.nan))
+    theta = np.log([10.0, 2.0, 7.0, 5.0])
+    words = report(zones, theta, Uncertainty.of(np.diag([1e4, 10.0, 1e4, 0.2])))
+    assert "muscle" in words[0] and "is well determined" in words[0] and "within" in words[0]
+    assert "fat" in words[1] and "roughly" in words[1] and "take it from elsewhere" in words[1]
+    assert "kappa / mu of fat" in words[2] and "muscle" not in words[2]
+
+
+def test_noise_factor_scales_the_covariance() -> None:
+    root = np.random.default_rng(0).standard_normal((8, 4))
+    one, three = Uncertainty.of(root.T @ root), Uncertainty.of(root.T @ root, 3.0)
+    assert three.covariance == pytest.approx(9.0 * one.covariance, rel=1e-12)
+    assert one.covariance == pytest.approx(np.linalg.inv(root.T @ root), rel=1e-9)
+
+
+@pytest.mark.parametrize("weight", [0.1, 10.0, 1000.0])
+def test_resolution_is_the_diagonal_of_the_resolution_matrix(weight: float) -> None:
+    body = cube(LAYERS, pushes=(PRESS, SHEAR))
+    zones = body.zones(each_cell=True)
+    at = linearised(body, zones)
+    penalty = Laplacian(ZoneGraph.of(body.mesh, zones))
+    data = at.concentrated(np.eye(384)).hessian
+    expected = np.diag(np.linalg.solve(data + weight * penalty.hessian(at.point.theta).toarray() + 1e-9 * data.max() * np.eye(384), data))
+    found = resolution(at, Objective(penalty, weight), explicit=True)
+    assert found == pytest.approx(expected, abs=1e-6)
+    assert (found > -1e-9).all() and (found < 1.0 + 1e-9).all()
+    estimated = resolution(at, Objective(penalty, weight), explicit=False, probes=60)
+    assert estimated.sum() == pytest.approx(expected.sum(), rel=0.25, abs=1.0)
+
+
+def test_weaker_penalties_and_more_trials_resolve_more() -> None:
+    sums = []
+    for pushes, weight in (((PRESS,), 10.0), ((PRESS,), 1.0), ((PRESS, SHEAR), 1.0)):
+        body = cube(LAYERS, pushes=pushes)
+        zones = body.zones(each_cell=True)
+        at = linearised(body, zones)
+        sums.append(resolution(at, Objective(Laplacian(ZoneGraph.of(body.mesh, zones)), weight), explicit=True).sum())
+    assert sums[0] < sums[1] < sums[2]
+
+
+def test_information_at_is_the_concentrated_hessian() -> None:
+    at = linearised(cube(LAYERS), cube(LAYERS).zones())
+    assert information_at(at.model, at.point) == pytest.approx(at.concentrated(np.eye(4)).hessian, rel=1e-6)
+
+
+def test_resolution_in_words_names_the_worst_place() -> None:
+    zones = Zones(np.arange(4), ("a", "b", "c", "d"), np.full(4, np.nan), np.full(4, np.nan))
+    centres = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0], [0.0, 0.0, 3.0], [0.0, 0.0, 40.0]])
+    words = resolution_report(zones, centres, np.array([0.9, 0.8, 0.95, 0.1, 0.2, 0.2, 0.2, 0.2]))
+    assert "75 % of 4 elements" in words[0] and "d (0.1)" in words[1] and "z 40 to 40" in words[1]
+    assert "0 % of 4 elements" in words[2] and len(words) == 3

@@ -1,0 +1,124 @@
+"""Links between two states: particles and lattices whose partners are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from marker_scenes import Cloud, lattice, particle_cloud
+
+from naibu import datasets
+from naibu.core.errors import InputError
+from naibu.imaging.markers.point_matching import link_markers
+
+
+def judged(cloud: Cloud) -> tuple[float, float]:
+    """Return the share of possible links that are right, and the share of links that are wrong."""
+    right, possible, wrong = cloud.judged(link_markers(cloud.reference, cloud.moving).pairs)
+    return right / possible, wrong / max(right + wrong, 1)
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+@pytest.mark.parametrize("stretch", [0.85, 0.65])
+def test_particles_are_linked_over_several_spacings(dimensions: int, stretch: float) -> None:
+    cloud = particle_cloud(3000, 1, dimensions=dimensions, stretch=stretch)
+    assert np.median(cloud.displacement) > 2.0
+    right, wrong = judged(cloud)
+    assert right > 0.97
+    assert wrong < 0.015
+
+
+def test_a_few_hundred_particles_are_linked_as_well() -> None:
+    right, wrong = judged(particle_cloud(300, 4, waviness=0.2))
+    assert right > 0.96
+    assert wrong < 0.03
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_35000_particles_of_which_a_tenth_vanish(seed: int) -> None:
+    right, wrong = judged(particle_cloud(35_000, seed, vanish=0.1, appear=0.1))
+    assert right > 0.99
+    assert wrong < 0.01
+
+
+def test_a_lattice_pressed_to_less_than_two_thirds_is_linked_row_by_row() -> None:
+    x = lattice((5, 5, 5), 10.0, 0.6)
+    centre = x.mean(axis=0)
+    y = (x - centre) * (1.3, 1.3, 0.58)
+    y += 0.004 * np.column_stack([y[:, 0] * np.abs(y[:, 2]), y[:, 1] * np.abs(y[:, 2]), np.zeros(len(y))])
+    order = np.random.default_rng(3).permutation(len(x))
+    links = link_markers(x, y[order])
+    assert len(links) == len(x)
+    assert (order[links.pairs[:, 1]] == links.pairs[:, 0]).all()
+    assert links.confidence.min() > 0.5
+
+
+@given(st.integers(0, 10_000), st.floats(-180.0, 180.0), st.floats(0.2, 50.0))
+@settings(max_examples=8, deadline=None)
+def test_links_do_not_depend_on_the_order_of_markers_or_on_the_unit(seed: int, shift: float, unit: float) -> None:
+    rng = np.random.default_rng(seed)
+    x = lattice((4, 4, 3), 8.0, 1.5, seed=seed)
+    y = x @ np.diag([1.1, 1.05, 0.85]) + (shift, 0.3 * shift, 2.0)
+    order = rng.permutation(len(x))
+    links = link_markers(unit * x, unit * y[order])
+    assert (order[links.pairs[:, 1]] == links.pairs[:, 0]).all()
+    assert len(links) == len(x)
+
+
+def test_no_marker_is_used_twice_and_strangers_stay_alone() -> None:
+    cloud = particle_cloud(2000, 7, vanish=0.2, appear=0.2)
+    links = link_markers(cloud.reference, cloud.moving)
+    assert len(set(links.pairs[:, 0])) == len(set(links.pairs[:, 1])) == len(links)
+    everything = np.sort(np.concatenate([links.pairs[:, 1], links.unmatched_moving]))
+    assert (everything == np.arange(len(cloud.moving))).all()
+    assert len(links.unmatched_reference) == len(cloud.reference) - len(links)
+    wrong = cloud.truth[links.pairs[:, 0]] != links.pairs[:, 1]
+    assert links.confidence[wrong].mean() < links.confidence[~wrong].mean()
+
+
+@pytest.mark.parametrize(
+    ("name", "state"),
+    [
+        ("ct_cube_plate", "height_35"),
+        ("ct_two_material_3", "deformed"),
+        ("ct_test_piece", "deformed"),
+        ("mr_agar", "deformed"),
+        ("us_agar", "trial1_deformed"),
+        ("us_agar", "trial2_deformed"),
+    ],
+)
+def test_measured_washers_are_linked_as_the_report_numbers_them(name: str, state: str) -> None:
+    experiment = datasets.load(name)
+    markers = experiment.state(state).markers
+    assert markers is not None
+    seen = slice(0, experiment.dimensions)
+    here, there = (np.isfinite(m.points[:, seen]).all(axis=1) for m in (experiment.initial, markers))
+    order = np.random.default_rng(0).permutation(int(there.sum()))
+    ids = markers.ids[there][order]
+    links = link_markers(experiment.initial.points[here][:, seen], markers.points[there][order][:, seen])
+    assert (ids[links.pairs[:, 1]] == experiment.initial.ids[here][links.pairs[:, 0]]).all()
+    assert len(links) == len(np.intersect1d(ids, experiment.initial.ids[here]))
+
+
+def test_clouds_that_cannot_be_linked_are_refused() -> None:
+    points = np.random.default_rng(0).uniform(size=(20, 3))
+    for a, b, words in (
+        (points[:2], points, "holds 2 markers"),
+        (points, points[:, :2], "same dimension"),
+        (points[:, :1], points, "shape"),
+        (np.where(np.arange(20)[:, None] == 3, np.nan, points), points, "leave incomplete markers out"),
+        (np.ones((5, 3)), points, "no structure"),
+    ):
+        with pytest.raises(InputError, match=words):
+            link_markers(a, b)
+    with pytest.raises(InputError, match="predicted"):
+        link_markers(points, points, predicted=points[:3])
+
+
+@pytest.mark.parametrize("n", [20, 100, 300, 900])
+def test_strangers_are_not_linked(n: int) -> None:
+    rng = np.random.default_rng(n)
+    with pytest.raises(InputError, match="no common structure"):
+        link_markers(rng.uniform(size=(n, 3)), rng.uniform(size=(n, 3)))

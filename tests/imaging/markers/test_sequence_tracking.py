@@ -1,0 +1,76 @@
+"""Markers in sequences of ultrasound images: followed through gaps, told from ghosts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from marker_scenes import Echoes, ultrasound
+
+from naibu.core.errors import InputError
+from naibu.imaging.markers.sequence_tracking import TrackedSequence, track_sequence
+
+
+@pytest.fixture(scope="module")
+def scene() -> Echoes:
+    return ultrasound(0)
+
+
+@pytest.fixture(scope="module")
+def followed(scene: Echoes) -> TrackedSequence:
+    return track_sequence(scene.frames, pixel_mm=scene.pixel_mm, diameter_mm=(3.0, 2.0))
+
+
+def test_every_marker_is_within_a_third_of_a_millimetre_in_every_frame(scene: Echoes, followed: TrackedSequence) -> None:
+    assert len(followed) == 5
+    error = np.linalg.norm(followed.points - scene.truth, axis=2)
+    assert error.max() < 0.3
+    assert np.median(error) < 0.05
+    assert not followed.seen[~scene.there].any()
+    assert followed.seen[scene.there].mean() > 0.95
+
+
+def test_ghosts_are_rejected_and_kept_out_by_a_region(scene: Echoes, followed: TrackedSequence) -> None:
+    assert any("ghost" in track.reason for track in followed.rejected)
+    inside = track_sequence(scene.frames, pixel_mm=scene.pixel_mm, diameter_mm=(3.0, 2.0), region_mm=(0.0, 60.0, 14.0, 45.0))
+    np.testing.assert_allclose(inside.points, followed.points, atol=0.05)
+    assert not any(track.point[1] < 14.0 for track in inside.rejected)
+
+
+def test_positions_in_gaps_say_that_they_are_less_certain(scene: Echoes, followed: TrackedSequence) -> None:
+    assert followed.sd_mm[~followed.seen].min() > followed.sd_mm[followed.seen].max() * 0.5
+    assert np.median(followed.sd_mm[~followed.seen]) > np.median(followed.sd_mm[followed.seen])
+    error = (followed.points - scene.truth)[followed.seen]
+    assert 0.6 < np.sqrt(np.mean(error**2)) / np.sqrt(np.mean(followed.sd_mm[followed.seen] ** 2)) < 1.6
+
+
+def test_frames_become_markers_in_a_plane(followed: TrackedSequence) -> None:
+    first, last = (followed.markers(f, origin=followed.middle) for f in (0, -1))
+    assert first.ids.tolist() == [1, 2, 3, 4, 5]
+    np.testing.assert_allclose(first.points[2, :2], 0.0, atol=1e-12)
+    assert np.isnan(first.points[:, 2]).all()
+    assert (np.diff(first.points[:, 0]) > 0).all()
+    assert (last.points[:, 1] < first.points[:, 1] - 2.0).all()  # the weight pushes down
+
+
+def test_dark_markers_and_other_counts() -> None:
+    scene = ultrasound(2, frames=60, markers=3, long_gap=5, pressed_mm=2.0)
+    dark = track_sequence(255 - scene.frames, pixel_mm=scene.pixel_mm, diameter_mm=(3.0, 2.0), polarity="dark", count=3)
+    assert np.linalg.norm(dark.points - scene.truth, axis=2).max() < 0.3
+
+
+def test_what_cannot_be_followed_is_refused(scene: Echoes) -> None:
+    frames = scene.frames[:6]
+    for values, arguments, words in (
+        (frames[0], {}, r"shape \(t, ny, nx\)"),
+        (np.zeros_like(frames), {}, "all pixels are 0"),
+        (np.where(np.arange(200) == 3, np.nan, frames), {}, "is nan"),
+        (frames, {"diameter_mm": 0.2}, "diameter_mm is"),
+        (frames, {"pixel_mm": -1.0}, "pixel_mm must be"),
+        (frames, {"count": 0}, "count is 0"),
+        (frames, {"region_mm": (90.0, 99.0, 0.0, 9.0)}, "no pixel lies in the region"),
+        (frames, {"region_mm": (9.0, 3.0, 0.0, 9.0)}, "region_mm must be"),
+        (frames, {"mask": np.ones((3, 3))}, "mask must have shape"),
+        (frames, {"count": 90}, "90 asked for"),
+    ):
+        with pytest.raises(InputError, match=words):
+            track_sequence(values, **({"pixel_mm": 0.3, "diameter_mm": (3.0, 2.0)} | arguments))  # type: ignore[arg-type]

@@ -1,0 +1,292 @@
+"""Volume correlation on textured bodies in air that move exactly as they are told: the material at x is evaluated where it came from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+from scenes import texture
+
+from naibu.core.errors import InputError
+from naibu.core.rotation import rotation_matrix
+from naibu.core.volume import Volume
+from naibu.imaging.preprocessing.object_mask import object_mask
+from naibu.imaging.preprocessing.resampling import positions
+from naibu.imaging.volume_correlation.correlate import CorrelationSettings, correlate_volumes
+from naibu.imaging.volume_correlation.result import CorrelatedDisplacement
+from naibu.imaging.volume_correlation.spline_grid import SplineGrid
+
+Array = np.ndarray
+Map = Callable[[Array], Array]
+MIDDLE = np.array([24.0, 22.0, 20.0])
+CHI_SQUARED_95 = 7.815
+NOISE = 3.0
+
+
+def frame(shape: tuple[int, int, int] = (40, 44, 48), spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Volume:
+    return Volume.from_array(np.zeros(shape), spacing_mm=spacing)
+
+
+RADII = np.array([15.0, 14.0, 13.0])
+SCALE = np.array([2.0, 1.0, 1.0])  # of the long body, along x
+
+
+def depth(x: Array, scale: Array | float = 1.0) -> Array:
+    """Return how deep points lie in an ellipsoid, mm, roughly."""
+    return (1.0 - np.linalg.norm((x - MIDDLE * scale) / (RADII * scale), axis=-1)) * min(RADII)
+
+
+def scans(
+    grid: Volume,
+    back: Map,
+    *,
+    plain: Callable[[Array], Array] | None = None,
+    scale: Array | float = 1.0,
+) -> tuple[Volume, Volume]:
+    """Return scans before and after; `back` tells where material at a place came from, `plain` in what share it has no texture."""
+    pattern, rng = texture(0, (5.0, 14.0)), np.random.default_rng(1)
+
+    def grey(x: Array) -> Array:
+        own = 0.0 if plain is None else plain(x)
+        return (200.0 + (1.0 - own) * (pattern(x) - 100.0)) / (1.0 + np.exp(-4.0 * depth(x, scale)))
+
+    x = positions(grid)
+    before, after = (v + NOISE * rng.standard_normal(v.shape) for v in (grey(x), grey(back(x))))
+    return grid.with_values(before), grid.with_values(after)
+
+
+def affine(matrix: Array, shift: Array) -> tuple[Map, Map]:
+    """Return the displacement of an affine motion about the middle, and where it came from."""
+    inverse = np.linalg.inv(matrix)
+    return lambda x: (x - MIDDLE) @ (matrix - np.eye(3)).T + shift, lambda x: (x - MIDDLE - shift) @ inverse.T + MIDDLE
+
+
+def errors(found: CorrelatedDisplacement, displacement: Map, least_depth: float = 0.0) -> Array:
+    x = positions(found.volume)
+    inside = found.valid & (depth(x) > least_depth)
+    return found.vectors[inside] - displacement(x[inside])
+
+
+def waves() -> tuple[Map, Map]:
+    """Return a smooth motion of up to 2 mm and its inverse by fixed-point iteration."""
+    k, phase = 2 * np.pi / np.array([34.0, 40.0, 46.0]), np.array([0.3, 1.1, 2.0])
+
+    def move(x: Array) -> Array:
+        return 2.0 * np.sin(x[..., [1, 2, 0]] * k + phase)
+
+    def back(x: Array) -> Array:
+        y = x.copy()
+        for _ in range(60):
+            y = y + 0.8 * (x - y - move(y))
+        return y
+
+    return move, back
+
+
+@cache
+def waved() -> tuple[Volume, Volume, CorrelatedDisplacement]:
+    before, after = scans(frame(), waves()[1])
+    return before, after, correlate_volumes(before, after)
+
+
+def test_a_rigid_motion_is_found_without_strain() -> None:
+    rotation = rotation_matrix(np.deg2rad(10.0) * np.array([2.0, -1.0, 2.0]) / 3.0)
+    displacement, back = affine(rotation, np.array([5.0, -4.0, 3.0]))
+    before, after = scans(frame(), back)
+    found = correlate_volumes(before, after)
+    assert np.linalg.norm(errors(found, displacement), axis=1).mean() < 0.05
+    inside = found.valid & (depth(positions(before)) > 2.0)
+    f = np.eye(3) + found.gradient()[inside]
+    strain = 0.5 * (np.swapaxes(f, 1, 2) @ f - np.eye(3))
+    assert np.sqrt((strain**2).mean()) < 0.005
+    assert np.abs(f.mean(axis=0) - rotation).max() < 0.002
+
+
+def test_a_uniform_compression_has_its_gradient() -> None:
+    stretch = np.diag([1.04, 1.03, 0.92])
+    displacement, back = affine(stretch, np.array([0.4, 0.0, -1.3]))
+    found = correlate_volumes(*scans(frame(), back))
+    inside = found.valid & (depth(positions(found.volume)) > 2.0)
+    assert np.abs(found.gradient()[inside].mean(axis=0) - (stretch - np.eye(3))).max() < 0.004
+    assert np.linalg.norm(errors(found, displacement), axis=1).mean() < 0.08
+
+
+def test_layers_are_told_apart() -> None:
+    z = np.linspace(-20.0, 60.0, 4001)
+    slope = np.where(z < 20.0, 0.90, 0.98)
+    after_z = np.concatenate([[0.0], np.cumsum(0.5 * (slope[1:] + slope[:-1]) * np.diff(z))]) + z[0]
+    back = lambda x: np.stack([x[..., 0], x[..., 1], np.interp(x[..., 2], after_z, z)], axis=-1)  # noqa: E731
+    found = correlate_volumes(*scans(frame(), back))
+    gradient, at = found.gradient()[..., 2, 2], positions(found.volume)
+    inside = found.valid & (depth(at) > 2.0)
+    assert gradient[inside & (at[..., 2] < 15.0)].mean() == pytest.approx(-0.10, abs=0.02)
+    assert gradient[inside & (at[..., 2] > 25.0)].mean() == pytest.approx(-0.02, abs=0.02)
+
+
+def test_what_has_no_texture_is_uncertain() -> None:
+    plain = lambda x: 1.0 / (1.0 + np.exp(-2.0 * (x[..., 0] - 48.0)))  # noqa: E731
+    move, back = waves()
+    found = correlate_volumes(*scans(frame((40, 44, 96)), back, plain=plain, scale=SCALE))
+    x = positions(found.volume)
+    deep = x[found.valid & (depth(x, SCALE) > 5.0)]
+    sd = np.sqrt(np.einsum("nii->n", found.covariance_at(deep)))
+    off = np.linalg.norm(found.displacement_at(deep) - move(deep), axis=1)
+    textured, bare = deep[:, 0] < 44.0, deep[:, 0] > 56.0
+    assert np.median(off[bare]) > 4.0 * np.median(off[textured])
+    assert np.median(sd[bare]) > 2.0 * np.median(sd[textured])
+
+
+def test_the_covariance_covers_the_truth() -> None:
+    _, _, found = waved()
+    move = waves()[0]
+    inside = positions(found.volume)[found.valid & (depth(positions(found.volume)) > 0.0)]
+    e = found.displacement_at(inside) - move(inside)
+    covered = np.einsum("ni,ni->n", e, np.linalg.solve(found.covariance_at(inside), e[..., None])[..., 0]) < CHI_SQUARED_95
+    assert np.linalg.norm(e, axis=1).mean() < 0.12
+    assert 0.9 <= covered.mean() <= 0.999
+    # and is no wider than it must be: errors are a fair share of it
+    assert np.sqrt((e**2).sum() / np.einsum("nii->", found.covariance_at(inside))) > 0.3
+
+
+def test_gain_and_offset_of_a_scan_do_not_matter() -> None:
+    before, after, found = waved()
+    bright = correlate_volumes(before, after.with_values(1.4 * after.values + 60.0))
+    both = found.valid & bright.valid
+    assert np.percentile(np.linalg.norm(found.vectors - bright.vectors, axis=-1)[both], 99) < 0.05
+    assert np.nanmedian(bright.gain) == pytest.approx(np.nanmedian(found.gain) / 1.4, rel=0.02)
+
+
+def test_vectors_turn_with_the_axes_of_the_scanner() -> None:
+    before, after, found = waved()
+    turn = rotation_matrix(np.array([0.3, -0.5, 0.9]))
+    turned = [Volume.from_array(v.values, spacing_mm=v.spacing_mm, origin_mm=(5.0, 6.0, 7.0), direction=turn) for v in (before, after)]
+    other = correlate_volumes(*turned)
+    # the same grey values give the same numbers, to the last bit
+    assert np.array_equal(other.coefficients, found.coefficients)
+    at = np.argwhere(found.valid)[::97, ::-1]
+    assert np.allclose(other.vectors[other.valid], found.vectors[found.valid] @ turn.T, atol=1e-9)
+    there = turned[0].to_physical(at)
+    assert np.allclose(other.displacement_at(there), found.displacement_at(before.to_physical(at)) @ turn.T, atol=1e-6)
+    expected = turn @ found.covariance_at(before.to_physical(at)) @ turn.T
+    assert np.allclose(other.covariance_at(there), expected, atol=1e-9)
+    assert np.allclose(other.gradient()[other.valid], turn @ found.gradient()[found.valid] @ turn.T, atol=1e-9)
+
+
+@pytest.mark.parametrize(("shape", "spacing"), [((16, 44, 48), (1.0, 1.0, 2.5)), ((40, 44, 19), (2.5, 1.0, 1.0))])
+def test_slices_may_be_thick_and_lie_along_any_axis(shape: tuple[int, int, int], spacing: tuple[float, float, float]) -> None:
+    move, back = waves()
+    found = correlate_volumes(*scans(frame(shape, spacing), back))
+    assert np.linalg.norm(errors(found, move, 3.0), axis=1).mean() < 0.2
+
+
+def test_the_gradient_is_that_of_the_splines() -> None:
+    _, _, found = waved()
+    at = np.argwhere(found.valid & (depth(positions(found.volume)) > 2.0))[::211]
+    x = found.volume.to_physical(at[:, ::-1])
+    numeric = np.stack([(found.displacement_at(x + 0.01 * e) - found.displacement_at(x - 0.01 * e)) / 0.02 for e in np.eye(3)], axis=-1)
+    assert np.allclose(found.gradient()[tuple(at.T)], numeric, atol=1e-6)
+    assert np.allclose(found.displacement_at(x), found.vectors[tuple(at.T)], atol=1e-9)
+
+
+def test_a_field_is_what_identification_takes() -> None:
+    _, _, found = waved()
+    field = found.field()
+    assert field.valid.all() and len(field.points) < found.valid.sum() / 20
+    assert np.allclose(field.vectors, found.displacement_at(field.points), atol=1e-9)
+    assert np.linalg.eigvalsh(field.covariance).min() > 0.0
+    assert len(found.field(step=1).points) == found.valid.sum()
+    with pytest.raises(InputError, match="1 or more"):
+        found.field(step=0)
+
+
+def test_a_stiff_body_moves_as_one() -> None:
+    # the ball keeps its shape, what is about it is squeezed, and both agree on its surface
+    move, _ = affine(np.diag([1.03, 1.03, 0.93]), np.zeros(3))
+
+    def displacement(x: Array) -> Array:
+        r = np.linalg.norm(x - MIDDLE, axis=-1, keepdims=True)
+        return move(x) * np.clip((r - 7.0) / 5.0, 0.0, 1.0) ** 2 + np.array([0.6, -0.4, 0.3])
+
+    def back(x: Array) -> Array:
+        y = x.copy()
+        for _ in range(60):
+            y = y + 0.8 * (x - y - displacement(y))
+        return y
+
+    before, after = scans(frame(), back)
+    ball = np.linalg.norm(positions(before) - MIDDLE, axis=-1) < 7.0
+    found = correlate_volumes(before, after, stiff_mask=ball)
+    assert np.array_equal(found.bodies > 0, ball)
+    f = np.eye(3) + found.gradient()[ball]
+    assert np.allclose(f @ np.swapaxes(f, 1, 2), np.eye(3), atol=1e-9)
+    assert np.linalg.norm(found.vectors[ball] - np.array([0.6, -0.4, 0.3]), axis=1).max() < 0.1
+    assert np.linalg.norm(errors(found, displacement), axis=1).mean() < 0.15
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        CorrelationSettings(local_gain=False, stiff_bodies=False),
+        CorrelationSettings(robust=np.inf),
+        CorrelationSettings(volume_term=False, adaptive_weight=False),
+        CorrelationSettings(slopes="mean", node_spacing_mm=5.0),
+    ],
+)
+def test_every_part_can_be_left_out(settings: CorrelationSettings) -> None:
+    before, after, _ = waved()
+    found = correlate_volumes(before, after, settings=settings)
+    # least squares is the worst of them: air that comes into the place of the surface weighs as much as all texture
+    assert np.linalg.norm(errors(found, waves()[0]), axis=1).mean() < 0.3
+
+
+def test_the_object_is_found_in_air() -> None:
+    before, _, _ = waved()
+    inside = depth(positions(before)) > 0.0
+    mask = object_mask(before)
+    assert (mask & inside).sum() / inside.sum() > 0.95
+    assert (mask & ~inside).sum() / inside.sum() < 0.2
+
+
+def test_splines_keep_their_field_when_cells_are_halved_and_know_their_bending() -> None:
+    grid = SplineGrid.around([0.0, 0.0, 0.0], [9.0, 12.0, 6.0], [3.0, 4.0, 2.0])
+    rng = np.random.default_rng(0)
+    c = rng.standard_normal((*grid.shape, 3))
+    x = rng.uniform(0.0, 1.0, (50, 3)) * [9.0, 12.0, 6.0]
+    assert np.allclose(grid.halved().values(grid.refined(c), x), grid.values(c, x), atol=1e-12)
+    # u = x y: its only second derivatives are the two mixed ones
+    nodes = grid.nodes_mm
+    local = (nodes[..., 0] * nodes[..., 1])[:4, :4, :4].ravel()
+    assert local @ grid.bending() @ local == pytest.approx(2.0 * np.prod(grid.step_mm))
+    assert np.allclose(grid.gauss_slopes()[:, 2] @ local, 0.0, atol=1e-12)
+
+
+def test_bad_scans_are_refused() -> None:
+    before, after, _ = waved()
+    with pytest.raises(InputError, match="different grids"):
+        correlate_volumes(before, Volume.from_array(after.values, spacing_mm=(1.0, 1.0, 2.0)))
+    with pytest.raises(InputError, match="constant"):
+        correlate_volumes(before, after.with_values(np.full(after.shape, 7.0)))
+    with pytest.raises(InputError, match="mask is empty"):
+        correlate_volumes(before, after, mask=np.zeros(before.shape, dtype=bool))
+    holed = after.values.copy()
+    holed[3, 4, 5] = np.nan
+    with pytest.raises(InputError, match=r"\(3, 4, 5\).*NaN"):
+        correlate_volumes(before, after.with_values(holed))
+    with pytest.raises(InputError, match="lucas_kanade"):
+        correlate_volumes(*(v.cropped((0, 0, 20), (48, 44, 21)) for v in (before, after)))
+    small = np.zeros(before.shape, dtype=bool)
+    small[20, 20:30, 20:30] = True
+    with pytest.raises(InputError, match=r"\[10, 10, 1\] voxels"):
+        correlate_volumes(before, after, mask=small)
+    with pytest.raises(InputError, match="slopes"):
+        correlate_volumes(before, after, settings=CorrelationSettings(slopes="none"))  # type: ignore[arg-type]
+
+
+def test_scans_that_are_known_in_different_places_do_not_overlap() -> None:
+    before, after, _ = waved()
+    left, right = before.values.copy(), after.values.copy()
+    left[:, :, 24:], right[:, :, :24] = np.nan, np.nan
+    with pytest.raises(InputError, match="overlap"):
+        correlate_volumes(before.with_values(left), after.with_values(right))

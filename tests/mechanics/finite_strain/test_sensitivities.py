@@ -1,0 +1,165 @@
+"""Sensitivities of whole load paths, Coulomb slip and its memory included, against central differences of solves."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from builders import GEL, of, problem
+from scipy.spatial.transform import Rotation
+
+from naibu.mechanics.contact.contact_surfaces import Friction, interface, rigid_contact
+from naibu.mechanics.contact.penalty_contact import STICK, Contact, RigidSurface, bar, plane
+from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
+from naibu.mechanics.finite_strain.sensitivities import Direction, sensitivities
+from naibu.mechanics.finite_strain.statics import Solution, solve
+from naibu.meshing.interfaces import split_at_plane
+from naibu.meshing.primitives import box
+from naibu.meshing.surface import faces_among, faces_towards, node_areas
+
+PATH = SolverSettings(first_step=0.125, largest_step=0.125, tolerance=1e-12, max_iterations=40)
+SIZE = 20.0
+MESH = box((SIZE, SIZE, SIZE), (4, 4, 4), layers=[("low", 10), ("high", 10)])
+MATERIALS = (GEL, of("neo_hookean", 0.4, 35.0))
+TILT = np.array([0.02, -0.03, 0.01])
+
+
+def pressed(surface: RigidSurface, mu: float, *, joined: bool = True) -> Problem:
+    """Two layers between a table and a tilted plate or bar that also moves sideways."""
+    mesh, joints = MESH, []
+    if not joined:
+        below = replace(mesh, cells=mesh.cells[mesh.regions == 0], regions=mesh.regions[mesh.regions == 0])
+        area = node_areas(mesh, faces_among(below, np.flatnonzero(np.abs(mesh.points[:, 2] - 10) < 1e-9)))
+        mesh, pairs = split_at_plane(mesh, 10.0)
+        joints = [interface("joint", mesh.points, pairs, area[pairs[:, 0]], friction=Friction(0.1, 300.0), normal_stiffness=1e4)]
+    turn = Rotation.from_rotvec(TILT).as_matrix()
+    base, top = (
+        rigid_contact(
+            name,
+            mesh.points,
+            faces_towards(mesh, (0, 0, side)),
+            face,
+            start=start,
+            stop=stop,
+            friction=Friction(mu, 150.0),
+            normal_stiffness=5e3,
+            rotation=rotation,
+        )
+        for name, side, face, start, stop, rotation in (
+            ("base", -1, plane((0, 0, 1)), (0, 0, 0), (0, 0, 0), None),
+            ("top", 1, surface, (0.2, 0.07, SIZE + 0.5), (0.7, -0.43, 0.8 * SIZE), turn),
+        )
+    )
+    return problem(mesh, *MATERIALS, contacts=(base, top, *joints))
+
+
+def changed(body: Problem, d: Direction, h: float) -> Problem:
+    """The problem after a finite step along a direction, made without the code under test."""
+    assembler = body.assembler
+    if d.materials is not None:
+        assembler = assembler.with_parameters(assembler.parameters + h * d.materials)
+    contacts = list(body.contacts)
+    if d.contact >= 0:
+        contacts[d.contact] = _moved(contacts[d.contact], d, h)
+    return body.with_changes(assembler=assembler, contacts=tuple(contacts))
+
+
+def _moved(c: Contact, d: Direction, h: float) -> Contact:
+    def plus(value, change):
+        return value if change is None else value + h * change
+
+    turn = np.eye(3) if d.rotation is None else Rotation.from_rotvec(h * d.rotation).as_matrix()
+    return replace(
+        c,
+        start=plus(c.start, d.start),
+        stop=plus(c.stop, d.stop),
+        rotation=turn @ c.rotation,
+        friction_coefficient=plus(c.friction_coefficient, d.friction),
+        tangential_stiffness=plus(c.tangential_stiffness, d.tangential_stiffness),
+    )
+
+
+def directions(body: Problem) -> dict[str, tuple[Direction, float]]:
+    """Every kind of direction, and the step of its finite difference."""
+    rng = np.random.default_rng(0)
+    cells, points = len(MESH.cells), [len(c.area) for c in body.contacts]
+    law = body.assembler.parameters
+    out = {
+        "one parameter everywhere": (Direction(materials=np.array([1.0, 0, 0, 0]) * np.ones((cells, 1))), 1e-5),
+        "every cell by itself": (Direction(materials=law * rng.uniform(-1, 1, law.shape)), 1e-5),
+        "one layer": (Direction(materials=law * (MESH.regions == 1)[:, None]), 1e-5),
+    }
+    for i, name in enumerate(c.name for c in body.contacts):
+        out[f"friction of {name}"] = (Direction(contact=i, friction=np.ones(points[i])), 1e-6)
+        out[f"friction of {name}, point by point"] = (Direction(contact=i, friction=rng.uniform(0, 1, points[i])), 1e-6)
+        out[f"tangential stiffness of {name}"] = (Direction(contact=i, tangential_stiffness=rng.uniform(0, 1, points[i])), 1e-3)
+    for i, axis in ((0, 2), (1, 0), (1, 1), (1, 2)):
+        unit = np.eye(3)[axis]
+        out[f"start {'xyz'[axis]} of {i}"] = (Direction(contact=i, start=unit), 1e-5)
+        out[f"stop {'xyz'[axis]} of {i}"] = (Direction(contact=i, stop=unit), 1e-5)
+        out[f"turn about {'xyz'[axis]} of {i}"] = (Direction(contact=i, rotation=unit), 1e-6)
+    out["all of a body at once"] = (
+        Direction(
+            contact=1, friction=np.ones(points[1]), start=rng.normal(size=3), stop=rng.normal(size=3), rotation=0.1 * rng.normal(size=3)
+        ),
+        1e-6,
+    )
+    return out
+
+
+def slipping(solution: Solution, body: Problem) -> np.ndarray:
+    """Share of the touching points of each contact that slip in the last step."""
+    out = []
+    for c, a in zip(body.contacts, solution.states[-2].anchors, strict=True):
+        response = c.evaluate(solution.displacement, a, 1.0)
+        touching = response.gap < 0
+        out.append(response.slip_direction.any(axis=1)[touching].mean())
+    return np.array(out)
+
+
+CASES = {
+    "plate": (plane((0, 0, -1)), 0.15, True),
+    "bar": (bar("y", 10.0, corner_radius_mm=2.0), 0.15, True),
+    "plate, sliding joint": (plane((0, 0, -1)), 0.3, False),
+    "bar, stick": (bar("x", 10.0, corner_radius_mm=2.0), STICK, True),
+}
+
+
+@pytest.mark.parametrize("case", list(CASES))
+def test_every_direction_against_finite_differences(case):
+    surface, mu, joined = CASES[case]
+    body = pressed(surface, mu, joined=joined)
+    solution = solve(body, settings=PATH)
+    slip = slipping(solution, body)
+    assert (slip == 0).all() if mu == STICK else slip.max() > 0.1
+    table = directions(body)
+    exact = sensitivities(body, solution.states, [d for d, _ in table.values()])
+    assert len(exact) == len(solution.states)
+    assert not exact[0].any()
+    for k, (name, (direction, h)) in enumerate(table.items()):
+        up, down = (
+            solve(changed(body, direction, s * h), settings=PATH, hints=[(x.load, x.displacement) for x in solution.states[1:]])
+            for s in (1, -1)
+        )
+        assert [s.load for s in up.states] == [s.load for s in down.states] == [s.load for s in solution.states]
+        for found, more, less in zip(exact[1:], up.states[1:], down.states[1:], strict=True):
+            slope = (more.displacement - less.displacement) / (2 * h)
+            error, size = np.abs(found[:, :, k] - slope).max(), np.abs(slope).max()
+            assert error < 1e-5 * size + 1e-8, (name, more.load, error, size)
+
+
+def test_sum_of_directions_is_the_direction_of_the_sum():
+    body = pressed(CASES["bar"][0], 0.15)
+    states = solve(body, settings=PATH).states
+    one, two = Direction(contact=1, stop=np.array([0, 0, 1.0])), Direction(contact=1, rotation=np.array([0.3, 0.1, 0]))
+    both = Direction(contact=1, stop=2 * one.stop, rotation=-one.stop[2] * two.rotation)
+    a, b, c = np.moveaxis(sensitivities(body, states, [one, two, both])[-1], 2, 0)
+    np.testing.assert_allclose(c, 2 * a - b, atol=1e-10 * np.abs(c).max())
+
+
+def test_scaling_all_stiffnesses_changes_nothing_but_penetration():
+    """Where only displacements are given, the answer depends on ratios of moduli; what remains is due to the penalty."""
+    body = pressed(plane((0, 0, -1)), 0.15)
+    states = solve(body, settings=PATH).states
+    table = [Direction(materials=body.assembler.parameters), Direction(materials=body.assembler.parameters * (MESH.regions == 1)[:, None])]
+    overall, ratio = np.moveaxis(sensitivities(body, states, table)[-1], 2, 0)
+    assert np.abs(overall).max() < 0.1 * np.abs(ratio).max()

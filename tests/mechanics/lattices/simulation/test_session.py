@@ -1,0 +1,210 @@
+"""Sessions against runs of many steps, and what decides whether helpers are asked; no test looks at a clock of the machine's."""
+
+from __future__ import annotations
+
+from threading import Thread
+from time import sleep
+
+import numpy as np
+import pytest
+
+from naibu.core.errors import ConvergenceError, InputError
+from naibu.mechanics.lattices.cpu import _thread_pool
+from naibu.mechanics.lattices.cpu.engine import LatticeEngine
+from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, lattice_parameters
+from naibu.mechanics.lattices.model.state import HeldNodes, explicit_step_limit
+from naibu.mechanics.lattices.simulation.session import LatticeSession
+
+LATTICE = classic_lattice(box_mask((9, 7, 10)), 5.0, total_mass_kg=0.6)
+Z = LATTICE.points[:, 2]
+HELD = HeldNodes.of(np.flatnonzero(Z < 1), 0) + HeldNodes.of(np.flatnonzero(Z > 49), 1, axes=(2, 0))
+FEWER = HeldNodes.of(np.flatnonzero(Z < 1), 0)
+PUSH = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, -30.0]])
+OPTIONS = [{"method": "implicit", "step": 2e-3}] + [
+    {"method": method, "step": 1e-4, "threads": threads, "precision": precision}
+    for method in ("euler", "symplectic_euler")
+    for threads in (1, 2, 3)
+    for precision in ("double", "single")
+]
+
+
+def engine(**options):
+    return LatticeEngine.of(LATTICE, lattice_parameters(LATTICE, 10.0, 0.01, 0.02), **options)
+
+
+@pytest.mark.parametrize("options", OPTIONS, ids=str)
+def test_a_session_takes_the_steps_of_a_run(options):
+    made = engine(**options)
+    weight = [0.0, 1e-3, -2e-3]
+    with LatticeSession.of(made, held=HELD, external_force=weight) as session:
+        reactions = [session.advance(PUSH) for _ in range(12)]
+        mean = session.advance(PUSH, 5)
+        pushed = session.state()
+        session.hold(FEWER)
+        session.advance(0.0, 8)
+        released = session.state()
+    first = made.run(made.rest(), 17, HELD, PUSH, weight)
+    second = made.run(first.state, 8, FEWER, 0.0, weight)
+    np.testing.assert_array_equal(reactions, first.reaction[:12])
+    np.testing.assert_allclose(mean, first.reaction[12:].mean(axis=0), rtol=1e-13)
+    for ours, own in ((pushed, first.state), (released, second.state)):
+        np.testing.assert_array_equal(ours.position, own.position)
+        np.testing.assert_array_equal(ours.velocity, own.velocity)
+        np.testing.assert_array_equal(ours.extension, own.extension)
+    np.testing.assert_array_equal(session.positions([3, 700]), released.position[[3, 700]])
+    assert session.steps == 25
+
+
+def test_sessions_of_one_engine_do_not_disturb_one_another():
+    made = engine(step=2e-3)
+    alone = made.run(made.rest(), 10, HELD, PUSH)
+    one, two = LatticeSession.of(made, held=HELD), LatticeSession.of(made, held=FEWER)
+    for _ in range(10):
+        one.advance(PUSH)
+        two.advance([[1.0, 2.0, 3.0]])
+    np.testing.assert_array_equal(one.state().position, alone.state.position)
+
+
+def test_who_takes_a_part_changes_nothing():
+    """Runs with helpers, and with the team at rest, give the same to the last bit."""
+    found = []
+    for alone in (False, True):
+        session = LatticeSession.of(engine(method="euler", step=1e-4, threads=4), held=HELD)
+        if alone:
+            session.stepper.control[_thread_pool.REST] = 10_000
+        for _ in range(20):
+            session.advance(PUSH, 10)
+        found.append(session.state())
+    np.testing.assert_array_equal(found[0].position, found[1].position)
+    np.testing.assert_array_equal(found[0].velocity, found[1].velocity)
+
+
+def test_helpers_are_asked_only_while_steps_take_most_of_the_time():
+    session = LatticeSession.of(engine(method="euler", step=1e-4, threads=2), held=HELD)
+    asked, now = [], [100.0]
+
+    class Stub:
+        def advance(self, velocity, reaction, *, alone=False):
+            asked.append(not alone)
+            now[0] += 1e-3  # what the call takes
+            return 0, 0
+
+    session.stepper, session.clock = Stub(), lambda: now[0]
+    for pause in (5.0, 0.9e-3, 0.1e-3, 1.1e-3, 0.0):
+        now[0] += pause
+        session.advance(PUSH)
+    assert asked == [False, True, True, False, True]
+
+
+def test_the_team_rests_longer_after_each_stall_and_forgets_them():
+    control = _thread_pool.new_control(2)
+    rests = []
+    for _ in range(9):
+        _thread_pool.judge(control, _thread_pool.STALL)
+        rests.append(int(control[_thread_pool.REST]))
+        while control[_thread_pool.REST]:
+            _thread_pool.judge(control, 0)
+    assert rests == [200, 600, 1400, 3000, 6200, 12600, 12800, 12800, 12800]
+    for _ in range(7_000):
+        _thread_pool.judge(control, 0)
+    _thread_pool.judge(control, _thread_pool.STALL)
+    assert control[_thread_pool.REST] == 2 * (12800 >> 7) + 200
+    _thread_pool.judge(_thread_pool.new_control(2), _thread_pool.STALL - 1)
+    assert not _thread_pool.new_control(2)[_thread_pool.REST]
+
+
+def test_a_helper_that_is_late_is_waited_for_and_stalls_the_team():
+    control = _thread_pool.new_control(2)
+    control[_thread_pool.DONE] = 2
+    assert nogil_wait(control) == 0  # compiled before the helper begins
+    _thread_pool.publish(control, 7)
+    assert control[_thread_pool.JOB] == 7
+    assert {_thread_pool.claim(control), _thread_pool.claim(control)} == {0, 1}
+    assert _thread_pool.claim(control) == -1
+    _thread_pool.finish(control)
+
+    def late() -> None:
+        sleep(0.05)
+        _thread_pool.finish(control)
+
+    helper = Thread(target=late)
+    helper.start()
+    naps = nogil_wait(control)
+    helper.join()
+    assert control[_thread_pool.DONE] == 2
+    _thread_pool.judge(control, naps)
+    assert control[_thread_pool.REST] > 0
+
+
+@_thread_pool.njit(nogil=True)
+def nogil_wait(control):
+    return _thread_pool.wait(control)
+
+
+def test_parts_are_taken_once_by_many_helpers():
+    """A thousand jobs of many parts, each of which counts itself."""
+    control, counts = _thread_pool.new_control(60), np.zeros(60, dtype=np.int64)
+    help_count(_thread_pool.new_control(1) + stopped(), counts)  # compiles
+    _thread_pool.lend(help_count, control, counts)
+    count_parts(control, counts, 1000)
+    _thread_pool.dismiss(control)
+    np.testing.assert_array_equal(counts, 1000)
+
+
+def stopped():
+    control = np.zeros_like(_thread_pool.new_control(1))
+    control[_thread_pool.STOP] = 1
+    return control
+
+
+@_thread_pool.njit(nogil=True)
+def count_parts(control, counts, jobs):
+    for _ in range(jobs):
+        _thread_pool.publish(control, 0)
+        part = _thread_pool.claim(control)
+        while part >= 0:
+            counts[part] += 1
+            _thread_pool.finish(control)
+            part = _thread_pool.claim(control)
+        _thread_pool.wait(control)
+
+
+@_thread_pool.njit(nogil=True)
+def help_count(control, counts):
+    part = _thread_pool.expect(control)
+    while part >= 0:
+        counts[part] += 1
+        _thread_pool.finish(control)
+        part = _thread_pool.expect(control)
+
+
+def test_a_session_that_blows_up_says_so():
+    parameters = lattice_parameters(LATTICE, 30.0, 0.01, 5.0)
+    made = LatticeEngine.of(LATTICE, parameters, step=8.0 * explicit_step_limit(LATTICE, parameters), method="symplectic_euler")
+    session = LatticeSession.of(made, held=HELD)
+    with pytest.raises(ConvergenceError, match="implicit"):
+        for _ in range(2000):
+            session.advance(PUSH)
+    assert session.steps <= 2000
+    with pytest.raises(ConvergenceError, match="blew up"):
+        session.state()
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda s: s.advance(np.full((2, 3), np.nan)), "velocity holds 6 NaN"),
+        (lambda s: s.advance(np.zeros((4, 3))), "velocities of 4 bodies are given, 2 hold masses"),
+        (lambda s: s.advance(np.zeros((2, 2))), "do not fit"),
+        (lambda s: s.advance(PUSH, 0), "at least one step, not 0"),
+        (lambda s: s.hold(HeldNodes.of([10_000])), "the lattice has 0 to"),
+        (lambda s: s.hold(HELD + HELD), "held twice"),
+        (lambda s: LatticeSession.of(s.engine, external_force=[np.inf, 0.0, 0.0]), "external_force"),
+    ],
+)
+def test_bad_input_is_named(call, said):
+    session = LatticeSession.of(engine(method="euler", step=1e-4), held=HELD)
+    with pytest.raises(InputError) as caught:
+        call(session)
+    assert said in str(caught.value)
+    session.advance(PUSH)

@@ -1,0 +1,244 @@
+"""The way from a folder of measurements to a model, predictions and pages, and what happens when it is left early."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from virtual_press import COARSE, KNOWN, OPENINGS_MM, TRUTH, Press, stop_at
+
+import naibu
+from naibu.core.errors import ConvergenceError, InputError
+from naibu.core.status import Status
+from naibu.io.files import atomic
+from naibu.viewer.result_page.payload import report_json
+from naibu.viewer.result_page.reading import report_from_json
+from naibu.workflows import identify
+from naibu.workflows.report_content import prediction_scene, trial_scene
+from naibu.workflows.result_folder import CHECKPOINT_FILE, MODEL_FILE
+
+STATE = {"press": ["pressed"]}
+
+
+def identified(folder: Path, out: Path, **options: object) -> identify.Identification:
+    return identify.identify(folder, known=KNOWN, settings=COARSE, states=STATE, out=out, **options)  # type: ignore[arg-type]
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+def names(folder: Path) -> set[str]:
+    return set(os.listdir(folder))
+
+
+def test_the_true_parameters_lie_near_the_identified_ones(press: Press) -> None:
+    model = press.identification.model
+    for name, value in TRUTH.items():
+        p = next(q for q in model.parameters if q.name == name)
+        if not p.fixed:  # the elements are coarse; four standard deviations allow for that
+            assert abs(p.inner(value) - p.inner(p.value)) < 4.0 * model.standard_deviation(name)
+    assert press.identification.calibration.match.status is Status.CONVERGED
+
+
+def test_results_are_complete(press: Press) -> None:
+    expected = {"model.json", "identification.json", "residuals.csv", "report.html", "report.json", "press_pressed.vtkhdf"}
+    assert names(press.results) == expected
+    summary = json.loads((press.results / "identification.json").read_text(encoding="utf-8"))
+    trial = summary["trials"]["press/pressed"]
+    assert summary["status"] == "CONVERGED" and trial["markers"] == 125
+    assert 0.8 < summary["noise_factor"] < 1.3
+    assert trial["rms_3d_mm"] == pytest.approx(np.sqrt(sum(trial[f"rms_{a}_mm"] ** 2 for a in "xyz")))
+    assert trial["rms_3d_mm"] < trial["baselines_rms_3d_mm"]["affine"] < trial["baselines_rms_3d_mm"]["rigid"]
+    plate, table = (trial["reactions_mN"][name] for name in ("indenter of acrylic", "base of table"))
+    np.testing.assert_allclose(plate, np.negative(table), atol=1e-4 * abs(table[2]))
+
+
+def test_files_and_page_tell_predicted_minus_measured(press: Press) -> None:
+    calibration = press.identification.calibration
+    fit, trial = calibration.match.fits[0], calibration.trials[0]
+    table = rows(press.results / "residuals.csv")
+    written = np.array([[float(r[f"residual_{a}_mm"]) for a in "xyz"] for r in table])
+    np.testing.assert_allclose(written, fit.predicted - trial.measured, atol=1e-4)
+    scene = trial_scene(trial, fit, press.identification.model.parameters.values())
+    # the scene stands in the object's frame; distances do not care
+    np.testing.assert_allclose(np.linalg.norm(scene.residual_mm, axis=1), np.linalg.norm(fit.residual, axis=1), atol=1e-9)
+    np.testing.assert_allclose(fit.pose.undone(fit.predicted), scene.steps[-1].markers, atol=1e-9)
+    stored = report_from_json((press.results / "report.json").read_text(encoding="utf-8"))
+    np.testing.assert_allclose(stored.scenes[0].residual_mm, scene.residual_mm, atol=1e-3)
+
+
+def test_the_model_survives_its_file(press: Press) -> None:
+    text = (press.results / MODEL_FILE).read_text(encoding="utf-8")
+    model = identify.read_model(press.results)
+    assert model.to_dict() == json.loads(text) == press.identification.model.to_dict()
+    np.testing.assert_array_equal(model.covariance, press.identification.model.covariance)
+
+
+def test_two_runs_write_the_same_bytes(press: Press, tmp_path: Path) -> None:
+    identified(press.folder, tmp_path)
+    for name in ("model.json", "identification.json", "residuals.csv", "report.html"):
+        assert (tmp_path / name).read_bytes() == (press.results / name).read_bytes(), name
+
+
+def test_results_name_no_folder(press: Press) -> None:
+    for path in press.results.iterdir():
+        assert str(press.folder.parent).encode() not in path.read_bytes(), path.name
+
+
+def test_every_marker_is_predicted(press: Press, tmp_path: Path) -> None:
+    prediction = identify.predict(press.results / MODEL_FILE, press.folder, state="pressed_more", heights_from_markers=True, out=tmp_path)
+    assert names(tmp_path) == {"predicted.csv", "summary.json", "predicted.html", "predicted.json", "predicted.vtu", "predicted.vtkhdf"}
+    table = rows(tmp_path / "predicted.csv")
+    assert list(table[0]) == ["marker", "x_mm", "y_mm", "z_mm", "sd_mm"]
+    assert [int(r["marker"]) for r in table] == rows_of(press.folder / "initial.csv")
+    assert prediction.opening_mm == pytest.approx(OPENINGS_MM["pressed_more"], abs=0.5)
+    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    assert summary["registered_to_measured"] and not summary["used_to_identify"]
+    measured = {int(r["marker"]): [float(r[f"{a}_mm"]) for a in "xyz"] for r in rows(press.folder / "pressed_more.csv")}
+    error = np.array([[float(r[f"{a}_mm"]) for a in "xyz"] for r in table]) - np.array([measured[int(r["marker"])] for r in table])
+    assert summary["rms_3d_mm"] == pytest.approx(np.sqrt((error**2).sum(axis=1).mean()), abs=2e-3)
+    assert summary["rms_3d_mm"] < 0.6
+    scene = prediction_scene(prediction)
+    np.testing.assert_allclose(np.linalg.norm(scene.residual_mm, axis=1), np.linalg.norm(error, axis=1), atol=2e-3)
+
+
+def rows_of(path: Path) -> list[int]:
+    return [int(r["marker"]) for r in rows(path)]
+
+
+def test_a_prediction_needs_no_measured_state(press: Press, experiment_folder: Path, tmp_path: Path) -> None:
+    (experiment_folder / "pressed_more.csv").unlink()
+    meta = experiment_folder / "meta.toml"
+    meta.write_text(meta.read_text(encoding="utf-8").replace('file = "pressed_more.csv"', "held_out = true"), encoding="utf-8")
+    out = tmp_path / "out"
+    blind = identify.predict(press.results, experiment_folder, state="pressed_more", height_mm=46.0, out=out)
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert not summary["registered_to_measured"] and summary["rms_3d_mm"] is None and summary["markers"] == 0
+    seen = identify.predict(press.results, press.folder, state="pressed_more", height_mm=46.0)
+    # without a measured state positions stand in the free scan's frame: the same shape, elsewhere
+    for points in (blind.points, seen.points):
+        points -= points.mean(axis=0)
+    np.testing.assert_allclose(np.linalg.svd(blind.points)[1], np.linalg.svd(seen.points)[1], rtol=1e-6)
+
+
+def test_a_prediction_may_share_the_folder_of_its_model(press: Press, tmp_path: Path) -> None:
+    identified(press.folder, tmp_path)
+    before = {name: (tmp_path / name).read_bytes() for name in names(tmp_path)}
+    identify.predict(tmp_path, press.folder, state="pressed_more", out=tmp_path)
+    assert {name: (tmp_path / name).read_bytes() for name in before} == before
+
+
+def test_pages_are_written_again_without_experiments(press: Press, tmp_path: Path) -> None:
+    stored = (press.results / "report.json").read_text(encoding="utf-8")
+    (tmp_path / "report.json").write_text(stored, encoding="utf-8")
+    assert identify.report(tmp_path) == [tmp_path / "report.html"]
+    assert (tmp_path / "report.html").read_bytes() == (press.results / "report.html").read_bytes()
+    assert report_json(report_from_json(stored)) == stored
+    (tmp_path / "report.json").write_text(stored[: len(stored) // 2], encoding="utf-8")
+    with pytest.raises(InputError, match=r"report\.json.*not JSON"):
+        identify.report(tmp_path)
+    (tmp_path / "report.json").write_text(stored.replace('"role"', '"rule"'), encoding="utf-8")
+    with pytest.raises(InputError, match=r"scenes\[0\]"):
+        identify.report(tmp_path)
+
+
+def test_experiments_are_predicted_from_each_other(press: Press, experiment_folder: Path, tmp_path: Path) -> None:
+    other = experiment_folder.rename(tmp_path / "sister")
+    found = identify.identify([press.folder, other], known=KNOWN, settings=COARSE, states=STATE, cross_validate=True)
+    assert {(r.experiment, r.state) for r in found.left_out} == {("press", "pressed"), ("sister", "pressed"), ("sister", "pressed_more")}
+    assert all(r.rms_mm < 0.6 for r in found.left_out)
+
+
+def test_an_interrupted_search_keeps_the_best_and_goes_on(press: Press, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        stop_at(patch, 3)
+        found = identified(press.folder, tmp_path)
+    assert found.interrupted and found.calibration.match.status is Status.INTERRUPTED
+    assert "Interrupted" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    # the half-way model predicts
+    identify.predict(tmp_path, press.folder, state="pressed_more")
+    again = identified(press.folder, tmp_path)
+    # the poses are registered anew, which may only help
+    assert again.calibration.match.history[0] <= found.calibration.match.history[-1] * 1.001
+    assert_same_result(again, press, tmp_path)
+
+
+def assert_same_result(found: identify.Identification, press: Press, out: Path) -> None:
+    assert not found.interrupted and CHECKPOINT_FILE not in names(out)
+    reference, values = press.identification.model, found.model.parameters.values()
+    for p in reference.parameters.free:
+        # a search ends where the next step would lower chi squared by 0.12 at most, that is, within 0.35 standard deviations
+        assert abs(p.inner(values[p.name]) - p.inner(p.value)) < 0.4 * reference.standard_deviation(p.name)
+
+
+def test_an_interruption_before_there_is_a_result_goes_on_too(press: Press, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        stop_at(patch, 1)
+        with pytest.raises(KeyboardInterrupt):
+            identified(press.folder, tmp_path)
+    assert names(tmp_path) <= {CHECKPOINT_FILE}
+    assert_same_result(identified(press.folder, tmp_path), press, tmp_path)
+
+
+@pytest.mark.parametrize("changed", ["settings", "damaged", "refused"])
+def test_a_checkpoint_of_something_else_is_not_used(press: Press, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changed: str) -> None:
+    with monkeypatch.context() as patch:
+        stop_at(patch, 3)
+        identified(press.folder, tmp_path)
+    file = tmp_path / CHECKPOINT_FILE
+    if changed == "settings":
+        file.write_text(file.read_text(encoding="utf-8").replace('"glued"', '"sliding"'), encoding="utf-8")
+    elif changed == "damaged":
+        file.write_text("{", encoding="utf-8")
+    again = identified(press.folder, tmp_path, resume=changed != "refused")
+    assert again.calibration.match.history == press.identification.calibration.match.history
+
+
+def test_an_interruption_while_comparing_loses_nothing(press: Press, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(identify, "baselines", interrupted)
+    found = identified(press.folder, tmp_path)
+    assert found.interrupted and CHECKPOINT_FILE in names(tmp_path)
+    assert (tmp_path / MODEL_FILE).read_bytes() == (press.results / MODEL_FILE).read_bytes()
+
+
+def test_an_experiment_left_out_that_cannot_be_predicted_loses_nothing(
+    press: Press, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*arguments: object, **options: object) -> None:
+        raise ConvergenceError("no way")
+
+    monkeypatch.setattr(identify, "leave_one_out", failing)
+    with pytest.raises(ConvergenceError, match="no way"):
+        identified(press.folder, tmp_path, cross_validate=True)
+    assert (tmp_path / MODEL_FILE).read_bytes() == (press.results / MODEL_FILE).read_bytes()
+
+
+@pytest.mark.parametrize("failure", [KeyboardInterrupt(), OSError(28, "No space left on device")])
+def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: BaseException) -> None:
+    file = tmp_path / "model.json"
+    file.write_text("old", encoding="utf-8")
+
+    def failing(_: int) -> None:
+        raise failure
+
+    monkeypatch.setattr(atomic.os, "fsync", failing)
+    with pytest.raises((KeyboardInterrupt, InputError)):
+        atomic.write_atomically(file, "new")
+    assert names(tmp_path) == {"model.json"} and file.read_text(encoding="utf-8") == "old"
+
+
+def test_the_verbs_are_functions_of_the_package() -> None:
+    assert naibu.identify is identify.identify and naibu.predict is identify.predict and naibu.report is identify.report
+    assert naibu.load_experiment("ct_cube_plate").name == "ct_cube_plate" and "ct_cube_plate" in naibu.datasets.names()
+    assert set(naibu.__all__) <= set(dir(naibu))
+    with pytest.raises(AttributeError, match="identify"):
+        _ = naibu.identity

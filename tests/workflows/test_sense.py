@@ -1,0 +1,167 @@
+"""From two scans to fields, numbers and a page."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from naibu.cli import main
+from naibu.core.displacement_field import Field
+from naibu.core.errors import InputError, NaibuError
+from naibu.core.volume import Volume
+from naibu.imaging.measure_displacement import METHODS, rigid_start, sense
+from naibu.io.images import read_displacement, read_volume, write_displacement, write_volume
+from naibu.io.marker_tables import import_markers
+from naibu.io.meshes import read_mesh
+from naibu.validation.specimens.textured_sphere import squeezed_ball
+from naibu.workflows.compare_methods import compare_methods
+from naibu.workflows.sense import read_pair, sense_pair
+
+Array = np.ndarray
+
+
+def at(grid: Volume, points: Array) -> tuple[Array, ...]:
+    """Indices of the voxels at points."""
+    return tuple(np.round(grid.to_index(points)).astype(int).T[::-1])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("scans")
+    before, after, truth, mask = squeezed_ball(seed=3)
+    write_volume(place / "before.mha", before)
+    write_volume(place / "after.nrrd", after)
+    write_volume(place / "mask.nii.gz", before.with_values(mask.astype(np.uint8)))
+    write_displacement(place / "truth.mha", truth, before)
+    return place
+
+
+# what classic methods reach on this pair; the rigid motion alone leaves a bump of 1.5 mm
+@pytest.mark.parametrize(
+    ("method", "most_mm"),
+    [("default", 0.15), ("features", 1.0), ("horn-schunck", 0.3), ("lucas-kanade", 0.4), ("ncc-blocks", 0.6), ("rigid", 0.6)],
+)
+def test_every_method_finds_the_motion(method: str, most_mm: float) -> None:
+    before, after, truth, mask = squeezed_ball(seed=3)
+    sensed = sense(before, after, method=method, mask=mask)  # type: ignore[arg-type]
+    error = np.linalg.norm(sensed.displacement.vectors - truth, axis=-1)[mask & sensed.displacement.valid]
+    assert np.median(error) < most_mm
+    assert np.isnan(sensed.displacement.vectors[~mask]).all()
+
+
+def test_the_default_states_a_covariance_that_holds_the_truth() -> None:
+    before, after, truth, _ = squeezed_ball(seed=3)
+    found = sense(before, after)
+    field = found.field(before, step=3)
+    error = field.vectors - truth[at(before, field.points)]
+    squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(field.covariance), error)
+    assert 0.8 < np.mean(squared < 7.81) <= 1.0  # chi-squared of three degrees of freedom, 95 %
+
+
+def test_the_rigid_start_takes_out_turn_and_shift() -> None:
+    before, after, _, mask = squeezed_ball(seed=3)
+    matches, rigid = rigid_start(before, after, mask)
+    assert len(matches) > 30
+    assert rigid.angle_deg == pytest.approx(3.0, abs=0.7)
+
+
+def test_files_are_what_other_programs_read(folder: Path, tmp_path: Path) -> None:
+    pair = read_pair(folder / "before.mha", folder / "after.nrrd", mask=folder / "mask.nii.gz", truth=folder / "truth.mha")
+    run = sense_pair(pair, out=tmp_path)
+    vectors, grid = read_displacement(tmp_path / "displacement.mha")
+    assert grid.same_grid(pair.before)
+    assert np.allclose(vectors, run.sensed.displacement.vectors, atol=1e-5, equal_nan=True)
+    assert read_mesh(tmp_path / "displacement.vtu").n_cells > 1000
+    stored = np.load(tmp_path / "field.npz")
+    field = Field.from_arrays(stored["points"], stored["vectors"], covariance=stored["covariance"], valid=stored["valid"])
+    assert len(field.points) > 1000
+    before, after = (import_markers(tmp_path / f"{name}.csv") for name in ("initial", "pressed"))
+    assert 100 < len(before) < 400
+    assert np.abs(after.points - before.points - run.sensed.displacement.vectors[at(pair.before, before.points)]).max() < 1e-6
+    told = json.loads((tmp_path / "sense.json").read_text())
+    assert told["figures"]["error, median, mm"] < 0.15
+    assert set(told["inputs"]) == {"before", "after", "mask", "truth"}
+    assert told["inputs"]["after"] == f"after.nrrd, SHA-256 {hashlib.sha256((folder / 'after.nrrd').read_bytes()).hexdigest()}"
+    page = (tmp_path / "report.html").read_text()
+    assert "standard deviation of the displacement" in page
+    assert not re.search(r"(?:src|href)=\"https?:", page)
+
+
+def test_the_same_scans_give_the_same_files(folder: Path, tmp_path: Path) -> None:
+    pair = read_pair(folder / "before.mha", folder / "after.nrrd")
+    for name in ("a", "b"):
+        sense_pair(pair, out=tmp_path / name)
+    for file in ("displacement.mha", "field.npz"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+def test_scans_of_one_name_in_two_folders_are_both_recorded(folder: Path, tmp_path: Path) -> None:
+    for part, file in (("a", "before.mha"), ("b", "mask.nii.gz")):
+        (tmp_path / part).mkdir()
+        write_volume(tmp_path / part / "scan.mha", read_volume(folder / file))
+    inputs = read_pair(tmp_path / "a" / "scan.mha", tmp_path / "b" / "scan.mha").inputs
+    assert inputs["before"] != inputs["after"]
+
+
+def test_a_single_slice_has_all_files_but_the_mesh(folder: Path, tmp_path: Path) -> None:
+    for name in ("before.mha", "after.nrrd"):
+        volume = read_volume(folder / name)
+        middle = Volume.from_array(volume.values[11:12], spacing_mm=volume.spacing_mm)
+        write_volume(tmp_path / name, middle)
+    run = sense_pair(read_pair(tmp_path / "before.mha", tmp_path / "after.nrrd"), method="horn-schunck", out=tmp_path / "out")
+    assert {p.name for p in run.files} == {p.name for p in (tmp_path / "out").iterdir()}
+    assert {"report.html", "displacement.mha", "field.npz", "sense.json"} <= {p.name for p in run.files}
+    assert not (tmp_path / "out" / "displacement.vtu").exists()
+
+
+def test_methods_that_all_fail_say_why(folder: Path, tmp_path: Path) -> None:
+    tiny = write_volume(tmp_path / "tiny.mha", Volume.from_array(np.zeros((6, 6, 6)), spacing_mm=(1, 1, 1)))
+    with pytest.raises(NaibuError):
+        compare_methods(read_pair(tiny, tiny), ["features", "features"], out=tmp_path / "out")
+
+
+def test_scans_on_different_grids_are_refused(folder: Path) -> None:
+    before, after, *_ = squeezed_ball(seed=3)
+    other = Volume.from_array(after.values, spacing_mm=(1.5, 1.5, 1.9))
+    with pytest.raises(InputError, match=r"different grids: 44x40x24 voxels of 1\.5x1\.5x2 mm before"):
+        sense(before, other)
+    with pytest.raises(InputError, match="there is no method 'best'"):
+        sense(before, after, method="best")  # type: ignore[arg-type]
+
+
+def test_a_mask_of_another_scan_is_refused(folder: Path, tmp_path: Path) -> None:
+    write_volume(tmp_path / "mask.mha", Volume.from_array(np.ones((3, 3, 3), np.uint8), spacing_mm=(1, 1, 1)))
+    with pytest.raises(InputError, match=r"mask\.mha has \(3, 3, 3\) voxels"):
+        read_pair(folder / "before.mha", folder / "after.nrrd", mask=tmp_path / "mask.mha")
+
+
+def test_the_verbs(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def run(*arguments: object) -> int:
+        monkeypatch.setattr(sys, "argv", ["naibu", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        return int(end.value.code or 0)
+
+    scanned = (folder / "before.mha", folder / "after.nrrd")
+    assert run("sense", *scanned, "--out", tmp_path / "s", "--method", "horn-schunck") == 0
+    assert (tmp_path / "s" / "report.html").exists()
+    chosen = ("--method", "rigid", "--method", "horn-schunck", "--truth", folder / "truth.mha")
+    assert run("compare-methods", *scanned, *chosen, "--out", tmp_path / "c") == 0
+    rows = json.loads((tmp_path / "c" / "methods.json").read_text())["tables"][0]["rows"]
+    assert [r[0] for r in rows] == ["rigid", "horn-schunck"]
+    assert run("sense", tmp_path / "nothing.mha", scanned[1]) == 2
+    assert "nothing.mha" in capsys.readouterr().err
+
+
+def test_every_method_has_a_place_on_the_command_line() -> None:
+    from typing import get_args
+
+    from naibu.cli.imaging import Method
+
+    assert get_args(Method) == METHODS

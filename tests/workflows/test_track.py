@@ -1,0 +1,127 @@
+"""From scans with beads to an experiment folder that the main job reads."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from marker_scenes import ultrasound
+
+from naibu.cli import main
+from naibu.core.errors import InputError
+from naibu.core.experiment import Layer, Loading, Shape
+from naibu.core.volume import Volume
+from naibu.imaging.preprocessing.resampling import positions
+from naibu.io.experiment_folder.reader import read_experiment
+from naibu.io.images import write_volume
+from naibu.workflows.track import ObjectDescription, track_files
+
+DIAMETER = 3.0
+LATTICE = np.stack(np.meshgrid(*[6.0 + 8.0 * np.arange(n) for n in (4, 4, 3)], indexing="ij"), axis=-1).reshape(-1, 3)
+SQUEEZE = np.diag([1.08, 1.08, 0.8])
+
+
+def beads(where: np.ndarray, seed: int) -> Volume:
+    """Bright beads, blurred by a voxel, in a noisy body."""
+    frame = Volume.from_array(np.zeros((28, 44, 44)), spacing_mm=(0.9, 0.9, 1.0))
+    x = positions(frame)
+    grey = 100.0 + np.random.default_rng(seed).normal(0.0, 8.0, frame.shape)
+    for p in where:
+        grey += 250.0 / (1.0 + np.exp((np.linalg.norm(x - p, axis=-1) - 0.5 * DIAMETER) / 0.35))
+    return frame.with_values(grey)
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    place = tmp_path_factory.mktemp("beads")
+    jitter = np.random.default_rng(0).uniform(-0.8, 0.8, LATTICE.shape)
+    files = []
+    for name, where in (("free", LATTICE + jitter), ("pressed", (LATTICE + jitter) @ SQUEEZE)):
+        np.save(place / f"{name}.npy", where)
+        volume = beads(where, len(files))
+        files.append(write_volume(place / f"{name}.nii.gz", volume.with_values(volume.values.astype(np.float32))))
+    return files
+
+
+def test_an_experiment_folder_comes_out(scans: list[Path], tmp_path: Path) -> None:
+    layers = (Layer("soft", 0.0, 14.0), Layer("firm", 14.0, 28.0))
+    described = ObjectDescription(Shape("box", (36.0, 36.0, 28.0)), Loading("plate"), layers, {"pressed": 22.0})
+    run = track_files(scans, out=tmp_path / "mine", diameter_mm=DIAMETER, description=described)
+    experiment = read_experiment(tmp_path / "mine")
+    assert experiment.layers == layers
+    assert experiment.loaded_states[0].stated_mm == 22.0
+    before, after = experiment.initial.points, experiment.loaded_states[0].markers.points
+    truth = np.load(scans[0].with_name("free.npy"))
+    nearest = np.linalg.norm(before[:, None] - truth[None], axis=-1)
+    assert len(before) == len(LATTICE)
+    assert nearest.min(axis=1).max() < 0.15
+    # the same number is the same bead
+    assert np.abs(after - truth[nearest.argmin(axis=1)] @ SQUEEZE).max() < 0.2
+    told = json.loads((tmp_path / "mine" / "tracking.json").read_text())
+    assert [row[2] for row in told["tables"][0]["rows"]] == [len(LATTICE)] * 2
+    assert set(told["settings"]) >= {"scan of initial", "scan of pressed"}
+    assert "SHA-256" in told["settings"]["scan of pressed"]
+    assert run.page.read_text().startswith("<!doctype html>")
+    # the identification learns how certain the places are
+    assert (experiment.xy_step_mm, experiment.z_step_mm) == pytest.approx(run.tracked.steps_mm)
+    sd = np.nanmedian(run.tracked.sd_mm[..., 2])
+    assert experiment.z_step_mm == pytest.approx(np.sqrt(12.0) * sd, rel=1e-6)
+
+
+def test_tables_alone_where_nothing_is_told_of_the_object(scans: list[Path], tmp_path: Path) -> None:
+    track_files(scans, out=tmp_path / "tables", diameter_mm=DIAMETER)
+    assert {p.name for p in (tmp_path / "tables").iterdir()} == {"initial.csv", "pressed.csv", "tracking.html", "tracking.json"}
+
+
+def test_mistakes_are_named(scans: list[Path], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="two scans would both be the state 'pressed'"):
+        track_files([*scans, scans[1]], out=tmp_path / "a", diameter_mm=DIAMETER)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="is not an empty folder"):
+        track_files(scans, out=tmp_path / "full", diameter_mm=DIAMETER)
+    small = write_volume(tmp_path / "small.mha", Volume.from_array(np.ones((3, 3, 3), np.uint8), spacing_mm=(1, 1, 1)))
+    with pytest.raises(InputError, match=r"small\.mha does not lie on the grid of free\.nii\.gz"):
+        track_files(scans, out=tmp_path / "b", diameter_mm=DIAMETER, mask=small)
+    assert not (tmp_path / "a").exists()
+    assert not (tmp_path / "b").exists()
+
+
+def test_the_verb(scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def run(*arguments: object) -> int:
+        monkeypatch.setattr(sys, "argv", ["naibu", "track", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        return int(end.value.code or 0)
+
+    options = ("--diameter-mm", DIAMETER, "--size-mm", 36, 36, 28, "--layer", "gel=0..28", "--stated-mm", "pressed=22")
+    assert run(*scans, *options, "--out", tmp_path / "exp") == 0
+    assert f"naibu identify {tmp_path / 'exp'}" in capsys.readouterr().out
+    assert read_experiment(tmp_path / "exp").materials == ("gel",)
+    assert run(*scans, "--diameter-mm", DIAMETER, "--layer", "gel=0..28", "--out", tmp_path / "no") == 2
+    assert "--size-mm" in capsys.readouterr().err
+
+
+def test_a_sequence_becomes_a_table_of_tracks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    echoes = ultrasound(seed=1, frames=40)
+    stack = write_volume(tmp_path / "cine.mha", Volume.from_array(echoes.frames, spacing_mm=(1.0, 1.0, 1.0)))
+    arguments = [stack, "--pixel-mm", echoes.pixel_mm, "--diameter-mm", 2.0, "--frame-rate-hz", 24.6, "--count", 5, "--out", tmp_path / "t"]
+    monkeypatch.setattr(sys, "argv", ["naibu", "track-sequence", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert not end.value.code
+    assert "tracks.csv" in capsys.readouterr().out
+    with (tmp_path / "t" / "tracks.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 40 * 5
+    assert float(rows[-1]["time_s"]) == pytest.approx(39 / 24.6, abs=1e-5)
+    found = np.array([[float(r["x_mm"]), float(r["y_mm"])] for r in rows]).reshape(40, 5, 2)
+    seen = np.array([r["seen"] == "1" for r in rows]).reshape(40, 5)
+    off = np.linalg.norm(found - echoes.truth, axis=-1)
+    assert off[seen].max() < 0.3
+    assert seen.mean() > 0.8
+    assert (tmp_path / "t" / "tracks.html").exists()
