@@ -12,7 +12,7 @@ import time
 import numpy as np
 
 from naibu.identification.from_markers.calibration import calibrate
-from naibu.identification.from_markers.known_materials import Knowledge
+from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
 from naibu.identification.from_markers.parameter_names import poisson_ratio, young_modulus
 from naibu.identification.from_markers.specimen_model import ModelSettings
@@ -33,7 +33,10 @@ def main() -> None:
     for seed in range(draws):
         data = virtual.scanned(seed=seed, scanner=Scanner(placing_mm=NOISE_MM, xy_step_mm=0.0, z_step_mm=0.0))
         found = calibrate(
-            [data.experiment], knowledge=Knowledge({"stiff": 222.0}), noise=NoiseModel(NOISE_MM), start={young_modulus("soft"): 120.0}
+            [data.experiment],
+            known_materials=KnownMaterials({"stiff": 222.0}),
+            noise=NoiseModel(NOISE_MM),
+            start={young_modulus("soft"): 120.0},
         )
         model = CalibratedModel.of(found)
         values = model.parameters.values()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from naibu.core.mesh import Mesh
 from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
-from naibu.mechanics.linear_algebra.block_matrix import constrained
+from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
 from naibu.mechanics.linear_algebra.direct import PardisoSolver, SuperLUSolver
 from naibu.mechanics.linear_algebra.protocols import Factorization, LinearSolver
 from naibu.meshing.element_conversion import to_tetra
@@ -92,17 +92,17 @@ def newton(case: Case, forces: Callable[[Array], Array], tangent: Callable[[Arra
     support, u, count = prescribed(case), np.zeros_like(case.mesh.points), 0
     linear = SuperLUSolver() if solver == "superlu" else Cholesky()
     for step in range(1, STEPS + 1):
-        jump = np.where(support.held, step / STEPS * support.values - u, 0.0)
+        jump = np.where(support.constrained, step / STEPS * support.values - u, 0.0)
         r = forces(u)
         for _ in range(20):
             matrix = tangent(u)
             rhs = r + (matrix @ jump.ravel()).reshape(-1, 3)
-            rhs[support.held] = 0.0
-            matrix = constrained(matrix, support.held)
+            rhs[support.constrained] = 0.0
+            matrix = with_dirichlet_rows(matrix, support.constrained)
             u = u + jump - linear.factorize(matrix).solve(rhs.ravel()).reshape(-1, 3)
             jump[:] = 0.0
             count += 1
             r = forces(u)
-            if np.abs(r[~support.held]).sum() <= TOLERANCE * np.abs(r[support.held]).sum():
+            if np.abs(r[~support.constrained]).sum() <= TOLERANCE * np.abs(r[support.constrained]).sum():
                 break
     return Result(u, forces(u)[case.top].sum(axis=0), count)

@@ -13,7 +13,7 @@ from fe_case import Case, Result, pardiso, prescribed
 from fe_driver import JAX_FEM, Peer, main
 from fe_linear_peers import LOWERED
 
-from naibu.mechanics.linear_algebra.block_matrix import constrained
+from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 
 
@@ -25,8 +25,8 @@ def run_naibu_direct(case: Case) -> Result:
     """Naibu's assembly with the solver that the peers are given."""
     support = prescribed(case, LOWERED)
     matrix = LinearBody.of(case.mesh).stiffness(case.lame, case.shear)
-    rhs = np.where(support.held.ravel(), 0.0, -(matrix @ support.values.ravel()))
-    matrix = constrained(matrix, support.held)
+    rhs = np.where(support.constrained.ravel(), 0.0, -(matrix @ support.values.ravel()))
+    matrix = with_dirichlet_rows(matrix, support.constrained)
     return Result(support.values + pardiso(matrix).factorize(matrix).solve(rhs).reshape(-1, 3))
 
 

@@ -16,7 +16,7 @@ import fe_peers
 import numpy as np
 from fe_case import POISSON, SIDE, SOFT, STIFF, Array, Case, Cholesky, Result, largest_residual, prescribed
 
-from naibu.mechanics.linear_algebra.block_matrix import constrained
+from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
 
 LOWERED = 3.0  # mm
 
@@ -34,7 +34,7 @@ def run_scikit_fem(case: Case, solver: str) -> Result:
     basis = skfem.Basis(skfem.MeshTet(case.mesh.points.T, case.mesh.cells.T), skfem.ElementVector(skfem.ElementTetP1()), intorder=0)
     stiffness = linear_elasticity(case.lame[:, None], case.shear[:, None]).assemble(basis)
     support = prescribed(case, LOWERED)
-    system = skfem.condense(stiffness, x=support.values.ravel(), D=np.flatnonzero(support.held))
+    system = skfem.condense(stiffness, x=support.values.ravel(), D=np.flatnonzero(support.constrained))
     return Result(skfem.solve(*system, **({"solver": cholesky} if solver == "pardiso" else {})).reshape(-1, 3))
 
 
@@ -68,7 +68,7 @@ def run_ngsolve(case: Case) -> Result:
     form = ng.BilinearForm(space, symmetric=True)
     form += (2 * mu * ng.InnerProduct(strain, virtual) + lame * ng.Trace(strain) * ng.Trace(virtual)) * ng.dx
     support = prescribed(case, LOWERED)
-    free = fe_peers.ngsolve_free(support.held.all(axis=1))
+    free = fe_peers.ngsolve_free(support.constrained.all(axis=1))
     solution = ng.GridFunction(space).vec
     solution.FV().NumPy()[:] = support.values.ravel()
     with ng.TaskManager():
@@ -119,8 +119,8 @@ def run_tatva(case: Case) -> Result:
     support = prescribed(case, LOWERED)
     matrix = stiffness(jnp.zeros(support.values.size), *data).to_csr().tobsr((3, 3))
     rhs = -(matrix @ support.values.ravel())
-    rhs[support.held.ravel()] = 0.0
-    return Result(support.values + Cholesky().factorize(constrained(matrix, support.held)).solve(rhs).reshape(-1, 3))
+    rhs[support.constrained.ravel()] = 0.0
+    return Result(support.values + Cholesky().factorize(with_dirichlet_rows(matrix, support.constrained)).solve(rhs).reshape(-1, 3))
 
 
 def run_jax_fem(case: Case, solver: str) -> Result:
@@ -161,5 +161,5 @@ def run_torch_fem(case: Case, method: str) -> Result:
     law = IsotropicElasticity3D(young, torch.full_like(young, POISSON))
     body = Solid(torch.as_tensor(case.mesh.points), torch.as_tensor(case.mesh.cells), law)
     support = prescribed(case, LOWERED)
-    body.constraints, body.displacements = torch.as_tensor(support.held), torch.as_tensor(support.values)
+    body.constraints, body.displacements = torch.as_tensor(support.constrained), torch.as_tensor(support.values)
     return Result(body.solve(method=method, aggregate_integration_points=False)[0].numpy())

@@ -18,7 +18,7 @@ import numpy as np
 import scipy.sparse as sp
 from fe_case import DEPTH, SIDE, STEPS, TOLERANCE, Array, Case, Cholesky, Result, largest_residual, newton, prescribed
 
-from naibu.mechanics.linear_algebra.block_matrix import constrained
+from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
 
 
 @functools.cache
@@ -110,12 +110,12 @@ def ngsolve_mesh(case: Case) -> tuple[Any, Any, Any]:
     return mesh, mu, lame
 
 
-def ngsolve_free(held: Any) -> Any:
+def ngsolve_free(constrained: Any) -> Any:
     """Return the unknowns that are not held, for NGSolve."""
     import ngsolve as ng
 
-    free = ng.BitArray(held.size)
-    for dof, fixed in enumerate(held):
+    free = ng.BitArray(constrained.size)
+    for dof, fixed in enumerate(constrained):
         free[dof] = not fixed
     return free
 
@@ -132,8 +132,8 @@ def run_ngsolve(case: Case) -> Result:
     form = ng.BilinearForm(space, symmetric=True)
     form += ng.Variation(energy.Compile() * ng.dx)
     support, count = prescribed(case), 0
-    held = support.held.T.ravel()  # unknowns stand component after component
-    free = ngsolve_free(held)
+    constrained = support.constrained.T.ravel()  # unknowns stand component after component
+    free = ngsolve_free(constrained)
     u, r, jump = (ng.GridFunction(space).vec for _ in range(3))
 
     def residual() -> Array:
@@ -143,7 +143,7 @@ def run_ngsolve(case: Case) -> Result:
     with ng.TaskManager():
         for step in range(1, STEPS + 1):
             target = step / STEPS * support.values.T.ravel()
-            jump.FV().NumPy()[:] = np.where(held, target - u.FV().NumPy(), 0.0)
+            jump.FV().NumPy()[:] = np.where(constrained, target - u.FV().NumPy(), 0.0)
             force = residual()
             for _ in range(20):
                 form.AssembleLinearization(u)
@@ -152,7 +152,7 @@ def run_ngsolve(case: Case) -> Result:
                 jump[:] = 0.0
                 count += 1
                 force = residual()
-                if np.abs(force[~held]).sum() <= TOLERANCE * np.abs(force[held]).sum():
+                if np.abs(force[~constrained]).sum() <= TOLERANCE * np.abs(force[constrained]).sum():
                     break
     displacement = np.array(u.FV().NumPy()).reshape(3, -1).T
     return Result(displacement, np.array(force).reshape(3, -1).T[case.top].sum(axis=0), count)
@@ -173,14 +173,14 @@ def jax_fem_ends(depth: float) -> list[Any]:
 
 def jax_fem_linear(case: Case) -> Callable[..., Array]:
     """Return naibu's direct solver for JAX-FEM; the rows of held nodes, which it replaces, are made symmetric again."""
-    held, cholesky = prescribed(case).held, Cholesky()
+    constrained, cholesky = prescribed(case).constrained, Cholesky()
 
     def linear(matrix: Any, b: Any, start: Any, _: Any) -> Array:
         indptr, indices, data = matrix.getValuesCSR()
         square, moved = sp.csr_matrix((data, indices, indptr), shape=matrix.getSize()), np.asarray(start)
         rhs = np.asarray(b) - square @ moved
-        rhs[held.ravel()] = 0.0
-        return moved + cholesky.factorize(constrained(square.tobsr((3, 3)), held)).solve(rhs)
+        rhs[constrained.ravel()] = 0.0
+        return moved + cholesky.factorize(with_dirichlet_rows(square.tobsr((3, 3)), constrained)).solve(rhs)
 
     return linear
 
@@ -300,7 +300,7 @@ def run_torch_fem(case: Case, method: str) -> Result:
     law = Hyperelastic3D(energy, torch.as_tensor(np.stack([case.shear, case.lame], axis=1)))
     body = Counted(torch.as_tensor(case.mesh.points), torch.as_tensor(case.mesh.cells), law)
     support = prescribed(case)
-    body.constraints = torch.as_tensor(support.held)
+    body.constraints = torch.as_tensor(support.constrained)
     body.displacements = torch.as_tensor(support.values)
     levels = torch.tensor([0.0, 1 / 3, *range(1, STEPS + 1)]) / STEPS
     u, force, *_ = body.solve(increments=levels, rtol=0.0, atol=largest_residual(case), method=method, aggregate_integration_points=False)

@@ -50,7 +50,7 @@ def noisy(body: PushedBody, states: Sequence[Array], noise: float, seed: int) ->
     for k, u in enumerate(states):
         sd = noise * float(np.linalg.norm(u, axis=1).max())
         field = Field.from_arrays(body.mesh.points, u + sd * rng.standard_normal(u.shape), sd_mm=sd)
-        out.append(FieldTrial.of(f"push {k + 1}", field, body.mesh, loaded=body.held))
+        out.append(FieldTrial.of(f"push {k + 1}", field, body.mesh, loaded=body.constrained))
     return out
 
 

@@ -25,7 +25,7 @@ import warp
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.gpu.engine import WarpLatticeEngine
 from naibu.mechanics.lattices.model.lattice import Lattice, box_mask, classic_lattice, lattice_parameters
-from naibu.mechanics.lattices.model.state import HeldNodes, Motion, explicit_step_limit
+from naibu.mechanics.lattices.model.state import ConstrainedNodes, Motion, explicit_step_limit
 
 SIDE_MM, MASS_KG = 80.0, 0.63
 GENTLE = (0.03, 0.002, 0.003)  # K, C1, C2 at 9^3 masses
@@ -48,11 +48,13 @@ def peak_gb() -> float:
     return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) / 2**20
 
 
-def pushed(lattice: Lattice) -> tuple[HeldNodes, np.ndarray]:
+def pushed(lattice: Lattice) -> tuple[ConstrainedNodes, np.ndarray]:
     """Return a floor and a stamp of 20 mm on the top, and their velocities."""
     x, y, z = lattice.points.T
     stamp = (z > SIDE_MM - 0.1) & (np.abs(x - 40.0) < 10.1) & (np.abs(y - 40.0) < 10.1)
-    return HeldNodes.of(np.flatnonzero(z < 0.1), 0) + HeldNodes.of(np.flatnonzero(stamp), 1), np.array([[0, 0, 0], [0, 0, -20.0]])
+    return ConstrainedNodes.of(np.flatnonzero(z < 0.1), 0) + ConstrainedNodes.of(np.flatnonzero(stamp), 1), np.array(
+        [[0, 0, 0], [0, 0, -20.0]]
+    )
 
 
 def differences(one: Motion, other: Motion) -> str:
@@ -69,11 +71,11 @@ def row(name: str, seconds: float, told: str = "") -> None:
 def explicit(lattice: Lattice, n: int, device: str, steps: int, repeats: int, cpu: bool) -> None:
     parameters = lattice_parameters(lattice, *(p * 8.0 / n for p in GENTLE))
     step = 0.5 * explicit_step_limit(lattice, parameters)
-    held, velocity = pushed(lattice)
+    constrained, velocity = pushed(lattice)
     for precision in ("double", "single"):
         options: dict[str, Any] = {"step": step, "method": "euler", "precision": precision}
         built, engine = clocked(lambda options=options: WarpLatticeEngine.of(lattice, parameters, device=device, **options))
-        session = engine.session(None, held)
+        session = engine.session(None, constrained)
         session.advance(32, velocity)
         taken = least(lambda session=session: session.advance(steps, velocity), repeats) / steps
         entries, size = 2 * lattice.n_elements, 8 if precision == "double" else 4
@@ -84,32 +86,32 @@ def explicit(lattice: Lattice, n: int, device: str, steps: int, repeats: int, cp
             continue
         built, reference = clocked(lambda options=options: LatticeEngine.of(lattice, parameters, **options))
         start = reference.rest()
-        least(lambda reference=reference, start=start: reference.run(start, 1, held, velocity), 1)
-        call = least(lambda reference=reference, start=start: reference.run(start, 0, held, velocity), repeats)
-        whole = least(lambda reference=reference, start=start: reference.run(start, steps, held, velocity), repeats)
-        expected = reference.run(start, steps, held, velocity)
-        told = f"{differences(engine.run(engine.rest(), steps, held, velocity), expected)} apart; prepared in {built:.1f} s"
+        least(lambda reference=reference, start=start: reference.run(start, 1, constrained, velocity), 1)
+        call = least(lambda reference=reference, start=start: reference.run(start, 0, constrained, velocity), repeats)
+        whole = least(lambda reference=reference, start=start: reference.run(start, steps, constrained, velocity), repeats)
+        expected = reference.run(start, steps, constrained, velocity)
+        told = f"{differences(engine.run(engine.rest(), steps, constrained, velocity), expected)} apart; prepared in {built:.1f} s"
         row(f"processor, explicit, {precision}, {reference.threads} thread(s)", (whole - call) / steps, told)
 
 
 def implicit(lattice: Lattice, device: str, steps: int, repeats: int, cpu: bool) -> None:
     parameters = lattice_parameters(lattice, *STIFF)
-    held, velocity = pushed(lattice)
+    constrained, velocity = pushed(lattice)
     engine = WarpLatticeEngine.of(lattice, parameters, device=device)
-    session = engine.session(None, held)
+    session = engine.session(None, constrained)
     session.advance(2, velocity)
     before = session.iterations
     taken = least(lambda: session.advance(steps, velocity), repeats) / steps
     row(f"{device}, implicit", taken, f"{(session.iterations - before) / (steps * repeats):.1f} iterations")
     if cpu:
         reference = LatticeEngine.of(lattice, parameters)
-        start = reference.run(reference.rest(), 2, held, velocity).state
-        call = least(lambda: reference.run(start, 0, held, velocity), repeats)
-        whole = least(lambda: reference.run(start, steps, held, velocity), repeats)
+        start = reference.run(reference.rest(), 2, constrained, velocity).state
+        call = least(lambda: reference.run(start, 0, constrained, velocity), repeats)
+        whole = least(lambda: reference.run(start, steps, constrained, velocity), repeats)
         row(
             "processor, implicit, 1 thread",
             (whole - call) / steps,
-            f"{reference.run(start, steps, held, velocity).iterations:.1f} iterations",
+            f"{reference.run(start, steps, constrained, velocity).iterations:.1f} iterations",
         )
 
 

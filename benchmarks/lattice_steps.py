@@ -25,7 +25,7 @@ from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.coefficients import explicit_coefficients
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters, box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.octree import octree_lattice
-from naibu.mechanics.lattices.model.state import HeldNodes
+from naibu.mechanics.lattices.model.state import ConstrainedNodes
 from naibu.mechanics.lattices.simulation.adjoint import push_gradient, recorded_push
 from naibu.mechanics.lattices.simulation.session import LatticeSession
 
@@ -85,27 +85,29 @@ def numpy_steps(lattice: Lattice, coefficients: tuple[np.ndarray, ...], steps: i
         x, v = x + STEP_S * v, v + STEP_S * np.stack(force, axis=1) / lattice.node_mass[:, None]
 
 
-def pushed(lattice: Lattice) -> tuple[HeldNodes, np.ndarray]:
+def pushed(lattice: Lattice) -> tuple[ConstrainedNodes, np.ndarray]:
     """Return a floor that holds the lowest masses and a stamp of 20 mm on the top, and their velocities."""
     x, y, z = lattice.points.T
     stamp = (z > SIDE_MM - 0.1) & (np.abs(x - 40.0) < 10.1) & (np.abs(y - 40.0) < 10.1)
-    return HeldNodes.of(np.flatnonzero(z < 0.1), 0) + HeldNodes.of(np.flatnonzero(stamp), 1), np.array([[0, 0, 0], [0, 0, -20.0]])
+    return ConstrainedNodes.of(np.flatnonzero(z < 0.1), 0) + ConstrainedNodes.of(np.flatnonzero(stamp), 1), np.array(
+        [[0, 0, 0], [0, 0, -20.0]]
+    )
 
 
 def timed(lattice: Lattice, parameters: LatticeParameters, steps: int, repeats: int, **options: object) -> tuple[float, float, float]:
     engine = LatticeEngine.of(lattice, parameters, step=STEP_S, **options)  # type: ignore[arg-type]
-    held, velocity = pushed(lattice)
+    constrained, velocity = pushed(lattice)
     start = engine.rest()
-    start = engine.run(start, steps, held, velocity).state  # not from rest
-    iterations = engine.run(start, steps, held, velocity).iterations
-    call = least(lambda: engine.run(start, 0, held, velocity), 1, repeats)
-    whole = least(lambda: engine.run(start, steps, held, velocity), 1, repeats)
+    start = engine.run(start, steps, constrained, velocity).state  # not from rest
+    iterations = engine.run(start, steps, constrained, velocity).iterations
+    call = least(lambda: engine.run(start, 0, constrained, velocity), 1, repeats)
+    whole = least(lambda: engine.run(start, steps, constrained, velocity), 1, repeats)
     return (whole[0] - call[0]) / steps, (whole[1] - call[1]) / steps, iterations
 
 
 def in_session(lattice: Lattice, parameters: LatticeParameters, steps: int, repeats: int, **options: object) -> tuple[float, float]:
-    held, velocity = pushed(lattice)
-    with LatticeSession.of(LatticeEngine.of(lattice, parameters, step=STEP_S, **options), held=held) as session:  # type: ignore[arg-type]
+    constrained, velocity = pushed(lattice)
+    with LatticeSession.of(LatticeEngine.of(lattice, parameters, step=STEP_S, **options), constrained=constrained) as session:  # type: ignore[arg-type]
 
         def one_by_one() -> None:
             for _ in range(steps):
@@ -144,10 +146,14 @@ def sizes(n: int, repeats: int) -> None:
             row(f"explicit, {precision}, {threads} thread(s)", cpu, wall, told)
     for threads in team:
         row(f"explicit, session, {threads} thread(s)", *in_session(lattice, gentle, steps, repeats, method="euler", threads=threads))
-    held, velocity = pushed(lattice)
+    constrained, velocity = pushed(lattice)
     engine = LatticeEngine.of(lattice, gentle, method="euler", threads=1)
     state = engine.rest()
-    row("run without steps", *least(lambda: engine.run(state, 0, held, velocity), 1, repeats), "conversion of the state, not in the rows")
+    row(
+        "run without steps",
+        *least(lambda: engine.run(state, 0, constrained, velocity), 1, repeats),
+        "conversion of the state, not in the rows",
+    )
     few = max(5, steps // 5)
     cpu, wall, iterations = timed(lattice, stiff, few, max(2, repeats // 4))
     row("implicit, 1 thread", cpu, wall, f"{iterations:.1f} iterations")
@@ -171,9 +177,9 @@ def jitter(n: int, rate: float, **options: object) -> None:
     """Print how much single steps of a session differ while a core is busy, in a tight loop or at a rate, Hz."""
     lattice = classic_lattice(box_mask((n,) * 3), SIDE_MM / n, total_mass_kg=MASS_KG)
     factors = STIFF if options["method"] == "implicit" else tuple(p * 8.0 / n for p in GENTLE)
-    held, velocity = pushed(lattice)
+    constrained, velocity = pushed(lattice)
     engine = LatticeEngine.of(lattice, lattice_parameters(lattice, *factors), step=STEP_S, **options)  # type: ignore[arg-type]
-    with LatticeSession.of(engine, held=held) as session:
+    with LatticeSession.of(engine, constrained=constrained) as session:
         session.advance(velocity, 5)
         busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
         try:
@@ -196,12 +202,12 @@ def jitter(n: int, rate: float, **options: object) -> None:
 def gradients(repeats: int) -> None:
     lattice = classic_lattice(box_mask((8, 8, 8)), 10.0, total_mass_kg=MASS_KG)
     engine = LatticeEngine.of(lattice, lattice_parameters(lattice, *GENTLE), step=STEP_S, method="symplectic_euler")
-    held, velocity = pushed(lattice)
+    constrained, velocity = pushed(lattice)
     path = np.zeros((2500, 2, 3))
     path[:500] = velocity
 
     def gradient() -> float:
-        push = recorded_push(engine, engine.rest(), [500, 1000, 1500, 2000, 2500], held, path)
+        push = recorded_push(engine, engine.rest(), [500, 1000, 1500, 2000, 2500], constrained, path)
         push_gradient(push, push.positions - lattice.points, push.reaction)
         return push.memory_mb
 

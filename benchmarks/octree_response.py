@@ -26,7 +26,7 @@ from naibu.mechanics.lattices.model.lattice import Lattice, box_mask, classic_la
 from naibu.mechanics.lattices.model.octree import octree_cubes, octree_lattice
 from naibu.mechanics.lattices.model.octree_compliance_correction import lengthening
 from naibu.mechanics.lattices.model.octree_energy_scaling import OctreeGrid
-from naibu.mechanics.lattices.model.state import HeldNodes
+from naibu.mechanics.lattices.model.state import ConstrainedNodes
 from naibu.mechanics.linear_algebra.direct import direct_solver
 from naibu.mechanics.linear_algebra.protocols import Factorization
 
@@ -93,18 +93,18 @@ def loads(lattice: Lattice) -> Iterator[tuple[str, Flags, Array]]:
         ("spot", top & spot & (np.abs(x - middle) < 0.26), down, (0, 1, 2)),
         ("side", side & ~floor, np.array([-0.1 * height, 0.0, 0.0]), (0, 1, 2)),
     ):
-        held = np.repeat(floor[:, None], 3, axis=1)
+        constrained = np.repeat(floor[:, None], 3, axis=1)
         for axis in axes:
-            held[part, axis] = True
-        yield name, held, np.where(part[:, None] & held & ~floor[:, None], np.broadcast_to(motion, lattice.points.shape), 0.0)
+            constrained[part, axis] = True
+        yield name, constrained, np.where(part[:, None] & constrained & ~floor[:, None], np.broadcast_to(motion, lattice.points.shape), 0.0)
 
 
 def answers(lattice: Lattice, k: Array) -> dict[str, tuple[float, Array]]:
     """Return the work of every load, and the displacements (n, 3)."""
     matrix, _ = stiffness(lattice, k)
     found = {}
-    for name, held, motion in loads(lattice):
-        free, u = ~held.ravel(), motion.ravel().copy()
+    for name, constrained, motion in loads(lattice):
+        free, u = ~constrained.ravel(), motion.ravel().copy()
         u[free] = factorized(matrix[free][:, free]).solve(-(matrix[free][:, ~free] @ u[~free]))
         found[name] = (float(u @ (matrix @ u)), u.reshape(-1, 3))
     return found
@@ -125,7 +125,7 @@ def pushed(lattice: Lattice, numbers: tuple[float, float, float]) -> tuple[Array
     """Return the force of the top (steps,), mN, and displacements (n, 3) when it is released and at the end, mm."""
     engine = LatticeEngine.of(lattice, lattice_parameters(lattice, *numbers), step=STEP_S)
     z = lattice.points[:, 2]
-    floor, top = (HeldNodes.of(np.flatnonzero(z == at), body=b) for b, at in enumerate((z.min(), z.max())))
+    floor, top = (ConstrainedNodes.of(np.flatnonzero(z == at), body=b) for b, at in enumerate((z.min(), z.max())))
     velocity = np.zeros((PHASES[0] + PHASES[1], 2, 3))
     velocity[: PHASES[0], 1, 2] = -SPEED
     kept = engine.run(engine.rest(), len(velocity), floor + top, velocity)

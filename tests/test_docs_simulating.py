@@ -24,7 +24,7 @@ def block(language: str) -> str:
 @pytest.mark.parametrize("name", TABLES)
 def test_every_key_is_told_in_the_page(name: str) -> None:
     key = name.removesuffix("Table").lower()
-    heading = "[[pusher]]" if key == "pusher" else f"[{key}]"
+    heading = "[[indenter]]" if key == "indenter" else f"[{key}]"
     assert f"``{heading}``" in PAGE
     for field, told in getattr(lattice_study_schema, name).model_fields.items():
         assert f"**{field}**" in PAGE if told.is_required() else re.search(rf"\*\*{field}\*\*|``{field}\b", PAGE), f"{heading} {field}"

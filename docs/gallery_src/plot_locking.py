@@ -42,9 +42,9 @@ def force(cells: int, poisson_ratio: float, formulation: Formulation) -> float:
     gel = material("neo_hookean", young_modulus=60.0, poisson_ratio=poisson_ratio)
     assembler = Assembler.from_materials(body, mesh.regions, [gel], block_pattern(mesh.n_points, body.connectivity))
     top = side_nodes(mesh, "z+")
-    held = Prescribed.nothing(mesh.n_points).and_also(side_nodes(mesh, "z-"), (0, 0, 0))
-    held = held.and_also(top, (0.0, 0.0, -COMPRESSION * SIDE_MM))
-    solution = solve(Problem(mesh.points, assembler, (), held, np.zeros_like(mesh.points)))
+    constrained = Prescribed.nothing(mesh.n_points).and_also(side_nodes(mesh, "z-"), (0, 0, 0))
+    constrained = constrained.and_also(top, (0.0, 0.0, -COMPRESSION * SIDE_MM))
+    solution = solve(Problem(mesh.points, assembler, (), constrained, np.zeros_like(mesh.points)))
     internal = assembler.forces(solution.displacement)[1]
     return -float(internal[top, 2].sum()) / 1000.0
 

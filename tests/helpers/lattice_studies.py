@@ -19,7 +19,7 @@ duration_s = 0.2
 [floor]
 contact = "friction"
 static_friction = 0.5
-[[pusher]]
+[[indenter]]
 name = "ball"
 shape = "sphere"
 radius_mm = 8.0

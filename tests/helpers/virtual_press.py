@@ -18,7 +18,7 @@ SIDE_MM = 60.0
 TRUTH = {"soft: young_modulus": 100.0, "firm: young_modulus": 200.0, "soft: poisson_ratio": 0.48, "firm: poisson_ratio": 0.48}
 KNOWN = ("firm=200 kPa",)
 COARSE = ModelSettings(element_size_mm=20.0)
-OPENINGS_MM = {"pressed": 50.0, "pressed_more": 46.0}
+PLATEN_POSITIONS_MM = {"pressed": 50.0, "pressed_more": 46.0}
 SCANNER = Scanner(placing_mm=0.1, shift_mm=5.0)
 
 
@@ -33,7 +33,7 @@ class Press:
 
 def virtual_press(seed: int = 1) -> Phantom:
     layers = [("soft", SIDE_MM / 2), ("firm", SIDE_MM / 2)]
-    template = box_experiment("press", (SIDE_MM,) * 3, layers, Loading("plate"), OPENINGS_MM)
+    template = box_experiment("press", (SIDE_MM,) * 3, layers, Loading("plate"), PLATEN_POSITIONS_MM)
     return phantom(template, TRUTH, seed=seed, scanner=SCANNER, settings=ModelSettings(element_size_mm=15.0))
 
 
@@ -62,7 +62,7 @@ def write_press(folder: Path, made: Phantom, states: tuple[str, ...] = ("pressed
         shape=e.shape,
         loading=e.loading,
         layers=e.layers,
-        stated_mm={s: OPENINGS_MM[s] for s in states},
+        stated_mm={s: PLATEN_POSITIONS_MM[s] for s in states},
         spacing_mm=e.nominal_spacing_mm,
         xy_step_mm=e.xy_step_mm,
         z_step_mm=e.z_step_mm,

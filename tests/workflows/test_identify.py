@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from virtual_press import COARSE, KNOWN, OPENINGS_MM, TRUTH, Press, stop_at
+from virtual_press import COARSE, KNOWN, PLATEN_POSITIONS_MM, TRUTH, Press, stop_at
 
 import naibu
 from naibu.core.errors import ConvergenceError, InputError
@@ -97,7 +97,7 @@ def test_every_marker_is_predicted(press: Press, tmp_path: Path) -> None:
     table = rows(tmp_path / "predicted.csv")
     assert list(table[0]) == ["marker", "x_mm", "y_mm", "z_mm", "sd_mm"]
     assert [int(r["marker"]) for r in table] == rows_of(press.folder / "initial.csv")
-    assert prediction.opening_mm == pytest.approx(OPENINGS_MM["pressed_more"], abs=0.5)
+    assert prediction.platen_position_mm == pytest.approx(PLATEN_POSITIONS_MM["pressed_more"], abs=0.5)
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert summary["registered_to_measured"] and not summary["used_to_identify"]
     measured = {int(r["marker"]): [float(r[f"{a}_mm"]) for a in "xyz"] for r in rows(press.folder / "pressed_more.csv")}
@@ -193,7 +193,7 @@ def test_a_checkpoint_of_something_else_is_not_used(press: Press, tmp_path: Path
         identified(press.folder, tmp_path)
     file = tmp_path / CHECKPOINT_FILE
     if changed == "settings":
-        file.write_text(file.read_text(encoding="utf-8").replace('"glued"', '"sliding"'), encoding="utf-8")
+        file.write_text(file.read_text(encoding="utf-8").replace('"tied"', '"sliding"'), encoding="utf-8")
     elif changed == "damaged":
         file.write_text("{", encoding="utf-8")
     again = identified(press.folder, tmp_path, resume=changed != "refused")

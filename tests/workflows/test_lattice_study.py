@@ -35,15 +35,15 @@ def test_the_studies_that_come_along_are_valid(name: str) -> None:
     ("name", "pushing"), [("dough-first-pushing", FIRST), ("dough-second-pushing", SECOND), ("cube-pushing", CUBE_PUSHING)]
 )
 def test_the_report_s_pushings_are_those_of_the_twin(name: str, pushing: object) -> None:
-    from naibu.mechanics.lattices.simulation.loading_history import glued_nodes
+    from naibu.mechanics.lattices.simulation.loading_history import tied_nodes
 
     study = prepared_study(name).study
-    floor, *held = glued_nodes(study.lattice, study.bodies)
-    for mine, theirs, body, face in zip(held, pushing.touched(study.lattice), study.bodies[1:], pushing.faces, strict=True):
+    floor, *constrained = tied_nodes(study.lattice, study.bodies)
+    for mine, theirs, body, face in zip(constrained, pushing.touched(study.lattice), study.bodies[1:], pushing.faces, strict=True):
         np.testing.assert_array_equal(mine, theirs)
         np.testing.assert_allclose(body.moved(np.array([pushing.push_s])), pushing.push_s * np.array([face.velocity]))
         np.testing.assert_allclose(body.moved(np.array([pushing.contact_s])), body.moved(np.array([pushing.push_s])))
-        assert body.glued_until_s == pytest.approx(pushing.contact_s)
+        assert body.tied_until_s == pytest.approx(pushing.contact_s)
     assert (study.lattice.points[floor, 2] == 0.0).all()
     if name.startswith("dough"):
         twin = dough_lattice()
@@ -156,15 +156,15 @@ def test_forces_and_velocities_move_pushers(tmp_path: Path) -> None:
         ("every_s = 0.02", "every_s = 0.02\nforces_every_s = 0.003", ("forces_every_s = 0.003", "step_s")),
         ("every_s = 0.02", 'every_s = 0.02\nquantities = ["speed"]', ("[output] quantities, entry 1 = 'speed'", "velocity")),
         ("centre_mm = [10.0, 10.0, 28.5]", "centre_mm = [10.0, 10.0, 25.0]", ("number 1 centre_mm", "25.0]", "inside", "move it back")),
-        ("radius_mm = 8.0", "size_mm = [1, 1, 1]", ("[[pusher]] number 1 a sphere has radius_mm", "add radius_mm")),
-        ("[0.1, 0, 0, -3]", "[0.1, 0, -3]", ("[[pusher]] number 1 path", "row 2 has 3 numbers", "[time in s")),
-        ("[0.1, 0, 0, -3]", "[0.0, 0, 0, -3]", ("[[pusher]] number 1 path", "must grow")),
+        ("radius_mm = 8.0", "size_mm = [1, 1, 1]", ("[[indenter]] number 1 a sphere has radius_mm", "add radius_mm")),
+        ("[0.1, 0, 0, -3]", "[0.1, 0, -3]", ("[[indenter]] number 1 path", "row 2 has 3 numbers", "[time in s")),
+        ("[0.1, 0, 0, -3]", "[0.0, 0, 0, -3]", ("[[indenter]] number 1 path", "must grow")),
         ("[[0.0, 0, 0, 0]", "[[0.0, 1, 0, 0]", ("must begin with 0, 0, 0", "centre_mm")),
         ("path =", "force = [[0.0, 1.0]]\npath =", ("path and force", "one of them")),
         ('contact = "friction"', 'contact = "sticking"', ("[floor]", "static_friction")),
         ("static_friction = 0.5", "static_friction = 0.5\nkinetic_friction = 0.7", ("kinetic_friction = 0.7 exceeds", "0.5")),
         ('name = "ball"', 'name = "floor"', ("name = 'floor'", "twice")),
-        ('shape = "sphere"', 'shape = "cone"', ("[[pusher]] number 1 shape = 'cone'", "cylinder")),
+        ('shape = "sphere"', 'shape = "cone"', ("[[indenter]] number 1 shape = 'cone'", "cylinder")),
         ("[floor]", "[flor]", ("flor is not a known key", "'floor'")),
         ("[lattice]", "[lattice", ("line 5", "not valid TOML")),
     ],

@@ -47,9 +47,9 @@ class Chain:
 
 def chain(folder: Path, side: float, apart: float, made_mm: float, sought_mm: float, spacing: tuple[float, float, float]) -> Chain:
     """Make, scan, track, identify from the first pressed state and predict the second; the meshes of truth and model differ."""
-    openings = {"pressed": 0.87 * side, "pressed_more": 0.8 * side}
+    platen_positions = {"pressed": 0.87 * side, "pressed_more": 0.8 * side}
     layers = [("soft", side / 2), ("firm", side / 2)]
-    template = box_experiment("press", (side,) * 3, layers, Loading("plate"), openings, spacing_mm=apart, margin_mm=apart)
+    template = box_experiment("press", (side,) * 3, layers, Loading("plate"), platen_positions, spacing_mm=apart, margin_mm=apart)
     specimen = virtual_specimen(template, TRUTH, settings=ModelSettings(element_size_mm=made_mm), jitter_mm=0.3, seed=3)
     scans = scanned_states(specimen, spacing_mm=spacing, seed=5)
     volumes = [scan.volume for scan in scans.values()]
@@ -66,7 +66,7 @@ def chain(folder: Path, side: float, apart: float, made_mm: float, sought_mm: fl
         shape=described.shape,
         loading=described.loading,
         layers=described.layers,
-        stated_mm=openings,
+        stated_mm=platen_positions,
         spacing_mm=described.nominal_spacing_mm,
         xy_step_mm=xy_step,
         z_step_mm=z_step,

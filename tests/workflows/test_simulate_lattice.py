@@ -163,11 +163,11 @@ def test_other_settings_are_not_resumed(tmp_path: Path) -> None:
 
 
 def test_steps_that_blow_up_leave_the_frames_before(tmp_path: Path) -> None:
-    glue = STUDY.replace('contact = "friction"\nstatic_friction = 0.5', "").replace("[lattice]", '[lattice]\nmasses = "equal"')
-    glue = glue.replace("centre_mm = [10.0, 10.0, 28.5]", "centre_mm = [10.0, 10.0, 28.0]").replace(
-        'name = "ball"', 'name = "ball"\ncontact = "glued"'
+    tie = STUDY.replace('contact = "friction"\nstatic_friction = 0.5', "").replace("[lattice]", '[lattice]\nmasses = "equal"')
+    tie = tie.replace("centre_mm = [10.0, 10.0, 28.5]", "centre_mm = [10.0, 10.0, 28.0]").replace(
+        'name = "ball"', 'name = "ball"\ncontact = "tied"'
     )
-    text = glue.replace("duration_s = 0.2", 'duration_s = 0.2\nmethod = "euler"').replace(
+    text = tie.replace("duration_s = 0.2", 'duration_s = 0.2\nmethod = "euler"').replace(
         "[0.1, 0, 0, -3]", "[0.05, 0, 0, 0], [0.1, 0, 0, -3]"
     )
     path = study_file(tmp_path, text)

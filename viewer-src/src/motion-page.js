@@ -57,7 +57,7 @@ class MotionPage {
       h("div", { class: "bar" }, views),
       this.stage,
       this.#timeControls(),
-      h("div", { class: "load shown" }, toggle("mesh", "edges of voxels"), toggle("bodies", "pushers"), toggle("free", "outline at rest")),
+      h("div", { class: "load shown" }, toggle("mesh", "edges of voxels"), toggle("bodies", "indenters"), toggle("free", "outline at rest")),
       h("div", { class: "bar" }, h("label", { for: "naibu-field" }, "Colours"), this.choice),
       h("div", { class: "motion-scale" }, this.gradient, this.ticks),
       h("p", { class: "hint" }, "Drag to turn, right-drag or two fingers to move. Click the view, then scroll to zoom."));

@@ -24,7 +24,7 @@ DEMO = ("ct_two_material_1", "ct_two_material_2", "ct_two_material_3")
 DEMO_KNOWN = "hardness 5=222 kPa"  # mean of the report's compression tests, Table 3.4
 ContactModel = Literal["coulomb", "stick", "springs"]
 PixelScale = Literal["given", "sought"]
-Joined = Literal["glued", "sliding"]
+Joined = Literal["tied", "sliding"]
 Law = Literal["neo_hookean", "neo_hookean_isochoric", "mooney_rivlin", "yeoh", "saint_venant_kirchhoff"]
 
 
@@ -50,7 +50,7 @@ def identify(
     out: Path = Path("naibu-results"),
     law: Law = "neo_hookean",
     contact: ContactModel = "coulomb",
-    joined: Joined = "glued",
+    joined: Joined = "tied",
     pixel_scale: PixelScale = "given",
     element_size_mm: float = 0.0,
     cross_validate: bool = False,
@@ -73,7 +73,7 @@ def identify(
     contact
         What plates and table do to the surface sideways: rub (coulomb), hold it (stick), or hold it by springs.
     joined
-        Whether blocks that were cast apart are glued or may slide.
+        Whether blocks that were cast apart are tied or may slide.
     pixel_scale
         Whether the size of a pixel along x and y is that of the file (given) or an unknown of every experiment (sought).
     element_size_mm
@@ -184,7 +184,7 @@ def predict(
         a = accuracy(result.specimen, result.fit, result.residual)
         rms = f"RMS x {a.x:.3f}, y {a.y:.3f}, z {a.z:.3f}, 3-D {a.total:.3f} mm"
         say(f"{a.markers} markers: {rms} ({a.noise_units:.2f} times the noise)")
-    say(f"Predicted at {result.opening_mm:.2f} mm: {out / 'predicted.csv'}   page: {out / 'predicted.html'}")
+    say(f"Predicted at {result.platen_position_mm:.2f} mm: {out / 'predicted.csv'}   page: {out / 'predicted.html'}")
 
 
 @app.command
@@ -211,7 +211,7 @@ def compare(
     contact
         What plates and table do to the surface sideways. May be repeated; coulomb and stick by default.
     joined
-        What holds blocks together that were cast apart. May be repeated; glued by default.
+        What holds blocks together that were cast apart. May be repeated; tied by default.
     element_size_mm
         Edge of the elements; 0 chooses.
     out
@@ -223,7 +223,7 @@ def compare(
 
     laws: list[Law] = law or ["neo_hookean", "mooney_rivlin"]
     contacts: list[ContactModel] = contact or ["coulomb", "stick"]
-    joints: list[Joined] = joined or ["glued"]
+    joints: list[Joined] = joined or ["tied"]
     candidates = [
         ModelSettings(law=one, contact=two, joined=three, element_size_mm=element_size_mm)
         for one, two, three in product(laws, contacts, joints)

@@ -161,7 +161,7 @@ class Experiment:
         return self.shape.size_mm["xyz".index(self.up_axis)]
 
     @property
-    def full_opening_mm(self) -> float:
+    def full_platen_position_mm(self) -> float:
         """Height of the plate or bar, or distance of the side plates, at which they touch the free object, mm."""
         size = self.shape.size_mm
         return size["xyz".index(self.loading.bar_axis)] if self.loading.kind == "side_plates" else size[2]

@@ -140,8 +140,8 @@ class FloorTable(_Surface):
     contact: Literal["sticking", "friction"] = "sticking"
 
 
-class PusherTable(_Surface):
-    """``[[pusher]]``: a rigid body."""
+class IndenterTable(_Surface):
+    """``[[indenter]]``: a rigid body."""
 
     name: Annotated[str, Field(min_length=1)] | None = None
     shape: Literal["box", "cylinder", "sphere"]
@@ -150,7 +150,7 @@ class PusherTable(_Surface):
     length_mm: Positive | None = None
     axis: Three = [0.0, 0.0, 1.0]
     centre_mm: Three
-    contact: Literal["friction", "glued"] = "friction"
+    contact: Literal["friction", "tied"] = "friction"
     until_s: NotNegative | None = None
     path: _timed(4, "[time in s, displacement along x, y, z in mm]") | None = None  # type: ignore[valid-type]
     velocity: _timed(4, "[time in s, velocity along x, y, z in mm/s from then on]") | None = None  # type: ignore[valid-type]
@@ -159,7 +159,7 @@ class PusherTable(_Surface):
     mass_g: Positive | None = None
 
     @model_validator(mode="after")
-    def _complete(self) -> PusherTable:
+    def _complete(self) -> IndenterTable:
         wanted = {"box": ("size_mm",), "cylinder": ("radius_mm", "length_mm"), "sphere": ("radius_mm",)}[self.shape]
         missing = [name for name in wanted if getattr(self, name) is None]
         spare = [n for n in ("size_mm", "radius_mm", "length_mm") if n not in wanted and getattr(self, n) is not None]
@@ -169,23 +169,23 @@ class PusherTable(_Surface):
             raise ValueError("axis = [0, 0, 0] has no direction; give that of the cylinder")
         moved = [name for name in ("path", "velocity", "force") if getattr(self, name) is not None]
         if len(moved) > 1:
-            raise ValueError(f"gives {' and '.join(moved)}; a pusher moves by one of them")
+            raise ValueError(f"gives {' and '.join(moved)}; an indenter moves by one of them")
         if self.path and any(self.path[0][1:]):
             raise ValueError(
                 f"path begins with the displacement {self.path[0][1:]}; it must begin with 0, 0, 0: set centre_mm to the start"
             )
         self._driven()
-        if self.until_s is not None and self.contact != "glued":
-            raise ValueError('until_s tells when a glued pusher lets go; write contact = "glued", or remove it')
+        if self.until_s is not None and self.contact != "tied":
+            raise ValueError('until_s tells when a tied indenter lets go; write contact = "tied", or remove it')
         return self
 
     def _driven(self) -> None:
         if self.force is None and (self.direction or self.mass_g):
-            raise ValueError("direction and mass_g belong to a pusher that is moved by force; give force, or remove them")
+            raise ValueError("direction and mass_g belong to an indenter that is moved by force; give force, or remove them")
         if self.force is not None and (self.direction is None or not any(self.direction) or self.mass_g is None):
-            raise ValueError("a pusher that is moved by force needs direction = [x, y, z] and mass_g")
-        if self.force is not None and self.contact == "glued":
-            raise ValueError('a glued pusher cannot be moved by force; write contact = "friction"')
+            raise ValueError("an indenter that is moved by force needs direction = [x, y, z] and mass_g")
+        if self.force is not None and self.contact == "tied":
+            raise ValueError('a tied indenter cannot be moved by force; write contact = "friction"')
 
 
 class OutputTable(_Table):
@@ -205,7 +205,7 @@ class StudyFile(_Table):
     parameters: ParametersTable
     simulation: SimulationTable
     floor: FloorTable | None = None
-    pusher: list[PusherTable] = []
+    indenter: list[IndenterTable] = []
     output: OutputTable = OutputTable()
 
     @property
@@ -225,8 +225,8 @@ class StudyFile(_Table):
                     f"[object] size_mm = {self.object.size_mm}: {edge:g} mm is no whole number of voxels of [lattice] spacing_mm = "
                     f"{spacing:g}; choose a spacing that divides all edges"
                 )
-        if self.floor is None and not self.pusher:
-            raise ValueError("there is neither a [floor] nor a [[pusher]]: nothing would touch the object; add one")
+        if self.floor is None and not self.indenter:
+            raise ValueError("there is neither a [floor] nor a [[indenter]]: nothing would touch the object; add one")
         self._times()
         self._contacts()
         return self
@@ -240,7 +240,7 @@ class StudyFile(_Table):
             ("[output] every_s", output.every_s, "[output] forces_every_s", self.sample_s),
             *(
                 (f"{_number(k)} until_s", p.until_s, "[simulation] step_s", simulation.step_s)
-                for k, p in enumerate(self.pusher)
+                for k, p in enumerate(self.indenter)
                 if p.until_s
             ),
         ]
@@ -250,31 +250,31 @@ class StudyFile(_Table):
                 raise ValueError(f"{name} = {value:g} is no whole number of times {of} = {part:g}; choose numbers that divide")
 
     def _contacts(self) -> None:
-        touching = [_number(k) for k, p in enumerate(self.pusher) if p.contact == "friction"]
-        glued = [_number(k) for k, p in enumerate(self.pusher) if p.contact == "glued"]
+        touching = [_number(k) for k, p in enumerate(self.indenter) if p.contact == "friction"]
+        tied = [_number(k) for k, p in enumerate(self.indenter) if p.contact == "tied"]
         sticking = self.floor is not None and self.floor.contact == "sticking"
-        if touching and glued:
-            raise ValueError(f'{touching[0]} has contact = "friction" and {glued[0]} contact = "glued"; one study has one kind of contact')
+        if touching and tied:
+            raise ValueError(f'{touching[0]} has contact = "friction" and {tied[0]} contact = "tied"; one study has one kind of contact')
         if touching and sticking:
             raise ValueError(
                 f'[floor] contact = "sticking" does not go with {touching[0]} in contact by friction; write contact = "friction" with '
-                'static_friction and kinetic_friction for the floor, or contact = "glued" for the pusher'
+                'static_friction and kinetic_friction for the floor, or contact = "tied" for the indenter'
             )
-        if glued and self.floor is not None and not sticking:
-            raise ValueError(f'[floor] contact = "friction" does not go with {glued[0]}, which is glued; write contact = "sticking"')
+        if tied and self.floor is not None and not sticking:
+            raise ValueError(f'[floor] contact = "friction" does not go with {tied[0]}, which is tied; write contact = "sticking"')
         rubbing = bool(touching) or (self.floor is not None and not sticking)
         if rubbing and self.simulation.method != "implicit":
             raise ValueError(f'[simulation] method = "{self.simulation.method}": contact by friction needs method = "implicit"')
-        driven = [k for k, p in enumerate(self.pusher) if p.force is not None]
+        driven = [k for k, p in enumerate(self.indenter) if p.force is not None]
         if len(driven) > 1:
-            raise ValueError(f"{_number(driven[1])} force: one pusher of a study can be moved by force; give the others a path")
-        moving = [k for k, p in enumerate(self.pusher) if p.path or p.velocity]
+            raise ValueError(f"{_number(driven[1])} force: one indenter of a study can be moved by force; give the others a path")
+        moving = [k for k, p in enumerate(self.indenter) if p.path or p.velocity]
         if driven and moving:
             raise ValueError(f"{_number(moving[0])} moves while {_number(driven[0])} is moved by force; then all others must stand still")
 
 
 def _number(k: int) -> str:
-    return f"[[pusher]] number {k + 1}"
+    return f"[[indenter]] number {k + 1}"
 
 
 _TABLES: dict[str, type[_Table]] = {
@@ -283,7 +283,7 @@ _TABLES: dict[str, type[_Table]] = {
     "parameters": ParametersTable,
     "simulation": SimulationTable,
     "floor": FloorTable,
-    "pusher": PusherTable,
+    "indenter": IndenterTable,
     "output": OutputTable,
 }
 _MENDS = {

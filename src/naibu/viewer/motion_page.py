@@ -87,7 +87,7 @@ class MotionPage:
     fields : sequence of ColourField
         The first one is shown first.
     bodies : sequence of RigidShape
-        Pushers and floor.
+        Indenters and floor.
     places : ndarray, shape (s, b, 3)
         Their centres, mm.
     force_times, force : ndarray, shape (k,) and (k, b, 3)

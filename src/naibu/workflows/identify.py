@@ -18,9 +18,9 @@ from naibu.core.rigid_transform import registration
 from naibu.core.status import Status
 from naibu.core.units import kilopascals
 from naibu.identification.from_markers.calibration import Calibration, calibrate
-from naibu.identification.from_markers.known_materials import Knowledge
+from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import Trial
-from naibu.identification.from_markers.parameter_names import opening
+from naibu.identification.from_markers.parameter_names import platen_position
 from naibu.identification.from_markers.specimen_model import ModelSettings
 from naibu.identification.prediction.baselines import affine, balanced, baselines
 from naibu.identification.prediction.calibrated_model import CalibratedModel
@@ -96,7 +96,7 @@ def load_experiment(source: Source) -> Experiment:
     )
 
 
-def parse_known(known: Sequence[str]) -> Knowledge | None:
+def parse_known(known: Sequence[str]) -> KnownMaterials | None:
     """Read ``"hardness 5=222 kPa"`` (absolute) or ``"hardness 5"`` (sets the scale of ratios).
 
     Raises
@@ -117,9 +117,9 @@ def parse_known(known: Sequence[str]) -> Knowledge | None:
     if len(without) > 1:
         raise InputError("without moduli only one material can set the scale; write for instance --known 'hardness 5=222 kPa'")
     if without:
-        return Knowledge({names[0]: RATIO_REFERENCE_KPA}, scale_is_absolute=False)
+        return KnownMaterials({names[0]: RATIO_REFERENCE_KPA}, scale_is_absolute=False)
     try:
-        return Knowledge({name: kilopascals(value) for name, value in pairs})
+        return KnownMaterials({name: kilopascals(value) for name, value in pairs})
     except InputError as error:
         raise InputError(f"--known {', '.join(repr(text) for text in known)}: {error}") from error
 
@@ -173,7 +173,7 @@ def identify(
         model has been written.
     """
     loaded = _loaded(experiments)
-    knowledge, chosen = parse_known(known), settings or ModelSettings()
+    known_materials, chosen = parse_known(known), settings or ModelSettings()
     _check_size(loaded, chosen.element_size_mm)
     _check_states(loaded, states or {})
     folder = None if out is None else result_folder(out)
@@ -187,7 +187,7 @@ def identify(
 
     start = read_checkpoint(folder, provenance) if folder is not None and resume else None
     try:
-        calibration = calibrate(loaded, knowledge=knowledge, states=states, settings=chosen, start=start, callback=each)
+        calibration = calibrate(loaded, known_materials=known_materials, states=states, settings=chosen, start=start, callback=each)
     except ConvergenceError as error:
         labels = [f"{e.name}/{s.name}" for e in loaded for s in _with_states(e, states or {}).loaded_states]
         one_of = "one of " * (len(labels) > 1) + ", ".join(labels)
@@ -270,12 +270,16 @@ def _compared(
 
     try:
         if not interrupted:
-            compared = {t.label: _baselines(t, values[opening(t.specimen.experiment, t.state)]) for t in calibration.trials}
+            compared = {t.label: _baselines(t, values[platen_position(t.specimen.experiment, t.state)]) for t in calibration.trials}
             for label, distance in balanced(calibration).items():
                 compared[label]["force balance"] = distance
         if not interrupted and left_in_turn:
             found = leave_one_out(
-                left_in_turn, knowledge=calibration.knowledge, settings=calibration.settings, reference=calibration, callback=each
+                left_in_turn,
+                known_materials=calibration.known_materials,
+                settings=calibration.settings,
+                reference=calibration,
+                callback=each,
             )
             left_out = tuple(found)
     except KeyboardInterrupt:
@@ -285,10 +289,10 @@ def _compared(
     return Identification(model, calibration, compared, left_out, interrupted), trouble
 
 
-def _baselines(trial: Trial, opening_mm: float) -> dict[str, float]:
+def _baselines(trial: Trial, platen_position_mm: float) -> dict[str, float]:
     """Simple descriptions of a state; without the linear one where it does not apply."""
     try:
-        return baselines(trial, opening_mm)
+        return baselines(trial, platen_position_mm)
     except NaibuError:
         free, measured = trial.specimen.marker_points, trial.measured
         return {"rigid": rms(measured - registration(free, measured).applied(free)), "affine": rms(measured - affine(free, measured))}
@@ -354,7 +358,7 @@ def predict(
         raise InputError("--height-mm and --heights-from-markers exclude each other; give one of them")
     folder = None if out is None else result_folder(out)
     try:
-        prediction = predict_state(calibrated, loaded, name, opening_mm=height_mm, heights_from_markers=heights_from_markers)
+        prediction = predict_state(calibrated, loaded, name, platen_position_mm=height_mm, heights_from_markers=heights_from_markers)
     except ConvergenceError as error:
         raise ConvergenceError(f"{loaded.name}/{name} cannot be solved: {error}") from error
     if folder is not None:
@@ -406,7 +410,7 @@ def compare(
     if not candidates:
         raise InputError("no model is given to compare; name at least one law or contact")
     loaded = _loaded(experiments)
-    knowledge = parse_known(known)
+    known_materials = parse_known(known)
     folder = None if out is None else result_folder(out)
     rows: list[ModelRow] = []
     for settings in candidates:
@@ -414,7 +418,7 @@ def compare(
         row = read_comparison(folder, provenance) if folder is not None else None
         if row is None:
             told = _stage(progress, settings)
-            row = compare_models(loaded, [settings], knowledge=knowledge, callback=told)[0]
+            row = compare_models(loaded, [settings], known_materials=known_materials, callback=told)[0]
             if folder is not None:
                 write_comparison(folder, provenance, row)
         rows.append(row)

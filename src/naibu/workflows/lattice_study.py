@@ -22,8 +22,8 @@ from naibu.core.mesh import Mesh
 from naibu.core.volume import Volume
 from naibu.io.files.provenance import sha256
 from naibu.io.images import read_volume
-from naibu.io.lattice_study_schema import FloorTable, ObjectTable, PusherTable, StudyFile, load_study
-from naibu.mechanics.contact.rigid_indenters import Pusher, plane, pusher_box, pusher_cylinder, pusher_sphere
+from naibu.io.lattice_study_schema import FloorTable, IndenterTable, ObjectTable, StudyFile, load_study
+from naibu.mechanics.contact.rigid_indenters import RigidIndenter, box_indenter, cylindrical_indenter, plane, spherical_indenter
 from naibu.mechanics.lattices.model.hexahedra import lattice_mesh
 from naibu.mechanics.lattices.model.lattice import CLASSES, Lattice, box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.octree import octree_lattice
@@ -101,7 +101,7 @@ def prepared_study(source: str | os.PathLike[str]) -> PreparedStudy:
     Raises
     ------
     InputError
-        No such study or file; a key or value that cannot be; an empty mask, or one in pieces; a pusher that starts inside the object.
+        No such study or file; a key or value that cannot be; an empty mask, or one in pieces; an indenter that starts inside the object.
         The message names the file, the field, its value and the mend.
     """
     path = Path(source)
@@ -263,22 +263,24 @@ def class_ratios(stiffness: float | Mapping[str, Any]) -> tuple[float, ...]:
 
 def _bodies(path: Path, settings: StudyFile, lattice: Lattice) -> tuple[StudyBody, ...]:
     bodies = [] if settings.floor is None else [_floor(settings.floor, lattice)]
-    for k, table in enumerate(settings.pusher):
-        body = _pusher(table, k, settings.simulation.duration_s)
+    for k, table in enumerate(settings.indenter):
+        body = _indenter(table, k, settings.simulation.duration_s)
         try:
-            begin_contact(lattice, [body.pusher])
+            begin_contact(lattice, [body.indenter])
         except InputError as error:
-            told = re.sub(r"^body 0, an? \w+, ", "the pusher ", str(error))
-            raise InputError(f"{path}: [[pusher]] number {k + 1} centre_mm = {table.centre_mm}: {told}") from error
+            told = re.sub(r"^body 0, an? \w+, ", "the indenter ", str(error))
+            raise InputError(f"{path}: [[indenter]] number {k + 1} centre_mm = {table.centre_mm}: {told}") from error
         bodies.append(body)
     names = [body.name for body in bodies]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice:
-        raise InputError(f"{path}: [[pusher]] name = {twice!r} is given twice; give every pusher a name of its own ('floor' is the floor)")
+        raise InputError(
+            f"{path}: [[indenter]] name = {twice!r} is given twice; give every indenter a name of its own ('floor' is the floor)"
+        )
     return tuple(bodies)
 
 
-def _surface(table: FloorTable | PusherTable) -> dict[str, float]:
+def _surface(table: FloorTable | IndenterTable) -> dict[str, float]:
     return {
         "static_friction": table.static_friction,
         "kinetic_friction": table.static_friction if table.kinetic_friction is None else table.kinetic_friction,
@@ -292,32 +294,32 @@ def _floor(table: FloorTable, lattice: Lattice) -> StudyBody:
     low, high = lattice.points.min(axis=0), lattice.points.max(axis=0)
     middle = 0.5 * (low + high)
     ground = plane((middle[0], middle[1], low[2]), **_surface(table))
-    return StudyBody("floor", ground, np.zeros(1), np.zeros((1, 3)), glued_until_s=np.inf if table.contact == "sticking" else None)
+    return StudyBody("floor", ground, np.zeros(1), np.zeros((1, 3)), tied_until_s=np.inf if table.contact == "sticking" else None)
 
 
-def _pusher(table: PusherTable, k: int, duration_s: float) -> StudyBody:
+def _indenter(table: IndenterTable, k: int, duration_s: float) -> StudyBody:
     times, offset = _programme(table, duration_s)
     drive = None
     if table.force is not None:
         force = np.array(table.force)
         drive = Drive(force[:, 0], force[:, 1], np.array(table.direction), 1e-3 * (table.mass_g or 0.0))
     until = None
-    if table.contact == "glued":
+    if table.contact == "tied":
         until = np.inf if table.until_s is None else table.until_s
-    return StudyBody(table.name or f"pusher {k + 1}", _rigid(table), times, offset, drive, until)
+    return StudyBody(table.name or f"indenter {k + 1}", _rigid(table), times, offset, drive, until)
 
 
-def _rigid(table: PusherTable) -> Pusher:
+def _rigid(table: IndenterTable) -> RigidIndenter:
     surface = _surface(table)
     if table.shape == "box":
-        return pusher_box(table.centre_mm, table.size_mm or (), **surface)
+        return box_indenter(table.centre_mm, table.size_mm or (), **surface)
     if table.shape == "sphere":
-        return pusher_sphere(table.centre_mm, table.radius_mm or 0.0, **surface)
-    return pusher_cylinder(table.centre_mm, table.radius_mm or 0.0, table.length_mm or 0.0, table.axis, **surface)
+        return spherical_indenter(table.centre_mm, table.radius_mm or 0.0, **surface)
+    return cylindrical_indenter(table.centre_mm, table.radius_mm or 0.0, table.length_mm or 0.0, table.axis, **surface)
 
 
-def _programme(table: PusherTable, duration_s: float) -> tuple[FloatArray, FloatArray]:
-    """Return times (k,), s, and displacements (k, 3), mm, of a pusher."""
+def _programme(table: IndenterTable, duration_s: float) -> tuple[FloatArray, FloatArray]:
+    """Return times (k,), s, and displacements (k, 3), mm, of an indenter."""
     if table.path:
         rows = np.array(table.path)
         return rows[:, 0], rows[:, 1:]

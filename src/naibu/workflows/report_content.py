@@ -174,7 +174,9 @@ def parameter_rows(model: CalibratedModel, names: Sequence[str]) -> tuple[Parame
     for p in model.parameters:
         if p.name in names or (p.fixed and p.name.endswith("young_modulus")):
             low, high = model.interval(p.name)
-            note = "" if not p.fixed else ("given" if model.knowledge.scale_is_absolute else "sets the scale: moduli are ratios to it")
+            note = (
+                "" if not p.fixed else ("given" if model.known_materials.scale_is_absolute else "sets the scale: moduli are ratios to it")
+            )
             rows.append(ParameterRow(p.name, p.name.replace("_", " "), p.value, low, high, p.unit, note))
     return tuple(rows)
 
@@ -182,7 +184,7 @@ def parameter_rows(model: CalibratedModel, names: Sequence[str]) -> tuple[Parame
 def undetermined(model: CalibratedModel, names: Sequence[str]) -> tuple[str, ...]:
     """Say in words what the data cannot tell about the parameters `names`."""
     out = []
-    if not model.knowledge.scale_is_absolute:
+    if not model.known_materials.scale_is_absolute:
         out.append("Displacements alone do not give the absolute stiffness: the moduli are ratios to the material that sets the scale.")
     by_name: dict[str, Parameter] = {p.name: p for p in model.parameters}
     for name in names:
@@ -280,7 +282,7 @@ def _prediction_headline(p: Prediction) -> tuple[str, ...]:
     what = {"side_plates": "side plates {} mm apart", "bar": "the bar {} mm above the base"}.get(
         p.specimen.experiment.loading.kind, "the plate {} mm above the base"
     )
-    place, label = what.format(f"{p.opening_mm:.2f}"), f"{p.specimen.experiment.name}/{p.state}"
+    place, label = what.format(f"{p.platen_position_mm:.2f}"), f"{p.specimen.experiment.name}/{p.state}"
     spread = f"The stated standard deviation of a predicted coordinate is {np.median(p.sd_mm):.2f} mm (median over the markers)."
     if not p.registered:
         return (f"{len(p.points)} markers of {label} are predicted, with {place}; no measured positions are there to compare.", spread)

@@ -216,7 +216,7 @@ def write_prediction(folder: Path, model: CalibratedModel, prediction: Predictio
         "experiment": p.specimen.experiment.name,
         "state": p.state,
         "used_to_identify": f"{p.specimen.experiment.name}/{p.state}" in model.trials,
-        "opening_mm": p.opening_mm,
+        "platen_position_mm": p.platen_position_mm,
         "registered_to_measured": p.registered,
         **_figures(accuracy(p.specimen, p.fit, p.residual)),
         "rms_3d_mm_with_completed": rms(p.residual) if p.registered else None,

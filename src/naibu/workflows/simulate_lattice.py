@@ -210,7 +210,7 @@ def _page(prepared: PreparedStudy, series: SeriesFile, state: StudyState) -> Mot
     if "stretch" in prepared.settings.output.quantities:
         stretch = np.stack([series.values(ARRAYS["stretch"], int(k))[nodes] for k in frames]).astype(float)
         fields.append(ColourField("mean stretch of the elements, %", 100.0 * stretch, two_sided=True))
-    bodies = [RigidShape(b.name, KINDS[b.pusher.kind], np.asarray(b.pusher.size), np.asarray(b.pusher.axes)) for b in study.bodies]
+    bodies = [RigidShape(b.name, KINDS[b.indenter.kind], np.asarray(b.indenter.size), np.asarray(b.indenter.axes)) for b in study.bodies]
     count = state.frame * study.samples
     force = series.rows("force_mN")[:count]
     places = series.rows("place_mm")[frames].reshape(len(frames), len(bodies), 3)

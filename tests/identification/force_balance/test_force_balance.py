@@ -257,7 +257,7 @@ def test_nodes_without_data_take_their_neighbours_out_and_nothing_else() -> None
     zones = body.zones()
     u = body.displacement((0.0, -25.0))
     u[6] = np.nan
-    trial = FieldTrial.of("hole", Field.from_arrays(body.mesh.points, u), body.mesh, loaded=body.held)
+    trial = FieldTrial.of("hole", Field.from_arrays(body.mesh.points, u), body.mesh, loaded=body.constrained)
     balance = trial_balances(body.mesh, [trial], zones)[0]
     around = set(body.mesh.cells[(body.mesh.cells == 6).any(axis=1)].ravel().tolist())
     assert set((balance.rows // 2).tolist()) == set(range(5, 20)) - around
@@ -272,7 +272,7 @@ def test_a_mesh_coarser_than_the_truth_errs_less_as_it_is_refined() -> None:
     errors = []
     for divisions in (4, 8, 16):
         body = square(SQUARE_PUSHES[0][:1], divisions=divisions)
-        trial = FieldTrial.of("fine", Field.from_arrays(fine.mesh.points, u), body.mesh, loaded=body.held)
+        trial = FieldTrial.of("fine", Field.from_arrays(fine.mesh.points, u), body.mesh, loaded=body.constrained)
         estimate = whitened_balance(body.mesh, [trial], body.zones())
         errors.append(abs(estimate.young_modulus[0] / SQUARE[0] - 1.0))
     assert errors[2] < errors[1] < errors[0]
@@ -285,20 +285,20 @@ def cramer_rao(body: PushedBody, zones: Zones, sd_mm: float) -> np.ndarray:
     Dense and by differentiating the solution, which `whitened_balance` never does.
     """
     lame, shear = body.moduli
-    linear, held = LinearBody.of(body.mesh), np.repeat(body.held, body.mesh.dimension)
+    linear, constrained = LinearBody.of(body.mesh), np.repeat(body.constrained, body.mesh.dimension)
     stiffness = linear.stiffness(lame, shear).toarray()
-    inner = np.linalg.inv(stiffness[np.ix_(~held, ~held)])
+    inner = np.linalg.inv(stiffness[np.ix_(~constrained, ~constrained)])
     total = np.zeros((2 * zones.count,) * 2)
     for push in body.pushes:
         u = body.displacement(push)
-        of_moduli = np.zeros((held.size, 2 * zones.count))
+        of_moduli = np.zeros((constrained.size, 2 * zones.count))
         for k in range(2 * zones.count):
             unit = (zones.of_cell == k % zones.count).astype(float)
             force = linear.forces(unit * (k < zones.count), unit * (k >= zones.count), u).ravel()
-            of_moduli[~held, k] = -inner @ force[~held]
-        of_boundary = np.zeros((held.size, int(held.sum())))
-        of_boundary[held] = np.eye(int(held.sum()))
-        of_boundary[~held] = -inner @ stiffness[np.ix_(~held, held)]
+            of_moduli[~constrained, k] = -inner @ force[~constrained]
+        of_boundary = np.zeros((constrained.size, int(constrained.sum())))
+        of_boundary[constrained] = np.eye(int(constrained.sum()))
+        of_boundary[~constrained] = -inner @ stiffness[np.ix_(~constrained, constrained)]
         cross = of_boundary.T @ of_moduli
         total += of_moduli.T @ of_moduli - cross.T @ np.linalg.solve(of_boundary.T @ of_boundary, cross)
     return np.linalg.inv(total) * sd_mm**2
@@ -371,7 +371,7 @@ def test_the_whitened_estimate_is_a_stationary_point_of_the_likelihood_written_o
     zones, trials = body.zones(), body.trials(sd_mm=0.2, seed=3)
     lame, shear = connection_matrices(simplices(body.mesh))
     index = (body.mesh.cells[:, :, None] * 2 + np.arange(2)).reshape(body.mesh.n_cells, 6)
-    rows = ~np.repeat(body.held, 2)
+    rows = ~np.repeat(body.constrained, 2)
 
     def deviance(log_moduli: np.ndarray) -> float:
         cell_lame, cell_shear = zones.per_cell(*np.exp(log_moduli).reshape(2, -1))
@@ -429,7 +429,7 @@ def test_data_on_points_of_their_own_need_the_noise_of_interpolation() -> None:
     body = cube()
     u = body.displacement((0.0, 0.0, -10.0))
     coarse = (np.rint(body.mesh.points / 10.0) % 2 == 0).all(axis=1)
-    trial = FieldTrial.of("coarse", Field.from_arrays(body.mesh.points[coarse], u[coarse], sd_mm=0.05), body.mesh, loaded=body.held)
+    trial = FieldTrial.of("coarse", Field.from_arrays(body.mesh.points[coarse], u[coarse], sd_mm=0.05), body.mesh, loaded=body.constrained)
     with pytest.raises(InputError, match=r"share the data of the same points.*interpolation_sd_mm"):
         whitened_balance(body.mesh, [trial], body.zones())
     estimate = whitened_balance(body.mesh, [trial], body.zones(), interpolation_sd_mm=0.5)
@@ -448,7 +448,7 @@ def broken() -> dict[str, tuple[str, str, list[FieldTrial], Zones, dict[str, obj
     mixed = replace(one, field=Field.from_arrays(mesh.points, one.field.vectors, sd_mm=0.1))
     nowhere = FieldTrial.of("held", one.field, mesh, loaded=np.ones(mesh.n_points, dtype=bool))
     unfit = replace(zones, known_lambda=np.full_like(zones.known_lambda, np.nan))
-    far = np.where(mesh.points[:, 1:] == 100.0, True, body.held[:, None])
+    far = np.where(mesh.points[:, 1:] == 100.0, True, body.constrained[:, None])
     return {
         "no trial": ("field", "no trial is given", [], zones, {}),
         "method": ("field", "method 'svd' is not known", [one], zones, {"method": "svd"}),
@@ -485,7 +485,7 @@ def test_zones_that_no_balance_reaches_are_named() -> None:
     zones = body.zones(each_cell=True)
     u = body.displacement((0.0, -25.0))
     u[5] = np.nan
-    trial = FieldTrial.of("hole", Field.from_arrays(body.mesh.points, u), body.mesh, loaded=body.held)
+    trial = FieldTrial.of("hole", Field.from_arrays(body.mesh.points, u), body.mesh, loaded=body.constrained)
     with pytest.raises(InputError, match=r"'lower half: cell 0', .* and 1 more zones appear in no balance"):
         field_balance(body.mesh, [trial], zones, method="minimum_norm")
 

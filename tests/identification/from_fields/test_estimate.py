@@ -37,7 +37,7 @@ def layered(law: str = "linear", pushes: Sequence[tuple[float, ...]] = (PRESS,))
 def with_noise(body: PushedBody, states: Sequence[np.ndarray], sd_mm: float, seed: int) -> list[FieldTrial]:
     rng = np.random.default_rng(seed)
     fields = [Field.from_arrays(body.mesh.points, u + sd_mm * rng.standard_normal(u.shape), sd_mm=sd_mm) for u in states]
-    return [FieldTrial.of(f"push {k}", field, body.mesh, loaded=body.held) for k, field in enumerate(fields)]
+    return [FieldTrial.of(f"push {k}", field, body.mesh, loaded=body.constrained) for k, field in enumerate(fields)]
 
 
 def true_theta(body: PushedBody, zones: Zones) -> np.ndarray:
@@ -395,7 +395,7 @@ def test_bad_input_is_named() -> None:
 def test_fields_that_say_too_little_are_told(points: int, message: str) -> None:
     body = layered()
     few = Field.from_arrays(body.mesh.points[60 : 60 + points], np.full((points, 3), 1.0), sd_mm=0.1)
-    trial = FieldTrial.of("push", few, body.mesh, loaded=body.held)
+    trial = FieldTrial.of("push", few, body.mesh, loaded=body.constrained)
     with pytest.raises(ConvergenceError, match=message):
         identify_field(body.mesh, [trial], body.zones())
 

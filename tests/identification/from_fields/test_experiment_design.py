@@ -20,7 +20,7 @@ SD_MM = 0.05
 def plan(sd_mm: float, noise: np.ndarray | float = 0.0):
     body = cube({"below": (0.25, 0.4)}, known=(0.3, 0.4), divisions=4)
     u = body.displacement((0.0, 0.0, -10.0)) + noise
-    return body, [FieldTrial.of("push", Field.from_arrays(body.mesh.points, u, sd_mm=sd_mm), body.mesh, loaded=body.held)]
+    return body, [FieldTrial.of("push", Field.from_arrays(body.mesh.points, u, sd_mm=sd_mm), body.mesh, loaded=body.constrained)]
 
 
 def expected(sd_mm: float):

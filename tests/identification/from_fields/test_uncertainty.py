@@ -60,7 +60,7 @@ def test_information_is_whitened_force_balance_where_every_node_is_measured() ->
     body = cube(LAYERS)
     zones = body.zones()
     at = linearised(body, zones)
-    free = ~np.repeat(body.held, 3)
+    free = ~np.repeat(body.constrained, 3)
     stiffness, columns = at.stiffness[0].toarray()[free], at.columns[0].toarray()[free]
     expected = columns.T @ np.linalg.solve(0.1**2 * stiffness @ stiffness.T, columns)
     assert at.concentrated(np.eye(4)).hessian == pytest.approx(expected, rel=1e-3)  # the weak prior on loaded nodes

@@ -12,7 +12,7 @@ from naibu.core.markers import Markers
 from naibu.identification.from_markers import gauss_newton, observations
 from naibu.identification.from_markers.calibration import calibrate, initial_parameters
 from naibu.identification.from_markers.gauss_newton import Matcher
-from naibu.identification.from_markers.known_materials import Knowledge
+from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import Nearby, NoiseModel, Trial
 from naibu.identification.from_markers.parameter_names import (
     base_offset,
@@ -29,7 +29,7 @@ from naibu.identification.prediction.prediction import predict, rms
 from naibu.mechanics.finite_strain.problem import SolverSettings
 from naibu.validation.specimens.marker_phantoms import Scanner, two_gels, virtual_specimen
 
-KNOWN = Knowledge({"hardness 5": 222.0})
+KNOWN = KnownMaterials({"hardness 5": 222.0})
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def test_derivatives_of_predicted_markers(
     monkeypatch.setattr(observations, "HINT_SPACING", 0.0)  # all on the same path
     experiment = datasets.load(name)
     body = specimen(experiment, ModelSettings(element_size_mm=size, law=law, pixel_scale="sought"))
-    known = KNOWN if "hardness 5" in experiment.materials else Knowledge()
+    known = KNOWN if "hardness 5" in experiment.materials else KnownMaterials()
     parameters = initial_parameters([body], {name: [state]}, known)
     matcher = Matcher([Trial.of(body, state, NoiseModel())], parameters)
     values = parameters.values() | {base_offset(experiment): 0.3, pixel_scale(experiment): 1.01}
@@ -78,7 +78,7 @@ def test_pixels_of_another_size_are_the_same_object() -> None:
     fits = []
     for scan, scale in ((experiment, experiment.xy_scale), (replace(experiment, states=states), 1.02 * experiment.xy_scale)):
         body = specimen(scan, ModelSettings(element_size_mm=20.0, pixel_scale="sought"))
-        parameters = initial_parameters([body], {scan.name: ["height_45"]}, Knowledge())
+        parameters = initial_parameters([body], {scan.name: ["height_45"]}, KnownMaterials())
         matcher = Matcher([Trial.of(body, "height_45", NoiseModel())], parameters)
         fits.append(matcher.evaluate(parameters.values() | {pixel_scale(scan): scale})[0])
     np.testing.assert_allclose(fits[1].predicted * shrink, fits[0].predicted, atol=1e-4)
@@ -112,7 +112,10 @@ def test_a_virtual_specimen_is_recovered_within_its_intervals() -> None:
     virtual = virtual_specimen(template, truth, settings=ModelSettings(element_size_mm=7.5), seed=1)
     data = virtual.scanned(seed=2, scanner=Scanner(placing_mm=0.15, xy_step_mm=0.0, z_step_mm=0.0))
     found = calibrate(
-        [data.experiment], knowledge=Knowledge({"stiff": 222.0}), noise=NoiseModel(0.15), settings=ModelSettings(element_size_mm=10.0)
+        [data.experiment],
+        known_materials=KnownMaterials({"stiff": 222.0}),
+        noise=NoiseModel(0.15),
+        settings=ModelSettings(element_size_mm=10.0),
     )
     model = CalibratedModel.of(found)
     assert found.match.status.ok
@@ -159,7 +162,7 @@ def test_heights_come_from_nothing_but_the_mean_z_of_two_layers(plate_model: Cal
     changed = replace(experiment, states=tuple(other if s.name == "height_35" else s for s in experiment.states))
     one = predict(plate_model, experiment, "height_35", heights_from_markers=True)
     two = predict(plate_model, changed, "height_35", heights_from_markers=True)
-    assert two.opening_mm == pytest.approx(one.opening_mm, abs=1e-6)
+    assert two.platen_position_mm == pytest.approx(one.platen_position_mm, abs=1e-6)
 
 
 def test_a_missing_coordinate_leaves_the_others_in_use() -> None:

@@ -10,7 +10,7 @@ from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, Loading
 from naibu.core.mesh import Mesh
 from naibu.identification.from_markers.initial_guess import balanced, force_balance
-from naibu.identification.from_markers.known_materials import Knowledge
+from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.marker_mesh import MarkerMesh, marker_mesh
 from naibu.identification.from_markers.parameter_names import poisson_ratio, young_modulus
 from naibu.identification.from_markers.specimen_model import ModelSettings
@@ -23,7 +23,7 @@ from naibu.mechanics.finite_strain.statics import solve
 from naibu.meshing.primitives import box_from_coordinates
 from naibu.validation.specimens.marker_phantoms import Scanner, VirtualSpecimen, box_experiment, virtual_specimen
 
-KNOWN = Knowledge({"hard": 222.0})
+KNOWN = KnownMaterials({"hard": 222.0})
 NOTHING = Scanner(0.0, 0.0, 0.0, missing=0.0)
 SOFT = (120.0, 0.47)
 
@@ -38,8 +38,8 @@ def solved(sign: float = 1.0) -> MarkerMesh:
     p = mesh.points
     on_surface = (np.abs(p[:, 0]) > 19.9) | (np.abs(p[:, 1]) > 19.9) | (p[:, 2] < 0.1) | (p[:, 2] > 39.9)
     pressed = np.stack([0.1 * p[:, 0] + sign * 2e-3 * p[:, 1] * p[:, 2], 0.05 * p[:, 1], -0.2 * p[:, 2] + 2e-3 * p[:, 0] ** 2], axis=1)
-    held = Prescribed.nothing(mesh.n_points).and_also(np.flatnonzero(on_surface), pressed[on_surface])
-    u = solve(Problem(p, assembler, (), held, np.zeros_like(p))).displacement
+    constrained = Prescribed.nothing(mesh.n_points).and_also(np.flatnonzero(on_surface), pressed[on_surface])
+    u = solve(Problem(p, assembler, (), constrained, np.zeros_like(p))).displacement
     return MarkerMesh("box/pressed", mesh, u, np.ones(u.shape, dtype=bool), np.flatnonzero(~on_surface))
 
 
@@ -113,7 +113,7 @@ def test_rigid_motion_of_the_scan_does_not_count() -> None:
 
 def test_bundled_cubes_give_a_start_of_the_right_size() -> None:
     experiments = [datasets.load(f"ct_two_material_{k}") for k in (2, 3)]
-    e, nu = force_balance(experiments, Knowledge({"hardness 5": 222.0}))["hardness 0"]
+    e, nu = force_balance(experiments, KnownMaterials({"hardness 5": 222.0}))["hardness 0"]
     assert 60.0 < e < 222.0
     assert 0.0 < nu < 0.5
 
@@ -135,7 +135,7 @@ def lone(experiment: Experiment) -> Experiment:
 )  # fmt: skip
 def test_what_cannot_be_balanced_is_said(experiments: list[Experiment], known: dict[str, float], words: str) -> None:
     with pytest.raises(InputError, match=words):
-        force_balance(experiments, Knowledge(known))
+        force_balance(experiments, KnownMaterials(known))
 
 
 def test_a_state_that_holds_no_positions_is_named() -> None:

@@ -110,15 +110,15 @@ def test_uncertain_measures_of_the_specimen_add_to_the_error():
     assert found.standard_error == pytest.approx(0.05 * 200.0, rel=1e-3)
 
 
-def held_cylinder(diameter: float, height: float, element_mm: float) -> tuple[list[float], list[float]]:
+def constrained_cylinder(diameter: float, height: float, element_mm: float) -> tuple[list[float], list[float]]:
     """Approach, mm, and force, mN, of a computed test between plates that hold the faces; E = 200 kPa."""
     mesh = cylinder(diameter, height, element_mm)
     z = mesh.points[:, 2]
     top, bottom = np.flatnonzero(z > height - 1e-6), np.flatnonzero(z < 1e-6)
-    held = Prescribed.nothing(mesh.n_points).and_also(bottom, (0, 0, 0)).and_also(top, (0, 0, -0.08 * height))
+    constrained = Prescribed.nothing(mesh.n_points).and_also(bottom, (0, 0, 0)).and_also(top, (0, 0, -0.08 * height))
     body = Assembler.from_materials(elements(mesh), mesh.regions, [material(young_modulus=200.0, poisson_ratio=0.499)])
     path = SolverSettings(first_step=0.2, largest_step=0.2)
-    states = solve(Problem(mesh.points, body, (), held, np.zeros_like(mesh.points)), settings=path).states
+    states = solve(Problem(mesh.points, body, (), constrained, np.zeros_like(mesh.points)), settings=path).states
     forces = [-float(body.forces(s.displacement)[1][top, 2].sum()) for s in states]
     return [0.08 * height * s.load for s in states], forces
 
@@ -128,7 +128,7 @@ def test_correction_for_held_faces_against_computed_specimens(diameter, height):
     """Gent and Lindley's factor for the report's cylinders: it leaves 6-7 % of the modulus, held faces add 16-80 %."""
     specimen = Specimen.cylinder(diameter, height)
     options = {"slack": False, "strain_range": (0.001, 0.1)}
-    d, force = held_cylinder(diameter, height, 3.5)
+    d, force = constrained_cylinder(diameter, height, 3.5)
     corrected = compression_test(d, force, specimen, ends="bonded", **options)
     assert corrected.young_modulus == pytest.approx(200.0, rel=0.085)
     assert corrected.apparent_modulus == pytest.approx(compression_test(d, force, specimen, **options).young_modulus)
@@ -163,7 +163,7 @@ D = np.linspace(0.0, 5.0, 30)
         (D, curve(D, 200.0, 0.0), {"strain_range": (0.9, 0.95)}, "0 readings lie between .* widen strain_range"),
         (D, curve(D, 200.0, 0.0), {"strain_range": (0.1, 0.1)}, "strain_range must rise"),
         (D, curve(D, 200.0, 0.0), {"curve": "cubic"}, "'cubic' is not known"),
-        (D, curve(D, 200.0, 0.0), {"ends": "glued"}, "'glued' are not known"),
+        (D, curve(D, 200.0, 0.0), {"ends": "tied"}, "'tied' are not known"),
         (D, curve(D, 200.0, 0.0), {"confidence": 1.0}, "confidence"),
         (D, curve(D, 200.0, 0.0), {"relative_area_sd": -1.0}, ">= 0"),
     ],
@@ -287,10 +287,10 @@ def test_held_faces_make_the_ratio_from_markers_a_lower_bound(nu):
     """A computed cube pressed by 25 % between plates that hold it: markers err by a few hundredths, the ratio of strains by far more."""
     mesh = box((60.0,) * 3, (6, 6, 6))
     z = mesh.points[:, 2]
-    held = Prescribed.nothing(mesh.n_points).and_also(np.flatnonzero(z < 1e-6), (0, 0, 0))
-    held = held.and_also(np.flatnonzero(z > 60.0 - 1e-6), (0, 0, -15.0))
+    constrained = Prescribed.nothing(mesh.n_points).and_also(np.flatnonzero(z < 1e-6), (0, 0, 0))
+    constrained = constrained.and_also(np.flatnonzero(z > 60.0 - 1e-6), (0, 0, -15.0))
     body = Assembler.from_materials(elements(mesh), mesh.regions, [material(young_modulus=100.0, poisson_ratio=nu)])
-    u = solve(Problem(mesh.points, body, (), held, np.zeros_like(mesh.points))).displacement
+    u = solve(Problem(mesh.points, body, (), constrained, np.zeros_like(mesh.points))).displacement
     inside = (np.abs(mesh.points[:, :2]) < 25.0).all(axis=1) & (z > 5.0) & (z < 55.0)
     free, loaded = cloud(mesh.points[inside]), cloud((mesh.points + u)[inside])
     found = poisson_ratio_from_markers(free, loaded).value

@@ -11,7 +11,7 @@ from naibu import datasets
 from naibu.core.errors import InputError
 from naibu.core.experiment import Layer
 from naibu.identification.from_markers.calibration import calibrate
-from naibu.identification.from_markers.known_materials import Knowledge
+from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel, Trial
 from naibu.identification.from_markers.specimen_model import ModelSettings, specimen
 from naibu.identification.prediction.baselines import affine, balanced, baselines, report_parameters
@@ -50,11 +50,11 @@ def test_an_affine_map_comes_back_from_points_with_gaps() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "state", "opening_mm"),
+    ("name", "state", "platen_position_mm"),
     [("ct_cube_plate", "height_45", 46.0), ("ct_two_material_2", "deformed", 43.5), ("ct_two_material_3", "deformed", 40.5)],
 )
-def test_every_description_explains_more_than_none(name: str, state: str, opening_mm: float) -> None:
-    found = baselines(trial(name, state), opening_mm)
+def test_every_description_explains_more_than_none(name: str, state: str, platen_position_mm: float) -> None:
+    found = baselines(trial(name, state), platen_position_mm)
     assert 3.0 < found["rigid"] < 12.0
     assert 0.3 < found["affine"] < 0.6 * found["rigid"]
     assert 0.5 < found["linear"] < 0.8 * found["rigid"]
@@ -79,7 +79,7 @@ def test_what_has_no_baseline_is_said(cube: Trial) -> None:
 
 def test_force_balance_stands_between_no_model_and_the_match() -> None:
     coarse = ModelSettings(element_size_mm=15.0)
-    found = calibrate([datasets.load("ct_two_material_2")], knowledge=Knowledge({"hardness 5": 222.0}), settings=coarse)
+    found = calibrate([datasets.load("ct_two_material_2")], known_materials=KnownMaterials({"hardness 5": 222.0}), settings=coarse)
     (distance,) = balanced(found).values()
     rigid = baselines(found.trials[0], 43.5)["rigid"]
     assert rms(found.match.fits[0].residual) < distance < 0.6 * rigid

@@ -9,7 +9,7 @@ from naibu.core.experiment import Experiment, Loading
 from naibu.identification.from_markers import calibration
 from naibu.identification.from_markers.calibration import calibrate
 from naibu.identification.from_markers.gauss_newton import MatchingSettings
-from naibu.identification.from_markers.known_materials import Knowledge
+from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
 from naibu.identification.from_markers.parameter_names import poisson_ratio, young_modulus
 from naibu.identification.from_markers.specimen_model import ModelSettings
@@ -19,7 +19,7 @@ from naibu.validation.specimens.marker_phantoms import Scanner, box_experiment, 
 
 COARSE = ModelSettings(contact="stick", element_size_mm=10.0)
 TRUTH = {young_modulus("soft"): 100.0, poisson_ratio("soft"): 0.48, young_modulus("hard"): 200.0, poisson_ratio("hard"): 0.48}
-KNOWN = Knowledge({"hard": 200.0})
+KNOWN = KnownMaterials({"hard": 200.0})
 QUICK = MatchingSettings(max_iterations=8)
 
 
@@ -37,7 +37,7 @@ def gels() -> list[Experiment]:
 def test_each_gel_is_predicted_from_the_other(gels: list[Experiment]) -> None:
     steps: list[str] = []
     rows = leave_one_out(
-        gels, knowledge=KNOWN, settings=COARSE, noise=NoiseModel(0.05), search=QUICK, callback=lambda name, *_: steps.append(name)
+        gels, known_materials=KNOWN, settings=COARSE, noise=NoiseModel(0.05), search=QUICK, callback=lambda name, *_: steps.append(name)
     )
     assert [(r.experiment, r.state, r.marker_count) for r in rows] == [("first", "pressed", 64), ("second", "pressed", 64)]
     assert set(steps) == {"first", "second"}
@@ -63,7 +63,7 @@ def test_an_interrupted_candidate_is_no_row(gels: list[Experiment]) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        compare_models(gels[:1], [COARSE], knowledge=KNOWN, noise=NoiseModel(0.05), search=QUICK, callback=stopped)
+        compare_models(gels[:1], [COARSE], known_materials=KNOWN, noise=NoiseModel(0.05), search=QUICK, callback=stopped)
 
 
 def test_a_failure_with_an_experiment_left_out_keeps_the_rest_of_the_row(gels: list[Experiment], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -71,7 +71,7 @@ def test_a_failure_with_an_experiment_left_out_keeps_the_rest_of_the_row(gels: l
         raise ConvergenceError("no equilibrium")
 
     monkeypatch.setattr(cross_validation, "leave_one_out", fails)
-    (row,) = compare_models(gels, [COARSE], knowledge=KNOWN, noise=NoiseModel(0.05), search=QUICK)
+    (row,) = compare_models(gels, [COARSE], known_materials=KNOWN, noise=NoiseModel(0.05), search=QUICK)
     assert "left out: no equilibrium" in row.problem
     assert row.noise_factor > 0.0
     n = 2 * 3 * 64
@@ -81,7 +81,7 @@ def test_a_failure_with_an_experiment_left_out_keeps_the_rest_of_the_row(gels: l
 @pytest.mark.slow
 def test_the_law_that_made_the_data_wins(gels: list[Experiment]) -> None:
     candidates = [COARSE, ModelSettings(law="linear_elastic", contact="stick", element_size_mm=10.0)]
-    right, wrong = compare_models(gels, candidates, knowledge=KNOWN, noise=NoiseModel(0.05))
+    right, wrong = compare_models(gels, candidates, known_materials=KNOWN, noise=NoiseModel(0.05))
     assert right.bic < wrong.bic
     assert right.left_out_mm < wrong.left_out_mm
 
@@ -108,7 +108,7 @@ def test_the_users_own_start_comes_first(gels: list[Experiment], monkeypatch: py
 
     monkeypatch.setattr(calibration.Matcher, "run", run)
     monkeypatch.setattr(calibration, "force_balance", lambda *_: {"soft": (90.0, 0.4)})
-    calibrate(gels[:1], knowledge=KNOWN, settings=COARSE)
+    calibrate(gels[:1], known_materials=KNOWN, settings=COARSE)
     assert begun[young_modulus("soft")] == 90.0
-    calibrate(gels[:1], knowledge=KNOWN, settings=COARSE, start={young_modulus("soft"): 70.0})
+    calibrate(gels[:1], known_materials=KNOWN, settings=COARSE, start={young_modulus("soft"): 70.0})
     assert begun[young_modulus("soft")] == 70.0

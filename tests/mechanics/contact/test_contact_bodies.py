@@ -64,11 +64,11 @@ def block(n=4, **options):
 def test_frictionless_compression_is_uniaxial(cell_type):
     mesh = block(cell_type=cell_type)
     zero = (0.0, 0.0, 0.0)
-    held = Prescribed.nothing(mesh.n_points)
-    held = held.and_also(np.flatnonzero(mesh.points[:, 0] == 0), zero, (True, False, False))
-    held = held.and_also(np.flatnonzero(mesh.points[:, 1] == 0), zero, (False, True, False))
+    constrained = Prescribed.nothing(mesh.n_points)
+    constrained = constrained.and_also(np.flatnonzero(mesh.points[:, 0] == 0), zero, (True, False, False))
+    constrained = constrained.and_also(np.flatnonzero(mesh.points[:, 1] == 0), zero, (False, True, False))
     base, top = plates(mesh, stop=(0, 0, 0.6 * SIZE), mu_base=0.0, mu_top=0.0)
-    solution = solve(problem(mesh, contacts=(base, top), prescribed=held))
+    solution = solve(problem(mesh, contacts=(base, top), prescribed=constrained))
 
     def mismatch(stretch):
         pressure = -uniaxial(GEL, stretch).nominal_stress[2]
@@ -175,7 +175,7 @@ def test_block_resting_exactly_on_the_table_carries_its_weight():
 def test_departing_plate_releases_the_block():
     mesh = block(3)
     base, top = plates(mesh, start=(0, 0, 0.9 * SIZE), stop=(0, 0, 1.1 * SIZE), mu_top=0.2)
-    glued = rigid_contact(
+    tied = rigid_contact(
         "base",
         mesh.points,
         base.nodes[::9],
@@ -184,10 +184,10 @@ def test_departing_plate_releases_the_block():
         stop=(0, 0, 0),
         friction=Friction(),
         normal_stiffness=K_N,
-        bonded=True,
+        tied=True,
     )
     pressed = []
-    solution = solve(problem(mesh, contacts=(glued, top)), callback=pressed.append)
+    solution = solve(problem(mesh, contacts=(tied, top)), callback=pressed.append)
     assert len(pressed) == len(solution.states) - 1
     early = -solution.states[1].displacement[:, 2].min()
     assert early > 1
@@ -195,12 +195,12 @@ def test_departing_plate_releases_the_block():
     np.testing.assert_allclose(solution.displacement, 0, atol=1e-6 * early)
 
 
-def joined(mu=0.0, *, bonded=False):
+def joined(mu=0.0, *, tied=False):
     """A block of two halves, and the contact between them."""
     mesh = block(layers=[("low", SIZE / 2), ("high", SIZE / 2)])
     areas = node_areas(mesh, faces_among(*_lower_half(mesh)))
     split, pairs = split_at_plane(mesh, SIZE / 2)
-    joint = interface("joint", split.points, pairs, areas[pairs[:, 0]], friction=Friction(mu, 2e4), normal_stiffness=1e6, bonded=bonded)
+    joint = interface("joint", split.points, pairs, areas[pairs[:, 0]], friction=Friction(mu, 2e4), normal_stiffness=1e6, tied=tied)
     return mesh, split, joint
 
 
@@ -211,12 +211,12 @@ def _lower_half(mesh):
 
 
 def moved_top(mesh, shift):
-    held = Prescribed.nothing(mesh.n_points).and_also(side_nodes(mesh, "z-"), (0, 0, 0))
-    return held.and_also(side_nodes(mesh, "z+"), shift)
+    constrained = Prescribed.nothing(mesh.n_points).and_also(side_nodes(mesh, "z-"), (0, 0, 0))
+    return constrained.and_also(side_nodes(mesh, "z+"), shift)
 
 
 def test_bonded_joint_is_as_good_as_one_piece():
-    mesh, split, joint = joined(bonded=True)
+    mesh, split, joint = joined(tied=True)
     assert joint.area.sum() == pytest.approx(SIZE**2)
     shift = (2.0, 0.0, 2.0)  # pulled apart and sheared
     whole = solve(problem(mesh, GEL, GEL, prescribed=moved_top(mesh, shift)))

@@ -20,7 +20,7 @@ FLAT, BAR = plane((0.0, 0.0, -1.0)), bar("y", 12.0, corner_radius_mm=2.0)
 TILT = Rotation.from_rotvec([0.1, -0.15, 0.05]).as_matrix()
 
 
-def points(y, *, surface=FLAT, mu=0.3, bonded=False, rotation=None, area=1.7) -> Contact:
+def points(y, *, surface=FLAT, mu=0.3, tied=False, rotation=None, area=1.7) -> Contact:
     """Free points that touch a body; displacement 0 puts them at `y` (p, 3) in the body's frame."""
     y, turn = np.atleast_2d(y).astype(float), np.eye(3) if rotation is None else rotation
     p, zero = len(y), np.zeros(3)
@@ -37,7 +37,7 @@ def points(y, *, surface=FLAT, mu=0.3, bonded=False, rotation=None, area=1.7) ->
         K_N,
         np.full(p, K_T),
         np.full(p, mu),
-        bonded,
+        tied,
     )
 
 
@@ -85,7 +85,7 @@ def test_derivatives_of_tractions(surface, regime, seed):
     rng = np.random.default_rng(seed)
     y = touching(seed, surface, ramp=regime == "ramp")
     mu = {"stick": 1e3, "slip": 0.01, "ramp": 0.3, "bonded": 0.1, "frictionless": 0.0}[regime]
-    c = points(y, surface=surface, mu=mu, bonded=regime == "bonded")
+    c = points(y, surface=surface, mu=mu, tied=regime == "bonded")
     anchors = y + rng.normal(scale=3.0 if regime == "slip" else 0.05, size=y.shape)
     zero = np.zeros_like(y)
     response = c.evaluate(zero, anchors, 0.0)
@@ -102,9 +102,7 @@ def test_derivatives_of_tractions(surface, regime, seed):
     np.testing.assert_allclose(response.tangential_stiffness, by_place, atol=1e-6 * size)
     by_anchor = differences(lambda a: c.evaluate(zero, a, 0.0).force, anchors)
     np.testing.assert_allclose(response.anchor_stiffness, by_anchor, atol=1e-6 * size)
-    more, less = (
-        points(y, surface=surface, mu=mu + s * 1e-6, bonded=regime == "bonded").evaluate(zero, anchors, 0.0).force for s in (1, -1)
-    )
+    more, less = (points(y, surface=surface, mu=mu + s * 1e-6, tied=regime == "bonded").evaluate(zero, anchors, 0.0).force for s in (1, -1))
     if mu > 0:
         np.testing.assert_allclose(response.slip_direction, (more - less) / 2e-6, atol=1e-6 * np.abs(response.force).max())
 
@@ -133,7 +131,7 @@ def test_points_apart_from_the_body_feel_nothing_unless_bonded():
     assert response.gap[0] == pytest.approx(0.5)
     assert not response.force.any()
     assert not response.stiffness.any()
-    np.testing.assert_allclose(points(away, bonded=True).evaluate(zero, away, 0.0).force, [[0, 0, 0.5 * K_N * 1.7]])
+    np.testing.assert_allclose(points(away, tied=True).evaluate(zero, away, 0.0).force, [[0, 0, 0.5 * K_N * 1.7]])
 
 
 def test_pressure_starts_smoothly_and_is_linear_beyond_the_ramp():

@@ -33,11 +33,11 @@ RATIOS = (0.45, 0.49, 0.499)
 def force(nu: float, kind: str, formulation: str, n: int = 4) -> float:
     """Force, mN, that presses the octant of a 20 mm cube by 40 % between plates to which it sticks."""
     mesh = as_kind(box((10, 10, 10), (n, n, n), centred=False), kind)
-    held = Prescribed.nothing(mesh.n_points)
+    constrained = Prescribed.nothing(mesh.n_points)
     for axis in range(3):
-        held = held.and_also(np.flatnonzero(mesh.points[:, axis] < 1e-9), (0, 0, 0), tuple(axis == k for k in range(3)))
+        constrained = constrained.and_also(np.flatnonzero(mesh.points[:, axis] < 1e-9), (0, 0, 0), tuple(axis == k for k in range(3)))
     top = side_nodes(mesh, "z+")
-    body = problem(mesh, of("neo_hookean", nu), prescribed=held.and_also(top, (0, 0, -4)), formulation=formulation)
+    body = problem(mesh, of("neo_hookean", nu), prescribed=constrained.and_also(top, (0, 0, -4)), formulation=formulation)
     solution = solve(body, settings=SolverSettings(tolerance=1e-6))
     return -float(body.assembler.forces(solution.displacement)[1][top, 2].sum())
 

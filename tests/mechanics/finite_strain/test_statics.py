@@ -28,10 +28,10 @@ ZERO = (0.0, 0.0, 0.0)
 
 def roller(mesh: Mesh, *, base=True) -> Prescribed:
     """Symmetry planes x = 0 and y = 0 of a mesh in the first octant, and z = 0."""
-    held = Prescribed.nothing(mesh.n_points)
+    constrained = Prescribed.nothing(mesh.n_points)
     for axis in range(3 if base else 2):
-        held = held.and_also(np.flatnonzero(np.abs(mesh.points[:, axis]) < 1e-9), ZERO, tuple(axis == k for k in range(3)))
-    return held
+        constrained = constrained.and_also(np.flatnonzero(np.abs(mesh.points[:, axis]) < 1e-9), ZERO, tuple(axis == k for k in range(3)))
+    return constrained
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -247,7 +247,7 @@ def test_linear_solvers_lead_to_the_same_state():
     assert relative(solve(body, solver=SuperLUSolver()).displacement, solve(body).displacement) < 1e-6
     mesh, stuck = crushed(0.3)
     reference = solve(stuck)
-    multigrid = solve(stuck, solver=MultigridSolver(mesh.points, stuck.prescribed.held.ravel()))
+    multigrid = solve(stuck, solver=MultigridSolver(mesh.points, stuck.prescribed.constrained.ravel()))
     assert relative(multigrid.displacement, reference.displacement) < 1e-6
     assert multigrid.linear_solver == MultigridSolver.name
 
@@ -261,7 +261,7 @@ def test_states_follow_the_load_and_are_reported():
     assert (np.diff([0.0, *seen]) > 0).all()
     for state in solution.states:
         np.testing.assert_allclose(
-            state.displacement[body.prescribed.held], state.load * body.prescribed.values[body.prescribed.held], atol=1e-14
+            state.displacement[body.prescribed.constrained], state.load * body.prescribed.values[body.prescribed.constrained], atol=1e-14
         )
 
 

@@ -185,16 +185,16 @@ def bar(m: Material, value=None, force: float = 0.0, divisions=(1, 1, 2)):
     """A cube on a frictionless floor, its free sides held from turning; the top is moved by `value`, or pulled by `force` mN."""
     mesh = box((SIDE,) * 3, divisions, centred=False)
     x = mesh.points
-    held = Prescribed.nothing(len(x))
+    constrained = Prescribed.nothing(len(x))
     for axis in range(3):
         only = tuple(k == axis for k in range(3))
-        held = held.and_also(np.flatnonzero(x[:, axis] < 1e-9), (0, 0, 0), only)
+        constrained = constrained.and_also(np.flatnonzero(x[:, axis] < 1e-9), (0, 0, 0), only)
     top = np.flatnonzero(x[:, 2] > SIDE - 1e-9)
     if value is not None:
-        held = held.and_also(top, (0, 0, value), (False, False, True))
+        constrained = constrained.and_also(top, (0, 0, value), (False, False, True))
     share = np.zeros_like(x)
     share[top, 2] = force / len(top)
-    return problem(mesh, m, prescribed=held, force=share), top
+    return problem(mesh, m, prescribed=constrained, force=share), top
 
 
 def test_slow_and_fast_ramps_are_the_maxwell_solids_of_small_strain():
@@ -240,9 +240,9 @@ def squeezed(m: Material, divisions=(3, 3, 3)):
     """A block pressed by 25 % between plates that hold it: the strain is far from uniform."""
     mesh = box((SIDE,) * 3, divisions)
     z = mesh.points[:, 2]
-    held = Prescribed.nothing(mesh.n_points).and_also(np.flatnonzero(z < 1e-9), (0, 0, 0))
+    constrained = Prescribed.nothing(mesh.n_points).and_also(np.flatnonzero(z < 1e-9), (0, 0, 0))
     top = np.flatnonzero(z > SIDE - 1e-9)
-    return problem(mesh, m, prescribed=held.and_also(top, (0.3, 0, -2.5))), top
+    return problem(mesh, m, prescribed=constrained.and_also(top, (0.3, 0, -2.5))), top
 
 
 def scaled(m: Material, factor: float) -> Material:

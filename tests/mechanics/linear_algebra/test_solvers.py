@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.mechanics.linear_algebra import direct, solver_selection
-from naibu.mechanics.linear_algebra.block_matrix import constrained
+from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
 from naibu.mechanics.linear_algebra.direct import PardisoSolver, SuperLUSolver, direct_solver, pardiso_library
 from naibu.mechanics.linear_algebra.iterative import RecycledCholesky
 from naibu.mechanics.linear_algebra.multigrid import MultigridSolver, rigid_body_modes
@@ -25,19 +25,19 @@ needs_pardiso = pytest.mark.skipif(pardiso_library() is None, reason="oneMKL is 
 def body(divisions: int):
     """A block, and which of its degrees of freedom are held."""
     mesh = distorted("hexahedron", divisions=divisions, amount=0.1)
-    held = np.zeros((mesh.n_points, 3), dtype=bool)
-    held[side_nodes(distorted("hexahedron", divisions=divisions, amount=0.0), "z-")] = True
-    return mesh, held
+    constrained = np.zeros((mesh.n_points, 3), dtype=bool)
+    constrained[side_nodes(distorted("hexahedron", divisions=divisions, amount=0.0), "z-")] = True
+    return mesh, constrained
 
 
-MESH, HELD = body(5)
+MESH, CONSTRAINED = body(5)
 
 
-def stiffness(young=20.0, nu=0.45, squeeze=0.05, held=HELD, mesh=MESH) -> sp.bsr_matrix:
+def stiffness(young=20.0, nu=0.45, squeeze=0.05, constrained=CONSTRAINED, mesh=MESH) -> sp.bsr_matrix:
     """Tangent of a block that is compressed by `squeeze` at constant volume: positive definite where it is held."""
     made = assembler(mesh, of("neo_hookean", nu, young))
     widening = (1 - squeeze) ** -0.5 - 1
-    return constrained(made.pattern.matrix(made.evaluate(mesh.points * [widening, widening, -squeeze])[2]), held)
+    return with_dirichlet_rows(made.pattern.matrix(made.evaluate(mesh.points * [widening, widening, -squeeze])[2]), constrained)
 
 
 def unsymmetric() -> sp.bsr_matrix:
@@ -60,7 +60,7 @@ def test_all_solvers_agree_with_dense_algebra(symmetric, columns):
     matrix = stiffness() if symmetric else unsymmetric()
     shape = matrix.shape[0] if columns is None else (matrix.shape[0], columns)
     b = np.random.default_rng(1).normal(size=shape)
-    b[HELD.ravel()] = 0
+    b[CONSTRAINED.ravel()] = 0
     exact = np.linalg.solve(matrix.toarray(), b)
     for solver in solvers(matrix, symmetric=symmetric):
         x = solver.factorize(matrix).solve(b)
@@ -70,7 +70,7 @@ def test_all_solvers_agree_with_dense_algebra(symmetric, columns):
 
 @pytest.mark.parametrize("symmetric", [True, False])
 def test_a_solver_serves_other_values_of_the_same_pattern(symmetric):
-    b = np.random.default_rng(2).normal(size=3 * MESH.n_points) * ~HELD.ravel()
+    b = np.random.default_rng(2).normal(size=3 * MESH.n_points) * ~CONSTRAINED.ravel()
     matrices = [stiffness(), stiffness(young=200.0, nu=0.3), stiffness(squeeze=0.2)]
     for solver in solvers(matrices[0], symmetric=symmetric):
         for matrix in matrices:
@@ -92,7 +92,7 @@ def test_pardiso_survives_an_indefinite_matrix_and_comes_back():
 
 @pytest.mark.parametrize("symmetric", [True, False])
 def test_singular_systems_are_refused(symmetric):
-    free = stiffness(held=np.zeros_like(HELD), squeeze=0.0)  # six rigid motions
+    free = stiffness(constrained=np.zeros_like(CONSTRAINED), squeeze=0.0)  # six rigid motions
     loose = stiffness()  # one node on which nothing acts
     node = MESH.n_points // 2
     rows = np.repeat(np.arange(MESH.n_points), np.diff(loose.indptr))
@@ -103,27 +103,27 @@ def test_singular_systems_are_refused(symmetric):
                 continue  # its last pivot is rounding, not zero
             with pytest.raises(ConvergenceError, match=r"singular.*held"):
                 solver.factorize(matrix)
-        held = stiffness()
-        np.testing.assert_allclose(held @ solver.factorize(held).solve(np.ones(held.shape[0])), 1, atol=1e-9)
+        constrained = stiffness()
+        np.testing.assert_allclose(constrained @ solver.factorize(constrained).solve(np.ones(constrained.shape[0])), 1, atol=1e-9)
 
 
 def test_multigrid_agrees_with_direct_solvers_also_with_an_aged_hierarchy():
-    mesh, held = body(9)
+    mesh, constrained = body(9)
     assert mesh.n_points > 600  # more than the size of the coarsest level
-    solver = MultigridSolver(mesh.points, held.ravel(), relative_tolerance=1e-11)
+    solver = MultigridSolver(mesh.points, constrained.ravel(), relative_tolerance=1e-11)
     rng = np.random.default_rng(5)
     for young, nu, squeeze in ((20.0, 0.45, 0.05), (20.0, 0.45, 0.06), (20.0, 0.49, 0.3)):
-        matrix = stiffness(young, nu, squeeze, held=held, mesh=mesh)
-        b = rng.normal(size=(matrix.shape[0], 2)) * ~held.reshape(-1, 1)
+        matrix = stiffness(young, nu, squeeze, constrained=constrained, mesh=mesh)
+        b = rng.normal(size=(matrix.shape[0], 2)) * ~constrained.reshape(-1, 1)
         x = solver.factorize(matrix).solve(b)
         assert relative(x, SuperLUSolver().factorize(matrix).solve(b)) < 1e-8
 
 
 def test_multigrid_says_when_it_does_not_converge():
-    mesh, held = body(9)
-    matrix = stiffness(held=held, mesh=mesh)
+    mesh, constrained = body(9)
+    matrix = stiffness(constrained=constrained, mesh=mesh)
     with pytest.raises(ConvergenceError, match="in 2 iterations"):
-        MultigridSolver(mesh.points, held.ravel(), max_iterations=2).factorize(matrix).solve(np.ones(matrix.shape[0]))
+        MultigridSolver(mesh.points, constrained.ravel(), max_iterations=2).factorize(matrix).solve(np.ones(matrix.shape[0]))
 
 
 def test_without_pardiso_superlu_is_used(monkeypatch):
@@ -137,16 +137,16 @@ def test_without_pardiso_superlu_is_used(monkeypatch):
     with pytest.raises(InputError, match="naibu\\[fast\\]"):
         PardisoSolver(matrix, symmetric=True)
     monkeypatch.setattr(solver_selection, "DIRECT_LIMIT", 60)
-    assert choose_solver(matrix, MESH.points, HELD.ravel(), symmetric=False).name == SuperLUSolver.name
+    assert choose_solver(matrix, MESH.points, CONSTRAINED.ravel(), symmetric=False).name == SuperLUSolver.name
 
 
 @pytest.mark.parametrize("symmetric", [True, False])
 def test_size_and_symmetry_choose_the_solver(monkeypatch, symmetric):
     matrix = stiffness()
-    small = choose_solver(matrix, MESH.points, HELD.ravel(), symmetric=symmetric)
+    small = choose_solver(matrix, MESH.points, CONSTRAINED.ravel(), symmetric=symmetric)
     assert not isinstance(small, MultigridSolver)
     monkeypatch.setattr(solver_selection, "DIRECT_LIMIT", 60)
-    large = choose_solver(matrix, MESH.points, HELD.ravel(), symmetric=symmetric)
+    large = choose_solver(matrix, MESH.points, CONSTRAINED.ravel(), symmetric=symmetric)
     assert isinstance(large, MultigridSolver) == symmetric
 
 
@@ -185,7 +185,7 @@ def test_recycled_cholesky_serves_other_tangents_and_many_columns():
     matrices = [stiffness(squeeze=s) for s in (0.05, 0.06, 0.07, 0.08)]
     solver, rng = Counting(matrices[0]), np.random.default_rng(6)
     for matrix in matrices:
-        b = rng.normal(size=(matrix.shape[0], 3)) * ~HELD.reshape(-1, 1)
+        b = rng.normal(size=(matrix.shape[0], 3)) * ~CONSTRAINED.reshape(-1, 1)
         b[:, 1] = 0.0
         factorization = solver.factorize(matrix)
         x = factorization.solve(b)
@@ -209,12 +209,12 @@ def test_recycled_cholesky_becomes_direct_where_the_tangent_is_indefinite_and_re
         for m in (shifted, matrix):
             assert relative(solver.factorize(m).solve(b), np.linalg.solve(m.toarray(), b)) < 1e-8
     with pytest.raises(ConvergenceError, match=r"singular.*held"):
-        RecycledCholesky(matrix).factorize(stiffness(held=np.zeros_like(HELD), squeeze=0.0)).solve(b)
+        RecycledCholesky(matrix).factorize(stiffness(constrained=np.zeros_like(CONSTRAINED), squeeze=0.0)).solve(b)
 
 
 @needs_pardiso
 def test_middle_sizes_recycle_their_factorization(monkeypatch):
     monkeypatch.setattr(solver_selection, "RECYCLING_FROM", 60)
     matrix = stiffness()
-    assert isinstance(choose_solver(matrix, MESH.points, HELD.ravel(), symmetric=True), RecycledCholesky)
-    assert isinstance(choose_solver(matrix, MESH.points, HELD.ravel(), symmetric=False), PardisoSolver)
+    assert isinstance(choose_solver(matrix, MESH.points, CONSTRAINED.ravel(), symmetric=True), RecycledCholesky)
+    assert isinstance(choose_solver(matrix, MESH.points, CONSTRAINED.ravel(), symmetric=False), PardisoSolver)

@@ -59,15 +59,15 @@ def test_a_simulation_obeys_the_system(kind: str) -> None:
     force = -rates(body.simplices, law.flow(), state.velocity, state.trace, state.strain)[0].ravel()
     inertia = mass_of(body, 1.0, kind)
     mass = sp.csc_matrix(np.stack([inertia.apply(column.reshape(-1, 2)).ravel() for column in np.eye(n)], axis=1))
-    held = np.zeros(body.points.shape, dtype=bool)
-    held[floor.nodes] = held[plate.nodes] = True
-    constraint = sp.csc_matrix(np.eye(n)[:, held.ravel()])
+    constrained = np.zeros(body.points.shape, dtype=bool)
+    constrained[floor.nodes] = constrained[plate.nodes] = True
+    constraint = sp.csc_matrix(np.eye(n)[:, constrained.ravel()])
     path = [np.zeros(body.points.shape) for _ in range(3)]
     for values, function in zip(path, (PUSH.displacement, lambda t: PUSH.velocity(t, -1), PUSH.acceleration), strict=True):
         values[plate.nodes] = function(0.4)
-    given = tuple(values[held] for values in path)
+    given = tuple(values[constrained] for values in path)
     _, multiplier = stabilized_accelerations(mass, constraint, force, (state.displacement.ravel(), state.velocity.ravel()), 15.0, given)  # type: ignore[arg-type]
-    assert motion.reaction[-1][held] == pytest.approx(multiplier, abs=1e-9)
+    assert motion.reaction[-1][constrained] == pytest.approx(multiplier, abs=1e-9)
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -164,10 +164,10 @@ def test_stable_at_huge_steps(method: str, step: float) -> None:
     assert step > 1.5 * explicit_step_limit(body, soft, 1e-4)
     plate = Support("plate", free, path=Path.through([0.0, step], [(0.0, 0.0), (0.01, -0.02)]))
     motion = simulate(body, soft, 1e-4, [floor, plate], step * np.arange(201.0), method=method)
-    held = np.zeros(body.points.shape)
-    held[free] = (0.01, -0.02)
-    assert motion.final.displacement == pytest.approx(held, abs=1e-12)
-    assert motion.final.reaction == pytest.approx(body.forces(*lame_parameters(10.0, 0.3), held), abs=1e-5)
+    constrained = np.zeros(body.points.shape)
+    constrained[free] = (0.01, -0.02)
+    assert motion.final.displacement == pytest.approx(constrained, abs=1e-12)
+    assert motion.final.reaction == pytest.approx(body.forces(*lame_parameters(10.0, 0.3), constrained), abs=1e-5)
 
 
 def test_the_default_damps_what_is_too_fast_for_its_steps() -> None:

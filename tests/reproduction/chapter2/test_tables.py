@@ -43,7 +43,7 @@ def test_squares_follow_the_closed_form(name: str) -> None:
     expected = released_strain(elements, 0.2, 10.0, 10.0, series.times)
     calm = np.abs(series.times - 20.0) > 0.06  # without C1 the square snaps back in one step
     assert -series.displacement[calm, study.middle_top, 1] == pytest.approx(expected[calm], abs=2e-6)
-    force, pushed = -series.force("pusher")[:, 1], (series.times > 0.0) & (series.times <= 20.0)
+    force, pushed = -series.force("indenter")[:, 1], (series.times > 0.0) & (series.times <= 20.0)
     stress = ramp_stress(elements, 1.0, 10.0, series.times[pushed])
     scale = force[pushed].max() / stress.max()
     assert force[pushed] == pytest.approx(scale * stress, abs=1e-5 * force.max())

@@ -7,8 +7,17 @@ import pytest
 
 from naibu import datasets
 from naibu.core.errors import InputError
-from naibu.reproduction.chapter3.material_tests import CHANCE, COMPLIANCE, HELD, SLACK, Specimens, explained_spread, table_3_4, table_3_5
-from naibu.reproduction.chapter3.poisson_readings import GELS, held_block, marker_ratios, pairs_that_fit, readings
+from naibu.reproduction.chapter3.material_tests import (
+    CHANCE,
+    COMPLIANCE,
+    CONSTRAINED,
+    SLACK,
+    Specimens,
+    explained_spread,
+    table_3_4,
+    table_3_5,
+)
+from naibu.reproduction.chapter3.poisson_readings import GELS, constrained_block, marker_ratios, pairs_that_fit, readings
 from naibu.viewer.chapter import Section
 
 PAPER = {t["id"]: t["rows"] for t in datasets.paper_tables()["tables"]}
@@ -38,14 +47,14 @@ def made(effect, size, moduli=(300.0, 150.0)) -> Specimens:
     gel = np.array([0, 0, 0, 1, 1, 1])
     area, shape, e = np.pi * diameter**2 / 4, diameter / (4 * height), np.array(moduli)[gel]
     apparent = {
-        HELD: e * (1 + 2 * shape**2),
+        CONSTRAINED: e * (1 + 2 * shape**2),
         COMPLIANCE: height / area / (height / (area * e) + size),  # deflections of specimen and machine add
         SLACK: e * 0.1 * height / (0.1 * height + size),  # force of a strain of 10 %, over the strain with the slack in it
     }[effect]
     return Specimens(gel, shape, area / height, height, apparent)
 
 
-@pytest.mark.parametrize(("effect", "size"), [(HELD, 0.0), (COMPLIANCE, 2e-5), (SLACK, 0.8)])
+@pytest.mark.parametrize(("effect", "size"), [(CONSTRAINED, 0.0), (COMPLIANCE, 2e-5), (SLACK, 0.8)])
 def test_an_effect_is_found_in_specimens_that_have_it(effect, size):
     specimens = made(effect, size)
     moduli, found, scatter = explained_spread(specimens, effect)
@@ -58,7 +67,7 @@ def test_an_effect_is_found_in_specimens_that_have_it(effect, size):
 
 def test_held_faces_do_not_explain_the_spread():
     left = {row[0]: row[-1] for row in table_3_4().tables[1].rows}
-    assert left[HELD] > 1.5 * left[CHANCE]
+    assert left[CONSTRAINED] > 1.5 * left[CHANCE]
     assert max(left[SLACK], left[COMPLIANCE]) < 0.6 * left[CHANCE]
 
 
@@ -110,7 +119,7 @@ def test_readings_follow_from_the_mean_heights_of_the_layers():
 
 def test_held_block_at_small_strain_widens_by_poissons_ratio_and_no_more():
     """Between a free bar (nu times the shortening) and a confined one (nothing); symmetric; nothing at the held faces."""
-    block = held_block(0.01, 0.3, 4)
+    block = constrained_block(0.01, 0.3, 4)
     middle = block.transversal_at(0.5)
     assert 0.002 < middle < 0.0035
     assert block.transversal[[0, -1]] == pytest.approx([0.0, 0.0], abs=1e-9)

@@ -9,7 +9,7 @@ from naibu import datasets
 from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, Loading
 from naibu.core.rigid_transform import registration
-from naibu.identification.from_markers.parameter_names import friction, opening, poisson_ratio, young_modulus
+from naibu.identification.from_markers.parameter_names import friction, platen_position, poisson_ratio, young_modulus
 from naibu.identification.from_markers.scan_alignment import placement
 from naibu.identification.from_markers.specimen_model import ModelSettings, specimen
 from naibu.mechanics.finite_elements.elements import elements
@@ -181,9 +181,9 @@ def test_the_softer_layer_gives_way():
 
 def test_the_opening_may_differ_from_the_nominal_one():
     template = plate()
-    truth = truth_of(gel=(20.0, 0.45)) | {opening(template, "pressed"): 35.0, "twin/pressed: tilt_x": 0.01}
+    truth = truth_of(gel=(20.0, 0.45)) | {platen_position(template, "pressed"): 35.0, "twin/pressed: tilt_x": 0.01}
     made = phantom(template, truth, seed=0, settings=COARSE, scanner=EXACT)
-    assert made.truth[opening(template, "pressed")] == 35.0
+    assert made.truth[platen_position(template, "pressed")] == 35.0
     assert made.experiment.state("pressed").stated_mm == 30.0
     top = made.specimen.solutions["pressed"].displacement[np.flatnonzero(made.specimen.model.mesh.points[:, 2] == 40)]
     assert top[:, 2].mean() == pytest.approx(-5, abs=0.02)

@@ -298,8 +298,8 @@ def test_ten_scenes_stay_below_the_limit() -> None:
 def test_minimal_and_unmeasured_reports() -> None:
     bare = report_html(Report("only words", ("Nothing to show yet.",)))
     assert "Nothing to show yet." in bare and "naibu-scenes" not in bare and len(bare) < 30_000
-    held_back = fake_scene("held_back", 45.0, 3, cells=4, known=False, role="held back")
-    shown = report_html(fake_report((held_back,)))
+    rotation_limited = fake_scene("held_back", 45.0, 3, cells=4, known=False, role="held back")
+    shown = report_html(fake_report((rotation_limited,)))
     assert scenes_in(shown)[0]["measured"] == [None] * 300
     assert '<section id="residuals"' not in shown
 

@@ -26,7 +26,7 @@ from naibu.mechanics.finite_elements.linear_simplices import Simplices, paramete
 from naibu.mechanics.finite_elements.modulus_derivatives import unit_forces
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
 from naibu.mechanics.finite_strain.statics import solve
-from naibu.mechanics.linear_algebra.block_matrix import constrained
+from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
 from naibu.mechanics.linear_algebra.direct import direct_solver, pardiso_library
 from naibu.mechanics.linear_algebra.protocols import Factorization, LinearSolver
 from naibu.mechanics.linear_algebra.solver_selection import DIRECT_LIMIT, choose_solver
@@ -240,16 +240,20 @@ class Solvers:
         self._law, self._points = law, points
         self._solvers: dict[bytes, LinearSolver] = {}
 
-    def factorized(self, lame: FloatArray, shear: FloatArray, u: FloatArray, held: BoolArray, owner: bytes = b"") -> Factorization:
-        """Factorize the stiffness at `u` with the components `held` (n, d) taken out.
+    def factorized(self, lame: FloatArray, shear: FloatArray, u: FloatArray, constrained: BoolArray, owner: bytes = b"") -> Factorization:
+        """Factorize the stiffness at `u` with the components `constrained` (n, d) taken out.
 
-        A factorization is valid until the next one of the same `held` and `owner`.
+        A factorization is valid until the next one of the same `constrained` and `owner`.
         """
-        matrix = constrained(self._law.stiffness(lame, shear, u), held)
-        key = owner + np.packbits(held).tobytes()
+        matrix = with_dirichlet_rows(self._law.stiffness(lame, shear, u), constrained)
+        key = owner + np.packbits(constrained).tobytes()
         if key not in self._solvers:
             direct = matrix.shape[0] <= DIRECT_LIMIT and pardiso_library() is not None
-            chosen = direct_solver(matrix, symmetric=True) if direct else choose_solver(matrix, self._points, held.ravel(), symmetric=True)
+            chosen = (
+                direct_solver(matrix, symmetric=True)
+                if direct
+                else choose_solver(matrix, self._points, constrained.ravel(), symmetric=True)
+            )
             self._solvers[key] = chosen
         return self._solvers[key].factorize(matrix)
 
@@ -264,21 +268,21 @@ def equilibrium(
     ConvergenceError
         Newton's method fails from this guess, or a cell inverts.
     """
-    u, held = guess, trial.loaded
-    factor, before = solvers.factorized(lame, shear, u, held, owner), np.inf
+    u, constrained = guess, trial.loaded
+    factor, before = solvers.factorized(lame, shear, u, constrained, owner), np.inf
     for _ in range(NEWTON_ITERATIONS):
         residual = law.forces(lame, shear, u) - trial.external_force
-        scale = float(np.abs(residual[held]).sum() + np.abs(trial.external_force).sum())
+        scale = float(np.abs(residual[constrained]).sum() + np.abs(trial.external_force).sum())
         if not np.isfinite(scale):
             raise ConvergenceError(f"trial {trial.name!r}: a cell is inverted")
-        residual[held] = 0.0
+        residual[constrained] = 0.0
         norm = float(np.abs(residual).sum()) / max(scale, 1e-300)
         if norm <= NEWTON_TOLERANCE and not law.linear:
-            return u, factor if before == np.inf else solvers.factorized(lame, shear, u, held, owner)
+            return u, factor if before == np.inf else solvers.factorized(lame, shear, u, constrained, owner)
         if norm > 0.1 * before:  # the tangent of an earlier displacement serves no more
-            factor = solvers.factorized(lame, shear, u, held, owner)
+            factor = solvers.factorized(lame, shear, u, constrained, owner)
         before = norm
-        u = u - np.where(held, 0.0, factor.solve(residual.ravel()).reshape(u.shape))
+        u = u - np.where(constrained, 0.0, factor.solve(residual.ravel()).reshape(u.shape))
         if law.linear:
             return u, factor
     raise ConvergenceError(f"trial {trial.name!r}: Newton's method did not find the balance within {NEWTON_ITERATIONS} iterations")

@@ -12,7 +12,7 @@ from naibu.core.experiment import Experiment, Layer, State
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.identification.from_markers.gauss_newton import Match, Matcher, MatchingSettings
 from naibu.identification.from_markers.initial_guess import force_balance
-from naibu.identification.from_markers.known_materials import Knowledge
+from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import Nearby, NoiseModel, Trial
 from naibu.identification.from_markers.parameter_names import (
     SHAPE_NAMES,
@@ -20,8 +20,8 @@ from naibu.identification.from_markers.parameter_names import (
     batch_stiffness,
     friction,
     joint_friction,
-    opening,
     pixel_scale,
+    platen_position,
     poisson_ratio,
     shape_parameter,
     straight_base,
@@ -46,7 +46,7 @@ class Calibration:
     match: Match
     settings: ModelSettings
     noise: NoiseModel
-    knowledge: Knowledge
+    known_materials: KnownMaterials
 
     @property
     def nearby(self) -> dict[str, Nearby]:
@@ -57,7 +57,7 @@ class Calibration:
 def calibrate(
     experiments: Sequence[Experiment],
     *,
-    knowledge: Knowledge | None = None,
+    known_materials: KnownMaterials | None = None,
     states: Mapping[str, Sequence[str]] | None = None,
     settings: ModelSettings | None = None,
     noise: NoiseModel | None = None,
@@ -72,7 +72,7 @@ def calibrate(
     ----------
     experiments : sequence of Experiment
         With three-dimensional markers.
-    knowledge : Knowledge, optional
+    known_materials : KnownMaterials, optional
         Materials with known modulus; by default the first one found stands for the scale, and the others' moduli are ratios to it.
     states : mapping, optional
         States to use, by experiment; all measured ones by default.
@@ -104,31 +104,31 @@ def calibrate(
     trials = tuple(Trial.of(s, name, measured) for s in specimens for name in used[s.experiment.name])
     if not trials:
         raise InputError(f"no loaded state with measured positions in {', '.join(e.name for e in experiments)}")
-    known = knowledge or _first_material(experiments)
+    known = known_materials or _first_material(experiments)
     parameters = initial_parameters(specimens, used, known)
     begin = dict(start or {}) or _start_from_force_balance(experiments, known, used)
     match = Matcher(trials, parameters, search or MatchingSettings()).run(callback, start=begin, nearby=nearby)
     return Calibration(trials, match, chosen, measured, known)
 
 
-def _first_material(experiments: Sequence[Experiment]) -> Knowledge:
-    return Knowledge({experiments[0].materials[0]: REFERENCE_MODULUS_KPA}, scale_is_absolute=False)
+def _first_material(experiments: Sequence[Experiment]) -> KnownMaterials:
+    return KnownMaterials({experiments[0].materials[0]: REFERENCE_MODULUS_KPA}, scale_is_absolute=False)
 
 
 def _start_from_force_balance(
-    experiments: Sequence[Experiment], knowledge: Knowledge, states: Mapping[str, Sequence[str]]
+    experiments: Sequence[Experiment], known_materials: KnownMaterials, states: Mapping[str, Sequence[str]]
 ) -> dict[str, float]:
     """Young's moduli, by parameter, from the force balance between markers, where it gives sensible ones; a start needs no more."""
     try:
-        found = force_balance(experiments, knowledge, states)
+        found = force_balance(experiments, known_materials, states)
     except (InputError, np.linalg.LinAlgError):
         return {}
-    reference = float(np.mean(list(knowledge.young_moduli.values())))
+    reference = float(np.mean(list(known_materials.young_moduli.values())))
     low, high = TRUSTED_RATIO
     return {young_modulus(name): e for name, (e, _) in found.items() if low < e / reference < high}
 
 
-def initial_parameters(specimens: Sequence[Specimen], states: Mapping[str, Sequence[str]], knowledge: Knowledge) -> ParameterSet:
+def initial_parameters(specimens: Sequence[Specimen], states: Mapping[str, Sequence[str]], known_materials: KnownMaterials) -> ParameterSet:
     """Return all parameters of the trials with their starting values and priors.
 
     Raises
@@ -138,14 +138,14 @@ def initial_parameters(specimens: Sequence[Specimen], states: Mapping[str, Seque
     """
     found: dict[str, Parameter] = {}
     materials = [m for s in specimens for m in s.experiment.materials]
-    for name in knowledge.young_moduli:
+    for name in known_materials.young_moduli:
         if name not in materials:
             raise InputError(f"known material {name!r} is in none of the experiments; they contain {', '.join(sorted(set(materials)))}")
-    reference = float(np.mean(list(knowledge.young_moduli.values()) or [REFERENCE_MODULUS_KPA]))
-    for p in _batch_parameters([layer for s in specimens for layer in s.experiment.layers if layer.batch], knowledge):
+    reference = float(np.mean(list(known_materials.young_moduli.values()) or [REFERENCE_MODULUS_KPA]))
+    for p in _batch_parameters([layer for s in specimens for layer in s.experiment.layers if layer.batch], known_materials):
         found[p.name] = p
     for s in specimens:
-        for p in _material_parameters(s, knowledge, reference) + _friction_parameters(s):
+        for p in _material_parameters(s, known_materials, reference) + _friction_parameters(s):
             if p.name not in found or (found[p.name].fixed and not p.fixed):  # free wherever one experiment can tell it
                 found[p.name] = p
         offset = base_offset(s.experiment)
@@ -163,10 +163,10 @@ def initial_parameters(specimens: Sequence[Specimen], states: Mapping[str, Seque
     return ParameterSet.of(found.values())
 
 
-def _material_parameters(s: Specimen, knowledge: Knowledge, reference: float) -> list[Parameter]:
+def _material_parameters(s: Specimen, known_materials: KnownMaterials, reference: float) -> list[Parameter]:
     out = []
     for m in s.experiment.materials:
-        given = knowledge.young_moduli.get(m)
+        given = known_materials.young_moduli.get(m)
         # without a known material in the body its modulus cannot be told from displacements: one body of one material has no scale
         alone = len(s.experiment.materials) == 1 and given is None
         out.append(Parameter(young_modulus(m), given or reference, "kPa", "log", prior_sd=2.0, fixed=given is not None or alone))
@@ -175,9 +175,9 @@ def _material_parameters(s: Specimen, knowledge: Knowledge, reference: float) ->
     return out
 
 
-def _batch_parameters(layers: Sequence[Layer], knowledge: Knowledge) -> list[Parameter]:
+def _batch_parameters(layers: Sequence[Layer], known_materials: KnownMaterials) -> list[Parameter]:
     """Stiffness of every batch relative to the one from which the known material's modulus is taken, the topmost that holds some."""
-    order = [layer.batch for layer in layers if layer.material in knowledge.young_moduli][::-1] + [layer.batch for layer in layers]
+    order = [layer.batch for layer in layers if layer.material in known_materials.young_moduli][::-1] + [layer.batch for layer in layers]
     return [
         Parameter(batch_stiffness(batch), 1.0, "", "log", prior_sd=BATCH_SD, fixed=number == 0)
         for number, batch in enumerate(dict.fromkeys(order))
@@ -206,9 +206,9 @@ def _friction_parameters(s: Specimen) -> list[Parameter]:
 def state_parameters(experiment: Experiment, state: State) -> list[Parameter]:
     """Parameters of the boundary conditions of one state, with their priors: opening, tilt of a plate, offset of a bar."""
     prefix = f"{experiment.name}/{state.name}"
-    full = experiment.full_opening_mm
+    full = experiment.full_platen_position_mm
     start = state.estimated_mm or state.stated_mm or 0.7 * full
-    out = [Parameter(opening(experiment, state.name), float(start), "mm", prior_sd=5.0)]
+    out = [Parameter(platen_position(experiment, state.name), float(start), "mm", prior_sd=5.0)]
     if experiment.loading.kind != "side_plates":
         out += [Parameter(f"{prefix}: tilt_{axis}", 0.0, "rad", prior_sd=0.01) for axis in "xy"]
     if experiment.loading.kind == "bar":

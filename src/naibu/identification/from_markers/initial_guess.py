@@ -29,7 +29,7 @@ from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import from_moduli, law_named
 
 if TYPE_CHECKING:
-    from naibu.identification.from_markers.known_materials import Knowledge
+    from naibu.identification.from_markers.known_materials import KnownMaterials
 
 LAW = law_named("neo_hookean")
 SWEEPS = 2  # with noise the estimate has not settled then, nor after 20: beyond about 4 it scatters from one noise draw to the next
@@ -100,7 +100,7 @@ class _Trial:
 
 def force_balance(
     experiments: Sequence[Experiment],
-    knowledge: Knowledge,
+    known_materials: KnownMaterials,
     states: Mapping[str, Sequence[str]] | None = None,
     *,
     poisson_ratios: Mapping[str, float] | None = None,
@@ -109,13 +109,13 @@ def force_balance(
 ) -> dict[str, tuple[float, float]]:
     """Estimate the materials with unknown modulus from the balance of forces between markers, over all trials jointly.
 
-    Blocks that merely lie on each other are taken to be glued.
+    Blocks that merely lie on each other are taken to be tied.
 
     Parameters
     ----------
     experiments : sequence of Experiment
         With markers numbered on a lattice.
-    knowledge : Knowledge
+    known_materials : KnownMaterials
         Materials with known Young's modulus, kPa; at least one.
     states : mapping, optional
         States to use, by experiment; all measured ones by default.
@@ -143,7 +143,7 @@ def force_balance(
             spreads.append(np.sqrt(2.0) * measured.standard_deviation(e.xy_step_mm, e.z_step_mm))
     if not meshes:
         raise InputError(f"no loaded state with measured positions in {', '.join(e.name for e in experiments) or 'no experiment'}")
-    return balanced(meshes, spreads, knowledge.young_moduli, poisson_ratios=poisson_ratios, sweeps=sweeps)
+    return balanced(meshes, spreads, known_materials.young_moduli, poisson_ratios=poisson_ratios, sweeps=sweeps)
 
 
 def balanced(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True, slots=True)
-class Knowledge:
+class KnownMaterials:
     """What is known before the search.
 
     Attributes

@@ -59,7 +59,7 @@ def straight_base(experiment: Experiment) -> str:
     return f"{experiment.name}: straight_base"
 
 
-def opening(experiment: Experiment, state: str) -> str:
+def platen_position(experiment: Experiment, state: str) -> str:
     """Name of the height of the plate or bar above the base, or of the distance between side plates, in a state."""
     kind = "width" if experiment.loading.kind == "side_plates" else "height"
     return f"{experiment.name}/{state}: {kind}"

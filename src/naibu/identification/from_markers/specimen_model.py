@@ -23,8 +23,8 @@ from naibu.identification.from_markers.parameter_names import (
     friction,
     joint_friction,
     layer_shift,
-    opening,
     pixel_scale,
+    platen_position,
     poisson_ratio,
     shape_parameter,
     straight_base,
@@ -58,7 +58,7 @@ class ModelSettings:
     contact : {"coulomb", "stick", "springs"}
         What the rigid bodies do to the surface sideways: rub with a friction coefficient for each pair of materials, hold it, or hold it
         by tangential springs.
-    joined : {"glued", "sliding"}
+    joined : {"tied", "sliding"}
         What holds separately cast blocks together.
     element_size_mm : float
         Edge of the hexahedra, smaller under a bar; 0 takes a seventh to a ninth of the object's height.
@@ -72,7 +72,7 @@ class ModelSettings:
 
     law: str = "neo_hookean"
     contact: ContactModel = "coulomb"
-    joined: Literal["glued", "sliding"] = "glued"
+    joined: Literal["tied", "sliding"] = "tied"
     element_size_mm: float = 0.0
     normal_stiffness: float = 5e3
     tangential_stiffness: float = 200.0
@@ -318,14 +318,14 @@ class Specimen:
 
     def _reference(self, contact: Contact, name: str, state: str) -> float:
         """Value of a path parameter at which the body is at its start."""
-        if name == opening(self.experiment, state):
-            return self.experiment.full_opening_mm
+        if name == platen_position(self.experiment, state):
+            return self.experiment.full_platen_position_mm
         return 0.0
 
     def _path_directions(self, contact: Contact, state: str) -> dict[str, Direction]:
         """How every parameter of the state moves the body, per unit of the parameter."""
         x, y, z = np.eye(3)
-        name = opening(self.experiment, state)
+        name = platen_position(self.experiment, state)
         if self.experiment.loading.kind == "side_plates":
             return {name: Direction(stop=-0.5 * contact.surface.normal)}
         prefix = f"{self.experiment.name}/{state}"

@@ -15,7 +15,7 @@ from naibu.core.errors import InputError
 from naibu.identification.lattice_calibration.shape_distance import checked_points, closest_points
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters, require_positive
-from naibu.mechanics.lattices.model.state import HeldNodes
+from naibu.mechanics.lattices.model.state import ConstrainedNodes
 from naibu.mechanics.lattices.model.surface import Hull, hull_of
 from naibu.mechanics.lattices.simulation.tangent_linear import Loads, ParameterChange, driven_steps, rest_change
 
@@ -52,7 +52,7 @@ class Pushing:
     faces : tuple of PushedFace
         One for each force sensor.
     push_s, keep_s, free_s : float
-        How long the pushers move, stand still, and the object is watched after they left, s.
+        How long the indenters move, stand still, and the object is watched after they left, s.
     capture_s : tuple of float
         When the shape is captured, s.
     """
@@ -66,27 +66,27 @@ class Pushing:
 
     @property
     def contact_s(self) -> float:
-        """How long the pushers touch the object, s."""
+        """How long the indenters touch the object, s."""
         return self.push_s + self.keep_s
 
     def touched(self, lattice: Lattice) -> tuple[IntArray, ...]:
-        """Return the masses that every pusher touches.
+        """Return the masses that every indenter touches.
 
         Raises
         ------
         InputError
-            A pusher that touches none, or inside of the object.
+            An indenter that touches none, or inside of the object.
         """
         slack = 1e-6 * lattice.spacing_mm
         found = []
-        for k, pusher in enumerate(self.faces):
-            inside = ((lattice.points >= np.array(pusher.low) - slack) & (lattice.points <= np.array(pusher.high) + slack)).all(axis=1)
+        for k, indenter in enumerate(self.faces):
+            inside = ((lattice.points >= np.array(indenter.low) - slack) & (lattice.points <= np.array(indenter.high) + slack)).all(axis=1)
             if not inside.any():
                 raise InputError(
-                    f"{self.name}: pusher {k} between {pusher.low} and {pusher.high} mm touches no mass; its box must hold some"
+                    f"{self.name}: indenter {k} between {indenter.low} and {indenter.high} mm touches no mass; its box must hold some"
                 )
             if not lattice.surface_node[inside].all():
-                raise InputError(f"{self.name}: pusher {k} starts inside of the object; move its box to the surface")
+                raise InputError(f"{self.name}: indenter {k} starts inside of the object; move its box to the surface")
             found.append(np.flatnonzero(inside))
         return tuple(found)
 
@@ -101,8 +101,8 @@ class Capture:
         What was done.
     points : tuple of ndarray, shape (k, 3)
         Captured surface points at every capture, mm.
-    force : ndarray, shape (samples, pushers, 3)
-        Force of every pusher on the object, mN: the mean over each `SAMPLE_S` from the start of the contact to its end.
+    force : ndarray, shape (samples, indenters, 3)
+        Force of every indenter on the object, mN: the mean over each `SAMPLE_S` from the start of the contact to its end.
     point_sd_mm, force_sd_mn : float
         Standard deviations of a coordinate and of a component.
     """
@@ -144,7 +144,7 @@ class Capture:
         if sampled.shape != expected:
             raise InputError(
                 f"{pushing.name}: forces of shape {sampled.shape}, but {pushing.contact_s:g} s of contact are {expected[0]} samples of "
-                f"{1e3 * SAMPLE_S:g} ms: (samples, pushers, 3) = {expected}; resample them to the same times"
+                f"{1e3 * SAMPLE_S:g} ms: (samples, indenters, 3) = {expected}; resample them to the same times"
             )
         lost = ~np.isfinite(sampled).all(axis=(1, 2))
         if lost.any():
@@ -162,11 +162,11 @@ class Reproduced:
     ----------
     positions : ndarray, shape (captures, n, 3)
         Of the masses at the times of capture, mm.
-    force : ndarray, shape (samples, pushers, 3)
-        Forces of the pushers while they touch, mN, mean over each `PushedLattice.long_step`.
+    force : ndarray, shape (samples, indenters, 3)
+        Forces of the indenters while they touch, mN, mean over each `PushedLattice.long_step`.
     positions_change : ndarray, shape (p, captures, n, 3)
         Derivatives along p directions of the parameters.
-    force_change : ndarray, shape (p, samples, pushers, 3)
+    force_change : ndarray, shape (p, samples, indenters, 3)
         Likewise.
     """
 
@@ -189,7 +189,7 @@ class PushedLattice:
     pushing : Pushing
         What is done.
     mode : str
-        ``"displacement"``: touched masses follow the pushers; ``"force"``: they share the measured forces by the area around them.
+        ``"displacement"``: touched masses follow the indenters; ``"force"``: they share the measured forces by the area around them.
     step : float
         s.
     long_step : float
@@ -202,8 +202,8 @@ class PushedLattice:
     mode: PushMode
     step: float
     long_step: float
-    floor: HeldNodes
-    held: HeldNodes
+    floor: ConstrainedNodes
+    constrained: ConstrainedNodes
     loads: Loads
     force: FloatArray
 
@@ -224,13 +224,13 @@ class PushedLattice:
         ----------
         lattice, pushing, mode, step, long_step
             See the attributes; steps must be whole numbers of force samples that divide all times of the pushing.
-        force : ndarray, shape (samples, pushers, 3)
+        force : ndarray, shape (samples, indenters, 3)
             Measured forces, mN; needed to push by force.
 
         Raises
         ------
         InputError
-            A pusher that touches nothing, a step that does not divide the times, or no measured force to push by.
+            An indenter that touches nothing, a step that does not divide the times, or no measured force to push by.
         """
         touched = pushing.touched(lattice)
         longest = step if long_step is None else long_step
@@ -241,7 +241,7 @@ class PushedLattice:
                 raise InputError(f"{pushing.name}: {uneven[0]:g} s is no whole number of steps of {divisor:g} s; choose another step")
         z = lattice.points[:, 2]
         ground = np.flatnonzero(z < z.min() + 1e-6 * lattice.spacing_mm)
-        floor, held, loads = HeldNodes.of(ground, len(touched)), HeldNodes.none(), Loads.none()
+        floor, constrained, loads = ConstrainedNodes.of(ground, len(touched)), ConstrainedNodes.none(), Loads.none()
         measured = np.zeros((0, len(touched), 3))
         if mode == "force":
             if force is None:
@@ -252,10 +252,10 @@ class PushedLattice:
             loads = Loads(np.concatenate(touched), np.concatenate(shares), body)
         elif mode == "displacement":
             for k, nodes in enumerate(touched):
-                held = held + HeldNodes.of(np.setdiff1d(nodes, ground), k)
+                constrained = constrained + ConstrainedNodes.of(np.setdiff1d(nodes, ground), k)
         else:
             raise InputError(f"pushing is by 'displacement' or 'force', not {mode!r}")
-        return cls(lattice, hull_of(lattice), pushing, mode, float(step), float(longest), floor, floor + held, loads, measured)
+        return cls(lattice, hull_of(lattice), pushing, mode, float(step), float(longest), floor, floor + constrained, loads, measured)
 
     def run(self, parameters: LatticeParameters, changes: Sequence[ParameterChange] = (), *, tolerance: float = 1e-2) -> Reproduced:
         """Return the motion with these parameters, and its derivatives along changes of them."""
@@ -271,9 +271,16 @@ class PushedLattice:
             count = (end - begin) // each
             force = np.concatenate([averaged(self.force[begin:end], each), np.zeros((count, 1, 3))], axis=1) if pushed else 0.0
             run = driven_steps(
-                engines[each], state, count, self.held if touching else self.floor, moving if end <= ends[0] else np.zeros_like(moving),
-                loads=self.loads if pushed else None, force=force, changes=changes, state_change=change,
-            )  # fmt: skip
+                engines[each],
+                state,
+                count,
+                self.constrained if touching else self.floor,
+                moving if end <= ends[0] else np.zeros_like(moving),
+                loads=self.loads if pushed else None,
+                force=force,
+                changes=changes,
+                state_change=change,
+            )
             state, change = run.state, run.state_change
             kept[end], kept_change[end] = state.position, change.position
             if touching:

@@ -57,7 +57,7 @@ class CalibrationProblem:
     index : str
         ``"shape"``, ``"force"`` or ``"joint"``: what counts.
     window : str
-        Forces that count: all of the ``"contact"``, or those while the pushers ``"keep"`` still, as in the report's S_force.
+        Forces that count: all of the ``"contact"``, or those while the indenters ``"keep"`` still, as in the report's S_force.
     window_s : float
         Forces are averaged over this time, s, which is also the coarse step.
     excess : tuple of float
@@ -406,7 +406,7 @@ class ReportIndices:
     large : tuple of int
         Points that are 2.5 mm or more away.
     force_mn : float
-        S_force over the samples while the pushers keep still, mN, sum over the sensors.
+        S_force over the samples while the indenters keep still, mN, sum over the sensors.
     samples : int
         Their number, for one sensor.
     """

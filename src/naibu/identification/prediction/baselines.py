@@ -12,7 +12,7 @@ from naibu.core.rigid_transform import registration
 from naibu.identification.from_markers.calibration import Calibration
 from naibu.identification.from_markers.initial_guess import force_balance
 from naibu.identification.from_markers.observations import Trial
-from naibu.identification.from_markers.parameter_names import opening, poisson_ratio, young_modulus
+from naibu.identification.from_markers.parameter_names import platen_position, poisson_ratio, young_modulus
 from naibu.identification.from_markers.specimen_model import ModelSettings, specimen
 from naibu.identification.prediction.prediction import rms
 from naibu.mechanics.finite_strain.statics import solve
@@ -21,7 +21,7 @@ REPORT = {"hardness 5": (222.0, 0.33), "hardness 0": (125.0, 0.44)}  # Young's m
 REPORT_SINGLE_GEL = (222.0, 0.38)  # of a gel without a name; its modulus has no bearing on displacements
 
 
-def baselines(trial: Trial, opening_mm: float) -> dict[str, float]:
+def baselines(trial: Trial, platen_position_mm: float) -> dict[str, float]:
     """Return the root mean square distance (mm) between measured markers and three simple descriptions of the state.
 
     Only markers with three trusted coordinates in the loaded state count; all of each description's freedoms are fitted to the data.
@@ -30,7 +30,7 @@ def baselines(trial: Trial, opening_mm: float) -> dict[str, float]:
     ----------
     trial : Trial
         A measured state.
-    opening_mm : float
+    platen_position_mm : float
         Height of the plate or bar above the base, or distance of the side plates, for the linear model.
 
     Returns
@@ -49,7 +49,7 @@ def baselines(trial: Trial, opening_mm: float) -> dict[str, float]:
     return {
         "rigid": rms(measured - registration(free, measured).applied(free)),
         "affine": rms(measured - affine(free, measured)),
-        "linear": rms(residual) if np.isfinite(residual := measured - _linear(trial, opening_mm)).any() else np.nan,
+        "linear": rms(residual) if np.isfinite(residual := measured - _linear(trial, platen_position_mm)).any() else np.nan,
     }
 
 
@@ -62,7 +62,7 @@ def balanced(calibration: Calibration) -> dict[str, float]:
     experiments = {t.specimen.experiment.name: t.specimen.experiment for t in calibration.trials}
     states = {name: [t.state for t in calibration.trials if t.specimen.experiment.name == name] for name in experiments}
     try:
-        found = force_balance(list(experiments.values()), calibration.knowledge, states)
+        found = force_balance(list(experiments.values()), calibration.known_materials, states)
     except (InputError, np.linalg.LinAlgError):
         return {}
     values = calibration.match.parameters.values()
@@ -115,15 +115,15 @@ def report_parameters(experiment: Experiment) -> dict[str, float]:
     return values
 
 
-def _linear(trial: Trial, opening_mm: float) -> FloatArray:
+def _linear(trial: Trial, platen_position_mm: float) -> FloatArray:
     """Positions (k, 3), mm, of linear elasticity with the report's parameters, registered to the measured ones."""
     experiment = trial.specimen.experiment
     full = experiment.shape.size_mm[1 if experiment.loading.kind == "side_plates" else 2]
-    if not 0.3 * full < opening_mm <= full:
-        raise InputError(f"an opening of {opening_mm:g} mm is not between 30 % and 100 % of the object's {full:g} mm")
+    if not 0.3 * full < platen_position_mm <= full:
+        raise InputError(f"an opening of {platen_position_mm:g} mm is not between 30 % and 100 % of the object's {full:g} mm")
     size = trial.specimen.settings.element_size_mm
     body = specimen(experiment, ModelSettings(law="linear_elastic", contact="stick", element_size_mm=size))
-    values = report_parameters(experiment) | {opening(experiment, trial.state): opening_mm}
+    values = report_parameters(experiment) | {platen_position(experiment, trial.state): platen_position_mm}
     try:
         solution = solve(body.problem(values, trial.state))
     except ConvergenceError:

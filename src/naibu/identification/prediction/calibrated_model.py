@@ -12,7 +12,7 @@ from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.identification.from_markers.calibration import Calibration
-from naibu.identification.from_markers.known_materials import Knowledge
+from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
 from naibu.identification.from_markers.specimen_model import ModelSettings
 
@@ -35,7 +35,7 @@ class CalibratedModel:
         Of the measurement.
     noise_factor : float
         Root mean square residual in units of the noise.
-    knowledge : Knowledge
+    known_materials : KnownMaterials
         What set the scale.
     trials : tuple of str
         ``experiment/state`` of the data used.
@@ -48,7 +48,7 @@ class CalibratedModel:
     covariance: FloatArray
     noise: NoiseModel
     noise_factor: float
-    knowledge: Knowledge
+    known_materials: KnownMaterials
     trials: tuple[str, ...]
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
@@ -57,7 +57,9 @@ class CalibratedModel:
         """Take the model from a calibration."""
         c = calibration
         labels = tuple(t.label for t in c.trials)
-        return cls(c.settings, c.match.parameters, c.match.covariance, c.noise, c.match.noise_factor, c.knowledge, labels, provenance or {})
+        return cls(
+            c.settings, c.match.parameters, c.match.covariance, c.noise, c.match.noise_factor, c.known_materials, labels, provenance or {}
+        )
 
     def standard_deviation(self, name: str) -> float:
         """Standard deviation of a parameter on the optimiser's scale; 0 where it was given.
@@ -98,7 +100,7 @@ class CalibratedModel:
             "settings": asdict(self.settings),
             "noise": asdict(self.noise),
             "noise_factor": self.noise_factor,
-            "known": {"young_moduli": dict(self.knowledge.young_moduli), "scale_is_absolute": self.knowledge.scale_is_absolute},
+            "known": {"young_moduli": dict(self.known_materials.young_moduli), "scale_is_absolute": self.known_materials.scale_is_absolute},
             "trials": list(self.trials),
             "parameters": rows,
             "covariance": self.covariance.tolist(),
@@ -122,7 +124,7 @@ class CalibratedModel:
             known = data["known"]
             return cls(
                 ModelSettings(**data["settings"]), parameters, covariance, NoiseModel(**data["noise"]), float(data["noise_factor"]),
-                Knowledge(known["young_moduli"], known["scale_is_absolute"]), tuple(data["trials"]), data.get("provenance", {}),
+                KnownMaterials(known["young_moduli"], known["scale_is_absolute"]), tuple(data["trials"]), data.get("provenance", {}),
             )  # fmt: skip
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"the model file is damaged or was written by another version ({error}); identify the model again") from error

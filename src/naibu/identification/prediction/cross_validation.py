@@ -15,7 +15,7 @@ from naibu.core.experiment import Experiment
 from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration, calibrate
 from naibu.identification.from_markers.gauss_newton import MatchingSettings
-from naibu.identification.from_markers.known_materials import Knowledge
+from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
 from naibu.identification.from_markers.specimen_model import ModelSettings
 from naibu.identification.prediction.calibrated_model import CalibratedModel
@@ -83,7 +83,7 @@ class ModelRow:
 def leave_one_out(
     experiments: Sequence[Experiment],
     *,
-    knowledge: Knowledge | None = None,
+    known_materials: KnownMaterials | None = None,
     settings: ModelSettings | None = None,
     noise: NoiseModel | None = None,
     search: MatchingSettings | None = None,
@@ -98,7 +98,7 @@ def leave_one_out(
     ----------
     experiments : sequence of Experiment
         Two at least.
-    knowledge, settings, noise, search : optional
+    known_materials, settings, noise, search : optional
         As for `calibrate`.
     reference : Calibration, optional
         The calibration on all experiments: the others start from its solutions, which saves time.
@@ -123,9 +123,15 @@ def leave_one_out(
     def without(left: Experiment) -> list[LeftOut]:
         others = [e for e in experiments if e is not left]
         found = calibrate(
-            others, knowledge=_applicable(knowledge, others), settings=settings, noise=noise, search=search, start=start, nearby=nearby,
+            others,
+            known_materials=_applicable(known_materials, others),
+            settings=settings,
+            noise=noise,
+            search=search,
+            start=start,
+            nearby=nearby,
             callback=_reporting(callback, left.name, stop),
-        )  # fmt: skip
+        )
         if found.match.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         model = CalibratedModel.of(found)
@@ -144,13 +150,13 @@ def leave_one_out(
             raise
 
 
-def _applicable(knowledge: Knowledge | None, experiments: Sequence[Experiment]) -> Knowledge | None:
+def _applicable(known_materials: KnownMaterials | None, experiments: Sequence[Experiment]) -> KnownMaterials | None:
     """What is known of materials that the experiments contain; None where nothing is."""
-    if knowledge is None:
+    if known_materials is None:
         return None
     materials = {m for e in experiments for m in e.materials}
-    known = {m: e for m, e in knowledge.young_moduli.items() if m in materials}
-    return Knowledge(known, knowledge.scale_is_absolute) if known else None
+    known = {m: e for m, e in known_materials.young_moduli.items() if m in materials}
+    return KnownMaterials(known, known_materials.scale_is_absolute) if known else None
 
 
 def _reporting(
@@ -183,7 +189,7 @@ def compare_models(
     experiments: Sequence[Experiment],
     candidates: Sequence[ModelSettings],
     *,
-    knowledge: Knowledge | None = None,
+    known_materials: KnownMaterials | None = None,
     noise: NoiseModel | None = None,
     search: MatchingSettings | None = None,
     callback: Callback | None = None,
@@ -203,7 +209,7 @@ def compare_models(
     for settings in candidates:
         try:
             found = calibrate(
-                experiments, knowledge=knowledge, settings=settings, noise=noise, search=search,
+                experiments, known_materials=known_materials, settings=settings, noise=noise, search=search,
                 callback=_reporting(callback, "none"),
             )  # fmt: skip
         except ConvergenceError as error:
@@ -216,7 +222,13 @@ def compare_models(
             try:
                 left_out = pooled_rms(
                     leave_one_out(
-                        experiments, knowledge=knowledge, settings=settings, noise=noise, search=search, reference=found, callback=callback
+                        experiments,
+                        known_materials=known_materials,
+                        settings=settings,
+                        noise=noise,
+                        search=search,
+                        reference=found,
+                        callback=callback,
                     )
                 )
             except ConvergenceError as error:

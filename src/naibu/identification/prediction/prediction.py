@@ -14,15 +14,15 @@ from naibu.core.parameters import Parameter, ParameterSet
 from naibu.core.rigid_transform import registration
 from naibu.identification.from_markers.calibration import REFERENCE_MODULUS_KPA, START_FRICTION, START_SPRING, initial_parameters
 from naibu.identification.from_markers.gauss_newton import Matcher
-from naibu.identification.from_markers.known_materials import Knowledge
+from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import Nearby, Trial, TrialFit
-from naibu.identification.from_markers.parameter_names import opening
+from naibu.identification.from_markers.parameter_names import platen_position
 from naibu.identification.from_markers.specimen_model import Specimen, specimen
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 
 LAYER_GAP = 0.4  # a new marker layer starts where the height jumps by this share of the markers' spacing
 UNKNOWN_SD = {"tilt_x": 0.007, "tilt_y": 0.007, "bar_offset": 0.5, "bar_yaw": 0.01, "base_offset": 0.5, "friction": 0.5}
-OPENING_SD_MM = {"given": 0.3, "markers": 0.15, "stated": 1.0}
+PLATEN_POSITION_SD_MM = {"given": 0.3, "markers": 0.15, "stated": 1.0}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +44,7 @@ class Prediction:
         Whether the positions were registered to measured ones.
     residual : ndarray, shape (k, 3)
         Measured minus predicted, true mm; NaN where not measured.
-    opening_mm : float
+    platen_position_mm : float
         Height of the plate or bar, or distance of the side plates, that was used.
     values : mapping
         Physical values of all parameters that were used.
@@ -62,7 +62,7 @@ class Prediction:
     sd_mm: FloatArray
     registered: bool
     residual: FloatArray
-    opening_mm: float
+    platen_position_mm: float
     values: Mapping[str, float]
     measured_in_object: FloatArray
     fit: TrialFit
@@ -74,7 +74,7 @@ def predict(
     experiment: Experiment,
     state: str,
     *,
-    opening_mm: float | None = None,
+    platen_position_mm: float | None = None,
     heights_from_markers: bool = False,
     nearby: Nearby | None = None,
 ) -> Prediction:
@@ -88,7 +88,7 @@ def predict(
         The object and its free state; the loaded state may be measured or not.
     state : str
         Name of the loaded state.
-    opening_mm : float, optional
+    platen_position_mm : float, optional
         Height of the plate or bar above the base, or distance of the side plates. By default what the file states, corrected by what
         other states of the same experiment showed.
     heights_from_markers : bool
@@ -107,12 +107,12 @@ def predict(
     body = specimen(experiment, model.settings)
     notes: list[str] = []
     parameters = _parameters(model, body, target, notes)
-    name = opening(experiment, state)
+    name = platen_position(experiment, state)
     use_layers = heights_from_markers and experiment.loading.kind != "side_plates"
     if heights_from_markers and not use_layers:
         notes.append("heights of marker layers do not give the distance of side plates; the stated distance is used")
-    start, sd = _opening(model, experiment, target, opening_mm, notes)
-    parameters = parameters.changed({name: Parameter(name, start, "mm", prior_sd=OPENING_SD_MM["markers"] if use_layers else sd)})
+    start, sd = _platen_position(model, experiment, target, platen_position_mm, notes)
+    parameters = parameters.changed({name: Parameter(name, start, "mm", prior_sd=PLATEN_POSITION_SD_MM["markers"] if use_layers else sd)})
     trial = _unmeasured(body, state, model)
     matcher = Matcher([trial], parameters)
     fit = matcher.evaluate(parameters.values(), [nearby])[0]
@@ -125,8 +125,8 @@ def _parameters(model: CalibratedModel, body: Specimen, state: State, notes: lis
     """Take parameters from the model; where it has none, from its nearest relatives, with a wide prior, and say so."""
     experiment = body.experiment
     own = set(experiment.materials)
-    known = {m: e for m, e in model.knowledge.young_moduli.items() if m in own}
-    wanted = initial_parameters([body], {experiment.name: [state.name]}, Knowledge(known, model.knowledge.scale_is_absolute))
+    known = {m: e for m, e in model.known_materials.young_moduli.items() if m in own}
+    wanted = initial_parameters([body], {experiment.name: [state.name]}, KnownMaterials(known, model.known_materials.scale_is_absolute))
     have = {p.name: p for p in model.parameters}
     out = []
     for p in wanted:
@@ -186,20 +186,24 @@ def _materials(model: CalibratedModel) -> str:
     return ", ".join(p.name.partition(":")[0] for p in model.parameters if p.name.endswith(": young_modulus"))
 
 
-def _opening(model: CalibratedModel, experiment: Experiment, state: State, given: float | None, notes: list[str]) -> tuple[float, float]:
+def _platen_position(
+    model: CalibratedModel, experiment: Experiment, state: State, given: float | None, notes: list[str]
+) -> tuple[float, float]:
     """Height or width to start from, and its standard deviation, mm."""
     if given is not None:
-        full = experiment.full_opening_mm
+        full = experiment.full_platen_position_mm
         if not 0.3 * full < given <= full:
             raise InputError(f"a height or width of {given:g} mm is not between 30 % and 100 % of the object's {full:g} mm")
-        return given, OPENING_SD_MM["given"]
+        return given, PLATEN_POSITION_SD_MM["given"]
     values = model.parameters.values()
-    name = opening(experiment, state.name)
+    name = platen_position(experiment, state.name)
     if name in values:
         return values[name], max(model.standard_deviation(name), 1e-3)
     if state.stated_mm is not None:
         shifts = [
-            values[n] - s.stated_mm for s in experiment.states if s.stated_mm is not None and (n := opening(experiment, s.name)) in values
+            values[n] - s.stated_mm
+            for s in experiment.states
+            if s.stated_mm is not None and (n := platen_position(experiment, s.name)) in values
         ]
         shift = float(np.mean(shifts)) if shifts else 0.0
         if shifts:
@@ -208,10 +212,10 @@ def _opening(model: CalibratedModel, experiment: Experiment, state: State, given
             )
         else:
             notes.append(f"the stated {state.stated_mm:g} mm is taken as it is; stated heights are nominal")
-        return state.stated_mm + shift, 0.5 if shifts else OPENING_SD_MM["stated"]
+        return state.stated_mm + shift, 0.5 if shifts else PLATEN_POSITION_SD_MM["stated"]
     if state.estimated_mm is not None:
         notes.append(f"the height of {state.estimated_mm:g} mm is the estimate in the file")
-        return state.estimated_mm, OPENING_SD_MM["stated"]
+        return state.estimated_mm, PLATEN_POSITION_SD_MM["stated"]
     if state.markers is not None:
         notes.append("the file states no height; the search for it starts at 70 % of the object's")
         return 0.7 * experiment.height_mm, 5.0

@@ -43,7 +43,7 @@ THIN = 0.11
 SAMPLED = 0.08  # a plate that two slices show is misplaced by about so much of a slice, as its profile is no Gaussian
 THINNEST = 0.3  # width of a fitted blob, voxels
 MOST_SHARED = 50.0  # voxels that share their noise: what smoothing leaves of it tells how many
-HELD, FREE = 1e12, 1.0  # axes of a blob: those of the volume, or its own
+CONSTRAINED, FREE = 1e12, 1.0  # axes of a blob: those of the volume, or its own
 # windows of the fits: half their width in diameters, and voxels besides; the first is for a look only
 ROUNDS = ((0.55, 0.5), (0.75, 1.0))
 # after the first look: share of the valley of the scores below which nothing is looked at again, and share of the better polarity's energy
@@ -254,7 +254,7 @@ def _first_look(values: Float32Array, peaks: Peaks, volume: Volume, diameter: fl
     blobs[:, [5, 7, 10]] = 1.0 / np.maximum(SMOOTHING * diameter, 0.5 * spacing)
     noise = noise_level(values, np.ones(values.shape, dtype=bool), shell_reach(diameter, spacing))
     look = _Look(peaks.sign, peaks.noise, peaks.strongest, values.size, noise, spacing, blobs, blobs, np.zeros((len(at), 3, 3)))
-    return _fitted_again(values, look, diameter, ROUNDS[0], HELD, alone=True) if len(at) else look
+    return _fitted_again(values, look, diameter, ROUNDS[0], CONSTRAINED, alone=True) if len(at) else look
 
 
 def _found(values: Float32Array, look: _Look, volume: Volume, diameter: float, count: int | None) -> _Found:
@@ -264,7 +264,7 @@ def _found(values: Float32Array, look: _Look, volume: Volume, diameter: float, c
     """
     spacing = volume.spacing_mm
     failed: list[Rejected] = []
-    for window, tilt in ((ROUNDS[1], HELD), (ROUNDS[1], FREE)):
+    for window, tilt in ((ROUNDS[1], CONSTRAINED), (ROUNDS[1], FREE)):
         good = np.isfinite(look.fits[:, 0])
         failed += [Rejected(p, NO_BLOB) for p in look.starts[~good, 2:5]]
         if not good.any():
@@ -275,7 +275,7 @@ def _found(values: Float32Array, look: _Look, volume: Volume, diameter: float, c
         failed += [Rejected(p, FAINTER) for p in look.fits[good][hopeless, 2:5]]
         look = look.chosen(np.flatnonzero(good)[~hopeless])
         thin = tilt == FREE and _thin(look.shape(np.isfinite(look.fits[:, 0])), spacing) is not None
-        look = _fitted_again(values, look, diameter, window, HELD if thin else tilt, alone=False)
+        look = _fitted_again(values, look, diameter, window, CONSTRAINED if thin else tilt, alone=False)
     found, failures = _settled(look, diameter, count)
     return _Found(found.sign, found.kept, (*failed, *failures, *found.rejected))
 

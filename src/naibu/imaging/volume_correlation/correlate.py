@@ -54,7 +54,7 @@ BENDING, SWELLING = 64.0, 5000.0
 PARTS = (2, 2, 4)
 STIFFER = (20.0, 1.0, 1.0, 1.0)  # bending of coarse grids, in units of BENDING
 STEPS = (8, 8, 3, 4)
-HELD = (0.05, 0.01, 0.0, 0.0)
+CONSTRAINED = (0.05, 0.01, 0.0, 0.0)
 SMOOTHING = 0.5  # standard deviation, voxels of a level
 BODY_SMOOTHING = 0.8
 WINDOW = 1.9  # cells in which a weight is shared
@@ -229,7 +229,9 @@ class _Work:
             system = SplineSystem(level, self.grid, self.ratio)
             self.fit = Correlation(level, system, self.how(k))
             self.bending, self.swelling = self.weights(system, STIFFER[k])
-            self.c = self.fit.iterate(self.c, self.bending, self.swelling * system.watched, Iterations(STEPS[k], held=HELD[k]))
+            self.c = self.fit.iterate(
+                self.c, self.bending, self.swelling * system.watched, Iterations(STEPS[k], constrained=CONSTRAINED[k])
+            )
             self.say(
                 f"cells of {self.grid.step_mm.mean():.1f} mm, voxels of {level.spacing.mean():.1f} mm: residual {self.fit.scatter:.4g}"
             )

@@ -64,7 +64,7 @@ class Iterations:
         Root mean square step of the cells at which they end, voxels.
     limit_voxels : float
         Longest step of all but 5 % of the cells, voxels; longer ones are shortened.
-    held : float
+    constrained : float
         How strongly voxels are held where they were at first, of what the mean slope of grey values says: where there is no texture they
         would wander while the scans are far from register.
     """
@@ -72,7 +72,7 @@ class Iterations:
     most: int = 6
     stop_voxels: float = 0.01
     limit_voxels: float = 2.0
-    held: float = 0.0
+    constrained: float = 0.0
 
 
 class Correlation:
@@ -99,9 +99,9 @@ class Correlation:
         first = None
         for _ in range(times.most):
             self.compare(c)
-            if times.held:
+            if times.constrained:
                 first = self.move.copy() if first is None else first
-                self._hold(first, times.held)
+                self._hold(first, times.constrained)
             load = self.system.assembled(c, self.products, self.force, bending, volume)
             step, _ = self.system.solved(load, SOLVE)
             length = np.linalg.norm(self.system.at_middles(step), axis=1)
@@ -214,8 +214,8 @@ def chosen_weights(
     """
     system = fit.system
     bent, swollen = system.energies(samples, c)
-    held = _unknowns(system, bending)
-    determined, energy = held - bending * bent, system.bent.astype(float)
+    constrained = _unknowns(system, bending)
+    determined, energy = constrained - bending * bent, system.bent.astype(float)
     out = np.empty_like(bending)
     z, y, x = system.cells[:, 2:].T
     for kind in np.unique(kinds):
@@ -228,8 +228,8 @@ def chosen_weights(
             return np.asarray(wide[z[m], y[m], x[m]])
 
         # where the data say little the weight is that of all cells together
-        common = np.maximum(determined[m].sum(axis=0), LEAST_SHARE * held[m].sum(axis=0)) / np.maximum(energy[m].sum(axis=0), 1e-30)
-        believed = COMMON * shared(held)
+        common = np.maximum(determined[m].sum(axis=0), LEAST_SHARE * constrained[m].sum(axis=0)) / np.maximum(energy[m].sum(axis=0), 1e-30)
+        believed = COMMON * shared(constrained)
         out[m] = (np.maximum(shared(determined), 0.0) + believed) / (shared(energy) + believed / common)
     per_cell = system.watched
     left = system.n - volume_weight * float(per_cell @ swollen)

@@ -16,8 +16,8 @@ TURN = np.deg2rad(10.0)
 FIRST_STEPS, LAST_STEPS = 6, 30
 ROBUST = 2.0  # multiples of the scatter
 # how strongly the shift is held where it was guessed, of what the grey values say: along a limb they may say little
-HELD = 0.1
-HELD_SHAPE = 0.1  # the same for an affine motion, of the outline's
+CONSTRAINED = 0.1
+CONSTRAINED_SHAPE = 0.1  # the same for an affine motion, of the outline's
 BEST = 3  # guesses that are followed to the end
 
 
@@ -53,9 +53,9 @@ class RigidStart:
             pull = 0.5 * (gain * self.slope / level.spacing + level.slope @ np.linalg.inv(linear))
             arms = (pull[:, :, None] * np.concatenate([arm / size, np.ones((len(arm), 1))], axis=1)[:, None, :]).reshape(len(arm), 12)
             matrix, load = (arms * weight[:, None]).T @ arms, arms.T @ (weight * r)
-            held = HELD_SHAPE * np.trace(matrix) / 12 + 1e-30
+            constrained = CONSTRAINED_SHAPE * np.trace(matrix) / 12 + 1e-30
             gone = np.concatenate([(linear - first[0]) * size, (shift - first[1])[:, None]], axis=1).ravel()
-            d = np.linalg.solve(matrix + held * np.eye(12), load - held * gone)
+            d = np.linalg.solve(matrix + constrained * np.eye(12), load - constrained * gone)
             d = (d * min(1.0, level.spacing.mean() / max(float(np.abs(d).max()), 1e-30))).reshape(3, 4)
             linear, shift = linear + d[:, :3] / size, shift + d[:, 3]
             if np.abs(d).max() < 0.01 * level.spacing.mean():
@@ -100,9 +100,9 @@ class RigidStart:
             pull = 0.5 * (gain * self.slope / level.spacing + level.slope @ rotation.T)
             arms = np.concatenate([np.cross(arm, pull), pull], axis=1)
             matrix, load = (arms * weight[:, None]).T @ arms, arms.T @ (weight * r)
-            held = HELD * np.trace(matrix[3:, 3:]) / 3
-            matrix[3:, 3:] += held * np.eye(3)
-            load[3:] -= held * (shift - guess)
+            constrained = CONSTRAINED * np.trace(matrix[3:, 3:]) / 3
+            matrix[3:, 3:] += constrained * np.eye(3)
+            load[3:] -= constrained * (shift - guess)
             d = np.linalg.solve(matrix + 1e-6 * np.diag(np.diag(matrix)) + 1e-30 * np.eye(6), load)
             d *= min(1.0, 2 * level.spacing.mean() / max(float(np.abs(d[3:]).max()), 1e-30), TURN / max(float(np.abs(d[:3]).max()), 1e-30))
             rotation, shift = Rotation.from_rotvec(d[:3]).as_matrix() @ rotation, shift + d[3:]

@@ -38,7 +38,7 @@ class Friction:
 
 def rigid_contact(
     name: str, points: FloatArray, faces: IntArray, surface: RigidSurface, *, start: ArrayLike, stop: ArrayLike,
-    friction: Friction | list[Friction], normal_stiffness: float, bonded: bool = False, rotation: FloatArray | None = None,
+    friction: Friction | list[Friction], normal_stiffness: float, tied: bool = False, rotation: FloatArray | None = None,
 ) -> Contact:  # fmt: skip
     """Let boundary faces touch a rigid body.
 
@@ -58,8 +58,8 @@ def rigid_contact(
         One for all faces or one for each face.
     normal_stiffness : float
         Penalty, kPa/mm: a pressure p lets the surface penetrate by p / normal_stiffness.
-    bonded : bool
-        Whether the body sticks to the faces for good (glue): no lift-off, no slip.
+    tied : bool
+        Whether the body sticks to the faces for good (tie): no lift-off, no slip.
     rotation : ndarray, shape (3, 3), optional
         Constant orientation of the body.
 
@@ -80,12 +80,12 @@ def rigid_contact(
     return Contact(
         name, nodes, coefficients, np.einsum("pk,pki->pi", coefficients, points[nodes]), area.ravel(), surface,
         np.asarray(start, dtype=float), np.asarray(stop, dtype=float), np.eye(3) if rotation is None else rotation, normal_stiffness,
-        np.repeat([f.stiffness for f in pairs], n_q), np.repeat([f.coefficient for f in pairs], n_q), bonded,
+        np.repeat([f.stiffness for f in pairs], n_q), np.repeat([f.coefficient for f in pairs], n_q), tied,
     )  # fmt: skip
 
 
 def interface(
-    name: str, points: FloatArray, pairs: IntArray, area: FloatArray, *, friction: Friction, normal_stiffness: float, bonded: bool = False
+    name: str, points: FloatArray, pairs: IntArray, area: FloatArray, *, friction: Friction, normal_stiffness: float, tied: bool = False
 ) -> Contact:
     """Lay one block on another: pairs (k, 2) of a lower and an upper node at the same place, each standing for `area` (k,) mm2.
 
@@ -103,7 +103,7 @@ def interface(
     k = len(pairs)
     return Contact(
         name, pairs, np.tile([-1.0, 1.0], (k, 1)), np.zeros((k, 3)), area, plane((0.0, 0.0, 1.0)), np.zeros(3), np.zeros(3), np.eye(3),
-        normal_stiffness, np.full(k, friction.stiffness), np.full(k, friction.coefficient), bonded,
+        normal_stiffness, np.full(k, friction.stiffness), np.full(k, friction.coefficient), tied,
     )  # fmt: skip
 
 

@@ -99,7 +99,7 @@ class Contact:
         kPa/mm.
     tangential_stiffness, friction_coefficient : ndarray, shape (p,)
         kPa/mm, and Coulomb's coefficient.
-    bonded : bool
+    tied : bool
         Whether the body also holds the point back.
     tilt : ndarray, shape (3,), optional
         Rotation vector, rad, by which the body turns about its reference point, in proportion to the load. A plate that tilts as it
@@ -118,7 +118,7 @@ class Contact:
     normal_stiffness: float
     tangential_stiffness: FloatArray
     friction_coefficient: FloatArray
-    bonded: bool = False
+    tied: bool = False
     tilt: FloatArray | None = None
 
     def orientation(self, load: float) -> FloatArray:
@@ -150,7 +150,7 @@ class Contact:
         response = ContactResponse(self.orientation(load), y, np.empty(n), *vectors, *matrices)
         _tractions(
             self.surface.kind, self.surface.packed(), y, anchors, self.normal_stiffness, self.tangential_stiffness,
-            self.friction_coefficient, self.bonded, float(curvature), response.gap, response.force, response.tangential,
+            self.friction_coefficient, self.tied, float(curvature), response.gap, response.force, response.tangential,
             response.slip_direction, response.stiffness, response.tangential_stiffness, response.anchor_stiffness,
         )  # fmt: skip
         for field in (response.force, response.stiffness, response.anchor_stiffness, response.slip_direction):
@@ -242,7 +242,7 @@ def _gap(kind, s, y, n, h):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 @njit(cache=True, nogil=True)
 def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
-    kind, s, y, anchors, k_n, k_t, mu, bonded, curvature, gap, force, tangential, slip, stiffness, tangential_stiffness, anchor_stiffness
+    kind, s, y, anchors, k_n, k_t, mu, tied, curvature, gap, force, tangential, slip, stiffness, tangential_stiffness, anchor_stiffness
 ):
     """Tractions of all points and their derivatives (per unit of area); see the module's text for the law."""
     n, e = np.empty(3), np.empty(3)
@@ -250,7 +250,7 @@ def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
     for q in range(len(y)):
         g = _gap(kind, s, y[q], n, h)
         gap[q] = g
-        if bonded:
+        if tied:
             p, dp = -k_n * g, -k_n
         elif g >= 0.0:
             continue
@@ -273,7 +273,7 @@ def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
                 for m in range(3):
                     hd += h[j, m] * (y[q, m] - anchors[q, m])
                 d_trial[i, j] = k_t[q] * ((1.0 if i == j else 0.0) - n[i] * n[j] - along * h[i, j] - n[i] * hd)
-        sliding = not bonded and size > mu[q] * p
+        sliding = not tied and size > mu[q] * p
         ratio = mu[q] * p / size if sliding else 1.0
         for i in range(3):
             tangential[q, i] = ratio * e[i]

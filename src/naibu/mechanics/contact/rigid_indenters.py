@@ -16,7 +16,7 @@ KINDS = ("plane", "box", "cylinder", "sphere")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pusher:
+class RigidIndenter:
     """A rigid body that touches a lattice.
 
     Attributes
@@ -67,20 +67,20 @@ class Pusher:
         return out[:, 3]
 
 
-def plane(point: ArrayLike, normal: ArrayLike = (0.0, 0.0, 1.0), **surface: float) -> Pusher:
+def plane(point: ArrayLike, normal: ArrayLike = (0.0, 0.0, 1.0), **surface: float) -> RigidIndenter:
     """Return a half space that ends at a plane through a point, mm; the normal points out of it. A floor, or a plate without end.
 
-    `surface` are friction and pull-off as in `Pusher`.
+    `surface` are friction and pull-off as in `Indenter`.
 
     Raises
     ------
     InputError
         A normal without length, or friction or pull-off that cannot be.
     """
-    return Pusher(PLANE, _vector(point), _frame(normal), np.zeros(3), **surface)
+    return RigidIndenter(PLANE, _vector(point), _frame(normal), np.zeros(3), **surface)
 
 
-def pusher_box(centre: ArrayLike, edges: ArrayLike, axes: ArrayLike | None = None, **surface: float) -> Pusher:
+def box_indenter(centre: ArrayLike, edges: ArrayLike, axes: ArrayLike | None = None, **surface: float) -> RigidIndenter:
     """Return a box with given edges, mm, along `axes` (rows, by default the frame's); see `plane` for `surface`.
 
     Raises
@@ -88,10 +88,12 @@ def pusher_box(centre: ArrayLike, edges: ArrayLike, axes: ArrayLike | None = Non
     InputError
         Edges that are not positive, or axes that are not orthonormal.
     """
-    return Pusher(BOX, _vector(centre), _orthonormal(axes), 0.5 * _positive(edges, "edges of a box"), **surface)
+    return RigidIndenter(BOX, _vector(centre), _orthonormal(axes), 0.5 * _positive(edges, "edges of a box"), **surface)
 
 
-def pusher_cylinder(centre: ArrayLike, radius: float, length: float, axis: ArrayLike = (0.0, 0.0, 1.0), **surface: float) -> Pusher:
+def cylindrical_indenter(
+    centre: ArrayLike, radius: float, length: float, axis: ArrayLike = (0.0, 0.0, 1.0), **surface: float
+) -> RigidIndenter:
     """Return a cylinder, mm, about an axis; see `plane` for `surface`.
 
     Raises
@@ -100,10 +102,10 @@ def pusher_cylinder(centre: ArrayLike, radius: float, length: float, axis: Array
         A radius or length that is not positive, or an axis without length.
     """
     sizes = _positive([radius, length, 1.0], "radius and length of a cylinder")
-    return Pusher(CYLINDER, _vector(centre), _frame(axis), sizes * (1.0, 0.5, 0.0), **surface)
+    return RigidIndenter(CYLINDER, _vector(centre), _frame(axis), sizes * (1.0, 0.5, 0.0), **surface)
 
 
-def pusher_sphere(centre: ArrayLike, radius: float, **surface: float) -> Pusher:
+def spherical_indenter(centre: ArrayLike, radius: float, **surface: float) -> RigidIndenter:
     """Return a sphere, mm; see `plane` for `surface`.
 
     Raises
@@ -111,7 +113,9 @@ def pusher_sphere(centre: ArrayLike, radius: float, **surface: float) -> Pusher:
     InputError
         A radius that is not positive.
     """
-    return Pusher(SPHERE, _vector(centre), np.eye(3), _positive([radius, 1.0, 1.0], "radius of a sphere") * (1.0, 0.0, 0.0), **surface)
+    return RigidIndenter(
+        SPHERE, _vector(centre), np.eye(3), _positive([radius, 1.0, 1.0], "radius of a sphere") * (1.0, 0.0, 0.0), **surface
+    )
 
 
 def _vector(values: ArrayLike) -> FloatArray:

@@ -17,13 +17,13 @@ class Prescribed:
 
     Attributes
     ----------
-    held : ndarray, shape (n, d), bool
+    constrained : ndarray, shape (n, d), bool
         Which components are prescribed.
     values : ndarray, shape (n, d)
         Their values at full load, mm.
     """
 
-    held: BoolArray
+    constrained: BoolArray
     values: FloatArray
 
     @classmethod
@@ -40,13 +40,13 @@ class Prescribed:
             A node number outside the mesh, or a value that is not finite.
         """
         index = np.asarray(nodes, dtype=np.int64)
-        given = np.broadcast_to(np.asarray(values, dtype=float), (len(index), self.held.shape[1]))
-        if len(index) and (index.min() < 0 or index.max() >= len(self.held)):
-            raise InputError(f"prescribed node {index.max()} does not exist; the mesh has nodes 0 to {len(self.held) - 1}")
+        given = np.broadcast_to(np.asarray(values, dtype=float), (len(index), self.constrained.shape[1]))
+        if len(index) and (index.min() < 0 or index.max() >= len(self.constrained)):
+            raise InputError(f"prescribed node {index.max()} does not exist; the mesh has nodes 0 to {len(self.constrained) - 1}")
         if not np.isfinite(given).all():
             raise InputError("prescribed displacements must be finite numbers; leave a component free instead of giving NaN")
-        held, all_values = self.held.copy(), self.values.copy()
-        for axis in range(self.held.shape[1]) if components is None else np.flatnonzero(components):
-            held[index, axis] = True
+        constrained, all_values = self.constrained.copy(), self.values.copy()
+        for axis in range(self.constrained.shape[1]) if components is None else np.flatnonzero(components):
+            constrained[index, axis] = True
             all_values[index, axis] = given[:, axis]
-        return Prescribed(held, all_values)
+        return Prescribed(constrained, all_values)

@@ -11,7 +11,7 @@ from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError
 from naibu.mechanics.contact.penalty_contact import ContactResponse
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
-from naibu.mechanics.linear_algebra.block_matrix import constrained
+from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
 from naibu.mechanics.linear_algebra.iterative import ApproximateFactorization
 from naibu.mechanics.linear_algebra.protocols import Factorization, LinearSolver
 from naibu.mechanics.linear_algebra.solver_selection import choose_solver
@@ -45,11 +45,11 @@ class Newton:
 
     def _balance(self, internal: FloatArray, contact: FloatArray) -> tuple[FloatArray, float]:
         r = internal - contact - self.problem.external_force
-        held = self.problem.prescribed.held
+        constrained = self.problem.prescribed.constrained
         # the floor is a force that would strain the body by 1e-5: it counts where contacts open and nothing presses any more
         floor = 1e-5 * float(self.problem.assembler.parameters[:, 0].max()) * float(np.ptp(self.problem.points, axis=0).max()) ** 2
-        scale = float(np.abs(contact).sum() + np.abs(r[held]).sum() + np.abs(self.problem.external_force).sum()) + floor
-        r[held] = 0.0
+        scale = float(np.abs(contact).sum() + np.abs(r[constrained]).sum() + np.abs(self.problem.external_force).sum()) + floor
+        r[constrained] = 0.0
         return r, scale
 
     def linearised(
@@ -85,9 +85,9 @@ class Newton:
 
     def _factorized(self, matrix: sp.bsr_matrix, drag: float = 0.0) -> Factorization:
         p = self.problem
-        matrix = constrained(matrix, p.prescribed.held, self.settings.anchor_stiffness + drag)
+        matrix = with_dirichlet_rows(matrix, p.prescribed.constrained, self.settings.anchor_stiffness + drag)
         if self.solver is None:
-            self.solver = choose_solver(matrix, p.points, p.prescribed.held.ravel(), symmetric=not p.unsymmetric)
+            self.solver = choose_solver(matrix, p.points, p.prescribed.constrained.ravel(), symmetric=not p.unsymmetric)
         return self.solver.factorize(matrix)
 
     def solve(self, u: FloatArray, anchors: tuple[FloatArray, ...], load: float) -> tuple[FloatArray, float] | None:
@@ -154,13 +154,13 @@ class Newton:
         Moving the held nodes alone would flatten the elements next to them.
         """
         p = self.problem
-        target = np.where(p.prescribed.held, load * p.prescribed.values, u)
+        target = np.where(p.prescribed.constrained, load * p.prescribed.values, u)
         jump = target - u
         if np.abs(jump).max() <= 1e-9 * float(np.ptp(p.points, axis=0).max()):
             return target
         residual, _, matrix, _ = self._tangent(u, anchors, load)
         residual += (matrix @ jump.ravel()).reshape(-1, 3)
-        residual[p.prescribed.held] = 0.0
+        residual[p.prescribed.constrained] = 0.0
         self.iterations += 1
         return np.asarray(target - solved(self._factorized(matrix), residual, _COARSE))
 

@@ -96,7 +96,7 @@ def sensitivities(
             explicit.append(change)
             for k in range(count):
                 rhs[:, :, k] += c.scattered(change.force[:, :, k], len(rhs), response.orientation)
-        rhs[problem.prescribed.held] = 0.0
+        rhs[problem.prescribed.constrained] = 0.0
         du = factorization.solve(rhs.reshape(-1, count)).reshape(rhs.shape)
         out.append(du)
         d_anchors = [

@@ -178,7 +178,7 @@ def finished(newton: Newton, states: list[LoadState], residual: float, status: S
         reactions[c.name] = (response.force @ response.orientation.T).sum(axis=0)
         penetration = max(penetration, float(-response.gap.min()))
     internal = problem.assembler.forces(last.displacement)[1]
-    held = problem.prescribed.held
-    reactions["prescribed"] = np.where(held, internal - contact - problem.external_force, 0.0).sum(axis=0)
+    constrained = problem.prescribed.constrained
+    reactions["prescribed"] = np.where(constrained, internal - contact - problem.external_force, 0.0).sum(axis=0)
     name = newton.solver.name if newton.solver is not None else "none"
     return Solution(tuple(states), status, reactions, newton.iterations, residual, penetration, name)

@@ -11,18 +11,18 @@ from naibu._numba.compilation import njit
 from naibu.core.arrays import BoolArray, FloatArray, Int32Array, IntArray
 
 
-def constrained(matrix: sp.bsr_matrix, held: BoolArray, anchor_stiffness: float = 0.0) -> sp.bsr_matrix:
+def with_dirichlet_rows(matrix: sp.bsr_matrix, constrained: BoolArray, anchor_stiffness: float = 0.0) -> sp.bsr_matrix:
     """Return `matrix` with held rows and columns replaced by a scaled identity, and weak springs on the diagonal.
 
     Changes the blocks of `matrix` in place.
     """
-    _constrain(matrix.indptr, matrix.indices, matrix.data, held, anchor_stiffness)
+    _set_dirichlet_rows(matrix.indptr, matrix.indices, matrix.data, constrained, anchor_stiffness)
     return matrix
 
 
 @njit(cache=True)
-def _constrain(indptr, indices, blocks, held, anchor_stiffness):  # type: ignore[no-untyped-def]  # pragma: no cover
-    n, d = held.shape
+def _set_dirichlet_rows(indptr, indices, blocks, constrained, anchor_stiffness):  # type: ignore[no-untyped-def]  # pragma: no cover
+    n, d = constrained.shape
     mean = 0.0
     for i in range(n):
         for at in range(indptr[i], indptr[i + 1]):
@@ -34,7 +34,7 @@ def _constrain(indptr, indices, blocks, held, anchor_stiffness):  # type: ignore
             j = indices[at]
             for a in range(d):
                 for b in range(d):
-                    if held[i, a] or held[j, b]:
+                    if constrained[i, a] or constrained[j, b]:
                         blocks[at, a, b] = mean if (i == j and a == b) else 0.0
                     elif i == j and a == b:
                         blocks[at, a, b] += anchor_stiffness * mean

@@ -19,7 +19,7 @@ class MultigridSolver(RecyclingSolver):
     ----------
     points : ndarray, shape (n, 3)
         Node positions, mm, from which the rigid-body modes are made.
-    held : ndarray, shape (3 n,), bool
+    constrained : ndarray, shape (3 n,), bool
         Degrees of freedom that are prescribed; their modes are zero.
     relative_tolerance : float
         Of the residual of each solve.
@@ -27,10 +27,10 @@ class MultigridSolver(RecyclingSolver):
 
     name = "CG + smoothed aggregation (pyamg)"
 
-    def __init__(self, points: FloatArray, held: BoolArray, *, relative_tolerance: float = 1e-8, max_iterations: int = 400) -> None:
+    def __init__(self, points: FloatArray, constrained: BoolArray, *, relative_tolerance: float = 1e-8, max_iterations: int = 400) -> None:
         super().__init__(relative_tolerance=relative_tolerance, max_iterations=max_iterations)
         self._modes = rigid_body_modes(points)
-        self._modes[held] = 0.0
+        self._modes[constrained] = 0.0
 
     def preconditioner(self, matrix: sp.bsr_matrix) -> Callable[[FloatArray], FloatArray]:
         """Return one V-cycle of a hierarchy made for `matrix`."""

@@ -21,11 +21,11 @@ DIRECT_LIMIT = 200_000  # unknowns from which a factorization costs more than mu
 RECYCLING_FROM = 4_000  # unknowns from which a factorization is worth recycling
 
 
-def choose_solver(matrix: sp.bsr_matrix, points: FloatArray, held: BoolArray, *, symmetric: bool) -> LinearSolver:
+def choose_solver(matrix: sp.bsr_matrix, points: FloatArray, constrained: BoolArray, *, symmetric: bool) -> LinearSolver:
     """Choose by size: direct for unsymmetric and for small systems, recycled Cholesky up to `DIRECT_LIMIT` unknowns, multigrid above."""
     limit = DIRECT_LIMIT if pardiso_library() is not None else DIRECT_LIMIT // 10
     if symmetric and matrix.shape[0] > limit:
-        return MultigridSolver(points, held)
+        return MultigridSolver(points, constrained)
     if symmetric and matrix.shape[0] > RECYCLING_FROM and pardiso_library() is not None:
         return RecycledCholesky(matrix)
     return direct_solver(matrix, symmetric=symmetric)

@@ -50,16 +50,16 @@ class GeneralizedAlpha(Integrator):
 
     def step(self, phase: Phase, state: MotionState, until: float) -> MotionState:
         """Return the state at `until`."""
-        h, held, law, body = until - state.time, phase.guide.held, phase.law, phase.body.simplices
+        h, constrained, law, body = until - state.time, phase.guide.constrained, phase.law, phase.body.simplices
         at, b, g, a_old = 1.0 - self.alpha_f, self.beta * h**2, self.gamma * h, self._acceleration
         predicted = (
             state.displacement + h * state.velocity + (0.5 * h**2 - b) * a_old,
             state.velocity + (h - g) * a_old,
         )
-        a = np.where(held, self._held_acceleration(phase, state, predicted, h), a_old)
+        a = np.where(constrained, self._constrained_acceleration(phase, state, predicted, h), a_old)
         u, v = predicted[0] + b * a, predicted[1] + g * a
         if phase.stabilization is None:
-            u, v = np.where(held, phase.guide.displacement(until), u), np.where(held, phase.guide.velocity(until, -1), v)
+            u, v = np.where(constrained, phase.guide.displacement(until), u), np.where(constrained, phase.guide.velocity(until, -1), v)
         full, part = self.factorizations.over(law, h), self.factorizations.over(law, at * h)
         now = _without_springs(law)
         inner = replace(part, dashpot=np.zeros_like(part.dashpot))
@@ -67,7 +67,7 @@ class GeneralizedAlpha(Integrator):
         force = stage_forces(body, now, at * v + (1.0 - at) * state.velocity, state.trace, state.strain)
         force += stage_forces(body, inner, mean, state.trace, state.strain)
         residual = phase.momentum((1.0 - self.alpha_m) * a + self.alpha_m * a_old) + force - phase.load(state.time + at * h)
-        residual[held] = 0.0
+        residual[constrained] = 0.0
         moduli = at * g * part.dashpot + b / h * part.spring * part.gain
         factor = self.factorizations.of(phase, f"alpha {h:.8g}", moduli, 1.0 - self.alpha_m)
         change = -factor.solve(residual.ravel()).reshape(u.shape)
@@ -81,12 +81,12 @@ class GeneralizedAlpha(Integrator):
         self.steps += 1
         return end
 
-    def _held_acceleration(self, phase: Phase, state: MotionState, predicted: tuple[FloatArray, FloatArray], h: float) -> FloatArray:
+    def _constrained_acceleration(self, phase: Phase, state: MotionState, predicted: tuple[FloatArray, FloatArray], h: float) -> FloatArray:
         """Return that at the end for which the mean over the step is right at the time of balance, as it is for the free nodes."""
         at, middle = 1.0 - self.alpha_f, state.time + (1.0 - self.alpha_f) * h
         u = at * predicted[0] + self.alpha_f * state.displacement
         v = at * predicted[1] + self.alpha_f * state.velocity
-        mean = phase.held_acceleration(middle, 1, u, v) - self.alpha_m * self._acceleration
+        mean = phase.constrained_acceleration(middle, 1, u, v) - self.alpha_m * self._acceleration
         w = 0.0 if phase.stabilization is None else phase.stabilization.frequency
         return mean / (1.0 - self.alpha_m + at * (2.0 * w * self.gamma * h + w**2 * self.beta * h**2))
 
@@ -100,11 +100,11 @@ def _accelerated(phase: Phase, state: MotionState, side: int) -> tuple[FloatArra
     """Return accelerations (n, d) and reactions (n, d) of a state with inertia."""
     if phase.mass is None:
         raise InputError("without inertia use 'sdirk2' or 'backward_euler'")
-    held = phase.guide.held
+    constrained = phase.guide.constrained
     force = phase.load(state.time) - rates(phase.body.simplices, phase.flow, state.velocity, state.trace, state.strain)[0]
-    known = phase.held_acceleration(state.time, side, state.displacement, state.velocity)
-    a = phase.mass.accelerations(force, held, known)
-    return a, np.where(held, phase.mass.apply(a) - force, 0.0)
+    known = phase.constrained_acceleration(state.time, side, state.displacement, state.velocity)
+    a = phase.mass.accelerations(force, constrained, known)
+    return a, np.where(constrained, phase.mass.apply(a) - force, 0.0)
 
 
 def _power(phase: Phase, time: float, velocity: FloatArray, reaction: FloatArray) -> float:

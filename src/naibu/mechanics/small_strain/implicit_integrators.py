@@ -35,13 +35,13 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.mechanics.finite_elements.linear_simplices import Simplices
-from naibu.mechanics.linear_algebra.block_matrix import constrained
+from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
 from naibu.mechanics.linear_algebra.direct import direct_solver
 from naibu.mechanics.linear_algebra.protocols import Factorization
 from naibu.mechanics.linear_algebra.solver_selection import DIRECT_LIMIT, choose_solver
 from naibu.mechanics.small_strain._rheology_kernels import advanced, stage_forces
 from naibu.mechanics.small_strain.constraint_stabilization import Stabilization
-from naibu.mechanics.small_strain.linear_elasticity import LinearBody, require_held
+from naibu.mechanics.small_strain.linear_elasticity import LinearBody, require_constrained
 from naibu.mechanics.small_strain.mass_matrix import Mass
 from naibu.mechanics.small_strain.prescribed_motion import Guide
 from naibu.mechanics.small_strain.rheology import CellRheology, FlowCoefficients, StepCoefficients
@@ -118,7 +118,7 @@ class Phase:
         """Return the momentum (n, d), zero where there is no inertia."""
         return np.zeros_like(velocity) if self.mass is None else self.mass.apply(velocity)
 
-    def held_acceleration(self, time: float, side: int, displacement: FloatArray, velocity: FloatArray) -> FloatArray:
+    def constrained_acceleration(self, time: float, side: int, displacement: FloatArray, velocity: FloatArray) -> FloatArray:
         """Return the acceleration (n, d), mm/s^2, of the held components; meaningless elsewhere."""
         second = self.guide.acceleration(time)
         if self.stabilization is None:
@@ -158,19 +158,19 @@ class Factorizations:
         InputError
             A body without inertia that can move freely.
         """
-        held = phase.guide.held
-        key = held.tobytes(), name
+        constrained = phase.guide.constrained
+        key = constrained.tobytes(), name
         if key in self._kept:
             self._kept.move_to_end(key)
             return self._kept[key]
         matrix = phase.body.stiffness(moduli[:, 0], moduli[:, 1])
         if phase.mass is None:
-            require_held(phase.body.points, held)
+            require_constrained(phase.body.points, constrained)
         else:
             phase.mass.add_to(matrix, mass_factor)
-        matrix = constrained(matrix, held)
+        matrix = with_dirichlet_rows(matrix, constrained)
         if matrix.shape[0] > DIRECT_LIMIT and phase.body.points.shape[1] == 3:
-            solver = choose_solver(matrix, phase.body.points, held.ravel(), symmetric=True)
+            solver = choose_solver(matrix, phase.body.points, constrained.ravel(), symmetric=True)
         else:
             solver = direct_solver(matrix, symmetric=True)
         self.made += 1
@@ -198,11 +198,11 @@ class Integrator(ABC):
         """
         if phase.mass is None or phase.stabilization is not None:
             return state
-        held = phase.guide.held
-        change = np.where(held, phase.guide.velocity(state.time, 1) - state.velocity, 0.0)
+        constrained = phase.guide.constrained
+        change = np.where(constrained, phase.guide.velocity(state.time, 1) - state.velocity, 0.0)
         if not change.any():
             return state
-        velocity = state.velocity + phase.mass.accelerations(np.zeros_like(change), held, change)
+        velocity = state.velocity + phase.mass.accelerations(np.zeros_like(change), constrained, change)
         before, after = (0.5 * float((v * phase.mass.apply(v)).sum()) for v in (state.velocity, velocity))
         return replace(state, velocity=velocity, work=state.work + after - before)
 
@@ -221,15 +221,15 @@ class Staged(Integrator):
         """Return the state just after an event; a body without inertia whose supports or loads changed jumps to its new equilibrium."""
         if phase.mass is not None or not changed:
             return super().begin(phase, state, step_s, changed)
-        instant, held, load = INSTANT * step_s, phase.guide.held, phase.load(state.time)
+        instant, constrained, load = INSTANT * step_s, phase.guide.constrained, phase.load(state.time)
         known = (phase.guide.displacement(state.time) - state.displacement) / instant
-        if not (known[held].any() or state.reaction.any() or load.any() or state.strain.any()):
+        if not (known[constrained].any() or state.reaction.any() or load.any() or state.strain.any()):
             return state
         start = state.displacement, np.zeros_like(state.velocity), state.trace, state.strain
         self._aimed(phase, instant)
         velocity, trace, strain, reaction, _ = self._stage(phase, start, instant, state.time, known)
         moved = instant * velocity
-        mean = np.where(held, 0.5 * (state.reaction + reaction), 0.0) + load
+        mean = np.where(constrained, 0.5 * (state.reaction + reaction), 0.0) + load
         work = state.work + float((moved * mean).sum())
         return _ended(phase, state.time, state.displacement + moved, state.velocity, trace, strain, reaction, work)
 
@@ -247,18 +247,18 @@ class Staged(Integrator):
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
         """Return velocity, internal strain (over `ahead`, if given, instead of h), reaction and power of a stage."""
         _, before, trace, strain = start
-        held, over = phase.guide.held, self.factorizations.over(phase.law, h)
+        constrained, over = phase.guide.constrained, self.factorizations.over(phase.law, h)
         body, load = phase.body.simplices, phase.load(until)
-        guess = np.where(held, known, before)
+        guess = np.where(constrained, known, before)
         residual = phase.momentum(guess - before) / h + stage_forces(body, over, guess, trace, strain) - load
-        residual[held] = 0.0
+        residual[constrained] = 0.0
         velocity = guess - self._factor(phase, h).solve(residual.ravel()).reshape(guess.shape)
         force, new_trace, new_strain = advanced(body, over, velocity, trace, strain, ahead)
         acceleration = (velocity - before) / h
-        reaction = np.where(held, phase.momentum(acceleration) + force - load, 0.0)
+        reaction = np.where(constrained, phase.momentum(acceleration) + force - load, 0.0)
         power = float((velocity * (reaction + load)).sum())
         if ahead is None and phase.stabilization is None and phase.mass is not None:
-            reaction = np.where(held, phase.mass.apply(_on_path(phase, until, acceleration)) + force - load, 0.0)
+            reaction = np.where(constrained, phase.mass.apply(_on_path(phase, until, acceleration)) + force - load, 0.0)
         return velocity, new_trace, new_strain, reaction, power
 
     def _factor(self, phase: Phase, h: float) -> Factorization:
@@ -325,11 +325,11 @@ def _on_path(phase: Phase, time: float, acceleration: FloatArray) -> FloatArray:
 
     Stage velocities on a path are good to second order, their quotients are not.
     """
-    held = phase.guide.held
-    wrong = np.where(held, phase.guide.acceleration(time) - acceleration, 0.0)
+    constrained = phase.guide.constrained
+    wrong = np.where(constrained, phase.guide.acceleration(time) - acceleration, 0.0)
     if phase.mass is None or not wrong.any():
         return acceleration
-    return acceleration + phase.mass.accelerations(np.zeros_like(wrong), held, wrong)
+    return acceleration + phase.mass.accelerations(np.zeros_like(wrong), constrained, wrong)
 
 
 def _ended(
@@ -343,5 +343,5 @@ def _ended(
     work: float,
 ) -> MotionState:
     if phase.stabilization is None:  # no drift by rounding
-        displacement = np.where(phase.guide.held, phase.guide.displacement(time), displacement)
+        displacement = np.where(phase.guide.constrained, phase.guide.displacement(time), displacement)
     return MotionState(time, displacement, velocity, trace, strain, reaction, work)

@@ -14,7 +14,7 @@ from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
 from naibu.mechanics.finite_elements.linear_simplices import Simplices, elastic_forces, per_cell, simplices
-from naibu.mechanics.linear_algebra.block_matrix import BlockPattern, block_pattern, constrained
+from naibu.mechanics.linear_algebra.block_matrix import BlockPattern, block_pattern, with_dirichlet_rows
 from naibu.mechanics.linear_algebra.protocols import Factorization
 from naibu.mechanics.linear_algebra.solver_selection import choose_solver
 
@@ -59,21 +59,23 @@ class LinearBody:
         """Return the nodal forces (n, d), mN, that hold a displacement (n, d), mm."""
         return elastic_forces(self.simplices, lame_lambda, shear_modulus, displacement)
 
-    def factorized(self, lame_lambda: ArrayLike, shear_modulus: ArrayLike, held: BoolArray) -> Factorization:
-        """Factorize the stiffness with the unknowns `held` (n, d) taken out: solving returns zero at them where the right side is zero.
+    def factorized(self, lame_lambda: ArrayLike, shear_modulus: ArrayLike, constrained: BoolArray) -> Factorization:
+        """Factorize the stiffness with the unknowns `constrained` (n, d) eliminated.
+
+        Solving returns zero at them where the right-hand side is zero.
 
         Raises
         ------
         InputError
             The body can move freely.
         """
-        return self._factorized(self.stiffness(lame_lambda, shear_modulus), held)
+        return self._factorized(self.stiffness(lame_lambda, shear_modulus), constrained)
 
-    def _factorized(self, stiffness: sp.bsr_matrix, held: BoolArray) -> Factorization:
+    def _factorized(self, stiffness: sp.bsr_matrix, constrained: BoolArray) -> Factorization:
         """Factorize a stiffness, which is changed in place."""
-        require_held(self.points, held)
-        matrix = constrained(stiffness, held)
-        return choose_solver(matrix, self.points, held, symmetric=True).factorize(matrix)
+        require_constrained(self.points, constrained)
+        matrix = with_dirichlet_rows(stiffness, constrained)
+        return choose_solver(matrix, self.points, constrained, symmetric=True).factorize(matrix)
 
     def solve(
         self, lame_lambda: ArrayLike, shear_modulus: ArrayLike, prescribed: Prescribed, external_force: FloatArray | None = None
@@ -85,22 +87,22 @@ class LinearBody:
         InputError
             Supports or forces of another shape than the nodes, or a body that can move freely.
         """
-        held = prescribed.held
-        if held.shape != self.points.shape:
-            raise InputError(f"the supports are for {held.shape} components, the body has {self.points.shape}")
+        constrained = prescribed.constrained
+        if constrained.shape != self.points.shape:
+            raise InputError(f"the supports are for {constrained.shape} components, the body has {self.points.shape}")
         stiffness = self.stiffness(lame_lambda, shear_modulus)
-        right = -(stiffness @ np.where(held, prescribed.values, 0.0).ravel()).reshape(held.shape)
+        right = -(stiffness @ np.where(constrained, prescribed.values, 0.0).ravel()).reshape(constrained.shape)
         if external_force is not None:
             if external_force.shape != self.points.shape:
                 raise InputError(f"external forces must have shape {self.points.shape}, not {external_force.shape}")
             right += external_force
-        right[held] = 0.0
-        solution = self._factorized(stiffness, held).solve(right.ravel()).reshape(right.shape)
-        return np.where(held, prescribed.values, solution)
+        right[constrained] = 0.0
+        solution = self._factorized(stiffness, constrained).solve(right.ravel()).reshape(right.shape)
+        return np.where(constrained, prescribed.values, solution)
 
 
-def require_held(points: FloatArray, held: BoolArray) -> None:
-    """Check that holding the components `held` (n, d) of points (n, d) leaves no rigid motion.
+def require_constrained(points: FloatArray, constrained: BoolArray) -> None:
+    """Check that holding the components `constrained` (n, d) of points (n, d) leaves no rigid motion.
 
     Raises
     ------
@@ -115,7 +117,7 @@ def require_held(points: FloatArray, held: BoolArray) -> None:
             turn = np.zeros_like(points)
             turn[:, a], turn[:, b] = -centred[:, b], centred[:, a]
             modes.append(turn / max(float(np.abs(turn).max()), 1e-300))
-    free = len(modes) - np.linalg.matrix_rank(np.array([mode[held] for mode in modes])) if held.any() else len(modes)
+    free = len(modes) - np.linalg.matrix_rank(np.array([mode[constrained] for mode in modes])) if constrained.any() else len(modes)
     if free:
         raise InputError(f"the body can move freely in {free} of {len(modes)} rigid ways: hold more nodes or components")
 

@@ -26,8 +26,8 @@ class Mass(Protocol):
         """Add `factor` times the mass to a matrix with the pattern of the body's stiffness, in place."""
         ...
 
-    def accelerations(self, force: FloatArray, held: BoolArray, known: FloatArray) -> FloatArray:
-        """Return accelerations (n, d), mm/s^2, under forces (n, d), mN, with those of the components `held` known."""
+    def accelerations(self, force: FloatArray, constrained: BoolArray, known: FloatArray) -> FloatArray:
+        """Return accelerations (n, d), mm/s^2, under forces (n, d), mN, with those of the components `constrained` known."""
         ...
 
 
@@ -48,9 +48,9 @@ class LumpedMass:
         for a in range(matrix.blocksize[0]):
             matrix.data[self._diagonal, a, a] += factor * self.of_node
 
-    def accelerations(self, force: FloatArray, held: BoolArray, known: FloatArray) -> FloatArray:
+    def accelerations(self, force: FloatArray, constrained: BoolArray, known: FloatArray) -> FloatArray:
         """Divide by the masses where nothing is known."""
-        return np.where(held, known, force / self.of_node[:, None])
+        return np.where(constrained, known, force / self.of_node[:, None])
 
 
 class ConsistentMass:
@@ -72,12 +72,12 @@ class ConsistentMass:
         for a in range(matrix.blocksize[0]):
             matrix.data[:, a, a] += factor * self.matrix.data
 
-    def accelerations(self, force: FloatArray, held: BoolArray, known: FloatArray) -> FloatArray:
+    def accelerations(self, force: FloatArray, constrained: BoolArray, known: FloatArray) -> FloatArray:
         """Solve for the components that are not known, direction by direction."""
-        out = np.where(held, known, 0.0)
+        out = np.where(constrained, known, 0.0)
         right = force - self.apply(out)
         for a in range(force.shape[1]):
-            free = ~held[:, a]
+            free = ~constrained[:, a]
             if free.any():
                 key = free.tobytes()
                 if key not in self._factors:

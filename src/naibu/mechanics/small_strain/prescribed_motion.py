@@ -153,7 +153,7 @@ class Guide:
     """
 
     def __init__(self, supports: Sequence[Support], shape: tuple[int, int], offsets: dict[str, FloatArray]) -> None:
-        self.held = np.zeros(shape, dtype=bool)
+        self.constrained = np.zeros(shape, dtype=bool)
         self._shape = shape
         self._parts: list[tuple[Support, tuple[IntArray, ...], FloatArray, list[int]]] = []
         for support in supports:
@@ -161,9 +161,9 @@ class Guide:
             if support.nodes.min() < 0 or support.nodes.max() >= shape[0] or min(axes) < 0 or max(axes) >= shape[1]:
                 raise InputError(f"support {support.name!r} names a node or an axis that a body of {shape[0]} nodes in {shape[1]} D lacks")
             where = support.nodes[:, None], np.array(axes)[None]
-            if self.held[where].any():
+            if self.constrained[where].any():
                 raise InputError(f"support {support.name!r} holds nodes that another support holds at the same time")
-            self.held[where] = True
+            self.constrained[where] = True
             self._parts.append((support, where, offsets.get(support.name, np.zeros((len(support.nodes), shape[1])))[:, axes], list(axes)))
 
     def displacement(self, time: float) -> FloatArray:

@@ -47,28 +47,28 @@ class Explicit(Integrator):
         """Return dy/dt and remember the reaction."""
         if phase.mass is None:
             raise InputError("without inertia use 'sdirk2' or 'backward_euler'")
-        held, body = phase.guide.held, phase.body.simplices
-        u, v, trace, strain = _unpacked(y, held.shape, body.n_cells)
+        constrained, body = phase.guide.constrained, phase.body.simplices
+        u, v, trace, strain = _unpacked(y, constrained.shape, body.n_cells)
         if phase.stabilization is None:
-            v = np.where(held, phase.guide.velocity(time, side), v)
+            v = np.where(constrained, phase.guide.velocity(time, side), v)
         internal, trace_rate, strain_rate = rates(body, phase.flow, v, trace, strain)
         load = phase.load(time)
-        a = phase.mass.accelerations(load - internal, held, phase.held_acceleration(time, side, u, v))
-        self._reaction = np.where(held, phase.mass.apply(a) + internal - load, 0.0)
+        a = phase.mass.accelerations(load - internal, constrained, phase.constrained_acceleration(time, side, u, v))
+        self._reaction = np.where(constrained, phase.mass.apply(a) + internal - load, 0.0)
         power = float((v * (self._reaction + load)).sum())
         return np.concatenate([v.ravel(), a.ravel(), trace_rate, strain_rate.ravel(), [power]])
 
     def _state(self, phase: Phase, time: float, y: FloatArray) -> MotionState:
         """Return the state with its reaction, held components where they belong, and remember its rate."""
         rate = self._rate(phase, time, -1, y)
-        held, guide = phase.guide.held, phase.guide
-        u, v, trace, strain = _unpacked(y, held.shape, phase.body.simplices.n_cells)
+        constrained, guide = phase.guide.constrained, phase.guide
+        u, v, trace, strain = _unpacked(y, constrained.shape, phase.body.simplices.n_cells)
         if not (np.isfinite(y).all() and np.abs(u).max() < 1e6 * np.ptp(phase.body.points, axis=0).max()):
             raise ConvergenceError(
                 f"the explicit steps blew up at {time:g} s: take shorter ones (see explicit_step_limit), or the method 'sdirk2'"
             )
         if phase.stabilization is None:
-            u, v = np.where(held, guide.displacement(time), u), np.where(held, guide.velocity(time, -1), v)
+            u, v = np.where(constrained, guide.displacement(time), u), np.where(constrained, guide.velocity(time, -1), v)
         state = MotionState(time, u, v, trace, strain, self._reaction, float(y[-1]))
         self._last = state, rate
         return state

@@ -186,7 +186,7 @@ class _Linearised(Sdirk2):
         self.tangent = _Tangent(zero, zero, np.zeros((p, m)), np.zeros((p, m, d, d)), zero)
         self.displacements: list[FloatArray] = []
         self.reactions: list[FloatArray] = []
-        self._held_rate = zero
+        self._constrained_rate = zero
         self._changes: dict[str, list[StepCoefficients]] = {}
 
     def told(self, state: MotionState) -> None:
@@ -201,15 +201,15 @@ class _Linearised(Sdirk2):
         if phase.mass is None:
             velocity = kept
         else:
-            wrong = np.where(phase.guide.held, -kept, 0.0)
+            wrong = np.where(phase.guide.constrained, -kept, 0.0)
             inertia, zero = phase.mass, np.zeros(kept.shape[1:])
-            velocity = np.array([v + inertia.accelerations(zero, phase.guide.held, w) for v, w in zip(kept, wrong, strict=True)])
+            velocity = np.array([v + inertia.accelerations(zero, phase.guide.constrained, w) for v, w in zip(kept, wrong, strict=True)])
         self.tangent = replace(self.tangent, velocity=velocity)
         return after
 
     def _aimed(self, phase: Phase, span: float) -> None:
         """What is held shall end on its path, wherever the materials had let it go."""
-        self._held_rate = np.where(phase.guide.held, -self.tangent.displacement / span, 0.0)
+        self._constrained_rate = np.where(phase.guide.constrained, -self.tangent.displacement / span, 0.0)
 
     def _stage(
         self,
@@ -226,10 +226,10 @@ class _Linearised(Sdirk2):
         last, span = (over, h) if ahead is None else (ahead, rest)
         velocity, internal, t = done[0], start[2:], self.tangent
         changes, later = self._changed(phase, h), self._changed(phase, span)
-        guess = np.where(phase.guide.held, self._held_rate, t.velocity)
+        guess = np.where(phase.guide.constrained, self._constrained_rate, t.velocity)
         direct = [stage_forces(body, _of_change(over, change), velocity, *internal) for change in changes]
         residual = self._residual(phase, over, guess, h, direct)
-        free = np.where(phase.guide.held, 0.0, residual)
+        free = np.where(phase.guide.constrained, 0.0, residual)
         found = self._factor(phase, h).solve(np.ascontiguousarray(free.reshape(len(free), -1).T))
         rate = guess - found.T.reshape(guess.shape)
         ends = [advanced(body, last, v, e, f) for v, e, f in zip(rate, t.trace, t.strain, strict=True)]
@@ -249,12 +249,12 @@ class _Linearised(Sdirk2):
         return np.array([phase.momentum(v - before) / h + stage_forces(body, over, v, e, f) + extra for v, before, e, f, extra in parts])
 
     def _reaction(self, phase: Phase, over: StepCoefficients, rate: FloatArray, h: float, direct: list[FloatArray]) -> FloatArray:
-        out, held = self._residual(phase, over, rate, h, direct), phase.guide.held
+        out, constrained = self._residual(phase, over, rate, h, direct), phase.guide.constrained
         if phase.mass is not None:  # as for the motion: the path's acceleration, which does not depend on the materials
             for i, acceleration in enumerate((rate - self.tangent.velocity) / h):
-                wrong = np.where(held, -acceleration, 0.0)
-                out[i] += phase.mass.apply(phase.mass.accelerations(np.zeros_like(wrong), held, wrong))
-        return np.where(held, out, 0.0)
+                wrong = np.where(constrained, -acceleration, 0.0)
+                out[i] += phase.mass.apply(phase.mass.accelerations(np.zeros_like(wrong), constrained, wrong))
+        return np.where(constrained, out, 0.0)
 
     def _changed(self, phase: Phase, step_s: float) -> list[StepCoefficients]:
         key = f"{step_s:.10g}"

@@ -63,7 +63,7 @@ def snapshots(study: Study) -> Draw:
 
 
 def curves(studies: Sequence[Study]) -> Draw:
-    """Draw displacement of the pushed point and force of the pusher against time."""
+    """Draw displacement of the pushed point and force of the indenter against time."""
 
     def draw(canvas: Canvas) -> None:
         left, right = canvas.subplots(1, 2)
@@ -71,12 +71,12 @@ def curves(studies: Sequence[Study]) -> Draw:
             series = study.series
             left.plot(series.times, series.displacement[:, study.middle_top, 1], line, label=study.name, lw=1.2)
             acts = series.times <= PHASES_S[1]
-            right.plot(series.times[acts], -series.force("pusher")[acts, 1], line, lw=1.2)
+            right.plot(series.times[acts], -series.force("indenter")[acts, 1], line, lw=1.2)
         for axis in (left, right):
             for time in PHASES_S[:2]:
                 axis.axvline(time, color="0.8", lw=0.8, zorder=0)
         left.set(xlabel="time, s", ylabel="displacement, mm", title="middle of the top")
-        right.set(xlabel="time, s", ylabel="force, mN per mm of thickness", title="pusher")
+        right.set(xlabel="time, s", ylabel="force, mN per mm of thickness", title="indenter")
         left.legend(frameon=False)
 
     return draw

@@ -136,7 +136,7 @@ def pushed_square(
     x, y = mesh.points.T
     top = np.flatnonzero((y > side_mm * (1.0 - 1e-9)) & (np.abs(x) <= side_mm * (0.5 * pushed_share + 1e-9)))
     path = Path.through([0.0, PHASES_S[0]], [(0.0, 0.0), (0.0, -push_mm)])
-    supports = [Support("floor", np.flatnonzero(y == 0.0)), Support("pusher", top, path=path, end_s=PHASES_S[1])]
+    supports = [Support("floor", np.flatnonzero(y == 0.0)), Support("indenter", top, path=path, end_s=PHASES_S[1])]
     times = np.linspace(0.0, PHASES_S[2], round(PHASES_S[2] / step_s) + 1)
     series = simulate(LinearBody.of(mesh), SQUARES[name], density, supports, times, method=method)
     return Study(name, mesh, SQUARES[name], series, _nearest(mesh, (0.0, side_mm)))

@@ -96,7 +96,7 @@ def _squares(step_s: float, divisions: int) -> Section:
         for i, s in enumerate(studies, start=1)
     ]
     curves = Figure(
-        "Pushed point", "Displacement of the middle of the top, and force of the pusher, against time.", drawn.curves(studies), (8.0, 3.2)
+        "Pushed point", "Displacement of the middle of the top, and force of the indenter, against time.", drawn.curves(studies), (8.0, 3.2)
     )
     text = (
         f"A square fixed on the floor is pushed in the middle of its top until {PHASES_S[0]:g} s, held until {PHASES_S[1]:g} s, and free "
@@ -114,11 +114,11 @@ def _square_row(study: Study) -> tuple[Cell, ...]:
     y = -series.displacement[:, study.middle_top, 1]
     push = float(y.max())
     calm = series.times > PHASES_S[1] if np.isinf(m.relaxation_time) else series.times >= PHASES_S[2]
-    force = -series.force("pusher")[:, 1]
+    force = -series.force("indenter")[:, 1]
     at = [float(force[int(np.argmin(np.abs(series.times - t)))]) for t in PHASES_S[:2]]
-    held = PHASES_S[1] - PHASES_S[0]
-    closed = float(released_strain(elements, 1.0, PHASES_S[0], held, [PHASES_S[2]])[0])
-    for_good = residual_strain(elements, 1.0, PHASES_S[0], held)
+    constrained = PHASES_S[1] - PHASES_S[0]
+    closed = float(released_strain(elements, 1.0, PHASES_S[0], constrained, [PHASES_S[2]])[0])
+    for_good = residual_strain(elements, 1.0, PHASES_S[0], constrained)
     printed = ", ".join(f"{value:g}" if np.isfinite(value) else "none" for value in elements)
     kept = 100.0 * float(y[calm].mean()) / push
     return study.name, printed, m.relaxation_time, m.retardation_time, kept, 100.0 * closed, 100.0 * for_good, *at

@@ -73,7 +73,7 @@ class PushedBody:
         return table[:, 0], table[:, 1]
 
     @property
-    def held(self) -> BoolArray:
+    def constrained(self) -> BoolArray:
         """Nodes of floor and top (n,), on which unknown forces act."""
         height = self.mesh.points[:, -1]
         return np.asarray((height < 1e-9) | (height > height.max() - 1e-9))
@@ -113,7 +113,7 @@ class PushedBody:
         for k, push in enumerate(self.pushes):
             u = self.displacement(push)
             field = Field.from_arrays(self.mesh.points, u + sd_mm * rng.standard_normal(u.shape), sd_mm=sd_mm)
-            out.append(FieldTrial.of(f"push {k + 1}", field, self.mesh, loaded=self.held))
+            out.append(FieldTrial.of(f"push {k + 1}", field, self.mesh, loaded=self.constrained))
         return tuple(out)
 
 

@@ -45,7 +45,7 @@ def cube_with_known(ratio: float, divisions: int = 4) -> PushedBody:
 def planned(body: PushedBody, points: FloatArray, vectors: FloatArray) -> list[FieldTrial]:
     """Return the push as it will be measured at some points, without noise yet."""
     field = Field.from_arrays(points, vectors, sd_mm=NOISE_MM)
-    return [FieldTrial.of("push", field, body.mesh, loaded=body.held)]
+    return [FieldTrial.of("push", field, body.mesh, loaded=body.constrained)]
 
 
 def known_stiffness(ratio: float) -> Accuracy:

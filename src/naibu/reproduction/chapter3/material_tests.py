@@ -22,7 +22,7 @@ from naibu.reproduction.chapter3.poisson_readings import (
     PLATE_STATES,
     READING_SD,
     SIDE_MM,
-    held_block,
+    constrained_block,
     marker_ratios,
     pairs_that_fit,
     readings,
@@ -48,7 +48,7 @@ class Specimens:
     printed: FloatArray
 
 
-CHANCE, HELD, COMPLIANCE, SLACK = (
+CHANCE, CONSTRAINED, COMPLIANCE, SLACK = (
     "nothing but chance",
     "faces held by the plates, 1 + 2 S^2 (Gent and Lindley 1959)",
     "compliance of the machine, mm/mN",
@@ -56,7 +56,7 @@ CHANCE, HELD, COMPLIANCE, SLACK = (
 )
 _SPREAD: dict[str, tuple[Spread, bool]] = {
     CHANCE: (lambda e, s, p: e, False),
-    HELD: (lambda e, s, p: e * (1.0 + 2.0 * s.shape_factor**2), False),
+    CONSTRAINED: (lambda e, s, p: e * (1.0 + 2.0 * s.shape_factor**2), False),
     COMPLIANCE: (lambda e, s, p: e / (1.0 + e * p * s.area_over_height), True),
     SLACK: (lambda e, s, p: e / (1.0 + p / (USUAL_STRAIN * s.height)), True),
 }
@@ -79,10 +79,10 @@ def table_3_4() -> Section:
             specimen = Specimen.cylinder(row[1], row[2])
             corrected = row[3] * 1e-3 / specimen.bonded_stiffening
             cells.append((gel, row[1], row[2], row[3] * 1e-3, round(specimen.shape_factor, 3), round(corrected, 1), None, None, None, None))
-        held = specimen_mean([r[3] * 1e-3 / Specimen.cylinder(r[1], r[2]).bonded_stiffening for r in own])
+        constrained = specimen_mean([r[3] * 1e-3 / Specimen.cylinder(r[1], r[2]).bonded_stiffening for r in own])
         low, high = mean.interval
         cells.append(
-            (gel, None, None, None, None, round(held.mean, 1), own[0][4] * 1e-3, round(mean.mean, 1), round(mean.standard_error, 1),
+            (gel, None, None, None, None, round(constrained.mean, 1), own[0][4] * 1e-3, round(mean.mean, 1), round(mean.standard_error, 1),
              f"{low:.0f} to {high:.0f}")
         )  # fmt: skip
     columns = (
@@ -152,10 +152,10 @@ def _spread_text(table: Table) -> tuple[str, ...]:
     return (
         "The report gives neither the readings nor the range of strain nor the friction at the plates. Within each gel the lowest "
         "specimen has the lowest modulus. Plates that hold the faces would do the opposite - they make low specimens look stiffer - and "
-        f"the correction for it takes the scatter from {left[CHANCE]:.0f} to {left[HELD]:.0f} %. Slack or a machine's compliance counted "
-        f"as strain goes the right way and leaves {left[SLACK]:.0f} and {left[COMPLIANCE]:.0f} %, but it would take {slack} mm of slack or "
-        f"{1e3 * compliance:.2g} mm/N of compliance, and moduli far above the printed ones. Specimens cast at different times may as well "
-        "differ. The readings would tell: naibu.identification.material_testing.uniaxial.compression_test estimates the slack from them.",
+        f"the correction for it takes the scatter from {left[CHANCE]:.0f} to {left[CONSTRAINED]:.0f} %. Slack or a machine's compliance "
+        f"counted as strain goes the right way and leaves {left[SLACK]:.0f} and {left[COMPLIANCE]:.0f} %, but it would take {slack} mm of "
+        f"slack or {1e3 * compliance:.2g} mm/N of compliance, and moduli far above the printed ones. Specimens cast at different times may "
+        "as well differ. The readings would tell: naibu.identification.material_testing.uniaxial.compression_test estimates the slack from them.",
     )
 
 
@@ -248,7 +248,7 @@ def _candidates(printed: dict[str, tuple[float, float, float]], divisions: int) 
     least = {gel: min(lateral[gel].values()) for gel in GELS}
     along = {gel: next(v for k, v in seen.longitudinal.items() if gel in k) for gel in GELS}
     stack, stated = seen.longitudinal["all layers"], seen.longitudinal["stated height"]
-    held = {gel: held_block(-printed[gel][0], 0.49, divisions) for gel in GELS}
+    constrained = {gel: constrained_block(-printed[gel][0], 0.49, divisions) for gel in GELS}
     free = {gel: float((1.0 + printed[gel][0]) ** -0.5) - 1.0 for gel in GELS}
     out = {
         "the gel's own layers": {g: (along[g], own[g]) for g in GELS},
@@ -260,7 +260,7 @@ def _candidates(printed: dict[str, tuple[float, float, float]], divisions: int) 
     }
     for name, height in (("middle", 0.5), ("one sixth of the height above a face", 1 / 6), ("one twelfth above a face", 1 / 12)):
         key = f"computed block, nu 0.49, faces held, read in the {name}" if height == 0.5 else f"computed block, faces held, read {name}"
-        out[key] = {g: (printed[g][0], held[g].transversal_at(height)) for g in GELS}
+        out[key] = {g: (printed[g][0], constrained[g].transversal_at(height)) for g in GELS}
     return out
 
 
@@ -268,7 +268,7 @@ def _volume_table(printed: dict[str, tuple[float, float, float]], divisions: int
     cells: list[tuple[Cell, ...]] = []
     for gel, (along, _, value) in printed.items():
         for nu, whose in ((value, "printed"), (0.49, "0.49")):
-            block = held_block(-along, nu, divisions)
+            block = constrained_block(-along, nu, divisions)
             cells.append((gel, whose, nu, -along, round(block.volume_ratio, 3), round(block.transversal_at(0.5), 3)))
     columns = ("gel", "which nu", "nu", "longitudinal strain", "volume ratio of the block", "transversal strain in the middle")
     note = "Cube with held faces, law neo_hookean, hexahedra with shared dilatation."
@@ -283,7 +283,7 @@ def _ratio_text(printed: dict[str, tuple[float, float, float]], tables: Sequence
     distances = {str(row[0]): tuple(float(str(d)) for d in row[-len(GELS) :]) for row in tables[2].rows}
     nearest = min(distances, key=lambda name: max(distances[name]))
     kept = [str(row[0]) for row in tables[1].rows if all(abs(float(str(v)) - 1.0) <= VOLUME_SPREAD for v in row[1:])]
-    held = [float(str(row[4])) for row in tables[3].rows if row[1] != "printed"]
+    constrained = [float(str(row[4])) for row in tables[3].rows if row[1] != "printed"]
     measure = (
         f"read as {' or '.join(kept)}, both printed pairs keep the volume" if kept else "under none do both printed pairs keep the volume"
     )
@@ -292,7 +292,7 @@ def _ratio_text(printed: dict[str, tuple[float, float, float]], tables: Sequence
         f"the same gels, in the same kind of images, say {min(volumes):.2f} to {max(volumes):.2f} times the free volume.",
         f"Resolution: were the volume kept, the width of the {SIDE_MM:.0f} mm cube would have been misread by {pixels[0]:.0f} and "
         f"{pixels[1]:.0f} pixels. Strain measure: {measure}. Held faces: they hold the widening back near plate and table only, and at "
-        f"nu = 0.49 leave {min(held):.2f} to {max(held):.2f} of the volume (last table).",
+        f"nu = 0.49 leave {min(constrained):.2f} to {max(constrained):.2f} of the volume (last table).",
         f"Other readings: of all {counts.tried} pairs of a longitudinal and a transversal strain between marker layers of the bundled "
         f"plate experiments, {counts.fitting[0]} lie within two standard deviations of the printed pair of {GELS[0]} and "
         f"{counts.fitting[1]} of that of {GELS[1]}. Of the candidates in the third table the one nearest to both is '{nearest}': "

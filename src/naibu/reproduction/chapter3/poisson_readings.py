@@ -56,7 +56,7 @@ class Readings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HeldBlock:
+class ConstrainedBlock:
     """A compressed cube with held faces: heights over the height (k,), transversal strain there (k,), volume ratio of the whole."""
 
     height: FloatArray
@@ -138,7 +138,7 @@ def pairs_that_fit(printed: Sequence[tuple[float, float, float]]) -> FittingPair
 
 
 @cache
-def held_block(shortening: float, poisson_ratio: float, divisions: int) -> HeldBlock:
+def constrained_block(shortening: float, poisson_ratio: float, divisions: int) -> ConstrainedBlock:
     """Compress a cube whose loaded faces are held, by a fraction `shortening` of its height; its Young's modulus does not matter."""
     mesh = box((SIDE_MM,) * 3, (divisions, divisions, 2 * divisions))
     z = mesh.points[:, 2]
@@ -150,7 +150,7 @@ def held_block(shortening: float, poisson_ratio: float, divisions: int) -> HeldB
     at = [np.abs(z - h) < 1e-3 for h in heights]
     across = np.array([_widening(mesh.points[k], mesh.points[k] + u[k]) for k in at])
     volume = elements(mesh.moved(u)).volume / elements(mesh).volume
-    return HeldBlock(heights / SIDE_MM, across, volume)
+    return ConstrainedBlock(heights / SIDE_MM, across, volume)
 
 
 def _widening(free: FloatArray, pressed: FloatArray) -> float:

@@ -105,7 +105,7 @@ def pattern_study(seed: int = 0, *, law: Law = "finer", spacing_mm: float = 10.0
 
 
 def calibrated(lattice: Lattice, captures: tuple[Capture, ...], key: Key) -> LatticeEstimate:
-    """Return one calibration; forces count while the pushers keep still, as in the report."""
+    """Return one calibration; forces count while the indenters keep still, as in the report."""
     number, mode, index = key
     problem = CalibrationProblem.of(lattice, [captures[number]], index=index, mode=mode, window="keep")
     scale = lattice.spacing_mm / 10.0

@@ -111,9 +111,9 @@ def virtual_capture(
     point_sd_mm: float = POINT_SD_MM,
     force_sd_mn: float = FORCE_SD_MN,
 ) -> Capture:
-    """Push a lattice, and return what two stereo cameras and a force sensor on each pusher see of it, with noise.
+    """Push a lattice, and return what two stereo cameras and a force sensor on each indenter see of it, with noise.
 
-    A camera sees the faces that look towards it, but neither the floor nor those that a pusher covers while it touches them; points are
+    A camera sees the faces that look towards it, but neither the floor nor those that an indenter covers while it touches them; points are
     spread evenly over what each camera sees, half of them for each. (Faces hide no other faces: shallow dents only.)
 
     Parameters

@@ -153,7 +153,7 @@ def box_experiment(
     size_mm: tuple[float, float, float],
     layers: Sequence[tuple[str, float]],
     loading: Loading,
-    openings_mm: Mapping[str, float],
+    platen_positions_mm: Mapping[str, float],
     *,
     spacing_mm: float = 10.0,
     margin_mm: float = 10.0,
@@ -171,7 +171,7 @@ def box_experiment(
         From the base up.
     loading : Loading
         Plate, bar or side plates.
-    openings_mm : mapping of str to float
+    platen_positions_mm : mapping of str to float
         Name of every loaded state, and the height of the plate or bar (or distance of the side plates) in it.
     spacing_mm, margin_mm : float
         Spacing of the markers' lattice, and the least distance of its outermost markers from the faces.
@@ -189,7 +189,7 @@ def box_experiment(
     bottoms = np.concatenate([[0.0], tops[:-1]])
     slabs = tuple(Layer(material, float(a), float(b)) for (material, _), a, b in zip(layers, bottoms, tops, strict=True))
     heights = _centred(size_mm[2], spacing_mm, margin_mm) + 0.5 * size_mm[2]
-    states = (State("initial", None, loaded=False), *(State(s, None, stated_mm=float(at)) for s, at in openings_mm.items()))
+    states = (State("initial", None, loaded=False), *(State(s, None, stated_mm=float(at)) for s, at in platen_positions_mm.items()))
     return Experiment(
         name=name,
         title=f"virtual specimen {name}",
@@ -254,7 +254,7 @@ def virtual_specimen(
         used but for the places of the markers where there is no nominal lattice.
     truth : mapping of str to float
         Physical values: `young_modulus` and `poisson_ratio` of every material, `friction` (sticking where left out), and what departs
-        from the nominal boundary conditions: `opening`, tilts, offset of a bar.
+        from the nominal boundary conditions: `platen_position`, tilts, offset of a bar.
     settings : ModelSettings, optional
         Law, contact, mesh; by default those of identification with `ELEMENTS_OVER_HEIGHT` elements over the height.
     markers : array_like, shape (k, 3), optional

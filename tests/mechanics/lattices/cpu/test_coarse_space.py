@@ -11,7 +11,7 @@ from naibu.mechanics.lattices.cpu._pcg_kernels import multiply
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters, box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.octree import octree_lattice
-from naibu.mechanics.lattices.model.state import HeldNodes, LatticeState
+from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState
 from naibu.mechanics.lattices.model.tetrahedral_springs import volumetric_lattice
 from naibu.meshing.primitives import box
 
@@ -56,8 +56,10 @@ SPECIMENS = specimens()
 
 def pushed(engine: LatticeEngine, steps: int = 8):
     z = engine.lattice.points[:, 2]
-    held = HeldNodes.of(np.flatnonzero(z < z.min() + 1e-6), 0) + HeldNodes.of(np.flatnonzero(z > z.max() - 1e-6), 1, axes=(2, 0))
-    return engine.run(engine.rest(), steps, held, [[0.0, 0.0, 0.0], [4.0, 0.0, -20.0]])
+    constrained = ConstrainedNodes.of(np.flatnonzero(z < z.min() + 1e-6), 0) + ConstrainedNodes.of(
+        np.flatnonzero(z > z.max() - 1e-6), 1, axes=(2, 0)
+    )
+    return engine.run(engine.rest(), steps, constrained, [[0.0, 0.0, 0.0], [4.0, 0.0, -20.0]])
 
 
 def helped(monkeypatch: pytest.MonkeyPatch, between: bool = False) -> None:
@@ -161,13 +163,13 @@ def test_energy_never_grows_with_coarse_functions(seed, monkeypatch):
     engine = LatticeEngine.of(lattice, lattice_parameters(lattice, *draw), tolerance=10.0 ** rng.uniform(-6, -0.05))
     assert len(engine.kernel[3][8][5][2])
     velocity = 10.0 ** rng.uniform(-2, 3) * (rng.normal(size=lattice.points.shape) + np.cross([0.1, -0.2, 0.3], lattice.points))
-    held = HeldNodes.of([0, 1, 2, 7]) if rng.random() < 0.5 else None
-    if held is not None:
+    constrained = ConstrainedNodes.of([0, 1, 2, 7]) if rng.random() < 0.5 else None
+    if constrained is not None:
         velocity[[0, 1, 2, 7]] = 0.0
     state = LatticeState(lattice.points, velocity, 0.3 * rng.normal(size=lattice.n_elements))
     energies = [engine.energy(state)]
     for _ in range(15):
-        state = engine.run(state, 1, held).state
+        state = engine.run(state, 1, constrained).state
         energies.append(engine.energy(state))
     assert np.diff(energies).max() <= 1e-9 * energies[0]
 
@@ -177,7 +179,7 @@ def test_a_run_does_not_depend_on_those_before_it(monkeypatch):
     lattice, parameters = SPECIMENS["classic"]
     engine = LatticeEngine.of(lattice, parameters)
     once = pushed(engine)
-    engine.run(engine.rest(), 3, HeldNodes.of([5, 9]), [1.0, 2.0, 3.0])
+    engine.run(engine.rest(), 3, ConstrainedNodes.of([5, 9]), [1.0, 2.0, 3.0])
     engine.run(engine.rest(), 3)
     again = pushed(engine)
     np.testing.assert_array_equal(again.state.position, once.state.position)
@@ -190,9 +192,9 @@ def test_a_lattice_that_has_turned_is_solved_as_well(monkeypatch):
     lattice, parameters = SPECIMENS["classic"]
     engine = LatticeEngine.of(lattice, parameters, tolerance=1e-6)
     z = lattice.points[:, 2]
-    held = HeldNodes.of(np.flatnonzero(z < 1.0), 0) + HeldNodes.of(np.flatnonzero(z > 49.0), 1)
-    upright = engine.run(engine.rest(), 5, held, [[0.0, 0.0, 0.0], [0.0, 0.0, -20.0]]).state
+    constrained = ConstrainedNodes.of(np.flatnonzero(z < 1.0), 0) + ConstrainedNodes.of(np.flatnonzero(z > 49.0), 1)
+    upright = engine.run(engine.rest(), 5, constrained, [[0.0, 0.0, 0.0], [0.0, 0.0, -20.0]]).state
     turn = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     start = LatticeState(lattice.points @ turn.T, np.zeros_like(lattice.points), np.zeros(lattice.n_elements))
-    lying = engine.run(start, 5, held, [[0.0, 0.0, 0.0], [-20.0, 0.0, 0.0]]).state
+    lying = engine.run(start, 5, constrained, [[0.0, 0.0, 0.0], [-20.0, 0.0, 0.0]]).state
     np.testing.assert_allclose(lying.position, upright.position @ turn.T, atol=2e-7)

@@ -12,7 +12,7 @@ from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.gpu.engine import WarpLatticeEngine
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.octree import octree_lattice
-from naibu.mechanics.lattices.model.state import HeldNodes, LatticeState
+from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState
 
 METHODS = ("implicit", "euler", "symplectic_euler")
 EXPLICIT_STEP_S = 1e-4
@@ -53,9 +53,9 @@ def pushed(lattice):
     x, y, z = lattice.points.T
     tilted = np.linalg.qr(np.random.default_rng(8).normal(size=(3, 3)))[0][:2]
     corner = np.argmax(x + y + z)
-    handle = HeldNodes(np.array([corner, corner]), tilted, np.array([0.7, 1.0]), np.array([2, 1]))
-    roller = HeldNodes.of(np.flatnonzero((x == x.max()) & (z > 0) & (np.arange(len(x)) != corner)), 1, axes=(0,), weight=0.5)
-    return HeldNodes.of(np.flatnonzero(z == 0.0), 0) + roller + handle, [[0, 0, 0], [9.0, 1.0, 4.0], [-5.0, 7.0, -20.0]]
+    handle = ConstrainedNodes(np.array([corner, corner]), tilted, np.array([0.7, 1.0]), np.array([2, 1]))
+    roller = ConstrainedNodes.of(np.flatnonzero((x == x.max()) & (z > 0) & (np.arange(len(x)) != corner)), 1, axes=(0,), weight=0.5)
+    return ConstrainedNodes.of(np.flatnonzero(z == 0.0), 0) + roller + handle, [[0, 0, 0], [9.0, 1.0, 4.0], [-5.0, 7.0, -20.0]]
 
 
 def spinning(lattice, seed=0, speed=3.0):
@@ -82,21 +82,21 @@ def test_it_moves_as_on_the_processor(device, kind, method):
     lattice = LATTICES[kind]()
     parameters = parameters_of(lattice, each=kind == "mask")
     options = {"method": method, "step": 2e-3 if method == "implicit" else EXPLICIT_STEP_S, "tolerance": 1e-6}
-    held, velocity = pushed(lattice)
+    constrained, velocity = pushed(lattice)
     motions = []
     for engine in (LatticeEngine.of(lattice, parameters, **options), WarpLatticeEngine.of(lattice, parameters, device=device, **options)):
-        motions.append(engine.run(spinning(lattice), 200 if method != "implicit" else 50, held, velocity, [0.0, 0.01, -0.02]))
+        motions.append(engine.run(spinning(lattice), 200 if method != "implicit" else 50, constrained, velocity, [0.0, 0.01, -0.02]))
     assert_alike(motions[1], motions[0], 1e-11 if method != "implicit" else 2e-6)
     assert np.abs(motions[0].state.position - lattice.points).max() > 0.1
 
 
 def test_single_precision_differs_in_the_last_digits_only(device):
     lattice = LATTICES["classic"]()
-    held, velocity = pushed(lattice)
+    constrained, velocity = pushed(lattice)
     runs = []
     for precision in ("double", "single"):
         options = {"method": "euler", "step": EXPLICIT_STEP_S, "precision": precision, "device": device}
-        runs.append(WarpLatticeEngine.of(lattice, parameters_of(lattice), **options).run(spinning(lattice), 200, held, velocity))
+        runs.append(WarpLatticeEngine.of(lattice, parameters_of(lattice), **options).run(spinning(lattice), 200, constrained, velocity))
     assert_alike(runs[1], runs[0], 1e-4)
     assert np.abs(runs[1].state.position - runs[0].state.position).max() > 0.0
 
@@ -106,11 +106,11 @@ def test_a_session_goes_on_where_it_was(device, method):
     """Steps in several calls, also more than fit on the device at once, are those of one call; twice the same are the same."""
     lattice = classic_lattice(box_mask((2, 2, 2)), 10.0, total_mass_kg=0.02)
     engine = WarpLatticeEngine.of(lattice, parameters_of(lattice), step=EXPLICIT_STEP_S, method=method, device=device)
-    held = HeldNodes.of([0, 1, 2]) + HeldNodes.of([20], 1)
+    constrained = ConstrainedNodes.of([0, 1, 2]) + ConstrainedNodes.of([20], 1)
     path = np.zeros((300, 2, 3))
     path[:, 1, 2] = 10.0 * np.sin(0.05 * np.arange(300))
-    whole = engine.run(spinning(lattice), 300, held, path)
-    session = engine.session(spinning(lattice), held)
+    whole = engine.run(spinning(lattice), 300, constrained, path)
+    session = engine.session(spinning(lattice), constrained)
     reaction = np.concatenate([session.advance(len(part), part) for part in (path[:7], path[7:280], path[280:])])
     np.testing.assert_array_equal(reaction, whole.reaction)
     np.testing.assert_array_equal(session.state().position, whole.state.position)
@@ -160,10 +160,10 @@ def test_energy_of_implicit_steps_never_grows(device, seed):
     parameters = lattice_parameters(lattice, *draw)
     engine = WarpLatticeEngine.of(lattice, parameters, tolerance=10.0 ** rng.uniform(-6, -0.05), device=device)
     start = spinning(lattice, seed, speed=10.0 ** rng.uniform(-2, 3))
-    held = HeldNodes.of([0, 1, 2]) if seed % 2 else None
-    if held is not None:
+    constrained = ConstrainedNodes.of([0, 1, 2]) if seed % 2 else None
+    if constrained is not None:
         start.velocity[:3] = 0.0
-    session, found = engine.session(start, held), [engine.energy(start)]
+    session, found = engine.session(start, constrained), [engine.energy(start)]
     for _ in range(20):
         session.advance(1)
         found.append(engine.energy(session.state()))
@@ -177,7 +177,7 @@ def test_rotation_is_held_back_as_on_the_processor(device):
     start = LatticeState(lattice.points, np.cross([0.0, 100.0, 300.0], lattice.points - 10.0), np.zeros(lattice.n_elements))
     one = LatticeEngine.of(lattice, parameters, tolerance=1e-10).run(start, 15)
     two = WarpLatticeEngine.of(lattice, parameters, tolerance=1e-10, device=device).run(start, 15)
-    assert two.held_back == one.held_back > 0
+    assert two.rotation_limited == one.rotation_limited > 0
     assert_alike(two, one, 1e-6)
     np.testing.assert_allclose(two.state.length, one.state.length, rtol=1e-6)
 
@@ -231,6 +231,6 @@ def test_bad_states_are_named_and_explicit_steps_that_blow_up_say_so(device):
         with pytest.raises(InputError, match=said):
             engine.run(state, 1)
     with pytest.raises(InputError, match="held masses have the numbers"):
-        engine.run(rest, 1, HeldNodes.of([lattice.n_nodes]))
+        engine.run(rest, 1, ConstrainedNodes.of([lattice.n_nodes]))
     with pytest.raises(ConvergenceError, match="blew up within 200 steps"):
         engine.run(spinning(lattice), 200)

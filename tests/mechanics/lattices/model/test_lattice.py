@@ -12,7 +12,7 @@ from naibu.mechanics.lattices.cpu.element_blocks import Blocks
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.coefficients import implicit_coefficients
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, general_lattice, lattice_parameters, voxel_parameters
-from naibu.mechanics.lattices.model.state import HeldNodes, LatticeState, explicit_step_limit
+from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState, explicit_step_limit
 from naibu.mechanics.lattices.model.tetrahedral_springs import volumetric_lattice
 from naibu.meshing.primitives import box
 
@@ -105,8 +105,8 @@ def test_relaxation_of_one_element_is_exact():
     engine = LatticeEngine.of(lattice, lattice_parameters(lattice, k, c1, c2), step=h)
     path = np.zeros((200, 2, 3))
     path[0, 1, 2] = stretch / h
-    held = HeldNodes.of([0], 0) + HeldNodes.of([1], 1)
-    motion = engine.run(engine.rest(), 200, held, path)
+    constrained = ConstrainedNodes.of([0], 0) + ConstrainedNodes.of([1], 1)
+    motion = engine.run(engine.rest(), 200, constrained, path)
     tau = (c1 + c2) / k
     y1 = c2 / k * (1.0 - np.exp(-h / tau)) * stretch / h
     t = h * np.arange(1, 200)
@@ -121,9 +121,9 @@ def creep(method, h, t_press=0.4, t_rest=2.0):
     k, c1, c2, force = 3.0, 0.4, 9.0, 1.2
     lattice = single(1e-3)
     engine = LatticeEngine.of(lattice, lattice_parameters(lattice, k, c1, c2), step=h, method=method, tolerance=1e-10)
-    held = HeldNodes.of([0])
-    pressed = engine.run(engine.rest(), round(t_press / h), held, external_force=[[0, 0, 0], [0, 0, force]])
-    rested = engine.run(pressed.state, round(t_rest / h), held)
+    constrained = ConstrainedNodes.of([0])
+    pressed = engine.run(engine.rest(), round(t_press / h), constrained, external_force=[[0, 0, 0], [0, 0, force]])
+    rested = engine.run(pressed.state, round(t_rest / h), constrained)
     exact = force / k * (1.0 - np.exp(-k * t_press / c1)) + force * t_press / c2
     return pressed.state.position[1, 2] - 10.0, exact, rested.state.position[1, 2] - 10.0, force * t_press / c2
 
@@ -146,11 +146,11 @@ def test_the_implicit_method_converges_at_first_order_to_the_explicit_one():
     lattice = classic_lattice(box_mask((2, 2, 3)), 10.0, total_mass_kg=0.02)
     parameters = lattice_parameters(lattice, 5.0, 0.02, 0.3)
     base, top = np.flatnonzero(lattice.points[:, 2] < 1.0), np.flatnonzero(lattice.points[:, 2] > 29.0)
-    held = HeldNodes.of(base, 0) + HeldNodes.of(top, 1)
+    constrained = ConstrainedNodes.of(base, 0) + ConstrainedNodes.of(top, 1)
 
     def press(method, h):
         engine = LatticeEngine.of(lattice, parameters, step=h, method=method, tolerance=1e-9)
-        return engine.run(engine.rest(), round(0.1 / h), held, [[0, 0, 0], [10.0, 0, -40.0]]).state.position
+        return engine.run(engine.rest(), round(0.1 / h), constrained, [[0, 0, 0], [10.0, 0, -40.0]]).state.position
 
     reference = 2.0 * press("symplectic_euler", 5e-6) - press("symplectic_euler", 1e-5)
     error = [np.abs(press("implicit", h) - reference).max() for h in (2e-3, 1e-3, 5e-4)]
@@ -211,19 +211,19 @@ def test_finite_rotations_do_not_strain_and_do_not_drift():
     for k, a in enumerate(arm):
         size = a[0] / radius
         path[:, k] = size * np.diff(ring, axis=0) / engine.step
-    held = HeldNodes.of([ends[0]], 0) + HeldNodes.of([ends[1]], 1)
-    end = engine.run(engine.rest(), n, held, path)
-    still = engine.run(LatticeState(end.state.position, 0.0 * end.state.velocity, end.state.extension), 2000, held).state
+    constrained = ConstrainedNodes.of([ends[0]], 0) + ConstrainedNodes.of([ends[1]], 1)
+    end = engine.run(engine.rest(), n, constrained, path)
+    still = engine.run(LatticeState(end.state.position, 0.0 * end.state.velocity, end.state.extension), 2000, constrained).state
     lengths = np.linalg.norm(still.position[lattice.elements[:, 1]] - still.position[lattice.elements[:, 0]], axis=1)
     np.testing.assert_allclose(still.extension, lengths - lattice.lengths, atol=2e-3)
     np.testing.assert_allclose(lengths, lattice.lengths, atol=4e-3)
 
 
-def energies(lattice, parameters, step, tolerance, start, held, steps):
+def energies(lattice, parameters, step, tolerance, start, constrained, steps):
     engine = LatticeEngine.of(lattice, parameters, step=step, tolerance=tolerance)
     state, found = start, [engine.energy(start)]
     for _ in range(steps):
-        state = engine.run(state, 1, held).state
+        state = engine.run(state, 1, constrained).state
         found.append(engine.energy(state))
     return np.array(found)
 
@@ -243,10 +243,10 @@ def random_energy(lattice, seed):
     if rng.random() < 0.1:
         draw[2][:] = np.inf
     start = spinning(lattice, seed, speed=10.0 ** rng.uniform(-2, 3))
-    held = HeldNodes.of([0, 1, 2]) if rng.random() < 0.5 else None
-    if held is not None:
+    constrained = ConstrainedNodes.of([0, 1, 2]) if rng.random() < 0.5 else None
+    if constrained is not None:
         start.velocity[:3] = 0.0
-    return energies(lattice, lattice_parameters(lattice, *draw), 2e-3, 10.0 ** rng.uniform(-6, -0.05), start, held, 20)
+    return energies(lattice, lattice_parameters(lattice, *draw), 2e-3, 10.0 ** rng.uniform(-6, -0.05), start, constrained, 20)
 
 
 def grows(found, rounding=1e-9):
@@ -283,10 +283,10 @@ def test_energy_never_grows_for_any_step(k, c1, c2, step, tolerance, spin):
 def test_reactions_balance_momentum():
     lattice = classic_lattice(box_mask((3, 2, 2)), 10.0, total_mass_kg=0.2)
     top = np.flatnonzero(lattice.points[:, 2] > 19.0)
-    held = HeldNodes.of(np.flatnonzero(lattice.points[:, 2] < 1.0), 0, axes=(2,)) + HeldNodes.of(top, 1)
+    constrained = ConstrainedNodes.of(np.flatnonzero(lattice.points[:, 2] < 1.0), 0, axes=(2,)) + ConstrainedNodes.of(top, 1)
     for method in METHODS:
         engine = LatticeEngine.of(lattice, lattice_parameters(lattice, 9.0, 0.05, 0.4), step=1e-4, method=method, tolerance=1e-8)
-        motion = engine.run(engine.rest(), 200, held, [[0, 0, 0], [3.0, 1.0, -20.0]], external_force=[0.0, 0.1, -0.2])
+        motion = engine.run(engine.rest(), 200, constrained, [[0, 0, 0], [3.0, 1.0, -20.0]], external_force=[0.0, 0.1, -0.2])
         impulse = engine.step * (motion.reaction.sum(axis=(0, 1)) + 200 * lattice.n_nodes * np.array([0.0, 0.1, -0.2]))
         np.testing.assert_allclose(momenta(lattice, motion.state)[0], impulse, rtol=1e-7, atol=1e-8)
 
@@ -295,11 +295,11 @@ def test_threads_and_precision_change_nothing_but_the_last_digits():
     lattice = classic_lattice(box_mask((9, 7, 10)), 5.0, total_mass_kg=0.6)
     parameters = lattice_parameters(lattice, 10.0, 0.01, 0.02)
     z = lattice.points[:, 2]
-    held = HeldNodes.of(np.flatnonzero(z < 1), 0) + HeldNodes.of(np.flatnonzero(z > 49), 1, axes=(2, 0))
+    constrained = ConstrainedNodes.of(np.flatnonzero(z < 1), 0) + ConstrainedNodes.of(np.flatnonzero(z > 49), 1, axes=(2, 0))
     runs = []
     for options in ({"threads": 1}, {"threads": 2}, {"threads": 3}, {"precision": "single"}):
         engine = LatticeEngine.of(lattice, parameters, step=1e-4, method="euler", **options)
-        runs.append(engine.run(engine.rest(), 60, held, [[0, 0, 0], [5.0, 0, -30.0]], external_force=[0.0, 0.0, -1e-3]))
+        runs.append(engine.run(engine.rest(), 60, constrained, [[0, 0, 0], [5.0, 0, -30.0]], external_force=[0.0, 0.0, -1e-3]))
     for other, digits in zip(runs[1:], (1e-12, 1e-12, 3e-5), strict=True):
         np.testing.assert_allclose(other.state.position, runs[0].state.position, atol=digits * 10.0)
         np.testing.assert_allclose(other.reaction, runs[0].reaction, atol=digits * np.abs(runs[0].reaction).max() * 10.0)
@@ -359,9 +359,9 @@ BOX = classic_lattice(box_mask((2, 2, 2)), 1.0, density=1e-6)
         (lambda: lattice_parameters(BOX, {"thick": 1.0}, 1.0, 1.0), "thick"),
         (lambda: lattice_parameters(BOX, np.ones(3), 1.0, 1.0), "(3,)"),
         (lambda: engine().run(LatticeState(np.full((27, 3), np.nan), np.zeros((27, 3)), np.zeros(BOX.n_elements)), 1), "NaN"),
-        (lambda: engine().run(engine().rest(), 1, HeldNodes.of([27])), "0 to 26"),
-        (lambda: engine().run(engine().rest(), 1, HeldNodes.of([2]) + HeldNodes.of([2], 1)), "mass 2 is held twice"),
-        (lambda: engine().run(engine().rest(), 1, HeldNodes.of([2]), np.zeros((2, 1, 3))), "(2, 1, 3)"),
+        (lambda: engine().run(engine().rest(), 1, ConstrainedNodes.of([27])), "0 to 26"),
+        (lambda: engine().run(engine().rest(), 1, ConstrainedNodes.of([2]) + ConstrainedNodes.of([2], 1)), "mass 2 is held twice"),
+        (lambda: engine().run(engine().rest(), 1, ConstrainedNodes.of([2]), np.zeros((2, 1, 3))), "(2, 1, 3)"),
         (lambda: engine(step=0.0), "the step"),
         (lambda: engine(method="heun"), "heun"),
     ],

@@ -16,7 +16,7 @@ from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import Lattice, box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.octree import octree_lattice
 from naibu.mechanics.lattices.model.octree_compliance_correction import EquilibriumPolynomials, lengthening
-from naibu.mechanics.lattices.model.state import HeldNodes
+from naibu.mechanics.lattices.model.state import ConstrainedNodes
 
 EQUAL = np.ones(3)
 
@@ -52,14 +52,14 @@ def top_moves(motion: Callable) -> Callable:
     def load(lattice):
         low, high = lattice.points.min(axis=0), lattice.points.max(axis=0)
         x, y, z = ((lattice.points - low) / (high - low)).T
-        held, u = np.repeat((z == 0.0)[:, None], 3, axis=1), np.zeros_like(lattice.points)
+        constrained, u = np.repeat((z == 0.0)[:, None], 3, axis=1), np.zeros_like(lattice.points)
         part, direction = motion(2.0 * x - 1.0, 2.0 * y - 1.0)
         chosen = (z == 1.0) & part
-        held[chosen], u[chosen] = (
+        constrained[chosen], u[chosen] = (
             True,
             0.05 * (high - low).max() * np.broadcast_to(np.stack(np.broadcast_arrays(*direction), axis=-1), u.shape)[chosen],
         )
-        return held, u
+        return constrained, u
 
     return load
 
@@ -74,8 +74,8 @@ LOADS = {
 
 
 def answer(lattice, k, load):
-    held, u = load(lattice)
-    matrix, free, u = stiffness(lattice, k), ~held.ravel(), u.ravel()
+    constrained, u = load(lattice)
+    matrix, free, u = stiffness(lattice, k), ~constrained.ravel(), u.ravel()
     u[free] = spla.spsolve(matrix[free][:, free].tocsc(), -(matrix[free][:, ~free] @ u[~free]), permc_spec="MMD_AT_PLUS_A")
     return float(u @ (matrix @ u)), u.reshape(-1, 3)
 
@@ -179,7 +179,7 @@ def test_a_push_kept_and_released_gives_the_force_and_shape_of_the_classic_latti
     classic, octree = pair(box_mask((8, 8, 8)), 0)
     for lattice in (classic, octree):
         engine = LatticeEngine.of(lattice, lattice_parameters(lattice, 0.02, 0.01, 0.03), step=2e-3)
-        floor, top = (HeldNodes.of(np.flatnonzero(lattice.points[:, 2] == z), body=b) for b, z in enumerate((0.0, 8.0)))
+        floor, top = (ConstrainedNodes.of(np.flatnonzero(lattice.points[:, 2] == z), body=b) for b, z in enumerate((0.0, 8.0)))
         velocity = np.zeros((200, 2, 3))
         velocity[:100, 1, 2] = -4.0
         kept = engine.run(engine.rest(), 200, floor + top, velocity)

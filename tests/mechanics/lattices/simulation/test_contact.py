@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from naibu.core.errors import InputError
-from naibu.mechanics.contact.rigid_indenters import plane, pusher_box, pusher_cylinder, pusher_sphere
+from naibu.mechanics.contact.rigid_indenters import box_indenter, cylindrical_indenter, plane, spherical_indenter
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, general_lattice, lattice_parameters
-from naibu.mechanics.lattices.model.state import HeldNodes, LatticeState
+from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState
 from naibu.mechanics.lattices.simulation.contact import begin_contact, displacement_drive, force_drive, hand_over, push, push_by_force
 
 GRAVITY = 9810.0  # mm/s^2
@@ -43,8 +43,8 @@ def test_force_and_moment_are_handed_over():
 def test_a_face_covered_by_points_moves_as_the_body_does():
     lattice, engine = block()
     points = [[x, y, 30.0] for x in np.linspace(0, 30, 7) for y in np.linspace(0, 30, 7)]
-    held = displacement_drive(lattice, "+z", points, 1) + HeldNodes.of(np.flatnonzero(lattice.points[:, 2] == 0.0))
-    motion = engine.run(engine.rest(), 100, held, [[0, 0, 0], [0, 0, -20.0]])
+    constrained = displacement_drive(lattice, "+z", points, 1) + ConstrainedNodes.of(np.flatnonzero(lattice.points[:, 2] == 0.0))
+    motion = engine.run(engine.rest(), 100, constrained, [[0, 0, 0], [0, 0, -20.0]])
     top = lattice.points[:, 2] == 30.0
     np.testing.assert_allclose(motion.state.position[top] - lattice.points[top], [[0, 0, -4.0]] * 16, atol=1e-9)
 
@@ -52,9 +52,9 @@ def test_a_face_covered_by_points_moves_as_the_body_does():
 @pytest.mark.parametrize("kind", ["box", "cylinder", "sphere", "plane"])
 def test_gaps_and_normals_of_bodies(kind):
     body = {
-        "box": pusher_box((1.0, 2.0, 3.0), (4.0, 6.0, 8.0)),
-        "cylinder": pusher_cylinder((1.0, 2.0, 3.0), 2.0, 5.0, (1.0, 1.0, 0.0)),
-        "sphere": pusher_sphere((1.0, 2.0, 3.0), 2.5),
+        "box": box_indenter((1.0, 2.0, 3.0), (4.0, 6.0, 8.0)),
+        "cylinder": cylindrical_indenter((1.0, 2.0, 3.0), 2.0, 5.0, (1.0, 1.0, 0.0)),
+        "sphere": spherical_indenter((1.0, 2.0, 3.0), 2.5),
         "plane": plane((1.0, 2.0, 3.0), (0.0, 1.0, 1.0)),
     }[kind]
     rng = np.random.default_rng(0)
@@ -91,7 +91,7 @@ def test_momentum_balances_with_the_reactions():
     lattice, engine = block()
     bodies = [
         plane((0, 0, 0), static_friction=0.3, kinetic_friction=0.2),
-        pusher_sphere((15.0, 15.0, 41.0), 10.0, static_friction=0.5, kinetic_friction=0.3),
+        spherical_indenter((15.0, 15.0, 41.0), 10.0, static_friction=0.5, kinetic_friction=0.3),
     ]
     motion = push(engine, engine.rest(), bodies, [[0, 0, 0], [10.0, 0, -30.0]], steps=200)
     momentum = (lattice.node_mass[:, None] * motion.state.velocity).sum(axis=0)
@@ -153,7 +153,7 @@ def test_a_released_plate_leaves_the_object():
     _, engine = block(c2=50.0)
     bodies = [
         plane((0, 0, 0), static_friction=0.5, kinetic_friction=0.5),
-        pusher_box((15, 15, 35), (30, 30, 10), static_friction=0.5, kinetic_friction=0.5),
+        box_indenter((15, 15, 35), (30, 30, 10), static_friction=0.5, kinetic_friction=0.5),
     ]
     path = np.zeros((300, 2, 3))
     path[:100, 1, 2], path[200:, 1, 2] = -20.0, 40.0
@@ -166,9 +166,9 @@ def test_a_released_plate_leaves_the_object():
 
 def test_a_body_driven_by_a_force_comes_to_balance():
     _, engine = block(k=50.0, c1=2.0)
-    bodies = [plane((0, 0, 0)), pusher_box((15, 15, 35), (30, 30, 10))]
+    bodies = [plane((0, 0, 0)), box_indenter((15, 15, 35), (30, 30, 10))]
     force = np.full(250, 800.0)
-    motion = push_by_force(engine, engine.rest(), bodies, force, driven=1, direction=[0, 0, -1], pusher_mass=0.05)
+    motion = push_by_force(engine, engine.rest(), bodies, force, driven=1, direction=[0, 0, -1], indenter_mass=0.05)
     assert -motion.reaction[-1, 1, 2] == pytest.approx(800.0, rel=1e-2)
     mass, step = 0.05, engine.step
     speed = -motion.speed[:, 1, 2]
@@ -181,12 +181,12 @@ def test_a_body_driven_by_a_force_comes_to_balance():
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        (lambda: begin_contact(block()[0], [pusher_sphere((15, 15, 30), 5.0)]), "begins inside the object"),
+        (lambda: begin_contact(block()[0], [spherical_indenter((15, 15, 30), 5.0)]), "begins inside the object"),
         (lambda: begin_contact(block()[0], []), "no body"),
         (lambda: plane((0, 0, 0), (0, 0, 0)), "length"),
         (lambda: plane((0, 0, 0), static_friction=0.2, kinetic_friction=0.3), "0.3 (kinetic)"),
-        (lambda: pusher_box((0, 0, 0), (1, -1, 1)), "-1"),
-        (lambda: pusher_sphere((np.nan, 0, 0), 1.0), "NaN"),
+        (lambda: box_indenter((0, 0, 0), (1, -1, 1)), "-1"),
+        (lambda: spherical_indenter((np.nan, 0, 0), 1.0), "NaN"),
         (lambda: hand_over(block()[0], "+z", [[40.0, 5.0, 0.0]]), "beside the face"),
         (lambda: hand_over(block()[0], "top", [[4.0, 5.0, 0.0]]), "'top'"),
         (lambda: push(block(method="euler", step=1e-5)[1], block()[1].rest(), [plane((0, 0, 0))], 0.0, steps=1), "implicit"),

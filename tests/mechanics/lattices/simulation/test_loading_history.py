@@ -10,7 +10,7 @@ import pytest
 
 from naibu.core.errors import InputError
 from naibu.identification.lattice_calibration.forward_model import PushedFace, PushedLattice, Pushing
-from naibu.mechanics.contact.rigid_indenters import Pusher, plane, pusher_box, pusher_sphere
+from naibu.mechanics.contact.rigid_indenters import RigidIndenter, box_indenter, plane, spherical_indenter
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.simulation.loading_history import Drive, LatticeStudy, StudyBody, StudyFrame, run_study
 
@@ -20,24 +20,24 @@ SOFT = lattice_parameters(LATTICE, {"short": 40.0, "normal": 25.0, "long": 15.0}
 SLIGHT = lattice_parameters(LATTICE, 40.0, 0.02, 0.5)  # explicit steps of 0.1 ms are stable
 
 
-def still(name: str, pusher: Pusher, **more: object) -> StudyBody:
-    return StudyBody(name, pusher, np.zeros(1), np.zeros((1, 3)), **more)
+def still(name: str, indenter: RigidIndenter, **more: object) -> StudyBody:
+    return StudyBody(name, indenter, np.zeros(1), np.zeros((1, 3)), **more)
 
 
-def moving(name: str, pusher: Pusher, rows: list[list[float]], **more: object) -> StudyBody:
+def moving(name: str, indenter: RigidIndenter, rows: list[list[float]], **more: object) -> StudyBody:
     table = np.array(rows)
-    return StudyBody(name, pusher, table[:, 0], table[:, 1:], **more)
+    return StudyBody(name, indenter, table[:, 0], table[:, 1:], **more)
 
 
-def glued(**changes: object) -> LatticeStudy:
-    box = pusher_box((-2.5, 15.0, 10.0), (5.0, 10.0, 10.0))
+def tied(**changes: object) -> LatticeStudy:
+    box = box_indenter((-2.5, 15.0, 10.0), (5.0, 10.0, 10.0))
     path = [[0, 0, 0, 0], [0.1, 2, 0, 0], [0.2, 2, 0, 0], [0.3, -5, 0, 0]]
-    bodies = (still("floor", plane((0, 0, 0)), glued_until_s=np.inf), moving("box", box, path, glued_until_s=0.15))
+    bodies = (still("floor", plane((0, 0, 0)), tied_until_s=np.inf), moving("box", box, path, tied_until_s=0.15))
     return replace(LatticeStudy(LATTICE, SOFT, bodies, 0.002, 10, 4, 4), **changes)
 
 
 def touching(**changes: object) -> LatticeStudy:
-    ball = pusher_sphere(
+    ball = spherical_indenter(
         (15.0, 15.0, 31.0), 10.0, static_friction=0.4, kinetic_friction=0.3, pull_stiffness=10.0, pull_damping=1.0, pull_speed=50.0
     )
     floor = plane((0, 0, 0), static_friction=0.5, kinetic_friction=0.4)
@@ -49,7 +49,7 @@ def touching(**changes: object) -> LatticeStudy:
 
 def driven(**changes: object) -> LatticeStudy:
     drive = Drive(np.array([0.0, 0.1]), np.array([0.0, 400.0]), np.array([0.0, 0.0, -1.0]), 0.05)
-    box = pusher_box((15.0, 15.0, 25.0), (40.0, 40.0, 10.0), static_friction=0.4, kinetic_friction=0.4)
+    box = box_indenter((15.0, 15.0, 25.0), (40.0, 40.0, 10.0), static_friction=0.4, kinetic_friction=0.4)
     floor = plane((0, 0, 0), static_friction=0.5, kinetic_friction=0.4)
     study = LatticeStudy(LATTICE, SOFT, (still("floor", floor), still("box", box, drive=drive)), 0.002, 6, 5, 5)
     return replace(study, **changes)
@@ -59,10 +59,10 @@ def test_a_study_is_the_pushing_that_calibration_computes() -> None:
     """The box of the study and the box of masses of a `Pushing` touch the same masses, and what follows is the same motion."""
     pushing = Pushing("push", (PushedFace((0.0, 10.0, 10.0), (0.0, 20.0, 20.0), (20.0, 0.0, 0.0)),), 0.1, 0.1, 0.12, (0.0, 0.1, 0.2, 0.32))
     expected = PushedLattice.of(LATTICE, pushing).run(SOFT, tolerance=1e-6)
-    box = pusher_box((-2.5, 15.0, 15.0), (5.0, 10.0, 10.0))
+    box = box_indenter((-2.5, 15.0, 15.0), (5.0, 10.0, 10.0))
     bodies = (
-        still("floor", plane((0, 0, 0)), glued_until_s=np.inf),
-        moving("box", box, [[0, 0, 0, 0], [0.1, 2, 0, 0]], glued_until_s=0.2),
+        still("floor", plane((0, 0, 0)), tied_until_s=np.inf),
+        moving("box", box, [[0, 0, 0, 0], [0.1, 2, 0, 0]], tied_until_s=0.2),
     )
     frames = list(run_study(LatticeStudy(LATTICE, SOFT, bodies, 0.002, 16, 10, 1, tolerance=1e-6)))
     for time, position in zip(pushing.capture_s, expected.positions, strict=True):
@@ -75,7 +75,7 @@ def test_a_study_is_the_pushing_that_calibration_computes() -> None:
 
 
 @pytest.mark.parametrize(
-    "study", [glued(tolerance=1e-6), touching(tolerance=1e-6), driven(tolerance=1e-6)], ids=["glued", "touching", "driven"]
+    "study", [tied(tolerance=1e-6), touching(tolerance=1e-6), driven(tolerance=1e-6)], ids=["tied", "touching", "driven"]
 )
 def test_impulses_make_the_momentum_and_work_is_stored_or_dissipated(study: LatticeStudy) -> None:
     frames = list(run_study(study))
@@ -101,7 +101,7 @@ def test_the_driven_body_is_in_balance() -> None:
 
 
 @pytest.mark.parametrize(
-    "study", [glued(), glued(method="euler", step_s=1e-4, samples=8, sample_steps=5, parameters=SLIGHT), touching(), driven()]
+    "study", [tied(), tied(method="euler", step_s=1e-4, samples=8, sample_steps=5, parameters=SLIGHT), touching(), driven()]
 )
 def test_a_run_that_stopped_goes_on_as_if_it_had_not(study: LatticeStudy) -> None:
     whole = list(run_study(study))
@@ -125,7 +125,7 @@ def same(a: StudyFrame, b: StudyFrame) -> None:
 
 
 def test_a_body_lets_go_when_it_is_to() -> None:
-    frames = list(run_study(glued()))
+    frames = list(run_study(tied()))
     times = np.concatenate([f.sample_times for f in frames])
     force = np.concatenate([f.force for f in frames])[:, 1]
     assert (force[times > 0.15 + 0.008] == 0.0).all() and (np.abs(force[times < 0.15 - 0.008]).max(axis=1) > 0.0).all()
@@ -133,15 +133,15 @@ def test_a_body_lets_go_when_it_is_to() -> None:
 
 
 def test_what_cannot_be_run_is_told() -> None:
-    ball = pusher_sphere((15.0, 15.0, 31.0), 10.0)
+    ball = spherical_indenter((15.0, 15.0, 31.0), 10.0)
     floor = still("floor", plane((0, 0, 0)))
     path = [[0.0, 0, 0, 0], [1.0, 0, 0, -5]]
     for study, words in (
         (touching(method="euler"), "needs method 'implicit'"),
-        (touching(bodies=(floor, moving("ball", ball, path, glued_until_s=1.0))), "floor cannot be in contact"),
-        (glued(bodies=(moving("ball", ball, path, glued_until_s=1.0),)), "ball touches no mass, the nearest is 3.077"),
-        (driven(bodies=(*driven().bodies, moving("ball", pusher_sphere((15.0, 15.0, 60.0), 5.0), path))), "ball cannot move"),
-        (touching(bodies=(floor, still("ball", pusher_sphere((15.0, 15.0, 25.0), 10.0)))), "begins inside the object"),
+        (touching(bodies=(floor, moving("ball", ball, path, tied_until_s=1.0))), "floor cannot be in contact"),
+        (tied(bodies=(moving("ball", ball, path, tied_until_s=1.0),)), "ball touches no mass, the nearest is 3.077"),
+        (driven(bodies=(*driven().bodies, moving("ball", spherical_indenter((15.0, 15.0, 60.0), 5.0), path))), "ball cannot move"),
+        (touching(bodies=(floor, still("ball", spherical_indenter((15.0, 15.0, 25.0), 10.0)))), "begins inside the object"),
     ):
         with pytest.raises(InputError, match=words):
             next(run_study(study))

@@ -12,13 +12,13 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.mechanics.lattices.cpu import _thread_pool
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, lattice_parameters
-from naibu.mechanics.lattices.model.state import HeldNodes, explicit_step_limit
+from naibu.mechanics.lattices.model.state import ConstrainedNodes, explicit_step_limit
 from naibu.mechanics.lattices.simulation.session import LatticeSession
 
 LATTICE = classic_lattice(box_mask((9, 7, 10)), 5.0, total_mass_kg=0.6)
 Z = LATTICE.points[:, 2]
-HELD = HeldNodes.of(np.flatnonzero(Z < 1), 0) + HeldNodes.of(np.flatnonzero(Z > 49), 1, axes=(2, 0))
-FEWER = HeldNodes.of(np.flatnonzero(Z < 1), 0)
+CONSTRAINED = ConstrainedNodes.of(np.flatnonzero(Z < 1), 0) + ConstrainedNodes.of(np.flatnonzero(Z > 49), 1, axes=(2, 0))
+FEWER = ConstrainedNodes.of(np.flatnonzero(Z < 1), 0)
 PUSH = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, -30.0]])
 OPTIONS = [{"method": "implicit", "step": 2e-3}] + [
     {"method": method, "step": 1e-4, "threads": threads, "precision": precision}
@@ -36,14 +36,14 @@ def engine(**options):
 def test_a_session_takes_the_steps_of_a_run(options):
     made = engine(**options)
     weight = [0.0, 1e-3, -2e-3]
-    with LatticeSession.of(made, held=HELD, external_force=weight) as session:
+    with LatticeSession.of(made, constrained=CONSTRAINED, external_force=weight) as session:
         reactions = [session.advance(PUSH) for _ in range(12)]
         mean = session.advance(PUSH, 5)
         pushed = session.state()
-        session.hold(FEWER)
+        session.constrain(FEWER)
         session.advance(0.0, 8)
         released = session.state()
-    first = made.run(made.rest(), 17, HELD, PUSH, weight)
+    first = made.run(made.rest(), 17, CONSTRAINED, PUSH, weight)
     second = made.run(first.state, 8, FEWER, 0.0, weight)
     np.testing.assert_array_equal(reactions, first.reaction[:12])
     np.testing.assert_allclose(mean, first.reaction[12:].mean(axis=0), rtol=1e-13)
@@ -57,8 +57,8 @@ def test_a_session_takes_the_steps_of_a_run(options):
 
 def test_sessions_of_one_engine_do_not_disturb_one_another():
     made = engine(step=2e-3)
-    alone = made.run(made.rest(), 10, HELD, PUSH)
-    one, two = LatticeSession.of(made, held=HELD), LatticeSession.of(made, held=FEWER)
+    alone = made.run(made.rest(), 10, CONSTRAINED, PUSH)
+    one, two = LatticeSession.of(made, constrained=CONSTRAINED), LatticeSession.of(made, constrained=FEWER)
     for _ in range(10):
         one.advance(PUSH)
         two.advance([[1.0, 2.0, 3.0]])
@@ -69,7 +69,7 @@ def test_who_takes_a_part_changes_nothing():
     """Runs with helpers, and with the team at rest, give the same to the last bit."""
     found = []
     for alone in (False, True):
-        session = LatticeSession.of(engine(method="euler", step=1e-4, threads=4), held=HELD)
+        session = LatticeSession.of(engine(method="euler", step=1e-4, threads=4), constrained=CONSTRAINED)
         if alone:
             session.stepper.control[_thread_pool.REST] = 10_000
         for _ in range(20):
@@ -80,7 +80,7 @@ def test_who_takes_a_part_changes_nothing():
 
 
 def test_helpers_are_asked_only_while_steps_take_most_of_the_time():
-    session = LatticeSession.of(engine(method="euler", step=1e-4, threads=2), held=HELD)
+    session = LatticeSession.of(engine(method="euler", step=1e-4, threads=2), constrained=CONSTRAINED)
     asked, now = [], [100.0]
 
     class Stub:
@@ -181,7 +181,7 @@ def help_count(control, counts):
 def test_a_session_that_blows_up_says_so():
     parameters = lattice_parameters(LATTICE, 30.0, 0.01, 5.0)
     made = LatticeEngine.of(LATTICE, parameters, step=8.0 * explicit_step_limit(LATTICE, parameters), method="symplectic_euler")
-    session = LatticeSession.of(made, held=HELD)
+    session = LatticeSession.of(made, constrained=CONSTRAINED)
     with pytest.raises(ConvergenceError, match="implicit"):
         for _ in range(2000):
             session.advance(PUSH)
@@ -197,13 +197,13 @@ def test_a_session_that_blows_up_says_so():
         (lambda s: s.advance(np.zeros((4, 3))), "velocities of 4 bodies are given, 2 hold masses"),
         (lambda s: s.advance(np.zeros((2, 2))), "do not fit"),
         (lambda s: s.advance(PUSH, 0), "at least one step, not 0"),
-        (lambda s: s.hold(HeldNodes.of([10_000])), "the lattice has 0 to"),
-        (lambda s: s.hold(HELD + HELD), "held twice"),
+        (lambda s: s.constrain(ConstrainedNodes.of([10_000])), "the lattice has 0 to"),
+        (lambda s: s.constrain(CONSTRAINED + CONSTRAINED), "held twice"),
         (lambda s: LatticeSession.of(s.engine, external_force=[np.inf, 0.0, 0.0]), "external_force"),
     ],
 )
 def test_bad_input_is_named(call, said):
-    session = LatticeSession.of(engine(method="euler", step=1e-4), held=HELD)
+    session = LatticeSession.of(engine(method="euler", step=1e-4), constrained=CONSTRAINED)
     with pytest.raises(InputError) as caught:
         call(session)
     assert said in str(caught.value)

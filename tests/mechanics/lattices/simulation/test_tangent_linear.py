@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from naibu.core.errors import InputError
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters, box_mask, classic_lattice, lattice_parameters
-from naibu.mechanics.lattices.model.state import HeldNodes
+from naibu.mechanics.lattices.model.state import ConstrainedNodes
 from naibu.mechanics.lattices.simulation.tangent_linear import DrivenMotion, Loads, ParameterChange, driven_steps
 
 Array = NDArray[np.float64]
@@ -32,12 +32,14 @@ def pushed(lattice: Lattice, given: LatticeParameters, changes: tuple[ParameterC
     """A face moved inwards, the one across pushed by a force, the floor held."""
     engine = LatticeEngine.of(lattice, given, step=STEP_S, tolerance=tolerance)
     p = lattice.points
-    held = HeldNodes.of(np.flatnonzero(p[:, 2] == 0.0), 0) + HeldNodes.of(np.flatnonzero((p[:, 0] == 0.0) & (p[:, 2] > 0.0)), 1)
+    constrained = ConstrainedNodes.of(np.flatnonzero(p[:, 2] == 0.0), 0) + ConstrainedNodes.of(
+        np.flatnonzero((p[:, 0] == 0.0) & (p[:, 2] > 0.0)), 1
+    )
     loaded = np.flatnonzero((p[:, 0] == 80.0) & (p[:, 2] > 10.0))
     loads = Loads(loaded, np.full(len(loaded), 1.0 / len(loaded)), np.full(len(loaded), 2))
     velocity, force = np.zeros((2, STEPS, 3, 3))
     velocity[:, 1, 0], force[:, 2, 0] = 20.0, -800.0
-    return driven_steps(engine, engine.rest(), STEPS, held, velocity, loads=loads, force=force, changes=changes)
+    return driven_steps(engine, engine.rest(), STEPS, constrained, velocity, loads=loads, force=force, changes=changes)
 
 
 @pytest.mark.parametrize(("kind", "group"), [(0, 0), (0, 2), (1, 1), (2, 0), (2, 2)])
@@ -67,10 +69,12 @@ def test_derivatives_are_those_of_finite_differences(lattice: Lattice, kind: int
 def test_the_motion_is_the_engines_own(lattice: Lattice) -> None:
     given = parameters(lattice)
     engine = LatticeEngine.of(lattice, given, step=STEP_S, tolerance=1e-8)
-    held = HeldNodes.of(np.flatnonzero(lattice.points[:, 2] == 0.0), 0) + HeldNodes.of(np.flatnonzero(lattice.points[:, 2] == 60.0), 1)
+    constrained = ConstrainedNodes.of(np.flatnonzero(lattice.points[:, 2] == 0.0), 0) + ConstrainedNodes.of(
+        np.flatnonzero(lattice.points[:, 2] == 60.0), 1
+    )
     velocity = np.zeros((STEPS, 2, 3))
     velocity[:, 1, 2] = -10.0
-    ours, own = driven_steps(engine, engine.rest(), STEPS, held, velocity), engine.run(engine.rest(), STEPS, held, velocity)
+    ours, own = driven_steps(engine, engine.rest(), STEPS, constrained, velocity), engine.run(engine.rest(), STEPS, constrained, velocity)
     np.testing.assert_allclose(ours.state.position, own.state.position, atol=1e-9)
     np.testing.assert_allclose(ours.reaction, own.reaction, atol=1e-6)
 
@@ -79,12 +83,14 @@ def test_a_run_in_two_parts_is_the_run_in_one(lattice: Lattice) -> None:
     given = parameters(lattice)
     change = (ParameterChange(given.stiffness, 0.0 * given.stiffness, 0.0 * given.stiffness),)
     engine = LatticeEngine.of(lattice, given, step=STEP_S, tolerance=1e-8)
-    held = HeldNodes.of(np.flatnonzero(lattice.points[:, 2] == 0.0), 0) + HeldNodes.of(np.flatnonzero(lattice.points[:, 2] == 60.0), 1)
+    constrained = ConstrainedNodes.of(np.flatnonzero(lattice.points[:, 2] == 0.0), 0) + ConstrainedNodes.of(
+        np.flatnonzero(lattice.points[:, 2] == 60.0), 1
+    )
     velocity = np.zeros((2, 3))
     velocity[1, 2] = -10.0
-    whole = driven_steps(engine, engine.rest(), STEPS, held, velocity, changes=change)
-    half = driven_steps(engine, engine.rest(), STEPS // 2, held, velocity, changes=change)
-    rest = driven_steps(engine, half.state, STEPS // 2, held, velocity, changes=change, state_change=half.state_change)
+    whole = driven_steps(engine, engine.rest(), STEPS, constrained, velocity, changes=change)
+    half = driven_steps(engine, engine.rest(), STEPS // 2, constrained, velocity, changes=change)
+    rest = driven_steps(engine, half.state, STEPS // 2, constrained, velocity, changes=change, state_change=half.state_change)
     np.testing.assert_allclose(
         rest.state_change.position, whole.state_change.position, atol=1e-6 * np.abs(whole.state_change.position).max()
     )
@@ -107,8 +113,8 @@ def test_wrong_input_is_told(lattice: Lattice) -> None:
     given = parameters(lattice)
     engine = LatticeEngine.of(lattice, given, method="euler")
     with pytest.raises(InputError, match="make one with method='implicit'"):
-        driven_steps(engine, engine.rest(), 1, HeldNodes.none(), 0.0)
+        driven_steps(engine, engine.rest(), 1, ConstrainedNodes.none(), 0.0)
     engine = LatticeEngine.of(lattice, given)
     wrong = ParameterChange(np.ones(3), given.voigt_damping, given.series_damping)
     with pytest.raises(InputError, match=r"the change of K has shape \(3,\)"):
-        driven_steps(engine, engine.rest(), 1, HeldNodes.none(), 0.0, changes=(wrong,))
+        driven_steps(engine, engine.rest(), 1, ConstrainedNodes.none(), 0.0, changes=(wrong,))

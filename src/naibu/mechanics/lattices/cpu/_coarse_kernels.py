@@ -190,9 +190,9 @@ def assemble(elements, directions, stiff, corner, weight, dense, diagonal):  # t
 
 
 @njit(cache=True)
-def add_held(held, smoother, corner, weight, dense, diagonal):  # type: ignore[no-untyped-def]  # pragma: no cover
+def add_constrained(constrained, smoother, corner, weight, dense, diagonal):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add what it costs that coarse functions do not move held components: the diagonal of the matrix there, as `assemble` does."""
-    node, direction = held[0], held[1]
+    node, direction = constrained[0], constrained[1]
     for h in range(len(node)):
         i = node[h]
         for k in range(8):
@@ -227,11 +227,11 @@ def _invert(a):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 
 @njit(cache=True)
-def build(coarse, smoother, held, slot):  # type: ignore[no-untyped-def]  # pragma: no cover
+def build(coarse, smoother, constrained, slot):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Invert the coarse matrix while components are held, into a slot."""
     _, _, _, (base, scale, diagonal, inverse), (corner, weight, fine_corner, fine_weight), _ = coarse
     dense, nothing, flat = base.copy(), np.zeros((0, 0, 0, 0)), np.zeros((0, 0))
-    add_held(held, smoother, corner, weight, dense, flat)
+    add_constrained(constrained, smoother, corner, weight, dense, flat)
     square = dense.reshape(inverse.shape[1:])
     _invert(square)
     for i in range(len(square)):
@@ -239,7 +239,7 @@ def build(coarse, smoother, held, slot):  # type: ignore[no-untyped-def]  # prag
             inverse[slot, i, j] = 0.5 * (square[i, j] + square[j, i])
     if diagonal.size:
         fine = diagonal.copy()
-        add_held(held, smoother, fine_corner, fine_weight, nothing, fine)
+        add_constrained(constrained, smoother, fine_corner, fine_weight, nothing, fine)
         for i in range(fine.shape[1]):  # half, since the levels above and below see part of it as well
             scale[slot, i] = 1.5 / (fine[0, i] + fine[1, i] + fine[2, i])
 
@@ -253,22 +253,22 @@ def begin(coarse):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 
 @njit(cache=True)
-def _knows(memory, held):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _knows(memory, constrained):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return whether the second inverse is that for these held components."""
     node, direction, state = memory
-    if state[NODES] != len(held[0]):
+    if state[NODES] != len(constrained[0]):
         return False
-    for h in range(len(held[0])):
-        if node[h] != held[0][h]:
+    for h in range(len(constrained[0])):
+        if node[h] != constrained[0][h]:
             return False
         for a in range(3):
-            if direction[h, a] != held[1][h, a]:
+            if direction[h, a] != constrained[1][h, a]:
                 return False
     return True
 
 
 @njit(cache=True)
-def follow(coarse, smoother, held, at_once):  # type: ignore[no-untyped-def]  # pragma: no cover
+def follow(coarse, smoother, constrained, at_once):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Make the inverse that of the held components: at once, or when the solver has worked so much that a new one is cheap beside it.
 
     Until then the one in use goes on; it is only slower.
@@ -277,25 +277,25 @@ def follow(coarse, smoother, held, at_once):  # type: ignore[no-untyped-def]  # 
     node, direction, state = memory
     if not len(state):
         return
-    if len(held[0]) == 0:
+    if len(constrained[0]) == 0:
         state[SLOT] = 0
         return
-    if state[SLOT] == 1 and _knows(memory, held):
+    if state[SLOT] == 1 and _knows(memory, constrained):
         return
     if not at_once and state[CREDIT] < state[PRICE]:
         return
-    if not _knows(memory, held):
-        build(coarse, smoother, held, 1)
-        state[NODES] = len(held[0])
-        for h in range(len(held[0])):
-            node[h] = held[0][h]
+    if not _knows(memory, constrained):
+        build(coarse, smoother, constrained, 1)
+        state[NODES] = len(constrained[0])
+        for h in range(len(constrained[0])):
+            node[h] = constrained[0][h]
             for a in range(3):
-                direction[h, a] = held[1][h, a]
+                direction[h, a] = constrained[1][h, a]
     state[SLOT], state[CREDIT] = 1, 0
 
 
 @njit(cache=True)
-def begin_with(inner, held):  # type: ignore[no-untyped-def]  # pragma: no cover
+def begin_with(inner, constrained):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Prepare the solver, whose arrays are `inner`, for a run in which these components are held."""
     begin(inner[8])
-    follow(inner[8], inner[3], held, True)
+    follow(inner[8], inner[3], constrained, True)

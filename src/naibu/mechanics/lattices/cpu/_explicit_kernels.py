@@ -43,13 +43,13 @@ def element_forces(first, second, rows, tables, x, v, y, f, pad, begin, end):  #
 
 
 @njit(cache=True, fastmath=_FAST)
-def drive(held, velocity, v, f, mass, step, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
+def drive(constrained, velocity, v, f, mass, step, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Change the forces on held masses so that they take on the velocity of their bodies (bodies, 3), mm/s, along the held directions.
 
-    `held` are mass, direction (h, 3), weight and body of every held component; what the bodies exert, mN, is added to `reaction`
+    `constrained` are mass, direction (h, 3), weight and body of every held component; what the bodies exert, mN, is added to `reaction`
     (bodies, 3).
     """
-    node, direction, weight, body = held
+    node, direction, weight, body = constrained
     pad = len(mass)
     for h in range(len(node)):
         i, k = node[h], body[h]
@@ -92,7 +92,9 @@ def _gather(forces, external, low, high, begin, end, p, pad):  # type: ignore[no
 @njit(cache=True, fastmath=_FAST)
 def _part(job, p, data):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Do part p of a step's first job, the forces of its blocks, or of the second, the motion of its masses; see `explicit_steps`."""
-    (first, second, rows), parts, tables, (x, v, y), (mass, inverse_mass), external, held, (now, shares), forces, (step, forward) = data
+    (first, second, rows), parts, tables, (x, v, y), (mass, inverse_mass), external, constrained, (now, shares), forces, (step, forward) = (
+        data
+    )
     cuts, nodes, low, high, mine = parts
     pad, f = len(mass), forces[p]
     if job == FORCES:
@@ -102,7 +104,7 @@ def _part(job, p, data):  # type: ignore[no-untyped-def]  # pragma: no cover
         return
     _gather(forces, external, low, high, nodes[p], nodes[p + 1], p, pad)
     begin, end = mine[p], mine[p + 1]
-    own = (held[0][begin:end], held[1][begin:end], held[2][begin:end], held[3][begin:end])
+    own = (constrained[0][begin:end], constrained[1][begin:end], constrained[2][begin:end], constrained[3][begin:end])
     shares[p] = 0.0
     drive(own, now, v, f, mass, step, shares[p])
     move(x, v, f, inverse_mass, step, forward, pad, nodes[p], nodes[p + 1])

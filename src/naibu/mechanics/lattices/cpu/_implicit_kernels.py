@@ -109,13 +109,13 @@ def rigid_part(x, mass, impulse, out):  # type: ignore[no-untyped-def]  # pragma
 
 
 @njit(cache=True, fastmath=_FAST)
-def settle(first, second, rows, stiff, axes, mass, held, x, v, r, p, q):  # type: ignore[no-untyped-def]  # pragma: no cover
+def settle(first, second, rows, stiff, axes, mass, constrained, x, v, r, p, q):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Make v1 . r of free components not negative, so that the early end of the solver raises no energy; keep a free body's momenta.
 
     Returns the v1 . r that is left.
     """
     pad = len(mass)
-    free = len(held[0]) == 0
+    free = len(constrained[0]) == 0
     if free:
         rigid_part(x, mass, r, p)
         for i in range(len(v)):
@@ -123,7 +123,7 @@ def settle(first, second, rows, stiff, axes, mass, held, x, v, r, p, q):  # type
             r[i] -= mass[i % pad] * p[i]
     for i in range(len(v)):
         p[i] = v[i]
-    project(held, p, pad)
+    project(constrained, p, pad)
     lost = dot(p, r)
     if lost >= 0.0:
         return lost
@@ -182,9 +182,9 @@ def extend(first, second, rows, tables, axes, lengths, x, v, y, step):  # type: 
 
 
 @njit(cache=True, fastmath=_FAST)
-def hold(held, v, pad):  # type: ignore[no-untyped-def]  # pragma: no cover
+def constrain(constrained, v, pad):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Give held components of v (3 pad,) their speeds."""
-    node, direction, speed = held[0], held[1], held[2]
+    node, direction, speed = constrained[0], constrained[1], constrained[2]
     for h in range(len(node)):
         i = node[h]
         lack = speed[h]
@@ -206,28 +206,29 @@ def add_momenta(mass, v, sign, right):  # type: ignore[no-untyped-def]  # pragma
 
 
 @njit(cache=True, fastmath=_FAST)
-def new_velocity(blocks, tables, x, v, y, mass, right, work, inner, held, step, solver):  # type: ignore[no-untyped-def]  # pragma: no cover
+def new_velocity(blocks, tables, x, v, y, mass, right, work, inner, constrained, step, solver):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Improve v to the velocity after a step, `right` being the momenta with the impulses of external forces before.
 
     `tables` are a, b, E, g, K and h^2 a; `work` the arrays axes (3, 8 nb) and r, p, q (3 pad,); `inner` those of `conjugate_gradients`;
-    `held` mass, direction (h, 3), speed and body of every held component; `solver` the tolerance and the most iterations. Leaves in r minus
-    the impulses that hold the masses; returns the number of iterations and the energy that the early end of the solver dissipates, mN mm.
+    `constrained` mass, direction (h, 3), speed and body of every held component; `solver` the tolerance and the most iterations. Leaves in
+    r minus the impulses that hold the masses; returns the number of iterations and the energy that the early end of the solver dissipates,
+    mN mm.
     """
     first, second, rows = blocks
     axes, r, p, q = work
-    hold(held, v, len(mass))
-    follow(inner[8], inner[3], held, False)
+    constrain(constrained, v, len(mass))
+    follow(inner[8], inner[3], constrained, False)
     r[:] = right
     add_momenta(mass, v, -1.0, r)
     floor = prepare(first, second, rows, tables, x, y, v, axes, inner[1], r, step) * 1e-20 / mass.max()
-    count = solve(first, second, rows, tables[5], axes, mass, v, r, p, q, inner, held, floor, solver[0], solver[1])
-    return count, settle(first, second, rows, tables[5], axes, mass, held, x, v, r, p, q)
+    count = solve(first, second, rows, tables[5], axes, mass, v, r, p, q, inner, constrained, floor, solver[0], solver[1])
+    return count, settle(first, second, rows, tables[5], axes, mass, constrained, x, v, r, p, q)
 
 
 @njit(cache=True, fastmath=_FAST)
-def add_reactions(held, r, pad, step, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
+def add_reactions(constrained, r, pad, step, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add to `reaction` (bodies, 3) the forces, mN, by which bodies hold masses, from the residual r of a step."""
-    node, direction, _, body = held
+    node, direction, _, body = constrained
     for h in range(len(node)):
         i = node[h]
         along = (direction[h, 0] * r[i] + direction[h, 1] * r[pad + i] + direction[h, 2] * r[2 * pad + i]) / step
@@ -268,18 +269,18 @@ def advance(blocks, tables, x, v, before, y, lengths, mass, axes, step, lost):  
 
 
 @njit(cache=True, fastmath=_FAST, nogil=True)
-def implicit_steps(blocks, tables, state, mass, external, work, inner, held, velocity, step, solver, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
+def implicit_steps(blocks, tables, state, mass, external, work, inner, constrained, velocity, step, solver, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Take len(velocity) steps with constant external forces (3 pad,), mN, or none.
 
     The state x, v, y and lengths is changed, reaction (steps, bodies, 3), zero before, is filled.
 
-    `held` are mass, direction, weight and body of held components, which move by their weights times the velocity (steps, bodies, 3) of
-    their bodies. Returns the number of iterations, and in how many steps rotation had to be held back.
+    `constrained` are mass, direction, weight and body of held components, which move by their weights times the velocity (steps, bodies,
+    3) of their bodies. Returns the number of iterations, and in how many steps rotation had to be held back.
     """
     x, v, y, lengths = state
     iterations, checked = 0, 0
     right, before = np.zeros_like(x), np.zeros_like(x)
-    node, direction, weight, body = held
+    node, direction, weight, body = constrained
     speed = np.zeros(len(node))
     now = (node, direction, speed, body)
     begin_with(inner, now)

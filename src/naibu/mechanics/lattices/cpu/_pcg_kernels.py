@@ -88,9 +88,9 @@ def _turn(p, r, smoother, beta):  # type: ignore[no-untyped-def]  # pragma: no c
 
 
 @njit(cache=True, fastmath=_FAST)
-def project(held, q, pad):  # type: ignore[no-untyped-def]  # pragma: no cover
+def project(constrained, q, pad):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Take the held components out of q; the directions at one mass are orthogonal."""
-    node, direction = held[0], held[1]
+    node, direction = constrained[0], constrained[1]
     for h in range(len(node)):
         i = node[h]
         along = direction[h, 0] * q[i] + direction[h, 1] * q[pad + i] + direction[h, 2] * q[2 * pad + i]
@@ -111,7 +111,7 @@ def _scaled_square(r, smoother):  # type: ignore[no-untyped-def]  # pragma: no c
 
 
 @njit(cache=True, fastmath=_FAST)
-def conjugate_gradients(first, second, rows, inner, held, goal, limit, helped):  # type: ignore[no-untyped-def]  # pragma: no cover
+def conjugate_gradients(first, second, rows, inner, constrained, goal, limit, helped):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Set w to about A^-1 r with held components zero, until the square of the residual's norm, times `smoother`, is below `goal`.
 
     `inner` are h^2 a, axes, mass, smoother, w, r, p, q and what coarse functions need, which is used if `helped`. Returns the number of
@@ -121,7 +121,7 @@ def conjugate_gradients(first, second, rows, inner, held, goal, limit, helped): 
     kind, pad = w.dtype.type, len(mass)
     w[:] = 0
     p[:] = 0
-    project(held, r, pad)
+    project(constrained, r, pad)
     norm = _scaled_square(r, smoother)
     old, beta = 1.0, 0.0
     count = 0
@@ -136,20 +136,20 @@ def conjugate_gradients(first, second, rows, inner, held, goal, limit, helped): 
         old = energy
         if helped:
             turn_with(coarse[0][0], coarse[1][1], p.reshape(3, pad), r.reshape(3, pad), smoother, kind(beta), 0, pad - WIDTH)
-            project(held, p, pad)
+            project(constrained, p, pad)
         else:
             _turn(p, r, smoother, kind(beta))
         curvature = multiply(first, second, rows, stiff, axes, mass, p, q)
         if not curvature > 0.0:
             return count, False
-        project(held, q, pad)
+        project(constrained, q, pad)
         norm = _descend(w, r, p, q, smoother, kind(energy / curvature))
         count += 1
     return count, True
 
 
 @njit(cache=True, fastmath=_FAST)
-def _norm(r, smoother, held):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _norm(r, smoother, constrained):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return the square of the norm of the free part of r, in double precision, times `smoother`, in single."""
     pad = len(smoother)
     s = splat(0.0)
@@ -159,21 +159,21 @@ def _norm(r, smoother, held):  # type: ignore[no-untyped-def]  # pragma: no cove
             residual = load(ra, i)
             s = s + residual * (residual * double(load(smoother, i)))
     norm = float(total(s))
-    for h in range(len(held[0])):
-        i = held[0][h]
-        along = held[1][h, 0] * r[i] + held[1][h, 1] * r[pad + i] + held[1][h, 2] * r[2 * pad + i]
+    for h in range(len(constrained[0])):
+        i = constrained[0][h]
+        along = constrained[1][h, 0] * r[i] + constrained[1][h, 1] * r[pad + i] + constrained[1][h, 2] * r[2 * pad + i]
         norm -= along * along * smoother[i]
     return norm
 
 
 @njit(cache=True, fastmath=_FAST)
-def solve(first, second, rows, stiff, axes, mass, v, r, p, q, inner, held, floor, tolerance, limit):  # type: ignore[no-untyped-def]  # pragma: no cover
+def solve(first, second, rows, stiff, axes, mass, v, r, p, q, inner, constrained, floor, tolerance, limit):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Improve v, whose residual is r, by conjugate gradients in single precision, again while r in full precision asks for it.
 
     It stops where the residual's norm fell to `tolerance` of its start or its square below `floor`. Returns the number of iterations.
     """
     smoother, w, rough, coarse = inner[3], inner[4], inner[5], inner[8]
-    norm = _norm(r, smoother, held)
+    norm = _norm(r, smoother, constrained)
     goal = max(tolerance**2 * norm, floor)
     count, helped = 0, len(coarse[5][2]) > 0
     for _ in range(8):
@@ -182,7 +182,7 @@ def solve(first, second, rows, stiff, axes, mass, v, r, p, q, inner, held, floor
         unit = np.sqrt(norm)
         for i in range(len(r)):
             rough[i] = r[i] / unit
-        done, well = conjugate_gradients(first, second, rows, inner, held, max(0.9 * goal / norm, 1e-10), limit - count, helped)
+        done, well = conjugate_gradients(first, second, rows, inner, constrained, max(0.9 * goal / norm, 1e-10), limit - count, helped)
         count, helped = count + done, helped and well
         for i in range(len(v)):
             p[i] = unit * w[i]
@@ -190,7 +190,7 @@ def solve(first, second, rows, stiff, axes, mass, v, r, p, q, inner, held, floor
         multiply(first, second, rows, stiff, axes, mass, p, q)
         for i in range(len(r)):
             r[i] -= q[i]
-        norm = _norm(r, smoother, held)
+        norm = _norm(r, smoother, constrained)
     if len(coarse[5][2]):
         coarse[5][2][CREDIT] += count
     return count

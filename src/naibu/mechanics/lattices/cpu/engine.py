@@ -18,13 +18,13 @@ from naibu.mechanics.lattices.cpu.stepper import ExplicitStepper, ImplicitSteppe
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters, require_positive
 from naibu.mechanics.lattices.model.state import (
     STEP_S,
-    HeldNodes,
+    ConstrainedNodes,
     LatticeState,
     Method,
     Motion,
     checked_velocity,
     explicit_step_limit,
-    require_held,
+    require_constrained,
     require_numbers,
 )
 
@@ -116,7 +116,7 @@ class LatticeEngine:
         self,
         state: LatticeState,
         steps: int,
-        held: HeldNodes | None = None,
+        constrained: ConstrainedNodes | None = None,
         velocity: ArrayLike = 0.0,
         external_force: ArrayLike | None = None,
     ) -> Motion:
@@ -128,7 +128,7 @@ class LatticeEngine:
             Where they begin; unchanged.
         steps : int
             How many.
-        held : HeldNodes
+        constrained : ConstrainedNodes
             Masses that bodies move.
         velocity : array_like
             Velocity of the bodies, mm/s, broadcast to (steps, bodies, 3).
@@ -142,17 +142,17 @@ class LatticeEngine:
         ConvergenceError
             The explicit method blew up.
         """
-        held = held or HeldNodes.none()
-        bodies = int(held.body.max(initial=-1)) + 1
+        constrained = constrained or ConstrainedNodes.none()
+        bodies = int(constrained.body.max(initial=-1)) + 1
         path = checked_velocity(velocity, steps, bodies)
         stepper = self.stepper(state, external_force, shared=True)
-        require_held(held, self.lattice.n_nodes)
+        require_constrained(constrained, self.lattice.n_nodes)
         reaction = np.zeros(path.shape)
-        stepper.hold((held.node, held.direction, held.weight, held.body), path.shape[1])
-        iterations, held_back = stepper.advance(path, reaction)
+        stepper.constrain((constrained.node, constrained.direction, constrained.weight, constrained.body), path.shape[1])
+        iterations, rotation_limited = stepper.advance(path, reaction)
         stepper.close()
         self.check(stepper, steps)
-        return Motion(self.state(stepper), reaction, iterations / max(steps, 1), held_back)
+        return Motion(self.state(stepper), reaction, iterations / max(steps, 1), rotation_limited)
 
     def stepper(self, state: LatticeState, external_force: ArrayLike | None = None, *, shared: bool) -> Stepper:
         """Return what takes steps from a state on; if `shared`, with the engine's working arrays, which serve one at a time.

@@ -37,7 +37,7 @@ class Stepper(ABC):
     length: Any
 
     @abstractmethod
-    def hold(self, entries: tuple[Any, ...], bodies: int) -> None:
+    def constrain(self, entries: tuple[Any, ...], bodies: int) -> None:
         """Hold masses from now on: node, direction, weight and body of every held component."""
 
     @abstractmethod
@@ -63,19 +63,19 @@ class ExplicitStepper(Stepper):
     control: Any = None
     data: tuple[Any, ...] = ()
 
-    def hold(self, entries: tuple[Any, ...], bodies: int) -> None:
+    def constrain(self, entries: tuple[Any, ...], bodies: int) -> None:
         """Hold masses from now on."""
         self.close()
         blocks, tables, masses, parts = self.kernel
         count = len(parts[0]) - 1
         order = np.argsort(entries[0], kind="stable")
-        held = tuple(np.ascontiguousarray(values[order]) for values in entries)
-        mine = np.searchsorted(held[0], parts[1])
+        constrained = tuple(np.ascontiguousarray(values[order]) for values in entries)
+        mine = np.searchsorted(constrained[0], parts[1])
         kind = self.position.dtype.type
         driven = (np.zeros((bodies, 3)), np.zeros((count, bodies, 3)))
         state, how = (self.position, self.velocity, self.extension), (kind(self.step), self.forward)
         forces = np.zeros((count, len(self.position)), kind)
-        self.data = (blocks, (*parts, mine), tables, state, masses, self.external, held, driven, forces, how)
+        self.data = (blocks, (*parts, mine), tables, state, masses, self.external, constrained, driven, forces, how)
         self.control = new_control(count)
         if count > 1:  # returns at once, compiled, lest helpers compile while steps wait
             dismiss(self.control)
@@ -107,11 +107,11 @@ class ImplicitStepper(Stepper):
     step: float
     mass: Any
     tolerance: float
-    held: tuple[Any, ...] = ()
+    constrained: tuple[Any, ...] = ()
 
-    def hold(self, entries: tuple[Any, ...], bodies: int) -> None:
+    def constrain(self, entries: tuple[Any, ...], bodies: int) -> None:
         """Hold masses from now on."""
-        self.held = entries
+        self.constrained = entries
 
     def advance(self, velocity: FloatArray, reaction: FloatArray, *, alone: bool = False) -> tuple[int, int]:
         """Take steps and fill the reactions."""
@@ -120,7 +120,7 @@ class ImplicitStepper(Stepper):
         reaction[:] = 0.0
         with _SHARED if self.shared else nullcontext():
             found: tuple[int, int] = implicit_steps(
-                blocks, tables, state, self.mass, self.external, work, inner, self.held, velocity, self.step, solver, reaction
+                blocks, tables, state, self.mass, self.external, work, inner, self.constrained, velocity, self.step, solver, reaction
             )
         return found
 

@@ -20,7 +20,7 @@ Vector12 = wp.types.vector(length=12, dtype=wp.float64)
 
 
 @wp.kernel
-def hold(
+def constrain(
     first: wp.array[wp.int32],
     node: wp.array[wp.int32],
     direction: wp.array[wp.vec3d],

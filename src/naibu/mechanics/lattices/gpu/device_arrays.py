@@ -15,7 +15,7 @@ from naibu.core.arrays import AnyArray, FloatArray, Int32Array, IntArray
 from naibu.core.errors import InputError
 from naibu.core.optional_packages import optional_package
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
-from naibu.mechanics.lattices.model.state import HeldNodes
+from naibu.mechanics.lattices.model.state import ConstrainedNodes
 
 _PART = 64  # entries of held masses that one thread adds up
 _CODES = 256  # different elements that a byte can number
@@ -169,7 +169,7 @@ def _numbered(k, c1, c2, codes, chosen):  # type: ignore[no-untyped-def]  # prag
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HeldArrays:
+class ConstrainedArrays:
     """Held components on a device, in the order of their masses.
 
     Attributes
@@ -181,7 +181,7 @@ class HeldArrays:
     first : warp array (masses + 1,), int32
         Where the components of every held mass begin.
     node, direction, weight, body : warp array (count,)
-        As in `HeldNodes`.
+        As in `ConstrainedNodes`.
     push : warp array (count,), vec3d
         What the bodies exert, mN.
     entry, part : warp array
@@ -203,11 +203,11 @@ class HeldArrays:
     part_body: IntArray
 
     @classmethod
-    def of(cls, held: HeldNodes, device: Any) -> HeldArrays:
+    def of(cls, constrained: ConstrainedNodes, device: Any) -> ConstrainedArrays:
         """Put held components on a device."""
         wp = warp_package()
-        order = np.argsort(held.node, kind="stable")
-        node, body = held.node[order], held.body[order]
+        order = np.argsort(constrained.node, kind="stable")
+        node, body = constrained.node[order], constrained.body[order]
         first = np.append(np.flatnonzero(np.diff(node, prepend=-1)), len(node))
         entry = np.argsort(body, kind="stable")
         sizes = np.bincount(body)
@@ -222,8 +222,8 @@ class HeldArrays:
             len(sizes),
             numbers(first),
             numbers(node),
-            wp.array(held.direction[order].astype(float).reshape(-1, 3), dtype=wp.vec3d, device=device),
-            wp.array(held.weight[order].astype(float), dtype=wp.float64, device=device),
+            wp.array(constrained.direction[order].astype(float).reshape(-1, 3), dtype=wp.vec3d, device=device),
+            wp.array(constrained.weight[order].astype(float), dtype=wp.float64, device=device),
             numbers(body),
             wp.zeros(len(node), dtype=wp.vec3d, device=device),
             numbers(entry),

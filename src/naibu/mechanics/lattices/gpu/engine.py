@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.mechanics.lattices.gpu.device_arrays import (
-    HeldArrays,
+    ConstrainedArrays,
     NeighbourLists,
     alike_elements,
     chosen_device,
@@ -29,13 +29,13 @@ from naibu.mechanics.lattices.model.coefficients import explicit_coefficients, i
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters, require_positive
 from naibu.mechanics.lattices.model.state import (
     STEP_S,
-    HeldNodes,
+    ConstrainedNodes,
     LatticeState,
     Method,
     Motion,
     checked_velocity,
     explicit_step_limit,
-    require_held,
+    require_constrained,
     require_numbers,
 )
 
@@ -142,7 +142,7 @@ class WarpLatticeEngine:
         return LatticeState(self.lattice.points.copy(), np.zeros_like(self.lattice.points), np.zeros(self.lattice.n_elements))
 
     def session(
-        self, state: LatticeState | None = None, held: HeldNodes | None = None, external_force: ArrayLike | None = None
+        self, state: LatticeState | None = None, constrained: ConstrainedNodes | None = None, external_force: ArrayLike | None = None
     ) -> LatticeSession:
         """Put a state on the device, from which it is moved on as often as wanted.
 
@@ -150,7 +150,7 @@ class WarpLatticeEngine:
         ----------
         state : LatticeState
             Where it begins, by default at rest; unchanged.
-        held : HeldNodes
+        constrained : ConstrainedNodes
             Masses that bodies move.
         external_force : array_like
             Forces on the masses that do not change, mN, broadcast to (n, 3).
@@ -160,13 +160,13 @@ class WarpLatticeEngine:
         InputError
             Shapes that do not fit, or NaN.
         """
-        return LatticeSession.of(self, state or self.rest(), held or HeldNodes.none(), external_force)
+        return LatticeSession.of(self, state or self.rest(), constrained or ConstrainedNodes.none(), external_force)
 
     def run(
         self,
         state: LatticeState,
         steps: int,
-        held: HeldNodes | None = None,
+        constrained: ConstrainedNodes | None = None,
         velocity: ArrayLike = 0.0,
         external_force: ArrayLike | None = None,
     ) -> Motion:
@@ -179,9 +179,9 @@ class WarpLatticeEngine:
         ConvergenceError
             The explicit method blew up.
         """
-        session = self.session(state, held, external_force)
+        session = self.session(state, constrained, external_force)
         reaction = session.advance(steps, velocity)
-        return Motion(session.state(), reaction, session.iterations / max(steps, 1), session.held_back)
+        return Motion(session.state(), reaction, session.iterations / max(steps, 1), session.rotation_limited)
 
     def energy(self, state: LatticeState) -> float:
         """Return kinetic energy plus that of the springs, mN mm; free of supports and forces it never grows by implicit steps."""
@@ -197,7 +197,7 @@ class LatticeSession:
     ----------
     engine : WarpLatticeEngine
         Lattice, parameters and method.
-    held : HeldArrays
+    constrained : ConstrainedArrays
         Held masses.
     x, v, f, external : warp array
         Position (mm), velocity (mm/s), force and external force (mN) of the masses; the last may be empty.
@@ -214,7 +214,7 @@ class LatticeSession:
     """
 
     engine: WarpLatticeEngine
-    held: HeldArrays
+    constrained: ConstrainedArrays
     x: Any
     v: Any
     f: Any
@@ -225,12 +225,14 @@ class LatticeSession:
     count: Any
     taken: int = 0
     iterations: int = 0
-    held_back: int = 0
+    rotation_limited: int = 0
     implicit: ImplicitSteps | None = None
     _many: Callable[[], None] | None = field(default=None, repr=False)
 
     @classmethod
-    def of(cls, engine: WarpLatticeEngine, state: LatticeState, held: HeldNodes, external_force: ArrayLike | None) -> LatticeSession:
+    def of(
+        cls, engine: WarpLatticeEngine, state: LatticeState, constrained: ConstrainedNodes, external_force: ArrayLike | None
+    ) -> LatticeSession:
         """Put a state on the device of an engine; see `WarpLatticeEngine.session`.
 
         Raises
@@ -241,7 +243,7 @@ class LatticeSession:
         wp, device = warp_package(), engine.device
         lattice = engine.lattice
         _check_state(lattice, state)
-        require_held(held, lattice.n_nodes)
+        require_constrained(constrained, lattice.n_nodes)
         vector = wp.vec3f if engine.mass.dtype == wp.float32 else wp.vec3d
         force = np.zeros((0, 3))
         if external_force is not None:
@@ -250,7 +252,7 @@ class LatticeSession:
         x, v, external = (wp.array(a, dtype=vector, device=device, copy=True) for a in (state.position, state.velocity, force))
         real = np.float32 if vector is wp.vec3f else np.float64
         y = wp.array(engine.lists.at_both_ends(state.extension, real), dtype=engine.mass.dtype, device=device)
-        entries = HeldArrays.of(held, device)
+        entries = ConstrainedArrays.of(constrained, device)
         f = wp.zeros(lattice.n_nodes, dtype=vector, device=device)
         path = wp.zeros((_CHUNK, max(entries.bodies, 1)), dtype=wp.vec3d, device=device)
         parts = wp.zeros((_CHUNK, max(len(entries.part_body), 1)), dtype=wp.vec3d, device=device)
@@ -274,18 +276,18 @@ class LatticeSession:
         InputError
             Shapes that do not fit, or NaN.
         """
-        path = checked_velocity(velocity, steps, self.held.bodies)
+        path = checked_velocity(velocity, steps, self.constrained.bodies)
         reaction = np.zeros(path.shape)
         for begin in range(0, steps, _CHUNK):
             size = min(_CHUNK, steps - begin)
-            if self.held.count:
-                coming = np.zeros((_CHUNK, self.held.bodies, 3))
-                coming[:size] = path[begin : begin + size, : self.held.bodies]
+            if self.constrained.count:
+                coming = np.zeros((_CHUNK, self.constrained.bodies, 3))
+                coming[:size] = path[begin : begin + size, : self.constrained.bodies]
                 self.path.assign(coming)
             self.count.zero_()
             self._take(size)
-            if self.held.count:
-                reaction[begin : begin + size] = self.held.reactions(self.parts.numpy()[:size], path.shape[1])
+            if self.constrained.count:
+                reaction[begin : begin + size] = self.constrained.reactions(self.parts.numpy()[:size], path.shape[1])
         self.taken += steps
         return reaction
 
@@ -306,9 +308,9 @@ class LatticeSession:
     def _take(self, steps: int) -> None:
         if self.implicit:
             for _ in range(steps):
-                iterations, held_back = self.implicit.take()
+                iterations, rotation_limited = self.implicit.take()
                 self.iterations += iterations
-                self.held_back += held_back
+                self.rotation_limited += rotation_limited
             return
         if self._many is None and steps >= _AT_ONCE:
             self._many = recorded(lambda: self._explicit_steps(_AT_ONCE), self.engine.device)
@@ -323,23 +325,23 @@ class LatticeSession:
 
     def _explicit_step(self) -> None:
         wp, kernels = warp_package(), compiled("_explicit_kernels")
-        engine, lists, held, n = self.engine, self.engine.lists, self.held, self.engine.lattice.n_nodes
+        engine, lists, constrained, n = self.engine, self.engine.lists, self.constrained, self.engine.lattice.n_nodes
         device = engine.device
         elements = [lists.start, lists.degree, lists.neighbour, engine.row, engine.table]
         wp.launch(kernels.forces, n, inputs=[*elements, self.x, self.v, self.y, self.external, self.f], device=device)
-        if held.count:
-            entries = [held.first, held.node, held.direction, held.weight, held.body]
-            motion = [self.path, self.count, engine.mass, self.v, wp.float64(engine.step), self.f, held.push]
-            wp.launch(kernels.drive, held.masses, inputs=[*entries, *motion], device=device)
+        if constrained.count:
+            entries = [constrained.first, constrained.node, constrained.direction, constrained.weight, constrained.body]
+            motion = [self.path, self.count, engine.mass, self.v, wp.float64(engine.step), self.f, constrained.push]
+            wp.launch(kernels.drive, constrained.masses, inputs=[*entries, *motion], device=device)
             self.collect()
         step, forward = engine.mass.dtype(engine.step), int(engine.method == "euler")
         wp.launch(kernels.move, n, inputs=[engine.inverse_mass, self.f, step, forward, self.count, self.x, self.v], device=device)
 
     def collect(self) -> None:
         """Add up what bodies exert in this step; meant for the steps."""
-        held, kernels = self.held, compiled("_explicit_kernels")
-        sums = [held.push, held.entry, held.part, self.count, self.parts]
-        warp_package().launch(kernels.collect, len(held.part_body), inputs=sums, device=self.engine.device)
+        constrained, kernels = self.constrained, compiled("_explicit_kernels")
+        sums = [constrained.push, constrained.entry, constrained.part, self.count, self.parts]
+        warp_package().launch(kernels.collect, len(constrained.part_body), inputs=sums, device=self.engine.device)
 
     def _checked(self, state: LatticeState) -> LatticeState:
         engine = self.engine

@@ -148,16 +148,32 @@ class ImplicitSteps:
     def take(self) -> tuple[int, bool]:
         """Take a step; return the iterations of the solver, and whether rotation had to be held back."""
         session = self.session
-        held = session.held
+        constrained = session.constrained
         warp_package().copy(self.before, session.v)
-        if held.count:
-            entries = [held.first, held.node, held.direction, held.weight, held.body, session.path, session.count, session.v]
-            self._launch("hold", held.masses, *entries)
+        if constrained.count:
+            entries = [
+                constrained.first,
+                constrained.node,
+                constrained.direction,
+                constrained.weight,
+                constrained.body,
+                session.path,
+                session.count,
+                session.v,
+            ]
+            self._launch("constrain", constrained.masses, *entries)
         iterations = self._solve()
         lost = self._settled()
-        if held.count:
+        if constrained.count:
             self._launch(
-                "support", held.masses, held.first, held.node, held.direction, self.r, self._number(session.engine.step), held.push
+                "support",
+                constrained.masses,
+                constrained.first,
+                constrained.node,
+                constrained.direction,
+                self.r,
+                self._number(session.engine.step),
+                constrained.push,
             )
             session.collect()
         return iterations, self._advance(lost)
@@ -177,9 +193,9 @@ class ImplicitSteps:
         return warp_package().float64(value)
 
     def _release(self, values: Any) -> None:
-        held = self.session.held
-        if held.count:
-            self._launch("release", held.masses, held.first, held.node, held.direction, values)
+        constrained = self.session.constrained
+        if constrained.count:
+            self._launch("release", constrained.masses, constrained.first, constrained.node, constrained.direction, values)
 
     def _dot(self, a: Any, b: Any) -> float:
         self.scalars.dot(a, b, self.scalar)
@@ -249,7 +265,7 @@ class ImplicitSteps:
     def _settled(self) -> float:
         """Keep v1 . r of free components from being negative, and a free body's momenta; return the v1 . r that is left."""
         session, engine = self.session, self.session.engine
-        wp, free = warp_package(), not self.session.held.count
+        wp, free = warp_package(), not self.session.constrained.count
         if free:
             rigid = self._rigid(self.r)
             self._on_masses("add_rigid", session.x, *rigid, self._number(1.0), session.v)

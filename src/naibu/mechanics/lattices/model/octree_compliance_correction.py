@@ -158,14 +158,14 @@ class _EnergyTest:
     @classmethod
     def of_motions(cls, elements: _Elements, moved: BoolArray, motions: FloatArray) -> _EnergyTest:
         """Move some masses (n,) by motions (n, 3, p)."""
-        held = np.flatnonzero(np.repeat(moved, 3))
-        imposed = elements.longer[:, held] @ motions.reshape(len(moved) * 3, -1)[held]
+        constrained = np.flatnonzero(np.repeat(moved, 3))
+        imposed = elements.longer[:, constrained] @ motions.reshape(len(moved) * 3, -1)[constrained]
         return cls(elements, ~moved, np.asarray(imposed), None)
 
     @classmethod
-    def of_forces(cls, elements: _Elements, held: BoolArray, forces: FloatArray) -> _EnergyTest:
+    def of_forces(cls, elements: _Elements, constrained: BoolArray, forces: FloatArray) -> _EnergyTest:
         """Hold some masses (n,), and put forces (n, 3, p) on others."""
-        return cls(elements, ~held, None, forces[~held].reshape(3 * int((~held).sum()), -1))
+        return cls(elements, ~constrained, None, forces[~constrained].reshape(3 * int((~constrained).sum()), -1))
 
     def evaluated(self, logarithms: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the errors (r,), positive where the octree is too stiff, in units of the tolerance, and their derivatives (r, groups)."""

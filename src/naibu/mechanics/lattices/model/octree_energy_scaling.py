@@ -61,21 +61,21 @@ class OctreeGrid:
 
     def sizes_at(self) -> IntArray:
         """Return the edges of the cubes that hold the voxels, 0 outside, with one empty layer around: (nx + 2, ny + 2, nz + 2)."""
-        held = np.zeros(tuple(n + 2 for n in self.filled.shape), dtype=np.int64)
+        constrained = np.zeros(tuple(n + 2 for n in self.filled.shape), dtype=np.int64)
         for size in np.unique(self.sizes):
             steps = np.array(list(np.ndindex(size, size, size))) + 1
-            held[tuple((self.cubes[self.sizes == size][:, None, :] + steps).reshape(-1, 3).T)] = size
-        return held
+            constrained[tuple((self.cubes[self.sizes == size][:, None, :] + steps).reshape(-1, 3).T)] = size
+        return constrained
 
     def around_masses(self) -> IntArray:
         """Return the edges of the cubes in the eight octants around the masses, 0 outside (n, 8)."""
-        held = self.sizes_at()
-        return np.stack([held[tuple((self.nodes + step).T)] for step in _OCTANTS], axis=1)
+        constrained = self.sizes_at()
+        return np.stack([constrained[tuple((self.nodes + step).T)] for step in _OCTANTS], axis=1)
 
     def around_middles(self) -> IntArray:
         """Return the edges of the cubes around the middles of the elements, each as often as it fills octants, 0 outside (m, 8)."""
-        held, middle = self.sizes_at(), self.nodes[self.pairs].sum(axis=1)  # in half voxels
-        return np.stack([held[tuple(((middle - step) // 2 + 1).T)] for step in _OCTANTS], axis=1)
+        constrained, middle = self.sizes_at(), self.nodes[self.pairs].sum(axis=1)  # in half voxels
+        return np.stack([constrained[tuple(((middle - step) // 2 + 1).T)] for step in _OCTANTS], axis=1)
 
     def hanging(self, around: IntArray) -> IntArray:
         """Return in how many octants around the masses there is a cube of which they are no corner (n,)."""

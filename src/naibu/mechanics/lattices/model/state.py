@@ -42,7 +42,7 @@ class LatticeState:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HeldNodes:
+class ConstrainedNodes:
     """Components of masses that move as rigid bodies do.
 
     Attributes
@@ -63,12 +63,12 @@ class HeldNodes:
     body: IntArray
 
     @classmethod
-    def none(cls) -> HeldNodes:
+    def none(cls) -> ConstrainedNodes:
         """Hold nothing."""
         return cls(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
 
     @classmethod
-    def of(cls, nodes: ArrayLike, body: int = 0, *, axes: Sequence[int] = (0, 1, 2), weight: ArrayLike = 1.0) -> HeldNodes:
+    def of(cls, nodes: ArrayLike, body: int = 0, *, axes: Sequence[int] = (0, 1, 2), weight: ArrayLike = 1.0) -> ConstrainedNodes:
         """Hold masses along axes of the frame by a body, with a weight, or one a mass."""
         chosen = np.atleast_1d(np.asarray(nodes, dtype=np.int64))
         share = np.broadcast_to(np.asarray(weight, dtype=float), chosen.shape)
@@ -77,10 +77,10 @@ class HeldNodes:
             np.repeat(chosen, k), np.tile(np.eye(3)[list(axes)], (len(chosen), 1)), np.repeat(share, k), np.full(k * len(chosen), body)
         )
 
-    def __add__(self, other: HeldNodes) -> HeldNodes:
+    def __add__(self, other: ConstrainedNodes) -> ConstrainedNodes:
         """Hold what either holds."""
         pairs = ((getattr(self, name), getattr(other, name)) for name in ("node", "direction", "weight", "body"))
-        return HeldNodes(*(np.concatenate(pair) for pair in pairs))
+        return ConstrainedNodes(*(np.concatenate(pair) for pair in pairs))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,7 +102,7 @@ class Motion:
     state: LatticeState
     reaction: FloatArray
     iterations: float = 0.0
-    held_back: int = 0
+    rotation_limited: int = 0
 
 
 def checked_velocity(velocity: ArrayLike, steps: int, bodies: int) -> FloatArray:
@@ -141,7 +141,7 @@ def require_numbers(values: FloatArray, what: str) -> None:
         raise InputError(f"{what} holds {int(wrong.sum())} NaN or infinite values, the first at {at}; leave them out or fill them")
 
 
-def require_held(held: HeldNodes, n_nodes: int) -> None:
+def require_constrained(constrained: ConstrainedNodes, n_nodes: int) -> None:
     """Check held masses.
 
     Raises
@@ -149,15 +149,17 @@ def require_held(held: HeldNodes, n_nodes: int) -> None:
     InputError
         A mass that is not there, directions that are not of unit length, or two that are not orthogonal at one mass.
     """
-    if not len(held.node):
+    if not len(constrained.node):
         return
-    if held.node.min() < 0 or held.node.max() >= n_nodes:
-        raise InputError(f"held masses have the numbers {held.node.min()} to {held.node.max()}, the lattice has 0 to {n_nodes - 1}")
-    require_numbers(held.direction, "the direction of held masses")
-    if np.abs(np.linalg.norm(held.direction, axis=1) - 1.0).max() > 1e-6:
+    if constrained.node.min() < 0 or constrained.node.max() >= n_nodes:
+        raise InputError(
+            f"held masses have the numbers {constrained.node.min()} to {constrained.node.max()}, the lattice has 0 to {n_nodes - 1}"
+        )
+    require_numbers(constrained.direction, "the direction of held masses")
+    if np.abs(np.linalg.norm(constrained.direction, axis=1) - 1.0).max() > 1e-6:
         raise InputError("the directions of held masses must be of unit length; divide them by their norm")
-    order = np.argsort(held.node, kind="stable")
-    node, direction = held.node[order], held.direction[order]
+    order = np.argsort(constrained.node, kind="stable")
+    node, direction = constrained.node[order], constrained.direction[order]
     for apart in range(1, min(4, len(node))):
         together = node[apart:] == node[:-apart]
         cosine = np.abs((direction[apart:] * direction[:-apart]).sum(axis=1))[together]

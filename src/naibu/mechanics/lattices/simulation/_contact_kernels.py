@@ -33,13 +33,13 @@ def _look(shapes, places, x, candidates, pad, near):  # type: ignore[no-untyped-
 
 
 @njit(cache=True)
-def _constraints(candidates, mode, near, velocity, step, held):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _constraints(candidates, mode, near, velocity, step, constrained):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Write what holds the touching masses to held and return how many entries there are.
 
     `near` are normals and gaps of the masses before, from the bodies after the step. A mass
     takes the normal of each body that it touches, made orthogonal to those before it, and what is left where it sticks.
     """
-    node, direction, speed, body = held
+    node, direction, speed, body = constrained
     count = 0
     t = np.empty(3)
     for c in range(len(candidates)):
@@ -66,14 +66,14 @@ def _constraints(candidates, mode, near, velocity, step, held):  # type: ignore[
                     direction[count, a] = t[a] / length
                 count += 1
         if sticks >= 0:
-            count = _complete(candidates[c], sticks, velocity[sticks], begin, count, held)
+            count = _complete(candidates[c], sticks, velocity[sticks], begin, count, constrained)
     return count
 
 
 @njit(cache=True)
-def _complete(mass, k, velocity, begin, count, held):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _complete(mass, k, velocity, begin, count, constrained):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add to the directions begin to count the ones that are orthogonal to them, in which the mass moves with body k."""
-    node, direction, speed, body = held
+    node, direction, speed, body = constrained
     t = np.empty(3)
     while count - begin < 3:
         best = 0.0
@@ -99,9 +99,9 @@ def _complete(mass, k, velocity, begin, count, held):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def _forces(held, count, candidates, row, r, pad, step, near, force):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _forces(constrained, count, candidates, row, r, pad, step, near, force):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Set force (c, bodies, 3) to what the bodies exert on held masses, mN, from the residual r."""
-    node, direction, _, body = held
+    node, direction, _, body = constrained
     force[:] = 0.0
     for h in range(count):
         i = node[h]
@@ -245,14 +245,14 @@ def _pull_off(touched, mode, pull, near, velocity, v, mass, candidates, step, pa
 
 
 @njit(cache=True)
-def _settle(engine, held, modes, seen, shapes, places, friction, candidates, base, masses, velocity, most, slow):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _settle(engine, constrained, modes, seen, shapes, places, friction, candidates, base, masses, velocity, most, slow):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Solve a step until its contacts agree with the solution; return iterations, passes, what the solver lost, and whether they agree.
 
     `engine` are what `new_velocity` takes; `base` the right side without friction (3 pad,); `masses` those of the lattice, its smoother
     and, for the matrix, all of them with drags.
     """
     blocks, tables, x, v, y, right, work, inner, step, solver = engine
-    node, direction, speed, body = held
+    node, direction, speed, body = constrained
     mode, sliding, drag, _, _ = modes
     near, after, force, applied = seen
     mass, smoother, heavy = masses
@@ -263,7 +263,7 @@ def _settle(engine, held, modes, seen, shapes, places, friction, candidates, bas
     for attempt in range(most):
         right[:] = base
         _load(candidates, mass, smoother, drag, sliding, velocity, step, pad, heavy, inner[2], inner[3], right)
-        count = _constraints(candidates, mode, near, velocity, step, held)
+        count = _constraints(candidates, mode, near, velocity, step, constrained)
         now = (node[:count], direction[:count], speed[:count], body[:count])
         done, lost = new_velocity(blocks, tables, x, v, y, heavy, right, work, inner, now, step, solver)
         iterations += done
@@ -290,7 +290,7 @@ def contact_steps(blocks, tables, x, v, y, lengths, mass, external, work, inner,
     most, slow = limit
     pad, c, k = len(mass), len(candidates), len(places)
     near, force, applied = np.zeros((c, k, 4)), np.zeros((c, k, 3)), np.zeros((c, k, 3))
-    held = (np.zeros(3 * c, np.int64), np.zeros((3 * c, 3)), np.zeros(3 * c), np.zeros(3 * c, np.int64))
+    constrained = (np.zeros(3 * c, np.int64), np.zeros((3 * c, 3)), np.zeros(3 * c), np.zeros(3 * c, np.int64))
     right, before, base, drag = np.zeros_like(x), np.zeros_like(x), np.zeros_like(x), np.zeros((c, k))
     heavy, smoother = mass.copy(), inner[3].copy()
     iterations, passes, unsettled = 0, 0, 0
@@ -309,7 +309,7 @@ def contact_steps(blocks, tables, x, v, y, lengths, mass, external, work, inner,
         seen, solved = (near, np.zeros_like(near), force, applied), (blocks, tables, x, v, y, right, work, inner, step, solver)
         masses = (mass, smoother, heavy)
         done, tries, lost, agreed = _settle(
-            solved, held, modes, seen, shapes, places, friction, candidates, base, masses, velocity[n], most, slow
+            solved, constrained, modes, seen, shapes, places, friction, candidates, base, masses, velocity[n], most, slow
         )
         iterations, passes, unsettled = iterations + done, passes + tries, unsettled + (not agreed)
         for m in range(c):

@@ -20,7 +20,7 @@ from naibu.mechanics.lattices.cpu._simd import WIDTH, aligned, inverse_root, loa
 from naibu.mechanics.lattices.cpu.element_blocks import explicit_tables
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import LatticeParameters
-from naibu.mechanics.lattices.model.state import HeldNodes, LatticeState, checked_velocity, require_held, require_numbers
+from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState, checked_velocity, require_constrained, require_numbers
 
 _FAST = {"contract", "nsz"}
 
@@ -45,7 +45,7 @@ class RecordedPush:
     observed: IntArray
     positions: FloatArray
     reaction: FloatArray
-    held: tuple[Any, ...]
+    constrained: tuple[Any, ...]
     velocity: FloatArray
     external: Any
     stretch: int
@@ -62,7 +62,7 @@ def recorded_push(
     engine: LatticeEngine,
     state: LatticeState,
     observed: ArrayLike,
-    held: HeldNodes,
+    constrained: ConstrainedNodes,
     velocity: ArrayLike,
     external_force: ArrayLike | None = None,
 ) -> RecordedPush:
@@ -76,7 +76,7 @@ def recorded_push(
         Where the steps begin.
     observed : array_like, shape (k,)
         Numbers of steps after which positions are wanted, growing.
-    held : HeldNodes
+    constrained : ConstrainedNodes
         Masses that bodies move.
     velocity : array_like, shape (steps, bodies, 3)
         Of the bodies, mm/s.
@@ -95,12 +95,12 @@ def recorded_push(
     given = np.asarray(velocity, dtype=float)
     if given.ndim != 3:
         raise InputError(f"velocities must have shape (steps, bodies, 3), not {given.shape}")
-    path = checked_velocity(given, len(given), int(held.body.max(initial=-1)) + 1)
+    path = checked_velocity(given, len(given), int(constrained.body.max(initial=-1)) + 1)
     steps = len(path)
     times = np.atleast_1d(np.asarray(observed, dtype=np.int64))
     if len(times) and (times.min() < 0 or times.max() > steps or (np.diff(times) <= 0).any()):
         raise InputError(f"observations must grow and lie within 0 to {steps} steps, and are {times.tolist()}")
-    require_held(held, engine.lattice.n_nodes)
+    require_constrained(constrained, engine.lattice.n_nodes)
     external = aligned((0,), float)
     if external_force is not None:
         force = np.broadcast_to(np.asarray(external_force, dtype=float), engine.lattice.points.shape)
@@ -110,7 +110,7 @@ def recorded_push(
     count = -(-steps // stretch)
     x, v, y = engine.stored(state)
     kept = (np.empty((count, len(x))), np.empty((count, len(v))), np.empty((count, len(y))))
-    entries = (held.node, held.direction, held.weight, held.body)
+    entries = (constrained.node, constrained.direction, constrained.weight, constrained.body)
     seen, reaction = np.zeros((len(times), len(x))), np.zeros(path.shape)
     blocks, tables, masses, _ = engine.kernel
     _record(
@@ -206,7 +206,7 @@ def push_gradient(
     adjoint = tuple(aligned((size,), float) for size in (3 * pad, 3 * pad, WIDTH * blocks.n_blocks))
     masses = engine.kernel[2]
     _backward(
-        (blocks.first, blocks.second, rows), tuple(tables[:4]), masses, push.external, push.held, push.velocity, engine.step,
+        (blocks.first, blocks.second, rows), tuple(tables[:4]), masses, push.external, push.constrained, push.velocity, engine.step,
         engine.method == "euler", push.observed, push.stretch, push.kept, marks.reshape(len(marks), -1), forces, adjoint, sums,
     )  # fmt: skip
     count = int(labels.max()) + 1
@@ -238,19 +238,19 @@ def _by_parameter(
 
 
 @njit(cache=True, fastmath=_FAST)
-def _step(blocks, tables, x, v, y, f, masses, external, held, velocity, step, forward, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _step(blocks, tables, x, v, y, f, masses, external, constrained, velocity, step, forward, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
     first, second, rows = blocks
     mass, inverse_mass = masses
     pad = len(mass)
     for i in range(len(f)):
         f[i] = external[i] if len(external) else 0.0
     element_forces(first, second, rows, tables, x, v, y, f, pad, 0, len(first))
-    drive(held, velocity, v, f, mass, step, reaction)
+    drive(constrained, velocity, v, f, mass, step, reaction)
     move(x, v, f, inverse_mass, step, forward, pad, 0, pad - WIDTH)
 
 
 @njit(cache=True)
-def _record(blocks, tables, x, v, y, masses, external, held, velocity, step, forward, observed, stretch, kept, seen, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _record(blocks, tables, x, v, y, masses, external, constrained, velocity, step, forward, observed, stretch, kept, seen, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Run steps; keep the states at the beginning of every stretch and the positions at observed times."""
     f = np.zeros_like(x)
     at = 0
@@ -262,11 +262,13 @@ def _record(blocks, tables, x, v, y, masses, external, held, velocity, step, for
             return
         if n % stretch == 0:
             kept[0][n // stretch], kept[1][n // stretch], kept[2][n // stretch] = x, v, y
-        _step(blocks, tables, x, v, y, f, masses, external, held, velocity[n], step, forward, reaction[n])
+        _step(blocks, tables, x, v, y, f, masses, external, constrained, velocity[n], step, forward, reaction[n])
 
 
 @njit(cache=True)
-def _backward(blocks, tables, masses, external, held, velocity, step, forward, observed, stretch, kept, marks, forces, adjoint, sums):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _backward(  # type: ignore[no-untyped-def]  # pragma: no cover
+    blocks, tables, masses, external, constrained, velocity, step, forward, observed, stretch, kept, marks, forces, adjoint, sums
+):
     """Go backwards through all steps; `adjoint` are the derivatives with respect to x, v, y and become those of the start."""
     steps = len(velocity)
     places, lanes = kept[0].shape[1], kept[2].shape[1]
@@ -280,24 +282,24 @@ def _backward(blocks, tables, masses, external, held, velocity, step, forward, o
         for n in range(begin, end):
             xs[n - begin], vs[n - begin], ys[n - begin] = x, v, y
             if n + 1 < end:
-                _step(blocks, tables, x, v, y, f, masses, external, held, velocity[n], step, forward, unused)
+                _step(blocks, tables, x, v, y, f, masses, external, constrained, velocity[n], step, forward, unused)
         for n in range(end - 1, begin - 1, -1):
             if at >= 0 and observed[at] == n + 1:
                 adjoint[0][:] += marks[at]
                 at -= 1
             k = n - begin
-            _masses_back(masses, held, step, forward, forces[n], adjoint[0], adjoint[1], f)
+            _masses_back(masses, constrained, step, forward, forces[n], adjoint[0], adjoint[1], f)
             _elements_back(blocks, tables, xs[k], vs[k], ys[k], f, adjoint, sums)
     if at >= 0 and observed[at] == 0:
         adjoint[0][:] += marks[at]
 
 
 @njit(cache=True, fastmath=_FAST)
-def _masses_back(masses, held, step, forward, forces, ax, av, f):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _masses_back(masses, constrained, step, forward, forces, ax, av, f):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Take the derivatives ax, av after the motion of the masses to those before it, and set f to those with respect to forces."""
     mass, inverse_mass = masses
     pad = len(mass)
-    node, direction, _, body = held
+    node, direction, _, body = constrained
     for axis in range(3):
         for i in range(pad):
             c = axis * pad + i

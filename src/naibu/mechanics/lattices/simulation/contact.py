@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.errors import InputError
-from naibu.mechanics.contact.rigid_indenters import KINDS, Pusher
+from naibu.mechanics.contact.rigid_indenters import KINDS, RigidIndenter
 from naibu.mechanics.lattices.cpu._simd import aligned
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import Lattice
-from naibu.mechanics.lattices.model.state import HeldNodes, LatticeState, checked_velocity, require_numbers
+from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState, checked_velocity, require_numbers
 from naibu.mechanics.lattices.simulation._contact_kernels import PASSES, contact_steps
 
 SNAP = 0.25  # a point nearer to a line of masses than this share of the spacing stands on it (equation 5 of the ICAT 2007 paper)
@@ -77,7 +77,7 @@ class ContactMotion:
 
 
 def begin_contact(
-    lattice: Lattice, pushers: Sequence[Pusher], state: LatticeState | None = None, nodes: ArrayLike | None = None
+    lattice: Lattice, indenters: Sequence[RigidIndenter], state: LatticeState | None = None, nodes: ArrayLike | None = None
 ) -> ContactState:
     """Return the contact of a lattice with bodies before anything moved: masses on a body's surface stick to it, the others are free.
 
@@ -85,7 +85,7 @@ def begin_contact(
     ----------
     lattice : Lattice
         Masses and elements.
-    pushers : sequence of Pusher
+    indenters : sequence of Indenter
         Bodies, floors included.
     state : LatticeState
         Where the masses are; at rest by default.
@@ -97,32 +97,32 @@ def begin_contact(
     InputError
         No body, or one that begins inside the object.
     """
-    if not pushers:
+    if not indenters:
         raise InputError("there is no body to push with; give at least a floor")
     if nodes is None:
         chosen = np.flatnonzero(lattice.surface_node) if lattice.surface_node.any() else np.arange(lattice.n_nodes)
     else:
         chosen = np.asarray(nodes, dtype=np.int64)
     points = lattice.points if state is None else state.position
-    gaps = np.stack([pusher.gap(points[chosen]) for pusher in pushers], axis=1)
+    gaps = np.stack([indenter.gap(points[chosen]) for indenter in indenters], axis=1)
     middles = points[lattice.elements].mean(axis=1)  # a small body may lie between the masses
-    for k, pusher in enumerate(pushers):
-        inside = np.append(gaps[:, k], pusher.gap(middles))
+    for k, indenter in enumerate(indenters):
+        inside = np.append(gaps[:, k], indenter.gap(middles))
         if inside.min() < -_TOUCH_MM:
             at = np.concatenate([points[chosen], middles])[int(np.argmin(inside))]
             raise InputError(
-                f"body {k}, a {KINDS[pusher.kind]}, begins inside the object: ({at[0]:.4g}, {at[1]:.4g}, {at[2]:.4g}) mm lies "
+                f"body {k}, a {KINDS[indenter.kind]}, begins inside the object: ({at[0]:.4g}, {at[1]:.4g}, {at[2]:.4g}) mm lies "
                 f"{-inside.min():.4g} mm deep in it; move it back by that"
             )
-    mode = np.where(gaps < _TOUCH_MM, [2 if p.static_friction == 0.0 else 1 for p in pushers], 0).astype(np.int64)
-    shape = (len(chosen), len(pushers))
-    return ContactState(chosen, mode, np.zeros((*shape, 3)), mode > 0, np.array([p.centre for p in pushers], dtype=float))
+    mode = np.where(gaps < _TOUCH_MM, [2 if p.static_friction == 0.0 else 1 for p in indenters], 0).astype(np.int64)
+    shape = (len(chosen), len(indenters))
+    return ContactState(chosen, mode, np.zeros((*shape, 3)), mode > 0, np.array([p.centre for p in indenters], dtype=float))
 
 
 def push(
     engine: LatticeEngine,
     state: LatticeState,
-    pushers: Sequence[Pusher],
+    indenters: Sequence[RigidIndenter],
     velocity: ArrayLike,
     *,
     steps: int | None = None,
@@ -143,7 +143,7 @@ def push(
         Of the implicit method.
     state : LatticeState
         Where the steps begin.
-    pushers : sequence of Pusher
+    indenters : sequence of Indenter
         Bodies; a floor is a plane that does not move.
     velocity : array_like, shape (steps, bodies, 3)
         mm/s; or what broadcasts to that where `steps` is given.
@@ -166,12 +166,12 @@ def push(
     if passes < 1:
         raise InputError(f"a step needs at least one pass, not {passes}")
     count = len(np.asarray(velocity)) if steps is None else steps
-    path = checked_velocity(velocity, count, len(pushers))
-    if path.shape[1] != len(pushers):
-        raise InputError(f"there are velocities for {path.shape[1]} bodies, and {len(pushers)} bodies")
-    known = contact or begin_contact(engine.lattice, pushers, state)
-    if known.mode.shape[1] != len(pushers):
-        raise InputError(f"the contact is that of {known.mode.shape[1]} bodies, and there are {len(pushers)}")
+    path = checked_velocity(velocity, count, len(indenters))
+    if path.shape[1] != len(indenters):
+        raise InputError(f"there are velocities for {path.shape[1]} bodies, and {len(indenters)} bodies")
+    known = contact or begin_contact(engine.lattice, indenters, state)
+    if known.mode.shape[1] != len(indenters):
+        raise InputError(f"the contact is that of {known.mode.shape[1]} bodies, and there are {len(indenters)}")
     x, v, y = engine.stored(state)
     lengths = engine.stored_lengths(state)
     external = aligned((0,), float)
@@ -183,7 +183,7 @@ def push(
     places = known.places.copy()
     reaction = np.zeros(path.shape)
     blocks, tables, work, inner = engine.kernel
-    bodies = _stored_bodies(pushers, places, known.nodes)
+    bodies = _stored_bodies(indenters, places, known.nodes)
     limit = (passes, SLOW * engine.lattice.spacing_mm / engine.step)
     _, tries, unsettled = contact_steps(
         blocks, tables, x, v, y, lengths, engine.mass, external, work, inner, bodies, memory, path, engine.step, (engine.tolerance, 20_000),
@@ -193,23 +193,23 @@ def push(
     return ContactMotion(end, ContactState(known.nodes, *memory, places), reaction, path, tries / max(count, 1), int(unsettled))
 
 
-def _stored_bodies(pushers: Sequence[Pusher], places: FloatArray, nodes: IntArray) -> tuple[Any, ...]:
-    kinds = np.array([p.kind for p in pushers], dtype=np.int64)
-    shapes = (kinds, np.array([p.axes for p in pushers], dtype=float), np.array([p.size for p in pushers], dtype=float))
-    friction = np.array([(p.static_friction, p.kinetic_friction) for p in pushers])
-    pull = np.array([(p.pull_stiffness, p.pull_damping, p.pull_speed) for p in pushers])
+def _stored_bodies(indenters: Sequence[RigidIndenter], places: FloatArray, nodes: IntArray) -> tuple[Any, ...]:
+    kinds = np.array([p.kind for p in indenters], dtype=np.int64)
+    shapes = (kinds, np.array([p.axes for p in indenters], dtype=float), np.array([p.size for p in indenters], dtype=float))
+    friction = np.array([(p.static_friction, p.kinetic_friction) for p in indenters])
+    pull = np.array([(p.pull_stiffness, p.pull_damping, p.pull_speed) for p in indenters])
     return shapes, places, friction, pull, nodes
 
 
 def push_by_force(
     engine: LatticeEngine,
     state: LatticeState,
-    pushers: Sequence[Pusher],
+    indenters: Sequence[RigidIndenter],
     force: ArrayLike,
     *,
     driven: int,
     direction: ArrayLike,
-    pusher_mass: float,
+    indenter_mass: float,
     speed: float = 0.0,
     contact: ContactState | None = None,
     external_force: ArrayLike | None = None,
@@ -219,7 +219,7 @@ def push_by_force(
 
     Parameters
     ----------
-    engine, state, pushers, contact, external_force
+    engine, state, indenters, contact, external_force
         As in `push`.
     force : array_like, shape (steps,)
         Along `direction`, mN.
@@ -227,7 +227,7 @@ def push_by_force(
         Number of the body that the force drives; the others stay where they are.
     direction : array_like, shape (3,)
         In which it is guided.
-    pusher_mass : float
+    indenter_mass : float
         kg.
     speed : float
         At the start, mm/s.
@@ -244,19 +244,19 @@ def push_by_force(
     require_numbers(forces, "force")
     if not (np.isfinite(along).all() and np.linalg.norm(along) > 0.0):
         raise InputError("the direction of the driven body must have a length")
-    if not 0 <= driven < len(pushers):
-        raise InputError(f"body {driven} is not among the {len(pushers)} bodies")
-    if not (np.isfinite(pusher_mass) and pusher_mass > 0.0):
-        raise InputError(f"the mass of the driven body must be positive, not {pusher_mass:g} kg")
+    if not 0 <= driven < len(indenters):
+        raise InputError(f"body {driven} is not among the {len(indenters)} bodies")
+    if not (np.isfinite(indenter_mass) and indenter_mass > 0.0):
+        raise InputError(f"the mass of the driven body must be positive, not {indenter_mass:g} kg")
     along /= np.linalg.norm(along)
-    known = contact or begin_contact(engine.lattice, pushers, state)
-    allowed, inertia = tolerance * max(float(np.abs(forces).max()), 1e-300), pusher_mass / engine.step
+    known = contact or begin_contact(engine.lattice, indenters, state)
+    allowed, inertia = tolerance * max(float(np.abs(forces).max()), 1e-300), indenter_mass / engine.step
     slope, reactions, speeds, tries, unsettled = inertia, [], [], 0.0, 0
 
     def tried(value: float) -> tuple[ContactMotion, float]:
-        path = np.zeros((1, len(pushers), 3))
+        path = np.zeros((1, len(indenters), 3))
         path[0, driven] = value * along
-        motion = push(engine, state, pushers, path, contact=known, external_force=external_force)
+        motion = push(engine, state, indenters, path, contact=known, external_force=external_force)
         return motion, float(motion.reaction[0, driven] @ along)
 
     for applied in forces:
@@ -329,7 +329,9 @@ def hand_over(lattice: Lattice, face: str, points: ArrayLike, *, snap: float = S
     return np.where(corners < 0, 0, corners), np.where(corners < 0, 0.0, weights)
 
 
-def displacement_drive(lattice: Lattice, face: str, points: ArrayLike, body: int = 0, *, axes: Sequence[int] = (0, 1, 2)) -> HeldNodes:
+def displacement_drive(
+    lattice: Lattice, face: str, points: ArrayLike, body: int = 0, *, axes: Sequence[int] = (0, 1, 2)
+) -> ConstrainedNodes:
     """Return how masses move when the points of a rigid body hand their displacement over to them (spec L4).
 
     A mass takes on the share of the displacement that the weights of all points add up to, at most all of it.
@@ -351,7 +353,7 @@ def displacement_drive(lattice: Lattice, face: str, points: ArrayLike, body: int
     corners, weights = hand_over(lattice, face, points)
     total = np.bincount(corners.ravel(), weights.ravel(), minlength=lattice.n_nodes)
     nodes = np.flatnonzero(total > 0.0)
-    return HeldNodes.of(nodes, body, axes=axes, weight=np.minimum(total[nodes], 1.0))
+    return ConstrainedNodes.of(nodes, body, axes=axes, weight=np.minimum(total[nodes], 1.0))
 
 
 def force_drive(lattice: Lattice, face: str, points: ArrayLike, force: ArrayLike) -> FloatArray:

@@ -10,10 +10,10 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
-from naibu.mechanics.contact.rigid_indenters import Pusher
+from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
-from naibu.mechanics.lattices.model.state import HeldNodes, LatticeState, Method
+from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState, Method
 from naibu.mechanics.lattices.simulation.contact import ContactState, begin_contact, push, push_by_force
 
 _TOUCH_MM = 1e-6
@@ -47,22 +47,22 @@ class StudyBody:
     ----------
     name : str
         For tables and messages.
-    pusher : Pusher
+    indenter : Indenter
         Shape, place at the start, friction and pull-off.
     times, offset : ndarray, shape (k,) and (k, 3)
         Displacement of the body, mm, linear between the times, s, and constant behind the last one.
     drive : Drive, optional
         Force that moves it instead; one body of a study at most, and the others then stand still.
-    glued_until_s : float, optional
+    tied_until_s : float, optional
         Masses that touch it at the start move with it until then, s, and are free of it afterwards; infinite for ever. None for contact.
     """
 
     name: str
-    pusher: Pusher
+    indenter: RigidIndenter
     times: FloatArray
     offset: FloatArray
     drive: Drive | None = None
-    glued_until_s: float | None = None
+    tied_until_s: float | None = None
 
     def moved(self, times: FloatArray) -> FloatArray:
         """Return the displacement (k, 3), mm, at times (k,), s."""
@@ -78,7 +78,7 @@ class LatticeStudy:
     lattice, parameters : Lattice, LatticeParameters
         The object.
     bodies : tuple of StudyBody
-        Either all glued, or all in contact.
+        Either all tied, or all in contact.
     step_s : float
         s.
     frames : int
@@ -117,9 +117,9 @@ class LatticeStudy:
         return self.samples * self.sample_s
 
     @property
-    def glued(self) -> bool:
-        """Whether masses are glued to the bodies, rather than in contact with them."""
-        return any(body.glued_until_s is not None for body in self.bodies) or not self.bodies
+    def tied(self) -> bool:
+        """Whether masses are tied to the bodies, rather than in contact with them."""
+        return any(body.tied_until_s is not None for body in self.bodies) or not self.bodies
 
     @property
     def driven(self) -> int | None:
@@ -190,8 +190,8 @@ class StudyFrame:
     force: FloatArray
 
 
-def glued_nodes(lattice: Lattice, bodies: tuple[StudyBody, ...]) -> tuple[IntArray, ...]:
-    """Return the masses that are glued to every body: those on its surface at the start, and on no earlier body's.
+def tied_nodes(lattice: Lattice, bodies: tuple[StudyBody, ...]) -> tuple[IntArray, ...]:
+    """Return the masses that are tied to every body: those on its surface at the start, and on no earlier body's.
 
     Raises
     ------
@@ -201,12 +201,12 @@ def glued_nodes(lattice: Lattice, bodies: tuple[StudyBody, ...]) -> tuple[IntArr
     free = np.ones(lattice.n_nodes, dtype=bool)
     found = []
     for body in bodies:
-        begin_contact(lattice, [body.pusher])
-        touched = np.abs(body.pusher.gap(lattice.points)) < _TOUCH_MM
+        begin_contact(lattice, [body.indenter])
+        touched = np.abs(body.indenter.gap(lattice.points)) < _TOUCH_MM
         if not touched.any():
-            nearest = float(body.pusher.gap(lattice.points).min())
+            nearest = float(body.indenter.gap(lattice.points).min())
             raise InputError(
-                f"{body.name} touches no mass, the nearest is {nearest:.4g} mm away: a body can be glued to what it touches at the start"
+                f"{body.name} touches no mass, the nearest is {nearest:.4g} mm away: a body can be tied to what it touches at the start"
             )
         found.append(np.flatnonzero(touched & free))
         free &= ~touched
@@ -219,24 +219,24 @@ def check_study(study: LatticeStudy) -> None:
     Raises
     ------
     InputError
-        Bodies both glued and in contact, contact by an explicit method, several driven bodies, or other bodies that move beside a driven
-        one; bodies that start inside the object, or are glued to nothing.
+        Bodies both tied and in contact, contact by an explicit method, several driven bodies, or other bodies that move beside a driven
+        one; bodies that start inside the object, or are tied to nothing.
     """
-    if study.glued:
-        loose = [body.name for body in study.bodies if body.glued_until_s is None]
+    if study.tied:
+        loose = [body.name for body in study.bodies if body.tied_until_s is None]
         if loose:
-            raise InputError(f"{', '.join(loose)} cannot be in contact while other bodies are glued: glue all, or none")
-        glued_nodes(study.lattice, study.bodies)
+            raise InputError(f"{', '.join(loose)} cannot be in contact while other bodies are tied: tie all, or none")
+        tied_nodes(study.lattice, study.bodies)
         return
     if study.method != "implicit":
-        raise InputError(f"contact with friction needs method 'implicit', not {study.method!r}; or glue the bodies")
+        raise InputError(f"contact with friction needs method 'implicit', not {study.method!r}; or tie the bodies")
     driven = [body for body in study.bodies if body.drive is not None]
     if len(driven) > 1:
         raise InputError(f"{', '.join(b.name for b in driven)} are all driven by forces; one can be")
     moving = [body.name for body in study.bodies if body.drive is None and np.abs(body.offset).max(initial=0.0) > 0.0]
     if driven and moving:
         raise InputError(f"{', '.join(moving)} cannot move while {driven[0].name} is driven by a force")
-    begin_contact(study.lattice, [body.pusher for body in study.bodies])
+    begin_contact(study.lattice, [body.indenter for body in study.bodies])
 
 
 def begin_study(study: LatticeStudy) -> StudyState:
@@ -248,11 +248,11 @@ def begin_study(study: LatticeStudy) -> StudyState:
         What `check_study` refuses.
     """
     check_study(study)
-    pushers = [body.pusher for body in study.bodies]
+    indenters = [body.indenter for body in study.bodies]
     state = LatticeState(study.lattice.points.copy(), np.zeros_like(study.lattice.points), np.zeros(study.lattice.n_elements))
-    contact = None if study.glued else begin_contact(study.lattice, pushers)
-    places = np.array([p.centre for p in pushers], dtype=float).reshape(-1, 3)
-    return StudyState(0, state, contact, 0.0, places, np.zeros(len(pushers)), 0.0, 0)
+    contact = None if study.tied else begin_contact(study.lattice, indenters)
+    places = np.array([p.centre for p in indenters], dtype=float).reshape(-1, 3)
+    return StudyState(0, state, contact, 0.0, places, np.zeros(len(indenters)), 0.0, 0)
 
 
 def run_study(study: LatticeStudy, start: StudyState | None = None) -> Iterator[StudyFrame]:
@@ -278,7 +278,7 @@ def run_study(study: LatticeStudy, start: StudyState | None = None) -> Iterator[
     if state is None:
         state = begin_study(study)
         yield _frame(study, engine, state, np.zeros((0, len(study.bodies), 3)))
-    advance = _Glued.of(study, engine).advance if study.glued else _Touching(study, engine).advance
+    advance = _Tied.of(study, engine).advance if study.tied else _Touching(study, engine).advance
     while state.frame < study.frames:
         forces = []
         for sample in range(study.samples):
@@ -307,21 +307,21 @@ def _external_work(study: LatticeStudy, before: LatticeState, after: LatticeStat
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Glued:
+class _Tied:
     """Steps of masses that bodies hold."""
 
     study: LatticeStudy
     engine: LatticeEngine
-    held: tuple[HeldNodes, ...]
+    constrained: tuple[ConstrainedNodes, ...]
     until: IntArray
 
     @classmethod
-    def of(cls, study: LatticeStudy, engine: LatticeEngine) -> _Glued:
-        nodes = glued_nodes(study.lattice, study.bodies)
-        ends = [body.glued_until_s for body in study.bodies]
+    def of(cls, study: LatticeStudy, engine: LatticeEngine) -> _Tied:
+        nodes = tied_nodes(study.lattice, study.bodies)
+        ends = [body.tied_until_s for body in study.bodies]
         never = np.iinfo(np.int64).max
         until = np.array([never if end is None or np.isinf(end) else round(end / study.step_s) for end in ends], dtype=np.int64)
-        return cls(study, engine, tuple(HeldNodes.of(mine, k) for k, mine in enumerate(nodes)), until)
+        return cls(study, engine, tuple(ConstrainedNodes.of(mine, k) for k, mine in enumerate(nodes)), until)
 
     def advance(self, state: StudyState, first: int) -> tuple[StudyState, FloatArray]:
         """Take the steps of a sample, in pieces between which bodies let go."""
@@ -331,15 +331,15 @@ class _Glued:
         lattice, work, impulse = state.lattice, state.work.copy(), np.zeros((bodies, 3))
         path = _velocities(study, first) if bodies else np.zeros((study.sample_steps, 0, 3))
         for begin, end in pairwise(stops):
-            held = HeldNodes.none()
-            for mine, until in zip(self.held, self.until, strict=True):
-                held = held + mine if until > begin else held
+            constrained = ConstrainedNodes.none()
+            for mine, until in zip(self.constrained, self.until, strict=True):
+                constrained = constrained + mine if until > begin else constrained
             own = path[begin - first : end - first]
-            motion = self.engine.run(lattice, end - begin, held, own, study.external_force)
+            motion = self.engine.run(lattice, end - begin, constrained, own, study.external_force)
             lattice = motion.state
             work += study.step_s * (motion.reaction * own).sum(axis=(0, 2))
             impulse += study.step_s * motion.reaction.sum(axis=0)
-        moved = [body.moved(np.array([study.step_s * last]))[0] + body.pusher.centre for body in study.bodies]
+        moved = [body.moved(np.array([study.step_s * last]))[0] + body.indenter.centre for body in study.bodies]
         external = state.external_work + _external_work(study, state.lattice, lattice)
         places = np.array(moved).reshape(-1, 3)
         return StudyState(state.frame, lattice, None, 0.0, places, work, external, 0), impulse / study.sample_s
@@ -355,11 +355,11 @@ class _Touching:
     def advance(self, state: StudyState, first: int) -> tuple[StudyState, FloatArray]:
         """Take the steps of a sample."""
         study, driven = self.study, self.study.driven
-        pushers = [body.pusher for body in study.bodies]
+        indenters = [body.indenter for body in study.bodies]
         speed = state.speed
         if driven is None:
             motion = push(
-                self.engine, state.lattice, pushers, _velocities(study, first), contact=state.contact, external_force=study.external_force
+                self.engine, state.lattice, indenters, _velocities(study, first), contact=state.contact, external_force=study.external_force
             )
         else:
             drive = study.bodies[driven].drive
@@ -367,8 +367,8 @@ class _Touching:
             ends = study.step_s * np.arange(first + 1, first + study.sample_steps + 1)
             direction = drive.direction / np.linalg.norm(drive.direction)
             motion = push_by_force(
-                self.engine, state.lattice, pushers, np.interp(ends, drive.times, drive.force), driven=driven, direction=direction,
-                pusher_mass=drive.mass_kg, speed=speed, contact=state.contact, external_force=study.external_force,
+                self.engine, state.lattice, indenters, np.interp(ends, drive.times, drive.force), driven=driven, direction=direction,
+                indenter_mass=drive.mass_kg, speed=speed, contact=state.contact, external_force=study.external_force,
             )  # fmt: skip
             speed = float(motion.speed[-1, driven] @ direction)
         work = state.work + study.step_s * (motion.reaction * motion.speed).sum(axis=(0, 2))

@@ -15,7 +15,7 @@ from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.cpu.stepper import Stepper
-from naibu.mechanics.lattices.model.state import HeldNodes, LatticeState, checked_velocity, require_held
+from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState, checked_velocity, require_constrained
 
 CHECK_EVERY = 200  # explicit steps between two looks whether they blew up
 
@@ -36,7 +36,7 @@ class LatticeSession:
     ----------
     engine : LatticeEngine
         Lattice, parameters, step and method.
-    held : HeldNodes
+    constrained : ConstrainedNodes
         What bodies hold.
     bodies : int
         Number of bodies.
@@ -51,12 +51,12 @@ class LatticeSession:
     """
 
     engine: LatticeEngine
-    held: HeldNodes
+    constrained: ConstrainedNodes
     bodies: int
     stepper: Stepper
     steps: int = 0
     iterations: int = 0
-    held_back: int = 0
+    rotation_limited: int = 0
     clock: Callable[[], float] = perf_counter
     _began: float = 0.0
     _ended: float = 0.0
@@ -69,7 +69,7 @@ class LatticeSession:
         cls,
         engine: LatticeEngine,
         state: LatticeState | None = None,
-        held: HeldNodes | None = None,
+        constrained: ConstrainedNodes | None = None,
         external_force: ArrayLike | None = None,
     ) -> LatticeSession:
         """Begin where a state is, by default at rest, and compile what the steps need.
@@ -80,8 +80,8 @@ class LatticeSession:
             Of any method.
         state : LatticeState
             Where it begins; copied.
-        held : HeldNodes
-            Masses that bodies move; see `hold`.
+        constrained : ConstrainedNodes
+            Masses that bodies move; see `constrain`.
         external_force : array_like
             Forces on the masses that do not change, mN, broadcast to (n, 3).
 
@@ -91,17 +91,17 @@ class LatticeSession:
             Shapes that do not fit, NaN, or held masses that are not there or held twice.
         """
         stepper = engine.stepper(state or engine.rest(), external_force, shared=False)
-        session = cls(engine, HeldNodes.none(), 0, stepper)
+        session = cls(engine, ConstrainedNodes.none(), 0, stepper)
         finalize(session, stepper.close)
-        session.hold(held or HeldNodes.none())
+        session.constrain(constrained or ConstrainedNodes.none())
         return session
 
-    def hold(self, held: HeldNodes, bodies: int = 0) -> None:
+    def constrain(self, constrained: ConstrainedNodes, bodies: int = 0) -> None:
         """Hold these masses, and no others, from the next step on.
 
         Parameters
         ----------
-        held : HeldNodes
+        constrained : ConstrainedNodes
             Masses that bodies move.
         bodies : int
             Number of bodies, if some hold nothing at present.
@@ -111,11 +111,11 @@ class LatticeSession:
         InputError
             Masses that are not there, or held twice in directions that are not orthogonal; what was held before is then held still.
         """
-        require_held(held, self.engine.lattice.n_nodes)
-        self.bodies = max(int(held.body.max(initial=-1)) + 1, bodies)
-        self.held = held
+        require_constrained(constrained, self.engine.lattice.n_nodes)
+        self.bodies = max(int(constrained.body.max(initial=-1)) + 1, bodies)
+        self.constrained = constrained
         self._path = self._reaction = np.zeros((0, self.bodies, 3))
-        self.stepper.hold((held.node, held.direction, held.weight, held.body), self.bodies)
+        self.stepper.constrain((constrained.node, constrained.direction, constrained.weight, constrained.body), self.bodies)
         self.stepper.advance(self._path, self._reaction)  # compiles what is to run, and builds what belongs to these masses
 
     def advance(self, velocity: ArrayLike = 0.0, steps: int = 1) -> FloatArray:
@@ -153,11 +153,11 @@ class LatticeSession:
         now = self.clock()
         idle = now - self._ended > self._ended - self._began
         self._began = now
-        iterations, held_back = self.stepper.advance(self._path, self._reaction, alone=idle)
+        iterations, rotation_limited = self.stepper.advance(self._path, self._reaction, alone=idle)
         self._ended = self.clock()
         self.steps += steps
         self.iterations += iterations
-        self.held_back += held_back
+        self.rotation_limited += rotation_limited
         self._unchecked += steps
         if self._unchecked >= CHECK_EVERY:
             self._check()

@@ -18,13 +18,13 @@ from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.mechanics.lattices.cpu._coarse_kernels import begin_with
-from naibu.mechanics.lattices.cpu._implicit_kernels import add_momenta, add_reactions, advance, hold, new_velocity
+from naibu.mechanics.lattices.cpu._implicit_kernels import add_momenta, add_reactions, advance, constrain, new_velocity
 from naibu.mechanics.lattices.cpu._pcg_kernels import multiply, solve
 from naibu.mechanics.lattices.cpu._simd import WIDTH, aligned, inverse_root, load, splat, store
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.coefficients import implicit_coefficients
 from naibu.mechanics.lattices.model.lattice import LatticeParameters
-from naibu.mechanics.lattices.model.state import HeldNodes, LatticeState, checked_velocity, require_held, require_numbers
+from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState, checked_velocity, require_constrained, require_numbers
 
 _FAST = {"contract", "nsz"}
 _STEP = 1e-5  # share of a parameter, for the central differences of the coefficients of a step
@@ -105,7 +105,7 @@ def driven_steps(
     engine: LatticeEngine,
     state: LatticeState,
     steps: int,
-    held: HeldNodes,
+    constrained: ConstrainedNodes,
     velocity: ArrayLike,
     *,
     loads: Loads | None = None,
@@ -124,7 +124,7 @@ def driven_steps(
         Where the steps begin; unchanged.
     steps : int
         How many.
-    held : HeldNodes
+    constrained : ConstrainedNodes
         Masses that bodies move.
     velocity : array_like
         Velocities of the bodies, mm/s, broadcast to (steps, bodies, 3).
@@ -153,9 +153,9 @@ def driven_steps(
         raise InputError(
             f"the state has derivatives along {len(start.position)} directions, and there are {len(changes)} changes of parameters"
         )
-    bodies = int(max(held.body.max(initial=-1), loads.body.max(initial=-1))) + 1
+    bodies = int(max(constrained.body.max(initial=-1), loads.body.max(initial=-1))) + 1
     path, pushed = checked_velocity(velocity, steps, bodies), checked_velocity(force, steps, bodies)
-    require_held(held, engine.lattice.n_nodes)
+    require_constrained(constrained, engine.lattice.n_nodes)
     x, v, y = engine.stored(state)
     lengths = engine.stored_lengths(state)
     tangents = _stored_change(engine, start)
@@ -164,7 +164,7 @@ def driven_steps(
     reaction, reaction_change = np.zeros(path.shape), np.zeros((len(changes), *path.shape))
     _driven_steps(
         blocks, own, rows, tables, (x, v, y, lengths), tangents, engine.mass, (loads.node, loads.share, loads.body), pushed, work, inner,
-        (held.node, held.direction, held.weight, held.body), path, engine.step,
+        (constrained.node, constrained.direction, constrained.weight, constrained.body), path, engine.step,
         (engine.tolerance, engine.tolerance if tolerance is None else tolerance, 20_000), reaction, reaction_change,
     )  # fmt: skip
     after = _read_change(engine, tangents)
@@ -288,7 +288,7 @@ def _driven_steps(  # type: ignore[no-untyped-def]  # pragma: no cover
     force,
     work,
     inner,
-    held,
+    constrained,
     velocity,
     step,
     solver,
@@ -302,9 +302,13 @@ def _driven_steps(  # type: ignore[no-untyped-def]  # pragma: no cover
     axes, r, aside, q = work
     node, share, body = loads
     own = (tables[1], tables[2], tables[3], tables[5])
-    held_node, direction, weight, held_by = held
-    speed, weightless = np.zeros(len(held_node)), np.zeros_like(force[0])
-    now, still, pad = (held_node, direction, speed, held_by), (held_node, direction, np.zeros(len(held_node)), held_by), len(mass)
+    constrained_node, direction, weight, constrained_by = constrained
+    speed, weightless = np.zeros(len(constrained_node)), np.zeros_like(force[0])
+    now, still, pad = (
+        (constrained_node, direction, speed, constrained_by),
+        (constrained_node, direction, np.zeros(len(constrained_node)), constrained_by),
+        len(mass),
+    )
     right, before, old_lengths = np.zeros_like(x), np.zeros_like(x), np.zeros_like(lengths)
     begin_with(inner, now)
     for n in range(len(velocity)):
@@ -314,8 +318,8 @@ def _driven_steps(  # type: ignore[no-untyped-def]  # pragma: no cover
             for a in range(3):
                 right[a * pad + node[k]] += step * share[k] * force[n, body[k], a]
         add_momenta(mass, v, 1.0, right)
-        for h in range(len(held_node)):
-            speed[h] = weight[h] * (direction[h] * velocity[n, held_by[h]]).sum()
+        for h in range(len(constrained_node)):
+            speed[h] = weight[h] * (direction[h] * velocity[n, constrained_by[h]]).sum()
         _, lost = new_velocity(blocks, tables, x, v, y, mass, right, work, inner, now, step, (solver[0], solver[2]))
         add_reactions(now, r, pad, step, reaction[n])
         _answer(loads, force[n], v, before, mass, step, reaction[n])
@@ -323,7 +327,7 @@ def _driven_steps(  # type: ignore[no-untyped-def]  # pragma: no cover
             right[:] = 0
             add_momenta(mass, vd[p], 1.0, right)
             _changed_impulse(first, second, rows, own, changed, changes[p], axes, x, v, y, xd[p], yd[p], right, step)
-            hold(still, vd[p], pad)
+            constrain(still, vd[p], pad)
             old = vd[p].copy()
             multiply(first, second, rows, tables[5], axes, mass, vd[p], q)
             r[:] = right - q
