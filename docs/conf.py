@@ -16,7 +16,19 @@ author = "The naibu developers"
 copyright = author
 release = version = naibu.__version__
 
-extensions = ["sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.viewcode", "numpydoc", "sphinx_gallery.gen_gallery", "naibu_help"]
+extensions = [
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.viewcode",
+    "sphinx.ext.mathjax",
+    "numpydoc",
+    "sphinx_gallery.gen_gallery",
+    "sphinxcontrib.bibtex",
+    "naibu_help",
+]
+bibtex_bibfiles = sorted(str(path.relative_to(Path(__file__).parent)) for path in Path(__file__).parent.glob("references/*.bib"))
+bibtex_reference_style = "author_year"
+bibtex_default_style = "plain"
 default_role = "py:obj"
 exclude_patterns = ["_build", "_templates", "gallery_src", "sg_execution_times.rst"]
 templates_path = ["_templates"]

@@ -155,7 +155,8 @@ def _spread_text(table: Table) -> tuple[str, ...]:
         f"the correction for it takes the scatter from {left[CHANCE]:.0f} to {left[CONSTRAINED]:.0f} %. Slack or a machine's compliance "
         f"counted as strain goes the right way and leaves {left[SLACK]:.0f} and {left[COMPLIANCE]:.0f} %, but it would take {slack} mm of "
         f"slack or {1e3 * compliance:.2g} mm/N of compliance, and moduli far above the printed ones. Specimens cast at different times may "
-        "as well differ. The readings would tell: naibu.identification.material_testing.uniaxial.compression_test estimates the slack from them.",
+        "as well differ. The readings would tell: naibu.identification.material_testing.uniaxial.compression_test "
+        "estimates the slack from them.",
     )
 
 
