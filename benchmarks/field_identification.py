@@ -21,7 +21,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from naibu.core.displacement_field import Field
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.estimate import FieldEstimate, identify_field
 from naibu.identification.from_fields.load_cases import FieldTrial, Zones
@@ -49,7 +49,7 @@ def noisy(body: PushedBody, states: Sequence[Array], noise: float, seed: int) ->
     out = []
     for k, u in enumerate(states):
         sd = noise * float(np.linalg.norm(u, axis=1).max())
-        field = Field.from_arrays(body.mesh.points, u + sd * rng.standard_normal(u.shape), sd_mm=sd)
+        field = DisplacementField.from_arrays(body.mesh.points, u + sd * rng.standard_normal(u.shape), sd_mm=sd)
         out.append(FieldTrial.of(f"push {k + 1}", field, body.mesh, loaded=body.constrained))
     return out
 
@@ -172,7 +172,7 @@ def pressed_ball(
         u = body.solve(lame, shear, Prescribed.nothing(truth.n_points).and_also(floor, (0, 0, 0)).and_also(top, push))
         sd = noise * float(np.linalg.norm(u, axis=1).max())
         vectors = where @ u + sd * rng.standard_normal(points.shape)
-        trials.append(FieldTrial.of(f"push {k + 1}", Field.from_arrays(points, vectors, sd_mm=sd), mesh, loaded=loaded))
+        trials.append(FieldTrial.of(f"push {k + 1}", DisplacementField.from_arrays(points, vectors, sd_mm=sd), mesh, loaded=loaded))
     zones = Zones.of(mesh, known={"pad": (10.0, 0.4)}, each_cell=True)
     return mesh, trials, zones, ball(mesh, radius, transition)[zones.of_cell >= 0]
 

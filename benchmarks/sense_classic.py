@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 
-from naibu.core.displacement_field import Field
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import MissingDependencyError
 from naibu.core.volume import Volume
 from naibu.imaging.dense_matching.block_matching import block_matching
@@ -188,7 +188,7 @@ def against_loops(case: Case) -> None:
     compare("Horn-Schunck, 40 steps, 4 of them", lambda: loop_horn_schunck(a, b, 4), 10, lambda: horn_schunck(volume, other, **AS_REPORTED))
     rng = np.random.default_rng(0)
     points = positions(volume)[case.mask][rng.integers(0, case.mask.sum(), 800)]
-    field = Field.from_arrays(points, rng.standard_normal(points.shape))
+    field = DisplacementField.from_arrays(points, rng.standard_normal(points.shape))
     everywhere = positions(volume)
     compare(
         "dense field of 800 points (SciPy)",

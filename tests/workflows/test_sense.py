@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from naibu.cli import main
-from naibu.core.displacement_field import Field
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError, NaibuError
 from naibu.core.volume import Volume
 from naibu.imaging.measure_displacement import METHODS, rigid_start, sense
@@ -79,7 +79,7 @@ def test_files_are_what_other_programs_read(folder: Path, tmp_path: Path) -> Non
     assert np.allclose(vectors, run.sensed.displacement.vectors, atol=1e-5, equal_nan=True)
     assert read_mesh(tmp_path / "displacement.vtu").n_cells > 1000
     stored = np.load(tmp_path / "field.npz")
-    field = Field.from_arrays(stored["points"], stored["vectors"], covariance=stored["covariance"], valid=stored["valid"])
+    field = DisplacementField.from_arrays(stored["points"], stored["vectors"], covariance=stored["covariance"], valid=stored["valid"])
     assert len(field.points) > 1000
     before, after = (import_markers(tmp_path / f"{name}.csv") for name in ("initial", "pressed"))
     assert 100 < len(before) < 400

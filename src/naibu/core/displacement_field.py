@@ -12,7 +12,7 @@ from naibu.core.errors import InputError
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Field:
+class DisplacementField:
     """Displacement at points.
 
     Attributes
@@ -41,7 +41,7 @@ class Field:
         sd_mm: ArrayLike = 0.0,
         covariance: ArrayLike | None = None,
         valid: ArrayLike | None = None,
-    ) -> Field:
+    ) -> DisplacementField:
         """Check the arrays and make a field of them.
 
         Parameters

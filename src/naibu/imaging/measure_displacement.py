@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from naibu.core.arrays import BoolArray, FloatArray
-from naibu.core.displacement_field import Field
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.imaging.dense_matching.block_matching import block_matching
@@ -79,13 +79,13 @@ class Sensed:
         out[known] = np.sqrt(np.linalg.eigvalsh(self.covariance[known])[:, -1])
         return out
 
-    def field(self, grid: Volume, *, step: int = 1) -> Field:
+    def field(self, grid: Volume, *, step: int = 1) -> DisplacementField:
         """Return the measured vectors at every `step`-th voxel along each axis, with their covariance where there is one."""
         some = np.zeros(self.mask.shape, dtype=bool)
         some[::step, ::step, ::step] = True
         some &= self.displacement.valid & self.mask
         covariance = None if self.covariance is None else self.covariance[some]
-        return Field.from_arrays(positions(grid)[some], self.displacement.vectors[some], covariance=covariance)
+        return DisplacementField.from_arrays(positions(grid)[some], self.displacement.vectors[some], covariance=covariance)
 
 
 def sense(

@@ -15,7 +15,7 @@ import numpy as np
 
 from naibu._version import __version__
 from naibu.core.arrays import BoolArray, FloatArray
-from naibu.core.displacement_field import Field
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.markers import Markers
 from naibu.core.mesh import Mesh
@@ -241,11 +241,11 @@ def _vtu(path: Path, grid: Volume, sensed: Sensed) -> Path:
 
 
 def _npz(path: Path, sensed: Sensed, grid: Volume) -> Path:
-    """The field as the identification takes it: `naibu.core.displacement_field.Field.from_arrays` on its arrays."""
+    """The field as the identification takes it: `naibu.core.displacement_field.DisplacementField.from_arrays` on its arrays."""
     step = 1
     while (sensed.mask & sensed.displacement.valid)[::step, ::step, ::step].sum() > FIELD_POINTS:
         step += 1
-    field: Field = sensed.field(grid, step=step)
+    field: DisplacementField = sensed.field(grid, step=step)
     stream = io.BytesIO()
     arrays = {"points": field.points, "vectors": field.vectors, "covariance": field.covariance, "valid": field.valid}
     np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import approx_fprime
 
-from naibu.core.displacement_field import Field
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.status import Status
@@ -153,7 +153,7 @@ def weighed(divisions: int = 4) -> tuple[Mesh, FieldTrial]:
     weight = lumped_mass(simplices(body.mesh), 1e-6)[:, None] * np.array([0.0, 0.0, -9810.0])
     floor = np.flatnonzero(body.mesh.points[:, 2] < 1e-9)
     u = LinearBody.of(body.mesh).solve(*body.moduli, Prescribed.nothing(body.mesh.n_points).and_also(floor, np.zeros(3)), weight)
-    field = Field.from_arrays(body.mesh.points, u)
+    field = DisplacementField.from_arrays(body.mesh.points, u)
     return body.mesh, FieldTrial.of("standing", field, body.mesh, loaded=body.mesh.points[:, 2] < 1e-9, external_force=weight)
 
 
@@ -185,7 +185,7 @@ def test_a_known_force_on_the_top_gives_the_scale_and_thickness_counts() -> None
     reaction = LinearBody.of(body.mesh, thickness_mm=3.0).forces(lame, shear, u)
     floor = body.mesh.points[:, 1] < 1e-9
     force = np.where(floor[:, None], 0.0, reaction)
-    trial = FieldTrial.of("push", Field.from_arrays(body.mesh.points, u), body.mesh, loaded=floor, external_force=force)
+    trial = FieldTrial.of("push", DisplacementField.from_arrays(body.mesh.points, u), body.mesh, loaded=floor, external_force=force)
     estimate = field_balance(body.mesh, [trial], Zones.of(body.mesh, known={}), thickness_mm=3.0)
     assert estimate.young_modulus == pytest.approx(np.full(2, SQUARE[0]), rel=1e-6)
     thin = field_balance(body.mesh, [trial], Zones.of(body.mesh, known={}))
@@ -210,12 +210,14 @@ def test_balance_at_finite_strain_is_exact_with_the_right_law_and_absurd_with_th
 def test_nodes_take_a_field_of_their_own_or_interpolate_one_linearly() -> None:
     mesh, rng = cube().mesh, np.random.default_rng(4)
     slope = rng.standard_normal((3, 3))
-    own = nodal_field(Field.from_arrays(mesh.points[::-1], mesh.points[::-1] @ slope, sd_mm=0.1, valid=np.arange(125) > 0), mesh)
+    own = nodal_field(
+        DisplacementField.from_arrays(mesh.points[::-1], mesh.points[::-1] @ slope, sd_mm=0.1, valid=np.arange(125) > 0), mesh
+    )
     assert own.displacement[:-1] == pytest.approx(mesh.points[:-1] @ slope)
     assert own.has_data.tolist() == [True] * 124 + [False]
     assert own.covariance.diagonal()[:-3] == pytest.approx(0.01)
     points = rng.uniform(-2.0, 42.0, (800, 3)) * [1.0, 1.0, 0.6]
-    other = nodal_field(Field.from_arrays(points, points @ slope, sd_mm=0.1), mesh)
+    other = nodal_field(DisplacementField.from_arrays(points, points @ slope, sd_mm=0.1), mesh)
     low = mesh.points[:, 2] < 25.0
     assert other.has_data[low].sum() > 60
     assert not other.has_data[~low].any()
@@ -232,7 +234,7 @@ def test_fields_are_interpolated_in_fewer_dimensions_too(dimension: int) -> None
     mesh = line if dimension == 1 else square().mesh
     high = float(mesh.points.max())
     points = np.vstack([rng.uniform(0.0, high, (200, dimension)), [[a * high] * dimension for a in (-0.1, 0.55)]])
-    given = Field.from_arrays(points, 2.0 * points + 1.0)
+    given = DisplacementField.from_arrays(points, 2.0 * points + 1.0)
     field = nodal_field(given, mesh)
     assert field.displacement[field.has_data] == pytest.approx(2.0 * mesh.points[field.has_data] + 1.0, abs=1e-9)
     inside = (mesh.points < points.max()).all(axis=1)
@@ -244,7 +246,7 @@ def test_an_interface_between_two_marker_layers_gets_their_mean() -> None:
     mesh = cube().mesh
     markers = mesh.points[mesh.points[:, 2] != 20.0]
     bent = np.column_stack([markers[:, 2] ** 2, markers[:, 0] * markers[:, 2], np.abs(markers[:, 2] - 20.0)])
-    field = nodal_field(Field.from_arrays(markers, bent, sd_mm=1.0), mesh)
+    field = nodal_field(DisplacementField.from_arrays(markers, bent, sd_mm=1.0), mesh)
     at = mesh.points[:, 2] == 20.0
     x = mesh.points[at, 0]
     assert field.displacement[at] == pytest.approx(np.column_stack([np.full(25, 500.0), 20.0 * x, np.full(25, 10.0)]), abs=1e-9)
@@ -257,7 +259,7 @@ def test_nodes_without_data_take_their_neighbours_out_and_nothing_else() -> None
     zones = body.zones()
     u = body.displacement((0.0, -25.0))
     u[6] = np.nan
-    trial = FieldTrial.of("hole", Field.from_arrays(body.mesh.points, u), body.mesh, loaded=body.constrained)
+    trial = FieldTrial.of("hole", DisplacementField.from_arrays(body.mesh.points, u), body.mesh, loaded=body.constrained)
     balance = trial_balances(body.mesh, [trial], zones)[0]
     around = set(body.mesh.cells[(body.mesh.cells == 6).any(axis=1)].ravel().tolist())
     assert set((balance.rows // 2).tolist()) == set(range(5, 20)) - around
@@ -272,7 +274,7 @@ def test_a_mesh_coarser_than_the_truth_errs_less_as_it_is_refined() -> None:
     errors = []
     for divisions in (4, 8, 16):
         body = square(SQUARE_PUSHES[0][:1], divisions=divisions)
-        trial = FieldTrial.of("fine", Field.from_arrays(fine.mesh.points, u), body.mesh, loaded=body.constrained)
+        trial = FieldTrial.of("fine", DisplacementField.from_arrays(fine.mesh.points, u), body.mesh, loaded=body.constrained)
         estimate = whitened_balance(body.mesh, [trial], body.zones())
         errors.append(abs(estimate.young_modulus[0] / SQUARE[0] - 1.0))
     assert errors[2] < errors[1] < errors[0]
@@ -316,7 +318,7 @@ CASES = {
 def test_the_covariance_of_the_whitened_balance_is_the_cramer_rao_bound(name: str) -> None:
     body, sd = CASES[name]
     zones = body.zones()
-    exact = [replace(t, field=Field.from_arrays(t.field.points, t.field.vectors, sd_mm=sd)) for t in body.trials()]
+    exact = [replace(t, field=DisplacementField.from_arrays(t.field.points, t.field.vectors, sd_mm=sd)) for t in body.trials()]
     estimate = whitened_balance(body.mesh, exact, zones)
     assert found(estimate) == pytest.approx(true(body, zones), rel=1e-6)
     bound = cramer_rao(body, zones, sd)
@@ -395,7 +397,7 @@ def test_the_whitened_estimate_is_a_stationary_point_of_the_likelihood_written_o
 def test_a_variance_that_is_not_given_is_estimated() -> None:
     body = cube(LAYERS, pushes=SHEARED)
     given = body.trials(sd_mm=0.05, seed=5)
-    plain = [replace(t, field=Field.from_arrays(t.field.points, t.field.vectors)) for t in given]
+    plain = [replace(t, field=DisplacementField.from_arrays(t.field.points, t.field.vectors)) for t in given]
     first, second = (whitened_balance(body.mesh, trials, body.zones()) for trials in (given, plain))
     assert found(second) == pytest.approx(found(first), rel=1e-6)
     factor = second.standard_deviation / first.standard_deviation
@@ -429,7 +431,9 @@ def test_data_on_points_of_their_own_need_the_noise_of_interpolation() -> None:
     body = cube()
     u = body.displacement((0.0, 0.0, -10.0))
     coarse = (np.rint(body.mesh.points / 10.0) % 2 == 0).all(axis=1)
-    trial = FieldTrial.of("coarse", Field.from_arrays(body.mesh.points[coarse], u[coarse], sd_mm=0.05), body.mesh, loaded=body.constrained)
+    trial = FieldTrial.of(
+        "coarse", DisplacementField.from_arrays(body.mesh.points[coarse], u[coarse], sd_mm=0.05), body.mesh, loaded=body.constrained
+    )
     with pytest.raises(InputError, match=r"share the data of the same points.*interpolation_sd_mm"):
         whitened_balance(body.mesh, [trial], body.zones())
     estimate = whitened_balance(body.mesh, [trial], body.zones(), interpolation_sd_mm=0.5)
@@ -443,9 +447,9 @@ def broken() -> dict[str, tuple[str, str, list[FieldTrial], Zones, dict[str, obj
     u = two.field.vectors
     inverted = u.copy()
     inverted[7] += [0.0, 120.0]
-    field = Field.from_arrays(mesh.points, inverted)
-    line = Field.from_arrays(mesh.points[:5], u[:5])
-    mixed = replace(one, field=Field.from_arrays(mesh.points, one.field.vectors, sd_mm=0.1))
+    field = DisplacementField.from_arrays(mesh.points, inverted)
+    line = DisplacementField.from_arrays(mesh.points[:5], u[:5])
+    mixed = replace(one, field=DisplacementField.from_arrays(mesh.points, one.field.vectors, sd_mm=0.1))
     nowhere = FieldTrial.of("held", one.field, mesh, loaded=np.ones(mesh.n_points, dtype=bool))
     unfit = replace(zones, known_lambda=np.full_like(zones.known_lambda, np.nan))
     far = np.where(mesh.points[:, 1:] == 100.0, True, body.constrained[:, None])
@@ -485,7 +489,7 @@ def test_zones_that_no_balance_reaches_are_named() -> None:
     zones = body.zones(each_cell=True)
     u = body.displacement((0.0, -25.0))
     u[5] = np.nan
-    trial = FieldTrial.of("hole", Field.from_arrays(body.mesh.points, u), body.mesh, loaded=body.constrained)
+    trial = FieldTrial.of("hole", DisplacementField.from_arrays(body.mesh.points, u), body.mesh, loaded=body.constrained)
     with pytest.raises(InputError, match=r"'lower half: cell 0', .* and 1 more zones appear in no balance"):
         field_balance(body.mesh, [trial], zones, method="minimum_norm")
 

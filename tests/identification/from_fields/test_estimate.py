@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from naibu.core.displacement_field import Field
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.estimate import FieldEstimate, identify_field
@@ -36,7 +36,7 @@ def layered(law: str = "linear", pushes: Sequence[tuple[float, ...]] = (PRESS,))
 
 def with_noise(body: PushedBody, states: Sequence[np.ndarray], sd_mm: float, seed: int) -> list[FieldTrial]:
     rng = np.random.default_rng(seed)
-    fields = [Field.from_arrays(body.mesh.points, u + sd_mm * rng.standard_normal(u.shape), sd_mm=sd_mm) for u in states]
+    fields = [DisplacementField.from_arrays(body.mesh.points, u + sd_mm * rng.standard_normal(u.shape), sd_mm=sd_mm) for u in states]
     return [FieldTrial.of(f"push {k}", field, body.mesh, loaded=body.constrained) for k, field in enumerate(fields)]
 
 
@@ -293,7 +293,7 @@ def ball_from_a_finer_mesh(cells: int, fine: int, noise: float = 0.005) -> tuple
         support = Prescribed.nothing(truth.n_points).and_also(np.flatnonzero(truth.points[:, 2] < 1e-9), (0, 0, 0))
         u = LinearBody.of(truth).solve(lame, shear, support.and_also(np.flatnonzero(truth.points[:, 2] > 50 - 1e-9), push))
         sd = noise * np.abs(u).max()
-        field = Field.from_arrays(points, where @ u + sd * rng.standard_normal(points.shape), sd_mm=sd)
+        field = DisplacementField.from_arrays(points, where @ u + sd * rng.standard_normal(points.shape), sd_mm=sd)
         height = mesh.points[:, 2]
         trials.append(FieldTrial.of(f"push {k}", field, mesh, loaded=(height < 1e-9) | (height > 50 - 1e-9)))
     zones = Zones.of(mesh, known={"pad": (10.0, 0.4)}, each_cell=True)
@@ -341,7 +341,9 @@ def test_a_known_force_gives_the_scale() -> None:
     u = LinearBody.of(body.mesh).solve(lame, shear, Prescribed(floor, np.zeros_like(weight)), weight)
     zones = Zones.of(body.mesh, known={})
     for factor in (1.0, 3.0):
-        trial = FieldTrial.of("push", Field.from_arrays(body.mesh.points, u), body.mesh, loaded=floor, external_force=factor * weight)
+        trial = FieldTrial.of(
+            "push", DisplacementField.from_arrays(body.mesh.points, u), body.mesh, loaded=floor, external_force=factor * weight
+        )
         found = identify_field(body.mesh, [trial], zones)
         assert found.young_modulus == pytest.approx(factor * UNIFORM[0], rel=1e-6)
         assert found.poisson_ratio == pytest.approx(UNIFORM[1], rel=1e-6)
@@ -383,18 +385,18 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(InputError, match="Poisson's ratio must increase"):
         Bounds(poisson_ratio=(0.3, 0.6))
     with pytest.raises(InputError, match="nothing moves"):
-        still = Field.from_arrays(body.mesh.points, np.zeros_like(body.mesh.points), sd_mm=0.1)
+        still = DisplacementField.from_arrays(body.mesh.points, np.zeros_like(body.mesh.points), sd_mm=0.1)
         identify_field(body.mesh, [replace(trials[0], field=still)], zones)
     some = np.where(np.arange(125) < 60, 0.0, 0.1)[:, None] * np.ones(3)
     with pytest.raises(InputError, match="some vectors have a standard deviation"):
-        mixed = Field.from_arrays(body.mesh.points, trials[0].field.vectors, sd_mm=some)
+        mixed = DisplacementField.from_arrays(body.mesh.points, trials[0].field.vectors, sd_mm=some)
         identify_field(body.mesh, [replace(trials[0], field=mixed)], zones)
 
 
 @pytest.mark.parametrize(("points", "message"), [(1, "how the loaded nodes move"), (2, "nothing of some moduli")])
 def test_fields_that_say_too_little_are_told(points: int, message: str) -> None:
     body = layered()
-    few = Field.from_arrays(body.mesh.points[60 : 60 + points], np.full((points, 3), 1.0), sd_mm=0.1)
+    few = DisplacementField.from_arrays(body.mesh.points[60 : 60 + points], np.full((points, 3), 1.0), sd_mm=0.1)
     trial = FieldTrial.of("push", few, body.mesh, loaded=body.constrained)
     with pytest.raises(ConvergenceError, match=message):
         identify_field(body.mesh, [trial], body.zones())

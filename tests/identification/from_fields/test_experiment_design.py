@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from naibu.core.displacement_field import Field
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.identification.from_fields.experiment_design import expected_accuracy
 from naibu.identification.from_fields.gauss_newton import Objective, first_point, search
@@ -20,7 +20,9 @@ SD_MM = 0.05
 def plan(sd_mm: float, noise: np.ndarray | float = 0.0):
     body = cube({"below": (0.25, 0.4)}, known=(0.3, 0.4), divisions=4)
     u = body.displacement((0.0, 0.0, -10.0)) + noise
-    return body, [FieldTrial.of("push", Field.from_arrays(body.mesh.points, u, sd_mm=sd_mm), body.mesh, loaded=body.constrained)]
+    return body, [
+        FieldTrial.of("push", DisplacementField.from_arrays(body.mesh.points, u, sd_mm=sd_mm), body.mesh, loaded=body.constrained)
+    ]
 
 
 def expected(sd_mm: float):

@@ -10,7 +10,7 @@ from scenes import grid
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial.transform import Rotation
 
-from naibu.core.displacement_field import Field
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.rotation import rotation_matrix
 from naibu.imaging.feature_matching.relaxation_labelling import PotentialMatches
@@ -31,10 +31,10 @@ def test_an_affine_motion_is_met_exactly_at_every_voxel_of_the_hull(seed: int) -
     rng = np.random.default_rng(seed)
     frame = grid((9, 12, 14), (1.0, 0.7, 1.8), rotation_matrix(rng.standard_normal(3)))
     points = frame.to_physical(rng.uniform(-2, [15, 13, 10], (60, 3)))
-    found = dense_from_sparse(Field.from_arrays(points, affine(points)), frame)
+    found = dense_from_sparse(DisplacementField.from_arrays(points, affine(points)), frame)
     np.testing.assert_allclose(found.vectors[found.valid], affine(positions(frame))[found.valid], atol=1e-9)
     assert np.isnan(found.vectors[~found.valid]).all()
-    whole = dense_from_sparse(Field.from_arrays(points, affine(points)), frame, outside="affine")
+    whole = dense_from_sparse(DisplacementField.from_arrays(points, affine(points)), frame, outside="affine")
     np.testing.assert_allclose(whole.vectors, affine(positions(frame)), atol=1e-8)
 
 
@@ -46,7 +46,7 @@ def test_the_field_is_that_of_scipy(shape: tuple[int, int, int]) -> None:
     index = np.zeros((80, 3))
     index[:, :d] = rng.uniform(0, np.array(shape[::-1])[:d], (80, d))
     points, vectors = frame.to_physical(index), rng.standard_normal((80, 3))
-    found = dense_from_sparse(Field.from_arrays(points, vectors), frame, outside="nearest")
+    found = dense_from_sparse(DisplacementField.from_arrays(points, vectors), frame, outside="nearest")
     reference = LinearNDInterpolator(points[:, :d], vectors)(positions(frame)[..., :d])
     inside = np.isfinite(reference).all(axis=-1)
     assert (inside == found.valid).mean() > 0.999
@@ -90,14 +90,14 @@ def test_points_that_span_nothing_are_refused() -> None:
     frame = grid((6, 7, 8))
     flat = frame.to_physical(np.random.default_rng(0).uniform(0, 6, (10, 3)) * [1, 1, 0])
     with pytest.raises(InputError, match="one plane"):
-        dense_from_sparse(Field.from_arrays(flat, flat), frame)
+        dense_from_sparse(DisplacementField.from_arrays(flat, flat), frame)
     with pytest.raises(InputError, match="4 matches or more"):
-        dense_from_sparse(Field.from_arrays(flat[:3], flat[:3]), frame)
+        dense_from_sparse(DisplacementField.from_arrays(flat[:3], flat[:3]), frame)
     away = np.random.default_rng(0).uniform(500, 510, (10, 3))
     with pytest.raises(InputError, match="in one frame"):
-        dense_from_sparse(Field.from_arrays(away, away), frame)
+        dense_from_sparse(DisplacementField.from_arrays(away, away), frame)
     with pytest.raises(InputError, match="outside must be"):
-        dense_from_sparse(Field.from_arrays(away, away), frame, outside="zero")  # type: ignore[arg-type]
+        dense_from_sparse(DisplacementField.from_arrays(away, away), frame, outside="zero")  # type: ignore[arg-type]
 
 
 def test_doubled_points_and_points_without_data_do_no_harm() -> None:
@@ -106,7 +106,7 @@ def test_doubled_points_and_points_without_data_do_no_harm() -> None:
     points = np.vstack([points, points[:5]])
     vectors = affine(points)
     vectors[7] = np.nan
-    found = dense_from_sparse(Field.from_arrays(points, vectors), frame)
+    found = dense_from_sparse(DisplacementField.from_arrays(points, vectors), frame)
     np.testing.assert_allclose(found.vectors[found.valid], affine(positions(frame))[found.valid], atol=1e-9)
     some = found.field(frame, step=3, sd_mm=0.2)
     assert len(some.points) == found.valid[::3, ::3, ::3].sum()

@@ -16,7 +16,7 @@ import scipy.sparse as sp
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
-from naibu.core.displacement_field import Field
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.load_cases import KNOWN, FieldTrial, Zones
@@ -56,7 +56,7 @@ class NodalField:
         return np.asarray(np.diff(self.weights.indptr) > 1)
 
 
-def nodal_field(field: Field, mesh: Mesh) -> NodalField:
+def nodal_field(field: DisplacementField, mesh: Mesh) -> NodalField:
     """Bring a measured field to the nodes of a mesh.
 
     Where every node is a point of the field, nodes take its vectors, and nodes at points that are not valid have none. Any other field is
@@ -78,7 +78,7 @@ def nodal_field(field: Field, mesh: Mesh) -> NodalField:
     return NodalField(np.asarray(weights @ vectors), weights, sp.csr_matrix(spread @ of_points @ spread.T))
 
 
-def _weights_of_same_points(field: Field, nodes: FloatArray) -> sp.csr_matrix | None:
+def _weights_of_same_points(field: DisplacementField, nodes: FloatArray) -> sp.csr_matrix | None:
     """Ones where nodes take the vectors of the field's own points; None where some node is no point of the field."""
     distance, nearest = (np.asarray(found) for found in cKDTree(field.points).query(nodes))
     if distance.max() > SAME_PLACE * float(np.ptp(nodes, axis=0).max()):
@@ -87,7 +87,7 @@ def _weights_of_same_points(field: Field, nodes: FloatArray) -> sp.csr_matrix | 
     return sp.csr_matrix((np.ones(len(rows)), (rows, nearest[rows])), shape=(len(nodes), len(field.points)))
 
 
-def _interpolation_weights(field: Field, nodes: FloatArray) -> sp.csr_matrix:
+def _interpolation_weights(field: DisplacementField, nodes: FloatArray) -> sp.csr_matrix:
     """Barycentric weights of the valid points around every node inside them."""
     valid = np.flatnonzero(field.valid)
     d = nodes.shape[1]

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
-from naibu.core.displacement_field import Field
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.load_cases import FieldTrial
@@ -188,7 +188,7 @@ class Observed:
         return np.asarray(self.operator @ u.ravel() - self.data)
 
 
-def _whitening(field: Field, name: str) -> tuple[FloatArray, float, bool]:
+def _whitening(field: DisplacementField, name: str) -> tuple[FloatArray, float, bool]:
     """Return the inverse square roots (k, d, d) of the covariances of the valid points, the RMS noise, mm, and whether it is nominal."""
     covariance = field.covariance[field.valid]
     largest = float(np.abs(field.vectors[field.valid]).max())

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
-from naibu.core.displacement_field import Field
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
@@ -25,7 +25,7 @@ class FieldTrial:
     ----------
     name : str
         For messages.
-    field : Field
+    field : DisplacementField
         Measured displacement, at any points inside the body.
     loaded : ndarray, shape (n, d), bool
         Components of the model's nodes at which forces act that nobody measured - floor, plates, clamps: balance says nothing there.
@@ -34,12 +34,14 @@ class FieldTrial:
     """
 
     name: str
-    field: Field
+    field: DisplacementField
     loaded: BoolArray
     external_force: FloatArray
 
     @classmethod
-    def of(cls, name: str, field: Field, mesh: Mesh, *, loaded: ArrayLike, external_force: ArrayLike | None = None) -> FieldTrial:
+    def of(
+        cls, name: str, field: DisplacementField, mesh: Mesh, *, loaded: ArrayLike, external_force: ArrayLike | None = None
+    ) -> FieldTrial:
         """Check and make a trial; `loaded` is a mask (n, d) of components or (n,) of nodes.
 
         Raises

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from naibu.core.arrays import BoolArray, FloatArray
-from naibu.core.displacement_field import Field
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.resampling import positions
 
@@ -31,9 +31,9 @@ class DenseDisplacement:
     valid: BoolArray
     quality: FloatArray
 
-    def field(self, grid: Volume, *, step: int = 1, sd_mm: ArrayLike = 0.0) -> Field:
+    def field(self, grid: Volume, *, step: int = 1, sd_mm: ArrayLike = 0.0) -> DisplacementField:
         """Return the measured vectors at every `step`-th voxel as a field of points, with one standard deviation, mm, for all."""
         some = np.zeros(self.valid.shape, dtype=bool)
         some[::step, ::step, ::step] = True
         some &= self.valid
-        return Field.from_arrays(positions(grid)[some], self.vectors[some], sd_mm=sd_mm)
+        return DisplacementField.from_arrays(positions(grid)[some], self.vectors[some], sd_mm=sd_mm)

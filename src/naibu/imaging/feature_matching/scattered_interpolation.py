@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from naibu.core.arrays import FloatArray, IntArray
-from naibu.core.displacement_field import Field
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.imaging.displacement.dense import DenseDisplacement
@@ -24,7 +24,7 @@ Outside = Literal["nan", "nearest", "affine"]
 FLAT = 1e-9
 
 
-def sparse_displacement(matches: PotentialMatches, rigid: RigidMotion | None = None, *, rotation_only: bool = False) -> Field:
+def sparse_displacement(matches: PotentialMatches, rigid: RigidMotion | None = None, *, rotation_only: bool = False) -> DisplacementField:
     """Return the displacement of matched points (spec S6).
 
     Parameters
@@ -39,7 +39,7 @@ def sparse_displacement(matches: PotentialMatches, rigid: RigidMotion | None = N
 
     Returns
     -------
-    Field
+    DisplacementField
         ``u = x2 - (R x1 + tau)`` at the points; the report's ``D = R x1 + tau - x2`` points the other way.
 
     Raises
@@ -50,9 +50,9 @@ def sparse_displacement(matches: PotentialMatches, rigid: RigidMotion | None = N
     if rigid is None:
         if rotation_only:
             raise InputError("rotation_only takes the rotation out of the displacement: give the rigid motion")
-        return Field.from_arrays(matches.initial_mm, matches.deformed_mm - matches.initial_mm)
+        return DisplacementField.from_arrays(matches.initial_mm, matches.deformed_mm - matches.initial_mm)
     start = matches.initial_mm @ rigid.rotation.T if rotation_only else rigid.moved(matches.initial_mm)
-    return Field.from_arrays(start, matches.deformed_mm - start)
+    return DisplacementField.from_arrays(start, matches.deformed_mm - start)
 
 
 def elevation_angle(vectors: ArrayLike) -> FloatArray:
@@ -99,12 +99,12 @@ def triangulated(points_mm: ArrayLike, grid: Volume) -> Triangulation:
     return Triangulation(p, np.asarray(cells, dtype=np.int64))
 
 
-def dense_from_sparse(field: Field, grid: Volume, *, outside: Outside = "nan") -> DenseDisplacement:
+def dense_from_sparse(field: DisplacementField, grid: Volume, *, outside: Outside = "nan") -> DenseDisplacement:
     """Return the displacement at every voxel, linear in the Delaunay simplices of the points of a field (spec S6, 1.11, 1.12, 1.27).
 
     Parameters
     ----------
-    field : Field
+    field : DisplacementField
         Displacement at points, mm; points without data are left out.
     grid : Volume
         Voxels where it is wanted; a volume of one slice is an image, with triangles.

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray, Int32Array, IntArray
-from naibu.core.displacement_field import Field
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.resampling import positions
@@ -123,7 +123,7 @@ class CorrelatedDisplacement:
         out[self.valid] = self._covariance(np.argwhere(self.valid)[:, ::-1] * self.volume.spacing_mm)
         return out
 
-    def field(self, *, step: int | tuple[int, int, int] | None = None) -> Field:
+    def field(self, *, step: int | tuple[int, int, int] | None = None) -> DisplacementField:
         """Return points with displacement and covariance, as identification takes them.
 
         Parameters
@@ -150,7 +150,7 @@ class CorrelatedDisplacement:
         if not some.any():
             raise InputError(f"no voxel of the object is left at every {every.tolist()}-th voxel; give a smaller step")
         points = positions(self.volume)[some]
-        return Field.from_arrays(points, self.vectors[some], covariance=self.covariance_at(points))
+        return DisplacementField.from_arrays(points, self.vectors[some], covariance=self.covariance_at(points))
 
     def _local(self, points_mm: ArrayLike) -> FloatArray:
         return self.volume.to_index(points_mm) * self.volume.spacing_mm

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from naibu.core.arrays import BoolArray, FloatArray
-from naibu.core.displacement_field import Field
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.volume import Volume
 from naibu.imaging.displacement.dense import DenseDisplacement
 from naibu.imaging.feature_matching.correlation_matching import Candidates, candidate_matches
@@ -65,7 +65,7 @@ class Matched:
 
     def moved_back(self, points_mm: FloatArray, grid: Volume) -> FloatArray:
         """Return where points after (k, 3), mm, came from by the net of the matched points after."""
-        backward = Field.from_arrays(self.matches.deformed_mm, self.matches.initial_mm - self.matches.deformed_mm)
+        backward = DisplacementField.from_arrays(self.matches.deformed_mm, self.matches.initial_mm - self.matches.deformed_mm)
         vectors = dense_from_sparse(backward, grid, outside="affine").vectors
         at = [sampled(grid.with_values(component), points_mm) for component in np.moveaxis(vectors, -1, 0)]
         return np.asarray(points_mm + np.stack(at, axis=-1))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
-from naibu.core.displacement_field import Field
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.load_cases import FieldTrial, Zones
@@ -112,7 +112,7 @@ class PushedBody:
         out = []
         for k, push in enumerate(self.pushes):
             u = self.displacement(push)
-            field = Field.from_arrays(self.mesh.points, u + sd_mm * rng.standard_normal(u.shape), sd_mm=sd_mm)
+            field = DisplacementField.from_arrays(self.mesh.points, u + sd_mm * rng.standard_normal(u.shape), sd_mm=sd_mm)
             out.append(FieldTrial.of(f"push {k + 1}", field, self.mesh, loaded=self.constrained))
         return tuple(out)
 

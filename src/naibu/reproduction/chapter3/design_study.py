@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from naibu.core.arrays import FloatArray
-from naibu.core.displacement_field import Field
+from naibu.core.displacement_field import DisplacementField
 from naibu.identification.from_fields.experiment_design import Accuracy, expected_accuracy
 from naibu.identification.from_fields.gauss_newton import Objective, first_point, search
 from naibu.identification.from_fields.load_cases import FieldTrial
@@ -44,7 +44,7 @@ def cube_with_known(ratio: float, divisions: int = 4) -> PushedBody:
 
 def planned(body: PushedBody, points: FloatArray, vectors: FloatArray) -> list[FieldTrial]:
     """Return the push as it will be measured at some points, without noise yet."""
-    field = Field.from_arrays(points, vectors, sd_mm=NOISE_MM)
+    field = DisplacementField.from_arrays(points, vectors, sd_mm=NOISE_MM)
     return [FieldTrial.of("push", field, body.mesh, loaded=body.constrained)]
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 
 from naibu import datasets
-from naibu.core.displacement_field import Field
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.identification.force_balance.batch import BalanceEstimate, field_balance
@@ -65,7 +65,7 @@ class Lattice:
         else:
             loaded[1:-1] = False
         sd = np.where(self.source.measured, MARKER_SD_MM, COMPLETED_SD_MM)
-        field = Field.from_arrays(self.mesh.points, self.source.displacement, sd_mm=sd)
+        field = DisplacementField.from_arrays(self.mesh.points, self.source.displacement, sd_mm=sd)
         return FieldTrial.of(self.name, field, self.mesh, loaded=loaded.ravel())
 
 

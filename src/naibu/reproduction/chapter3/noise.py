@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from naibu.core.arrays import FloatArray
-from naibu.core.displacement_field import Field
+from naibu.core.displacement_field import DisplacementField
 from naibu.identification.force_balance.batch import BalanceEstimate, field_balance
 from naibu.identification.force_balance.weighted import whitened_balance
 from naibu.reproduction.chapter3 import figures as drawn
@@ -50,7 +50,7 @@ def noise_scatter(body: PushedBody, sd_mm: float, seed: int, draws: int) -> Scat
     top among the unknowns.
     """
     zones = body.zones()
-    exact = [replace(t, field=Field.from_arrays(t.field.points, t.field.vectors, sd_mm=sd_mm)) for t in body.trials()]
+    exact = [replace(t, field=DisplacementField.from_arrays(t.field.points, t.field.vectors, sd_mm=sd_mm)) for t in body.trials()]
     best = whitened_balance(body.mesh, exact, zones)
     plain, weighted = [], []
     for k in range(draws):
