@@ -1,4 +1,4 @@
-"""The program, its two consoles, and how it speaks: lines, tables, progress, failures.
+"""The command-line application, its output and error consoles: lines, tables, progress, failures.
 
 Exit codes: 0 done, 1 the installation is not sound (``doctor``), 2 input that cannot be used, 3 a solve that failed, 130 interrupted.
 """
@@ -6,6 +6,7 @@ Exit codes: 0 done, 1 the installation is not sound (``doctor``), 2 input that c
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NoReturn
@@ -16,16 +17,17 @@ from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
-    Progress,
     SpinnerColumn,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.progress import Progress as Display
 from rich.table import Table
 
 from naibu._version import __version__
+from naibu.core.progress import Progress, ProgressReport
 
 app = App(
     name="naibu",
@@ -37,13 +39,75 @@ WIDTH_OF_FILES = 160  # where the output is no terminal
 console = Console(width=None if sys.stdout.isatty() else WIDTH_OF_FILES)
 errors = Console(stderr=True, width=None if sys.stderr.isatty() else WIDTH_OF_FILES)
 BAD_INPUT, NO_SOLUTION, INTERRUPTED = 2, 3, 130
+QUIET_S, INTERVAL_S = 1.0, 5.0  # plain progress lines: none before the first, then one in the second
+
+
+class _PlainProgress:
+    """Progress as plain lines, where the output is no terminal: for each stage, and then every few seconds."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._began = clock()
+        self._stage, self._said = "", -INTERVAL_S
+
+    def __call__(self, report: ProgressReport) -> None:
+        now = self._clock() - self._began
+        # what takes no time, or fails at once, prints nothing
+        if now < QUIET_S or (report.stage == self._stage and now - self._said < INTERVAL_S):
+            return
+        self._stage, self._said = report.stage, now
+        percent = "" if report.fraction is None else f"{100.0 * report.fraction:.0f} %"
+        parts = (report.stage, _count(report), percent, _objective(report), f"{now:.0f} s")
+        errors.print(", ".join(part for part in parts if part), soft_wrap=True, highlight=False, markup=False)
+
+
+@contextmanager
+def progress_display(clock: Callable[[], float] = time.monotonic) -> Iterator[Progress]:
+    """Show progress on stderr: a bar for each stage on a terminal, plain lines elsewhere.
+
+    Parameters
+    ----------
+    clock : callable
+        Seconds from any origin.
+
+    Yields
+    ------
+    Progress
+        The callback to hand to a computation.
+    """
+    if not errors.is_terminal:
+        yield _PlainProgress(clock)
+        return
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[found]}"), TimeElapsedColumn())
+    with Display(*columns, console=errors, transient=True) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def show(report: ProgressReport) -> None:
+            if report.stage not in tasks:
+                for task in tasks.values():
+                    bars.stop_task(task)
+                tasks[report.stage] = bars.add_task(escape(report.stage), total=None, found="")
+            found = ", ".join(part for part in (_count(report), _objective(report)) if part)
+            bars.update(tasks[report.stage], completed=report.done, total=report.total, found=found)
+
+        yield show
+
+
+def _count(report: ProgressReport) -> str:
+    if report.done is None:
+        return ""
+    return f"{report.done:g}" if report.total is None else f"{report.done:g} of {report.total:g}"
+
+
+def _objective(report: ProgressReport) -> str:
+    return "" if report.objective is None else f"objective {report.objective:.4g}"
 
 
 @contextmanager
 def progress_lines() -> Iterator[Callable[[str, int, float], None]]:
     """A line for each stage that tells iteration and objective."""
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TextColumn("{task.fields[found]}"), TimeElapsedColumn())
-    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
+    with Display(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
         tasks: dict[str, TaskID] = {"identify": bar.add_task("identify", total=None, found="reading, and solving with the first guess")}
 
         def tell(stage: str, iteration: int, objective: float) -> None:
@@ -58,7 +122,7 @@ def progress_lines() -> Iterator[Callable[[str, int, float], None]]:
 def stages() -> Iterator[Callable[[str], None]]:
     """One line that tells the present stage."""
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
+    with Display(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
         task = bar.add_task("reading", total=None)
         yield lambda stage: bar.update(task, description=stage)
 
@@ -67,7 +131,7 @@ def stages() -> Iterator[Callable[[str], None]]:
 def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
     """A bar for a known number of parts."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
+    with Display(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, of: bar.update(task, completed=done, total=of)
 
