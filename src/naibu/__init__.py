@@ -9,14 +9,23 @@ from naibu._version import __version__
 
 if TYPE_CHECKING:
     from naibu import datasets
-    from naibu.workflows.identify import compare, identify, load_experiment, predict, report
+    from naibu.workflows.compare import compare
+    from naibu.workflows.experiments import load_experiment
+    from naibu.workflows.identify import identify
+    from naibu.workflows.predict import predict
+    from naibu.workflows.report import report
 
 __all__ = ["__version__", "compare", "datasets", "identify", "load_experiment", "predict", "report"]
 
 # loaded when first used, by name, so that `import naibu` stays light
-_MODULES = {"datasets": "naibu.datasets"} | dict.fromkeys(
-    ("compare", "identify", "load_experiment", "predict", "report"), "naibu.workflows.identify"
-)
+_MODULES = {
+    "compare": "naibu.workflows.compare",
+    "datasets": "naibu.datasets",
+    "identify": "naibu.workflows.identify",
+    "load_experiment": "naibu.workflows.experiments",
+    "predict": "naibu.workflows.predict",
+    "report": "naibu.workflows.report",
+}
 
 
 def __getattr__(name: str) -> object:

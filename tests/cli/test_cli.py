@@ -19,7 +19,7 @@ from naibu import cli
 from naibu.identification.from_markers.specimen_model import ModelSettings
 from naibu.io.experiment_folder.reader import read_experiment
 from naibu.mechanics.finite_strain.newton import Newton
-from naibu.workflows import identify
+from naibu.workflows import compare as comparison
 
 Run = Callable[..., tuple[int, str, str]]
 COARSE = ("--element-size-mm", "20", "--known", KNOWN[0])
@@ -71,7 +71,7 @@ def test_identify_predict_report(naibu: Run, press: Press) -> None:
 
 def test_compare_keeps_what_it_has_found(naibu: Run, press: Press, monkeypatch: pytest.MonkeyPatch) -> None:
     models = ("--law", "neo_hookean", "--law", "mooney_rivlin", "--contact", "coulomb", "--out", "compared")
-    compare = identify.compare_models
+    compare = comparison.compare_models
     done: list[str] = []
 
     def once(loaded: object, candidates: list[ModelSettings], **options: object) -> object:
@@ -80,16 +80,16 @@ def test_compare_keeps_what_it_has_found(naibu: Run, press: Press, monkeypatch: 
         done.append(candidates[0].law)
         return compare(loaded, candidates, **options)
 
-    monkeypatch.setattr(identify, "compare_models", once)
+    monkeypatch.setattr(comparison, "compare_models", once)
     assert naibu("compare", press.folder, *COARSE, *models)[0] == cli.INTERRUPTED
     (first,) = json.loads(Path("compared/comparison.json").read_text(encoding="utf-8"))
     assert first["result"]["noise_factor"] < 3.0 and first["result"]["left_out_mm"] is None
-    monkeypatch.setattr(identify, "compare_models", compare)
+    monkeypatch.setattr(comparison, "compare_models", compare)
     code, out, _ = naibu("compare", press.folder, *COARSE, *models)
     assert code == 0 and "neo_hookean" in out and "mooney_rivlin" in out and "BIC above best" in out
     entries = json.loads(Path("compared/comparison.json").read_text(encoding="utf-8"))
     assert entries[0] == first and len(entries) == 2
-    monkeypatch.setattr(identify, "compare_models", None)  # nothing is left to be solved
+    monkeypatch.setattr(comparison, "compare_models", None)  # nothing is left to be solved
     assert naibu("compare", press.folder, *COARSE, *models)[1] == out
 
 

@@ -17,9 +17,9 @@ from naibu.core.status import Status
 from naibu.io.files import atomic
 from naibu.viewer.result_page.payload import report_json
 from naibu.viewer.result_page.reading import report_from_json
-from naibu.workflows import identify
+from naibu.workflows import identify, predict, report
 from naibu.workflows.report_content import prediction_scene, trial_scene
-from naibu.workflows.result_folder import CHECKPOINT_FILE, MODEL_FILE
+from naibu.workflows.result_folder import CHECKPOINT_FILE, MODEL_FILE, read_model
 
 STATE = {"press": ["pressed"]}
 
@@ -75,7 +75,7 @@ def test_files_and_page_tell_predicted_minus_measured(press: Press) -> None:
 
 def test_the_model_survives_its_file(press: Press) -> None:
     text = (press.results / MODEL_FILE).read_text(encoding="utf-8")
-    model = identify.read_model(press.results)
+    model = read_model(press.results)
     assert model.to_dict() == json.loads(text) == press.identification.model.to_dict()
     np.testing.assert_array_equal(model.covariance, press.identification.model.covariance)
 
@@ -92,7 +92,7 @@ def test_results_name_no_folder(press: Press) -> None:
 
 
 def test_every_marker_is_predicted(press: Press, tmp_path: Path) -> None:
-    prediction = identify.predict(press.results / MODEL_FILE, press.folder, state="pressed_more", heights_from_markers=True, out=tmp_path)
+    prediction = predict.predict(press.results / MODEL_FILE, press.folder, state="pressed_more", heights_from_markers=True, out=tmp_path)
     assert names(tmp_path) == {"predicted.csv", "summary.json", "predicted.html", "predicted.json", "predicted.vtu", "predicted.vtkhdf"}
     table = rows(tmp_path / "predicted.csv")
     assert list(table[0]) == ["marker", "x_mm", "y_mm", "z_mm", "sd_mm"]
@@ -117,10 +117,10 @@ def test_a_prediction_needs_no_measured_state(press: Press, experiment_folder: P
     meta = experiment_folder / "meta.toml"
     meta.write_text(meta.read_text(encoding="utf-8").replace('file = "pressed_more.csv"', "held_out = true"), encoding="utf-8")
     out = tmp_path / "out"
-    blind = identify.predict(press.results, experiment_folder, state="pressed_more", height_mm=46.0, out=out)
+    blind = predict.predict(press.results, experiment_folder, state="pressed_more", height_mm=46.0, out=out)
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     assert not summary["registered_to_measured"] and summary["rms_3d_mm"] is None and summary["markers"] == 0
-    seen = identify.predict(press.results, press.folder, state="pressed_more", height_mm=46.0)
+    seen = predict.predict(press.results, press.folder, state="pressed_more", height_mm=46.0)
     # without a measured state positions stand in the free scan's frame: the same shape, elsewhere
     for points in (blind.points, seen.points):
         points -= points.mean(axis=0)
@@ -130,22 +130,22 @@ def test_a_prediction_needs_no_measured_state(press: Press, experiment_folder: P
 def test_a_prediction_may_share_the_folder_of_its_model(press: Press, tmp_path: Path) -> None:
     identified(press.folder, tmp_path)
     before = {name: (tmp_path / name).read_bytes() for name in names(tmp_path)}
-    identify.predict(tmp_path, press.folder, state="pressed_more", out=tmp_path)
+    predict.predict(tmp_path, press.folder, state="pressed_more", out=tmp_path)
     assert {name: (tmp_path / name).read_bytes() for name in before} == before
 
 
 def test_pages_are_written_again_without_experiments(press: Press, tmp_path: Path) -> None:
     stored = (press.results / "report.json").read_text(encoding="utf-8")
     (tmp_path / "report.json").write_text(stored, encoding="utf-8")
-    assert identify.report(tmp_path) == [tmp_path / "report.html"]
+    assert report.report(tmp_path) == [tmp_path / "report.html"]
     assert (tmp_path / "report.html").read_bytes() == (press.results / "report.html").read_bytes()
     assert report_json(report_from_json(stored)) == stored
     (tmp_path / "report.json").write_text(stored[: len(stored) // 2], encoding="utf-8")
     with pytest.raises(InputError, match=r"report\.json.*not JSON"):
-        identify.report(tmp_path)
+        report.report(tmp_path)
     (tmp_path / "report.json").write_text(stored.replace('"role"', '"rule"'), encoding="utf-8")
     with pytest.raises(InputError, match=r"scenes\[0\]"):
-        identify.report(tmp_path)
+        report.report(tmp_path)
 
 
 def test_experiments_are_predicted_from_each_other(press: Press, experiment_folder: Path, tmp_path: Path) -> None:
@@ -162,7 +162,7 @@ def test_an_interrupted_search_keeps_the_best_and_goes_on(press: Press, tmp_path
     assert found.interrupted and found.calibration.match.status is Status.INTERRUPTED
     assert "Interrupted" in (tmp_path / "report.html").read_text(encoding="utf-8")
     # the half-way model predicts
-    identify.predict(tmp_path, press.folder, state="pressed_more")
+    predict.predict(tmp_path, press.folder, state="pressed_more")
     again = identified(press.folder, tmp_path)
     # the poses are registered anew, which may only help
     assert again.calibration.match.history[0] <= found.calibration.match.history[-1] * 1.001
@@ -237,7 +237,7 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, monkeypatch: p
 
 
 def test_the_verbs_are_functions_of_the_package() -> None:
-    assert naibu.identify is identify.identify and naibu.predict is identify.predict and naibu.report is identify.report
+    assert naibu.identify is identify.identify and naibu.predict is predict.predict and naibu.report is report.report
     assert naibu.load_experiment("ct_cube_plate").name == "ct_cube_plate" and "ct_cube_plate" in naibu.datasets.names()
     assert set(naibu.__all__) <= set(dir(naibu))
     with pytest.raises(AttributeError, match="identify"):

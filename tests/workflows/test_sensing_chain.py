@@ -18,7 +18,7 @@ from naibu.io.marker_tables import write_experiment_folder
 from naibu.validation.scanners.ct_mr import STEEL_WASHER, VirtualScan
 from naibu.validation.scanners.experiments import scanned_states
 from naibu.validation.specimens.marker_phantoms import VirtualSpecimen, box_experiment, virtual_specimen
-from naibu.workflows import identify
+from naibu.workflows import identify, predict
 
 TRUTH = {
     "soft: young_modulus": 100.0,
@@ -73,7 +73,7 @@ def chain(folder: Path, side: float, apart: float, made_mm: float, sought_mm: fl
     )
     settings = ModelSettings(element_size_mm=sought_mm)
     found = identify.identify(folder / "press", known=["firm=200 kPa"], settings=settings, states={"press": ["pressed"]})
-    unseen = identify.predict(found.model, folder / "press", state="pressed_more", heights_from_markers=True)
+    unseen = predict.predict(found.model, folder / "press", state="pressed_more", heights_from_markers=True)
     return Chain(specimen, scans, tracked, found, unseen)
 
 

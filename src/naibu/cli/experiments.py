@@ -174,10 +174,12 @@ def predict(
     out
         Folder for predicted.csv, summary.json, predicted.html and files for ParaView; may be that of the model.
     """
-    from naibu.workflows import identify
+    from naibu.workflows import predict as predict_workflow
     from naibu.workflows.report_content import accuracy
 
-    result = identify.predict(model, experiment, state=state, height_mm=height_mm, heights_from_markers=heights_from_markers, out=out)
+    result = predict_workflow.predict(
+        model, experiment, state=state, height_mm=height_mm, heights_from_markers=heights_from_markers, out=out
+    )
     for note in (*result.specimen.experiment.loading.assumed, *result.notes):
         say(note, "dim")
     if result.registered:
@@ -218,7 +220,7 @@ def compare(
         Folder for comparison.json; models that it holds already are not repeated.
     """
     from naibu.identification.from_markers.specimen_model import ModelSettings
-    from naibu.workflows import identify
+    from naibu.workflows import compare as compare_workflow
     from naibu.workflows.report_content import comparison_table
 
     laws: list[Law] = law or ["neo_hookean", "mooney_rivlin"]
@@ -229,7 +231,7 @@ def compare(
         for one, two, three in product(laws, contacts, joints)
     ]
     with progress_lines() as progress:
-        rows = identify.compare(experiments, candidates=candidates, known=known or (), out=out, progress=progress)
+        rows = compare_workflow.compare(experiments, candidates=candidates, known=known or (), out=out, progress=progress)
     table = comparison_table(rows)
     print_table(table.title, table.columns, table.rows)
     say(table.note, "dim")
@@ -244,9 +246,9 @@ def report(folder: Path) -> None:
     folder
         Where 'naibu identify' or 'naibu predict' wrote its results.
     """
-    from naibu.workflows import identify
+    from naibu.workflows import report as report_workflow
 
-    for page in identify.report(folder):
+    for page in report_workflow.report(folder):
         say(f"Report: {page}")
 
 

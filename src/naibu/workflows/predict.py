@@ -1,0 +1,75 @@
+"""Predict the markers of a state with a calibrated model, and write positions, summary and page."""
+
+from __future__ import annotations
+
+import os
+
+from naibu.core.errors import ConvergenceError, InputError
+from naibu.core.experiment import Experiment
+from naibu.identification.prediction.calibrated_model import CalibratedModel
+from naibu.identification.prediction.prediction import Prediction
+from naibu.identification.prediction.prediction import predict as predict_state
+from naibu.workflows.experiments import Source, load_experiment, loaded_names, require_loaded
+from naibu.workflows.result_folder import read_model, result_folder, write_prediction
+
+
+def predict(
+    model: CalibratedModel | str | os.PathLike[str],
+    experiment: Source,
+    *,
+    state: str | None = None,
+    height_mm: float | None = None,
+    heights_from_markers: bool = False,
+    out: str | os.PathLike[str] | None = None,
+) -> Prediction:
+    """Predict the markers of one state with a calibrated model, and write them.
+
+    Parameters
+    ----------
+    model : CalibratedModel or path
+        A model, or its ``model.json``.
+    experiment : path, str or Experiment
+        Folder, bundled dataset, or object.
+    state : str, optional
+        Name of the state; may be left out where there is only one loaded state.
+    height_mm : float, optional
+        Height of the plate or bar, or distance of the side plates, mm.
+    heights_from_markers : bool
+        Take the height from the lowest and highest marker layer of the measured state.
+    out : path, optional
+        Folder for ``predicted.csv``, ``summary.json``, ``predicted.html`` with ``predicted.json`` behind it, and ``predicted.vtu`` and
+        ``predicted.vtkhdf`` for ParaView.
+
+    Returns
+    -------
+    Prediction
+        Positions, uncertainty and assumptions.
+
+    Raises
+    ------
+    InputError
+        Unusable input; see `naibu.identification.prediction.prediction.predict`.
+    ConvergenceError
+        The state cannot be solved.
+    """
+    calibrated = model if isinstance(model, CalibratedModel) else read_model(model)
+    loaded = load_experiment(experiment)
+    name = state or _only_state(loaded)
+    require_loaded(loaded, name)
+    if height_mm is not None and heights_from_markers:
+        raise InputError("--height-mm and --heights-from-markers exclude each other; give one of them")
+    folder = None if out is None else result_folder(out)
+    try:
+        prediction = predict_state(calibrated, loaded, name, platen_position_mm=height_mm, heights_from_markers=heights_from_markers)
+    except ConvergenceError as error:
+        raise ConvergenceError(f"{loaded.name}/{name} cannot be solved: {error}") from error
+    if folder is not None:
+        write_prediction(folder, calibrated, prediction)
+    return prediction
+
+
+def _only_state(experiment: Experiment) -> str:
+    loaded = [s.name for s in experiment.states[1:] if s.loaded]
+    if len(loaded) != 1:
+        raise InputError(f"{experiment.name} has {len(loaded)} loaded states ({loaded_names(experiment)}); choose one with --state")
+    return loaded[0]
