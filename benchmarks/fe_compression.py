@@ -31,7 +31,7 @@ def run_naibu(case: Case, *, load_steps: int | None = STEPS, solver: str = "defa
     if solver == "direct":
         linear = pardiso(body.pattern.matrix(np.zeros((body.pattern.n_blocks, 3, 3))))
     elif solver == "multigrid":
-        linear = MultigridSolver(case.mesh.points, problem.prescribed.constrained.ravel())
+        linear = MultigridSolver(case.mesh.points, problem.prescribed.constrained)
     solution = solve(problem, settings=settings, solver=linear)
     u = solution.displacement
     return Result(u, body.forces(u)[1][case.top].sum(axis=0), solution.iterations)

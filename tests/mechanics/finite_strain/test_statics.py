@@ -247,9 +247,10 @@ def test_linear_solvers_lead_to_the_same_state():
     assert relative(solve(body, solver=SuperLUSolver()).displacement, solve(body).displacement) < 1e-6
     mesh, stuck = crushed(0.3)
     reference = solve(stuck)
-    multigrid = solve(stuck, solver=MultigridSolver(mesh.points, stuck.prescribed.constrained.ravel()))
+    multigrid = solve(stuck, solver=MultigridSolver(mesh.points, stuck.prescribed.constrained))
     assert relative(multigrid.displacement, reference.displacement) < 1e-6
     assert multigrid.linear_solver == MultigridSolver.name
+    assert solve(stuck, settings=SolverSettings(linear_solver="multigrid")).linear_solver == MultigridSolver.name
 
 
 def test_states_follow_the_load_and_are_reported():

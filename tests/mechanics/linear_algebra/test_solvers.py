@@ -110,7 +110,7 @@ def test_singular_systems_are_refused(symmetric):
 def test_multigrid_agrees_with_direct_solvers_also_with_an_aged_hierarchy():
     mesh, constrained = body(9)
     assert mesh.n_points > 600  # more than the size of the coarsest level
-    solver = MultigridSolver(mesh.points, constrained.ravel(), relative_tolerance=1e-11)
+    solver = MultigridSolver(mesh.points, constrained, relative_tolerance=1e-11)
     rng = np.random.default_rng(5)
     for young, nu, squeeze in ((20.0, 0.45, 0.05), (20.0, 0.45, 0.06), (20.0, 0.49, 0.3)):
         matrix = stiffness(young, nu, squeeze, constrained=constrained, mesh=mesh)
@@ -123,7 +123,7 @@ def test_multigrid_says_when_it_does_not_converge():
     mesh, constrained = body(9)
     matrix = stiffness(constrained=constrained, mesh=mesh)
     with pytest.raises(ConvergenceError, match="in 2 iterations"):
-        MultigridSolver(mesh.points, constrained.ravel(), max_iterations=2).factorize(matrix).solve(np.ones(matrix.shape[0]))
+        MultigridSolver(mesh.points, constrained, max_iterations=2).factorize(matrix).solve(np.ones(matrix.shape[0]))
 
 
 def test_without_pardiso_superlu_is_used(monkeypatch):
@@ -137,27 +137,27 @@ def test_without_pardiso_superlu_is_used(monkeypatch):
     with pytest.raises(InputError, match="naibu\\[fast\\]"):
         PardisoSolver(matrix, symmetric=True)
     monkeypatch.setattr(solver_selection, "DIRECT_LIMIT", 60)
-    assert choose_solver(matrix, MESH.points, CONSTRAINED.ravel(), symmetric=False).name == SuperLUSolver.name
+    assert choose_solver(matrix, MESH.points, CONSTRAINED, symmetric=False).name == SuperLUSolver.name
 
 
 @pytest.mark.parametrize("symmetric", [True, False])
 def test_size_and_symmetry_choose_the_solver(monkeypatch, symmetric):
     matrix = stiffness()
-    small = choose_solver(matrix, MESH.points, CONSTRAINED.ravel(), symmetric=symmetric)
+    small = choose_solver(matrix, MESH.points, CONSTRAINED, symmetric=symmetric)
     assert not isinstance(small, MultigridSolver)
     monkeypatch.setattr(solver_selection, "DIRECT_LIMIT", 60)
-    large = choose_solver(matrix, MESH.points, CONSTRAINED.ravel(), symmetric=symmetric)
+    large = choose_solver(matrix, MESH.points, CONSTRAINED, symmetric=symmetric)
     assert isinstance(large, MultigridSolver) == symmetric
 
 
-@given(seed=st.integers(0, 2**32 - 1))
+@given(seed=st.integers(0, 2**32 - 1), dimension=st.integers(1, 3))
 @settings(max_examples=10, deadline=None)
-def test_rigid_body_modes_span_rigid_motions(seed):
+def test_rigid_body_modes_span_rigid_motions(seed, dimension):
     rng = np.random.default_rng(seed)
-    points = rng.normal(scale=20, size=(9, 3))
-    motion = np.cross(rng.normal(size=3), points) + rng.normal(size=3)
+    points, spin = rng.normal(scale=20, size=(9, dimension)), rng.normal(size=(dimension, dimension))
+    motion = points @ (spin - spin.T) + rng.normal(size=dimension)
     modes = rigid_body_modes(points)
-    assert np.linalg.matrix_rank(modes) == 6
+    assert modes.shape[1] == np.linalg.matrix_rank(modes) == dimension * (dimension + 1) // 2
     found = np.linalg.lstsq(modes, motion.ravel(), rcond=None)[0]
     np.testing.assert_allclose(modes @ found, motion.ravel(), atol=1e-10)
 
@@ -212,9 +212,22 @@ def test_recycled_cholesky_becomes_direct_where_the_tangent_is_indefinite_and_re
         RecycledCholesky(matrix).factorize(stiffness(constrained=np.zeros_like(CONSTRAINED), squeeze=0.0)).solve(b)
 
 
+@pytest.mark.parametrize("name", ["recycled_cholesky", "multigrid"])
+def test_iterative_solvers_refuse_unsymmetric_matrices(name):
+    with pytest.raises(InputError, match="needs a symmetric matrix"):
+        choose_solver(unsymmetric(), MESH.points, CONSTRAINED, symmetric=False, solver=name)
+
+
+def test_unknown_solvers_and_constraints_of_another_shape_are_refused():
+    with pytest.raises(InputError, match="solver='lu' is not known; use one of automatic, superlu"):
+        choose_solver(stiffness(), MESH.points, CONSTRAINED, symmetric=True, solver="lu")
+    with pytest.raises(InputError, match="constrained must have shape"):
+        MultigridSolver(MESH.points, CONSTRAINED.ravel())
+
+
 @needs_pardiso
 def test_middle_sizes_recycle_their_factorization(monkeypatch):
     monkeypatch.setattr(solver_selection, "RECYCLING_FROM", 60)
     matrix = stiffness()
-    assert isinstance(choose_solver(matrix, MESH.points, CONSTRAINED.ravel(), symmetric=True), RecycledCholesky)
-    assert isinstance(choose_solver(matrix, MESH.points, CONSTRAINED.ravel(), symmetric=False), PardisoSolver)
+    assert isinstance(choose_solver(matrix, MESH.points, CONSTRAINED, symmetric=True), RecycledCholesky)
+    assert isinstance(choose_solver(matrix, MESH.points, CONSTRAINED, symmetric=False), PardisoSolver)

@@ -315,7 +315,7 @@ def push(**changes: object) -> Series:
         ({"mass": "heavy"}, "'lumped' or 'consistent'"),
         ({"density": None, "method": "rk4"}, "without inertia use"),
         ({"density": None, "stabilization": 10.0}, "without inertia use"),
-        ({"density": None, "supports": []}, "freely in 3 of 3 rigid ways"),
+        ({"density": None, "supports": []}, "3 of 3 rigid-body motions"),
         ({"stabilization": -1.0}, "stabilisation must be positive"),
         ({"method": "generalized_alpha", "spectral_radius": 1.5}, r"in \[0, 1\]"),
         ({"method": "rkf45", "tolerance": 0.0}, "tolerance"),

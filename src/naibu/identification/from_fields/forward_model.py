@@ -249,11 +249,7 @@ class Solvers:
         key = owner + np.packbits(constrained).tobytes()
         if key not in self._solvers:
             direct = matrix.shape[0] <= DIRECT_LIMIT and pardiso_library() is not None
-            chosen = (
-                direct_solver(matrix, symmetric=True)
-                if direct
-                else choose_solver(matrix, self._points, constrained.ravel(), symmetric=True)
-            )
+            chosen = direct_solver(matrix, symmetric=True) if direct else choose_solver(matrix, self._points, constrained, symmetric=True)
             self._solvers[key] = chosen
         return self._solvers[key].factorize(matrix)
 

@@ -87,7 +87,9 @@ class Newton:
         p = self.problem
         matrix = with_dirichlet_rows(matrix, p.prescribed.constrained, self.settings.anchor_stiffness + drag)
         if self.solver is None:
-            self.solver = choose_solver(matrix, p.points, p.prescribed.constrained.ravel(), symmetric=not p.unsymmetric)
+            self.solver = choose_solver(
+                matrix, p.points, p.prescribed.constrained, symmetric=not p.unsymmetric, solver=self.settings.linear_solver
+            )
         return self.solver.factorize(matrix)
 
     def solve(self, u: FloatArray, anchors: tuple[FloatArray, ...], load: float) -> tuple[FloatArray, float] | None:

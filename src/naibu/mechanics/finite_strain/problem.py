@@ -8,6 +8,7 @@ from naibu.core.arrays import FloatArray, Int32Array
 from naibu.mechanics.contact.penalty_contact import PLANE, Contact
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.linear_algebra.solver_selection import SolverName
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +26,8 @@ class SolverSettings:
     anchor_stiffness : float
         Weak springs to the ground on every node, as a fraction of the mean diagonal of the tangent; they only keep a body that nothing
         holds yet from drifting.
+    linear_solver : {"automatic", "superlu", "pardiso", "recycled_cholesky", "multigrid"}
+        See `naibu.mechanics.linear_algebra.solver_selection`.
     """
 
     first_step: float = 0.05
@@ -33,6 +36,7 @@ class SolverSettings:
     tolerance: float = 1e-7
     max_iterations: int = 16
     anchor_stiffness: float = 1e-9
+    linear_solver: SolverName = "automatic"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,4 +1,4 @@
-"""Smoothed-aggregation algebraic multigrid with rigid-body modes."""
+"""Smoothed-aggregation algebraic multigrid with rigid-body modes :cite:p:`vanek1996`, by pyamg :cite:p:`bell2022`."""
 
 from __future__ import annotations
 
@@ -8,21 +8,28 @@ import numpy as np
 import pyamg
 import scipy.sparse as sp
 
-from naibu.core.arrays import BoolArray, FloatArray
+from naibu.core.arrays import BoolArray, FloatArray, require_shape
 from naibu.mechanics.linear_algebra.iterative import RecyclingSolver
 
 
 class MultigridSolver(RecyclingSolver):
-    """Conjugate gradients with smoothed aggregation from the rigid-body modes.
+    """Conjugate gradients preconditioned by smoothed aggregation of the rigid-body modes.
 
     Parameters
     ----------
-    points : ndarray, shape (n, 3)
+    points : ndarray, shape (n, d)
         Node positions, mm, from which the rigid-body modes are made.
-    constrained : ndarray, shape (3 n,), bool
-        Degrees of freedom that are prescribed; their modes are zero.
+    constrained : ndarray, shape (n, d), bool
+        Constrained components; their modes are zero.
     relative_tolerance : float
         Of the residual of each solve.
+    max_iterations : int
+        After which a hierarchy is built anew, and after a second time the solve fails.
+
+    Raises
+    ------
+    InputError
+        `constrained` has another shape than `points`.
     """
 
     name = "CG + smoothed aggregation (pyamg)"
@@ -30,7 +37,8 @@ class MultigridSolver(RecyclingSolver):
     def __init__(self, points: FloatArray, constrained: BoolArray, *, relative_tolerance: float = 1e-8, max_iterations: int = 400) -> None:
         super().__init__(relative_tolerance=relative_tolerance, max_iterations=max_iterations)
         self._modes = rigid_body_modes(points)
-        self._modes[constrained] = 0.0
+        require_shape("constrained", constrained, points.shape)
+        self._modes[constrained.ravel()] = 0.0
 
     def preconditioner(self, matrix: sp.bsr_matrix) -> Callable[[FloatArray], FloatArray]:
         """Return one V-cycle of a hierarchy made for `matrix`."""
@@ -44,11 +52,12 @@ class MultigridSolver(RecyclingSolver):
 
 
 def rigid_body_modes(points: FloatArray) -> FloatArray:
-    """Return the six rigid-body modes (3 n, 6) of points (n, 3), about their centroid."""
-    x, y, z = (points - points.mean(axis=0)).T
-    modes = np.zeros((len(points), 3, 6))
-    modes[:, 0, 0] = modes[:, 1, 1] = modes[:, 2, 2] = 1.0
-    modes[:, 1, 3], modes[:, 2, 3] = -z, y
-    modes[:, 0, 4], modes[:, 2, 4] = z, -x
-    modes[:, 0, 5], modes[:, 1, 5] = -y, x
-    return modes.reshape(-1, 6)
+    """Return the rigid-body modes (n d, d (d + 1) / 2) of points (n, d), about their centroid: translations, then rotations."""
+    n, d = points.shape
+    centred = points - points.mean(axis=0)
+    planes = [(1, 2), (2, 0), (0, 1)] if d == 3 else [(0, 1)] * (d - 1)
+    modes = np.zeros((n, d, d + len(planes)))
+    modes[:, range(d), range(d)] = 1.0
+    for k, (a, b) in enumerate(planes):
+        modes[:, a, d + k], modes[:, b, d + k] = -centred[:, b], centred[:, a]
+    return modes.reshape(n * d, -1)

@@ -1,31 +1,82 @@
-"""Two-phase solution of sparse linear systems: analyse a pattern once, factorize values, solve right-hand sides.
+"""Choice of a linear solver by size, symmetry and what is installed.
 
-``solver = direct_solver(matrix)`` analyses the pattern, ``factorization = solver.factorize(matrix)`` takes the values, and
-``factorization.solve(b)`` may be called for any number of right-hand sides. Supernodal PARDISO (Intel oneMKL, a pip wheel) is used
-where it can be loaded, SuperLU of SciPy elsewhere. Symmetric systems that change little from one to the next are better served by
-`RecycledCholesky`, conjugate gradients preconditioned by an earlier factorization, and large ones by `MultigridSolver`, conjugate
-gradients preconditioned by smoothed aggregation with rigid-body modes. What these solve, they solve as accurately as asked.
+Sparse systems are solved in two phases: ``solver = choose_solver(matrix, ...)`` analyses the pattern, ``solver.factorize(matrix)`` takes
+the values, and ``solve(b)`` of the factorization may be called for any number of right-hand sides. The solvers are
+
+``"superlu"``
+    Sparse LU factorization of SciPy; always there.
+``"pardiso"``
+    Supernodal Cholesky or LU factorization of Intel oneMKL, a pip wheel.
+``"recycled_cholesky"``
+    Conjugate gradients preconditioned by a single-precision Cholesky factor of an earlier matrix, for symmetric systems that change little
+    from one to the next.
+``"multigrid"``
+    Conjugate gradients preconditioned by smoothed aggregation with rigid-body modes, for large symmetric systems :cite:p:`vanek1996`.
+
+All solve to their relative tolerance whatever the preconditioner.
 """
 
 from __future__ import annotations
 
+from typing import Literal, get_args
+
 import scipy.sparse as sp
 
 from naibu.core.arrays import BoolArray, FloatArray
-from naibu.mechanics.linear_algebra.direct import direct_solver, pardiso_library
+from naibu.core.errors import InputError
+from naibu.mechanics.linear_algebra.direct import PardisoSolver, SuperLUSolver, pardiso_library
 from naibu.mechanics.linear_algebra.iterative import RecycledCholesky
 from naibu.mechanics.linear_algebra.multigrid import MultigridSolver
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
+
+SolverName = Literal["automatic", "superlu", "pardiso", "recycled_cholesky", "multigrid"]
 
 DIRECT_LIMIT = 200_000  # unknowns from which a factorization costs more than multigrid, even if it is recycled; a tenth of that for SuperLU
 RECYCLING_FROM = 4_000  # unknowns from which a factorization is worth recycling
 
 
-def choose_solver(matrix: sp.bsr_matrix, points: FloatArray, constrained: BoolArray, *, symmetric: bool) -> LinearSolver:
-    """Choose by size: direct for unsymmetric and for small systems, recycled Cholesky up to `DIRECT_LIMIT` unknowns, multigrid above."""
-    limit = DIRECT_LIMIT if pardiso_library() is not None else DIRECT_LIMIT // 10
-    if symmetric and matrix.shape[0] > limit:
-        return MultigridSolver(points, constrained)
-    if symmetric and matrix.shape[0] > RECYCLING_FROM and pardiso_library() is not None:
-        return RecycledCholesky(matrix)
-    return direct_solver(matrix, symmetric=symmetric)
+def choose_solver(
+    matrix: sp.bsr_matrix, points: FloatArray, constrained: BoolArray, *, symmetric: bool, solver: SolverName = "automatic"
+) -> LinearSolver:
+    """Return a linear solver for matrices of the pattern of `matrix`.
+
+    Parameters
+    ----------
+    matrix : bsr_matrix, shape (n d, n d)
+        A first matrix, with the rows and columns of the constrained components replaced.
+    points : ndarray, shape (n, d)
+        Node positions, mm.
+    constrained : ndarray, shape (n, d), bool
+        Constrained components.
+    symmetric : bool
+        Whether all matrices will be symmetric.
+    solver : {"automatic", "superlu", "pardiso", "recycled_cholesky", "multigrid"}
+        See the module. ``"automatic"`` is direct for unsymmetric and for small systems, recycled Cholesky up to `DIRECT_LIMIT` unknowns
+        (where oneMKL is installed), and multigrid above; without oneMKL multigrid begins at a tenth of that.
+
+    Raises
+    ------
+    InputError
+        An unknown solver, one that needs oneMKL where it is not installed, or an iterative one for an unsymmetric matrix.
+    """
+    if solver not in get_args(SolverName):
+        raise InputError(f"solver={solver!r} is not known; use one of {', '.join(get_args(SolverName))}")
+    if solver == "automatic":
+        solver = _automatic(matrix.shape[0], symmetric=symmetric)
+    if solver == "superlu":
+        return SuperLUSolver()
+    if solver == "pardiso":
+        return PardisoSolver(matrix, symmetric=symmetric)
+    if not symmetric:
+        raise InputError(f"solver={solver!r} needs a symmetric matrix; with friction use 'pardiso', 'superlu' or 'automatic'")
+    return RecycledCholesky(matrix) if solver == "recycled_cholesky" else MultigridSolver(points, constrained)
+
+
+def _automatic(unknowns: int, *, symmetric: bool) -> SolverName:
+    with_mkl = pardiso_library() is not None
+    direct: SolverName = "pardiso" if with_mkl else "superlu"
+    if not symmetric:
+        return direct
+    if unknowns > (DIRECT_LIMIT if with_mkl else DIRECT_LIMIT // 10):
+        return "multigrid"
+    return "recycled_cholesky" if with_mkl and unknowns > RECYCLING_FROM else direct

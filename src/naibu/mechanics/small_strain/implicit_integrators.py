@@ -170,7 +170,7 @@ class Factorizations:
             phase.mass.add_to(matrix, mass_factor)
         matrix = with_dirichlet_rows(matrix, constrained)
         if matrix.shape[0] > DIRECT_LIMIT and phase.body.points.shape[1] == 3:
-            solver = choose_solver(matrix, phase.body.points, constrained.ravel(), symmetric=True)
+            solver = choose_solver(matrix, phase.body.points, constrained, symmetric=True)
         else:
             solver = direct_solver(matrix, symmetric=True)
         self.made += 1

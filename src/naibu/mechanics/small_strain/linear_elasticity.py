@@ -9,14 +9,15 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from naibu._numba.compilation import njit
-from naibu.core.arrays import BoolArray, FloatArray, Int32Array
+from naibu.core.arrays import BoolArray, FloatArray, Int32Array, require_shape
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
 from naibu.mechanics.finite_elements.linear_simplices import Simplices, elastic_forces, per_cell, simplices
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern, block_pattern, with_dirichlet_rows
+from naibu.mechanics.linear_algebra.multigrid import rigid_body_modes
 from naibu.mechanics.linear_algebra.protocols import Factorization
-from naibu.mechanics.linear_algebra.solver_selection import choose_solver
+from naibu.mechanics.linear_algebra.solver_selection import SolverName, choose_solver
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,67 +60,90 @@ class LinearBody:
         """Return the nodal forces (n, d), mN, that hold a displacement (n, d), mm."""
         return elastic_forces(self.simplices, lame_lambda, shear_modulus, displacement)
 
-    def factorized(self, lame_lambda: ArrayLike, shear_modulus: ArrayLike, constrained: BoolArray) -> Factorization:
-        """Factorize the stiffness with the unknowns `constrained` (n, d) eliminated.
+    def factorized(
+        self, lame_lambda: ArrayLike, shear_modulus: ArrayLike, constrained: BoolArray, *, solver: SolverName = "automatic"
+    ) -> Factorization:
+        """Factorize the stiffness with constrained components eliminated.
 
-        Solving returns zero at them where the right-hand side is zero.
+        Parameters
+        ----------
+        lame_lambda, shear_modulus : array_like
+            Lame's constants, kPa, one number or one a cell.
+        constrained : ndarray, shape (n, d), bool
+            Constrained components. A solution is zero there where the right-hand side is zero.
+        solver : str
+            Linear solver; see `naibu.mechanics.linear_algebra.solver_selection`.
 
         Raises
         ------
         InputError
-            The body can move freely.
+            `constrained` has another shape than the nodes, rigid-body motions remain, or the solver cannot be used.
         """
-        return self._factorized(self.stiffness(lame_lambda, shear_modulus), constrained)
+        return self._factorized(self.stiffness(lame_lambda, shear_modulus), constrained, solver)
 
-    def _factorized(self, stiffness: sp.bsr_matrix, constrained: BoolArray) -> Factorization:
+    def _factorized(self, stiffness: sp.bsr_matrix, constrained: BoolArray, solver: SolverName) -> Factorization:
         """Factorize a stiffness, which is changed in place."""
+        require_shape("constrained", constrained, self.points.shape)
         require_constrained(self.points, constrained)
         matrix = with_dirichlet_rows(stiffness, constrained)
-        return choose_solver(matrix, self.points, constrained, symmetric=True).factorize(matrix)
+        return choose_solver(matrix, self.points, constrained, symmetric=True, solver=solver).factorize(matrix)
 
     def solve(
-        self, lame_lambda: ArrayLike, shear_modulus: ArrayLike, prescribed: Prescribed, external_force: FloatArray | None = None
+        self,
+        lame_lambda: ArrayLike,
+        shear_modulus: ArrayLike,
+        prescribed: Prescribed,
+        external_force: FloatArray | None = None,
+        *,
+        solver: SolverName = "automatic",
     ) -> FloatArray:
-        """Return the displacement (n, d), mm, in equilibrium with prescribed displacements and nodal forces (n, d), mN.
+        """Return the displacement (n, d), mm, in static equilibrium.
+
+        Parameters
+        ----------
+        lame_lambda, shear_modulus : array_like
+            Lame's constants, kPa, one number or one a cell.
+        prescribed : Prescribed
+            Dirichlet boundary conditions.
+        external_force : ndarray, shape (n, d), optional
+            Nodal forces, mN.
+        solver : str
+            Linear solver; see `naibu.mechanics.linear_algebra.solver_selection`.
 
         Raises
         ------
         InputError
-            Supports or forces of another shape than the nodes, or a body that can move freely.
+            Boundary conditions or forces of another shape than the nodes, a body whose rigid-body motions are not constrained, or a solver
+            that cannot be used.
+        ConvergenceError
+            The iterative solver did not converge.
         """
         constrained = prescribed.constrained
-        if constrained.shape != self.points.shape:
-            raise InputError(f"the supports are for {constrained.shape} components, the body has {self.points.shape}")
+        require_shape("prescribed.constrained", constrained, self.points.shape)
         stiffness = self.stiffness(lame_lambda, shear_modulus)
         right = -(stiffness @ np.where(constrained, prescribed.values, 0.0).ravel()).reshape(constrained.shape)
         if external_force is not None:
-            if external_force.shape != self.points.shape:
-                raise InputError(f"external forces must have shape {self.points.shape}, not {external_force.shape}")
+            require_shape("external_force", external_force, self.points.shape)
             right += external_force
         right[constrained] = 0.0
-        solution = self._factorized(stiffness, constrained).solve(right.ravel()).reshape(right.shape)
+        solution = self._factorized(stiffness, constrained, solver).solve(right.ravel()).reshape(right.shape)
         return np.where(constrained, prescribed.values, solution)
 
 
 def require_constrained(points: FloatArray, constrained: BoolArray) -> None:
-    """Check that holding the components `constrained` (n, d) of points (n, d) leaves no rigid motion.
+    """Check that the constrained components (n, d) of points (n, d) leave no rigid-body motion.
 
     Raises
     ------
     InputError
-        The body can move freely; the message says in how many ways.
+        Rigid-body motions remain; the message says how many.
     """
-    d = points.shape[1]
-    centred = points - points.mean(axis=0)
-    modes = [np.broadcast_to(np.eye(d)[a], points.shape) for a in range(d)]
-    for a in range(d):
-        for b in range(a + 1, d):
-            turn = np.zeros_like(points)
-            turn[:, a], turn[:, b] = -centred[:, b], centred[:, a]
-            modes.append(turn / max(float(np.abs(turn).max()), 1e-300))
-    free = len(modes) - np.linalg.matrix_rank(np.array([mode[constrained] for mode in modes])) if constrained.any() else len(modes)
+    modes = rigid_body_modes(points)
+    modes = modes / np.maximum(np.abs(modes).max(axis=0), 1e-300)
+    count = modes.shape[1]
+    free = count - int(np.linalg.matrix_rank(modes[constrained.ravel()])) if constrained.any() else count
     if free:
-        raise InputError(f"the body can move freely in {free} of {len(modes)} rigid ways: hold more nodes or components")
+        raise InputError(f"{free} of {count} rigid-body motions are not constrained: constrain more nodes or components")
 
 
 @njit(cache=True)

@@ -194,7 +194,7 @@ def _solver(matrix: sp.bsr_matrix, points: FloatArray) -> LinearSolver:
     """Return a direct solver, which serves all motions at once, where a fast one is installed."""
     if pardiso_library() is not None:
         return direct_solver(matrix, symmetric=True)
-    return choose_solver(matrix, points, np.zeros(matrix.shape[0], dtype=bool), symmetric=True)
+    return choose_solver(matrix, points, np.zeros(points.shape, dtype=bool), symmetric=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
