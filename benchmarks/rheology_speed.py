@@ -18,7 +18,7 @@ import time
 import numpy as np
 
 from naibu.core.errors import ConvergenceError
-from naibu.mechanics.small_strain.dynamics import Series, explicit_step_limit, simulate
+from naibu.mechanics.small_strain.dynamics import Series, explicit_step_limit, simulate_motion
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.mechanics.small_strain.prescribed_motion import Path, Support
 from naibu.mechanics.small_strain.rheology import Rheology, three_element
@@ -40,7 +40,7 @@ def press(body: LinearBody, material: Rheology, method: str, span: float, step: 
         Support("plate", np.flatnonzero(z > SIDE_MM - 1e-9), path=Path.of(swing)),
     ]
     start = time.process_time()
-    series = simulate(body, material, DENSITY, supports, np.linspace(0.0, span, 6), step=step, method=method)
+    series = simulate_motion(body, material, DENSITY, supports, np.linspace(0.0, span, 6), step=step, method=method)
     return series, time.process_time() - start
 
 

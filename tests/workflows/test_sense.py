@@ -15,7 +15,7 @@ from naibu.cli import main
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError, NaibuError
 from naibu.core.volume import Volume
-from naibu.imaging.measure_displacement import METHODS, rigid_start, sense
+from naibu.imaging.measure_displacement import METHODS, measure_displacement, rigid_start
 from naibu.io.images import read_displacement, read_volume, write_displacement, write_volume
 from naibu.io.marker_tables import import_markers
 from naibu.io.meshes import read_mesh
@@ -49,7 +49,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 )
 def test_every_method_finds_the_motion(method: str, most_mm: float) -> None:
     before, after, truth, mask = squeezed_ball(seed=3)
-    sensed = sense(before, after, method=method, mask=mask)  # type: ignore[arg-type]
+    sensed = measure_displacement(before, after, method=method, mask=mask)  # type: ignore[arg-type]
     error = np.linalg.norm(sensed.displacement.vectors - truth, axis=-1)[mask & sensed.displacement.valid]
     assert np.median(error) < most_mm
     assert np.isnan(sensed.displacement.vectors[~mask]).all()
@@ -57,7 +57,7 @@ def test_every_method_finds_the_motion(method: str, most_mm: float) -> None:
 
 def test_the_default_states_a_covariance_that_holds_the_truth() -> None:
     before, after, truth, _ = squeezed_ball(seed=3)
-    found = sense(before, after)
+    found = measure_displacement(before, after)
     field = found.field(before, step=3)
     error = field.vectors - truth[at(before, field.points)]
     squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(field.covariance), error)
@@ -130,9 +130,9 @@ def test_scans_on_different_grids_are_refused(folder: Path) -> None:
     before, after, *_ = squeezed_ball(seed=3)
     other = Volume.from_array(after.values, spacing_mm=(1.5, 1.5, 1.9))
     with pytest.raises(InputError, match=r"different grids: 44x40x24 voxels of 1\.5x1\.5x2 mm before"):
-        sense(before, other)
+        measure_displacement(before, other)
     with pytest.raises(InputError, match="there is no method 'best'"):
-        sense(before, after, method="best")  # type: ignore[arg-type]
+        measure_displacement(before, after, method="best")  # type: ignore[arg-type]
 
 
 def test_a_mask_of_another_scan_is_refused(folder: Path, tmp_path: Path) -> None:

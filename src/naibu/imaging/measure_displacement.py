@@ -88,7 +88,7 @@ class Sensed:
         return DisplacementField.from_arrays(positions(grid)[some], self.displacement.vectors[some], covariance=covariance)
 
 
-def sense(
+def measure_displacement(
     reference: Volume, deformed: Volume, *, method: Method = "default", mask: ArrayLike | None = None, progress: Progress | None = None
 ) -> Sensed:
     """Return the displacement that carries one volume onto another, by a method of one's choice with settings that fit the volumes.

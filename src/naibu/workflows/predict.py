@@ -7,8 +7,7 @@ import os
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.experiment import Experiment
 from naibu.identification.prediction.calibrated_model import CalibratedModel
-from naibu.identification.prediction.prediction import Prediction
-from naibu.identification.prediction.prediction import predict as predict_state
+from naibu.identification.prediction.prediction import Prediction, predict_state
 from naibu.workflows.experiments import Source, load_experiment, loaded_names, require_loaded
 from naibu.workflows.result_folder import read_model, result_folder, write_prediction
 
@@ -48,7 +47,7 @@ def predict(
     Raises
     ------
     InputError
-        Unusable input; see `naibu.identification.prediction.prediction.predict`.
+        Unusable input; see `naibu.identification.prediction.prediction.predict_state`.
     ConvergenceError
         The state cannot be solved.
     """

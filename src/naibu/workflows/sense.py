@@ -22,7 +22,7 @@ from naibu.core.mesh import Mesh
 from naibu.core.volume import Volume
 from naibu.imaging.displacement.accuracy import check_point_errors, end_point_error, intensity_rms
 from naibu.imaging.displacement.strain import folded_share, green_lagrange_strain_of
-from naibu.imaging.measure_displacement import Method, Sensed, sense
+from naibu.imaging.measure_displacement import Method, Sensed, measure_displacement
 from naibu.imaging.preprocessing.resampling import positions, warped
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
@@ -136,7 +136,7 @@ def sense_pair(
     pair : Pair
         From `read_pair`.
     method : str
-        See `naibu.imaging.measure_displacement.sense`.
+        See `naibu.imaging.measure_displacement.measure_displacement`.
     out : path-like, optional
         Folder for ``displacement.mha``, ``standard_deviation.mha`` (where the method states one), ``displacement.vtu`` (of volumes),
         ``field.npz``, ``initial.csv`` and ``pressed.csv`` (places in the object as markers), ``sense.json`` and the page ``report.html``.
@@ -146,11 +146,11 @@ def sense_pair(
     Raises
     ------
     InputError
-        As `naibu.imaging.measure_displacement.sense`; also a folder that cannot be written to.
+        As `naibu.imaging.measure_displacement.measure_displacement`; also a folder that cannot be written to.
     """
     folder = None if out is None else result_folder(out)
     began = time.perf_counter()
-    sensed = sense(pair.before, pair.after, method=method, mask=pair.mask, progress=progress)
+    sensed = measure_displacement(pair.before, pair.after, method=method, mask=pair.mask, progress=progress)
     run = SenseRun(sensed, time.perf_counter() - began, figures(pair, sensed))
     return run if folder is None else SenseRun(sensed, run.seconds, run.figures, tuple(_written(pair, run, folder)))
 

@@ -25,7 +25,7 @@ from naibu.identification.from_markers.parameter_names import (
 from naibu.identification.from_markers.specimen_model import ModelSettings, specimen
 from naibu.identification.prediction.baselines import affine
 from naibu.identification.prediction.calibrated_model import CalibratedModel
-from naibu.identification.prediction.prediction import predict, rms
+from naibu.identification.prediction.prediction import predict_state, rms
 from naibu.mechanics.finite_strain.problem import SolverSettings
 from naibu.validation.specimens.marker_phantoms import Scanner, two_gels, virtual_specimen
 
@@ -141,7 +141,7 @@ def plate_model() -> CalibratedModel:
 
 def test_the_measured_cube_is_predicted_far_better_than_by_an_affine_map(plate_model: CalibratedModel) -> None:
     experiment = datasets.load("ct_cube_plate")
-    prediction = predict(plate_model, experiment, "height_35", heights_from_markers=True)
+    prediction = predict_state(plate_model, experiment, "height_35", heights_from_markers=True)
     trial = Trial.of(prediction.specimen, "height_35", NoiseModel())
     mapped = affine(prediction.specimen.marker_points, trial.measured)
     assert rms(prediction.residual) < 0.5 * rms(trial.measured - mapped)
@@ -160,8 +160,8 @@ def test_heights_come_from_nothing_but_the_mean_z_of_two_layers(plate_model: Cal
     points[:25, 2] += rng.permutation(np.linspace(-1.0, 1.0, 25))
     other = replace(state, markers=Markers.from_arrays(state.markers.ids, points, state.markers.trusted))
     changed = replace(experiment, states=tuple(other if s.name == "height_35" else s for s in experiment.states))
-    one = predict(plate_model, experiment, "height_35", heights_from_markers=True)
-    two = predict(plate_model, changed, "height_35", heights_from_markers=True)
+    one = predict_state(plate_model, experiment, "height_35", heights_from_markers=True)
+    two = predict_state(plate_model, changed, "height_35", heights_from_markers=True)
     assert two.platen_position_mm == pytest.approx(one.platen_position_mm, abs=1e-6)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from naibu.core.errors import InputError
 from naibu.identification.from_motion.rheology import MotionTrial, _Problem, identify_motion, rheology_parameters
-from naibu.mechanics.small_strain.dynamics import simulate
+from naibu.mechanics.small_strain.dynamics import simulate_motion
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.mechanics.small_strain.mass_matrix import mass_of
 from naibu.mechanics.small_strain.prescribed_motion import Path, Support
@@ -44,7 +44,7 @@ def measured(*, heavy: bool = False, force: bool = False, seed: int = 0) -> Moti
     fine, supports = body_of((36, 18))
     body = LinearBody.of(fine, thickness_mm=20.0)
     load = weight(fine) if heavy else None
-    series = simulate(body, per_region(fine, {"body": TRUTH}), DENSITY, supports, TIMES, step=1.0 / 64.0, load=load)
+    series = simulate_motion(body, per_region(fine, {"body": TRUTH}), DENSITY, supports, TIMES, step=1.0 / 64.0, load=load)
     operator = interpolation_operator(fine, POINTS)
     u = np.stack([operator @ state for state in series.displacement])
     u += SD_MM * rng.standard_normal(u.shape)

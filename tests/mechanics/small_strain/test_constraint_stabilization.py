@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.mechanics.small_strain._rheology_kernels import rates
 from naibu.mechanics.small_strain.constraint_stabilization import Stabilization, stabilized_accelerations
-from naibu.mechanics.small_strain.dynamics import METHODS, simulate
+from naibu.mechanics.small_strain.dynamics import METHODS, simulate_motion
 from naibu.mechanics.small_strain.implicit_integrators import MotionState
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.mechanics.small_strain.mass_matrix import mass_of
@@ -53,7 +53,7 @@ def test_a_simulation_obeys_the_system(kind: str) -> None:
     """Reactions of a simulated state are the multipliers of system (9) for that state."""
     body, floor, free = block()
     plate = Support("plate", free[:1], path=PUSH)
-    motion = simulate(body, GEL, 1.0, [floor, plate], [0.0, 0.4], step=0.01, method="rk4", mass=kind, stabilization=15.0)
+    motion = simulate_motion(body, GEL, 1.0, [floor, plate], [0.0, 0.4], step=0.01, method="rk4", mass=kind, stabilization=15.0)
     state, n = motion.final, body.points.size
     law = CellRheology.of(body.simplices.n_cells, GEL)
     force = -rates(body.simplices, law.flow(), state.velocity, state.trace, state.strain)[0].ravel()
@@ -78,7 +78,7 @@ def test_gaps_close_like_a_critically_damped_oscillator(method: str) -> None:
     lifted[floor.nodes] = [0.0, 0.05]
     start = replace(MotionState.at_rest(body.simplices), displacement=lifted)
     times = np.linspace(0.0, 1.0, 11)
-    motion = simulate(
+    motion = simulate_motion(
         body,
         GEL,
         1.0,
@@ -100,7 +100,7 @@ def test_contact_forces_are_those_of_exact_supports(method: str) -> None:
     plate = Support("plate", free[:1], path=PUSH, end_s=0.6)
     step = 0.002
     exact, kept = (
-        simulate(body, GEL, 1.0, [floor, plate], np.linspace(0.0, 1.0, 11), step=step, method=method, stabilization=w)
+        simulate_motion(body, GEL, 1.0, [floor, plate], np.linspace(0.0, 1.0, 11), step=step, method=method, stabilization=w)
         for w in (None, 200.0)
     )
     assert kept.displacement == pytest.approx(exact.displacement, abs=5e-4)
@@ -114,9 +114,9 @@ def test_contact_forces_are_those_of_exact_supports(method: str) -> None:
 def test_stable_with_stiff_stabilisation_and_huge_steps() -> None:
     body, floor, free = block()
     plate = Support("plate", free, path=Path.through([0.0, 1.0], [(0.0, 0.0), (0.0, -0.1)]))
-    motion = simulate(body, voigt(10.0, 1.0, 0.3), 1.0, [floor, plate], np.arange(60.0), step=1.0, stabilization=1e4)
+    motion = simulate_motion(body, voigt(10.0, 1.0, 0.3), 1.0, [floor, plate], np.arange(60.0), step=1.0, stabilization=1e4)
     assert motion.displacement[-1, free] == pytest.approx(np.tile([0.0, -0.1], (len(free), 1)), abs=1e-9)
-    exact = simulate(body, voigt(10.0, 1.0, 0.3), 1.0, [floor, plate], np.arange(60.0), step=1.0)
+    exact = simulate_motion(body, voigt(10.0, 1.0, 0.3), 1.0, [floor, plate], np.arange(60.0), step=1.0)
     assert motion.reaction[-1] == pytest.approx(exact.reaction[-1], abs=1e-6)
 
 

@@ -13,7 +13,7 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.mechanics.finite_elements.linear_simplices import connection_matrices
-from naibu.mechanics.small_strain.dynamics import METHODS, Series, explicit_step_limit, simulate
+from naibu.mechanics.small_strain.dynamics import METHODS, Series, explicit_step_limit, simulate_motion
 from naibu.mechanics.small_strain.implicit_integrators import MotionState
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.mechanics.small_strain.mass_matrix import ConsistentMass, mass_of
@@ -72,7 +72,7 @@ def test_rate_of_convergence(method: str, kind: str) -> None:
     errors = []
     for count in (40, 80):
         tolerance = 1e-5 * (40 / count) ** 4  # of Runge-Kutta-Fehlberg, whose steps then keep their proportion
-        end = simulate(
+        end = simulate_motion(
             body, GEL, 1.0, [floor], [0.0, 1.0], step=1.0 / count, method=method, mass=kind, initial=start, tolerance=tolerance
         ).final
         errors.append(max(np.abs(end.displacement[free].ravel() - u).max(), np.abs(end.velocity[free].ravel() - v).max()))
@@ -91,10 +91,10 @@ def test_rate_under_moving_supports(method: str, support: str, kind: str) -> Non
     """Displacement, velocity, reactions and work keep the order where plates move, change their speed and let go."""
     body, free, floor = small_block()
     plate = Support("plate", free[:1], path=SMOOTH) if support == "smooth" else Support("plate", free[:1], path=BROKEN, end_s=0.7)
-    fine = simulate(body, GEL, 1.0, [floor, plate], [0.0, 0.5, 1.0], step=1 / 800, method="rk4", mass=kind)
+    fine = simulate_motion(body, GEL, 1.0, [floor, plate], [0.0, 0.5, 1.0], step=1 / 800, method="rk4", mass=kind)
     errors = []
     for count in (40, 80):
-        motion = simulate(body, GEL, 1.0, [floor, plate], [0.0, 0.5, 1.0], step=1 / count, method=method, mass=kind)
+        motion = simulate_motion(body, GEL, 1.0, [floor, plate], [0.0, 0.5, 1.0], step=1 / count, method=method, mass=kind)
         names = ("displacement", "velocity", "reaction", "work")
         errors.append([np.abs(getattr(motion, name) - getattr(fine, name)).max() for name in names])
     rates = np.log2(np.array(errors[0]) / errors[1])
@@ -105,10 +105,10 @@ def test_rate_under_moving_supports(method: str, support: str, kind: str) -> Non
 def test_rate_without_inertia(method: str, order: int) -> None:
     body, free, floor = small_block()
     plate = Support("plate", free[:1], path=BROKEN, end_s=0.7)
-    fine = simulate(body, GEL, None, [floor, plate], [0.0, 1.0], step=1 / 3000).final
+    fine = simulate_motion(body, GEL, None, [floor, plate], [0.0, 1.0], step=1 / 3000).final
     errors = [
         np.abs(
-            simulate(body, GEL, None, [floor, plate], [0.0, 1.0], step=1 / n, method=method).final.displacement - fine.displacement
+            simulate_motion(body, GEL, None, [floor, plate], [0.0, 1.0], step=1 / n, method=method).final.displacement - fine.displacement
         ).max()
         for n in (40, 80)
     ]
@@ -119,7 +119,7 @@ def test_slow_motion_is_that_without_inertia() -> None:
     body, free, floor = small_block()
     slow = Path.through([0.0, 30.0, 60.0], [(0.0, 0.0), (0.0, -0.1), (0.05, -0.1)])
     plate = Support("plate", free[:1], path=slow)
-    still, moving = (simulate(body, GEL, rho, [floor, plate], np.linspace(0, 60, 13), step=0.1) for rho in (None, 1e-3))
+    still, moving = (simulate_motion(body, GEL, rho, [floor, plate], np.linspace(0, 60, 13), step=0.1) for rho in (None, 1e-3))
     assert moving.displacement == pytest.approx(still.displacement, abs=1e-5)
     assert moving.force("plate")[1:] == pytest.approx(still.force("plate")[1:], abs=2e-3)
 
@@ -147,7 +147,7 @@ def test_energy_never_grows(seed: int, exponent: float, method: str, kind: str) 
     floor = [Support("floor", np.flatnonzero(mesh.points[:, 1] == 0.0))] if seed % 3 else []
     free = np.flatnonzero(mesh.points[:, 1] > 0.0)
     step = 10.0**exponent
-    motion = simulate(
+    motion = simulate_motion(
         body, random_law(mesh.n_cells, rng), 1.0, floor, step * np.arange(8.0), method=method, mass=kind, initial=flung(body, free, seed)
     )
     energy = motion.kinetic + motion.elastic
@@ -163,7 +163,7 @@ def test_stable_at_huge_steps(method: str, step: float) -> None:
     soft = voigt(10.0, 0.1, 0.3)
     assert step > 1.5 * explicit_step_limit(body, soft, 1e-4)
     plate = Support("plate", free, path=Path.through([0.0, step], [(0.0, 0.0), (0.01, -0.02)]))
-    motion = simulate(body, soft, 1e-4, [floor, plate], step * np.arange(201.0), method=method)
+    motion = simulate_motion(body, soft, 1e-4, [floor, plate], step * np.arange(201.0), method=method)
     constrained = np.zeros(body.points.shape)
     constrained[free] = (0.01, -0.02)
     assert motion.final.displacement == pytest.approx(constrained, abs=1e-12)
@@ -173,7 +173,7 @@ def test_stable_at_huge_steps(method: str, step: float) -> None:
 def test_the_default_damps_what_is_too_fast_for_its_steps() -> None:
     """Overdamped nodes that are let go stop at once, rather than to swing from step to step."""
     body, free, floor = small_block()
-    motion = simulate(body, voigt(1.0, 1e3, 0.3), 1e-6, [floor], [0.0, 1.0, 2.0], initial=flung(body, free))
+    motion = simulate_motion(body, voigt(1.0, 1e3, 0.3), 1e-6, [floor], [0.0, 1.0, 2.0], initial=flung(body, free))
     speed = np.abs(motion.velocity).max(axis=(1, 2))
     assert speed[1] < 1e-6 * speed[0] and speed[2] <= speed[1]
 
@@ -185,7 +185,7 @@ def test_generalized_alpha_keeps_or_damps_as_asked() -> None:
     energy = [
         (m.kinetic + m.elastic) / m.kinetic[0]
         for m in (
-            simulate(
+            simulate_motion(
                 body, elastic(10.0, 0.3), 1.0, [floor], 0.5 * np.arange(200.0), method="generalized_alpha", spectral_radius=r, initial=start
             )
             for r in (1.0, 0.5)
@@ -204,7 +204,7 @@ def test_bar_vibrates_at_its_frequency() -> None:
     shape = np.sin(0.5 * np.pi * x / length)
     start = replace(MotionState.at_rest(body.simplices), velocity=0.3 * shape[:, None])
     times = np.linspace(0.0, 2.0 * period, 9)
-    motion = simulate(body, elastic(9.0, 0.0), 1e-3, [Support("wall", np.array([0]))], times, step=period / 400, initial=start)
+    motion = simulate_motion(body, elastic(9.0, 0.0), 1e-3, [Support("wall", np.array([0]))], times, step=period / 400, initial=start)
     expected = 0.3 * period / (2.0 * np.pi) * np.sin(2.0 * np.pi * times / period)
     assert motion.displacement[:, -1, 0] == pytest.approx(expected, abs=2e-3 * 0.3 * period / 6.0)
 
@@ -213,9 +213,9 @@ def test_energy_balance_of_a_push() -> None:
     """Work is kinetic plus spring energy plus what dampers took, and these never give back."""
     body, free, floor = small_block()
     plate = Support("plate", free[:1], path=BROKEN, end_s=0.7)
-    motion = simulate(body, GEL, 0.1, [floor, plate], np.linspace(0.0, 3.0, 301), step=0.002)
+    motion = simulate_motion(body, GEL, 0.1, [floor, plate], np.linspace(0.0, 3.0, 301), step=0.002)
     assert (np.diff(motion.dissipated) >= -1e-12).all()
-    frictionless = simulate(body, elastic(10.0, 0.3), 0.1, [floor, plate], np.linspace(0.0, 0.7, 8), step=0.0002)
+    frictionless = simulate_motion(body, elastic(10.0, 0.3), 0.1, [floor, plate], np.linspace(0.0, 0.7, 8), step=0.0002)
     assert np.abs(frictionless.dissipated).max() < 2e-4 * frictionless.work.max()
     assert motion.work[-1] == pytest.approx(motion.work[75], rel=1e-12)  # nobody pushes any more
 
@@ -227,7 +227,7 @@ def test_forces_balance() -> None:
     masses = mass_of(body, 1e-3, "lumped").apply(np.ones(mesh.points.shape))
     weight = masses * [0.0, 0.0, -9810.0]
     floor = Support("floor", np.flatnonzero(mesh.points[:, 2] < 1e-9))
-    motion = simulate(body, voigt(100.0, 0.5, 0.4), 1e-3, [floor], np.linspace(0.0, 3.0, 61), step=0.01, load=weight)
+    motion = simulate_motion(body, voigt(100.0, 0.5, 0.4), 1e-3, [floor], np.linspace(0.0, 3.0, 61), step=0.01, load=weight)
     total = 1e-3 * 64.0 * 9810.0
     assert motion.force("floor")[-1] == pytest.approx([0.0, 0.0, total], abs=1e-3 * total)
     assert motion.displacement[-1] == pytest.approx(body.solve(*lame_parameters(100.0, 0.4), _fixed(mesh, floor), weight), abs=1e-3)
@@ -243,9 +243,9 @@ def test_going_on_is_the_same_as_going_through() -> None:
     body, free, floor = small_block()
     plate = Support("plate", free[:1], path=SMOOTH)
     for method in ("sdirk2", "backward_euler", "rk4"):
-        whole = simulate(body, GEL, 1.0, [floor, plate], [0.0, 0.5, 1.0], step=0.01, method=method)
-        half = simulate(body, GEL, 1.0, [floor, plate], [0.0, 0.5], step=0.01, method=method)
-        rest = simulate(body, GEL, 1.0, [floor, plate], [0.5, 1.0], step=0.01, method=method, initial=half.final)
+        whole = simulate_motion(body, GEL, 1.0, [floor, plate], [0.0, 0.5, 1.0], step=0.01, method=method)
+        half = simulate_motion(body, GEL, 1.0, [floor, plate], [0.0, 0.5], step=0.01, method=method)
+        rest = simulate_motion(body, GEL, 1.0, [floor, plate], [0.5, 1.0], step=0.01, method=method, initial=half.final)
         assert rest.final.displacement == pytest.approx(whole.final.displacement, abs=1e-4)
         assert rest.final.displacement == pytest.approx(whole.final.displacement, abs=1e-13) or method != "rk4"
 
@@ -257,7 +257,7 @@ def test_relative_support_pushes_from_where_the_body_is() -> None:
     again = Path.through([3.0, 4.0], [(0.0, 0.0), (0.0, -0.1)])
     law = maxwell(10.0, 0.5, 0.3)
     supports = [floor, Support("first", free, path=down, end_s=2.0), Support("second", free, path=again, start_s=3.0, relative=True)]
-    motion = simulate(body, law, None, supports, np.linspace(0.0, 5.0, 51))
+    motion = simulate_motion(body, law, None, supports, np.linspace(0.0, 5.0, 51))
     assert motion.displacement[30, free, 1] == pytest.approx(-0.1, abs=1e-6)
     assert motion.displacement[40, free, 1] == pytest.approx(-0.2, abs=1e-6)
     assert motion.force("first")[25:] == pytest.approx(0.0) and motion.force("second")[:29] == pytest.approx(0.0)
@@ -267,8 +267,8 @@ def test_relative_support_pushes_from_where_the_body_is() -> None:
 def test_one_factorization_a_step_size_and_set_of_supports() -> None:
     body, free, floor = small_block()
     plate = Support("plate", free[:1], path=BROKEN, end_s=0.6)
-    assert simulate(body, GEL, 1.0, [floor, plate], np.linspace(0.0, 1.2, 13), step=0.01).factorizations == 2
-    assert simulate(body, GEL, 1.0, [floor], np.linspace(0.0, 1.2, 13), step=0.01).factorizations == 1
+    assert simulate_motion(body, GEL, 1.0, [floor, plate], np.linspace(0.0, 1.2, 13), step=0.01).factorizations == 2
+    assert simulate_motion(body, GEL, 1.0, [floor], np.linspace(0.0, 1.2, 13), step=0.01).factorizations == 1
 
 
 def test_explicit_limit() -> None:
@@ -278,17 +278,17 @@ def test_explicit_limit() -> None:
     for law in (elastic(10.0, 0.3), voigt(10.0, 5.0, 0.3), GEL):
         limit = explicit_step_limit(body, law, 1.0)
         start = flung(body, np.flatnonzero(mesh.points[:, 1] > 0.0))
-        calm = simulate(body, law, 1.0, [floor], limit * np.arange(301.0), method="rk4", initial=start)
+        calm = simulate_motion(body, law, 1.0, [floor], limit * np.arange(301.0), method="rk4", initial=start)
         assert calm.kinetic[-1] + calm.elastic[-1] <= calm.kinetic[0]
         with pytest.raises(ConvergenceError, match="take shorter ones"):
-            simulate(body, law, 1.0, [floor], 3.0 * limit * np.arange(1001.0), method="rk4", initial=start)
+            simulate_motion(body, law, 1.0, [floor], 3.0 * limit * np.arange(1001.0), method="rk4", initial=start)
 
 
 def test_fehlberg_keeps_its_tolerance() -> None:
     body, free, floor = small_block()
     plate = Support("plate", free[:1], path=BROKEN, end_s=0.7)
-    fine = simulate(body, GEL, 1.0, [floor, plate], [0.0, 1.0], step=1 / 2000, method="rk4").final
-    found = [simulate(body, GEL, 1.0, [floor, plate], [0.0, 1.0], method="rkf45", tolerance=tolerance) for tolerance in (1e-4, 1e-7)]
+    fine = simulate_motion(body, GEL, 1.0, [floor, plate], [0.0, 1.0], step=1 / 2000, method="rk4").final
+    found = [simulate_motion(body, GEL, 1.0, [floor, plate], [0.0, 1.0], method="rkf45", tolerance=tolerance) for tolerance in (1e-4, 1e-7)]
     errors = [np.abs(m.final.displacement - fine.displacement).max() / np.abs(fine.displacement).max() for m in found]
     assert errors[0] < 1e-3 and errors[1] < 1e-6 and found[0].steps < found[1].steps
 
@@ -297,7 +297,7 @@ def push(**changes: object) -> Series:
     body, _, floor = small_block()
     options: dict[str, object] = {"density": 1.0, "supports": [floor], "times": [0.0, 1.0]}
     options |= changes
-    return simulate(body, GEL, options.pop("density"), options.pop("supports"), options.pop("times"), **options)  # type: ignore[arg-type]
+    return simulate_motion(body, GEL, options.pop("density"), options.pop("supports"), options.pop("times"), **options)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -351,9 +351,9 @@ def test_bad_supports_are_named() -> None:
         push().force("hand")
     lonely = Mesh.from_arrays([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [5.0, 5.0]], [[0, 1, 2]], "triangle")
     with pytest.raises(InputError, match="node 3 belongs to no cell"):
-        simulate(LinearBody.of(lonely), GEL, 1.0, [], [0.0, 1.0])
+        simulate_motion(LinearBody.of(lonely), GEL, 1.0, [], [0.0, 1.0])
     body, free, floor = small_block()
     with pytest.raises(InputError, match="the times start at 1 s"):
-        simulate(body, GEL, 1.0, [floor], [1.0, 2.0], initial=flung(body, free))
+        simulate_motion(body, GEL, 1.0, [floor], [1.0, 2.0], initial=flung(body, free))
     with pytest.raises(InputError, match="of another body"):
-        simulate(body, GEL, 1.0, [floor], [0.0, 2.0], initial=MotionState.at_rest(LinearBody.of(lonely).simplices))
+        simulate_motion(body, GEL, 1.0, [floor], [0.0, 2.0], initial=MotionState.at_rest(LinearBody.of(lonely).simplices))

@@ -15,7 +15,7 @@ from naibu.core.mesh import Mesh
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.mechanics.finite_elements.linear_simplices import connection_matrices, simplices
 from naibu.mechanics.small_strain._rheology_kernels import advanced, elastic_energy, rates, stage_forces
-from naibu.mechanics.small_strain.dynamics import Series, simulate
+from naibu.mechanics.small_strain.dynamics import Series, simulate_motion
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.mechanics.small_strain.prescribed_motion import Path, Support
 from naibu.mechanics.small_strain.rheology import CellRheology, Rheology, elastic, maxwell, per_region, three_element, voigt
@@ -44,7 +44,7 @@ def pulled(elements: Elements, path: Path, times: np.ndarray, **options: object)
     """A rod of 5 mm and 2 mm^2, without inertia, whose right end follows a path."""
     body = rod()
     supports = [Support("wall", np.array([0])), Support("hand", np.array([4]), path=path)]
-    return simulate(body, material(elements), None, supports, times, **options)  # type: ignore[arg-type]
+    return simulate_motion(body, material(elements), None, supports, times, **options)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -59,7 +59,7 @@ def test_creep_and_recovery(name: str) -> None:
     expected[[0, 20]] = creep_strain(elements, 3.0, 2.0, [0.0, 2.0])
     errors = []
     for step in (0.1, 0.05):
-        motion = simulate(
+        motion = simulate_motion(
             body, material(elements), None, [wall], times, step=step, load=lambda t: pull if t < 2.0 else 0.0 * pull, breaks=[2.0]
         )
         strain = motion.displacement[:, 4, 0] / 5.0
@@ -90,7 +90,7 @@ def test_displacement_that_stays(name: str) -> None:
     path = Path.through([0.0, 1.5], [[0.0], [0.1]])
     body = rod()
     supports = [Support("wall", np.array([0])), Support("hand", np.array([4]), path=path, end_s=4.5)]
-    motion = simulate(body, material(elements), None, supports, times, step=0.02)
+    motion = simulate_motion(body, material(elements), None, supports, times, step=0.02)
     assert motion.displacement[:, 4, 0] == pytest.approx(5.0 * released_strain(elements, 0.02, 1.5, 3.0, times), abs=1e-5)
     assert motion.displacement[-1, 4, 0] == pytest.approx(5.0 * residual_strain(elements, 0.02, 1.5, 3.0), abs=1e-5)
     assert motion.force("hand")[2:] == pytest.approx(0.0, abs=1e-12)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from naibu.core.errors import InputError
-from naibu.mechanics.small_strain.dynamics import simulate
+from naibu.mechanics.small_strain.dynamics import simulate_motion
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.mechanics.small_strain.prescribed_motion import Path, Support
 from naibu.mechanics.small_strain.rheology import CellRheology, elastic, maxwell, three_element, voigt
-from naibu.mechanics.small_strain.sensitivities import NAMES, MaterialChange, simulate_with_derivatives
+from naibu.mechanics.small_strain.sensitivities import NAMES, MaterialChange, simulate_motion_with_derivatives
 from naibu.meshing.primitives import box
 from naibu.meshing.structured_2d import rectangle
 
@@ -47,13 +47,13 @@ def test_derivatives_are_those_of_finite_differences(name: str, inertia: str) ->
     directions = [MaterialChange.relative(law, parameter, upper) for parameter in NAMES]
     density, mass = (None, "lumped") if inertia == "none" else (0.5, inertia)
     times = np.linspace(0.0, 1.2, 13)
-    series, found = simulate_with_derivatives(body, law, density, supports, times, directions, step=0.04, mass=mass, load=load)
-    same = simulate(body, law, density, supports, times, step=0.04, mass=mass, load=load)
+    series, found = simulate_motion_with_derivatives(body, law, density, supports, times, directions, step=0.04, mass=mass, load=load)
+    same = simulate_motion(body, law, density, supports, times, step=0.04, mass=mass, load=load)
     assert series.displacement == pytest.approx(same.displacement, abs=1e-14)
     eps = 1e-4
     for i, direction in enumerate(directions):
         ends = [
-            simulate(body, changed(law, direction, sign * eps), density, supports, times, step=0.04, mass=mass, load=load)
+            simulate_motion(body, changed(law, direction, sign * eps), density, supports, times, step=0.04, mass=mass, load=load)
             for sign in (1, -1)
         ]
         for field in ("displacement", "reaction"):
@@ -69,7 +69,7 @@ def test_three_dimensions_and_forces() -> None:
     supports = [Support("floor", np.flatnonzero(z < 0.1)), plate]
     law = CellRheology.of(mesh.n_cells, three_element(10.0, 2.0, 6.0, 0.4))
     directions = [MaterialChange.relative(law, parameter) for parameter in NAMES]
-    series, found = simulate_with_derivatives(body, law, None, supports, [0.0, 0.5, 1.0, 3.0], directions, step=0.1)
+    series, found = simulate_motion_with_derivatives(body, law, None, supports, [0.0, 0.5, 1.0, 3.0], directions, step=0.1)
     total = found.force(plate).sum(axis=0)
     assert total[1:] == pytest.approx(series.force("plate")[1:], rel=1e-6)  # forces are of first degree in E, C1 and C2 together
     assert np.abs(found.displacement).max() < 1e-7  # and prescribed shapes of none
@@ -84,8 +84,8 @@ def test_any_parameter_by_differences_of_tables() -> None:
 
     direction = MaterialChange.between(law_of(0.4 - 1e-6), law_of(0.4 + 1e-6), 2e-6)
     times = np.linspace(0.0, 1.2, 7)
-    _, found = simulate_with_derivatives(body, law_of(0.4), 0.5, supports, times, [direction], step=0.04)
-    ends = [simulate(body, law_of(0.4 + e), 0.5, supports, times, step=0.04).displacement for e in (-1e-4, 1e-4)]
+    _, found = simulate_motion_with_derivatives(body, law_of(0.4), 0.5, supports, times, [direction], step=0.04)
+    ends = [simulate_motion(body, law_of(0.4 + e), 0.5, supports, times, step=0.04).displacement for e in (-1e-4, 1e-4)]
     assert found.displacement[0] == pytest.approx((ends[1] - ends[0]) / 2e-4, abs=1e-6)
     with pytest.raises(InputError, match="has no neighbours"):
         MaterialChange.between(law_of(0.4), CellRheology.of(8, MATERIALS["three"]), 1.0)
@@ -103,12 +103,12 @@ def test_a_modulus_is_found_again() -> None:
         return CellRheology.from_arrays(body.simplices.n_cells, e, first, second, 0.3)
 
     times = np.linspace(0.0, 2.0, 41)
-    seen = simulate(body, law_of(truth), 0.5, supports, times, step=0.005).displacement
+    seen = simulate_motion(body, law_of(truth), 0.5, supports, times, step=0.005).displacement
     guess = np.log([10.0, 2.0, 6.0])
     for _ in range(8):
         law = law_of(guess)
         directions = [MaterialChange.relative(law, parameter, upper) for parameter in NAMES]
-        series, slopes = simulate_with_derivatives(body, law, 0.5, supports, times, directions, step=0.01)
+        series, slopes = simulate_motion_with_derivatives(body, law, 0.5, supports, times, directions, step=0.01)
         jacobian = slopes.displacement.reshape(3, -1).T
         guess = guess - np.linalg.lstsq(jacobian, (series.displacement - seen).ravel(), rcond=None)[0]
     assert guess == pytest.approx(truth, abs=0.01)
@@ -122,7 +122,7 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(InputError, match="mask of cells"):
         MaterialChange.relative(law, "young_modulus", upper[1:])
     with pytest.raises(InputError, match="one or more directions"):
-        simulate_with_derivatives(body, law, None, supports, [0.0, 1.0], [])
+        simulate_motion_with_derivatives(body, law, None, supports, [0.0, 1.0], [])
     moving = [supports[0], replace(supports[1], relative=True)]
     with pytest.raises(InputError, match="count from the free shape"):
-        simulate_with_derivatives(body, law, None, moving, [0.0, 1.0], [MaterialChange.relative(law, "young_modulus")])
+        simulate_motion_with_derivatives(body, law, None, moving, [0.0, 1.0], [MaterialChange.relative(law, "young_modulus")])

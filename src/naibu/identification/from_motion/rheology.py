@@ -19,11 +19,11 @@ from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.parameters import Parameter, ParameterSet, Scale
-from naibu.mechanics.small_strain.dynamics import Load, Series, simulate
+from naibu.mechanics.small_strain.dynamics import Load, Series, simulate_motion
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.mechanics.small_strain.prescribed_motion import Support
 from naibu.mechanics.small_strain.rheology import CellRheology, Rheology, per_region, three_element
-from naibu.mechanics.small_strain.sensitivities import MaterialChange, SeriesDerivatives, simulate_with_derivatives
+from naibu.mechanics.small_strain.sensitivities import MaterialChange, SeriesDerivatives, simulate_motion_with_derivatives
 from naibu.meshing.point_location import interpolation_operator
 
 KINDS = ("young_modulus", "voigt_viscosity", "series_viscosity", "poisson_ratio")
@@ -129,12 +129,12 @@ class MotionTrial:
 
     def simulated(self, materials: CellRheology) -> Series:
         """Return the motion with these materials."""
-        return simulate(self.body, materials, self.density, self.supports, self.times_s, step=self.step_s, load=self.load)
+        return simulate_motion(self.body, materials, self.density, self.supports, self.times_s, step=self.step_s, load=self.load)
 
     def differentiated(self, materials: CellRheology, directions: Sequence[MaterialChange]) -> SeriesDerivatives:
         """Return the derivatives of the motion along changes of the materials."""
         given = self.body, materials, self.density, self.supports, self.times_s
-        return simulate_with_derivatives(*given, directions, step=self.step_s, load=self.load)[1]
+        return simulate_motion_with_derivatives(*given, directions, step=self.step_s, load=self.load)[1]
 
     def compared(self, displacement: FloatArray, forces: Mapping[str, FloatArray]) -> FloatArray:
         """Return computed displacements (k, q, d) and forces in units of the noise, in one row, where there is a measurement."""

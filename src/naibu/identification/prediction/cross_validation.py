@@ -19,7 +19,7 @@ from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
 from naibu.identification.from_markers.specimen_model import ModelSettings
 from naibu.identification.prediction.calibrated_model import CalibratedModel
-from naibu.identification.prediction.prediction import Prediction, predict, rms
+from naibu.identification.prediction.prediction import Prediction, predict_state, rms
 from naibu.mechanics.linear_algebra.direct import use_one_thread
 
 Callback = Callable[[str, int, float], None]
@@ -136,7 +136,7 @@ def leave_one_out(
             raise KeyboardInterrupt
         model = CalibratedModel.of(found)
         return [
-            _left_out(predict(model, left, state.name, heights_from_markers=True, nearby=nearby.get(f"{left.name}/{state.name}")))
+            _left_out(predict_state(model, left, state.name, heights_from_markers=True, nearby=nearby.get(f"{left.name}/{state.name}")))
             for state in left.loaded_states
         ]
 

@@ -69,7 +69,7 @@ class Prediction:
     notes: tuple[str, ...]
 
 
-def predict(
+def predict_state(
     model: CalibratedModel,
     experiment: Experiment,
     state: str,

@@ -42,7 +42,7 @@ class Series:
     supports : tuple of Support
         As given.
     final : MotionState
-        From which `simulate` can go on.
+        From which `simulate_motion` can go on.
     method : str
         Its name.
     steps, factorizations : int
@@ -85,7 +85,7 @@ class Series:
         raise InputError(f"no support is called {name!r}; there are {', '.join(s.name for s in self.supports) or 'none'}")
 
 
-def simulate(
+def simulate_motion(
     body: LinearBody,
     materials: Rheology | CellRheology,
     density: ArrayLike | None,
@@ -169,7 +169,7 @@ def driven(
     initial: MotionState | None = None,
     stabilization: float | None = None,
 ) -> Series:
-    """Move a body through time by an integrator of one's own; otherwise as `simulate`."""
+    """Move a body through time by an integrator of one's own; otherwise as `simulate_motion`."""
     output = _checked_times(times, step)
     law = CellRheology.of(body.simplices.n_cells, materials)
     inertia = None if density is None else mass_of(body, density, mass)

@@ -128,7 +128,7 @@ class SeriesDerivatives:
         return out
 
 
-def simulate_with_derivatives(
+def simulate_motion_with_derivatives(
     body: LinearBody,
     materials: Rheology | CellRheology,
     density: ArrayLike | None,

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
-from naibu.mechanics.small_strain.dynamics import Series, simulate
+from naibu.mechanics.small_strain.dynamics import Series, simulate_motion
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.mechanics.small_strain.prescribed_motion import Path, Support
 from naibu.mechanics.small_strain.rheology import Rheology, elastic, maxwell, three_element
@@ -123,7 +123,7 @@ def pushed_square(
     step_s : float
         Step, and time between stored states.
     method : str
-        Of `simulate`.
+        Of `simulate_motion`.
 
     Raises
     ------
@@ -138,7 +138,7 @@ def pushed_square(
     path = Path.through([0.0, PHASES_S[0]], [(0.0, 0.0), (0.0, -push_mm)])
     supports = [Support("floor", np.flatnonzero(y == 0.0)), Support("indenter", top, path=path, end_s=PHASES_S[1])]
     times = np.linspace(0.0, PHASES_S[2], round(PHASES_S[2] / step_s) + 1)
-    series = simulate(LinearBody.of(mesh), SQUARES[name], density, supports, times, method=method)
+    series = simulate_motion(LinearBody.of(mesh), SQUARES[name], density, supports, times, method=method)
     return Study(name, mesh, SQUARES[name], series, _nearest(mesh, (0.0, side_mm)))
 
 
@@ -180,7 +180,7 @@ def agar_block(
     density = AGAR_MASS_KG / (width * depth * height)
     body = LinearBody.of(mesh, thickness_mm=depth)
     times = np.linspace(0.0, watched_s, round(watched_s / step_s) + 1)
-    series = simulate(body, material, density, supports, times)
+    series = simulate_motion(body, material, density, supports, times)
     return Study("agar block", mesh, material, series, _nearest(mesh, (middle, height)))
 
 
@@ -206,7 +206,7 @@ def agar_block_3d(
     top = np.flatnonzero((z > height - 1e-9) & (np.hypot(x + shift_mm, y) <= 0.5 * WEIGHT_MM + 1e-9))
     path = Path.through([0.0, push_s], [(0.0, 0.0, 0.0), (0.0, 0.0, -AGAR_PUSH_MM)])
     supports = [Support("floor", np.flatnonzero(z < 1e-9)), Support("weight", top, path=path)]
-    series = simulate(LinearBody.of(mesh), material, None, supports, [0.0, push_s, watched_s], step=0.5)
+    series = simulate_motion(LinearBody.of(mesh), material, None, supports, [0.0, push_s, watched_s], step=0.5)
     return Study("agar block, 3-D", mesh, material, series, _nearest(mesh, (-shift_mm, 0.0, height)))
 
 
@@ -230,7 +230,7 @@ def agar_under_bar(*, push_mm: float = 1.0, strip_mm: float = 15.0, material: Rh
     top = np.flatnonzero((y == height) & (np.abs(x) <= 0.5 * strip_mm + 1e-9))
     path = Path.through([0.0, 1.0], [(0.0, 0.0), (0.0, -push_mm)])
     supports = [Support("floor", np.flatnonzero(y == 0.0)), Support("bar", top, path=path)]
-    series = simulate(LinearBody.of(mesh), material, None, supports, [0.0, 1.0], step=0.5)
+    series = simulate_motion(LinearBody.of(mesh), material, None, supports, [0.0, 1.0], step=0.5)
     return Study("agar under a bar", mesh, material, series, _nearest(mesh, (0.0, height)))
 
 
