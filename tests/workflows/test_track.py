@@ -65,7 +65,7 @@ def test_an_experiment_folder_comes_out(scans: list[Path], tmp_path: Path) -> No
     assert [row[2] for row in told["tables"][0]["rows"]] == [len(LATTICE)] * 2
     assert set(told["settings"]) >= {"scan of initial", "scan of pressed"}
     assert "SHA-256" in told["settings"]["scan of pressed"]
-    assert run.page.read_text().startswith("<!doctype html>")
+    assert run.page.read_text().startswith("<!DOCTYPE html>")
     # the identification learns how certain the places are
     assert (experiment.xy_step_mm, experiment.z_step_mm) == pytest.approx(run.tracked.steps_mm)
     sd = np.nanmedian(run.tracked.sd_mm[..., 2])

@@ -38,7 +38,7 @@ def reproduce(chapter: ChapterName, *, out: Path = Path("naibu-reproduction"), s
         done = CHAPTERS[chapter](seed)
     for section in done.sections:
         for table in section.tables:
-            print_table(f"{table.name}: {table.caption}", table.columns, table.rows)
+            print_table(f"{table.title}: {table.caption}", table.columns, table.rows)
             if table.note:
                 say(table.note, "dim")
     page, numbers = write_chapter(done, out)

@@ -1,4 +1,4 @@
-"""What a page of results is made of: sections with tables and figures, such as a reproduced chapter of the report."""
+"""The content of a chapter page: sections of text, tables and figures."""
 
 from __future__ import annotations
 
@@ -6,40 +6,27 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from naibu.viewer.tables import Cell, Table
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
-
-Cell = str | float | int | None
-
-
-@dataclass(frozen=True, slots=True)
-class Table:
-    """One table; columns name their unit.
-
-    Attributes
-    ----------
-    name : str
-        What it reproduces, ``"Table 3.2"``.
-    caption : str
-        What it shows, in a sentence.
-    columns : tuple of str
-        Headers, with units.
-    rows : tuple of tuple
-        Cells; None where the report prints nothing.
-    note : str
-        What a reader must know: misprints, assumptions, why a number differs.
-    """
-
-    name: str
-    caption: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
-    note: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One figure: `draw` paints it on an empty matplotlib figure of `size` inches."""
+    """A figure that matplotlib draws.
+
+    Attributes
+    ----------
+    name : str
+        Label, such as ``"Fig. 3.4"``.
+    caption : str
+        What it shows.
+    draw : callable
+        Draws on an empty matplotlib figure.
+    size : (float, float)
+        Width and height, inches.
+    """
 
     name: str
     caption: str
@@ -49,7 +36,7 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A part of a chapter: paragraphs, then tables and figures."""
+    """A section of a chapter: a title, paragraphs, then tables and figures."""
 
     title: str
     paragraphs: tuple[str, ...] = ()
@@ -59,18 +46,18 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class Chapter:
-    """A reproduced chapter.
+    """The content of a page of tables and figures, such as a reproduced chapter of the 2008 report.
 
     Attributes
     ----------
     name : str
-        ``"ch3"``.
+        Name of its files, such as ``"ch3"``.
     title : str
         Heading of the page.
     sections : tuple of Section
-        In the report's order.
+        In reading order.
     settings : dict
-        Seeds and sizes that the numbers depend on.
+        Seeds and sizes that the numbers depend on, shown at the end of the page.
     """
 
     name: str

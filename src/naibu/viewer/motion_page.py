@@ -13,10 +13,9 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray, Int16Array, IntArray
 from naibu.core.errors import InputError
-from naibu.viewer.result_page.document import POLICY, asset
-from naibu.viewer.result_page.figures import ticks_between
-from naibu.viewer.result_page.payload import Table
-from naibu.viewer.result_page.tables import plain_table, provenance_table
+from naibu.viewer.page_frame import asset, page_html
+from naibu.viewer.tables import Table, provenance_section, table_html
+from naibu.viewer.ticks import ticks_between
 
 STEPS = 4000  # whole multiples from no displacement to the largest
 LEVELS = 255  # of colours
@@ -158,22 +157,17 @@ def _thinned(page: MotionPage) -> MotionPage:
 def _html(page: MotionPage) -> str:
     data = json.dumps(_packed(page), separators=(",", ":"), allow_nan=False).replace("</", "<\\/")
     lead = "".join(f"<p>{escape(s)}</p>" for s in page.sentences)
-    tables = "".join(plain_table(t) for t in page.tables)
+    tables = "".join(table_html(t) for t in page.tables)
     curves = f'<div class="curves">{force_curves(page)}</div>' if len(page.force_times) and len(page.bodies) else ""
-    provenance = ""
-    if page.provenance:
-        inner = f"<details><summary>How this was computed</summary>{provenance_table(page.provenance)}</details>"
-        provenance = f'<section id="provenance">{inner}</section>'
-    return (
-        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{POLICY}">'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><meta name="color-scheme" content="light dark">'
-        f'<title>{escape(page.title)}</title><link rel="icon" href="data:,"><style>{asset("report.css")}</style></head>\n'
-        f'<body><header><h1>{escape(page.title)}</h1>{lead}</header>\n<main><section class="motion"><div id="naibu-motion"></div>'
+    provenance = provenance_section(page.provenance) if page.provenance else ""
+    main = (
+        '<section class="motion"><div id="naibu-motion"></div>'
         '<noscript><p class="no-3d">The 3-D view needs JavaScript; curves and tables are complete without it.</p></noscript>'
-        f"{curves}</section>{f'<section>{tables}</section>' if tables else ''}{provenance}</main>\n"
-        "<footer>Lengths in mm, forces in mN. This page is complete in itself: it loads nothing from the network.</footer>\n"
-        f'<script type="application/json" id="naibu-frames">{data}</script><script>{asset("report.js")}</script></body></html>\n'
+        f"{curves}</section>{f'<section>{tables}</section>' if tables else ''}{provenance}"
     )
+    footer = "Lengths in mm, forces in mN. This page is self-contained: it loads nothing from the network."
+    scripts = f'<script type="application/json" id="naibu-frames">{data}</script><script>{asset("report.js")}</script>'
+    return page_html(page.title, lead, main, footer, scripts=scripts)
 
 
 def _packed(page: MotionPage) -> dict[str, object]:

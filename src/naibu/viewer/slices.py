@@ -14,8 +14,7 @@ import numpy as np
 
 from naibu.core.arrays import AnyFloatArray
 from naibu.core.errors import InputError
-from naibu.viewer.result_page.payload import Table
-from naibu.viewer.result_page.tables import plain_table
+from naibu.viewer.tables import Table, table_html
 
 GREYS = 255
 LEVELS = 254  # of an overlay; 255 says that nothing is known
@@ -103,7 +102,7 @@ def slices_html(view: SliceView) -> str:
     template = (files("naibu.viewer") / "assets" / "slices.html").read_text(encoding="utf-8")
     data = json.dumps(payload, separators=(",", ":"), allow_nan=False).replace("</", "<\\/")
     words = "".join(f"<p>{escape(s)}</p>" for s in view.sentences)
-    tables = "".join(plain_table(t) for t in view.tables)
+    tables = "".join(table_html(t) for t in view.tables)
     return template.replace("$TITLE", escape(view.title)).replace("$WORDS", words).replace("$TABLES", tables).replace("$DATA", data)
 
 

@@ -15,8 +15,9 @@ from naibu.core.errors import NaibuError
 from naibu.imaging.displacement.accuracy import end_point_error
 from naibu.imaging.measure_displacement import Method
 from naibu.imaging.preprocessing.resampling import warped
-from naibu.viewer.chapter import Cell, Chapter, Figure, Section, Table
+from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
+from naibu.viewer.tables import Cell, Table
 from naibu.workflows.result_folder import result_folder
 from naibu.workflows.sense import Pair, SenseRun, sense_pair
 
@@ -75,7 +76,7 @@ def compare_methods(
     columns, rows = _table(pair, runs)
     note = " ".join(f"{name} could not be used: {why}." for name, why in failures.items())
     caption = f"{pair.names[0]} to {pair.names[1]}; 'rigid' moves the object as one piece."
-    table = Table("Methods", caption, columns, rows, note)
+    table = Table("Methods", columns, rows, caption=caption, note=note)
     figures = tuple(_figure(pair, name, run) for name, run in runs.items())
     section = Section("Methods side by side", _words(pair), (table,), figures)
     settings: dict[str, Cell] = {**pair.inputs, "mask": "given" if pair.mask is not None else "found"}

@@ -16,7 +16,8 @@ from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.cross_validation import LeftOut, ModelRow
 from naibu.identification.prediction.prediction import Prediction, marker_layers
 from naibu.meshing.surface import boundary_faces, triangles_of_faces
-from naibu.viewer.result_page.payload import Box, Cell, Correlation, ParameterRow, Report, ResidualSet, Scene, Step, Table
+from naibu.viewer.result_page.payload import Box, Correlation, ParameterRow, Report, ResidualSet, Scene, Step
+from naibu.viewer.tables import Cell, Table
 
 _ACCURACY_COLUMNS = ("experiment/state", "markers", "x mm", "y mm", "z mm", "3-D mm", "in noise units")
 
@@ -70,7 +71,7 @@ def accuracy_table(calibration: Calibration, baselines: Mapping[str, Mapping[str
         note += " Left out: the other experiments identified the parameters."
     if names:
         note += " What comes last are distances in 3-D that simple descriptions leave."
-    return Table("Measured against predicted markers", columns, tuple(rows), note)
+    return Table("Measured against predicted markers", columns, tuple(rows), note=note)
 
 
 def comparison_table(rows: Sequence[ModelRow]) -> Table:
@@ -86,7 +87,7 @@ def comparison_table(rows: Sequence[ModelRow]) -> Table:
         "BIC: Bayesian information criterion, misfit with a penalty for parameters; differences above 10 are decisive. "
         "Left out: over all markers of the experiments, each predicted from the others."
     )
-    return Table("Models compared", columns, tuple(cells), note)
+    return Table("Models compared", columns, tuple(cells), note=note)
 
 
 def _accuracy_row(label: str, a: Accuracy) -> tuple[Cell, ...]:

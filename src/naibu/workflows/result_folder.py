@@ -24,8 +24,9 @@ from naibu.identification.prediction.prediction import Prediction, rms
 from naibu.io.files.atomic import write_atomically
 from naibu.io.vtk_files import write_vtkhdf_series, write_vtu
 from naibu.mechanics.finite_strain.statics import Solution
+from naibu.viewer.json_values import jsonable
 from naibu.viewer.result_page.page import report_html
-from naibu.viewer.result_page.payload import Report, jsonable, report_json
+from naibu.viewer.result_page.payload import Report, report_json
 from naibu.viewer.result_page.reading import report_from_json
 from naibu.workflows.report_content import Accuracy, accuracy, build_report, prediction_report
 

@@ -30,8 +30,8 @@ from naibu.io.images import read_displacement, read_volume, write_displacement, 
 from naibu.io.marker_tables import import_markers, write_markers
 from naibu.io.vtk_files import write_vtu
 from naibu.meshing.primitives import grid_cells
-from naibu.viewer.result_page.payload import Cell, Table
 from naibu.viewer.slices import Overlay, SliceView, slices_html
+from naibu.viewer.tables import Cell, Table
 from naibu.workflows.result_folder import result_folder
 
 Progress = Callable[[str], None]

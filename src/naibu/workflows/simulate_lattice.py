@@ -24,7 +24,7 @@ from naibu.mechanics.lattices.model.surface import hull_of
 from naibu.mechanics.lattices.simulation.contact import ContactState
 from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy, StudyFrame, StudyState, run_study
 from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, motion_html
-from naibu.viewer.result_page.payload import Table
+from naibu.viewer.tables import Table
 from naibu.workflows.lattice_study import PreparedStudy, prepared_study
 from naibu.workflows.result_folder import result_folder
 

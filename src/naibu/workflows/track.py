@@ -18,8 +18,9 @@ from naibu.imaging.markers.tracking import TrackedMarkers, track_markers
 from naibu.io.files.provenance import input_record
 from naibu.io.images import read_volume
 from naibu.io.marker_tables import write_experiment_folder, write_markers
-from naibu.viewer.chapter import Cell, Chapter, Figure, Section, Table
+from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
+from naibu.viewer.tables import Cell, Table
 from naibu.workflows.result_folder import result_folder
 
 if TYPE_CHECKING:
@@ -153,7 +154,7 @@ def _section(tracked: TrackedMarkers, columns: tuple[str, ...], rows: tuple[tupl
         "probable than one half, or where the marker departs from the smooth motion of its neighbours; such markers are not used by an "
         "identification.",
     )
-    table = Table("Markers", "found in every scan, and linked to the free state", columns, rows)
+    table = Table("Markers", columns, rows, caption="found in every scan, and linked to the free state")
     return Section("Markers", words, (table,), tuple(_figure(tracked, s) for s in range(1, len(tracked.names))))
 
 

@@ -19,8 +19,9 @@ from naibu.imaging.markers.sequence_tracking import TrackedSequence, track_seque
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
 from naibu.io.images import read_volume
-from naibu.viewer.chapter import Cell, Chapter, Figure, Section, Table
+from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
+from naibu.viewer.tables import Cell, Table
 from naibu.workflows.result_folder import result_folder
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ def track_sequence_file(
     section = Section(
         "Markers",
         ("Numbers run from left to right; x points right and y down the image, from the centre of its first pixel.",),
-        (Table("Tracks", f"{len(tracked)} markers in {len(stack)} frames", columns, rows, f"Rejected tracks: {rejected}."),),
+        (Table("Tracks", columns, rows, caption=f"{len(tracked)} markers in {len(stack)} frames", note=f"Rejected tracks: {rejected}."),),
         (_figure(tracked, stack, times, float(dx), float(dy)),),
     )
     page, _ = write_chapter(Chapter("tracks", "Markers followed through a sequence", (section,), settings), folder)

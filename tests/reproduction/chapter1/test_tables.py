@@ -27,8 +27,9 @@ from naibu.reproduction.chapter1.matching import (
     under_noise,
 )
 from naibu.reproduction.chapter1.tables import chapter1
-from naibu.viewer.chapter import Chapter, Table
+from naibu.viewer.chapter import Chapter
 from naibu.viewer.chapter_page import chapter_numbers, write_chapter
+from naibu.viewer.tables import Table
 
 PAPER = {t["id"]: t["rows"] for t in datasets.paper_tables()["tables"]}
 SIZES = {"pixels": 96, "slices": 15, "plane_points": (100, 120), "space_points": (300, 900), "draws": 1}
@@ -63,7 +64,7 @@ def chapter() -> Chapter:
 
 
 def table(chapter: Chapter, name: str) -> Table:
-    return next(t for s in chapter.sections for t in s.tables if t.name == name)
+    return next(t for s in chapter.sections for t in s.tables if t.title == name)
 
 
 @given(within_leg, st.floats(2.0, 14.0))
@@ -219,7 +220,7 @@ def test_pages_are_the_same_every_time(chapter: Chapter, tmp_path: Path) -> None
 def test_tables_fit_and_figures_are_labelled(chapter: Chapter) -> None:
     for section in chapter.sections:
         for each in section.tables:
-            assert all(len(r) == len(each.columns) for r in each.rows), each.name
+            assert all(len(r) == len(each.columns) for r in each.rows), each.title
         for figure in section.figures:
             canvas = Canvas(figsize=figure.size)
             figure.draw(canvas)

@@ -22,7 +22,8 @@ from naibu.reproduction.chapter2.tables import (
     ultrasound_trial,
 )
 from naibu.validation.analytic.viscoelastic import ramp_stress, released_strain, residual_strain
-from naibu.viewer.chapter import Chapter, Table
+from naibu.viewer.chapter import Chapter
+from naibu.viewer.tables import Table
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +32,7 @@ def chapter() -> Chapter:
 
 
 def table(chapter: Chapter, name: str) -> Table:
-    return next(t for s in chapter.sections for t in s.tables if t.name == name)
+    return next(t for s in chapter.sections for t in s.tables if t.title == name)
 
 
 @pytest.mark.parametrize("name", SQUARES)
@@ -132,9 +133,9 @@ def test_tables_show_what_they_say(chapter: Chapter) -> None:
     assert [s.title.split(",")[0] for s in chapter.sections] == titles
     for section in chapter.sections:
         for t in section.tables:
-            assert all(len(row) == len(t.columns) for row in t.rows), t.name
+            assert all(len(row) == len(t.columns) for row in t.rows), t.title
             assert all(np.isfinite(c) or "time" in t.columns[i] for row in t.rows for i, c in enumerate(row) if isinstance(c, float)), (
-                t.name
+                t.title
             )
     errors = table(chapter, "Errors against ultrasound")
     assert [row[1:3] for row in errors.rows] == [(1.0, 0.5), (1.8, 0.5), (2.8, 0.2)]

@@ -19,8 +19,9 @@ from naibu.reproduction.chapter3.experiment import EXPERIMENT, experiment_sectio
 from naibu.reproduction.chapter3.noise import noise_scatter, noise_section
 from naibu.reproduction.chapter3.square import accumulation, square_section
 from naibu.reproduction.chapter3.tables import chapter3
-from naibu.viewer.chapter import Section, Table
+from naibu.viewer.chapter import Section
 from naibu.viewer.chapter_page import write_chapter
+from naibu.viewer.tables import Table
 
 PAPER = {t["id"]: t["rows"] for t in datasets.paper_tables()["tables"]}
 

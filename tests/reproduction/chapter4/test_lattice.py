@@ -12,7 +12,7 @@ from naibu.reproduction.chapter4.lattice import _one_set, _pattern_table, exact_
 from naibu.reproduction.chapter4.octree import chapter4_octree, cost_section
 from naibu.reproduction.chapter4.patterns import JOINT, PATTERNS, RIVALS, PatternStudy, pattern_study
 from naibu.validation.specimens.lattice_twin import dough_lattice
-from naibu.viewer.chapter import Table
+from naibu.viewer.tables import Table
 
 PAPER = {t["id"]: t["rows"] for t in datasets.paper_tables()["tables"]}
 

@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 from naibu.core.errors import InputError
-from naibu.viewer.result_page.document import asset
+from naibu.viewer.json_values import jsonable
+from naibu.viewer.page_frame import asset
+from naibu.viewer.result_page.estimates import diverging_colour, parameter_table
 from naibu.viewer.result_page.packing import packed_scene, packed_scenes, thinned
 from naibu.viewer.result_page.page import MAX_BYTES, report_html, write_report
 from naibu.viewer.result_page.payload import (
@@ -23,11 +25,9 @@ from naibu.viewer.result_page.payload import (
     ResidualSet,
     Scene,
     Step,
-    Table,
-    jsonable,
     report_json,
 )
-from naibu.viewer.result_page.tables import cell_text, diverging_colour, parameter_table
+from naibu.viewer.tables import Table, cell_text
 
 SIDE_MM = 60.0
 
@@ -127,7 +127,9 @@ def fake_accuracy() -> Table:
         ("two_material_2", "plate at 45 mm", 98, 0.241, 0.232, 0.198, 0.388, 1.40, 8.12, 1.31),
         ("cube_plate", "plate at 35 mm", 98, 0.262, float("nan"), 0.207, 0.402, 1.45, 14.9, 2.08),
     )
-    return Table("Distance between predicted and measured markers", columns, rows, "Noise unit: what measurement noise alone would give.")
+    return Table(
+        "Distance between predicted and measured markers", columns, rows, note="Noise unit: what measurement noise alone would give."
+    )
 
 
 def fake_report(scenes: tuple[Scene, ...] | None = None) -> Report:

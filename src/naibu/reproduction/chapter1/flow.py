@@ -19,7 +19,8 @@ from naibu.imaging.preprocessing.rigid_registration import RigidMotion
 from naibu.reproduction.chapter1 import figures as drawn
 from naibu.reproduction.chapter1.calf_phantom import CalfCase, Tissue
 from naibu.reproduction.chapter1.matching import REPORT_PIXEL_MM, judged, picked_registration
-from naibu.viewer.chapter import Cell, Figure, Section, Table
+from naibu.viewer.chapter import Figure, Section
+from naibu.viewer.tables import Cell, Table
 
 Flow = Callable[[Volume, Volume], DenseDisplacement]
 LEAST_RANGE, LOST_MM = 30.0, 5.0
@@ -79,13 +80,13 @@ def flow_section(case: CalfCase, image: CalfCase, others: Mapping[str, FloatArra
     )
     note = "Errors are lengths of vectors against the true motion of the tissue, where the method measured."
     tables = (
-        Table("Section 3.5, image", "One slice, errors within it.", COLUMNS, tuple(_row(m, image, None) for m in plane), note),
+        Table("Section 3.5, image", COLUMNS, tuple(_row(m, image, None) for m in plane), caption="One slice, errors within it.", note=note),
         Table(
             "Section 3.5, volume",
-            "The volume, slices that count as in Table 1.3.",
             COLUMNS,
             tuple(_row(m, case, region) for m in space),
-            note,
+            caption="The volume, slices that count as in Table 1.3.",
+            note=note,
         ),
     )
     chosen = [m for m in plane if not m.name.startswith(("SSD", "NCC"))]

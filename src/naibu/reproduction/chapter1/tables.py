@@ -28,7 +28,8 @@ from naibu.reproduction.chapter1.matching import (
     under_noise,
 )
 from naibu.reproduction.chapter3.material_tests import printed_table
-from naibu.viewer.chapter import Cell, Chapter, Figure, Section, Table
+from naibu.viewer.chapter import Chapter, Figure, Section
+from naibu.viewer.tables import Cell, Table
 
 DEFAULT_NAME = "naibu's default"
 STOPS = {"max_iterations was reached": "alpha reached 10"}
@@ -157,8 +158,8 @@ def _registration(calf: Calf) -> Table:
         rows.append((name, found.angle_deg, found.rms_mm, float(off.mean()), float(off.max())))
     columns = ("registration", "angle, degrees", "residual at the points, RMS mm", "error over the tibia, mean mm", "largest, mm")
     note = f"The true motion turns the leg by {leg_pose().angle_deg:.2f} degrees, 3.00 of them within the slices."
-    return Table("Registration", "Motion of the tibia from points picked to the nearest voxel, against the true one.", columns,
-                 tuple(rows), note)  # fmt: skip
+    caption = "Motion of the tibia from points picked to the nearest voxel, against the true one."
+    return Table("Registration", columns, tuple(rows), caption=caption, note=note)
 
 
 def _plane_section(calf: Calf, draws: int, seed: int) -> Section:
@@ -205,7 +206,7 @@ def _table_1_1(calf: Calf) -> Table:
         "The table's printed title, 'Error of the checking points', belongs to Table 1.2. Times, printed as 5 s for both, depend on the "
         "machine and are left out; the relaxation takes milliseconds today."
     )
-    return Table("Table 1.1", "Matches of interest points in two slices.", columns, tuple(rows), note)
+    return Table("Table 1.1", columns, tuple(rows), caption="Matches of interest points in two slices.", note=note)
 
 
 def _table_of_noise(calf: Calf, draws: int, seed: int) -> Table:
@@ -219,7 +220,7 @@ def _table_of_noise(calf: Calf, draws: int, seed: int) -> Table:
         rows.append((*case, "of all, %", *(r.right_percent for r in group)))
     columns = ("added noise, sd in grey levels", "registered", "candidate pairs", "", *names)
     caption = "The same slices with noise added, registered first or searched in a box 2.75 times as wide."
-    return Table("Matches under noise", caption, columns, tuple(rows), f"Means over {draws} draws of the noise.")
+    return Table("Matches under noise", columns, tuple(rows), caption=caption, note=f"Means over {draws} draws of the noise.")
 
 
 def _table_1_2(calf: Calf, points: CheckPoints) -> Table:
@@ -245,7 +246,7 @@ def _table_1_2(calf: Calf, points: CheckPoints) -> Table:
         "0.000 may have been. They are moved back by the net that the matched points make after the push; outside it by the affine motion "
         "that fits all matches."
     )
-    return Table("Table 1.2", "Ten check points moved back: distance from where they were.", columns, tuple(rows), note)
+    return Table("Table 1.2", columns, tuple(rows), caption="Ten check points moved back: distance from where they were.", note=note)
 
 
 def _two_means(errors: FloatArray) -> tuple[float, float]:
@@ -305,7 +306,9 @@ def table_1_3(calf: Calf) -> Table:
         "leads back to the volume before: such voxels do not count in the RMS, and are white in the figure below. Right matches lie within "
         f"{RIGHT_MM:g} mm of the truth."
     )
-    return Table("Table 1.3", "Matches in volumes, the dense field, and the grey difference that is left.", columns, tuple(rows), note)
+    return Table(
+        "Table 1.3", columns, tuple(rows), caption="Matches in volumes, the dense field, and the grey difference that is left.", note=note
+    )
 
 
 def _judged(case: CalfCase, vectors: FloatArray, measured: BoolArray | None) -> tuple[float, float, float, float, float]:

@@ -14,7 +14,8 @@ from naibu.identification.from_motion.rheology import MotionTrial, identify_moti
 from naibu.mechanics.small_strain.prescribed_motion import Path, Support
 from naibu.mechanics.small_strain.rheology import elastic
 from naibu.reproduction.chapter2.simulations import AGAR, AGAR_PUSH_MM, AGAR_SIZE_MM, WEIGHT_MM, agar_block_3d
-from naibu.viewer.chapter import Cell, Section, Table
+from naibu.viewer.chapter import Section
+from naibu.viewer.tables import Cell, Table
 
 STEP_MM = 0.5  # of the printed coordinates
 PLACING_MM = 0.3  # of the middle of a blurred echo
@@ -57,7 +58,7 @@ def agar_section(trials: Mapping[str, tuple[FloatArray, FloatArray]], *, cell_mm
         "see naibu.identification.from_motion.rheology.",
     )
     note = "At strains of 25 % the linear law itself is wrong by more than the readings: the intervals hold for the model as it is."
-    table = Table("Agar", "Identified from the markers of Table 2.1.", columns, tuple(rows), note)
+    table = Table("Agar", columns, tuple(rows), caption="Identified from the markers of Table 2.1.", note=note)
     return Section("What the ultrasound markers tell about the agar", text, (table,))
 
 

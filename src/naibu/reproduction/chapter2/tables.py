@@ -25,7 +25,8 @@ from naibu.reproduction.chapter2.simulations import (
     pushed_square,
 )
 from naibu.validation.analytic.viscoelastic import released_strain, residual_strain
-from naibu.viewer.chapter import Cell, Chapter, Figure, Section, Table
+from naibu.viewer.chapter import Chapter, Figure, Section
+from naibu.viewer.tables import Cell, Table
 
 TRIALS = ("trial1", "trial2")
 MARKER_HEIGHT_MM = 20.0  # 10 mm below the top of a block of 30 mm
@@ -104,7 +105,10 @@ def _squares(step_s: float, divisions: int) -> Section:
         "material, prescribed displacements leave no room for the moduli. Only the forces, and what happens after release, differ."
     )
     return Section(
-        "Three squares, pushed and released", (text,), (Table("Squares", "What stays.", columns, rows, note),), (*snapshots, curves)
+        "Three squares, pushed and released",
+        (text,),
+        (Table("Squares", columns, rows, caption="What stays.", note=note),),
+        (*snapshots, curves),
     )
 
 
@@ -160,7 +164,7 @@ def _table_2_1(trials: dict[str, Readings], middle: Study, left: Study) -> Table
         "Positions and displacements measured (step 0.5 mm), and displacements simulated at the markers' measured first positions, 20 mm "
         "above the floor for y = 0. Trial 2 began with the middle marker at y = -3: the block had not come back, or the origin was kept."
     )
-    return Table("Table 2.1", "Marker displacements by ultrasound, and ours.", columns, tuple(rows), note)
+    return Table("Table 2.1", columns, tuple(rows), caption="Marker displacements by ultrasound, and ours.", note=note)
 
 
 def _table_of_errors(trials: dict[str, Readings], middle: Study, left: Study) -> Table:
@@ -174,7 +178,7 @@ def _table_of_errors(trials: dict[str, Readings], middle: Study, left: Study) ->
         "Report and 'ours': weight one mesh left of the middle. As the report does, the simulation is read at the lattice points that "
         "stand for the markers, 10 mm apart in the row 10 mm below the top."
     )
-    return Table("Errors against ultrasound", "Difference of simulated and measured displacement.", columns, rows, note)
+    return Table("Errors against ultrasound", columns, rows, caption="Difference of simulated and measured displacement.", note=note)
 
 
 def marker_errors(study: Study, seen: Readings) -> FloatArray:
@@ -212,7 +216,7 @@ def _table_of_variants(trials: dict[str, Readings], cell_mm: float) -> Table:
         "deep as the block, three dimensions a round one. Gels keep their volume, so a Poisson ratio near 0.5 is the better assumption: it "
         "moves the markers further sideways, as measured; linear triangles and tetrahedra are then too stiff, their forces too large."
     )
-    return Table("Variants", "What the report leaves open, and what it assumes.", columns, (printed, *rows), note)
+    return Table("Variants", columns, (printed, *rows), caption="What the report leaves open, and what it assumes.", note=note)
 
 
 def replace_poisson(material: Rheology, poisson_ratio: float) -> Rheology:
@@ -248,7 +252,7 @@ def _magnetic_resonance() -> Section:
         "Marker 5, right under the bar, goes down by 2 mm and comes back: rheological deformation is seen. As the report says, the other "
         "markers move too little for more; the comparison can only show that nothing contradicts the model.",
     )
-    table = Table("Table 2.2", "Marker displacements by MR, and ours.", columns, tuple(rows), note)
+    table = Table("Table 2.2", columns, tuple(rows), caption="Marker displacements by MR, and ours.", note=note)
     figure = Figure("Table 2.2, drawn", "Measured (blue) and simulated (orange) displacements, threefold.",
                     drawn.cross_section(study, seen.start, seen.displacement, simulated, trusted), (7.0, 3.4))  # fmt: skip
     return Section("Agar under a bar, seen by MR", text, (table,), (figure,))

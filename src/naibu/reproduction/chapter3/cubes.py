@@ -15,7 +15,8 @@ from naibu.identification.from_fields.load_cases import Zones
 from naibu.reproduction.chapter3 import figures as drawn
 from naibu.reproduction.chapter3.bodies import LAYERS, PushedBody, Split, cube, shape_error_percent
 from naibu.reproduction.chapter3.material_tests import printed_table
-from naibu.viewer.chapter import Cell, Figure, Section, Table
+from naibu.viewer.chapter import Figure, Section
+from naibu.viewer.tables import Cell, Table
 
 SPLITS: tuple[Split, ...] = get_args(Split)
 SIDE_MM = 40.0
@@ -107,7 +108,7 @@ def uniform_section() -> Section:
         )
     )
     rows += [(f"ours, {split}", *_moments(result, "lower half"), result.error, result.sideways) for split, result in results.items()]
-    table = Table("Table 3.2", "Uniform parameters, every tetrahedron unknown.", _columns(), tuple(rows), _DEFINITION)
+    table = Table("Table 3.2", _columns(), tuple(rows), caption="Uniform parameters, every tetrahedron unknown.", note=_DEFINITION)
     found, shown = results["symmetric"], {split: result.body.mesh for split, result in results.items()}
     figures = (
         Figure("Figure 3.9", "The two meshes: faces of the cube.", lambda c: drawn.meshes(c, shown)),
@@ -165,13 +166,16 @@ def layer_section() -> Section:
         rows.append((f"{layer}, true", e, nu, *(None,) * 8))
         rows.append((f"{layer}, paper", e_found, nu_found, *ranges[0], *ranges[1], *PRINTED_MODES[layer], error, None))
         rows += [(f"{layer}, ours, {s}", *_moments(r, layer), r.error, r.sideways) for s, r in results.items()]
+    note = (
+        f"{_DEFINITION} One error is printed for both layers. The printed mean nu of layer 2, 0.32, lies outside the printed range of its "
+        "elements."
+    )
     table = Table(
         "Table 3.3",
-        "Two unknown layers, every tetrahedron unknown.",
         _columns(),
         tuple(rows),
-        f"{_DEFINITION} One error is printed for both layers. The printed mean nu of layer 2, 0.32, lies outside the printed range of its "
-        "elements.",
+        caption="Two unknown layers, every tetrahedron unknown.",
+        note=note,
     )
     found = results["symmetric"]
     figures: list[Figure] = []
@@ -215,7 +219,7 @@ def reach_section() -> Section:
             error = float(np.abs(found.young_modulus / truth - 1.0)[fixed].max()) if fixed.any() else None
             rows.append((split, name, found.equations, found.unknowns, found.rank, int(fixed.sum()), zones.count, error))
     columns = ("mesh", "pushes", "equations", "unknowns", "rank", "tetrahedra determined", "of", "their largest relative error of E")
-    table = Table("Meshes and pushes", "What exact displacements determine.", columns, tuple(rows))
+    table = Table("Meshes and pushes", columns, tuple(rows), caption="What exact displacements determine.")
     text = (
         "Rigid motions of the top give at most three independent trials, as the body is linear. Even with the top moved in any way the "
         "rank ends short of the number of unknowns: two moduli of every tetrahedron are more than balances at nodes can hold, on either "

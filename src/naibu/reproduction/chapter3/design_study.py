@@ -15,7 +15,8 @@ from naibu.identification.from_fields.load_cases import FieldTrial
 from naibu.identification.from_fields.sensitivities import FieldModel, logarithms, young_and_poisson
 from naibu.meshing.point_location import interpolation_operator
 from naibu.reproduction.chapter3.bodies import PushedBody, cube
-from naibu.viewer.chapter import Figure, Section, Table
+from naibu.viewer.chapter import Figure, Section
+from naibu.viewer.tables import Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -141,7 +142,7 @@ def _stiffness_table(expected: list[Accuracy], checked: dict[float, Repeated], d
         e = [None, None] if found is None else (100.0 * found.young_modulus).tolist()
         nu = [None, None] if found is None else found.poisson_ratio.tolist()
         rows.append((ratio, *(100.0 * a.young_modulus_sd).tolist(), *e, *a.poisson_ratio_sd.tolist(), *nu))
-    return Table("Known object", "Accuracy against the stiffness of the known half", columns, tuple(rows))
+    return Table("Known object", columns, tuple(rows), caption="Accuracy against the stiffness of the known half")
 
 
 def _density_table(lattices: dict[tuple[int, int], Accuracy]) -> Table:
@@ -150,7 +151,7 @@ def _density_table(lattices: dict[tuple[int, int], Accuracy]) -> Table:
         (n, k, 100.0 * _rms(a.young_modulus_sd), 100.0 * _rms(a.young_modulus_bias), _rms(a.poisson_ratio_sd), _rms(a.poisson_ratio_bias))
         for (n, k), a in lattices.items()
     )
-    return Table("Density", "Accuracy against mesh and markers, root mean square over both layers", columns, rows)
+    return Table("Density", columns, rows, caption="Accuracy against mesh and markers, root mean square over both layers")
 
 
 def _rms(values: FloatArray) -> float:

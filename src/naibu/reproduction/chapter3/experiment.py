@@ -20,7 +20,8 @@ from naibu.reproduction.chapter3 import figures as drawn
 from naibu.reproduction.chapter3.bodies import LAYERS, Split, cube, split_hexahedra
 from naibu.reproduction.chapter3.cubes import mean_error_percent
 from naibu.reproduction.chapter3.material_tests import printed_table
-from naibu.viewer.chapter import Cell, Figure, Section, Table
+from naibu.viewer.chapter import Figure, Section
+from naibu.viewer.tables import Cell, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -132,13 +133,16 @@ def table_3_7(body: Lattice) -> Table:
         "chi2 / dof",
         "unbalanced force, %",
     )
+    note = (
+        "The SI2007 paper exchanges the Poisson ratios of the gels. A weighted balance that does not end within its limit of sweeps gives "
+        "no moduli: the likelihood then hardly depends on them. Least squares with a Poisson ratio above 0.5 describes no solid."
+    )
     return Table(
         "Table 3.7",
-        f"The unknown gel, hardness 0, with E 222 kPa of the known one; experiment {EXPERIMENT}.",
         columns,
         tuple(rows),
-        "The SI2007 paper exchanges the Poisson ratios of the gels. A weighted balance that does not end within its limit of sweeps gives "
-        "no moduli: the likelihood then hardly depends on them. Least squares with a Poisson ratio above 0.5 describes no solid.",
+        caption=f"The unknown gel, hardness 0, with E 222 kPa of the known one; experiment {EXPERIMENT}.",
+        note=note,
     )
 
 
@@ -192,11 +196,11 @@ def printed_errors(body: Lattice) -> Table:
     )
     return Table(
         "Error (3.35) of the printed moduli",
-        "Simulation with the true against that with the printed identified moduli, as means of whole regions.",
         ("moduli of", "printed error, %", "ours, %"),
         rows,
-        f"Simulations of the experiment: a cube of 40 mm, floor held, top moved {push:.1f} mm down, as the highest markers move towards "
-        "the lowest ones.",
+        caption="Simulation with the true against that with the printed identified moduli, as means of whole regions.",
+        note=f"Simulations of the experiment: a cube of 40 mm, base fixed, top face moved {push:.1f} mm down, which is the relative "
+        "displacement of the highest and the lowest markers.",
     )
 
 
@@ -209,7 +213,7 @@ def _other_experiments() -> Table:
             row = _one_pair(body, nu, "inner", "neo_hookean", "weighted")
             rows.append((name, what, "no" if ":" in str(row[0]) else "yes", *row[2:8]))
     columns = ("experiment", "push", "converged", "nu of the known gel", "E, kPa", "nu", "sd of E, kPa", "sd of nu", "chi2 / dof")
-    return Table("Other cubes", "Hardness 0 in further experiments: inner nodes, neo-Hookean, weighted.", columns, tuple(rows))
+    return Table("Other cubes", columns, tuple(rows), caption="Hardness 0 in further experiments: inner nodes, neo-Hookean, weighted.")
 
 
 def _draw(canvas: Canvas, body: Lattice) -> None:

@@ -27,7 +27,8 @@ from naibu.reproduction.chapter3.poisson_readings import (
     pairs_that_fit,
     readings,
 )
-from naibu.viewer.chapter import Cell, Figure, Section, Table
+from naibu.viewer.chapter import Figure, Section
+from naibu.viewer.tables import Cell, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -94,7 +95,13 @@ def table_3_4() -> Section:
         "1 + 2 S^2, as if the plates had held the faces."
     )
     tables = (
-        Table("Table 3.4", "Young's modulus of the gels from compression tests of three cylinders each.", columns, tuple(cells), note),
+        Table(
+            "Table 3.4",
+            columns,
+            tuple(cells),
+            caption="Young's modulus of the gels from compression tests of three cylinders each.",
+            note=note,
+        ),
         _spread_table(rows),
     )
     return Section("Table 3.4: Young's modulus from compression tests", _spread_text(tables[1]), tables)
@@ -142,7 +149,7 @@ def _spread_table(rows: list[list[Any]]) -> Table:
         "scatter left (%)",
     )
     note = "Least squares of ln E, scatter per degree of freedom. Six values bear no finer judgement than which effect goes the right way."
-    return Table("Spread of Table 3.4", "Effects that could make specimens of one gel differ.", columns, tuple(cells), note)
+    return Table("Spread of Table 3.4", columns, tuple(cells), caption="Effects that could make specimens of one gel differ.", note=note)
 
 
 def _spread_text(table: Table) -> tuple[str, ...]:
@@ -199,7 +206,7 @@ def _ratio_table(printed: dict[str, tuple[float, float, float]]) -> Table:
         "Shortening is positive, as the report prints it. 0.10 / 0.32 is 0.31; 0.33 is printed. Markers: local affine maps, 0.15 mm for "
         "each coordinate. nu (Hencky) = (1 - ln J / ln l) / 2; the gel of the plate cube is not stated."
     )
-    return Table("Table 3.5", "Poisson's ratio of the gels.", columns, tuple(cells), note)
+    return Table("Table 3.5", columns, tuple(cells), caption="Poisson's ratio of the gels.", note=note)
 
 
 _STRETCH: dict[str, Callable[[float], float]] = {
@@ -218,7 +225,7 @@ def _definition_table(printed: dict[str, tuple[float, float, float]]) -> Table:
         cells.append((name, *(round(v, 3) for v in volumes)))
     columns = ("strain, if it was read as", *(f"J of {gel}" for gel in printed))
     note = f"A definition would explain the table if both volume ratios were those of the markers, 1.00 within {VOLUME_SPREAD:g}."
-    return Table("Strain measures", "Volume ratios that the printed strains imply.", columns, tuple(cells), note)
+    return Table("Strain measures", columns, tuple(cells), caption="Volume ratios that the printed strains imply.", note=note)
 
 
 def _candidate_table(printed: dict[str, tuple[float, float, float]], divisions: int) -> Table:
@@ -237,7 +244,11 @@ def _candidate_table(printed: dict[str, tuple[float, float, float]], divisions: 
     )  # fmt: skip
     note = f"Markers of ct_two_material_2, the experiment of chapter 3.6. One standard deviation of a reading is taken as {READING_SD:g}."
     return Table(
-        "Candidate readings", "Strains that a reader of the images could have taken, beside the printed ones.", columns, tuple(cells), note
+        "Candidate readings",
+        columns,
+        tuple(cells),
+        caption="Strains that a reader of the images could have taken, beside the printed ones.",
+        note=note,
     )
 
 
@@ -273,7 +284,9 @@ def _volume_table(printed: dict[str, tuple[float, float, float]], divisions: int
             cells.append((gel, whose, nu, -along, round(block.volume_ratio, 3), round(block.transversal_at(0.5), 3)))
     columns = ("gel", "which nu", "nu", "longitudinal strain", "volume ratio of the block", "transversal strain in the middle")
     note = "Cube with held faces, law neo_hookean, hexahedra with shared dilatation."
-    return Table("Volume under the printed ratio", "What markers would show if the printed ratio held.", columns, tuple(cells), note)
+    return Table(
+        "Volume under the printed ratio", columns, tuple(cells), caption="What markers would show if the printed ratio held.", note=note
+    )
 
 
 def _ratio_text(printed: dict[str, tuple[float, float, float]], tables: Sequence[Table]) -> tuple[str, ...]:

@@ -13,7 +13,8 @@ from naibu.identification.force_balance.batch import BalanceEstimate, field_bala
 from naibu.identification.force_balance.weighted import whitened_balance
 from naibu.reproduction.chapter3 import figures as drawn
 from naibu.reproduction.chapter3.bodies import LAYERS, PushedBody, cube
-from naibu.viewer.chapter import Cell, Figure, Section, Table
+from naibu.viewer.chapter import Figure, Section
+from naibu.viewer.tables import Cell, Table
 
 NOISE_MM = 0.1  # a hundredth of the push, as the best measurements of the report's chapter 3.6 allow
 
@@ -92,4 +93,4 @@ def _table(cases: Mapping[str, Scatter]) -> Table:
                     numbers += [np.mean(values[:, z, at]), np.std(values[:, z, at])]
                 rows.append((case, name, quantity, *(scale * float(number) for number in numbers)))
     columns = ("case", "zone", "quantity", "true", "bound", "least squares, mean", "scatter", "weighted, mean", "scatter ")
-    return Table("Noise", f"Means and standard deviations with noise of {NOISE_MM:g} mm.", columns, tuple(rows))
+    return Table("Noise", columns, tuple(rows), caption=f"Means and standard deviations with noise of {NOISE_MM:g} mm.")

@@ -13,7 +13,8 @@ from naibu.identification.force_balance.incremental import IncrementalStep, incr
 from naibu.identification.from_fields.load_cases import KNOWN, Zones
 from naibu.reproduction.chapter3.bodies import SQUARE, PushedBody, square
 from naibu.reproduction.chapter3.material_tests import printed_table
-from naibu.viewer.chapter import Cell, Figure, Section, Table
+from naibu.viewer.chapter import Figure, Section
+from naibu.viewer.tables import Cell, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -83,7 +84,7 @@ def counts() -> Table:
         ("independent equations, one trial", None, one.rank),
         ("independent equations, two trials", None, two.rank),
     )
-    return Table("Table 3.1", "Number of unknown moduli and of equations of the square.", ("quantity", "paper", "ours"), rows)
+    return Table("Table 3.1", ("quantity", "paper", "ours"), rows, caption="Number of unknown moduli and of equations of the square.")
 
 
 def two_triangles(seed: int, draws: int) -> Table:
@@ -102,11 +103,11 @@ def two_triangles(seed: int, draws: int) -> Table:
     moduli = [f"{name}{cell}, kPa, {who}" for cell in (13, 14) for name in ("lambda", "mu") for who in ("paper", "ours")]
     return Table(
         "Table 2 (2007)",
-        "Two unknown triangles after two pushes of the top; true lambda 10.74 kPa, mu 1.748 kPa.",
         ("push 1 (x, y), mm", "push 2 (x, y), mm", *moduli, "noise that explains lambda13, % of the push"),
         tuple(rows),
-        "The last column is the standard deviation of the displacement, over the larger push, with which the printed lambda of triangle 13 "
-        "would lie one standard deviation off. x to the left and y downwards are positive.",
+        caption="Two unknown triangles after two pushes of the top; true lambda 10.74 kPa, mu 1.748 kPa.",
+        note="The last column is the standard deviation of the displacement noise relative to the larger push, at which the printed lambda "
+        "of triangle 13 would lie one standard deviation off. x to the left and y downwards are positive.",
     )
 
 
@@ -147,9 +148,9 @@ def _growth_table(growth: Accumulation) -> Table:
     )
     return Table(
         "Incremental and batch",
-        f"Errors of Young's modulus in the report's order, with noise of {STEP_NOISE_MM:g} mm (medians).",
         ("node", "triangles found", "steps it rests on", "condition number", "error, incremental, %", "error, batch, %"),
         rows,
+        caption=f"Errors of Young's modulus in the report's order, with noise of {STEP_NOISE_MM:g} mm (medians).",
     )
 
 

@@ -20,7 +20,8 @@ from naibu.validation.specimens.lattice_twin import (
     dough_parameters,
     virtual_capture,
 )
-from naibu.viewer.chapter import Cell, Chapter, Section, Table
+from naibu.viewer.chapter import Chapter, Section
+from naibu.viewer.tables import Cell, Table
 
 MODELS = ("classic", "type 0", "type 1", "type 2")
 TABLES = {8: ("4-III", "4-V"), 16: ("4-IV", "4-VI")}  # calibrated parameters and shape differences, by voxels an edge
@@ -85,7 +86,7 @@ def _parameters(n: int, fits: list[LatticeEstimate]) -> Table:
         "1st: between the finest masses; 2nd and 3rd: in cubes of two and four voxels an edge, as if they were of one; an element's own "
         "are greater by the factor that its lattice has for it. a is not determined by any data (it changes nothing) and not sought."
     )
-    return Table(f"Table {number[2:]}", f"Calibrated parameters, {n + 1} masses an edge.", columns, tuple(rows), note)
+    return Table(f"Table {number[2:]}", columns, tuple(rows), caption=f"Calibrated parameters, {n + 1} masses an edge.", note=note)
 
 
 def _differences(n: int, fits: list[LatticeEstimate], lattices: list[Lattice], capture: Capture) -> Table:
@@ -103,4 +104,4 @@ def _differences(n: int, fits: list[LatticeEstimate], lattices: list[Lattice], c
     note = "The paper's 4 to 5 mm a point hold errors of registration, ours none."
     if number == "4-V":
         note = f"The report prints the octrees' means at the second time in cm. {note}"
-    return Table(f"Table {number[2:]}", f"S_shape at five times, {n + 1} masses an edge.", columns, tuple(rows), note)
+    return Table(f"Table {number[2:]}", columns, tuple(rows), caption=f"S_shape at five times, {n + 1} masses an edge.", note=note)

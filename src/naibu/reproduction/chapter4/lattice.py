@@ -9,7 +9,8 @@ from naibu.identification.lattice_calibration.unknowns import UNITS
 from naibu.reproduction.chapter3.material_tests import printed_table
 from naibu.reproduction.chapter4.patterns import START, PatternStudy, pattern_study, with_spread
 from naibu.validation.specimens.lattice_twin import FORCE_SD_MN, POINT_SD_MM, POINTS, TRUTH, dough_lattice, dough_twin
-from naibu.viewer.chapter import Cell, Chapter, Section, Table
+from naibu.viewer.chapter import Chapter, Section
+from naibu.viewer.tables import Cell, Table
 
 PRINTED_FORCE_N = {"a": 3803.6, "b": 538.7, "c": 7448.3, "d": 979.5}  # captions of Figure 14 of the ICAT paper
 PRINTED_COUNTS = {"first": (2821, 2795, 3075, 2815, 2811), "second": (2255, 2195, 2213, 2201, 2165)}  # the third and the second corrected
@@ -60,7 +61,7 @@ def exact_section(seed: int, points: int) -> Section:
     return Section(
         "Nine parameters of a twin that follows the law",
         (TWIN_TEXT,),
-        (Table("Nine parameters", "Truth and found.", columns, tuple(rows), note),),
+        (Table("Nine parameters", columns, tuple(rows), caption="Truth and found.", note=note),),
     )
 
 
@@ -106,7 +107,7 @@ def _pattern_table(number: str, which: str, letters: str, joint: tuple[str, ...]
         f"{2 * 1000 * FORCE_SD_MN * np.sqrt(8.0 / np.pi) / 1e3:.0f} N. Joint: by displacement, on shape and force together."
     )
     caption = f"Patterns ({letters[0]}) to ({letters[-1]}), {which} pushing."
-    return Table(number, caption, columns, tuple(rows), note)
+    return Table(number, columns, tuple(rows), caption=caption, note=note)
 
 
 def _entry(found: ReportIndices, quantity: str, time: Cell) -> Cell:
@@ -132,7 +133,7 @@ def _one_set(study: PatternStudy) -> Table:
         "S_force, set for shape, N", "set for force", "one joint set", "joint / set for force",
     )  # fmt: skip
     note = "The report concludes that two sets are needed, one for what is seen and one for what is felt."
-    return Table("One set or two", "The joint set beside the set for shape and the set for force.", columns, tuple(rows), note)
+    return Table("One set or two", columns, tuple(rows), caption="The joint set beside the set for shape and the set for force.", note=note)
 
 
 def _parameter_table(study: PatternStudy) -> Table:
@@ -143,7 +144,7 @@ def _parameter_table(study: PatternStudy) -> Table:
     where = ("first", "second")
     columns = ("parameter", *(f"{where[number]}, by {mode}, {index}" for number, mode, index in study.estimates))
     note = "Found, and the factor by which the 95 % interval reaches up and down. What the data leave open stays near the start."
-    return Table("Parameters", "What each calibration found.", columns, tuple(rows), note)
+    return Table("Parameters", columns, tuple(rows), caption="What each calibration found.", note=note)
 
 
 def _undetermined_table(study: PatternStudy) -> Table:
@@ -151,4 +152,4 @@ def _undetermined_table(study: PatternStudy) -> Table:
     for (number, mode, index), estimate in study.estimates.items():
         for sentence in estimate.undetermined[:-1] or ("All combinations are determined.",):
             rows.append((f"{('first', 'second')[number]}, by {mode}, {index}", sentence))
-    return Table("Not determined", "What the data of each calibration leave open.", ("calibration", "combination"), tuple(rows))
+    return Table("Not determined", ("calibration", "combination"), tuple(rows), caption="What the data of each calibration leave open.")

@@ -11,7 +11,8 @@ from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import Lattice, box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.octree import octree_lattice
 from naibu.reproduction.chapter3.material_tests import printed_table
-from naibu.viewer.chapter import Cell, Chapter, Section, Table
+from naibu.viewer.chapter import Chapter, Section
+from naibu.viewer.tables import Cell, Table
 
 KINDS = ("classic", "type 0", "type 1", "type 2")
 EDGE_MM, MASS_KG = 80.0, 0.63
@@ -66,7 +67,7 @@ def _lattices(n: int) -> list[Lattice]:
 def _count_table(number: str, title: str, ours: list[list[int]], edges: list[int]) -> Table:
     rows = _saving_rows(number, dict(zip(edges, ours, strict=True)))
     columns = ("masses an edge", "lattice", "paper", "ours", "paper saves, %", "ours saves, %")
-    return Table(title, "Printed and ours.", columns, rows, NOTES.get(number, ""))
+    return Table(title, columns, rows, caption="Printed and ours.", note=NOTES.get(number, ""))
 
 
 def cost_section(n: int) -> Section:
@@ -86,8 +87,8 @@ def cost_section(n: int) -> Section:
                                         "basic element": [m[1] for m in memory]})  # fmt: skip
     columns = ("part", "lattice", "paper", "ours", "paper saves, %", "ours saves, %")
     tables = (
-        Table(f"Table {times[2:]}", f"Time of a step, ms, {n + 1} masses an edge.", columns, time_rows, NOTES.get(times, "")),
-        Table(f"Table {bytes_[2:]}", f"Memory, KByte, {n + 1} masses an edge.", columns, memory_rows, NOTES.get(bytes_, "")),
+        Table(f"Table {times[2:]}", columns, time_rows, caption=f"Time of a step, ms, {n + 1} masses an edge.", note=NOTES.get(times, "")),
+        Table(f"Table {bytes_[2:]}", columns, memory_rows, caption=f"Memory, KByte, {n + 1} masses an edge.", note=NOTES.get(bytes_, "")),
     )
     return Section(f"Time and memory, {n + 1} x {n + 1} x {n + 1} masses", text, tables)
 

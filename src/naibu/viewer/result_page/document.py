@@ -4,21 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
-from importlib.resources import files
 
+from naibu.viewer.page_frame import asset, page_html
+from naibu.viewer.result_page.estimates import correlation_table, parameter_table
 from naibu.viewer.result_page.figures import residual_panels, rms_bars
 from naibu.viewer.result_page.packing import packed_scenes
 from naibu.viewer.result_page.payload import Report, ResidualSet, Scene
-from naibu.viewer.result_page.tables import correlation_table, parameter_table, plain_table, provenance_table
-
-# The page may run its own script and style and nothing else: no request leaves the reader's machine.
-POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
-
-
-def asset(name: str) -> str:
-    """Return a file of the bundle that ``viewer-src`` builds, safe to stand inside a script or style element."""
-    text = (files("naibu.viewer") / "assets" / name).read_text(encoding="utf-8")
-    return text.replace("</script", r"<\/script").replace("</style", r"<\/style").replace("<!--", r"<\!--")
+from naibu.viewer.tables import provenance_section, table_html
 
 
 def document(report: Report, scenes: Sequence[Scene]) -> str:
@@ -26,15 +18,12 @@ def document(report: Report, scenes: Sequence[Scene]) -> str:
     sections = _sections(report)
     links = "".join(f'<li><a href="#{key}">{escape(title)}</a></li>' for key, title, _ in sections)
     body = "".join(_section(key, title, inner) for key, title, inner in sections)
-    data = _scene_data(scenes) if scenes else ""
-    return (
-        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{POLICY}">'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><meta name="color-scheme" content="light dark">'
-        f'<title>{escape(report.title)}</title><link rel="icon" href="data:,"><style>{asset("report.css")}</style></head>\n'
-        f'<body><header><h1>{escape(report.title)}</h1>{_headline(report)}<nav aria-label="Contents"><ul>{links}</ul></nav></header>\n'
-        f"<main>{body}</main>\n<footer>Lengths in mm, pressures and moduli in kPa, forces in mN. This page is complete in itself: it loads "
-        f"nothing from the network.</footer>\n{data}</body></html>\n"
-    )
+    if report.provenance:
+        links += '<li><a href="#provenance">How this was computed</a></li>'
+        body += provenance_section(report.provenance)
+    header = f'{_headline(report)}<nav aria-label="Contents"><ul>{links}</ul></nav>'
+    footer = "Lengths in mm, pressures and moduli in kPa, forces in mN. This page is self-contained: it loads nothing from the network."
+    return page_html(report.title, header, body, footer, scripts=_scene_data(scenes) if scenes else "")
 
 
 def _scene_data(scenes: Sequence[Scene]) -> str:
@@ -48,8 +37,6 @@ def _headline(report: Report) -> str:
 
 
 def _section(key: str, title: str, inner: str) -> str:
-    if key == "provenance":
-        return f'<section id="{key}"><details><summary>{escape(title)}</summary>{inner}</details></section>\n'
     return f'<section id="{key}" class="long" aria-labelledby="h-{key}"><h2 id="h-{key}">{escape(title)}</h2>{inner}</section>\n'
 
 
@@ -57,12 +44,11 @@ def _sections(report: Report) -> list[tuple[str, str, str]]:
     """Return key, title and inner HTML of what the report has, in reading order."""
     found = [
         ("view", "Predicted and measured markers in 3-D", _viewer() if report.scenes else ""),
-        ("accuracy", "Accuracy", plain_table(report.accuracy) if report.accuracy else ""),
+        ("accuracy", "Accuracy", table_html(report.accuracy) if report.accuracy else ""),
         ("residuals", "Residuals by marker layer", _residuals(report.residuals)),
         ("parameters", "Parameters", _parameters(report)),
         ("limits", "What the data cannot tell", _limits(report.undetermined)),
-        ("tables", "Further tables", "".join(plain_table(t) for t in report.tables)),
-        ("provenance", "How this was computed", provenance_table(report.provenance) if report.provenance else ""),
+        ("tables", "Further tables", "".join(table_html(t) for t in report.tables)),
     ]
     return [entry for entry in found if entry[2]]
 

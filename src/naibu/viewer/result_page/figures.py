@@ -10,6 +10,7 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.viewer.result_page.payload import ResidualSet, Scene
+from naibu.viewer.ticks import tick_text, ticks_between
 
 PANEL_WIDTH, LEFT, RIGHT = 340.0, 44.0, 12.0
 ROW_HEIGHT, TOP, BOTTOM = 30.0, 8.0, 40.0
@@ -20,28 +21,6 @@ def short(value: float, digits: int = 1) -> str:
     """Return a coordinate with few characters."""
     text = f"{value:.{digits}f}".rstrip("0").rstrip(".") if digits else f"{value:.0f}"
     return "0" if text in ("-0", "") else text
-
-
-def nice_step(span: float, at_most: int) -> float:
-    """Return the smallest 1, 2, 2.5 or 5 times a power of ten that divides `span` into at most `at_most` parts."""
-    if not span > 0:
-        return 1.0
-    raw = span / at_most
-    power = 10.0 ** math.floor(math.log10(raw))
-    return next(m * power for m in (1.0, 2.0, 2.5, 5.0, 10.0) if m * power >= raw * (1 - 1e-9))
-
-
-def ticks_between(low: float, high: float, at_most: int = 5) -> list[float]:
-    """Return round numbers from `low` to `high`."""
-    step = nice_step(high - low, at_most)
-    first = math.ceil(low / step - 1e-9)
-    last = math.floor(high / step + 1e-9)
-    return [i * step for i in range(first, last + 1)]
-
-
-def tick_text(value: float) -> str:
-    """Return a tick's label with a true minus sign."""
-    return f"{0.0 if abs(value) < 1e-12 else value:.4g}".replace("-", "−")
 
 
 def rms_bars(scenes: Sequence[Scene]) -> str:

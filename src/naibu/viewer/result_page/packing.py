@@ -14,7 +14,8 @@ from dataclasses import replace
 import numpy as np
 
 from naibu.core.arrays import FloatArray, IntArray
-from naibu.viewer.result_page.payload import Scene, jsonable
+from naibu.viewer.json_values import jsonable
+from naibu.viewer.result_page.payload import Scene
 
 SURFACE_QUANTUM_MM = 0.01
 MARKER_QUANTUM_MM = 0.001

@@ -7,15 +7,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
-
-Cell = str | float | int | None
+from naibu.viewer.json_values import jsonable
+from naibu.viewer.tables import Table
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,21 +140,6 @@ class Scene:
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
-    """A table as the reader sees it; units belong into the column names. None and NaN show as a dash."""
-
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
-    note: str = ""
-
-    def __post_init__(self) -> None:
-        for i, row in enumerate(self.rows):
-            if len(row) != len(self.columns):
-                raise InputError(f"table {self.title!r}: row {i} has {len(row)} cells, there are {len(self.columns)} columns")
-
-
-@dataclass(frozen=True, slots=True)
 class ParameterRow:
     """An estimated parameter with its 95 % interval; an infinite or NaN bound means that the data do not bound it."""
 
@@ -246,34 +231,6 @@ class Report:
     undetermined: tuple[str, ...] = ()
     tables: tuple[Table, ...] = ()
     provenance: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
-
-
-def jsonable(value: object, digits: int = 6) -> object:
-    """Turn records, arrays and mappings into what JSON knows.
-
-    Parameters
-    ----------
-    value : object
-        A record of this module, or anything made of mappings, sequences, arrays, numbers, text and None.
-    digits : int
-        Significant digits kept of a float.
-
-    Returns
-    -------
-    object
-        NaN and infinities have become None; anything unknown its text.
-    """
-    if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: jsonable(getattr(value, f.name), digits) for f in fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): jsonable(entry, digits) for key, entry in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        return jsonable(value.tolist(), digits)
-    if isinstance(value, list | tuple | set | frozenset):
-        return [jsonable(entry, digits) for entry in value]
-    if isinstance(value, float):
-        return float(f"{value:.{digits}g}") if np.isfinite(value) else None
-    return value if value is None or isinstance(value, str | bool | int) else str(value)
 
 
 def report_json(report: Report, digits: int = 6) -> str:

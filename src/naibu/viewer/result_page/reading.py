@@ -12,7 +12,8 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
-from naibu.viewer.result_page.payload import Cell, Report
+from naibu.viewer.result_page.payload import Report
+from naibu.viewer.tables import Cell
 
 # arrays of positions, whose second axis JSON forgets where there are none
 _OF_POINTS = {"faces", "free_surface", "surface", "markers", "initial_markers", "measured", "residual_mm"}

@@ -1,67 +1,20 @@
-"""Tables of the page: any table, parameters with their intervals, correlations, provenance."""
+"""Estimates as HTML: the table of parameters with their intervals, and the matrix of correlations."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from html import escape
 
 import numpy as np
 
 from naibu.core.arrays import FloatArray
-from naibu.viewer.result_page.figures import tick_text, ticks_between
-from naibu.viewer.result_page.payload import Cell, Correlation, ParameterRow, Table, jsonable
+from naibu.viewer.result_page.payload import Correlation, ParameterRow
+from naibu.viewer.tables import cell_text, scrollable
+from naibu.viewer.ticks import tick_text, ticks_between
 
 NEGATIVE, NEUTRAL, POSITIVE = (0.45, -0.05, -0.11), (0.965, 0.0, 0.0), (0.50, 0.11, 0.09)
 LOG_SPAN = 30.0
-
-
-def cell_text(value: Cell) -> str:
-    """Return a cell as the reader sees it: three significant digits at least, never an exponent where it can be helped."""
-    if value is None:
-        return "–"
-    if isinstance(value, str):
-        return escape(value)
-    if isinstance(value, int):
-        return str(value).replace("-", "−")
-    if not math.isfinite(value):
-        return "–" if math.isnan(value) else ("∞" if value > 0 else "−∞")
-    return _number(value)
-
-
-def _number(value: float) -> str:
-    size = abs(value)
-    if size != 0 and (size >= 1e5 or size < 1e-3):
-        mantissa, exponent = f"{value:.2e}".split("e")
-        return f"{mantissa}·10<sup>{int(exponent)}</sup>".replace("-", "−")
-    digits = 0 if size >= 100 else 1 if size >= 10 else 2 if size >= 1 or size == 0 else 3
-    return f"{value:.{digits}f}".replace("-", "−")
-
-
-def scrollable(label: str, inner: str, kind: str = "") -> str:
-    """Wrap what may be wider than a phone, so that it scrolls by touch and by keyboard."""
-    return f'<div class="scroll {kind}" role="region" tabindex="0" aria-label="{escape(label, quote=True)}">{inner}</div>'
-
-
-def plain_table(table: Table) -> str:
-    """Return a table; columns of numbers are set flush right."""
-    numeric = [_is_numeric(table, i) for i in range(len(table.columns))]
-    kind = [' class="num"' if n else "" for n in numeric]
-    head = "".join(f'<th scope="col"{k}>{escape(c)}</th>' for c, k in zip(table.columns, kind, strict=True))
-    body = ""
-    for row in table.rows:
-        first = f'<th scope="row"{kind[0]}>{cell_text(row[0])}</th>' if row else ""
-        rest = "".join(f"<td{k}>{cell_text(v)}</td>" for v, k in zip(row[1:], kind[1:], strict=True))
-        body += f"<tr>{first}{rest}</tr>"
-    inner = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-    note = f'<p class="note">{escape(table.note)}</p>' if table.note else ""
-    # The heading stands outside of what scrolls, so that a phone shows all of it.
-    return f'<p class="caption">{escape(table.title)}</p>{scrollable(table.title, inner)}{note}'
-
-
-def _is_numeric(table: Table, column: int) -> bool:
-    cells = [row[column] for row in table.rows if row[column] is not None]
-    return bool(cells) and not any(isinstance(c, str) for c in cells)
 
 
 class _Scale:
@@ -204,19 +157,3 @@ def _correlation_cell(value: float) -> str:
         return "<td>–</td>"
     ground, ink = diverging_colour(value)
     return f'<td style="background:{ground};color:{ink}">{f"{value:.2f}".replace("-", "−")}</td>'
-
-
-def provenance_table(provenance: Mapping[str, object]) -> str:
-    """Return every entry of a nested mapping as a row."""
-    rows = "".join(f'<tr><th scope="row">{escape(k)}</th><td>{escape(v)}</td></tr>' for k, v in _flat(provenance))
-    return f'<div class="prov-box"><table class="prov"><tbody>{rows}</tbody></table></div>'
-
-
-def _flat(entries: Mapping[str, object], prefix: str = "") -> Iterator[tuple[str, str]]:
-    for key, value in entries.items():
-        name = f"{prefix}{key}"
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{name} › ")
-            continue
-        plain = jsonable(value)
-        yield name, ", ".join(str(v) for v in plain) if isinstance(plain, list) else "–" if plain is None else str(plain)
