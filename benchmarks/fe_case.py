@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from naibu.core.mesh import Mesh
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
 from naibu.mechanics.linear_algebra.direct import PardisoSolver, SuperLUSolver
@@ -55,8 +55,8 @@ def make_case(cells: int) -> Case:
     return Case(mesh, values[:, 1].copy(), values[:, 0].copy(), below, above)
 
 
-def prescribed(case: Case, depth: float = DEPTH) -> Prescribed:
-    nothing = Prescribed.nothing(case.mesh.n_points)
+def prescribed(case: Case, depth: float = DEPTH) -> PrescribedDisplacement:
+    nothing = PrescribedDisplacement.none(case.mesh.n_points)
     return nothing.and_also(case.bottom, (0.0, 0.0, 0.0)).and_also(case.top, (0.0, 0.0, -depth))
 
 

@@ -28,7 +28,7 @@ from naibu.identification.from_fields.load_cases import FieldTrial, Zones
 from naibu.identification.from_fields.regularization import cell_volumes
 from naibu.identification.from_fields.sensitivities import logarithms, young_and_poisson
 from naibu.identification.from_fields.uncertainty import cramer_rao_bound
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.meshing.point_location import interpolation_operator
@@ -169,7 +169,7 @@ def pressed_ball(
     floor, top = (np.flatnonzero(np.abs(truth.points[:, 2] - z) < 1e-9) for z in (0.0, 50.0))
     loaded = (mesh.points[:, 2] < 1e-9) | (mesh.points[:, 2] > 50.0 - 1e-9)
     for k, push in enumerate(((0.0, 0.0, -4.0), (4.0, 0.0, -1.0), (0.0, 4.0, -1.0))):
-        u = body.solve(lame, shear, Prescribed.nothing(truth.n_points).and_also(floor, (0, 0, 0)).and_also(top, push))
+        u = body.solve(lame, shear, PrescribedDisplacement.none(truth.n_points).and_also(floor, (0, 0, 0)).and_also(top, push))
         sd = noise * float(np.linalg.norm(u, axis=1).max())
         vectors = where @ u + sd * rng.standard_normal(points.shape)
         trials.append(FieldTrial.of(f"push {k + 1}", DisplacementField.from_arrays(points, vectors, sd_mm=sd), mesh, loaded=loaded))

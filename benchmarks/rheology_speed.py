@@ -18,10 +18,11 @@ import time
 import numpy as np
 
 from naibu.core.errors import ConvergenceError
+from naibu.mechanics.prescribed_motion import PrescribedMotion
 from naibu.mechanics.small_strain.dynamics import Series, explicit_step_limit, simulate_motion
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
-from naibu.mechanics.small_strain.prescribed_motion import Path, Support
 from naibu.mechanics.small_strain.rheology import Rheology, three_element
+from naibu.mechanics.small_strain.supports import Support
 from naibu.meshing.primitives import box
 
 SIDE_MM, CELLS, DENSITY = 50.0, 10, 1.1e-6
@@ -37,7 +38,7 @@ def press(body: LinearBody, material: Rheology, method: str, span: float, step: 
     z = body.points[:, 2]
     supports = [
         Support("floor", np.flatnonzero(z < 1e-9)),
-        Support("plate", np.flatnonzero(z > SIDE_MM - 1e-9), path=Path.of(swing)),
+        Support("plate", np.flatnonzero(z > SIDE_MM - 1e-9), motion=PrescribedMotion.of(swing)),
     ]
     start = time.process_time()
     series = simulate_motion(body, material, DENSITY, supports, np.linspace(0.0, span, 6), step=step, method=method)

@@ -17,7 +17,7 @@ import numpy as np
 from naibu.mechanics.contact.contact_surfaces import Friction, rigid_contact
 from naibu.mechanics.contact.penalty_contact import Contact, plane
 from naibu.mechanics.finite_elements.assembly import Assembler
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import material
 from naibu.mechanics.finite_strain.problem import Problem
@@ -49,7 +49,7 @@ def pressed(coefficient: float) -> Solution:
     body = elements(mesh)
     pattern = block_pattern(mesh.n_points, body.connectivity, *(contact.nodes for contact in contacts))
     assembler = Assembler.from_materials(body, mesh.regions, gels, pattern)
-    nothing, no_weight = Prescribed.nothing(mesh.n_points), np.zeros_like(mesh.points)
+    nothing, no_weight = PrescribedDisplacement.none(mesh.n_points), np.zeros_like(mesh.points)
     return solve(Problem(mesh.points, assembler, contacts, nothing, no_weight))
 
 

@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from naibu.mechanics.finite_elements.assembly import Assembler
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import Formulation, elements
 from naibu.mechanics.finite_elements.hyperelasticity import LAWS, material
 from naibu.mechanics.finite_strain.problem import Problem
@@ -42,7 +42,7 @@ def force(cells: int, poisson_ratio: float, formulation: Formulation) -> float:
     gel = material("neo_hookean", young_modulus=60.0, poisson_ratio=poisson_ratio)
     assembler = Assembler.from_materials(body, mesh.regions, [gel], block_pattern(mesh.n_points, body.connectivity))
     top = side_nodes(mesh, "z+")
-    constrained = Prescribed.nothing(mesh.n_points).and_also(side_nodes(mesh, "z-"), (0, 0, 0))
+    constrained = PrescribedDisplacement.none(mesh.n_points).and_also(side_nodes(mesh, "z-"), (0, 0, 0))
     constrained = constrained.and_also(top, (0.0, 0.0, -COMPRESSION * SIDE_MM))
     solution = solve(Problem(mesh.points, assembler, (), constrained, np.zeros_like(mesh.points)))
     internal = assembler.forces(solution.displacement)[1]

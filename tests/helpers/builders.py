@@ -4,7 +4,7 @@ import numpy as np
 
 from naibu.core.mesh import Mesh
 from naibu.mechanics.finite_elements.assembly import Assembler
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import Material, material
 from naibu.mechanics.finite_strain.problem import Problem
@@ -44,7 +44,7 @@ def problem(mesh: Mesh, *materials: Material, contacts=(), prescribed=None, forc
     pattern = block_pattern(mesh.n_points, table.connectivity, *(c.nodes for c in contacts))
     body = Assembler.from_materials(table, mesh.regions, list(materials) or [GEL], pattern)
     weight = np.zeros(mesh.points.shape) if force is None else force
-    return Problem(mesh.points, body, tuple(contacts), prescribed or Prescribed.nothing(mesh.n_points), weight)
+    return Problem(mesh.points, body, tuple(contacts), prescribed or PrescribedDisplacement.none(mesh.n_points), weight)
 
 
 def relative(a, b) -> float:

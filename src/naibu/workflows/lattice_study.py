@@ -29,6 +29,7 @@ from naibu.mechanics.lattices.model.lattice import CLASSES, Lattice, box_mask, c
 from naibu.mechanics.lattices.model.octree import octree_lattice
 from naibu.mechanics.lattices.simulation.contact import begin_contact
 from naibu.mechanics.lattices.simulation.loading_history import Drive, LatticeStudy, StudyBody, check_study
+from naibu.mechanics.prescribed_motion import PrescribedMotion
 
 OCTREES = ("octree-0", "octree-1", "octree-2")
 BASES = ("cube-pushing", "dough-first-pushing", "dough-second-pushing", "dough-pressed-by-sphere", "dough-pushed-over-floor")
@@ -294,11 +295,10 @@ def _floor(table: FloorTable, lattice: Lattice) -> StudyBody:
     low, high = lattice.points.min(axis=0), lattice.points.max(axis=0)
     middle = 0.5 * (low + high)
     ground = plane((middle[0], middle[1], low[2]), **_surface(table))
-    return StudyBody("floor", ground, np.zeros(1), np.zeros((1, 3)), tied_until_s=np.inf if table.contact == "sticking" else None)
+    return StudyBody("floor", ground, tied_until_s=np.inf if table.contact == "sticking" else None)
 
 
 def _indenter(table: IndenterTable, k: int, duration_s: float) -> StudyBody:
-    times, offset = _programme(table, duration_s)
     drive = None
     if table.force is not None:
         force = np.array(table.force)
@@ -306,7 +306,7 @@ def _indenter(table: IndenterTable, k: int, duration_s: float) -> StudyBody:
     until = None
     if table.contact == "tied":
         until = np.inf if table.until_s is None else table.until_s
-    return StudyBody(table.name or f"indenter {k + 1}", _rigid(table), times, offset, drive, until)
+    return StudyBody(table.name or f"indenter {k + 1}", _rigid(table), _motion(table, duration_s), drive, until)
 
 
 def _rigid(table: IndenterTable) -> RigidIndenter:
@@ -318,15 +318,15 @@ def _rigid(table: IndenterTable) -> RigidIndenter:
     return cylindrical_indenter(table.centre_mm, table.radius_mm or 0.0, table.length_mm or 0.0, table.axis, **surface)
 
 
-def _programme(table: IndenterTable, duration_s: float) -> tuple[FloatArray, FloatArray]:
-    """Return times (k,), s, and displacements (k, 3), mm, of an indenter."""
+def _motion(table: IndenterTable, duration_s: float) -> PrescribedMotion | None:
+    """Return the prescribed motion of an indenter, None where it does not move."""
     if table.path:
         rows = np.array(table.path)
-        return rows[:, 0], rows[:, 1:]
+        return PrescribedMotion.through(rows[:, 0], rows[:, 1:]) if rows[:, 1:].any() else None
     if not table.velocity:
-        return np.zeros(1), np.zeros((1, 3))
+        return None
     rows = np.array(table.velocity)
     rows = rows[rows[:, 0] < duration_s]
     times = np.append(rows[:, 0], duration_s)
     moved = np.cumsum(rows[:, 1:] * np.diff(times)[:, None], axis=0)
-    return times, np.concatenate([np.zeros((1, 3)), moved])
+    return PrescribedMotion.through(times, np.concatenate([np.zeros((1, 3)), moved])) if moved.any() else None

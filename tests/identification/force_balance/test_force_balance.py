@@ -18,7 +18,7 @@ from naibu.identification.force_balance.equations import nodal_field, trial_bala
 from naibu.identification.force_balance.incremental import incremental_balance
 from naibu.identification.force_balance.weighted import whitened_balance
 from naibu.identification.from_fields.load_cases import FieldTrial, Zones
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.mechanics.finite_elements.linear_simplices import connection_matrices, lumped_mass, simplices
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
@@ -152,7 +152,7 @@ def weighed(divisions: int = 4) -> tuple[Mesh, FieldTrial]:
     body = cube(divisions=divisions)
     weight = lumped_mass(simplices(body.mesh), 1e-6)[:, None] * np.array([0.0, 0.0, -9810.0])
     floor = np.flatnonzero(body.mesh.points[:, 2] < 1e-9)
-    u = LinearBody.of(body.mesh).solve(*body.moduli, Prescribed.nothing(body.mesh.n_points).and_also(floor, np.zeros(3)), weight)
+    u = LinearBody.of(body.mesh).solve(*body.moduli, PrescribedDisplacement.none(body.mesh.n_points).and_also(floor, np.zeros(3)), weight)
     field = DisplacementField.from_arrays(body.mesh.points, u)
     return body.mesh, FieldTrial.of("standing", field, body.mesh, loaded=body.mesh.points[:, 2] < 1e-9, external_force=weight)
 

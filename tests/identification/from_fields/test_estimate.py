@@ -18,7 +18,7 @@ from naibu.identification.from_fields.regularization import Laplacian, TotalVari
 from naibu.identification.from_fields.sensitivities import FieldModel, Linearised, Point, logarithms, moduli_of, young_and_poisson
 from naibu.identification.from_fields.truncated_newton import RegularizedSystem, conjugate_gradients, truncated_step
 from naibu.identification.from_fields.uncertainty import cramer_rao_bound
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.meshing.point_location import interpolation_operator
@@ -290,7 +290,7 @@ def ball_from_a_finer_mesh(cells: int, fine: int, noise: float = 0.005) -> tuple
     points = np.stack(np.meshgrid(at, at, np.arange(2.0, 50.0, 4.0), indexing="ij"), axis=-1).reshape(-1, 3)
     where, trials = interpolation_operator(truth, points), []
     for k, push in enumerate(((0.0, 0.0, -4.0), (4.0, 0.0, -1.0))):
-        support = Prescribed.nothing(truth.n_points).and_also(np.flatnonzero(truth.points[:, 2] < 1e-9), (0, 0, 0))
+        support = PrescribedDisplacement.none(truth.n_points).and_also(np.flatnonzero(truth.points[:, 2] < 1e-9), (0, 0, 0))
         u = LinearBody.of(truth).solve(lame, shear, support.and_also(np.flatnonzero(truth.points[:, 2] > 50 - 1e-9), push))
         sd = noise * np.abs(u).max()
         field = DisplacementField.from_arrays(points, where @ u + sd * rng.standard_normal(points.shape), sd_mm=sd)
@@ -338,7 +338,7 @@ def test_a_known_force_gives_the_scale() -> None:
     top = body.mesh.points[:, 2] > 40.0 - 1e-9
     weight[top, 2] = -20.0 / top.sum()
     floor = np.repeat((body.mesh.points[:, 2] < 1e-9)[:, None], 3, axis=1)
-    u = LinearBody.of(body.mesh).solve(lame, shear, Prescribed(floor, np.zeros_like(weight)), weight)
+    u = LinearBody.of(body.mesh).solve(lame, shear, PrescribedDisplacement(floor, np.zeros_like(weight)), weight)
     zones = Zones.of(body.mesh, known={})
     for factor in (1.0, 3.0):
         trial = FieldTrial.of(

@@ -15,7 +15,7 @@ from naibu.identification.from_markers.marker_mesh import MarkerMesh, marker_mes
 from naibu.identification.from_markers.parameter_names import poisson_ratio, young_modulus
 from naibu.identification.from_markers.specimen_model import ModelSettings
 from naibu.mechanics.finite_elements.assembly import Assembler
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import material
 from naibu.mechanics.finite_strain.problem import Problem
@@ -38,7 +38,7 @@ def solved(sign: float = 1.0) -> MarkerMesh:
     p = mesh.points
     on_surface = (np.abs(p[:, 0]) > 19.9) | (np.abs(p[:, 1]) > 19.9) | (p[:, 2] < 0.1) | (p[:, 2] > 39.9)
     pressed = np.stack([0.1 * p[:, 0] + sign * 2e-3 * p[:, 1] * p[:, 2], 0.05 * p[:, 1], -0.2 * p[:, 2] + 2e-3 * p[:, 0] ** 2], axis=1)
-    constrained = Prescribed.nothing(mesh.n_points).and_also(np.flatnonzero(on_surface), pressed[on_surface])
+    constrained = PrescribedDisplacement.none(mesh.n_points).and_also(np.flatnonzero(on_surface), pressed[on_surface])
     u = solve(Problem(p, assembler, (), constrained, np.zeros_like(p))).displacement
     return MarkerMesh("box/pressed", mesh, u, np.ones(u.shape, dtype=bool), np.flatnonzero(~on_surface))
 

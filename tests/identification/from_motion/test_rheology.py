@@ -7,11 +7,12 @@ import pytest
 
 from naibu.core.errors import InputError
 from naibu.identification.from_motion.rheology import MotionTrial, _Problem, identify_motion, rheology_parameters
+from naibu.mechanics.prescribed_motion import PrescribedMotion
 from naibu.mechanics.small_strain.dynamics import simulate_motion
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.mechanics.small_strain.mass_matrix import mass_of
-from naibu.mechanics.small_strain.prescribed_motion import Path, Support
 from naibu.mechanics.small_strain.rheology import per_region, three_element
+from naibu.mechanics.small_strain.supports import Support
 from naibu.meshing.point_location import interpolation_operator
 from naibu.meshing.structured_2d import rectangle
 
@@ -19,7 +20,7 @@ SIZE = (60.0, 30.0)
 TRUTH = three_element(10.0, 6.0, 60.0, 0.4)
 TIMES = np.arange(0.0, 6.0, 1.0 / 8.0)
 POINTS = np.array([[x, y] for x in (-20.0, -7.0, 0.0, 7.0, 20.0) for y in (8.0, 16.0, 24.0)])
-PUSH = Path.through([0.0, 1.0, 3.0], [(0.0, 0.0), (0.0, -5.0), (0.0, -5.0)])
+PUSH = PrescribedMotion.through([0.0, 1.0, 3.0], [(0.0, 0.0), (0.0, -5.0), (0.0, -5.0)])
 DENSITY, GRAVITY = 1e-6, 9810.0
 SD_MM, SD_MN = 0.05, 20.0
 
@@ -28,7 +29,7 @@ def body_of(cells: tuple[int, int]):
     mesh = rectangle(SIZE, cells)
     x, y = mesh.points.T
     top = np.flatnonzero((y > SIZE[1] - 1e-9) & (np.abs(x) <= 10.0 + 1e-9))
-    return mesh, [Support("floor", np.flatnonzero(y < 1e-9)), Support("plate", top, path=PUSH, end_s=3.0)]
+    return mesh, [Support("floor", np.flatnonzero(y < 1e-9)), Support("plate", top, motion=PUSH, end_s=3.0)]
 
 
 def weight(mesh) -> np.ndarray:

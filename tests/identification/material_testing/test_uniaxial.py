@@ -16,7 +16,7 @@ from naibu.identification.from_markers.marker_mesh import marker_mesh
 from naibu.identification.material_testing.marker_strain import marker_strain, poisson_ratio_from_markers
 from naibu.identification.material_testing.uniaxial import Specimen, compression_test, poisson_ratio, specimen_mean
 from naibu.mechanics.finite_elements.assembly import Assembler
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import material
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
@@ -115,7 +115,7 @@ def constrained_cylinder(diameter: float, height: float, element_mm: float) -> t
     mesh = cylinder(diameter, height, element_mm)
     z = mesh.points[:, 2]
     top, bottom = np.flatnonzero(z > height - 1e-6), np.flatnonzero(z < 1e-6)
-    constrained = Prescribed.nothing(mesh.n_points).and_also(bottom, (0, 0, 0)).and_also(top, (0, 0, -0.08 * height))
+    constrained = PrescribedDisplacement.none(mesh.n_points).and_also(bottom, (0, 0, 0)).and_also(top, (0, 0, -0.08 * height))
     body = Assembler.from_materials(elements(mesh), mesh.regions, [material(young_modulus=200.0, poisson_ratio=0.499)])
     path = SolverSettings(first_step=0.2, largest_step=0.2)
     states = solve(Problem(mesh.points, body, (), constrained, np.zeros_like(mesh.points)), settings=path).states
@@ -287,7 +287,7 @@ def test_held_faces_make_the_ratio_from_markers_a_lower_bound(nu):
     """A computed cube pressed by 25 % between plates that hold it: markers err by a few hundredths, the ratio of strains by far more."""
     mesh = box((60.0,) * 3, (6, 6, 6))
     z = mesh.points[:, 2]
-    constrained = Prescribed.nothing(mesh.n_points).and_also(np.flatnonzero(z < 1e-6), (0, 0, 0))
+    constrained = PrescribedDisplacement.none(mesh.n_points).and_also(np.flatnonzero(z < 1e-6), (0, 0, 0))
     constrained = constrained.and_also(np.flatnonzero(z > 60.0 - 1e-6), (0, 0, -15.0))
     body = Assembler.from_materials(elements(mesh), mesh.regions, [material(young_modulus=100.0, poisson_ratio=nu)])
     u = solve(Problem(mesh.points, body, (), constrained, np.zeros_like(mesh.points))).displacement

@@ -13,7 +13,7 @@ from naibu.core.status import Status
 from naibu.mechanics.contact.contact_surfaces import Friction, interface, rigid_contact
 from naibu.mechanics.contact.penalty_contact import RAMP_MM, STICK, Contact, bar, plane
 from naibu.mechanics.finite_elements.assembly import body_force
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_strain.newton import Newton
 from naibu.mechanics.finite_strain.problem import SolverSettings
@@ -64,7 +64,7 @@ def block(n=4, **options):
 def test_frictionless_compression_is_uniaxial(cell_type):
     mesh = block(cell_type=cell_type)
     zero = (0.0, 0.0, 0.0)
-    constrained = Prescribed.nothing(mesh.n_points)
+    constrained = PrescribedDisplacement.none(mesh.n_points)
     constrained = constrained.and_also(np.flatnonzero(mesh.points[:, 0] == 0), zero, (True, False, False))
     constrained = constrained.and_also(np.flatnonzero(mesh.points[:, 1] == 0), zero, (False, True, False))
     base, top = plates(mesh, stop=(0, 0, 0.6 * SIZE), mu_base=0.0, mu_top=0.0)
@@ -211,7 +211,7 @@ def _lower_half(mesh):
 
 
 def moved_top(mesh, shift):
-    constrained = Prescribed.nothing(mesh.n_points).and_also(side_nodes(mesh, "z-"), (0, 0, 0))
+    constrained = PrescribedDisplacement.none(mesh.n_points).and_also(side_nodes(mesh, "z-"), (0, 0, 0))
     return constrained.and_also(side_nodes(mesh, "z+"), shift)
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from naibu.core.errors import InputError
 from naibu.mechanics.contact.contact_surfaces import Friction, face_quadrature, interface, rigid_contact
 from naibu.mechanics.contact.penalty_contact import RAMP_MM, STICK, Contact, bar, plane
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.meshing.primitives import box
 from naibu.meshing.surface import face_normals, faces_towards
 from naibu.validation.analytic.finite_strain import plate_penetration
@@ -195,6 +195,6 @@ def test_bad_contacts_are_refused():
     with pytest.raises(InputError, match="coinciding nodes"):
         interface("joint", mesh.points, np.array([[0, 1]]), np.ones(1), friction=Friction(), normal_stiffness=1.0)
     with pytest.raises(InputError, match="node 9 does not exist"):
-        Prescribed.nothing(8).and_also([9], (0, 0, 0))
+        PrescribedDisplacement.none(8).and_also([9], (0, 0, 0))
     with pytest.raises(InputError, match="finite"):
-        Prescribed.nothing(8).and_also([1], (0, 0, np.nan))
+        PrescribedDisplacement.none(8).and_also([1], (0, 0, np.nan))

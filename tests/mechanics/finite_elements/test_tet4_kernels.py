@@ -8,7 +8,7 @@ from builders import assembler, distorted, of, problem, relative
 
 from naibu.mechanics.finite_elements import assembly
 from naibu.mechanics.finite_elements._tet4_kernels import shares
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.hyperelasticity import LAWS
 from naibu.mechanics.finite_strain.problem import SolverSettings
 from naibu.mechanics.finite_strain.statics import solve
@@ -56,7 +56,9 @@ def test_a_flat_element_is_told_by_its_determinant(formulation, divisions):
 def test_one_step_may_be_deeper_than_an_element(formulation):
     mesh = distorted("tetra", divisions=5, amount=0.0)
     prescribed = (
-        Prescribed.nothing(mesh.n_points).and_also(side_nodes(mesh, "z-"), (0, 0, 0)).and_also(side_nodes(mesh, "z+"), (0, 0, -2.5))
+        PrescribedDisplacement.none(mesh.n_points)
+        .and_also(side_nodes(mesh, "z-"), (0, 0, 0))
+        .and_also(side_nodes(mesh, "z+"), (0, 0, -2.5))
     )
     body = problem(mesh, prescribed=prescribed, formulation=formulation)
     once = solve(body, settings=SolverSettings(first_step=1.0, largest_step=1.0))

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from builders import as_kind, of, problem
 
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_strain.problem import SolverSettings
 from naibu.mechanics.finite_strain.statics import solve
 from naibu.meshing.primitives import box
@@ -33,7 +33,7 @@ RATIOS = (0.45, 0.49, 0.499)
 def force(nu: float, kind: str, formulation: str, n: int = 4) -> float:
     """Force, mN, that presses the octant of a 20 mm cube by 40 % between plates to which it sticks."""
     mesh = as_kind(box((10, 10, 10), (n, n, n), centred=False), kind)
-    constrained = Prescribed.nothing(mesh.n_points)
+    constrained = PrescribedDisplacement.none(mesh.n_points)
     for axis in range(3):
         constrained = constrained.and_also(np.flatnonzero(mesh.points[:, axis] < 1e-9), (0, 0, 0), tuple(axis == k for k in range(3)))
     top = side_nodes(mesh, "z+")

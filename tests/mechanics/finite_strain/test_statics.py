@@ -10,7 +10,7 @@ from naibu.core.status import Status
 from naibu.mechanics.contact.contact_surfaces import Friction, rigid_contact
 from naibu.mechanics.contact.penalty_contact import plane
 from naibu.mechanics.finite_elements.assembly import body_force
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import LAWS
 from naibu.mechanics.finite_strain.newton import Newton
@@ -26,9 +26,9 @@ from naibu.validation.analytic.finite_strain import ThickShell, confined, first_
 ZERO = (0.0, 0.0, 0.0)
 
 
-def roller(mesh: Mesh, *, base=True) -> Prescribed:
+def roller(mesh: Mesh, *, base=True) -> PrescribedDisplacement:
     """Symmetry planes x = 0 and y = 0 of a mesh in the first octant, and z = 0."""
-    constrained = Prescribed.nothing(mesh.n_points)
+    constrained = PrescribedDisplacement.none(mesh.n_points)
     for axis in range(3 if base else 2):
         constrained = constrained.and_also(np.flatnonzero(np.abs(mesh.points[:, axis]) < 1e-9), ZERO, tuple(axis == k for k in range(3)))
     return constrained
@@ -40,7 +40,7 @@ def test_patch_prescribed_on_the_boundary_fills_the_inside(kind, law):
     mesh = distorted(kind, divisions=2)
     move = np.array([[0.1, 0.15, -0.05], [0.0, -0.1, 0.1], [-0.1, 0.05, 0.15]])
     outside = boundary_nodes(mesh)
-    support = Prescribed.nothing(mesh.n_points).and_also(outside, mesh.points[outside] @ move.T)
+    support = PrescribedDisplacement.none(mesh.n_points).and_also(outside, mesh.points[outside] @ move.T)
     solution = solve(problem(mesh, of(law), prescribed=support), settings=SolverSettings(tolerance=1e-10))
     np.testing.assert_allclose(solution.displacement, mesh.points @ move.T, atol=1e-8)
     assert solution.status is Status.CONVERGED
@@ -105,7 +105,7 @@ def test_pressurised_tube_converges_to_lame(kind, formulation, rate):
         radius = np.hypot(mesh.points[:, 0], mesh.points[:, 1])
         radial = shell.displacement(radius)[:, None] * mesh.points * [1, 1, 0] / radius[:, None]
         inner = np.flatnonzero(radius < 10.001)
-        support = Prescribed.nothing(mesh.n_points).and_also(np.arange(mesh.n_points), ZERO, (False, False, True))
+        support = PrescribedDisplacement.none(mesh.n_points).and_also(np.arange(mesh.n_points), ZERO, (False, False, True))
         support = support.and_also(np.flatnonzero(mesh.points[:, 0] < 1e-9), ZERO, (True, False, False))
         support = support.and_also(np.flatnonzero(mesh.points[:, 1] < 1e-9), ZERO, (False, True, False)).and_also(inner, radial[inner])
         solution = solve(
@@ -154,7 +154,7 @@ def test_manufactured_finite_deformation_converges_with_order_two(law):
     for n in (3, 6, 12):
         mesh = box((10, 10, 10), (n, n, n), centred=False)
         exact, outside = manufactured(mesh.points), boundary_nodes(mesh)
-        support = Prescribed.nothing(mesh.n_points).and_also(outside, exact[outside])
+        support = PrescribedDisplacement.none(mesh.n_points).and_also(outside, exact[outside])
         body = problem(mesh, m, prescribed=support, force=nodal_load(mesh, m))
         newton = Newton(body, SolverSettings())
         found = newton.solve(exact, (), 1.0)
@@ -166,7 +166,11 @@ def test_manufactured_finite_deformation_converges_with_order_two(law):
 
 def crushed(share: float) -> tuple:
     mesh = box((10, 10, 10), (3, 3, 3))
-    support = Prescribed.nothing(mesh.n_points).and_also(side_nodes(mesh, "z-"), ZERO).and_also(side_nodes(mesh, "z+"), (0, 0, -10 * share))
+    support = (
+        PrescribedDisplacement.none(mesh.n_points)
+        .and_also(side_nodes(mesh, "z-"), ZERO)
+        .and_also(side_nodes(mesh, "z+"), (0, 0, -10 * share))
+    )
     return mesh, problem(mesh, prescribed=support)
 
 

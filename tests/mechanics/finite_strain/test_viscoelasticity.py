@@ -16,7 +16,7 @@ from naibu.core.status import Status
 from naibu.mechanics.contact.contact_surfaces import Friction, rigid_contact
 from naibu.mechanics.contact.penalty_contact import plane
 from naibu.mechanics.finite_elements import stress_history
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.hyperelasticity import LAWS, Material, from_moduli
 from naibu.mechanics.finite_elements.stress_history import HistoryAssembler, second_piola
 from naibu.mechanics.finite_strain.statics import solve
@@ -185,7 +185,7 @@ def bar(m: Material, value=None, force: float = 0.0, divisions=(1, 1, 2)):
     """A cube on a frictionless floor, its free sides held from turning; the top is moved by `value`, or pulled by `force` mN."""
     mesh = box((SIDE,) * 3, divisions, centred=False)
     x = mesh.points
-    constrained = Prescribed.nothing(len(x))
+    constrained = PrescribedDisplacement.none(len(x))
     for axis in range(3):
         only = tuple(k == axis for k in range(3))
         constrained = constrained.and_also(np.flatnonzero(x[:, axis] < 1e-9), (0, 0, 0), only)
@@ -240,7 +240,7 @@ def squeezed(m: Material, divisions=(3, 3, 3)):
     """A block pressed by 25 % between plates that hold it: the strain is far from uniform."""
     mesh = box((SIDE,) * 3, divisions)
     z = mesh.points[:, 2]
-    constrained = Prescribed.nothing(mesh.n_points).and_also(np.flatnonzero(z < 1e-9), (0, 0, 0))
+    constrained = PrescribedDisplacement.none(mesh.n_points).and_also(np.flatnonzero(z < 1e-9), (0, 0, 0))
     top = np.flatnonzero(z > SIDE - 1e-9)
     return problem(mesh, m, prescribed=constrained.and_also(top, (0.3, 0, -2.5))), top
 

@@ -9,18 +9,19 @@ import pytest
 import scipy.sparse as sp
 
 from naibu.core.errors import ConvergenceError, InputError
+from naibu.mechanics.prescribed_motion import PrescribedMotion
 from naibu.mechanics.small_strain._rheology_kernels import rates
 from naibu.mechanics.small_strain.constraint_stabilization import Stabilization, stabilized_accelerations
 from naibu.mechanics.small_strain.dynamics import METHODS, simulate_motion
 from naibu.mechanics.small_strain.implicit_integrators import MotionState
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.mechanics.small_strain.mass_matrix import mass_of
-from naibu.mechanics.small_strain.prescribed_motion import Path, Support
 from naibu.mechanics.small_strain.rheology import CellRheology, three_element, voigt
+from naibu.mechanics.small_strain.supports import Support
 from naibu.meshing.structured_2d import rectangle
 
 GEL = three_element(10.0, 3.0, 20.0, 0.3)
-PUSH = Path.of(
+PUSH = PrescribedMotion.of(
     lambda t: (0.02 * np.sin(3 * t), -0.1 * np.sin(2 * t) ** 2),
     velocity=lambda t: (0.06 * np.cos(3 * t), -0.2 * np.sin(4 * t)),
     acceleration=lambda t: (-0.18 * np.sin(3 * t), -0.8 * np.cos(4 * t)),
@@ -52,7 +53,7 @@ def test_system_of_the_report() -> None:
 def test_a_simulation_obeys_the_system(kind: str) -> None:
     """Reactions of a simulated state are the multipliers of system (9) for that state."""
     body, floor, free = block()
-    plate = Support("plate", free[:1], path=PUSH)
+    plate = Support("plate", free[:1], motion=PUSH)
     motion = simulate_motion(body, GEL, 1.0, [floor, plate], [0.0, 0.4], step=0.01, method="rk4", mass=kind, stabilization=15.0)
     state, n = motion.final, body.points.size
     law = CellRheology.of(body.simplices.n_cells, GEL)
@@ -97,7 +98,7 @@ def test_gaps_close_like_a_critically_damped_oscillator(method: str) -> None:
 def test_contact_forces_are_those_of_exact_supports(method: str) -> None:
     """Stiff stabilisation and elimination agree in shape and force, while a plate moves and after it has let go."""
     body, floor, free = block()
-    plate = Support("plate", free[:1], path=PUSH, end_s=0.6)
+    plate = Support("plate", free[:1], motion=PUSH, end_s=0.6)
     step = 0.002
     exact, kept = (
         simulate_motion(body, GEL, 1.0, [floor, plate], np.linspace(0.0, 1.0, 11), step=step, method=method, stabilization=w)
@@ -113,7 +114,7 @@ def test_contact_forces_are_those_of_exact_supports(method: str) -> None:
 
 def test_stable_with_stiff_stabilisation_and_huge_steps() -> None:
     body, floor, free = block()
-    plate = Support("plate", free, path=Path.through([0.0, 1.0], [(0.0, 0.0), (0.0, -0.1)]))
+    plate = Support("plate", free, motion=PrescribedMotion.through([0.0, 1.0], [(0.0, 0.0), (0.0, -0.1)]))
     motion = simulate_motion(body, voigt(10.0, 1.0, 0.3), 1.0, [floor, plate], np.arange(60.0), step=1.0, stabilization=1e4)
     assert motion.displacement[-1, free] == pytest.approx(np.tile([0.0, -0.1], (len(free), 1)), abs=1e-9)
     exact = simulate_motion(body, voigt(10.0, 1.0, 0.3), 1.0, [floor, plate], np.arange(60.0), step=1.0)

@@ -13,12 +13,13 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.mechanics.finite_elements.linear_simplices import connection_matrices
+from naibu.mechanics.prescribed_motion import PrescribedMotion
 from naibu.mechanics.small_strain.dynamics import METHODS, Series, explicit_step_limit, simulate_motion
 from naibu.mechanics.small_strain.implicit_integrators import MotionState
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.mechanics.small_strain.mass_matrix import ConsistentMass, mass_of
-from naibu.mechanics.small_strain.prescribed_motion import Path, Support
 from naibu.mechanics.small_strain.rheology import CellRheology, elastic, maxwell, three_element, voigt
+from naibu.mechanics.small_strain.supports import Support
 from naibu.meshing.primitives import box
 from naibu.meshing.structured_2d import interval, rectangle
 from naibu.validation.analytic.viscoelastic import free_motion
@@ -80,8 +81,8 @@ def test_rate_of_convergence(method: str, kind: str) -> None:
     assert errors[-1] < {1: 1e-2, 2: 1e-4, 4: 1e-6}[ORDER[method]]
 
 
-SMOOTH = Path.of(lambda t: (0.02 * np.sin(3 * t), -0.1 * np.sin(2 * t) ** 2))
-BROKEN = Path.through([0.0, 0.3, 0.6], [(0.0, 0.0), (0.0, -0.1), (0.05, -0.1)])
+SMOOTH = PrescribedMotion.of(lambda t: (0.02 * np.sin(3 * t), -0.1 * np.sin(2 * t) ** 2))
+BROKEN = PrescribedMotion.through([0.0, 0.3, 0.6], [(0.0, 0.0), (0.0, -0.1), (0.05, -0.1)])
 
 
 @pytest.mark.parametrize("kind", ["lumped", "consistent"])
@@ -90,7 +91,7 @@ BROKEN = Path.through([0.0, 0.3, 0.6], [(0.0, 0.0), (0.0, -0.1), (0.05, -0.1)])
 def test_rate_under_moving_supports(method: str, support: str, kind: str) -> None:
     """Displacement, velocity, reactions and work keep the order where plates move, change their speed and let go."""
     body, free, floor = small_block()
-    plate = Support("plate", free[:1], path=SMOOTH) if support == "smooth" else Support("plate", free[:1], path=BROKEN, end_s=0.7)
+    plate = Support("plate", free[:1], motion=SMOOTH) if support == "smooth" else Support("plate", free[:1], motion=BROKEN, end_s=0.7)
     fine = simulate_motion(body, GEL, 1.0, [floor, plate], [0.0, 0.5, 1.0], step=1 / 800, method="rk4", mass=kind)
     errors = []
     for count in (40, 80):
@@ -104,7 +105,7 @@ def test_rate_under_moving_supports(method: str, support: str, kind: str) -> Non
 @pytest.mark.parametrize(("method", "order"), [("sdirk2", 2), ("backward_euler", 1)])
 def test_rate_without_inertia(method: str, order: int) -> None:
     body, free, floor = small_block()
-    plate = Support("plate", free[:1], path=BROKEN, end_s=0.7)
+    plate = Support("plate", free[:1], motion=BROKEN, end_s=0.7)
     fine = simulate_motion(body, GEL, None, [floor, plate], [0.0, 1.0], step=1 / 3000).final
     errors = [
         np.abs(
@@ -117,8 +118,8 @@ def test_rate_without_inertia(method: str, order: int) -> None:
 
 def test_slow_motion_is_that_without_inertia() -> None:
     body, free, floor = small_block()
-    slow = Path.through([0.0, 30.0, 60.0], [(0.0, 0.0), (0.0, -0.1), (0.05, -0.1)])
-    plate = Support("plate", free[:1], path=slow)
+    slow = PrescribedMotion.through([0.0, 30.0, 60.0], [(0.0, 0.0), (0.0, -0.1), (0.05, -0.1)])
+    plate = Support("plate", free[:1], motion=slow)
     still, moving = (simulate_motion(body, GEL, rho, [floor, plate], np.linspace(0, 60, 13), step=0.1) for rho in (None, 1e-3))
     assert moving.displacement == pytest.approx(still.displacement, abs=1e-5)
     assert moving.force("plate")[1:] == pytest.approx(still.force("plate")[1:], abs=2e-3)
@@ -162,7 +163,7 @@ def test_stable_at_huge_steps(method: str, step: float) -> None:
     body, free, floor = small_block()
     soft = voigt(10.0, 0.1, 0.3)
     assert step > 1.5 * explicit_step_limit(body, soft, 1e-4)
-    plate = Support("plate", free, path=Path.through([0.0, step], [(0.0, 0.0), (0.01, -0.02)]))
+    plate = Support("plate", free, motion=PrescribedMotion.through([0.0, step], [(0.0, 0.0), (0.01, -0.02)]))
     motion = simulate_motion(body, soft, 1e-4, [floor, plate], step * np.arange(201.0), method=method)
     constrained = np.zeros(body.points.shape)
     constrained[free] = (0.01, -0.02)
@@ -212,7 +213,7 @@ def test_bar_vibrates_at_its_frequency() -> None:
 def test_energy_balance_of_a_push() -> None:
     """Work is kinetic plus spring energy plus what dampers took, and these never give back."""
     body, free, floor = small_block()
-    plate = Support("plate", free[:1], path=BROKEN, end_s=0.7)
+    plate = Support("plate", free[:1], motion=BROKEN, end_s=0.7)
     motion = simulate_motion(body, GEL, 0.1, [floor, plate], np.linspace(0.0, 3.0, 301), step=0.002)
     assert (np.diff(motion.dissipated) >= -1e-12).all()
     frictionless = simulate_motion(body, elastic(10.0, 0.3), 0.1, [floor, plate], np.linspace(0.0, 0.7, 8), step=0.0002)
@@ -234,14 +235,14 @@ def test_forces_balance() -> None:
 
 
 def _fixed(mesh: Mesh, floor: Support):  # type: ignore[no-untyped-def]
-    from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+    from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 
-    return Prescribed.nothing(mesh.n_points).and_also(floor.nodes, np.zeros(3))
+    return PrescribedDisplacement.none(mesh.n_points).and_also(floor.nodes, np.zeros(3))
 
 
 def test_going_on_is_the_same_as_going_through() -> None:
     body, free, floor = small_block()
-    plate = Support("plate", free[:1], path=SMOOTH)
+    plate = Support("plate", free[:1], motion=SMOOTH)
     for method in ("sdirk2", "backward_euler", "rk4"):
         whole = simulate_motion(body, GEL, 1.0, [floor, plate], [0.0, 0.5, 1.0], step=0.01, method=method)
         half = simulate_motion(body, GEL, 1.0, [floor, plate], [0.0, 0.5], step=0.01, method=method)
@@ -253,10 +254,10 @@ def test_going_on_is_the_same_as_going_through() -> None:
 def test_relative_support_pushes_from_where_the_body_is() -> None:
     """Released plastic square is pushed again: relative paths count from the shape that it kept."""
     body, free, floor = small_block()
-    down = Path.through([0.0, 1.0], [(0.0, 0.0), (0.0, -0.1)])
-    again = Path.through([3.0, 4.0], [(0.0, 0.0), (0.0, -0.1)])
+    down = PrescribedMotion.through([0.0, 1.0], [(0.0, 0.0), (0.0, -0.1)])
+    again = PrescribedMotion.through([3.0, 4.0], [(0.0, 0.0), (0.0, -0.1)])
     law = maxwell(10.0, 0.5, 0.3)
-    supports = [floor, Support("first", free, path=down, end_s=2.0), Support("second", free, path=again, start_s=3.0, relative=True)]
+    supports = [floor, Support("first", free, motion=down, end_s=2.0), Support("second", free, motion=again, start_s=3.0, relative=True)]
     motion = simulate_motion(body, law, None, supports, np.linspace(0.0, 5.0, 51))
     assert motion.displacement[30, free, 1] == pytest.approx(-0.1, abs=1e-6)
     assert motion.displacement[40, free, 1] == pytest.approx(-0.2, abs=1e-6)
@@ -266,7 +267,7 @@ def test_relative_support_pushes_from_where_the_body_is() -> None:
 
 def test_one_factorization_a_step_size_and_set_of_supports() -> None:
     body, free, floor = small_block()
-    plate = Support("plate", free[:1], path=BROKEN, end_s=0.6)
+    plate = Support("plate", free[:1], motion=BROKEN, end_s=0.6)
     assert simulate_motion(body, GEL, 1.0, [floor, plate], np.linspace(0.0, 1.2, 13), step=0.01).factorizations == 2
     assert simulate_motion(body, GEL, 1.0, [floor], np.linspace(0.0, 1.2, 13), step=0.01).factorizations == 1
 
@@ -286,7 +287,7 @@ def test_explicit_limit() -> None:
 
 def test_fehlberg_keeps_its_tolerance() -> None:
     body, free, floor = small_block()
-    plate = Support("plate", free[:1], path=BROKEN, end_s=0.7)
+    plate = Support("plate", free[:1], motion=BROKEN, end_s=0.7)
     fine = simulate_motion(body, GEL, 1.0, [floor, plate], [0.0, 1.0], step=1 / 2000, method="rk4").final
     found = [simulate_motion(body, GEL, 1.0, [floor, plate], [0.0, 1.0], method="rkf45", tolerance=tolerance) for tolerance in (1e-4, 1e-7)]
     errors = [np.abs(m.final.displacement - fine.displacement).max() / np.abs(fine.displacement).max() for m in found]
@@ -325,8 +326,8 @@ def push(**changes: object) -> Series:
         ({"supports": [Support("a", np.array([17]))]}, "a node or an axis"),
         ({"supports": [Support("a", np.array([0]), axes=(2,))]}, "a node or an axis"),
         ({"supports": [Support("a", np.array([0])), Support("a", np.array([1]))]}, "different names"),
-        ({"supports": [Support("a", np.array([0])), Support("b", np.array([0]))]}, "another support holds"),
-        ({"supports": [Support("a", np.array([0]), path=Path.through([0.0, 1.0], [[0.0], [1.0]]))]}, "not 2 finite numbers"),
+        ({"supports": [Support("a", np.array([0])), Support("b", np.array([0]))]}, "another support constrains"),
+        ({"supports": [Support("a", np.array([0]), motion=PrescribedMotion.through([0.0, 1.0], [[0.0], [1.0]]))]}, "not 2 finite numbers"),
     ],
 )
 def test_bad_input_is_named(changes: dict[str, object], what: str) -> None:
@@ -343,10 +344,6 @@ def test_bad_supports_are_named() -> None:
     ]:
         with pytest.raises(InputError, match=what):
             Support(*arguments)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="must increase"):
-        Path.through([0.0, 0.0], [[0.0], [1.0]])
-    with pytest.raises(InputError, match="a path needs times"):
-        Path.through([0.0, 1.0], [0.0, 1.0])
     with pytest.raises(InputError, match="no support is called 'hand'; there are floor"):
         push().force("hand")
     lonely = Mesh.from_arrays([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [5.0, 5.0]], [[0, 1, 2]], "triangle")

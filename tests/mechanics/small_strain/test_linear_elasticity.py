@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.mechanics.finite_elements.linear_simplices import (
     connection_matrices,
@@ -104,7 +104,7 @@ def test_patch_test_and_uniaxial_stress() -> None:
     low, high = np.flatnonzero(points[:, 2] < 1e-9), np.flatnonzero(points[:, 2] > 20 - 1e-9)
     along = np.flatnonzero((np.abs(points[:, 1:]) < 1e-9).all(axis=1))
     vertical, sideways = (False, False, True), (False, True, False)
-    support = Prescribed.nothing(mesh.n_points).and_also(low, (0, 0, 0), vertical).and_also(high, (0, 0, -0.2), vertical)
+    support = PrescribedDisplacement.none(mesh.n_points).and_also(low, (0, 0, 0), vertical).and_also(high, (0, 0, -0.2), vertical)
     support = support.and_also(along, (0, 0, 0), sideways).and_also(along[points[along, 0] == 0.0], (0, 0, 0))
     u = body.solve(lame, shear, support)
     assert u == pytest.approx(points * [0.4 * 0.01, 0.4 * 0.01, -0.01], abs=1e-10)
@@ -126,7 +126,7 @@ def test_every_linear_solver_finds_the_homogeneous_deformation(monkeypatch, solv
     low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
     boundary = np.flatnonzero(((mesh.points < low + 1e-9) | (mesh.points > high - 1e-9)).any(axis=1))
     expected = mesh.points @ (0.01 * np.arange(1.0, dimension**2 + 1.0).reshape(dimension, dimension)).T
-    support = Prescribed.nothing(mesh.n_points, dimension).and_also(boundary, expected[boundary])
+    support = PrescribedDisplacement.none(mesh.n_points, dimension).and_also(boundary, expected[boundary])
     if not with_mkl and solver in ("pardiso", "recycled_cholesky"):
         with pytest.raises(InputError, match=r"naibu\[fast\]"):
             LinearBody.of(mesh).solve(30.0, 10.0, support, solver=solver)
@@ -141,7 +141,7 @@ def test_large_bodies_are_solved_by_multigrid(monkeypatch, with_mkl: bool) -> No
         for module in (direct, solver_selection):
             monkeypatch.setattr(module, "pardiso_library", lambda: None)
     mesh = box((8.0, 8.0, 8.0), (8, 8, 8), cell_type="tetra")
-    support = Prescribed.nothing(mesh.n_points).and_also(np.flatnonzero(mesh.points[:, 2] < 1e-9), (0.0, 0.0, 0.0))
+    support = PrescribedDisplacement.none(mesh.n_points).and_also(np.flatnonzero(mesh.points[:, 2] < 1e-9), (0.0, 0.0, 0.0))
     weight = np.full(mesh.points.shape, -0.01)
     exact = LinearBody.of(mesh).solve(30.0, 10.0, support, weight)
     made = []
@@ -160,6 +160,6 @@ def test_bad_input_is_named() -> None:
         LinearBody.of(mesh).stiffness(np.ones(3), 1.0)
     body = LinearBody.of(box((10.0, 10.0, 10.0), (2, 2, 2), cell_type="tetra"))
     with pytest.raises(InputError, match="6 of 6 rigid-body motions"):
-        body.solve(1.0, 1.0, Prescribed.nothing(27))
+        body.solve(1.0, 1.0, PrescribedDisplacement.none(27))
     with pytest.raises(InputError, match="3 of 6"):
-        body.solve(1.0, 1.0, Prescribed.nothing(27).and_also(range(9), (0, 0, 0), (False, False, True)))
+        body.solve(1.0, 1.0, PrescribedDisplacement.none(27).and_also(range(9), (0, 0, 0), (False, False, True)))

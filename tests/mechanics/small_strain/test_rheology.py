@@ -14,11 +14,12 @@ from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.mechanics.finite_elements.linear_simplices import connection_matrices, simplices
+from naibu.mechanics.prescribed_motion import PrescribedMotion
 from naibu.mechanics.small_strain._rheology_kernels import advanced, elastic_energy, rates, stage_forces
 from naibu.mechanics.small_strain.dynamics import Series, simulate_motion
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
-from naibu.mechanics.small_strain.prescribed_motion import Path, Support
 from naibu.mechanics.small_strain.rheology import CellRheology, Rheology, elastic, maxwell, per_region, three_element, voigt
+from naibu.mechanics.small_strain.supports import Support
 from naibu.meshing.primitives import box
 from naibu.meshing.structured_2d import interval, rectangle
 from naibu.validation.analytic.viscoelastic import complex_modulus, creep_strain, ramp_stress, released_strain, residual_strain
@@ -40,10 +41,10 @@ def material(elements: Elements) -> Rheology:
     return three_element(*elements, 0.0)  # in one dimension the report's J is that of lambda = 0, 2 mu = E
 
 
-def pulled(elements: Elements, path: Path, times: np.ndarray, **options: object) -> Series:
+def pulled(elements: Elements, path: PrescribedMotion, times: np.ndarray, **options: object) -> Series:
     """A rod of 5 mm and 2 mm^2, without inertia, whose right end follows a path."""
     body = rod()
-    supports = [Support("wall", np.array([0])), Support("hand", np.array([4]), path=path)]
+    supports = [Support("wall", np.array([0])), Support("hand", np.array([4]), motion=path)]
     return simulate_motion(body, material(elements), None, supports, times, **options)  # type: ignore[arg-type]
 
 
@@ -75,7 +76,7 @@ def test_stress_of_a_ramp_is_exact_at_any_step(name: str) -> None:
     """A strain that grows evenly and is held: the exponential update leaves no error, whatever the step."""
     elements, strain = CASES[name], 0.02
     times = np.array([0.0, 0.7, 1.5, 4.0, 40.0, 4000.0])
-    motion = pulled(elements, Path.through([0.0, 1.5], [[0.0], [5.0 * strain]]), times, step=1e6)
+    motion = pulled(elements, PrescribedMotion.through([0.0, 1.5], [[0.0], [5.0 * strain]]), times, step=1e6)
     assert motion.steps == 5
     stress = motion.force("hand")[1:, 0] / 2.0
     assert stress == pytest.approx(ramp_stress(elements, strain, 1.5, times[1:]), rel=1e-9, abs=1e-9)
@@ -87,9 +88,9 @@ def test_displacement_that_stays(name: str) -> None:
     """Pulled in 1.5 s, held for 3 s, released: the residual is the series damper's share."""
     elements = CASES[name]
     times = np.array([0.0, 4.5, 5.0, 6.0, 60.0])
-    path = Path.through([0.0, 1.5], [[0.0], [0.1]])
+    path = PrescribedMotion.through([0.0, 1.5], [[0.0], [0.1]])
     body = rod()
-    supports = [Support("wall", np.array([0])), Support("hand", np.array([4]), path=path, end_s=4.5)]
+    supports = [Support("wall", np.array([0])), Support("hand", np.array([4]), motion=path, end_s=4.5)]
     motion = simulate_motion(body, material(elements), None, supports, times, step=0.02)
     assert motion.displacement[:, 4, 0] == pytest.approx(5.0 * released_strain(elements, 0.02, 1.5, 3.0, times), abs=1e-5)
     assert motion.displacement[-1, 4, 0] == pytest.approx(5.0 * residual_strain(elements, 0.02, 1.5, 3.0), abs=1e-5)
@@ -100,7 +101,7 @@ def test_displacement_that_stays(name: str) -> None:
 def test_steady_vibration(name: str) -> None:
     """Stress over strain of a steady vibration is the complex modulus of the chain."""
     elements, w = CASES[name], 3.0
-    path = Path.of(lambda t: [0.1 * np.sin(w * t)], velocity=lambda t: [0.1 * w * np.cos(w * t)])
+    path = PrescribedMotion.of(lambda t: [0.1 * np.sin(w * t)], velocity=lambda t: [0.1 * w * np.cos(w * t)])
     start = 60.0
     times = np.concatenate([[0.0], start + np.linspace(0.0, 2.0 * np.pi / w, 9)])
     motion = pulled(elements, path, times, step=0.02)

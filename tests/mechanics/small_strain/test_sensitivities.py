@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from naibu.core.errors import InputError
+from naibu.mechanics.prescribed_motion import PrescribedMotion
 from naibu.mechanics.small_strain.dynamics import simulate_motion
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
-from naibu.mechanics.small_strain.prescribed_motion import Path, Support
 from naibu.mechanics.small_strain.rheology import CellRheology, elastic, maxwell, three_element, voigt
 from naibu.mechanics.small_strain.sensitivities import NAMES, MaterialChange, simulate_motion_with_derivatives
+from naibu.mechanics.small_strain.supports import Support
 from naibu.meshing.primitives import box
 from naibu.meshing.structured_2d import rectangle
 
@@ -22,13 +23,13 @@ MATERIALS = {
     "maxwell": maxwell(10.0, 6.0, 0.3),
     "three": three_element(10.0, 2.0, 6.0, 0.3, voigt_poisson_ratio=0.2, series_poisson_ratio=0.45),
 }
-PUSH = Path.through([0.0, 0.3, 0.6], [(0.0, 0.0), (0.0, -0.1), (0.05, -0.1)])
+PUSH = PrescribedMotion.through([0.0, 0.3, 0.6], [(0.0, 0.0), (0.0, -0.1), (0.05, -0.1)])
 
 
 def set_up() -> tuple[LinearBody, list[Support], np.ndarray]:
     mesh = rectangle((2.0, 1.0), (2, 2))
     floor = Support("floor", np.flatnonzero(mesh.points[:, 1] == 0.0))
-    plate = Support("plate", np.flatnonzero(mesh.points[:, 1] == 1.0)[:2], path=PUSH, end_s=0.7)
+    plate = Support("plate", np.flatnonzero(mesh.points[:, 1] == 1.0)[:2], motion=PUSH, end_s=0.7)
     return LinearBody.of(mesh), [floor, plate], mesh.points[mesh.cells][:, :, 1].mean(axis=1) > 0.5
 
 
@@ -65,7 +66,7 @@ def test_derivatives_are_those_of_finite_differences(name: str, inertia: str) ->
 def test_three_dimensions_and_forces() -> None:
     mesh = box((2.0, 2.0, 2.0), (2, 2, 2), cell_type="tetra")
     body, z = LinearBody.of(mesh), mesh.points[:, 2]
-    plate = Support("plate", np.flatnonzero(z > 1.9), path=Path.through([0.0, 1.0], [np.zeros(3), [0.0, 0.0, -0.2]]))
+    plate = Support("plate", np.flatnonzero(z > 1.9), motion=PrescribedMotion.through([0.0, 1.0], [np.zeros(3), [0.0, 0.0, -0.2]]))
     supports = [Support("floor", np.flatnonzero(z < 0.1)), plate]
     law = CellRheology.of(mesh.n_cells, three_element(10.0, 2.0, 6.0, 0.4))
     directions = [MaterialChange.relative(law, parameter) for parameter in NAMES]

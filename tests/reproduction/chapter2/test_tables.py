@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure as Canvas
 
 from naibu.core.errors import InputError
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.mechanics.small_strain.rheology import three_element
@@ -78,7 +78,7 @@ def test_agar_shape_needs_no_moduli() -> None:
     x, y = mesh.points.T
     top = np.flatnonzero((y == 30.0) & (np.abs(x + 2.5) <= 20.0 + 1e-9))
     assert len(top) == 17
-    support = Prescribed.nothing(mesh.n_points, 2).and_also(np.flatnonzero(y == 0.0), (0.0, 0.0)).and_also(top, (0.0, -7.5))
+    support = PrescribedDisplacement.none(mesh.n_points, 2).and_also(np.flatnonzero(y == 0.0), (0.0, 0.0)).and_also(top, (0.0, -7.5))
     static = LinearBody.of(mesh, thickness_mm=75.0).solve(*lame_parameters(10.0, 0.35), support)
     assert study.series.displacement[-1] == pytest.approx(static, abs=1e-4)
     other = agar_block(shifted_cells=1.0, material=three_element(55.0, 3.0, 900.0, 0.35))

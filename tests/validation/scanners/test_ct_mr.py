@@ -15,7 +15,7 @@ from naibu.core.rigid_transform import Pose
 from naibu.core.rotation import rotation_matrix
 from naibu.core.volume import Volume
 from naibu.mechanics.finite_elements.assembly import Assembler
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import material
 from naibu.mechanics.finite_strain.problem import Problem
@@ -144,7 +144,7 @@ def pressed() -> MeshMotion:
     """A block of gel, pressed and sheared between two plates that hold it: solved."""
     mesh = box((24.0, 20.0, 16.0), (5, 4, 4))
     height = mesh.points[:, 2]
-    support = Prescribed.nothing(mesh.n_points).and_also(np.flatnonzero(height < 1e-9), np.zeros(3))
+    support = PrescribedDisplacement.none(mesh.n_points).and_also(np.flatnonzero(height < 1e-9), np.zeros(3))
     support = support.and_also(np.flatnonzero(height > 16.0 - 1e-9), [2.0, 0.0, -3.0])
     body = Assembler.from_materials(elements(mesh), mesh.regions, [material(young_modulus=30.0, poisson_ratio=0.45)])
     solution = solve(Problem(mesh.points, body, (), support, np.zeros(mesh.points.shape)))

@@ -19,7 +19,7 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.load_cases import FieldTrial
 from naibu.mechanics.finite_elements.assembly import Assembler
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import material
 from naibu.mechanics.finite_elements.linear_simplices import Simplices, parameter_forces, simplices
@@ -297,5 +297,5 @@ def loaded_from_rest(
     if not isinstance(law, NeoHookean):
         return moved
     values = np.where(trial.loaded, moved, 0.0)
-    problem = Problem(points, law.assembler(lame, shear), (), Prescribed(trial.loaded, values), trial.external_force)
+    problem = Problem(points, law.assembler(lame, shear), (), PrescribedDisplacement(trial.loaded, values), trial.external_force)
     return solve(problem, settings=SolverSettings(first_step=0.2, largest_step=0.5, tolerance=1e-8)).displacement

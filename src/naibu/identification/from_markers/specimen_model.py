@@ -34,7 +34,7 @@ from naibu.identification.from_markers.scan_alignment import Placement, placemen
 from naibu.identification.from_markers.specimen_mesh import element_size, model_mesh, on_straight_base
 from naibu.mechanics.contact.penalty_contact import STICK, Contact
 from naibu.mechanics.finite_elements.assembly import Assembler, body_force
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import Law, from_moduli, law_named, parameter_vector
 from naibu.mechanics.finite_strain.problem import Problem
@@ -235,7 +235,7 @@ class Specimen:
         weight = np.zeros((n, 3))
         if self.experiment.loading.kind == "side_plates":
             weight = body_force(body._assembler.elements, np.full(self.mesh.n_cells, self.settings.density), GRAVITY)
-        return Problem(body.mesh.points, assembler, tuple(contacts), Prescribed.nothing(n), weight)
+        return Problem(body.mesh.points, assembler, tuple(contacts), PrescribedDisplacement.none(n), weight)
 
     def direction(self, name: str, values: Mapping[str, float], state: str) -> list[Direction]:
         """Return how the problem of a state depends on the physical value of a parameter; empty where it does not.

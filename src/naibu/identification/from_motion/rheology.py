@@ -21,9 +21,9 @@ from naibu.core.mesh import Mesh
 from naibu.core.parameters import Parameter, ParameterSet, Scale
 from naibu.mechanics.small_strain.dynamics import Load, Series, simulate_motion
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
-from naibu.mechanics.small_strain.prescribed_motion import Support
 from naibu.mechanics.small_strain.rheology import CellRheology, Rheology, per_region, three_element
 from naibu.mechanics.small_strain.sensitivities import MaterialChange, SeriesDerivatives, simulate_motion_with_derivatives
+from naibu.mechanics.small_strain.supports import Support
 from naibu.meshing.point_location import interpolation_operator
 
 KINDS = ("young_modulus", "voigt_viscosity", "series_viscosity", "poisson_ratio")

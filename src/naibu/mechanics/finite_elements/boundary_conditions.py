@@ -1,4 +1,4 @@
-"""Dirichlet boundary conditions."""
+"""Dirichlet boundary conditions: prescribed displacement components."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from naibu.core.errors import InputError
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Prescribed:
-    """Displacement components that are given; they grow in proportion to the load.
+class PrescribedDisplacement:
+    """Prescribed displacement components of all nodes; they grow in proportion to the load.
 
     Attributes
     ----------
@@ -27,12 +27,21 @@ class Prescribed:
     values: FloatArray
 
     @classmethod
-    def nothing(cls, n_points: int, dimension: int = 3) -> Prescribed:
-        """Return a support that holds nothing."""
+    def none(cls, n_points: int, dimension: int = 3) -> PrescribedDisplacement:
+        """Return no constraint on any of `n_points` nodes."""
         return cls(np.zeros((n_points, dimension), dtype=bool), np.zeros((n_points, dimension)))
 
-    def and_also(self, nodes: ArrayLike, values: ArrayLike, components: tuple[bool, ...] | None = None) -> Prescribed:
-        """Return the support with the `components` (all by default) of `nodes` prescribed to `values` (d,) or (len(nodes), d), mm, as well.
+    def and_also(self, nodes: ArrayLike, values: ArrayLike, components: tuple[bool, ...] | None = None) -> PrescribedDisplacement:
+        """Return these conditions with further components prescribed.
+
+        Parameters
+        ----------
+        nodes : array_like, shape (k,)
+            Node numbers.
+        values : array_like, shape (d,) or (k, d)
+            Displacements at full load, mm.
+        components : tuple of bool, optional
+            Which of the d components are prescribed; all by default.
 
         Raises
         ------
@@ -41,12 +50,13 @@ class Prescribed:
         """
         index = np.asarray(nodes, dtype=np.int64)
         given = np.broadcast_to(np.asarray(values, dtype=float), (len(index), self.constrained.shape[1]))
-        if len(index) and (index.min() < 0 or index.max() >= len(self.constrained)):
-            raise InputError(f"prescribed node {index.max()} does not exist; the mesh has nodes 0 to {len(self.constrained) - 1}")
+        outside = (index < 0) | (index >= len(self.constrained))
+        if outside.any():
+            raise InputError(f"nodes has node {index[outside][0]}; the mesh has nodes 0 to {len(self.constrained) - 1}")
         if not np.isfinite(given).all():
-            raise InputError("prescribed displacements must be finite numbers; leave a component free instead of giving NaN")
+            raise InputError("values must be finite displacements; leave a component out of `components` instead of giving NaN")
         constrained, all_values = self.constrained.copy(), self.values.copy()
         for axis in range(self.constrained.shape[1]) if components is None else np.flatnonzero(components):
             constrained[index, axis] = True
             all_values[index, axis] = given[:, axis]
-        return Prescribed(constrained, all_values)
+        return PrescribedDisplacement(constrained, all_values)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from naibu.core.arrays import FloatArray, Int32Array
 from naibu.mechanics.contact.penalty_contact import PLANE, Contact
 from naibu.mechanics.finite_elements.assembly import Assembler
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.linear_algebra.solver_selection import SolverName
 
 
@@ -51,7 +51,7 @@ class Problem:
         Elements and materials; its pattern must hold the contacts' couplings (`block_pattern` with their nodes).
     contacts : tuple of Contact
         Rigid bodies and interfaces.
-    prescribed : Prescribed
+    prescribed : PrescribedDisplacement
         Given displacements.
     external_force : ndarray, shape (n, 3)
         Dead load, mN, present from the beginning (weight).
@@ -60,7 +60,7 @@ class Problem:
     points: FloatArray
     assembler: Assembler
     contacts: tuple[Contact, ...]
-    prescribed: Prescribed
+    prescribed: PrescribedDisplacement
     external_force: FloatArray
     _positions: tuple[Int32Array, ...] = field(default=())
 

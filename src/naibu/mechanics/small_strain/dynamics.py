@@ -17,9 +17,9 @@ from naibu.mechanics.small_strain.generalized_alpha import GeneralizedAlpha
 from naibu.mechanics.small_strain.implicit_integrators import BackwardEuler, Integrator, MotionState, Phase, Sdirk2
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.mechanics.small_strain.mass_matrix import Mass, mass_of
-from naibu.mechanics.small_strain.prescribed_motion import Guide, Support
 from naibu.mechanics.small_strain.rheology import CellRheology, Rheology
 from naibu.mechanics.small_strain.runge_kutta import RungeKutta4, RungeKuttaFehlberg
+from naibu.mechanics.small_strain.supports import ActiveSupports, Support
 
 METHODS = ("sdirk2", "backward_euler", "generalized_alpha", "rk4", "rkf45")
 Load = Callable[[float], FloatArray]
@@ -256,10 +256,10 @@ class _Run:
     def _phase(self, active: tuple[Support, ...]) -> Phase:
         for support in active:
             if support.relative and (self.active is None or support not in self.active):
-                path = support.path.displacement(self.state.time) if support.path is not None else 0.0
+                path = support.motion.displacement(self.state.time) if support.motion is not None else 0.0
                 self.offsets[support.name] = self.state.displacement[support.nodes] - path
         self.active = active
-        guide = Guide(active, self.body.points.shape, self.offsets)
+        guide = ActiveSupports(active, self.body.points.shape, self.offsets)
         return Phase(self.body, self.law, self.flow, self.mass, self.load, guide, self.rule)
 
 

@@ -43,8 +43,8 @@ from naibu.mechanics.small_strain._rheology_kernels import advanced, stage_force
 from naibu.mechanics.small_strain.constraint_stabilization import Stabilization
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody, require_constrained
 from naibu.mechanics.small_strain.mass_matrix import Mass
-from naibu.mechanics.small_strain.prescribed_motion import Guide
 from naibu.mechanics.small_strain.rheology import CellRheology, FlowCoefficients, StepCoefficients
+from naibu.mechanics.small_strain.supports import ActiveSupports
 
 STAGE = 1.0 - np.sqrt(0.5)
 INSTANT = 1e-8  # of a step: how long a jump of a body without inertia takes
@@ -100,7 +100,7 @@ class Phase:
         Inertia; None for a body that is in equilibrium at any time.
     load : callable
         From a time, s, to the forces on the nodes (n, d), mN.
-    guide : Guide
+    guide : ActiveSupports
         Where the held components go.
     stabilization : Stabilization or None
         How supports are kept; None: exactly, their components are eliminated.
@@ -111,7 +111,7 @@ class Phase:
     flow: FlowCoefficients
     mass: Mass | None
     load: Callable[[float], FloatArray]
-    guide: Guide
+    guide: ActiveSupports
     stabilization: Stabilization | None
 
     def momentum(self, velocity: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ from naibu._numba.compilation import njit
 from naibu.core.arrays import BoolArray, FloatArray, Int32Array, require_shape
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.linear_simplices import Simplices, elastic_forces, per_cell, simplices
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern, block_pattern, with_dirichlet_rows
 from naibu.mechanics.linear_algebra.multigrid import rigid_body_modes
@@ -92,7 +92,7 @@ class LinearBody:
         self,
         lame_lambda: ArrayLike,
         shear_modulus: ArrayLike,
-        prescribed: Prescribed,
+        prescribed: PrescribedDisplacement,
         external_force: FloatArray | None = None,
         *,
         solver: SolverName = "automatic",
@@ -103,7 +103,7 @@ class LinearBody:
         ----------
         lame_lambda, shear_modulus : array_like
             Lame's constants, kPa, one number or one a cell.
-        prescribed : Prescribed
+        prescribed : PrescribedDisplacement
             Dirichlet boundary conditions.
         external_force : ndarray, shape (n, d), optional
             Nodal forces, mN.

@@ -20,8 +20,8 @@ from naibu.mechanics.small_strain._rheology_kernels import advanced, stage_force
 from naibu.mechanics.small_strain.dynamics import Load, Series, driven
 from naibu.mechanics.small_strain.implicit_integrators import STAGE, MotionState, Phase, Sdirk2
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
-from naibu.mechanics.small_strain.prescribed_motion import Support
 from naibu.mechanics.small_strain.rheology import CellRheology, Rheology, StepCoefficients
+from naibu.mechanics.small_strain.supports import Support
 
 NAMES = {"young_modulus": "elastic", "voigt_viscosity": "voigt", "series_viscosity": "series"}
 

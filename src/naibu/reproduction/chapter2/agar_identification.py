@@ -11,8 +11,9 @@ from scipy.optimize import least_squares
 from naibu.core.arrays import FloatArray
 from naibu.core.parameters import MAX_POISSON_RATIO
 from naibu.identification.from_motion.rheology import MotionTrial, identify_motion, rheology_parameters
-from naibu.mechanics.small_strain.prescribed_motion import Path, Support
+from naibu.mechanics.prescribed_motion import PrescribedMotion
 from naibu.mechanics.small_strain.rheology import elastic
+from naibu.mechanics.small_strain.supports import Support
 from naibu.reproduction.chapter2.simulations import AGAR, AGAR_PUSH_MM, AGAR_SIZE_MM, WEIGHT_MM, agar_block_3d
 from naibu.viewer.chapter import Section
 from naibu.viewer.tables import Cell, Table
@@ -88,8 +89,8 @@ def told_by_histories(readings: tuple[FloatArray, FloatArray], fit: AgarFit, cel
     study = agar_block_3d(cell_mm=cell_mm, push_s=1.0, watched_s=WATCHED_S)
     top = study.mesh.points
     under = np.flatnonzero((top[:, 2] > AGAR_SIZE_MM[2] - 1e-9) & (np.hypot(top[:, 0], top[:, 1]) <= 0.5 * WEIGHT_MM + 1e-9))
-    path = Path.through([0.0, 1.0], [(0.0, 0.0, 0.0), (0.0, 0.0, -float(depth))])
-    supports = [Support("floor", np.flatnonzero(top[:, 2] < 1e-9)), Support("weight", under, path=path)]
+    path = PrescribedMotion.through([0.0, 1.0], [(0.0, 0.0, 0.0), (0.0, 0.0, -float(depth))])
+    supports = [Support("floor", np.flatnonzero(top[:, 2] < 1e-9)), Support("weight", under, motion=path)]
     u = np.full((2, len(start), 3), np.nan)
     u[0], u[1, :, 0], u[1, :, 2] = 0.0, displacement[:, 0], displacement[:, 1]
     force = np.full((2, 3), np.nan)

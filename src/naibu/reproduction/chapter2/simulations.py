@@ -17,10 +17,11 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
+from naibu.mechanics.prescribed_motion import PrescribedMotion
 from naibu.mechanics.small_strain.dynamics import Series, simulate_motion
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
-from naibu.mechanics.small_strain.prescribed_motion import Path, Support
 from naibu.mechanics.small_strain.rheology import Rheology, elastic, maxwell, three_element
+from naibu.mechanics.small_strain.supports import Support
 from naibu.meshing.primitives import box
 from naibu.meshing.structured_2d import rectangle
 
@@ -135,8 +136,8 @@ def pushed_square(
     mesh = rectangle((side_mm, side_mm), (divisions, divisions))
     x, y = mesh.points.T
     top = np.flatnonzero((y > side_mm * (1.0 - 1e-9)) & (np.abs(x) <= side_mm * (0.5 * pushed_share + 1e-9)))
-    path = Path.through([0.0, PHASES_S[0]], [(0.0, 0.0), (0.0, -push_mm)])
-    supports = [Support("floor", np.flatnonzero(y == 0.0)), Support("indenter", top, path=path, end_s=PHASES_S[1])]
+    path = PrescribedMotion.through([0.0, PHASES_S[0]], [(0.0, 0.0), (0.0, -push_mm)])
+    supports = [Support("floor", np.flatnonzero(y == 0.0)), Support("indenter", top, motion=path, end_s=PHASES_S[1])]
     times = np.linspace(0.0, PHASES_S[2], round(PHASES_S[2] / step_s) + 1)
     series = simulate_motion(LinearBody.of(mesh), SQUARES[name], density, supports, times, method=method)
     return Study(name, mesh, SQUARES[name], series, _nearest(mesh, (0.0, side_mm)))
@@ -170,10 +171,10 @@ def agar_block(
     x, y = mesh.points.T
     middle = -shifted_cells * width / 30
     top = np.flatnonzero((y == height) & (np.abs(x - middle) <= 0.5 * WEIGHT_MM + 1e-9))
-    path = Path.through([0.0, push_s], [(0.0, 0.0), (0.0, -AGAR_PUSH_MM)])
+    path = PrescribedMotion.through([0.0, push_s], [(0.0, 0.0), (0.0, -AGAR_PUSH_MM)])
     supports = [
         Support("floor", np.flatnonzero(y == 0.0), axes=None if floor_sticks else (1,)),
-        Support("weight", top, axes=None if weight_sticks else (1,), path=path),
+        Support("weight", top, axes=None if weight_sticks else (1,), motion=path),
     ]
     if not (weight_sticks or floor_sticks):
         supports.append(Support("middle", np.array([_nearest(mesh, (0.0, 0.0))]), axes=(0,)))
@@ -204,8 +205,8 @@ def agar_block_3d(
     mesh = box((width, depth, height), [max(2, round(size / cell_mm)) for size in AGAR_SIZE_MM], cell_type="tetra")
     x, y, z = mesh.points.T
     top = np.flatnonzero((z > height - 1e-9) & (np.hypot(x + shift_mm, y) <= 0.5 * WEIGHT_MM + 1e-9))
-    path = Path.through([0.0, push_s], [(0.0, 0.0, 0.0), (0.0, 0.0, -AGAR_PUSH_MM)])
-    supports = [Support("floor", np.flatnonzero(z < 1e-9)), Support("weight", top, path=path)]
+    path = PrescribedMotion.through([0.0, push_s], [(0.0, 0.0, 0.0), (0.0, 0.0, -AGAR_PUSH_MM)])
+    supports = [Support("floor", np.flatnonzero(z < 1e-9)), Support("weight", top, motion=path)]
     series = simulate_motion(LinearBody.of(mesh), material, None, supports, [0.0, push_s, watched_s], step=0.5)
     return Study("agar block, 3-D", mesh, material, series, _nearest(mesh, (-shift_mm, 0.0, height)))
 
@@ -228,8 +229,8 @@ def agar_under_bar(*, push_mm: float = 1.0, strip_mm: float = 15.0, material: Rh
     mesh = rectangle((width, height), (round(width / cell_mm), round(height / cell_mm)))
     x, y = mesh.points.T
     top = np.flatnonzero((y == height) & (np.abs(x) <= 0.5 * strip_mm + 1e-9))
-    path = Path.through([0.0, 1.0], [(0.0, 0.0), (0.0, -push_mm)])
-    supports = [Support("floor", np.flatnonzero(y == 0.0)), Support("bar", top, path=path)]
+    path = PrescribedMotion.through([0.0, 1.0], [(0.0, 0.0), (0.0, -push_mm)])
+    supports = [Support("floor", np.flatnonzero(y == 0.0)), Support("bar", top, motion=path)]
     series = simulate_motion(LinearBody.of(mesh), material, None, supports, [0.0, 1.0], step=0.5)
     return Study("agar under a bar", mesh, material, series, _nearest(mesh, (0.0, height)))
 

@@ -21,7 +21,7 @@ from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.load_cases import FieldTrial, Zones
 from naibu.mechanics.finite_elements.assembly import Assembler
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters, material
 from naibu.mechanics.finite_elements.modulus_derivatives import SimplexLaw
@@ -93,7 +93,7 @@ class PushedBody:
         lame, shear = self.moduli if moduli is None else moduli
         height = self.mesh.points[:, -1]
         floor, top = np.flatnonzero(height < 1e-9), np.flatnonzero(height > height.max() - 1e-9)
-        prescribed = Prescribed.nothing(self.mesh.n_points, self.mesh.dimension).and_also(floor, np.zeros(self.mesh.dimension))
+        prescribed = PrescribedDisplacement.none(self.mesh.n_points, self.mesh.dimension).and_also(floor, np.zeros(self.mesh.dimension))
         prescribed = prescribed.and_also(top, np.asarray(push, dtype=float))
         if self.law == "linear":
             return LinearBody.of(self.mesh).solve(lame, shear, prescribed)

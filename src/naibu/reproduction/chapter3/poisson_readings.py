@@ -17,7 +17,7 @@ from naibu.core.markers import Markers
 from naibu.identification.material_testing.marker_strain import marker_strain, poisson_ratio_from_markers
 from naibu.identification.material_testing.uniaxial import PoissonRatio
 from naibu.mechanics.finite_elements.assembly import Assembler
-from naibu.mechanics.finite_elements.boundary_conditions import Prescribed
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import material
 from naibu.mechanics.finite_strain.problem import Problem
@@ -143,7 +143,7 @@ def constrained_block(shortening: float, poisson_ratio: float, divisions: int) -
     mesh = box((SIDE_MM,) * 3, (divisions, divisions, 2 * divisions))
     z = mesh.points[:, 2]
     bottom, top = np.flatnonzero(z < 1e-9), np.flatnonzero(z > SIDE_MM - 1e-9)
-    supports = Prescribed.nothing(mesh.n_points).and_also(bottom, (0.0, 0.0, 0.0)).and_also(top, (0.0, 0.0, -shortening * SIDE_MM))
+    supports = PrescribedDisplacement.none(mesh.n_points).and_also(bottom, (0.0, 0.0, 0.0)).and_also(top, (0.0, 0.0, -shortening * SIDE_MM))
     body = Assembler.from_materials(elements(mesh), mesh.regions, [material(young_modulus=100.0, poisson_ratio=poisson_ratio)])
     u = solve(Problem(mesh.points, body, (), supports, np.zeros_like(mesh.points))).displacement
     heights = np.unique(z.round(6))

@@ -13,6 +13,7 @@ from naibu.identification.lattice_calibration.forward_model import PushedFace, P
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter, box_indenter, plane, spherical_indenter
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.simulation.loading_history import Drive, LatticeStudy, StudyBody, StudyFrame, run_study
+from naibu.mechanics.prescribed_motion import PrescribedMotion
 
 GRAVITY = 9810.0  # mm/s^2
 LATTICE = classic_lattice(box_mask((3, 3, 2)), 10.0, total_mass_kg=0.05)
@@ -21,12 +22,12 @@ SLIGHT = lattice_parameters(LATTICE, 40.0, 0.02, 0.5)  # explicit steps of 0.1 m
 
 
 def still(name: str, indenter: RigidIndenter, **more: object) -> StudyBody:
-    return StudyBody(name, indenter, np.zeros(1), np.zeros((1, 3)), **more)
+    return StudyBody(name, indenter, **more)
 
 
 def moving(name: str, indenter: RigidIndenter, rows: list[list[float]], **more: object) -> StudyBody:
     table = np.array(rows)
-    return StudyBody(name, indenter, table[:, 0], table[:, 1:], **more)
+    return StudyBody(name, indenter, PrescribedMotion.through(table[:, 0], table[:, 1:]), **more)
 
 
 def tied(**changes: object) -> LatticeStudy:

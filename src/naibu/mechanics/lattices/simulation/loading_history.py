@@ -15,6 +15,7 @@ from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState, Method
 from naibu.mechanics.lattices.simulation.contact import ContactState, begin_contact, push, push_by_force
+from naibu.mechanics.prescribed_motion import PrescribedMotion
 
 _TOUCH_MM = 1e-6
 
@@ -49,8 +50,8 @@ class StudyBody:
         For tables and messages.
     indenter : Indenter
         Shape, place at the start, friction and pull-off.
-    times, offset : ndarray, shape (k,) and (k, 3)
-        Displacement of the body, mm, linear between the times, s, and constant behind the last one.
+    motion : PrescribedMotion or None
+        Displacement of the body; None where it does not move.
     drive : Drive, optional
         Force that moves it instead; one body of a study at most, and the others then stand still.
     tied_until_s : float, optional
@@ -59,14 +60,13 @@ class StudyBody:
 
     name: str
     indenter: RigidIndenter
-    times: FloatArray
-    offset: FloatArray
+    motion: PrescribedMotion | None = None
     drive: Drive | None = None
     tied_until_s: float | None = None
 
     def moved(self, times: FloatArray) -> FloatArray:
         """Return the displacement (k, 3), mm, at times (k,), s."""
-        return np.stack([np.interp(times, self.times, self.offset[:, a]) for a in range(3)], axis=1)
+        return np.zeros((len(times), 3)) if self.motion is None else self.motion.sampled(times)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -233,7 +233,7 @@ def check_study(study: LatticeStudy) -> None:
     driven = [body for body in study.bodies if body.drive is not None]
     if len(driven) > 1:
         raise InputError(f"{', '.join(b.name for b in driven)} are all driven by forces; one can be")
-    moving = [body.name for body in study.bodies if body.drive is None and np.abs(body.offset).max(initial=0.0) > 0.0]
+    moving = [body.name for body in study.bodies if body.drive is None and body.motion is not None]
     if driven and moving:
         raise InputError(f"{', '.join(moving)} cannot move while {driven[0].name} is driven by a force")
     begin_contact(study.lattice, [body.indenter for body in study.bodies])
