@@ -25,6 +25,7 @@ extensions = [
     "sphinx_gallery.gen_gallery",
     "sphinxcontrib.bibtex",
     "naibu_help",
+    "public_names",
 ]
 bibtex_bibfiles = sorted(str(path.relative_to(Path(__file__).parent)) for path in Path(__file__).parent.glob("references/*.bib"))
 bibtex_reference_style = "author_year"

@@ -139,7 +139,16 @@ def loaded_by(statement: str) -> set[str]:
 
 
 def test_importing_naibu_is_light() -> None:
-    assert loaded_by("import naibu") == set()
+    assert loaded_by("import naibu; dir(naibu)") == set()
+    # the packages of public names load nothing until a name is used
+    for package in ("core", "identification", "imaging", "io", "mechanics", "meshing", "validation", "workflows"):
+        assert loaded_by(f"import naibu; dir(naibu.{package})") == set()
+
+
+def test_importing_naibu_is_fast() -> None:
+    timed = "from time import perf_counter; began = perf_counter(); import naibu; print(perf_counter() - began)"
+    best = min(float(subprocess.run([sys.executable, "-c", timed], capture_output=True, text=True, check=True).stdout) for _ in range(5))
+    assert best < 0.2
 
 
 def test_the_mechanics_load_no_plotting_and_no_command_line() -> None:

@@ -18,7 +18,7 @@ from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.resampling import positions
 from naibu.io.experiment_folder.reader import read_experiment
 from naibu.io.images import write_volume
-from naibu.workflows.track import ObjectDescription, track_files
+from naibu.workflows.track import ObjectDescription, track
 
 DIAMETER = 3.0
 LATTICE = np.stack(np.meshgrid(*[6.0 + 8.0 * np.arange(n) for n in (4, 4, 3)], indexing="ij"), axis=-1).reshape(-1, 3)
@@ -50,7 +50,7 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 def test_an_experiment_folder_comes_out(scans: list[Path], tmp_path: Path) -> None:
     layers = (Layer("soft", 0.0, 14.0), Layer("firm", 14.0, 28.0))
     described = ObjectDescription(Shape("box", (36.0, 36.0, 28.0)), Loading("plate"), layers, {"pressed": 22.0})
-    run = track_files(scans, out=tmp_path / "mine", diameter_mm=DIAMETER, description=described)
+    run = track(scans, out=tmp_path / "mine", diameter_mm=DIAMETER, description=described)
     experiment = read_experiment(tmp_path / "mine")
     assert experiment.layers == layers
     assert experiment.loaded_states[0].stated_mm == 22.0
@@ -73,20 +73,20 @@ def test_an_experiment_folder_comes_out(scans: list[Path], tmp_path: Path) -> No
 
 
 def test_tables_alone_where_nothing_is_told_of_the_object(scans: list[Path], tmp_path: Path) -> None:
-    track_files(scans, out=tmp_path / "tables", diameter_mm=DIAMETER)
+    track(scans, out=tmp_path / "tables", diameter_mm=DIAMETER)
     assert {p.name for p in (tmp_path / "tables").iterdir()} == {"initial.csv", "pressed.csv", "tracking.html", "tracking.json"}
 
 
 def test_mistakes_are_named(scans: list[Path], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="two scans would both be the state 'pressed'"):
-        track_files([*scans, scans[1]], out=tmp_path / "a", diameter_mm=DIAMETER)
+        track([*scans, scans[1]], out=tmp_path / "a", diameter_mm=DIAMETER)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="is not an empty folder"):
-        track_files(scans, out=tmp_path / "full", diameter_mm=DIAMETER)
+        track(scans, out=tmp_path / "full", diameter_mm=DIAMETER)
     small = write_volume(tmp_path / "small.mha", Volume.from_array(np.ones((3, 3, 3), np.uint8), spacing_mm=(1, 1, 1)))
     with pytest.raises(InputError, match=r"small\.mha does not lie on the grid of free\.nii\.gz"):
-        track_files(scans, out=tmp_path / "b", diameter_mm=DIAMETER, mask=small)
+        track(scans, out=tmp_path / "b", diameter_mm=DIAMETER, mask=small)
     assert not (tmp_path / "a").exists()
     assert not (tmp_path / "b").exists()
 

@@ -119,17 +119,17 @@ def track(
     out
         Folder to make: the experiment, with tracking.html and tracking.json beside its tables.
     """
-    from naibu.workflows.track import ObjectDescription, track_files
+    from naibu.workflows import track as tracking
 
     options = described or ObjectOptions()
     description = None
     if size_mm is not None:
-        description = ObjectDescription(**options.described(size_mm), title=title)
+        description = tracking.ObjectDescription(**options.described(size_mm), title=title)
     elif options.layer or options.stated_mm:
         raise InputError("--layer and --stated-mm describe an object: give its extents too, --size-mm X Y Z")
     with stages() as tell:
         tell("finding markers and linking them")
-        run = track_files(
+        run = tracking.track(
             scans, out=out, diameter_mm=diameter_mm, thickness_mm=thickness_mm, polarity=polarity, count=count, mask=mask,
             spacing_mm=spacing, description=description,
         )  # fmt: skip

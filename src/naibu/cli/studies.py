@@ -5,14 +5,13 @@ from __future__ import annotations
 import signal
 import sys
 import time
-import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
-from naibu.cli.console import INTERRUPTED, app, errors, print_table, progress_bar, say
-from naibu.core.errors import InputError
+from naibu.cli.console import INTERRUPTED, app, errors, print_table, progress_display, say
+from naibu.core.progress import ProgressReport
 
 ChapterName = Literal["ch1", "ch2", "ch3", "ch4-lattice", "ch4-cube", "ch4-octree"]
 
@@ -47,55 +46,40 @@ def reproduce(chapter: ChapterName, *, out: Path = Path("naibu-reproduction"), s
 
 @app.command
 def simulate(study: str = "", *, out: Path = Path("naibu-simulation"), resume: bool = False, example: bool = False) -> None:
-    """Run a simulation, and write its motion for ParaView, an animated page and the numbers.
+    """Simulate a study, and write its motion for ParaView, an animated page and the numbers.
 
-    Without STUDY it lists those of the report. Ctrl-C keeps what is computed.
+    Without STUDY, the studies that come with naibu are listed. Ctrl-C keeps what has been computed.
 
     Parameters
     ----------
     study
-        Name of a study, or your own file STUDY.toml of a lattice of springs and dampers.
+        Name of a study, or your own file STUDY.toml of a mass-spring-dashpot lattice.
     out
         Folder for the files.
     resume
-        Go on with an interrupted run of a lattice.
+        Resume an interrupted run of a lattice.
     example
-        Print the file of a lattice study, to begin your own: naibu simulate --example > my_study.toml
+        Print the file of a lattice study as a template for your own: naibu simulate --example > my_study.toml
     """
-    from naibu.workflows.lattice_study import NAMED, TEMPLATE, study_text
-    from naibu.workflows.simulate_study import SLUGS, SQUARES_TOGETHER, simulate_study
+    from naibu.workflows.lattice_study import TEMPLATE, study_text
+    from naibu.workflows.simulate import named_studies
+    from naibu.workflows.simulate import simulate as simulated
 
     if example:
         sys.stdout.write(study_text(study or TEMPLATE))
         return
     if not study:
-        rows = [(name, "finite elements", SLUGS.get(name, "three squares side by side")) for name in (SQUARES_TOGETHER, *SLUGS)]
-        lattices = [(name, "springs and dampers", tomllib.loads(study_text(name))["title"]) for name in NAMED]
-        print_table("Studies", ("name", "made of", "what"), rows + lattices, left=True)
+        print_table("Studies", ("name", "model", "title"), [(s.name, s.model, s.title) for s in named_studies()], left=True)
         return
     began = time.perf_counter()
-    if study == SQUARES_TOGETHER or study in SLUGS:
-        if resume:
-            raise InputError(f"{study} takes seconds and cannot be resumed; run it without --resume")
-        with progress_bar(f"computing {study}") as tell:
-            files = simulate_study(study, out, tell=tell)
-        say(f"{time.perf_counter() - began:.0f} s. {', '.join(str(path) for path in files)}")
-        return
-    _simulate_lattice(study, out, resume)
+    with stopped_gently() as stopping, progress_display() as display:
 
-
-def _simulate_lattice(study: str, out: Path, resume: bool) -> None:
-    from naibu.workflows.simulate_lattice import simulate_lattice
-
-    began = time.perf_counter()
-    with stopped_gently() as stopping, progress_bar(f"computing {study}") as told:
-
-        def tell(done: int, of: int) -> None:
-            told(done, of)
+        def progress(report: ProgressReport) -> None:
+            display(report)
             if stopping():
                 raise KeyboardInterrupt
 
-        run = simulate_lattice(study, out, resume=resume, tell=tell)
+        run = simulated(study, out=out, resume=resume, progress=progress)
     say(f"{time.perf_counter() - began:.0f} s. {', '.join(str(path) for path in run.files)}")
     if not run.finished:
         errors.print(f"Interrupted: {run.frames} of {run.of} frames are kept. The same command with --resume goes on.", soft_wrap=True)

@@ -1,5 +1,5 @@
-"""The bundled measurements: markers inside gels before and after loading, as printed in the 2008 report."""
+"""The bundled measurements: markers inside gels before and after loading, as printed in the 2008 report :cite:p:`hirai2008`."""
 
-from naibu.datasets.measurements import load, names, paper_tables, path
+import lazy_loader
 
-__all__ = ["load", "names", "paper_tables", "path"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

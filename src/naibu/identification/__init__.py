@@ -1,1 +1,5 @@
-"""From measured markers to parameters: an experiment as a model, the search for its parameters, and predictions with them."""
+"""Material parameters from markers, displacement fields, motions and forces, and predictions with them."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

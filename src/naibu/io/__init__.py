@@ -1,1 +1,5 @@
-"""Read and write experiments, tables and results."""
+"""Reading and writing volumes, meshes, marker tables, experiments and results."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,1 +1,5 @@
-"""Equilibrium at finite strain: elements, laws, supports with contact and friction, linear solvers, and sensitivities."""
+"""Finite elements at small and finite strain, contact with rigid indenters, and mass-spring-dashpot lattices."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,1 +1,5 @@
-"""Meshes: made from measures, judged, cut at interfaces, and searched for the cell around a point."""
+"""Finite element meshes of simple solids: generation, conversion, boundaries, quality, point location."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,1 +1,5 @@
-"""Closed forms, virtual specimens and measures with which results are judged."""
+"""Virtual specimens and scanners with known truth, and closed-form solutions."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

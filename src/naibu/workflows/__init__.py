@@ -1,1 +1,5 @@
-"""The verbs, from files to folders of results."""
+"""The verbs, from files to folders of results: their settings and results."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -126,6 +126,36 @@ def _same(grid: Volume, other: Volume, file: Path, reference: Path) -> None:
         )
 
 
+def sense(
+    reference: str | os.PathLike[str],
+    deformed: str | os.PathLike[str],
+    *,
+    method: Method = "default",
+    mask: str | os.PathLike[str] | None = None,
+    truth: str | os.PathLike[str] | None = None,
+    check_points: tuple[str | os.PathLike[str], str | os.PathLike[str]] | None = None,
+    spacing_mm: Sequence[float] | None = None,
+    out: str | os.PathLike[str] | None = None,
+    progress: Progress | None = None,
+) -> SenseRun:
+    """Measure the displacement between two scans, by digital volume correlation or a classic method, and write it.
+
+    Parameters
+    ----------
+    reference, deformed, mask, truth, check_points, spacing_mm
+        See `read_pair`.
+    method, out, progress
+        See `sense_pair`.
+
+    Raises
+    ------
+    InputError
+        As `read_pair` and `sense_pair`.
+    """
+    pair = read_pair(reference, deformed, mask=mask, truth=truth, check_points=check_points, spacing_mm=spacing_mm)
+    return sense_pair(pair, method=method, out=out, progress=progress)
+
+
 def sense_pair(
     pair: Pair, *, method: Method = "default", out: str | os.PathLike[str] | None = None, progress: Progress | None = None
 ) -> SenseRun:

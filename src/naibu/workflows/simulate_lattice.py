@@ -35,15 +35,15 @@ ARRAYS = {"displacement": "displacement_mm", "velocity": "velocity_mm_per_s", "s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LatticeRun:
-    """What a run left.
+class SimulationRun:
+    """The files of a simulation, and how far it came.
 
     Attributes
     ----------
     files : tuple of Path
-        Page, series and numbers, and, where it was interrupted, the state to go on from.
+        Page, series and numbers, and, where it was interrupted, the checkpoint from which it resumes.
     frames, of : int
-        Frames behind the first one that are kept, and that were asked for.
+        Number of frames kept after the first, and number asked for; of finite elements, number of studies.
     """
 
     files: tuple[Path, ...]
@@ -58,7 +58,7 @@ class LatticeRun:
 
 def simulate_lattice(
     source: str | os.PathLike[str], out: str | os.PathLike[str], *, resume: bool = False, tell: Tell | None = None
-) -> LatticeRun:
+) -> SimulationRun:
     """Run a study, and write ``NAME.html``, ``NAME.vtkhdf`` and ``NAME.json``; an interruption keeps the frames computed so far.
 
     The memory needed does not grow with the number of frames.
@@ -76,7 +76,7 @@ def simulate_lattice(
 
     Returns
     -------
-    LatticeRun
+    SimulationRun
         Of a run that Ctrl-C stopped, too; it then holds ``NAME.checkpoint.npz``.
 
     Raises
@@ -106,7 +106,7 @@ def simulate_lattice(
         files = (*files, checkpoint)
     if stopped is not None and not isinstance(stopped, KeyboardInterrupt):
         raise type(stopped)(f"{stopped} The first {state.frame * prepared.study.frame_s:g} s are kept in {path}.") from stopped
-    return LatticeRun(files, state.frame, prepared.study.frames)
+    return SimulationRun(files, state.frame, prepared.study.frames)
 
 
 def _computed(

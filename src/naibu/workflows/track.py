@@ -52,7 +52,7 @@ class TrackRun:
     files: tuple[Path, ...]
 
 
-def track_files(
+def track(
     scans: Sequence[str | os.PathLike[str]],
     *,
     out: str | os.PathLike[str],

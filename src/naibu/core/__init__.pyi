@@ -1,0 +1,25 @@
+from .chunked_volume import ChunkedVolume
+from .errors import ConvergenceError, InputError, MissingDependencyError, NaibuError
+from .experiment import Layer, Loading, Shape, State
+from .parameters import Parameter, ParameterSet
+from .progress import ProgressReport
+from .rigid_transform import Pose, registration
+from .status import Status
+
+__all__ = [
+    "ChunkedVolume",
+    "ConvergenceError",
+    "InputError",
+    "Layer",
+    "Loading",
+    "MissingDependencyError",
+    "NaibuError",
+    "Parameter",
+    "ParameterSet",
+    "Pose",
+    "ProgressReport",
+    "Shape",
+    "State",
+    "Status",
+    "registration",
+]

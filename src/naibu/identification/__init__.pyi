@@ -1,0 +1,79 @@
+from .force_balance.batch import BalanceEstimate, field_balance
+from .force_balance.incremental import IncrementalEstimate, incremental_balance
+from .force_balance.weighted import whitened_balance
+from .from_fields.estimate import FieldEstimate, identify_field
+from .from_fields.experiment_design import Accuracy, expected_accuracy
+from .from_fields.load_cases import FieldTrial, Zones
+from .from_fields.uncertainty import cramer_rao_bound
+from .from_markers.calibration import Calibration, calibrate
+from .from_markers.gauss_newton import MatchingSettings
+from .from_markers.known_materials import KnownMaterials
+from .from_markers.observations import NoiseModel
+from .from_markers.specimen_model import ModelSettings
+from .from_motion.rheology import MotionEstimate, MotionTrial, identify_motion
+from .lattice_calibration.evolutionary import search_cma_es, search_genetic
+from .lattice_calibration.forward_model import Capture, PushedFace, Pushing
+from .lattice_calibration.gauss_newton import CalibrationProblem, LatticeEstimate, ReportIndices, calibrate_lattice, indices
+from .lattice_calibration.shape_distance import force_difference, shape_difference
+from .lattice_calibration.unknowns import LatticeUnknowns
+from .material_testing.marker_strain import MarkerStrain, marker_strain, poisson_ratio_from_markers
+from .material_testing.uniaxial import CompressionTest, PoissonRatio, Specimen, SpecimenMean, compression_test, poisson_ratio, specimen_mean
+from .prediction.baselines import baselines
+from .prediction.calibrated_model import CalibratedModel
+from .prediction.cross_validation import LeftOut, ModelRow, compare_models, leave_one_out
+from .prediction.prediction import Prediction, predict_state
+
+__all__ = [
+    "Accuracy",
+    "BalanceEstimate",
+    "CalibratedModel",
+    "Calibration",
+    "CalibrationProblem",
+    "Capture",
+    "CompressionTest",
+    "FieldEstimate",
+    "FieldTrial",
+    "IncrementalEstimate",
+    "KnownMaterials",
+    "LatticeEstimate",
+    "LatticeUnknowns",
+    "LeftOut",
+    "MarkerStrain",
+    "MatchingSettings",
+    "ModelRow",
+    "ModelSettings",
+    "MotionEstimate",
+    "MotionTrial",
+    "NoiseModel",
+    "PoissonRatio",
+    "Prediction",
+    "PushedFace",
+    "Pushing",
+    "ReportIndices",
+    "Specimen",
+    "SpecimenMean",
+    "Zones",
+    "baselines",
+    "calibrate",
+    "calibrate_lattice",
+    "compare_models",
+    "compression_test",
+    "cramer_rao_bound",
+    "expected_accuracy",
+    "field_balance",
+    "force_difference",
+    "identify_field",
+    "identify_motion",
+    "incremental_balance",
+    "indices",
+    "leave_one_out",
+    "marker_strain",
+    "poisson_ratio",
+    "poisson_ratio_from_markers",
+    "predict_state",
+    "search_cma_es",
+    "search_genetic",
+    "shape_difference",
+    "specimen_mean",
+    "whitened_balance",
+]

@@ -1,0 +1,83 @@
+from .dense_matching.block_matching import block_matching
+from .dense_matching.hybrid import hybrid_flow
+from .dense_matching.optical_flow import horn_schunck, lucas_kanade
+from .displacement.accuracy import (
+    ErrorSummary,
+    check_point_errors,
+    end_point_error,
+    forward_backward_error,
+    intensity_rms,
+    inverse_displacement,
+)
+from .displacement.strain import displacement_gradient, green_lagrange_strain, jacobian_determinant, small_strain
+from .feature_matching.correlation_matching import Candidates, candidate_matches
+from .feature_matching.harris import InterestPoints, interest_points
+from .feature_matching.relaxation_labelling import PotentialMatches, relaxed
+from .feature_matching.scattered_interpolation import Triangulation, dense_from_sparse, sparse_displacement, triangulated
+from .markers.detection import DetectedMarkers, detect_markers
+from .markers.point_matching import Links, link_markers
+from .markers.sequence_tracking import TrackedSequence, track_sequence
+from .markers.tracking import TrackedMarkers, track_markers
+from .measure_displacement import Sensed, measure_displacement
+from .out_of_core import ChunkedDisplacement, chunked_block_matching, chunked_harris_response, chunked_horn_schunck
+from .preprocessing.bone_mask import bone_mask
+from .preprocessing.object_mask import object_mask
+from .preprocessing.resampling import cropped_to_mask, masked, resampled_to_grid, resampled_to_spacing, warped, with_slices_between
+from .preprocessing.rigid_registration import RigidMotion, register_rigid, rigid_from_points
+from .volume_correlation.correlate import CorrelationSettings, correlate_volumes
+from .volume_correlation.result import CorrelatedDisplacement
+
+__all__ = [
+    "Candidates",
+    "ChunkedDisplacement",
+    "CorrelatedDisplacement",
+    "CorrelationSettings",
+    "DetectedMarkers",
+    "ErrorSummary",
+    "InterestPoints",
+    "Links",
+    "PotentialMatches",
+    "RigidMotion",
+    "Sensed",
+    "TrackedMarkers",
+    "TrackedSequence",
+    "Triangulation",
+    "block_matching",
+    "bone_mask",
+    "candidate_matches",
+    "check_point_errors",
+    "chunked_block_matching",
+    "chunked_harris_response",
+    "chunked_horn_schunck",
+    "correlate_volumes",
+    "cropped_to_mask",
+    "dense_from_sparse",
+    "detect_markers",
+    "displacement_gradient",
+    "end_point_error",
+    "forward_backward_error",
+    "green_lagrange_strain",
+    "horn_schunck",
+    "hybrid_flow",
+    "intensity_rms",
+    "interest_points",
+    "inverse_displacement",
+    "jacobian_determinant",
+    "link_markers",
+    "lucas_kanade",
+    "masked",
+    "measure_displacement",
+    "object_mask",
+    "register_rigid",
+    "relaxed",
+    "resampled_to_grid",
+    "resampled_to_spacing",
+    "rigid_from_points",
+    "small_strain",
+    "sparse_displacement",
+    "track_markers",
+    "track_sequence",
+    "triangulated",
+    "warped",
+    "with_slices_between",
+]

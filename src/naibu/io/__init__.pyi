@@ -1,0 +1,24 @@
+from .experiment_folder.reader import read_experiment
+from .images import open_volume, read_displacement, read_volume_box, write_displacement, write_volume
+from .marker_tables import import_markers, write_experiment_folder, write_markers
+from .meshes import Surface, read_mesh, read_surface
+from .vtk_files import write_vtkhdf_series, write_vtu
+from .vtkhdf_series import SeriesFile
+
+__all__ = [
+    "SeriesFile",
+    "Surface",
+    "import_markers",
+    "open_volume",
+    "read_displacement",
+    "read_experiment",
+    "read_mesh",
+    "read_surface",
+    "read_volume_box",
+    "write_displacement",
+    "write_experiment_folder",
+    "write_markers",
+    "write_volume",
+    "write_vtkhdf_series",
+    "write_vtu",
+]

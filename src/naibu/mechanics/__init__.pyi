@@ -1,0 +1,126 @@
+from .contact.contact_surfaces import Friction, interface, rigid_contact
+from .contact.penalty_contact import Contact, RigidSurface, bar, plane
+from .contact.rigid_indenters import RigidIndenter, box_indenter, cylindrical_indenter, spherical_indenter
+from .finite_elements.assembly import Assembler, body_force
+from .finite_elements.boundary_conditions import Prescribed
+from .finite_elements.elements import Elements, elements
+from .finite_elements.hyperelasticity import Law, Material, lame_parameters, law_named, material
+from .finite_strain.problem import Problem, SolverSettings
+from .finite_strain.sensitivities import sensitivities
+from .finite_strain.statics import LoadState, Solution, solve
+from .finite_strain.viscoelasticity import PronySeries, ViscoelasticSolution, simulate_viscoelastic
+from .lattices.cpu.engine import LatticeEngine
+from .lattices.gpu.engine import WarpLatticeEngine
+from .lattices.model.hexahedra import lattice_mesh
+from .lattices.model.lattice import (
+    Lattice,
+    LatticeParameters,
+    box_mask,
+    classic_lattice,
+    general_lattice,
+    lattice_parameters,
+    voxel_parameters,
+)
+from .lattices.model.octree import octree_lattice
+from .lattices.model.state import ConstrainedNodes, LatticeState, Motion
+from .lattices.model.tetrahedral_springs import volumetric_lattice
+from .lattices.simulation.adjoint import ParameterGradient, RecordedPush, push_gradient, recorded_push
+from .lattices.simulation.contact import ContactMotion, push, push_by_force
+from .lattices.simulation.loading_history import LatticeStudy, StudyBody, StudyFrame, StudyState, run_study
+from .lattices.simulation.session import LatticeSession
+from .linear_algebra.block_matrix import BlockPattern, block_pattern, with_dirichlet_rows
+from .linear_algebra.direct import direct_solver
+from .linear_algebra.multigrid import MultigridSolver, rigid_body_modes
+from .linear_algebra.protocols import Factorization, LinearSolver
+from .linear_algebra.solver_selection import choose_solver
+from .small_strain.dynamics import Series, simulate_motion
+from .small_strain.implicit_integrators import MotionState
+from .small_strain.linear_elasticity import LinearBody
+from .small_strain.prescribed_motion import Guide, Support
+from .small_strain.rheology import Rheology, elastic, maxwell, per_region, three_element, voigt
+from .small_strain.sensitivities import MaterialChange, SeriesDerivatives, simulate_motion_with_derivatives
+
+__all__ = [
+    "Assembler",
+    "BlockPattern",
+    "ConstrainedNodes",
+    "Contact",
+    "ContactMotion",
+    "Elements",
+    "Factorization",
+    "Friction",
+    "Guide",
+    "Lattice",
+    "LatticeEngine",
+    "LatticeParameters",
+    "LatticeSession",
+    "LatticeState",
+    "LatticeStudy",
+    "Law",
+    "LinearBody",
+    "LinearSolver",
+    "LoadState",
+    "Material",
+    "MaterialChange",
+    "Motion",
+    "MotionState",
+    "MultigridSolver",
+    "ParameterGradient",
+    "Prescribed",
+    "Problem",
+    "PronySeries",
+    "RecordedPush",
+    "Rheology",
+    "RigidIndenter",
+    "RigidSurface",
+    "Series",
+    "SeriesDerivatives",
+    "Solution",
+    "SolverSettings",
+    "StudyBody",
+    "StudyFrame",
+    "StudyState",
+    "Support",
+    "ViscoelasticSolution",
+    "WarpLatticeEngine",
+    "bar",
+    "block_pattern",
+    "body_force",
+    "box_indenter",
+    "box_mask",
+    "choose_solver",
+    "classic_lattice",
+    "cylindrical_indenter",
+    "direct_solver",
+    "elastic",
+    "elements",
+    "general_lattice",
+    "interface",
+    "lame_parameters",
+    "lattice_mesh",
+    "lattice_parameters",
+    "law_named",
+    "material",
+    "maxwell",
+    "octree_lattice",
+    "per_region",
+    "plane",
+    "push",
+    "push_by_force",
+    "push_gradient",
+    "recorded_push",
+    "rigid_body_modes",
+    "rigid_contact",
+    "run_study",
+    "sensitivities",
+    "simulate_motion",
+    "simulate_motion_with_derivatives",
+    "simulate_viscoelastic",
+    "solve",
+    "spherical_indenter",
+    "three_element",
+    "voigt",
+    "volumetric_lattice",
+    "voxel_parameters",
+    "with_dirichlet_rows",
+]

@@ -1,0 +1,61 @@
+from .analytic.finite_strain import HomogeneousState, ThickShell, confined, equibiaxial, simple_shear, uniaxial
+from .analytic.viscoelastic import complex_modulus, creep_strain, free_motion, ramp_stress, residual_strain
+from .scanners.ct_mr import MarkerKind, VirtualObject, VirtualScan, scan
+from .scanners.experiments import rescanned, scanned_states
+from .scanners.imaging_artifacts import CTDevice, MRDevice
+from .scanners.motions import FormulaMotion, MatchedMotion, MeshMotion, PosedMotion, Still
+from .scanners.textures import Texture, layered_block
+from .scanners.ultrasound import Scatterers, UltrasoundDevice, ultrasound, ultrasound_sequence
+from .specimens.lattice_twin import Twin, dough_lattice, dough_parameters, dough_twin, virtual_capture
+from .specimens.marker_phantoms import Phantom, Scanner, VirtualSpecimen, box_experiment, phantom, two_gels, virtual_specimen
+from .specimens.specimen_matching import BlockMatch, block_match
+from .specimens.textured_sphere import ScannedBall, squeezed_ball
+
+__all__ = [
+    "BlockMatch",
+    "CTDevice",
+    "FormulaMotion",
+    "HomogeneousState",
+    "MRDevice",
+    "MarkerKind",
+    "MatchedMotion",
+    "MeshMotion",
+    "Phantom",
+    "PosedMotion",
+    "ScannedBall",
+    "Scanner",
+    "Scatterers",
+    "Still",
+    "Texture",
+    "ThickShell",
+    "Twin",
+    "UltrasoundDevice",
+    "VirtualObject",
+    "VirtualScan",
+    "VirtualSpecimen",
+    "block_match",
+    "box_experiment",
+    "complex_modulus",
+    "confined",
+    "creep_strain",
+    "dough_lattice",
+    "dough_parameters",
+    "dough_twin",
+    "equibiaxial",
+    "free_motion",
+    "layered_block",
+    "phantom",
+    "ramp_stress",
+    "rescanned",
+    "residual_strain",
+    "scan",
+    "scanned_states",
+    "simple_shear",
+    "squeezed_ball",
+    "two_gels",
+    "ultrasound",
+    "ultrasound_sequence",
+    "uniaxial",
+    "virtual_capture",
+    "virtual_specimen",
+]

@@ -1,0 +1,86 @@
+"""Run a study by its name or from its file: lattices, or the finite element simulations of the 2008 report :cite:p:`hirai2008`."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from dataclasses import dataclass
+
+from naibu.core.errors import InputError
+from naibu.core.progress import Progress, report_progress
+from naibu.workflows.lattice_study import NAMED, study_text
+from naibu.workflows.simulate_lattice import SimulationRun, simulate_lattice
+from naibu.workflows.simulate_study import SLUGS, SQUARES_TOGETHER, simulate_study
+
+
+@dataclass(frozen=True, slots=True)
+class NamedStudy:
+    """A study that naibu brings along.
+
+    Attributes
+    ----------
+    name : str
+        What `simulate` takes.
+    model : str
+        ``"finite elements"`` or ``"mass-spring-dashpot lattice"``.
+    title : str
+        What is simulated.
+    """
+
+    name: str
+    model: str
+    title: str
+
+
+def named_studies() -> tuple[NamedStudy, ...]:
+    """Return the studies that `simulate` knows by name."""
+    elements = [(name, SLUGS.get(name, "three squares side by side")) for name in (SQUARES_TOGETHER, *SLUGS)]
+    lattices = [(name, tomllib.loads(study_text(name))["title"]) for name in NAMED]
+    return (
+        *(NamedStudy(name, "finite elements", title) for name, title in elements),
+        *(NamedStudy(name, "mass-spring-dashpot lattice", title) for name, title in lattices),
+    )
+
+
+def simulate(
+    study: str | os.PathLike[str], *, out: str | os.PathLike[str], resume: bool = False, progress: Progress | None = None
+) -> SimulationRun:
+    """Simulate a study, and write its motion for ParaView, an animated page and the numbers.
+
+    Ctrl-C (KeyboardInterrupt) ends the run of a lattice: the frames computed so far are kept, and the run can be resumed.
+
+    Parameters
+    ----------
+    study : str or path-like
+        Name of a study (see `named_studies`), or a TOML file that describes a lattice, its indenters and their motion.
+    out : path-like
+        Folder for the files.
+    resume : bool
+        Whether an interrupted run of a lattice is resumed; the result is the same as without an interruption.
+    progress : callable, optional
+        Called with a `ProgressReport` after every frame of a lattice, and after every study of finite elements.
+
+    Returns
+    -------
+    SimulationRun
+        The files, and how many frames they hold.
+
+    Raises
+    ------
+    InputError
+        A study that cannot be used, a folder that cannot be written to, or nothing to resume.
+    ConvergenceError
+        An explicit method became unstable; the frames before are kept.
+    """
+
+    def tell(done: int, of: int) -> None:
+        report_progress(progress, f"simulate {name}", done=done, total=of)
+
+    name = os.fspath(study)
+    if name != SQUARES_TOGETHER and name not in SLUGS:
+        return simulate_lattice(study, out, resume=resume, tell=tell)
+    if resume:
+        raise InputError(f"resume: {name} takes seconds and keeps nothing to resume from; run it without")
+    files = simulate_study(name, out, tell=tell)
+    count = sum(path.suffix == ".vtkhdf" for path in files)
+    return SimulationRun(tuple(files), count, count)
