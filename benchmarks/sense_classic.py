@@ -25,6 +25,7 @@ from scipy.interpolate import LinearNDInterpolator
 
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import MissingDependencyError
+from naibu.core.rigid_transform import RigidTransform
 from naibu.core.volume import Volume
 from naibu.imaging.dense_matching.block_matching import block_matching
 from naibu.imaging.dense_matching.hybrid import hybrid_flow
@@ -38,7 +39,7 @@ from naibu.imaging.feature_matching.relaxation_labelling import STRENGTHS, relax
 from naibu.imaging.feature_matching.scattered_interpolation import dense_from_sparse, sparse_displacement, triangulated
 from naibu.imaging.preprocessing.bone_mask import bone_mask
 from naibu.imaging.preprocessing.resampling import positions, resampled_to_grid
-from naibu.imaging.preprocessing.rigid_registration import RigidMotion, register_rigid
+from naibu.imaging.preprocessing.rigid_registration import register_rigid, total_displacement
 
 Array = NDArray[Any]
 T = TypeVar("T")
@@ -53,13 +54,13 @@ class Case:
     deformed: Volume
     truth: Array
     mask: Array
-    rigid: RigidMotion
+    rigid: RigidTransform
     rigid_from: str
 
     @property
     def brought_back(self) -> Volume:
         """The deformed volume in the frame of the reference."""
-        return resampled_to_grid(self.deformed, self.reference, through=self.rigid.moved)
+        return resampled_to_grid(self.deformed, self.reference, through=self.rigid.applied)
 
 
 def read_case(path: str) -> Case:
@@ -67,10 +68,11 @@ def read_case(path: str) -> Case:
     reference, deformed = (
         Volume.from_array(np.ascontiguousarray(data[name].transpose(2, 1, 0)), spacing_mm=data["spacing"]) for name in ("ref", "deformed")
     )
-    rigid, source = RigidMotion.from_matrix(data["rigid"]), "the case"
+    rigid, source = RigidTransform.from_matrix(data["rigid"]), "the case"
     if json.loads(str(data["meta"]))["kind"] == "limb":
         try:
-            seconds, rigid = timed(lambda: register_rigid(reference, deformed, bone_mask(reference, appearance="dark", count=2)))
+            seconds, found = timed(lambda: register_rigid(reference, deformed, bone_mask(reference, appearance="dark", count=2)))
+            rigid = found.transform
             source = f"SimpleITK on two bones, {seconds:.1f} s"
         except MissingDependencyError:
             pass
@@ -88,7 +90,7 @@ def timed(work: Callable[[], T], repeat: int = 1) -> tuple[float, T]:
 
 
 def show(case: Case, name: str, seconds: float, vectors: Array, valid: Array) -> None:
-    whole = case.rigid.after(np.where(np.isfinite(vectors), vectors, 0.0), case.reference)
+    whole = total_displacement(np.where(np.isfinite(vectors), vectors, 0.0), case.rigid, case.reference)
     error = end_point_error(whole, case.truth, case.mask)
     told = f"{error.mean_mm:5.2f} / {error.median_mm:4.2f} / {error.p95_mm:5.2f}"
     share = (valid & case.mask).sum() / case.mask.sum()

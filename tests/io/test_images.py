@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from naibu.core.errors import InputError, MissingDependencyError
-from naibu.core.rotation import rotation_matrix
+from naibu.core.rigid_transform import rotation_matrix
 from naibu.core.volume import Volume
 from naibu.io.images import read_displacement, read_volume, read_volume_box, write_displacement, write_volume
 

@@ -68,7 +68,7 @@ def test_files_and_page_tell_predicted_minus_measured(press: Press) -> None:
     scene = trial_scene(trial, fit, press.identification.model.parameters.values())
     # the scene stands in the object's frame; distances do not care
     np.testing.assert_allclose(np.linalg.norm(scene.residual_mm, axis=1), np.linalg.norm(fit.residual, axis=1), atol=1e-9)
-    np.testing.assert_allclose(fit.pose.undone(fit.predicted), scene.steps[-1].markers, atol=1e-9)
+    np.testing.assert_allclose(fit.pose.inverse().applied(fit.predicted), scene.steps[-1].markers, atol=1e-9)
     stored = report_from_json((press.results / "report.json").read_text(encoding="utf-8"))
     np.testing.assert_allclose(stored.scenes[0].residual_mm, scene.residual_mm, atol=1e-3)
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
+from naibu.core.rigid_transform import RigidTransform
 from naibu.core.volume import Volume
 from naibu.imaging.dense_matching.block_matching import block_matching
 from naibu.imaging.dense_matching.hybrid import hybrid_flow
@@ -24,7 +25,7 @@ from naibu.imaging.feature_matching.relaxation_labelling import PotentialMatches
 from naibu.imaging.feature_matching.scattered_interpolation import dense_from_sparse, sparse_displacement
 from naibu.imaging.preprocessing.object_mask import object_mask
 from naibu.imaging.preprocessing.resampling import positions, require_mask, resampled_to_grid
-from naibu.imaging.preprocessing.rigid_registration import RigidMotion, rigid_from_points
+from naibu.imaging.preprocessing.rigid_registration import rigid_from_points, total_displacement
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
 
 Method = Literal["default", "features", "sad-blocks", "ssd-blocks", "ncc-blocks", "horn-schunck", "lucas-kanade", "hybrid", "rigid"]
@@ -52,7 +53,7 @@ class Sensed:
         ``du_a / dx_b``.
     covariance : ndarray, shape (nz, ny, nx, 3, 3), optional
         Of every vector, mm^2; None where the method states none.
-    rigid : RigidMotion, optional
+    rigid : RigidTransform, optional
         What was taken out first.
     matches : PotentialMatches, optional
         Points matched by the method of features, in the frame of the object before.
@@ -65,7 +66,7 @@ class Sensed:
     mask: BoolArray
     gradient: FloatArray
     covariance: FloatArray | None = None
-    rigid: RigidMotion | None = None
+    rigid: RigidTransform | None = None
     matches: PotentialMatches | None = None
     facts: dict[str, float | int | str] = field(default_factory=dict)
 
@@ -128,9 +129,9 @@ def measure_displacement(
     if method == "features":
         return _from_features(reference, matches, rigid, inside)
     tell(method)
-    back = resampled_to_grid(deformed, reference, through=rigid.moved)
+    back = resampled_to_grid(deformed, reference, through=rigid.applied)
     found = _still(reference) if method == "rigid" else _flow(method, reference, back, inside)
-    vectors = rigid.after(found.vectors, reference)
+    vectors = total_displacement(found.vectors, rigid, reference)
     vectors[~inside] = np.nan
     dense = DenseDisplacement(vectors, found.valid & inside, found.quality)
     return Sensed(method, dense, inside, displacement_gradient(vectors, reference), rigid=rigid, facts={"matched points": len(matches)})
@@ -140,7 +141,7 @@ def _grid(volume: Volume) -> str:
     return f"{'x'.join(str(n) for n in volume.shape[::-1])} voxels of {'x'.join(f'{d:g}' for d in volume.spacing_mm)} mm"
 
 
-def rigid_start(reference: Volume, deformed: Volume, mask: BoolArray) -> tuple[PotentialMatches, RigidMotion]:
+def rigid_start(reference: Volume, deformed: Volume, mask: BoolArray) -> tuple[PotentialMatches, RigidTransform]:
     """Match interest points of the object, and return them with the rigid motion that most of them share.
 
     The motion is the identity where fewer than a dozen points agree. Points are searched within an eighth of the object's size.
@@ -155,17 +156,17 @@ def rigid_start(reference: Volume, deformed: Volume, mask: BoolArray) -> tuple[P
     return found, _shared_motion(found)
 
 
-def _shared_motion(found: PotentialMatches) -> RigidMotion:
+def _shared_motion(found: PotentialMatches) -> RigidTransform:
     """Horn's motion of the matches, from which the worst are left out until the others stay within three times their median."""
     kept = np.ones(len(found), dtype=bool)
     for _ in range(20):
         if kept.sum() < FEWEST_MATCHES:
-            return RigidMotion.identity()
+            return RigidTransform.identity()
         try:
-            motion = rigid_from_points(found.initial_mm[kept], found.deformed_mm[kept])
+            motion = rigid_from_points(found.initial_mm[kept], found.deformed_mm[kept]).transform
         except InputError:  # on one line
-            return RigidMotion.identity()
-        off = np.linalg.norm(motion.moved(found.initial_mm) - found.deformed_mm, axis=1)
+            return RigidTransform.identity()
+        off = np.linalg.norm(motion.applied(found.initial_mm) - found.deformed_mm, axis=1)
         good = off <= 3.0 * np.median(off[kept])
         if (good == kept).all():
             break
@@ -192,7 +193,7 @@ def _flow(method: Method, a: Volume, b: Volume, mask: BoolArray) -> DenseDisplac
     return block_matching(a, b, block=block, search=search, measure=measures[method], mask=mask)
 
 
-def _from_features(reference: Volume, matches: PotentialMatches, rigid: RigidMotion, mask: BoolArray) -> Sensed:
+def _from_features(reference: Volume, matches: PotentialMatches, rigid: RigidTransform, mask: BoolArray) -> Sensed:
     if len(matches) < FEWEST_MATCHES:
         raise InputError(f"only {len(matches)} points of the volumes match; the images have too little texture in common for features")
     dense = dense_from_sparse(sparse_displacement(matches), reference, outside="affine")

@@ -153,7 +153,7 @@ def _box(specimen: Specimen, position: FloatArray, normal: FloatArray) -> Box:
 
 def trial_scene(trial: Trial, fit: TrialFit, values: Mapping[str, float], role: str = "fitted") -> Scene:
     """Return a fitted trial for the 3-D view."""
-    measured = fit.pose.undone(trial.measured * trial.specimen.enlargement(values))
+    measured = fit.pose.inverse().applied(trial.measured * trial.specimen.enlargement(values))
     return scene(trial.specimen, trial.state, fit, measured, values, role)
 
 

@@ -7,7 +7,7 @@ import pytest
 from scenes import grid, inner, pair, texture
 
 from naibu.core.errors import InputError
-from naibu.core.rotation import rotation_matrix
+from naibu.core.rigid_transform import rotation_matrix
 from naibu.core.volume import Volume
 from naibu.imaging.dense_matching.block_matching import block_matching, grey_range
 from naibu.imaging.preprocessing.resampling import positions

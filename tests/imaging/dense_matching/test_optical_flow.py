@@ -9,7 +9,7 @@ from scenes import grid, inner, pair, texture
 from scipy.sparse.linalg import spsolve
 
 from naibu.core.errors import InputError
-from naibu.core.rotation import rotation_matrix
+from naibu.core.rigid_transform import rotation_matrix
 from naibu.core.volume import Volume
 from naibu.imaging.dense_matching.optical_flow import AS_REPORTED, horn_schunck, lucas_kanade
 from naibu.imaging.preprocessing.resampling import positions

@@ -10,7 +10,7 @@ from scenes import grid, inner, pair, texture
 from scipy.spatial.transform import Rotation
 
 from naibu.core.errors import InputError
-from naibu.core.rotation import rotation_matrix
+from naibu.core.rigid_transform import rotation_matrix
 from naibu.core.volume import Volume
 from naibu.imaging.displacement.accuracy import (
     check_point_errors,

@@ -7,11 +7,10 @@ import pytest
 from scenes import grid, texture
 
 from naibu.core.errors import InputError
-from naibu.core.rotation import rotation_matrix
+from naibu.core.rigid_transform import RigidTransform, rotation_matrix
 from naibu.core.volume import Volume
 from naibu.imaging.feature_matching.correlation_matching import candidate_matches
 from naibu.imaging.preprocessing.resampling import positions, sampled
-from naibu.imaging.preprocessing.rigid_registration import RigidMotion
 
 RNG = np.random.default_rng(8)
 
@@ -53,19 +52,19 @@ def test_scores_are_those_of_numpy(shape: tuple[int, int, int]) -> None:
 
 def test_turned_boxes_match_what_was_turned() -> None:
     frame = grid((24, 40, 40), (1.0, 1.0, 1.2))
-    motion = RigidMotion(rotation_matrix(np.array([0.05, -0.1, 0.5])), np.array([2.0, -3.0, 1.0]), np.zeros(0))
+    motion = RigidTransform.of(rotation_matrix(np.array([0.05, -0.1, 0.5])), [2.0, -3.0, 1.0])
     grey, x = texture(1, (5.0, 12.0)), positions(frame)
     about = frame.to_physical([20, 20, 12])
-    motion = RigidMotion(motion.rotation, motion.translation + about - motion.rotation @ about, np.zeros(0))
-    before, after = frame.with_values(grey(x)), frame.with_values(grey(motion.inverse().moved(x)))
+    motion = RigidTransform.of(motion.rotation, motion.translation + about - motion.rotation @ about)
+    before, after = frame.with_values(grey(x)), frame.with_values(grey(motion.inverse().applied(x)))
     points = frame.to_physical(np.array([20, 20, 12]) + RNG.integers(-5, 6, (10, 3)))
     options = {"rigid": motion, "least_score": -1.0, "search": (1, 1, 1)}
-    turned = candidate_matches(before, after, points, motion.moved(points), turned_boxes=True, **options)
-    straight = candidate_matches(before, after, points, motion.moved(points), **options)
+    turned = candidate_matches(before, after, points, motion.applied(points), turned_boxes=True, **options)
+    straight = candidate_matches(before, after, points, motion.applied(points), **options)
     own = turned.pairs[:, 0] == turned.pairs[:, 1]
     assert turned.scores[own].min() > 0.98
     assert straight.scores[own].mean() < turned.scores[own].mean() - 0.1
-    value = np.abs(sampled(after, motion.moved(points)) - sampled(before, points))
+    value = np.abs(sampled(after, motion.applied(points)) - sampled(before, points))
     assert value.max() < 8.0
     assert np.nanmax(turned.residuals[own]) < 8.0
 

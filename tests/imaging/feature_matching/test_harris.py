@@ -7,7 +7,7 @@ import pytest
 from scenes import grid, inner, texture
 
 from naibu.core.errors import InputError
-from naibu.core.rotation import rotation_matrix
+from naibu.core.rigid_transform import rotation_matrix
 from naibu.core.volume import Volume
 from naibu.imaging.feature_matching.harris import harris_response, interest_points
 from naibu.imaging.preprocessing.resampling import positions

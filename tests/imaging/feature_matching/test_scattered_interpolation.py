@@ -12,11 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
-from naibu.core.rotation import rotation_matrix
+from naibu.core.rigid_transform import RigidTransform, rotation_matrix
 from naibu.imaging.feature_matching.relaxation_labelling import PotentialMatches
 from naibu.imaging.feature_matching.scattered_interpolation import dense_from_sparse, elevation_angle, sparse_displacement, triangulated
 from naibu.imaging.preprocessing.resampling import positions
-from naibu.imaging.preprocessing.rigid_registration import RigidMotion
 
 MATRIX, SHIFT = np.array([[0.1, 0.02, 0], [-0.05, 0.2, 0.01], [0.0, 0.03, -0.1]]), np.array([1.0, -2.0, 0.5])
 
@@ -58,21 +57,21 @@ def test_the_field_is_that_of_scipy(shape: tuple[int, int, int]) -> None:
     assert triangulated(points, frame).simplices.shape[1] == d + 1
 
 
-def matched(seed: int = 0) -> tuple[PotentialMatches, RigidMotion, np.ndarray]:
+def matched(seed: int = 0) -> tuple[PotentialMatches, RigidTransform, np.ndarray]:
     rng = np.random.default_rng(seed)
-    rigid = RigidMotion(Rotation.from_euler("z", 20, degrees=True).as_matrix(), np.array([5.0, 1.0, -2.0]), np.zeros(0))
+    rigid = RigidTransform.of(Rotation.from_euler("z", 20, degrees=True).as_matrix(), [5.0, 1.0, -2.0])
     x1, local = rng.uniform(0, 30, (20, 3)), 0.5 * rng.standard_normal((20, 3))
-    x2 = rigid.moved(x1) + local
+    x2 = rigid.applied(x1) + local
     nothing = np.zeros(20)
     pairs = np.column_stack([np.arange(20)] * 2)
-    return PotentialMatches(pairs, x1, x2, rigid.moved(x1), nothing, nothing, nothing, nothing, "nothing changed"), rigid, local
+    return PotentialMatches(pairs, x1, x2, rigid.applied(x1), nothing, nothing, nothing, nothing, "nothing changed"), rigid, local
 
 
 def test_the_displacement_is_told_in_the_registered_frame_or_as_a_whole() -> None:
     matches, rigid, local = matched()
     registered = sparse_displacement(matches, rigid)
     np.testing.assert_allclose(registered.vectors, local, atol=1e-12)
-    np.testing.assert_allclose(registered.points, rigid.moved(matches.initial_mm))
+    np.testing.assert_allclose(registered.points, rigid.applied(matches.initial_mm))
     turned = sparse_displacement(matches, rigid, rotation_only=True)
     np.testing.assert_allclose(turned.vectors, local + rigid.translation, atol=1e-12)
     whole = sparse_displacement(matches)

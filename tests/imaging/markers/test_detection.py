@@ -10,7 +10,7 @@ from marker_scenes import lattice, render_spheres
 from scipy.spatial import cKDTree
 
 from naibu.core.errors import InputError
-from naibu.core.rotation import rotation_matrix
+from naibu.core.rigid_transform import rotation_matrix
 from naibu.core.volume import Volume
 from naibu.imaging.markers.detection import DetectedMarkers, detect_markers
 from naibu.imaging.markers.washers import slice_profile

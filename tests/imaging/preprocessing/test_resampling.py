@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scenes import grid, texture
 
 from naibu.core.errors import InputError
-from naibu.core.rotation import rotation_matrix
+from naibu.core.rigid_transform import RigidTransform, rotation_matrix
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.resampling import (
     covered,
@@ -23,7 +23,6 @@ from naibu.imaging.preprocessing.resampling import (
     with_slices,
     with_slices_between,
 )
-from naibu.imaging.preprocessing.rigid_registration import RigidMotion
 
 TURN = rotation_matrix(np.array([0.2, -0.1, 0.4]))
 
@@ -85,10 +84,10 @@ def test_a_smooth_function_is_met_with_the_order_of_the_interpolation() -> None:
 def test_a_volume_moved_rigidly_and_brought_back_is_the_same(seed: int) -> None:
     rng = np.random.default_rng(seed)
     frame = grid((10, 11, 12), (0.9, 1.2, 1.5), rotation_matrix(rng.standard_normal(3)))
-    motion = RigidMotion(rotation_matrix(0.3 * rng.standard_normal(3)), rng.standard_normal(3), np.zeros(0))
-    moved = Volume(frame.values, frame.spacing_mm, motion.moved(frame.origin_mm), motion.rotation @ frame.direction)
+    motion = RigidTransform.of(rotation_matrix(0.3 * rng.standard_normal(3)), rng.standard_normal(3))
+    moved = Volume(frame.values, frame.spacing_mm, motion.applied(frame.origin_mm), motion.rotation @ frame.direction)
     volume = moved.with_values(rng.uniform(0, 100, frame.shape))
-    np.testing.assert_allclose(resampled_to_grid(volume, frame, through=motion.moved).values, volume.values, atol=1e-3)
+    np.testing.assert_allclose(resampled_to_grid(volume, frame, through=motion.applied).values, volume.values, atol=1e-3)
 
 
 def test_a_coarser_grid_takes_the_mean_and_keeps_its_place() -> None:

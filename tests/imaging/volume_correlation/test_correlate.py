@@ -10,7 +10,7 @@ import pytest
 from scenes import texture
 
 from naibu.core.errors import InputError
-from naibu.core.rotation import rotation_matrix
+from naibu.core.rigid_transform import rotation_matrix
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.object_mask import object_mask
 from naibu.imaging.preprocessing.resampling import positions

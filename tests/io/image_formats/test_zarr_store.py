@@ -9,7 +9,7 @@ import pytest
 
 from naibu.core.chunked_volume import ChunkedVolume
 from naibu.core.errors import InputError
-from naibu.core.rotation import rotation_matrix
+from naibu.core.rigid_transform import rotation_matrix
 from naibu.core.volume import Volume
 from naibu.io.image_formats.zarr_store import create_chunked
 from naibu.io.images import open_volume, read_volume, read_volume_box, write_volume

@@ -53,7 +53,7 @@ def image() -> CalfCase:
 
 @pytest.fixture(scope="module")
 def ways(image: CalfCase) -> dict[str, Matched]:
-    pairs, _, _ = candidates_of(image.initial, image.deformed, (200, 240), picked_registration(image))
+    pairs, _, _ = candidates_of(image.initial, image.deformed, (200, 240), picked_registration(image).transform)
     found = [matched(image, pairs, way) for way in (None, *WAYS)]
     return {each.name: each for each in found}
 
@@ -84,15 +84,15 @@ def test_bones_move_rigidly(axis: tuple[float, float], reach: float) -> None:
     fitted = rigid_from_points(p, CalfMotion().to_space(p))
     assert fitted.residuals_mm.max() < 1e-4
     if axis == TIBIA:
-        assert CalfMotion().to_space(p) == pytest.approx(leg_pose().moved(p), abs=1e-9)
+        assert CalfMotion().to_space(p) == pytest.approx(leg_pose().applied(p), abs=1e-9)
     else:
-        assert abs(fitted.angle_deg - leg_pose().angle_deg) > 0.5  # it turns against the tibia
+        assert abs(fitted.transform.angle_deg - leg_pose().angle_deg) > 0.5  # it turns against the tibia
 
 
 def test_the_plate_pushes_up_and_the_sides_bulge() -> None:
     below, sides = np.array([[0.0, 50.0, 4.0]]), np.array([[-45.0, 15.0, 4.0], [45.0, 15.0, 4.0]])
     motion, rest = CalfMotion(12.0), leg_pose().inverse()
-    up, out = rest.moved(motion.to_space(below)) - below, rest.moved(motion.to_space(sides)) - sides
+    up, out = rest.applied(motion.to_space(below)) - below, rest.applied(motion.to_space(sides)) - sides
     assert -12.0 < up[0, 1] < -9.0
     assert out[0, 0] < -2.0 < 2.0 < out[1, 0]
     assert CalfMotion(0.0).to_space(np.array([[0.0, 50.0, 4.0]]))[:, 1] != pytest.approx(motion.to_space(below)[:, 1], abs=5.0)
@@ -144,7 +144,7 @@ def test_check_points_come_back(image: CalfCase, ways: dict[str, Matched]) -> No
 def test_the_bone_is_registered_by_picked_points(image: CalfCase) -> None:
     found = picked_registration(image)
     axis = np.array([[*TIBIA, image.initial.origin_mm[2]]])
-    assert found.moved(axis)[:, :2] == pytest.approx(leg_pose().moved(axis)[:, :2], abs=1.0)
+    assert found.transform.applied(axis)[:, :2] == pytest.approx(leg_pose().applied(axis)[:, :2], abs=1.0)
 
 
 def test_noise_costs_matches(image: CalfCase) -> None:
@@ -202,7 +202,7 @@ def test_flow_of_section_3_5(chapter: Chapter) -> None:
 def test_the_same_seed_gives_the_same_scans_and_matches(image: CalfCase, ways: dict[str, Matched]) -> None:
     again = calf_case(0, pixels=192, slices=3).slices(2)
     assert np.array_equal(again.deformed.values, image.deformed.values)
-    pairs, _, _ = candidates_of(again.initial, again.deformed, (200, 240), picked_registration(again))
+    pairs, _, _ = candidates_of(again.initial, again.deformed, (200, 240), picked_registration(again).transform)
     found = matched(again, pairs, "direction26")
     assert np.array_equal(found.matches.pairs, ways["direction26"].matches.pairs)
     other = calf_case(1, pixels=48, slices=2)

@@ -11,8 +11,7 @@ from scipy.special import i0e, i1e
 
 from naibu import datasets
 from naibu.core.errors import ConvergenceError, InputError
-from naibu.core.rigid_transform import Pose
-from naibu.core.rotation import rotation_matrix
+from naibu.core.rigid_transform import RigidTransform, rotation_matrix
 from naibu.core.volume import Volume
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
@@ -127,7 +126,7 @@ def test_rigid_motions_carry_markers_texture_and_outline() -> None:
     block = layered_block((20.0, 16.0, 12.0), texture=100.0, seed=4)
     body = VirtualObject.of(block, [[3.0, 2.0, 5.0], [-4.0, -3.0, 7.0]], BALL)
     grid = empty_grid([-12, -10, -2], [12, 10, 14], 1.0)
-    pose = Pose(rotation_matrix(np.array([0.1, -0.2, 0.7])), np.zeros(3), np.array([30.0, -12.0, 5.0]))
+    pose = RigidTransform(rotation_matrix(np.array([0.1, -0.2, 0.7])), np.zeros(3), np.array([30.0, -12.0, 5.0]))
     along = Volume.from_array(
         grid.values, spacing_mm=grid.spacing_mm, origin_mm=pose.applied(grid.origin_mm[None])[0], direction=pose.rotation
     )

@@ -17,7 +17,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.parameters import Parameter, ParameterSet
-from naibu.core.rigid_transform import Pose, registration
+from naibu.core.rigid_transform import RigidTransform, registration
 from naibu.core.status import Status
 from naibu.identification.from_markers.observations import Nearby, Trial, TrialFit
 from naibu.identification.from_markers.parameter_names import pixel_scale
@@ -126,7 +126,7 @@ class Matcher:
     _solvers: dict[int, LinearSolver | None] = field(default_factory=dict)
 
     def evaluate(
-        self, values: Mapping[str, float], nearby: Sequence[Nearby | None] = (), poses: Sequence[Pose | None] = ()
+        self, values: Mapping[str, float], nearby: Sequence[Nearby | None] = (), poses: Sequence[RigidTransform | None] = ()
     ) -> list[TrialFit]:
         """Solve all trials at `values`; solutions `nearby` help, and `poses` stand in for those that register the markers best.
 
@@ -145,7 +145,7 @@ class Matcher:
         with ThreadPoolExecutor(min(len(self.trials), os.cpu_count() or 1), initializer=use_one_thread) as pool:
             return list(pool.map(one, range(len(self.trials))))
 
-    def _evaluate_one(self, index: int, values: Mapping[str, float], hints: Sequence[Hint], pose: Pose | None) -> TrialFit:
+    def _evaluate_one(self, index: int, values: Mapping[str, float], hints: Sequence[Hint], pose: RigidTransform | None) -> TrialFit:
         trial = self.trials[index]
         problem = trial.specimen.problem(values, trial.state)
         try:
@@ -171,7 +171,7 @@ class Matcher:
         return tuple(d @ gather for d in raw)
 
     def _observed(
-        self, trial: Trial, values: Mapping[str, float], solution: Solution, path: tuple[FloatArray, ...], pose: Pose | None
+        self, trial: Trial, values: Mapping[str, float], solution: Solution, path: tuple[FloatArray, ...], pose: RigidTransform | None
     ) -> TrialFit:
         specimen = trial.specimen.reshaped(values)
         u = specimen.observation @ solution.displacement
@@ -183,7 +183,7 @@ class Matcher:
         placed = pose.applied(moved)
         predicted = placed / enlargement  # residuals stay in the file's millimetres: a smaller scale must not make them smaller
         turned = np.einsum("ij,kjl->kil", pose.rotation, gradient)
-        rotated = specimen.placement.rotation.T  # noise of the free scan, turned into the object's frame
+        rotated = specimen.placement.pose.rotation.T  # noise of the free scan, turned into the object's frame
         both = np.einsum("kij,jl->kil", turned, rotated)
         sd = np.sqrt(trial.sd**2 + np.einsum("kil,kl->ki", both**2, trial.free_sd**2))
         du = path[-1]
@@ -356,10 +356,9 @@ def _bounded_step(hessian: FloatArray, gradient: FloatArray, limits: FloatArray)
     return step
 
 
-def _first_pose(specimen: Specimen, points: FloatArray, measured: FloatArray) -> Pose:
+def _first_pose(specimen: Specimen, points: FloatArray, measured: FloatArray) -> RigidTransform:
     """Pose that brings `points` to the `measured` ones; without data that of the free scan."""
     if np.isfinite(measured).all(axis=1).sum() >= 4:
         return registration(points, measured)
-    place = specimen.placement
-    centre = points.mean(axis=0)
-    return Pose(place.rotation, centre, place.rotation @ centre + place.origin)
+    pose, centre = specimen.placement.pose, points.mean(axis=0)
+    return RigidTransform(pose.rotation, centre, pose.applied(centre))

@@ -10,7 +10,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.core.parameters import ParameterSet
-from naibu.core.rigid_transform import Pose
+from naibu.core.rigid_transform import RigidTransform
 from naibu.identification.from_markers.marker_grid import FILLED_SD_MM
 from naibu.identification.from_markers.specimen_model import Specimen
 from naibu.mechanics.finite_strain.statics import Hint, Solution
@@ -99,7 +99,7 @@ class TrialFit:
     """
 
     solution: Solution
-    pose: Pose
+    pose: RigidTransform
     predicted: FloatArray
     residual: FloatArray
     sd: FloatArray

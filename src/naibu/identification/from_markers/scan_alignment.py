@@ -9,35 +9,32 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment
+from naibu.core.rigid_transform import RigidTransform
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placement:
-    """Rigid motion from the object's frame (base at z = 0, centre at x = y = 0) to the scan, and the scan's x, y scale.
-
-    A point X of the object lies at ``rotation @ X + origin`` in the scan (true mm); printed coordinates are those divided by `scale`.
+    """Pose of the object in the scan of its reference configuration, and the scale of the scan's coordinates.
 
     Attributes
     ----------
-    rotation : ndarray, shape (3, 3)
-        Turn about the vertical.
-    origin : ndarray, shape (3,)
-        Centre of the base, mm.
+    pose : RigidTransform
+        From the object's frame (base at z = 0, centre at x = y = 0) to the scan, true mm: a rotation about the vertical, and the position
+        of the centre of the base.
     scale : ndarray, shape (3,)
         True mm per printed mm along x, y, z.
     """
 
-    rotation: FloatArray
-    origin: FloatArray
+    pose: RigidTransform
     scale: FloatArray
 
     def to_object(self, printed: FloatArray) -> FloatArray:
         """Return positions (n, 3) in the object's frame, mm, of printed coordinates."""
-        return (printed * self.scale - self.origin) @ self.rotation
+        return self.pose.inverse().applied(printed * self.scale)
 
     def to_scan(self, points: FloatArray) -> FloatArray:
         """Return printed coordinates (n, 3) of positions in the object's frame."""
-        return (points @ self.rotation.T + self.origin) / self.scale
+        return np.asarray(self.pose.applied(points) / self.scale)
 
 
 def placement(experiment: Experiment) -> Placement:
@@ -62,7 +59,7 @@ def placement(experiment: Experiment) -> Placement:
     turned = points @ rotation
     centre = _lattice_centre(turned[:, :2], experiment.nominal_spacing_mm)
     base = _base(experiment, turned - [*centre, 0.0])
-    return Placement(rotation, rotation @ np.array([*centre, base]), scale)
+    return Placement(RigidTransform(rotation, np.zeros(3), rotation @ np.array([*centre, base])), scale)
 
 
 def _lattice_turn(points: FloatArray, spacing: float) -> float:

@@ -13,7 +13,7 @@ from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, Layer
 from naibu.core.mesh import Mesh
-from naibu.core.rotation import rotation_matrix
+from naibu.core.rigid_transform import rotation_matrix
 from naibu.identification.from_markers.boundary_conditions import material_of, rigid_bodies, sliding_joints
 from naibu.identification.from_markers.marker_grid import completed
 from naibu.identification.from_markers.parameter_names import (

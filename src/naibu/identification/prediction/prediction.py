@@ -279,10 +279,10 @@ def _finished(
     registered = bool(np.isfinite(measured).all(axis=1).sum() >= 4)
     pose = registration(fit.predicted, measured) if registered else None
     points = pose.applied(fit.predicted) if pose is not None else fit.predicted
-    back = (pose.undone(measured) if pose is not None else measured) * body.enlargement(parameters.values())
+    back = (pose.inverse().applied(measured) if pose is not None else measured) * body.enlargement(parameters.values())
     return Prediction(
         body, state.name, points / scale, _standard_deviation(model, parameters, fit), registered, measured - points,
-        parameters.values()[name], parameters.values(), fit.pose.undone(back), fit, tuple(notes),
+        parameters.values()[name], parameters.values(), fit.pose.inverse().applied(back), fit, tuple(notes),
     )  # fmt: skip
 
 

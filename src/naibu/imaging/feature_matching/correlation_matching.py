@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
+from naibu.core.rigid_transform import RigidTransform
 from naibu.core.volume import Volume
 from naibu.imaging.feature_matching._correlation_kernels import candidates, compare
 from naibu.imaging.preprocessing.resampling import positions
-from naibu.imaging.preprocessing.rigid_registration import RigidMotion
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +54,7 @@ def candidate_matches(
     *,
     search: ArrayLike = (8, 8, 3),
     match: ArrayLike = (4, 4, 2),
-    rigid: RigidMotion | None = None,
+    rigid: RigidTransform | None = None,
     least_score: float = 0.6,
     search_growth: float = 0.0,
     turned_boxes: bool = False,
@@ -71,7 +71,7 @@ def candidate_matches(
         Half the search box (u, v, w) along x, y, z, voxels: the box has ``(2u+1)(2v+1)(2w+1)``.
     match : array_like, shape (3,)
         Half the match box (m, n, h) along x, y, z, voxels. The report: (4, 4, 2) in (8, 8, 3), or (4, 4, 1) in (8, 8, 1).
-    rigid : RigidMotion, optional
+    rigid : RigidTransform, optional
         Motion of the bone, which carries the points before to where they are searched for; by default none.
     least_score : float
         Pairs that score less are left out.
@@ -101,8 +101,8 @@ def candidate_matches(
         )
     # a volume of one slice is an image: its boxes are flat
     match_half = np.where(np.array(initial.shape[::-1]) > 1, match_half, 0)
-    motion = RigidMotion.identity() if rigid is None else rigid
-    projected = motion.moved(x1)
+    motion = RigidTransform.identity() if rigid is None else rigid
+    projected = motion.applied(x1)
     half = np.broadcast_to(search_half.astype(float), x1.shape).copy()
     if search_growth > 0.0:
         half *= 1.0 + search_growth * _eccentricity(initial, x1)[:, None]

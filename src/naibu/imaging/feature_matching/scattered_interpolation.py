@@ -12,26 +12,28 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
+from naibu.core.rigid_transform import RigidTransform
 from naibu.core.volume import Volume
 from naibu.imaging.displacement.dense import DenseDisplacement
 from naibu.imaging.feature_matching._delaunay_kernels import fill_simplices
 from naibu.imaging.feature_matching.relaxation_labelling import PotentialMatches
 from naibu.imaging.preprocessing.resampling import positions
-from naibu.imaging.preprocessing.rigid_registration import RigidMotion
 
 Outside = Literal["nan", "nearest", "affine"]
 # of the mean simplex: flatter ones are rounding, and their voxels belong to neighbours
 FLAT = 1e-9
 
 
-def sparse_displacement(matches: PotentialMatches, rigid: RigidMotion | None = None, *, rotation_only: bool = False) -> DisplacementField:
+def sparse_displacement(
+    matches: PotentialMatches, rigid: RigidTransform | None = None, *, rotation_only: bool = False
+) -> DisplacementField:
     """Return the displacement of matched points (spec S6).
 
     Parameters
     ----------
     matches : PotentialMatches
         Pairs of points.
-    rigid : RigidMotion, optional
+    rigid : RigidTransform, optional
         The points then stand in the registered frame, ``R x1 + tau``, and what the rigid motion does is no displacement. By default
         they stand where they were before, and the displacement is the whole ``x2 - x1``.
     rotation_only : bool
@@ -51,7 +53,7 @@ def sparse_displacement(matches: PotentialMatches, rigid: RigidMotion | None = N
         if rotation_only:
             raise InputError("rotation_only takes the rotation out of the displacement: give the rigid motion")
         return DisplacementField.from_arrays(matches.initial_mm, matches.deformed_mm - matches.initial_mm)
-    start = matches.initial_mm @ rigid.rotation.T if rotation_only else rigid.moved(matches.initial_mm)
+    start = matches.initial_mm @ rigid.rotation.T if rotation_only else rigid.applied(matches.initial_mm)
     return DisplacementField.from_arrays(start, matches.deformed_mm - start)
 
 

@@ -13,6 +13,7 @@ from scipy import ndimage
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.optional_packages import optional_package
+from naibu.core.rigid_transform import RigidTransform
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.resampling import covered, positions, require_mask, resampled_to_grid
 
@@ -26,89 +27,54 @@ class NotRigidWarning(UserWarning):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RigidMotion:
-    """A rigid motion ``x' = R x + tau``.
+class RigidRegistration:
+    """Rigid transform found by registration, and what it leaves.
 
     Attributes
     ----------
-    rotation : ndarray, shape (d, d)
-        R.
-    translation : ndarray, shape (d,)
-        tau, mm.
+    transform : RigidTransform
+        ``x' = R x + t``.
     residuals_mm : ndarray, shape (n,)
-        How far each point, or each part of the mask, ends from where it was found, mm; empty where nothing was measured.
+        Distance of each point, or of each part of the mask, from where it was found, after the transform, mm.
     """
 
-    rotation: FloatArray
-    translation: FloatArray
+    transform: RigidTransform
     residuals_mm: FloatArray
-
-    @classmethod
-    def from_matrix(cls, matrix: ArrayLike) -> RigidMotion:
-        """Return the motion of a homogeneous matrix (d + 1, d + 1), mm.
-
-        Raises
-        ------
-        InputError
-            A matrix that is not rigid.
-        """
-        m = np.asarray(matrix, dtype=float)
-        d = len(m) - 1
-        if m.shape not in ((3, 3), (4, 4)) or np.abs(m[:d, :d].T @ m[:d, :d] - np.eye(d)).max() > 1e-6 or np.linalg.det(m[:d, :d]) < 0:
-            raise InputError(f"the matrix of a rigid motion must be (4, 4) or (3, 3) with a rotation in it, not {m.tolist()}")
-        return cls(m[:d, :d].copy(), m[:d, d].copy(), np.zeros(0))
-
-    @classmethod
-    def identity(cls, dimension: int = 3) -> RigidMotion:
-        """Return no motion."""
-        return cls(np.eye(dimension), np.zeros(dimension), np.zeros(0))
 
     @property
     def rms_mm(self) -> float:
-        """Root mean square of the residuals, mm; NaN where there are none."""
-        return float(np.sqrt(np.mean(self.residuals_mm**2))) if len(self.residuals_mm) else float("nan")
-
-    @property
-    def angle_deg(self) -> float:
-        """Angle of the rotation, degrees."""
-        d = len(self.rotation)
-        if d == 2:
-            return float(np.degrees(abs(np.arctan2(self.rotation[1, 0], self.rotation[0, 0]))))
-        sine = 0.5 * np.linalg.norm((self.rotation - self.rotation.T)[[2, 0, 1], [1, 2, 0]])
-        return float(np.degrees(np.arctan2(sine, 0.5 * (np.trace(self.rotation) - 1.0))))
-
-    def moved(self, points_mm: ArrayLike) -> FloatArray:
-        """Return where positions (..., d), mm, are carried."""
-        return np.asarray(np.asarray(points_mm, dtype=float) @ self.rotation.T + self.translation)
-
-    def inverse(self) -> RigidMotion:
-        """Return the motion back; (3.36) of the report is written that way."""
-        return RigidMotion(self.rotation.T, -self.rotation.T @ self.translation, self.residuals_mm)
-
-    def displacement(self, grid: Volume) -> FloatArray:
-        """Return the displacement (nz, ny, nx, 3), mm, of all voxels of a grid."""
-        return self.after(np.zeros((*grid.shape, 3)), grid)
-
-    def after(self, displacement: ArrayLike, grid: Volume) -> FloatArray:
-        """Return the whole displacement where the rigid motion follows another.
-
-        Parameters
-        ----------
-        displacement : array_like, shape (nz, ny, nx, 3)
-            Displacement v, mm, measured against the deformed volume brought back by this motion (`resampled_to_grid` with `through=moved`).
-        grid : Volume
-            Where it stands.
-
-        Returns
-        -------
-        ndarray, shape (nz, ny, nx, 3)
-            ``R (x + v) + tau - x``, mm.
-        """
-        places = positions(grid)
-        return np.asarray(self.moved(places + np.asarray(displacement, dtype=float)) - places)
+        """Root mean square of the residuals, mm."""
+        return float(np.sqrt(np.mean(self.residuals_mm**2)))
 
 
-def rigid_from_points(initial: ArrayLike, deformed: ArrayLike, *, rigid_within_mm: float | None = None) -> RigidMotion:
+def total_displacement(displacement: ArrayLike, transform: RigidTransform, grid: Volume) -> FloatArray:
+    """Return the displacement where a rigid transform follows a displacement: ``R (x + v) + t - x``.
+
+    Parameters
+    ----------
+    displacement : array_like, shape (nz, ny, nx, 3)
+        Displacement v, mm, measured against the deformed volume resampled through `transform`
+        (`naibu.imaging.preprocessing.resampling.resampled_to_grid` with ``through=transform.applied``).
+    transform : RigidTransform
+        ``R x + t``.
+    grid : Volume
+        Voxels of the displacement.
+
+    Returns
+    -------
+    ndarray, shape (nz, ny, nx, 3)
+        mm.
+    """
+    points = positions(grid)
+    return np.asarray(transform.applied(points + np.asarray(displacement, dtype=float)) - points)
+
+
+def rigid_displacement(transform: RigidTransform, grid: Volume) -> FloatArray:
+    """Return the displacement (nz, ny, nx, 3), mm, of all voxels of a grid by a rigid transform."""
+    return transform.displacement(positions(grid))
+
+
+def rigid_from_points(initial: ArrayLike, deformed: ArrayLike, *, rigid_within_mm: float | None = None) -> RigidRegistration:
     """Return the rigid motion that carries points best onto their counterparts, in closed form (spec S2, Horn 1987).
 
     Parameters
@@ -120,7 +86,7 @@ def rigid_from_points(initial: ArrayLike, deformed: ArrayLike, *, rigid_within_m
 
     Returns
     -------
-    RigidMotion
+    RigidRegistration
         With the residual of every point.
 
     Raises
@@ -156,7 +122,7 @@ def rigid_from_points(initial: ArrayLike, deformed: ArrayLike, *, rigid_within_m
     rotation = _rotation_from_quaternion(_best_quaternion(m)) if x.shape[1] == 3 else _plane_rotation(m)
     translation = middle_y - rotation @ middle_x
     residuals = np.linalg.norm(x @ rotation.T + translation - y, axis=1)
-    motion = RigidMotion(rotation, translation, residuals)
+    motion = RigidRegistration(RigidTransform.of(rotation, translation), residuals)
     _warn_unless_rigid(motion, rigid_within_mm, "point")
     return motion
 
@@ -195,7 +161,7 @@ def _plane_rotation(m: FloatArray) -> FloatArray:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-def _warn_unless_rigid(motion: RigidMotion, within_mm: float | None, what: str) -> None:
+def _warn_unless_rigid(motion: RigidRegistration, within_mm: float | None, what: str) -> None:
     if within_mm is not None and motion.rms_mm > within_mm:
         worst = int(np.argmax(motion.residuals_mm))
         warnings.warn(
@@ -211,13 +177,13 @@ def register_rigid(
     deformed: Volume,
     mask: ArrayLike,
     *,
-    start: RigidMotion | None = None,
+    start: RigidTransform | None = None,
     levels: int = 3,
     widening_mm: float = 6.0,
     sampling: float = 0.5,
     seed: int = 1,
     rigid_within_mm: float | None = None,
-) -> RigidMotion:
+) -> RigidRegistration:
     """Return the rigid motion that fits the grey values inside a mask, by SimpleITK (spec S2).
 
     Parameters
@@ -227,7 +193,7 @@ def register_rigid(
     mask : array_like, shape (nz, ny, nx)
         Voxels of the reference that move rigidly, as from `naibu.imaging.preprocessing.bone_mask.bone_mask`; it should reach a little over
         the bone, for its edge holds most of the contrast.
-    start : RigidMotion, optional
+    start : RigidTransform, optional
         First guess; by default the centres of grey mass are brought together.
     levels : int
         Grids, each twice as coarse as the next, that are gone through from coarse to fine.
@@ -243,7 +209,7 @@ def register_rigid(
 
     Returns
     -------
-    RigidMotion
+    RigidRegistration
         Its residuals are the leftover motions of eight parts of the mask.
 
     Raises
@@ -275,7 +241,7 @@ def register_rigid(
             reason = str(error).strip().splitlines()[-1]
             raise InputError(f"rigid registration failed ({reason}); do the volumes overlap? give a start or a larger mask") from error
     motion = _motion(transform)
-    found = RigidMotion(motion.rotation, motion.translation, leftover_motion(reference, deformed, inside, motion))
+    found = RigidRegistration(motion, leftover_motion(reference, deformed, inside, motion))
     _warn_unless_rigid(found, float(reference.spacing_mm.max()) / 2 if rigid_within_mm is None else rigid_within_mm, "part")
     return found
 
@@ -297,7 +263,7 @@ def _method(sitk: Any, level: int, spacing_mm: float, sampling: float, seed: int
     return method
 
 
-def leftover_motion(reference: Volume, deformed: Volume, mask: ArrayLike, motion: RigidMotion, parts: int = 8) -> FloatArray:
+def leftover_motion(reference: Volume, deformed: Volume, mask: ArrayLike, motion: RigidTransform, parts: int = 8) -> FloatArray:
     """Return how far parts of a mask move against a rigid motion (parts,), mm, by least squares on the grey values of each.
 
     Parameters
@@ -306,14 +272,14 @@ def leftover_motion(reference: Volume, deformed: Volume, mask: ArrayLike, motion
         Before and after.
     mask : array_like, shape (nz, ny, nx)
         Voxels of the reference that should move rigidly.
-    motion : RigidMotion
+    motion : RigidTransform
         Motion found.
     parts : int
         The mask is halved along its longest extent until there are so many; a power of two.
     """
     inside = require_mask(mask, reference)
-    back = resampled_to_grid(deformed, reference, through=motion.moved)
-    inside = inside & covered(deformed, reference, through=motion.moved)
+    back = resampled_to_grid(deformed, reference, through=motion.applied)
+    inside = inside & covered(deformed, reference, through=motion.applied)
     active = [a for a in range(3) if reference.shape[2 - a] > 1]
     grey = np.asarray(reference.values, dtype=float)
     slopes = np.stack([np.gradient(0.5 * (grey + back.values), reference.spacing_mm[a], axis=2 - a)[inside] for a in active], axis=1)
@@ -358,7 +324,7 @@ def _image(sitk: Any, volume: Volume) -> Any:
     return image
 
 
-def _start(sitk: Any, fixed: Any, moving: Any, reference: Volume, mask: BoolArray, start: RigidMotion | None) -> Any:
+def _start(sitk: Any, fixed: Any, moving: Any, reference: Volume, mask: BoolArray, start: RigidTransform | None) -> Any:
     """Return the first guess, turning about the middle of the mask."""
     transform = sitk.VersorRigid3DTransform()
     centre = positions(reference)[mask].mean(axis=0)
@@ -370,11 +336,11 @@ def _start(sitk: Any, fixed: Any, moving: Any, reference: Volume, mask: BoolArra
         start = _motion(sitk.VersorRigid3DTransform(guess))
     transform.SetCenter(centre.tolist())
     transform.SetMatrix(start.rotation.ravel().tolist(), 1e-6)
-    transform.SetTranslation((start.moved(centre) - centre).tolist())
+    transform.SetTranslation(start.displacement(centre).tolist())
     return transform
 
 
-def _motion(transform: Any) -> RigidMotion:
+def _motion(transform: Any) -> RigidTransform:
     rotation = np.array(transform.GetMatrix()).reshape(3, 3)
     centre = np.array(transform.GetCenter())
-    return RigidMotion(rotation, np.array(transform.GetTranslation()) + centre - rotation @ centre, np.zeros(0))
+    return RigidTransform.of(rotation, np.array(transform.GetTranslation()) + centre - rotation @ centre)

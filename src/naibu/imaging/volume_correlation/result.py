@@ -97,7 +97,7 @@ class CorrelatedDisplacement:
         if not np.array_equal(r, np.eye(3)):
             out = r @ out @ r.T
         for motion in self.motions:
-            out[self.bodies == motion.number] = r @ (motion.rotation - np.eye(3)) @ r.T
+            out[self.bodies == motion.number] = r @ (motion.transform.rotation - np.eye(3)) @ r.T
         out[~self.valid] = np.nan
         return out
 

@@ -11,6 +11,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray, Int32Array, IntArray
+from naibu.core.rigid_transform import RigidTransform
 from naibu.core.volume import Volume
 from naibu.imaging.volume_correlation._warp_kernels import OUTSIDE, sample_spline
 
@@ -122,31 +123,29 @@ def _opened(found: BoolArray, spacing: FloatArray, radius: float) -> BoolArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyMotion:
-    """Rigid motion of a body, ``x`` to ``R (x - middle) + middle + shift``, mm along the axes of the volume from its first voxel.
+    """Rigid motion of a body, mm along the axes of the volume from its first voxel.
 
     Attributes
     ----------
     number : int
         Number of the body in the result's `bodies`.
-    rotation, middle, shift : ndarray, shape (3, 3), (3,) and (3,)
-        The motion, mm.
+    transform : RigidTransform
+        The motion about the body's middle, mm.
     covariance : ndarray, shape (6, 6)
         Of a small further rotation about the moved middle, rad, and of the shift, mm.
     """
 
     number: int
-    rotation: FloatArray
-    middle: FloatArray
-    shift: FloatArray
+    transform: RigidTransform
     covariance: FloatArray
 
     def displacement(self, points: FloatArray) -> FloatArray:
         """Return the displacement (n, 3), mm, of points (n, 3), mm, both along the axes of the volume."""
-        return np.asarray((points - self.middle) @ (self.rotation - np.eye(3)).T + self.shift)
+        return self.transform.displacement(points)
 
     def displacement_covariance(self, points: FloatArray) -> FloatArray:
         """Return its covariance (n, 3, 3), mm^2."""
-        x, y, z = ((points - self.middle) @ self.rotation.T).T
+        x, y, z = (self.transform.applied(points) - self.transform.position).T
         arms = np.zeros((len(points), 3, 6))
         arms[:, 0, 1], arms[:, 0, 2], arms[:, 1, 0] = z, -y, -z
         arms[:, 1, 2], arms[:, 2, 0], arms[:, 2, 1] = x, y, -x
@@ -180,7 +179,7 @@ class StiffBody:
         draws = np.array(self.draws)
         covariance = draws.T @ draws / len(draws)
         covariance[3:, 3:] += (INTERPOLATED * self.level.spacing.mean()) ** 2 * np.eye(3)
-        return BodyMotion(self.number, self.rotation, self.middle, self.shift, covariance)
+        return BodyMotion(self.number, RigidTransform(self.rotation, self.middle, self.middle + self.shift), covariance)
 
     @property
     def moved(self) -> FloatArray:

@@ -16,7 +16,7 @@ import numpy as np
 from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
 from naibu.core.errors import InputError
-from naibu.core.rotation import rotation_matrix
+from naibu.core.rigid_transform import rotation_matrix
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 
 PLANE, BAR = 0, 1

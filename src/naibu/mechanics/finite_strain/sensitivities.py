@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from naibu.core.arrays import FloatArray
-from naibu.core.rotation import left_jacobian, rotation_matrix
+from naibu.core.rigid_transform import left_jacobian, rotation_matrix
 from naibu.mechanics.contact.penalty_contact import Contact, ContactResponse
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_strain.newton import Newton

@@ -10,7 +10,7 @@ from numba import prange
 
 from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray
-from naibu.imaging.preprocessing.rigid_registration import RigidMotion
+from naibu.core.rigid_transform import RigidTransform
 
 # places of the bones' axes, mm, and the largest distance of their surfaces from them
 TIBIA, FIBULA = (-13.0, -21.0), (24.0, -8.0)
@@ -32,13 +32,13 @@ _STEPS = 5
 _FARTHEST = 70.0
 
 
-def leg_pose() -> RigidMotion:
+def leg_pose() -> RigidTransform:
     """Return the motion of the tibia, and with it of the leg as a whole."""
     a, b, c = np.radians(_TURNS_DEG)
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(a), -np.sin(a)], [0.0, np.sin(a), np.cos(a)]])
     about_y = np.array([[np.cos(b), 0.0, np.sin(b)], [0.0, 1.0, 0.0], [-np.sin(b), 0.0, np.cos(b)]])
     about_z = np.array([[np.cos(c), -np.sin(c), 0.0], [np.sin(c), np.cos(c), 0.0], [0.0, 0.0, 1.0]])
-    return RigidMotion(about_z @ about_y @ about_x, np.array(_SHIFT_MM), np.zeros(0))
+    return RigidTransform.of(about_z @ about_y @ about_x, _SHIFT_MM)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,11 +59,11 @@ class CalfMotion:
 
     def to_space(self, material: FloatArray) -> FloatArray:
         """Return positions (n, 3), mm, of material points (n, 3), mm."""
-        return leg_pose().moved(self._carried(np.asarray(material, dtype=float), 1.0))
+        return leg_pose().applied(self._carried(np.asarray(material, dtype=float), 1.0))
 
     def to_material(self, positions: FloatArray) -> FloatArray:
         """Return material points (n, 3), mm, of positions (n, 3), mm."""
-        return self._carried(leg_pose().inverse().moved(positions), -1.0)
+        return self._carried(leg_pose().inverse().applied(positions), -1.0)
 
     def _carried(self, points: FloatArray, time: float) -> FloatArray:
         out = np.empty((len(points), 3))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray
+from naibu.core.rigid_transform import RigidTransform
 from naibu.core.volume import Volume
 from naibu.imaging.dense_matching.block_matching import MEASURES, Measure, block_matching
 from naibu.imaging.dense_matching.hybrid import hybrid_flow
@@ -15,7 +16,7 @@ from naibu.imaging.dense_matching.optical_flow import AS_REPORTED, REPORT_LEVELS
 from naibu.imaging.displacement.accuracy import end_point_error
 from naibu.imaging.displacement.dense import DenseDisplacement
 from naibu.imaging.preprocessing.resampling import resampled_to_grid
-from naibu.imaging.preprocessing.rigid_registration import RigidMotion
+from naibu.imaging.preprocessing.rigid_registration import total_displacement
 from naibu.reproduction.chapter1 import figures as drawn
 from naibu.reproduction.chapter1.calf_phantom import CalfCase, Tissue
 from naibu.reproduction.chapter1.matching import REPORT_PIXEL_MM, judged, picked_registration
@@ -101,14 +102,14 @@ def flow_section(case: CalfCase, image: CalfCase, others: Mapping[str, FloatArra
 
 def _measured(case: CalfCase, kind: int) -> list[Measured]:
     """Run all methods of an image (kind 0) or a volume (kind 1)."""
-    rigid = picked_registration(case)
-    back = resampled_to_grid(case.deformed, case.initial, through=rigid.moved)
+    rigid = picked_registration(case).transform
+    back = resampled_to_grid(case.deformed, case.initial, through=rigid.applied)
     return [_one(name, flow(case.initial, back), case, rigid) for name, flow in _flows(case, kind).items()]
 
 
-def _one(name: str, found: DenseDisplacement, case: CalfCase, rigid: RigidMotion) -> Measured:
+def _one(name: str, found: DenseDisplacement, case: CalfCase, rigid: RigidTransform) -> Measured:
     known = np.where(found.valid[..., None] & case.leg[..., None], found.vectors, np.nan)
-    return _against(name, rigid.after(known, case.initial), case)
+    return _against(name, total_displacement(known, rigid, case.initial), case)
 
 
 def _against(name: str, vectors: FloatArray, case: CalfCase) -> Measured:

@@ -9,6 +9,7 @@ from scipy import ndimage
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.displacement_field import DisplacementField
+from naibu.core.rigid_transform import RigidTransform
 from naibu.core.volume import Volume
 from naibu.imaging.displacement.dense import DenseDisplacement
 from naibu.imaging.feature_matching.correlation_matching import Candidates, candidate_matches
@@ -16,7 +17,7 @@ from naibu.imaging.feature_matching.harris import InterestPoints, interest_point
 from naibu.imaging.feature_matching.relaxation_labelling import STRENGTHS, PotentialMatches, Strength, relaxed
 from naibu.imaging.feature_matching.scattered_interpolation import Triangulation, dense_from_sparse, sparse_displacement, triangulated
 from naibu.imaging.preprocessing.resampling import sampled
-from naibu.imaging.preprocessing.rigid_registration import RigidMotion, rigid_from_points
+from naibu.imaging.preprocessing.rigid_registration import RigidRegistration, rigid_from_points
 from naibu.reproduction.chapter1.calf_motion import TIBIA
 from naibu.reproduction.chapter1.calf_phantom import FIELD_OF_VIEW_MM, CalfCase
 
@@ -71,7 +72,7 @@ class Matched:
         return np.asarray(points_mm + np.stack(at, axis=-1))
 
 
-def picked_registration(case: CalfCase) -> RigidMotion:
+def picked_registration(case: CalfCase) -> RigidRegistration:
     """Return the motion of the tibia from points picked on its rim, as the report does: three in an image, eighteen in a volume.
 
     Points are picked as well as a hand can: at the voxels that hold them in either state.
@@ -88,12 +89,12 @@ def picked_registration(case: CalfCase) -> RigidMotion:
         return rigid_from_points(before, after)
     found = rigid_from_points(before[:, :2], after[:, :2])
     rotation = np.eye(3)
-    rotation[:2, :2] = found.rotation
-    return RigidMotion(rotation, np.array([*found.translation, 0.0]), found.residuals_mm)
+    rotation[:2, :2] = found.transform.rotation
+    return RigidRegistration(RigidTransform.of(rotation, [*found.transform.translation, 0.0]), found.residuals_mm)
 
 
 def candidates_of(
-    initial: Volume, deformed: Volume, counts: tuple[int, int], rigid: RigidMotion | None, *, reach: float = 1.0
+    initial: Volume, deformed: Volume, counts: tuple[int, int], rigid: RigidTransform | None, *, reach: float = 1.0
 ) -> tuple[Candidates, InterestPoints, InterestPoints]:
     """Return pairs that look alike, and the interest points before and after.
 
@@ -103,7 +104,7 @@ def candidates_of(
         Before and after.
     counts : tuple of int
         Interest points before and after.
-    rigid : RigidMotion, optional
+    rigid : RigidTransform, optional
         Which carries the points before to where they are searched for; without it the search box does not grow.
     reach : float
         Factor on the search box along x and y.
@@ -202,7 +203,7 @@ class NoiseRow:
 
 def under_noise(case: CalfCase, counts: tuple[int, int], levels: tuple[float, ...], draws: int, seed: int) -> list[NoiseRow]:
     """Match one image pair with more and more noise, with and without registration first, by every strength."""
-    rigid = picked_registration(case)
+    rigid = picked_registration(case).transform
     rows = []
     for level in levels:
         for motion in (rigid, None):

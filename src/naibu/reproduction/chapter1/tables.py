@@ -8,7 +8,7 @@ import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.imaging.displacement.accuracy import end_point_error, intensity_rms, moved_back
-from naibu.imaging.preprocessing.rigid_registration import RigidMotion
+from naibu.imaging.preprocessing.rigid_registration import RigidRegistration, rigid_displacement
 from naibu.reproduction.chapter1 import figures as drawn
 from naibu.reproduction.chapter1.calf_motion import leg_pose
 from naibu.reproduction.chapter1.calf_phantom import CalfCase, calf_case
@@ -50,7 +50,7 @@ class Calf:
         Interest points before and after, in the image and in the volumes.
     candidates : tuple of int
         Pairs that look alike.
-    rigid : RigidMotion
+    rigid : RigidRegistration
         Motion of the tibia in the volumes from picked points.
     default : ndarray, shape (nz, ny, nx, 3)
         Displacement by naibu's default, mm; NaN where it has none.
@@ -62,7 +62,7 @@ class Calf:
     space: list[Matched]
     counts: tuple[tuple[int, int], tuple[int, int]]
     candidates: tuple[int, int]
-    rigid: RigidMotion
+    rigid: RigidRegistration
     default: FloatArray
 
 
@@ -109,7 +109,7 @@ def examined(case: CalfCase, plane_points: tuple[int, int] = (200, 240), space_p
     numbers, points = [], []
     rigid = picked_registration(case)
     for each, counts, motion in ((image, plane_points, picked_registration(image)), (case, space_points, rigid)):
-        pairs, before, after = candidates_of(each.initial, each.deformed, counts, motion)
+        pairs, before, after = candidates_of(each.initial, each.deformed, counts, motion.transform)
         found.append([matched(each, pairs, way) for way in (None, *WAYS)])
         numbers.append(len(pairs))
         points.append((len(before), len(after)))
@@ -121,7 +121,7 @@ def _case_section(calf: Calf) -> Section:
     case = calf.case
     nz, ny, nx = case.initial.shape
     length = np.linalg.norm(case.truth[case.leg], axis=-1)
-    inner = np.linalg.norm(leg_pose().inverse().moved(_places(case) + case.truth[case.leg]) - _places(case), axis=-1)
+    inner = np.linalg.norm(leg_pose().inverse().applied(_places(case) + case.truth[case.leg]) - _places(case), axis=-1)
     text = (
         "The report's MR volumes of a volunteer's calf are lost. In their place stands a phantom of a calf (skin, fat, muscles with septa, "
         "tibia and fibula with marrow, vessels, textures that the tissue carries), scanned by a virtual MR scanner with noise, blur, "
@@ -154,8 +154,8 @@ def _registration(calf: Calf) -> Table:
         ("image: three points (3.36)", plane, slab, 2),
         ("volumes: eighteen points (Horn)", calf.rigid, tibia, 3),
     ):
-        off = np.linalg.norm((found.moved(places) - leg_pose().moved(places))[:, :axes], axis=1)
-        rows.append((name, found.angle_deg, found.rms_mm, float(off.mean()), float(off.max())))
+        off = np.linalg.norm((found.transform.applied(places) - leg_pose().applied(places))[:, :axes], axis=1)
+        rows.append((name, found.transform.angle_deg, found.rms_mm, float(off.mean()), float(off.max())))
     columns = ("registration", "angle, degrees", "residual at the points, RMS mm", "error over the tibia, mean mm", "largest, mm")
     note = f"The true motion turns the leg by {leg_pose().angle_deg:.2f} degrees, 3.00 of them within the slices."
     caption = "Motion of the tibia from points picked to the nearest voxel, against the true one."
@@ -288,7 +288,9 @@ def table_1_3(calf: Calf) -> Table:
     case = calf.case
     still = np.zeros_like(case.truth)
     rows.append(("ours, nothing moved", *(None,) * 4, *_judged(case, still, None), None))
-    rows.append(("ours, bone's motion alone", *(None,) * 4, *_judged(case, calf.rigid.displacement(case.initial), None), None))
+    rows.append(
+        ("ours, bone's motion alone", *(None,) * 4, *_judged(case, rigid_displacement(calf.rigid.transform, case.initial), None), None)
+    )
     for way in calf.space:
         row = _judged(case, way.dense.vectors, way.dense.valid)
         rows.append((f"ours, {way.name}", *calf.counts[1], len(way.matches), len(way.net.simplices), *row, way.right_percent))

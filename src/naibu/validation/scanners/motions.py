@@ -13,7 +13,7 @@ from scipy.interpolate import RBFInterpolator
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
-from naibu.core.rigid_transform import Pose
+from naibu.core.rigid_transform import RigidTransform
 from naibu.meshing.point_location import interpolation_operator, locate, operator_of
 
 # Newton for the material point at a place in space: iterations, step of the differences and accuracy, mm
@@ -146,12 +146,12 @@ class PosedMotion:
     ----------
     motion : Motion
         In the frame of the object.
-    pose : Pose
+    pose : RigidTransform
         Of that frame in the scan.
     """
 
     motion: Motion
-    pose: Pose
+    pose: RigidTransform
 
     def to_space(self, material: FloatArray) -> FloatArray:
         """Return positions (n, 3), mm, of material points (n, 3), mm."""
@@ -159,7 +159,7 @@ class PosedMotion:
 
     def to_material(self, positions: FloatArray) -> FloatArray:
         """Return material points (n, 3), mm, at positions (n, 3), mm; NaN where there are none."""
-        return self.motion.to_material(self.pose.undone(positions))
+        return self.motion.to_material(self.pose.inverse().applied(positions))
 
 
 class MatchedMotion:

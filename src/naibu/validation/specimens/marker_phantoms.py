@@ -18,8 +18,7 @@ from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, Layer, Loading, Shape, State
 from naibu.core.markers import Markers
-from naibu.core.rigid_transform import Pose
-from naibu.core.rotation import rotation_matrix
+from naibu.core.rigid_transform import RigidTransform, rotation_matrix
 from naibu.identification.from_markers.calibration import state_parameters
 from naibu.identification.from_markers.parameter_names import friction, poisson_ratio, young_modulus
 from naibu.identification.from_markers.scan_alignment import placement
@@ -70,11 +69,11 @@ class Scanner:
         steps = np.array([self.xy_step_mm, self.xy_step_mm, self.z_step_mm])
         return np.sqrt(self.placing_mm**2 + steps**2 / 12.0)
 
-    def pose(self, rng: np.random.Generator, *, upright: bool) -> Pose:
+    def pose(self, rng: np.random.Generator, *, upright: bool) -> RigidTransform:
         """Draw the pose of an object in a scan."""
         tilt, turn = np.radians(self.tilt_deg) * rng.normal(size=2), np.radians(self.turn_deg) * rng.normal()
         leaning = np.eye(3) if upright else rotation_matrix(np.array([*tilt, 0.0]))
-        return Pose(leaning @ rotation_matrix(np.array([0.0, 0.0, turn])), np.zeros(3), self.shift_mm * rng.normal(size=3))
+        return RigidTransform(leaning @ rotation_matrix(np.array([0.0, 0.0, turn])), np.zeros(3), self.shift_mm * rng.normal(size=3))
 
     def seen(self, positions: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Return what is read of positions (k, 3), mm: with the error of placing, rounded, and with gaps."""
@@ -138,14 +137,14 @@ class Phantom:
         Physical value of every parameter, under the names that identification uses.
     specimen : VirtualSpecimen
         What was scanned.
-    poses : mapping of str to Pose
+    poses : mapping of str to RigidTransform
         Pose of the object in the scan of every state.
     """
 
     experiment: Experiment
     truth: dict[str, float]
     specimen: VirtualSpecimen
-    poses: Mapping[str, Pose]
+    poses: Mapping[str, RigidTransform]
 
 
 def box_experiment(
