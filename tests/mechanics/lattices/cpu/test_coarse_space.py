@@ -80,7 +80,7 @@ def test_the_solution_is_the_same_with_fewer_iterations(name, between, monkeypat
     plain = pushed(LatticeEngine.of(lattice, parameters, tolerance=1e-8))
     helped(monkeypatch, between)
     engine = LatticeEngine.of(lattice, parameters, tolerance=1e-8)
-    assert (engine.kernel[3][8][3][1].shape[1] > 0) == between
+    assert (engine.scratch.coarse[3][1].shape[1] > 0) == between
     ours = pushed(engine)
     moved = np.abs(plain.state.position - lattice.points).max()
     np.testing.assert_allclose(ours.state.position, plain.state.position, atol=1e-6 * moved)
@@ -95,7 +95,7 @@ def test_coarse_functions_reproduce_linear_fields(name, between, monkeypatch):
     helped(monkeypatch, between)
     lattice, parameters = SPECIMENS[name]
     engine = LatticeEngine.of(lattice, parameters)
-    steps, vectors, (further, less), _, weights, _ = engine.kernel[3][8]
+    steps, vectors, (further, less), _, weights, _ = engine.scratch.coarse
     rng = np.random.default_rng(2)
     pad, n = len(engine.mass), lattice.n_nodes
     slope = rng.normal(size=(3, 3))
@@ -140,7 +140,9 @@ def test_the_coarse_matrix_is_the_lattices_own(name, monkeypatch):
     lattice, parameters = SPECIMENS[name]
     engine = LatticeEngine.of(lattice, parameters)
     engine.run(engine.rest(), 1)  # stores the directions at rest
-    (first, second, rows), _, _, inner = engine.kernel
+    (first, second, rows), _ = engine.kernel
+    with engine.scratch() as (_, inner):  # that of the run
+        pass
     base, weights, smoother = inner[8][3][0], inner[8][4], inner[3]
     pad, n = len(engine.mass), lattice.n_nodes
     c = np.zeros(base.shape[:2])
@@ -161,7 +163,7 @@ def test_energy_never_grows_with_coarse_functions(seed, monkeypatch):
     ranges = ((500, 3e4), (100, 2e4), (500, 3e4))
     draw = [unit * np.exp(rng.uniform(np.log(low / 100), np.log(100 * high), lattice.n_elements)) for low, high in ranges]
     engine = LatticeEngine.of(lattice, lattice_parameters(lattice, *draw), tolerance=10.0 ** rng.uniform(-6, -0.05))
-    assert len(engine.kernel[3][8][5][2])
+    assert len(engine.scratch.coarse[5][2])
     velocity = 10.0 ** rng.uniform(-2, 3) * (rng.normal(size=lattice.points.shape) + np.cross([0.1, -0.2, 0.3], lattice.points))
     constrained = ConstrainedNodes.of([0, 1, 2, 7]) if rng.random() < 0.5 else None
     if constrained is not None:

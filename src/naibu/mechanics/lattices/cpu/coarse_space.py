@@ -9,13 +9,12 @@ which only the diagonal is used. Positions are all that is needed, so that every
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from naibu.core.arrays import AnyFloatArray, FloatArray, IntArray
 from naibu.mechanics.lattices.cpu._coarse_kernels import NODES, PRICE, assemble, build
 from naibu.mechanics.lattices.cpu._simd import WIDTH, aligned
+from naibu.mechanics.lattices.cpu.scratch import KernelTuple
 from naibu.mechanics.lattices.model.lattice import Lattice
 
 _LEAST = 3.5  # spacings between coarse nodes; closer ones take more work than iterations
@@ -30,9 +29,7 @@ _LANE = 3  # what eight values at a time cost beside one
 _PRICE = 2  # how many iterations' multiplications of an element a number of the small matrix's cube is worth, to rebuild it at leisure
 
 
-def coarse_space(
-    lattice: Lattice, stiff: FloatArray, diagonal: FloatArray, smoother: AnyFloatArray, pad: int, parts: int
-) -> tuple[Any, ...]:
+def coarse_space(lattice: Lattice, stiff: FloatArray, diagonal: FloatArray, smoother: AnyFloatArray, pad: int, parts: int) -> KernelTuple:
     """Return what the kernels need of coarse functions, or arrays without numbers where they do not pay.
 
     Parameters
@@ -149,7 +146,7 @@ def _add_masses(dense: FloatArray, mass: FloatArray, corner: IntArray, weight: F
         dense[axis, range(count, size), axis, range(count, size)] = 1.0
 
 
-def _steps(place: FloatArray, cells: IntArray, used: IntArray, pad: int, parts: int) -> tuple[Any, ...]:
+def _steps(place: FloatArray, cells: IntArray, used: IntArray, pad: int, parts: int) -> KernelTuple:
     """Return the three steps from places (n, 3), in cells, to the nodes of a grid, along z, y and x, and their vectors.
 
     What follows one another along x does so in columns and lines as well, so that eight are taken at a time; where there are no such rows,
@@ -201,7 +198,7 @@ def _reduced(place: FloatArray, axis: int, cells: IntArray) -> tuple[IntArray, I
     return source, rank[number.ravel()], weight, reached[start[order]]
 
 
-def _lanes(source: IntArray, target: IntArray, weight: FloatArray, shift: int, places: int) -> tuple[Any, ...]:
+def _lanes(source: IntArray, target: IntArray, weight: FloatArray, shift: int, places: int) -> KernelTuple:
     """Return targets and weights of every eight sources, as `gather` reads them; targets stand eight places further on."""
     apart = len(source) + len(target) + 4 * WIDTH
     key = (source + shift) // WIDTH * (2 * apart) + (target + WIDTH) - (source + shift) + apart
@@ -217,7 +214,7 @@ def _lanes(source: IntArray, target: IntArray, weight: FloatArray, shift: int, p
     return starts, WIDTH * tile + gap - apart, WIDTH * number.ravel(), table
 
 
-def _nothing() -> tuple[Any, ...]:
+def _nothing() -> KernelTuple:
     steps, vectors = _steps(np.zeros((0, 3)), np.ones(3, dtype=np.int64), np.zeros(1, dtype=np.int64), 0, 1)
     single, whole, square = np.float32, np.zeros(0, np.int64), np.zeros((0, 8), np.int64)
     small = (np.zeros((3, 0, 3, 0)), np.zeros((2, 0), single), np.zeros((3, 0)), np.zeros((2, 0, 0), single))

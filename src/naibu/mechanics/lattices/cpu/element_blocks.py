@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
 from naibu.core.arrays import AnyFloatArray, FloatArray, IntArray
 from naibu.mechanics.lattices.cpu._simd import WIDTH, aligned
 from naibu.mechanics.lattices.cpu.coarse_space import coarse_space
+from naibu.mechanics.lattices.cpu.scratch import KernelTuple, ScratchPool
 from naibu.mechanics.lattices.model.coefficients import explicit_coefficients, implicit_coefficients
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
 
@@ -96,7 +96,9 @@ def explicit_tables(parameters: LatticeParameters, step: float, forward: bool) -
     return a, b, d * step, g * step
 
 
-def explicit_kernel(parameters: LatticeParameters, step: float, blocks: Blocks, mass: Any, threads: int, forward: bool) -> tuple[Any, ...]:
+def explicit_kernel(
+    parameters: LatticeParameters, step: float, blocks: Blocks, mass: AnyFloatArray, threads: int, forward: bool
+) -> KernelTuple:
     """Return what explicit steps need: blocks, tables, masses with their inverses, and the parts of each thread.
 
     A part has blocks and masses; the masses that its blocks touch begin and end at the last two.
@@ -111,8 +113,10 @@ def explicit_kernel(parameters: LatticeParameters, step: float, blocks: Blocks, 
     return (first, second, rows), tuple(tables), (mass, inverse), (cuts, nodes, low, np.maximum(np.array(ends), nodes[1:]))
 
 
-def implicit_kernel(lattice: Lattice, parameters: LatticeParameters, step: float, blocks: Blocks, mass: Any) -> tuple[Any, ...]:
-    """Return what implicit steps need: blocks, tables, working arrays, and those of the solver in single precision."""
+def implicit_kernel(
+    lattice: Lattice, parameters: LatticeParameters, step: float, blocks: Blocks, mass: AnyFloatArray
+) -> tuple[KernelTuple, ScratchPool]:
+    """Return what implicit steps need: blocks and tables, which they read only, and the pool of their scratch arrays."""
     a, b, decay, g = implicit_coefficients(parameters, step)
     rows, tables = blocks.patterns(a, b, decay, g, parameters.stiffness, step**2 * a)
     single, places, pad = np.float32, WIDTH * blocks.n_blocks, len(mass)
@@ -120,7 +124,6 @@ def implicit_kernel(lattice: Lattice, parameters: LatticeParameters, step: float
     smoother, light = aligned((pad,), single), aligned((pad,), single)
     smoother[: lattice.n_nodes] = 1.0 / diagonal
     light[:] = mass
-    work = (aligned((3, places), float), *(aligned((3 * pad,), float) for _ in range(3)))
     coarse = coarse_space(lattice, step**2 * a, diagonal, smoother, pad, 1)
-    inner = (tables[5].astype(single), aligned((3, places), single), light, smoother, *(aligned((3 * pad,), single) for _ in range(4)))
-    return (blocks.first, blocks.second, rows), tuple(tables), work, (*inner, coarse)
+    pool = ScratchPool(tables[5].astype(single), light, smoother, coarse, places)
+    return ((blocks.first, blocks.second, rows), tuple(tables)), pool

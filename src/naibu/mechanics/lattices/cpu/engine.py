@@ -14,7 +14,8 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.mechanics.lattices.cpu._simd import WIDTH, aligned
 from naibu.mechanics.lattices.cpu._thread_pool import MOST_PARTS
 from naibu.mechanics.lattices.cpu.element_blocks import Blocks, explicit_kernel, implicit_kernel
-from naibu.mechanics.lattices.cpu.stepper import ExplicitStepper, ImplicitStepper, Stepper, own_copy
+from naibu.mechanics.lattices.cpu.scratch import KernelTuple, Scratch, ScratchPool
+from naibu.mechanics.lattices.cpu.stepper import ExplicitStepper, ImplicitStepper, Stepper
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters, require_positive
 from naibu.mechanics.lattices.model.state import (
     STEP_S,
@@ -52,6 +53,12 @@ class LatticeEngine:
         Of the implicit solver, relative to the residual that the old velocity leaves.
     threads : int
         Threads of the explicit steps.
+    kernel : tuple
+        What the kernels read: blocks and tables of coefficients; of explicit methods also the masses and the parts of the threads.
+    mass : ndarray, shape (pad,)
+        Nodal masses, kg.
+    scratch : ScratchPool
+        Scratch arrays of the implicit method, a set for each thread that steps at a time.
     """
 
     lattice: Lattice
@@ -61,8 +68,9 @@ class LatticeEngine:
     blocks: Blocks
     tolerance: float
     threads: int
-    kernel: tuple[Any, ...]
+    kernel: KernelTuple
     mass: AnyFloatArray
+    scratch: ScratchPool
 
     @classmethod
     def of(
@@ -105,8 +113,8 @@ class LatticeEngine:
         pad = -(-lattice.n_nodes // WIDTH) * WIDTH + WIDTH
         mass = aligned((pad,), kind)
         mass[: lattice.n_nodes] = lattice.node_mass
-        kernel = _kernel(lattice, parameters, step, method, blocks, mass, threads)
-        return cls(lattice, parameters, float(step), method, blocks, float(tolerance), threads, kernel, mass)
+        kernel, scratch = _kernel(lattice, parameters, step, method, blocks, mass, threads)
+        return cls(lattice, parameters, float(step), method, blocks, float(tolerance), threads, kernel, mass, scratch)
 
     def rest(self) -> LatticeState:
         """Return the lattice at rest, without any force."""
@@ -145,17 +153,18 @@ class LatticeEngine:
         constrained = constrained or ConstrainedNodes.none()
         bodies = int(constrained.body.max(initial=-1)) + 1
         path = checked_velocity(velocity, steps, bodies)
-        stepper = self.stepper(state, external_force, shared=True)
         require_constrained(constrained, self.lattice.n_nodes)
         reaction = np.zeros(path.shape)
-        stepper.constrain((constrained.node, constrained.direction, constrained.weight, constrained.body), path.shape[1])
-        iterations, rotation_limited = stepper.advance(path, reaction)
-        stepper.close()
+        with self.scratch() as scratch:
+            stepper = self.stepper(state, external_force, scratch)
+            stepper.constrain((constrained.node, constrained.direction, constrained.weight, constrained.body), path.shape[1])
+            iterations, rotation_limited = stepper.advance(path, reaction)
+            stepper.close()
         self.check(stepper, steps)
         return Motion(self.state(stepper), reaction, iterations / max(steps, 1), rotation_limited)
 
-    def stepper(self, state: LatticeState, external_force: ArrayLike | None = None, *, shared: bool) -> Stepper:
-        """Return what takes steps from a state on; if `shared`, with the engine's working arrays, which serve one at a time.
+    def stepper(self, state: LatticeState, external_force: ArrayLike | None = None, scratch: Scratch | None = None) -> Stepper:
+        """Return what takes steps from a state on, with scratch arrays of its own unless some are lent.
 
         Raises
         ------
@@ -170,9 +179,8 @@ class LatticeEngine:
             external = self.by_component(force, x.dtype)
         if self.method != "implicit":
             return ExplicitStepper(x, v, y, None, self.kernel, external, self.step, self.method == "euler")
-        blocks, tables, work, inner = self.kernel
-        own = (blocks, tables, work, inner) if shared else (blocks, tables, own_copy(work), own_copy(inner))
-        return ImplicitStepper(x, v, y, self.stored_lengths(state), own, shared, external, self.step, self.mass, self.tolerance)
+        own = scratch or self.scratch.made()
+        return ImplicitStepper(x, v, y, self.stored_lengths(state), self.kernel, own, external, self.step, self.mass, self.tolerance)
 
     def energy(self, state: LatticeState) -> float:
         """Return kinetic energy plus that of the springs, mN mm; free of supports and forces it never grows."""
@@ -253,10 +261,10 @@ class LatticeEngine:
 
 def _kernel(
     lattice: Lattice, parameters: LatticeParameters, step: float, method: Method, blocks: Blocks, mass: Any, threads: int
-) -> tuple[Any, ...]:
+) -> tuple[KernelTuple, ScratchPool]:
     if method == "implicit":
         return implicit_kernel(lattice, parameters, step, blocks, mass)
-    return explicit_kernel(parameters, step, blocks, mass, min(threads, MOST_PARTS), method == "euler")
+    return explicit_kernel(parameters, step, blocks, mass, min(threads, MOST_PARTS), method == "euler"), ScratchPool.empty()
 
 
 def _check(
@@ -288,5 +296,5 @@ def with_parameters(engine: LatticeEngine, parameters: LatticeParameters) -> Lat
     """
     precision: Literal["double", "single"] = "single" if engine.mass.dtype == np.float32 else "double"
     _check(engine.lattice, parameters, engine.step, engine.method, precision, engine.tolerance, engine.threads)
-    kernel = _kernel(engine.lattice, parameters, engine.step, engine.method, engine.blocks, engine.mass, engine.threads)
-    return replace(engine, parameters=parameters, kernel=kernel)
+    kernel, scratch = _kernel(engine.lattice, parameters, engine.step, engine.method, engine.blocks, engine.mass, engine.threads)
+    return replace(engine, parameters=parameters, kernel=kernel, scratch=scratch)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from contextlib import nullcontext
 from dataclasses import dataclass
-from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -14,9 +12,9 @@ from naibu.core.arrays import FloatArray
 from naibu.mechanics.lattices.cpu._explicit_kernels import explicit_steps, help_explicit
 from naibu.mechanics.lattices.cpu._implicit_kernels import implicit_steps
 from naibu.mechanics.lattices.cpu._thread_pool import PARTS, REST, STOP, dismiss, lend, new_control
+from naibu.mechanics.lattices.cpu.scratch import KernelTuple, Scratch
 
 MOST_ITERATIONS = 20_000
-_SHARED = Lock()
 
 
 @dataclass(slots=True, eq=False)
@@ -99,10 +97,10 @@ class ExplicitStepper(Stepper):
 
 @dataclass(slots=True, eq=False)
 class ImplicitStepper(Stepper):
-    """Implicit steps; the working arrays in `kernel` are its own, unless it is `shared` with others, who wait for one another."""
+    """Implicit steps with scratch arrays of their own."""
 
-    kernel: tuple[Any, ...]
-    shared: bool
+    kernel: KernelTuple
+    scratch: Scratch
     external: Any
     step: float
     mass: Any
@@ -115,27 +113,13 @@ class ImplicitStepper(Stepper):
 
     def advance(self, velocity: FloatArray, reaction: FloatArray, *, alone: bool = False) -> tuple[int, int]:
         """Take steps and fill the reactions."""
-        blocks, tables, work, inner = self.kernel
+        (blocks, tables), (work, inner) = self.kernel, self.scratch
         state, solver = (self.position, self.velocity, self.extension, self.length), (self.tolerance, MOST_ITERATIONS)
         reaction[:] = 0.0
-        with _SHARED if self.shared else nullcontext():
-            found: tuple[int, int] = implicit_steps(
-                blocks, tables, state, self.mass, self.external, work, inner, self.constrained, velocity, self.step, solver, reaction
-            )
+        found: tuple[int, int] = implicit_steps(
+            blocks, tables, state, self.mass, self.external, work, inner, self.constrained, velocity, self.step, solver, reaction
+        )
         return found
 
     def close(self) -> None:
         """There are no helpers to send away."""
-
-
-def own_copy(arrays: Any) -> Any:
-    """Return a copy of working arrays in tuples, aligned as they are."""
-    if isinstance(arrays, tuple):
-        return tuple(own_copy(one) for one in arrays)
-    if isinstance(arrays, np.ndarray):
-        raw = np.zeros(arrays.nbytes + 64, dtype=np.uint8)
-        start = -raw.ctypes.data % 64
-        result = raw[start : start + arrays.nbytes].view(arrays.dtype).reshape(arrays.shape)
-        result[...] = arrays
-        return result
-    return arrays

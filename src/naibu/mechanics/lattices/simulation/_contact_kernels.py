@@ -277,7 +277,7 @@ def _settle(engine, constrained, modes, seen, shapes, places, friction, candidat
     return iterations, most, lost, False
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def contact_steps(blocks, tables, x, v, y, lengths, mass, external, work, inner, bodies, memory, velocity, step, solver, reaction, limit):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Take len(velocity) steps in contact; x, v, y, lengths, `memory` and places are changed, reaction (steps, bodies, 3) is filled.
 

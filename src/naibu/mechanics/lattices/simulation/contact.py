@@ -182,13 +182,14 @@ def push(
     memory = (known.mode.copy(), known.friction.copy(), known.touched.copy())
     places = known.places.copy()
     reaction = np.zeros(path.shape)
-    blocks, tables, work, inner = engine.kernel
+    blocks, tables = engine.kernel
     bodies = _stored_bodies(indenters, places, known.nodes)
     limit = (passes, SLOW * engine.lattice.spacing_mm / engine.step)
-    _, tries, unsettled = contact_steps(
-        blocks, tables, x, v, y, lengths, engine.mass, external, work, inner, bodies, memory, path, engine.step, (engine.tolerance, 20_000),
-        reaction, limit,
-    )  # fmt: skip
+    with engine.scratch() as (work, inner):
+        _, tries, unsettled = contact_steps(
+            blocks, tables, x, v, y, lengths, engine.mass, external, work, inner, bodies, memory, path, engine.step,
+            (engine.tolerance, 20_000), reaction, limit,
+        )  # fmt: skip
     end = replace(engine.read(x, v, y), length=lengths[engine.blocks.lane])
     return ContactMotion(end, ContactState(known.nodes, *memory, places), reaction, path, tries / max(count, 1), int(unsettled))
 

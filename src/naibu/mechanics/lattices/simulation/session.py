@@ -90,7 +90,7 @@ class LatticeSession:
         InputError
             Shapes that do not fit, NaN, or held masses that are not there or held twice.
         """
-        stepper = engine.stepper(state or engine.rest(), external_force, shared=False)
+        stepper = engine.stepper(state or engine.rest(), external_force)
         session = cls(engine, ConstrainedNodes.none(), 0, stepper)
         finalize(session, stepper.close)
         session.constrain(constrained or ConstrainedNodes.none())

@@ -119,7 +119,7 @@ def driven_steps(
     Parameters
     ----------
     engine : LatticeEngine
-        Of the implicit method. Its work arrays are used: one run at a time.
+        Of the implicit method.
     state : LatticeState
         Where the steps begin; unchanged.
     steps : int
@@ -160,13 +160,14 @@ def driven_steps(
     lengths = engine.stored_lengths(state)
     tangents = _stored_change(engine, start)
     rows, tables = _changed_coefficients(engine, changes)
-    blocks, own, work, inner = engine.kernel
+    blocks, own = engine.kernel
     reaction, reaction_change = np.zeros(path.shape), np.zeros((len(changes), *path.shape))
-    _driven_steps(
-        blocks, own, rows, tables, (x, v, y, lengths), tangents, engine.mass, (loads.node, loads.share, loads.body), pushed, work, inner,
-        (constrained.node, constrained.direction, constrained.weight, constrained.body), path, engine.step,
-        (engine.tolerance, engine.tolerance if tolerance is None else tolerance, 20_000), reaction, reaction_change,
-    )  # fmt: skip
+    with engine.scratch() as (work, inner):
+        _driven_steps(
+            blocks, own, rows, tables, (x, v, y, lengths), tangents, engine.mass, (loads.node, loads.share, loads.body), pushed, work,
+            inner, (constrained.node, constrained.direction, constrained.weight, constrained.body), path, engine.step,
+            (engine.tolerance, engine.tolerance if tolerance is None else tolerance, 20_000), reaction, reaction_change,
+        )  # fmt: skip
     after = _read_change(engine, tangents)
     require_numbers(reaction, "the computed reaction")
     return DrivenMotion(replace(engine.read(x, v, y), length=lengths[engine.blocks.lane]), reaction, after, reaction_change)
