@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from marker_scenes import ultrasound
 
 from naibu.cli import main
 from naibu.core.errors import InputError
@@ -104,24 +102,3 @@ def test_the_verb(scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert read_experiment(tmp_path / "exp").materials == ("gel",)
     assert run(*scans, "--diameter-mm", DIAMETER, "--layer", "gel=0..28", "--out", tmp_path / "no") == 2
     assert "--size-mm" in capsys.readouterr().err
-
-
-def test_a_sequence_becomes_a_table_of_tracks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    echoes = ultrasound(seed=1, frames=40)
-    stack = write_volume(tmp_path / "cine.mha", Volume.from_array(echoes.frames, spacing_mm=(1.0, 1.0, 1.0)))
-    arguments = [stack, "--pixel-mm", echoes.pixel_mm, "--diameter-mm", 2.0, "--frame-rate-hz", 24.6, "--count", 5, "--out", tmp_path / "t"]
-    monkeypatch.setattr(sys, "argv", ["naibu", "track-sequence", *map(str, arguments)])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert not end.value.code
-    assert "tracks.csv" in capsys.readouterr().out
-    with (tmp_path / "t" / "tracks.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == 40 * 5
-    assert float(rows[-1]["time_s"]) == pytest.approx(39 / 24.6, abs=1e-5)
-    found = np.array([[float(r["x_mm"]), float(r["y_mm"])] for r in rows]).reshape(40, 5, 2)
-    seen = np.array([r["seen"] == "1" for r in rows]).reshape(40, 5)
-    off = np.linalg.norm(found - echoes.truth, axis=-1)
-    assert off[seen].max() < 0.3
-    assert seen.mean() > 0.8
-    assert (tmp_path / "t" / "tracks.html").exists()

@@ -1,4 +1,4 @@
-"""Follow markers through a sequence of images, such as ultrasound, from a file to a table and a page."""
+"""Marker tracking in an image sequence, such as B-mode ultrasound: from a file to a table of tracks and a page."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from naibu.core.arrays import FloatArray
-from naibu.imaging.markers.sequence_tracking import TrackedSequence, track_sequence
+from naibu.core.arrays import AnyArray, FloatArray, require_positive
+from naibu.core.progress import Progress, report_progress
+from naibu.imaging.markers.sequence_tracking import EchoPolarity, TrackedSequence, lengths_mm, track_sequence
+from naibu.imaging.markers.settings import SequenceSettings
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
 from naibu.io.images import read_volume
@@ -32,7 +33,19 @@ COLUMNS = ("frame", "time_s", "marker", "x_mm", "y_mm", "sd_mm", "seen")
 
 @dataclass(frozen=True, slots=True)
 class SequenceRun:
-    """Tracks, a row for each marker, and the files."""
+    """Tracks of markers and the files that hold them.
+
+    Attributes
+    ----------
+    tracked : TrackedSequence
+        Positions in every frame.
+    columns : tuple of str
+        Headers of `rows`, with units.
+    rows : tuple of tuple
+        One row a marker.
+    page, table : Path
+        ``tracks.html`` and ``tracks.csv``.
+    """
 
     tracked: TrackedSequence
     columns: tuple[str, ...]
@@ -50,49 +63,74 @@ def track_sequence_file(
     frame_rate_hz: float = 1.0,
     region_mm: Sequence[float] | None = None,
     count: int | None = None,
-    polarity: Literal["bright", "dark"] = "bright",
+    polarity: EchoPolarity = "bright",
+    settings: SequenceSettings | None = None,
+    progress: Progress | None = None,
 ) -> SequenceRun:
-    """Follow markers through the images of a stack, and write ``tracks.csv``, ``tracks.html`` and ``tracks.json``.
+    """Track markers through a stack of images, and write ``tracks.csv``, ``tracks.html`` and ``tracks.json``.
 
     Parameters
     ----------
     frames : path-like
-        A stack of images (see `naibu.io.images.read_volume`), the times along its third axis.
+        Stack of images (see `naibu.io.images.read_volume`), time along its third axis.
     out : path-like
         Folder for the files.
     frame_rate_hz : float
-        Frames a second.
-    pixel_mm, diameter_mm, region_mm, count, polarity
+        Frames per second; above 0.
+    pixel_mm, diameter_mm, region_mm, count, polarity, settings, progress
         See `naibu.imaging.markers.sequence_tracking.track_sequence`.
+
+    Returns
+    -------
+    SequenceRun
+        Tracks and files.
 
     Raises
     ------
     InputError
-        A stack that cannot be read, markers that cannot be found, or a folder that cannot be written to.
+        A stack that cannot be read, an argument out of range, markers that cannot be found, or a folder that cannot be written to. No
+        file is then written.
     """
+    rate = require_positive("frame_rate_hz", frame_rate_hz, "frames per second")
+    dx, dy = (float(v) for v in lengths_mm("pixel_mm", pixel_mm))
     folder = result_folder(out)
-    dx, dy = np.broadcast_to(np.asarray(pixel_mm, dtype=float), 2)
+    report_progress(progress, "reading")
     stack = read_volume(frames, spacing_mm=(dx, dy, 1.0)).values
-    tracked = track_sequence(stack, pixel_mm=pixel_mm, diameter_mm=diameter_mm, region_mm=region_mm, count=count, polarity=polarity)
-    times = np.arange(len(stack)) / frame_rate_hz
+    tracked = track_sequence(
+        stack, pixel_mm=pixel_mm, diameter_mm=diameter_mm, region_mm=region_mm, count=count, polarity=polarity, settings=settings,
+        progress=progress,
+    )  # fmt: skip
+    report_progress(progress, "writing")
+    times = np.arange(len(stack)) / rate
     table = write_atomically(folder / "tracks.csv", _csv(tracked, times))
+    columns, rows = _summary(tracked)
+    described: dict[str, Cell] = {"frames": len(stack), "frame rate, Hz": rate, "pixel, mm": f"{dx:g}, {dy:g}"}
+    described |= {"diameter, mm": f"{diameter_mm}", **input_record({"images": frames})}
+    caption = f"{len(tracked)} markers in {len(stack)} frames"
+    section = Section(
+        "Markers",
+        ("Markers are numbered from left to right; x points right and y down the image, from the centre of its first pixel.",),
+        (Table("Tracks", columns, rows, caption=caption, note=f"Rejected tracks: {_rejections(tracked)}."),),
+        (_figure(tracked, stack, times, dx, dy),),
+    )
+    page, _ = write_chapter(Chapter("tracks", "Markers tracked through an image sequence", (section,), described), folder)
+    return SequenceRun(tracked, columns, rows, page, table)
+
+
+def _summary(tracked: TrackedSequence) -> tuple[tuple[str, ...], tuple[tuple[Cell, ...], ...]]:
+    """Return headers and one row a marker."""
     columns = ("marker", "seen in frames", "largest displacement, mm", "standard deviation (median), mm", "contrast")
     moved = np.linalg.norm(tracked.points - tracked.points[0], axis=-1).max(axis=0)
     rows = tuple(
         (i + 1, int(tracked.seen[:, i].sum()), float(moved[i]), float(np.median(tracked.sd_mm[:, i])), float(tracked.strength[i]))
         for i in range(len(tracked))
     )
-    settings: dict[str, Cell] = {"frames": len(stack), "frame rate, Hz": frame_rate_hz, "pixel, mm": f"{dx:g}, {dy:g}"}
-    settings |= {"diameter, mm": f"{diameter_mm}", **input_record({"images": frames})}
-    rejected = "; ".join(f"{n} {why}" for why, n in Counter(r.reason for r in tracked.rejected).items()) or "none"
-    section = Section(
-        "Markers",
-        ("Numbers run from left to right; x points right and y down the image, from the centre of its first pixel.",),
-        (Table("Tracks", columns, rows, caption=f"{len(tracked)} markers in {len(stack)} frames", note=f"Rejected tracks: {rejected}."),),
-        (_figure(tracked, stack, times, float(dx), float(dy)),),
-    )
-    page, _ = write_chapter(Chapter("tracks", "Markers followed through a sequence", (section,), settings), folder)
-    return SequenceRun(tracked, columns, rows, page, table)
+    return columns, rows
+
+
+def _rejections(tracked: TrackedSequence) -> str:
+    """Return how many tracks were rejected for which reason."""
+    return "; ".join(f"{n} {why}" for why, n in Counter(r.reason for r in tracked.rejected).items()) or "none"
 
 
 def _csv(tracked: TrackedSequence, times: FloatArray) -> str:
@@ -105,7 +143,7 @@ def _csv(tracked: TrackedSequence, times: FloatArray) -> str:
     return stream.getvalue()
 
 
-def _figure(tracked: TrackedSequence, stack: NDArray[np.generic], times: FloatArray, dx: float, dy: float) -> Figure:
+def _figure(tracked: TrackedSequence, stack: AnyArray, times: FloatArray, dx: float, dy: float) -> Figure:
     def draw(canvas: Canvas) -> None:
         image, along, down = canvas.subplots(1, 3, width_ratios=[1.2, 1.0, 1.0])
         _, ny, nx = stack.shape
@@ -125,6 +163,5 @@ def _figure(tracked: TrackedSequence, stack: NDArray[np.generic], times: FloatAr
         down.set(xlabel="time, s", ylabel="displacement along y, mm")
         down.legend(title="marker", fontsize=7, ncols=2, frameon=False)
 
-    return Figure(
-        "Tracks", "Dotted where a marker was not seen and its place was filled in by the motion of the others.", draw, (11.0, 4.0)
-    )
+    caption = "Dotted where a marker was not seen and its position was filled in from the motion of the others."
+    return Figure("Tracks", caption, draw, (11.0, 4.0))

@@ -1,4 +1,4 @@
-"""Markers in sequences of ultrasound images: followed through gaps, told from ghosts."""
+"""Marker tracking in sequences of ultrasound images: through gaps, and told from ghosts."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from marker_scenes import Echoes, ultrasound
 
 from naibu.core.errors import InputError
 from naibu.imaging.markers.sequence_tracking import TrackedSequence, track_sequence
+from naibu.imaging.markers.settings import SequenceSettings
 
 
 @pytest.fixture(scope="module")
@@ -67,10 +68,48 @@ def test_what_cannot_be_followed_is_refused(scene: Echoes) -> None:
         (frames, {"diameter_mm": 0.2}, "diameter_mm is"),
         (frames, {"pixel_mm": -1.0}, "pixel_mm must be"),
         (frames, {"count": 0}, "count is 0"),
-        (frames, {"region_mm": (90.0, 99.0, 0.0, 9.0)}, "no pixel lies in the region"),
+        (frames, {"region_mm": (90.0, 99.0, 0.0, 9.0)}, "no pixel lies in region_mm"),
         (frames, {"region_mm": (9.0, 3.0, 0.0, 9.0)}, "region_mm must be"),
         (frames, {"mask": np.ones((3, 3))}, "mask must have shape"),
+        (frames, {"mask": np.zeros(frames.shape[1:])}, "mask is empty"),
         (frames, {"count": 90}, "90 asked for"),
+        (frames, {"polarity": "auto"}, "polarity must be"),
+        (frames.astype(complex), {}, "frames must hold real numbers"),
     ):
         with pytest.raises(InputError, match=words):
             track_sequence(values, **({"pixel_mm": 0.3, "diameter_mm": (3.0, 2.0)} | arguments))  # type: ignore[arg-type]
+
+
+def test_settings_out_of_range_are_refused() -> None:
+    for arguments, words in (
+        ({"min_contrast": -1.0}, "min_contrast must lie between 0 and infinity"),
+        ({"max_jump": 0.0}, "max_jump must be positive"),
+        ({"longest_gap": 2.5}, "longest_gap must be a whole number"),
+        ({"longest_gap": -1}, "longest_gap must lie"),
+        ({"min_seen": 1.5}, "min_seen must lie between 0 and 1, not 1.5"),
+        ({"min_gain": np.nan}, "min_gain must lie"),
+        ({"ghost_strength": -0.1}, "ghost_strength must lie"),
+        ({"outlier_sd": 0.0}, "outlier_sd must be positive"),
+        ({"min_outlier": np.inf}, "min_outlier must lie"),
+        ({"shared_motions": 0.5}, "shared_motions must be a whole number"),
+    ):
+        with pytest.raises(InputError, match=words):
+            SequenceSettings(**arguments)  # type: ignore[arg-type]
+
+
+def test_settings_decide_what_counts_as_a_marker(scene: Echoes, followed: TrackedSequence) -> None:
+    sizes = {"pixel_mm": scene.pixel_mm, "diameter_mm": (3.0, 2.0)}
+    with_ghosts = track_sequence(scene.frames, **sizes, settings=SequenceSettings(ghost_strength=0.0, min_gain=0.0))
+    assert len(with_ghosts) > len(followed) and not any("ghost" in track.reason for track in with_ghosts.rejected)
+    # a track must bridge the longest gap of a marker, or it is split
+    patient, hasty = (track_sequence(scene.frames, **sizes, settings=SequenceSettings(longest_gap=g, min_seen=0.6)) for g in (60, 2))
+    assert len(patient) == 5 > len(hasty)
+    with pytest.raises(InputError, match="0 markers were followed"):
+        track_sequence(scene.frames, **sizes, settings=SequenceSettings(min_contrast=1000.0))
+
+
+def test_labels_and_frames_that_are_not_there_are_refused(followed: TrackedSequence) -> None:
+    with pytest.raises(InputError, match="frame 150 is not among the 150 frames"):
+        followed.markers(150)
+    with pytest.raises(InputError, match="origin is 6; it must be the label of a marker, 1 to 5"):
+        followed.markers(0, origin=6)
