@@ -13,7 +13,6 @@ from naibu.core.rigid_transform import registration
 from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration, calibrate
 from naibu.identification.from_markers.observations import Trial
-from naibu.identification.from_markers.parameter_names import platen_position
 from naibu.identification.from_markers.specimen_model import ModelSettings
 from naibu.identification.prediction.baselines import affine, balanced, baselines
 from naibu.identification.prediction.calibrated_model import CalibratedModel
@@ -178,7 +177,7 @@ def _compared(
 
     try:
         if not interrupted:
-            compared = {t.label: _baselines(t, values[platen_position(t.specimen.experiment, t.state)]) for t in calibration.trials}
+            compared = {t.label: _baselines(t, values) for t in calibration.trials}
             for label, distance in balanced(calibration).items():
                 compared[label]["force balance"] = distance
         if not interrupted and left_in_turn:
@@ -197,10 +196,10 @@ def _compared(
     return Identification(model, calibration, compared, left_out, interrupted), trouble
 
 
-def _baselines(trial: Trial, platen_position_mm: float) -> dict[str, float]:
+def _baselines(trial: Trial, values: Mapping[str, float]) -> dict[str, float]:
     """Simple descriptions of a state; without the linear one where it does not apply."""
     try:
-        return baselines(trial, platen_position_mm)
+        return baselines(trial, values)
     except NaibuError:
         free, measured = trial.specimen.marker_points, trial.measured
         return {"rigid": rms(measured - registration(free, measured).applied(free)), "affine": rms(measured - affine(free, measured))}

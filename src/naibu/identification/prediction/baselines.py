@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from naibu.core.arrays import FloatArray
@@ -17,11 +19,11 @@ from naibu.identification.from_markers.specimen_model import ModelSettings, spec
 from naibu.identification.prediction.prediction import rms
 from naibu.mechanics.finite_strain.statics import solve
 
-REPORT = {"hardness 5": (222.0, 0.33), "hardness 0": (125.0, 0.44)}  # Young's modulus, kPa, and Poisson's ratio (report, Tables 3.4, 3.5)
-REPORT_SINGLE_GEL = (222.0, 0.38)  # of a gel without a name; its modulus has no bearing on displacements
+# Young's modulus, kPa, and Poisson's ratio that Hirai et al. (2008), Tables 3.4 and 3.5, give for their two gels
+REPORT = {"hardness 5": (222.0, 0.33), "hardness 0": (125.0, 0.44)}
 
 
-def baselines(trial: Trial, platen_position_mm: float) -> dict[str, float]:
+def baselines(trial: Trial, values: Mapping[str, float]) -> dict[str, float]:
     """Return the root mean square distance (mm) between measured markers and three simple descriptions of the state.
 
     Only markers with three trusted coordinates in the loaded state count; all of each description's freedoms are fitted to the data.
@@ -30,26 +32,26 @@ def baselines(trial: Trial, platen_position_mm: float) -> dict[str, float]:
     ----------
     trial : Trial
         A measured state.
-    platen_position_mm : float
-        Height of the plate or bar above the base, or distance of the side plates, for the linear model.
+    values : mapping of str to float
+        Identified or stated parameters; the linear model takes the platen position and the moduli from them.
 
     Returns
     -------
     dict
-        ``rigid``: the free state moved rigidly; ``affine``: under the best affine map; ``linear``: linear elasticity with the report's
-        parameters, sticking everywhere, registered to the markers; NaN where it has no solution (a law for small strain can turn
-        elements over).
+        ``rigid``: a rigid transform of the reference configuration; ``affine``: the best affine map; ``linear``: linear elasticity with
+        the parameters of `linear_parameters`, sticking everywhere, registered to the markers; NaN where it has no solution (a law for
+        small strain can turn elements over).
 
     Raises
     ------
     InputError
-        Layers of materials that the report does not know, or an opening out of reach.
+        A platen position out of reach.
     """
     free, measured = trial.specimen.marker_points, trial.measured
     return {
         "rigid": rms(measured - registration(free, measured).applied(free)),
         "affine": rms(measured - affine(free, measured)),
-        "linear": rms(residual) if np.isfinite(residual := measured - _linear(trial, platen_position_mm)).any() else np.nan,
+        "linear": rms(residual) if np.isfinite(residual := measured - _linear(trial, values)).any() else np.nan,
     }
 
 
@@ -99,33 +101,31 @@ def affine(points: FloatArray, measured: FloatArray) -> FloatArray:
     return out
 
 
-def report_parameters(experiment: Experiment) -> dict[str, float]:
-    """Return the report's moduli, kPa, and Poisson's ratios of the materials, by parameter name.
+def linear_parameters(experiment: Experiment, values: Mapping[str, float]) -> dict[str, float]:
+    """Return the Young's moduli, kPa, and Poisson's ratios of the linear baseline, by parameter name.
 
-    Raises
-    ------
-    InputError
-        Several materials, of which the report does not know one.
+    They are those of :cite:t:`hirai2008` for an experiment on both of its gels, and else the identified or stated ones in `values`.
     """
-    values = {}
-    for name in experiment.materials:
-        if name not in REPORT and len(experiment.materials) > 1:
-            raise InputError(f"the report measured {', '.join(REPORT)}; experiment {experiment.name!r} also has {name!r}")
-        values[young_modulus(name)], values[poisson_ratio(name)] = REPORT.get(name, REPORT_SINGLE_GEL)
-    return values
+    if set(experiment.materials) == set(REPORT):
+        found = {m: REPORT[m] for m in experiment.materials}
+    else:
+        found = {m: (values[young_modulus(m)], values[poisson_ratio(m)]) for m in experiment.materials}
+    return {name(m): v for m, pair in found.items() for name, v in zip((young_modulus, poisson_ratio), pair, strict=True)}
 
 
-def _linear(trial: Trial, platen_position_mm: float) -> FloatArray:
-    """Positions (k, 3), mm, of linear elasticity with the report's parameters, registered to the measured ones."""
+def _linear(trial: Trial, values: Mapping[str, float]) -> FloatArray:
+    """Positions (k, 3), mm, of linear elasticity with the parameters of `linear_parameters`, registered to the measured ones."""
     experiment = trial.specimen.experiment
+    position = platen_position(experiment, trial.state)
+    platen_position_mm = values[position]
     full = experiment.shape.size_mm[1 if experiment.loading.kind == "side_plates" else 2]
     if not 0.3 * full < platen_position_mm <= full:
-        raise InputError(f"an opening of {platen_position_mm:g} mm is not between 30 % and 100 % of the object's {full:g} mm")
+        raise InputError(f"a platen position of {platen_position_mm:g} mm is not between 30 % and 100 % of the object's {full:g} mm")
     size = trial.specimen.settings.element_size_mm
     body = specimen(experiment, ModelSettings(law="linear_elastic", contact="stick", element_size_mm=size))
-    values = report_parameters(experiment) | {platen_position(experiment, trial.state): platen_position_mm}
+    chosen = linear_parameters(experiment, values) | {position: platen_position_mm}
     try:
-        solution = solve(body.problem(values, trial.state))
+        solution = solve(body.problem(chosen, trial.state))
     except ConvergenceError:
         return np.full_like(trial.measured, np.nan)
     moved = body.marker_points + body.observation @ solution.displacement
