@@ -31,7 +31,6 @@ from naibu.imaging.dense_matching.block_matching import block_matching
 from naibu.imaging.dense_matching.hybrid import hybrid_flow
 from naibu.imaging.dense_matching.optical_flow import AS_REPORTED, horn_schunck, lucas_kanade
 from naibu.imaging.displacement.accuracy import end_point_error, intensity_rms
-from naibu.imaging.displacement.dense import DenseDisplacement
 from naibu.imaging.displacement.strain import folded_share
 from naibu.imaging.feature_matching.correlation_matching import Candidates, candidate_matches
 from naibu.imaging.feature_matching.harris import interest_points
@@ -141,7 +140,7 @@ def at_points(case: Case, points: Array) -> Array:
 def dense_methods(case: Case) -> None:
     back = case.brought_back
     a, b = case.reference, back
-    methods: dict[str, Callable[[], DenseDisplacement]] = {
+    methods: dict[str, Callable[[], DisplacementField]] = {
         "block matching SAD 3x3x3 in 31x31x3": lambda: block_matching(a, b, block=BLOCK, search=SEARCH),
         "block matching SSD 7x7x5 in 17x17x9": lambda: block_matching(a, b, block=(7, 7, 5), search=(8, 8, 4), measure="ssd"),
         "block matching NCC 7x7x5 in 17x17x9": lambda: block_matching(a, b, block=(7, 7, 5), search=(8, 8, 4), measure="ncc"),

@@ -25,7 +25,7 @@ from scipy import ndimage
 
 from naibu.core.volume import Volume
 from naibu.imaging.volume_correlation.correlate import CorrelationSettings, correlate_volumes
-from naibu.imaging.volume_correlation.result import CorrelatedDisplacement
+from naibu.imaging.volume_correlation.result import CorrelationResult
 
 Array = NDArray[Any]
 TISSUES = {
@@ -59,10 +59,10 @@ def compile_all() -> None:
     correlate_volumes(grid, grid.with_values(np.roll(values, 1, 2).astype(np.float32)), mask=np.ones_like(inner), stiff_mask=inner)
 
 
-def score(case: dict[str, Array], found: CorrelatedDisplacement) -> dict[str, Any]:
+def score(case: dict[str, Array], found: CorrelationResult) -> dict[str, Any]:
     truth, mask, labels = np.moveaxis(zyx(case["u"]), 0, -1), zyx(case["mask"]), zyx(case["labels"])
     answered = mask & found.valid
-    off = np.where(answered[..., None], found.vectors - truth, 0.0)
+    off = np.where(answered[..., None], found.displacement.vectors - truth, 0.0)
     length = np.linalg.norm(off, axis=-1)
     kind = json.loads(str(case["meta"]))["kind"]
     out: dict[str, Any] = {"answered": answered.sum() / mask.sum(), "mm": (length[answered].mean(), np.median(length[answered]))}

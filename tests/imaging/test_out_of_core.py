@@ -163,7 +163,7 @@ def test_two_workers_give_the_same(tmp_path: Path) -> None:
         pids = np.unique(map_overlapping(process, [before.values], (0, 0, 0), block=(16, 16, 8), dtype=int).compute())
         assert len(pids) == 2 and os.getpid() not in pids
     expected = block_matching(before, after, search=(3, 4, 1))
-    found = unpacked(displacement[...])
+    found = unpacked(displacement[...], before)
     np.testing.assert_array_equal(found.vectors, expected.vectors)
     np.testing.assert_array_equal(found.valid, expected.valid)
     np.testing.assert_array_equal(response[...], harris_response(before))

@@ -58,7 +58,7 @@ def test_every_method_finds_the_motion(method: str, most_mm: float) -> None:
 def test_the_default_states_a_covariance_that_holds_the_truth() -> None:
     before, after, truth, _ = squeezed_ball(seed=3)
     found = measure_displacement(before, after)
-    field = found.field(before, step=3)
+    field = found.displacement.at_points(step=3)
     error = field.vectors - truth[at(before, field.points)]
     squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(field.covariance), error)
     assert 0.8 < np.mean(squared < 7.81) <= 1.0  # chi-squared of three degrees of freedom, 95 %

@@ -1,4 +1,4 @@
-"""A scanned volume that need not fit into memory: voxels that are read block by block, and where they lie in the scanner."""
+"""Image volume larger than memory: intensities that are read block by block, and their geometry in the frame of the scanner."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from naibu.core.volume import Volume
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChunkedVolume:
-    """Voxels in a Zarr or Dask array, an HDF5 dataset or a memory map, with their geometry.
+    """Image volume in a Zarr or Dask array, an HDF5 dataset or a memory map, with its geometry.
 
     Attributes
     ----------
     values : array with ``shape``, ``dtype`` and slicing, shape (nz, ny, nx)
-        Grey values; only what is sliced is read.
+        Intensities; only what is sliced is read.
     spacing_mm : ndarray, shape (3,)
         Distance between the centres of voxels along x, y, z, mm.
     origin_mm : ndarray, shape (3,)
@@ -38,12 +38,12 @@ class ChunkedVolume:
     def from_array(
         cls, values: Any, *, spacing_mm: ArrayLike, origin_mm: ArrayLike = (0.0, 0.0, 0.0), direction: ArrayLike | None = None
     ) -> ChunkedVolume:
-        """Check the geometry; the voxels stay where they are.
+        """Return a volume after checking its geometry; no voxel is read.
 
         Parameters
         ----------
         values : array with ``shape``, ``dtype`` and slicing, shape (nz, ny, nx)
-            Grey values.
+            Intensities.
         spacing_mm, origin_mm : array_like, shape (3,)
             As in `naibu.core.volume.Volume.from_array`.
         direction : array_like, shape (3, 3), optional
@@ -52,11 +52,11 @@ class ChunkedVolume:
         Raises
         ------
         InputError
-            An array that has not three axes or no real numbers, or a geometry that is none.
+            An array without three axes or of other than real numbers, or an invalid geometry.
         """
         shape, dtype = getattr(values, "shape", ()), np.dtype(getattr(values, "dtype", np.void))
         if len(shape) != 3 or 0 in shape or dtype.kind not in "biuf":
-            raise InputError(f"a volume has three axes z, y, x of real numbers; the array has shape {tuple(shape)} of {dtype}")
+            raise InputError(f"values must have three axes z, y, x of real numbers, not shape {tuple(shape)} of {dtype}")
         grid = Volume.from_array(np.zeros((1, 1, 1)), spacing_mm=spacing_mm, origin_mm=origin_mm, direction=direction)
         return cls(values, grid.spacing_mm, grid.origin_mm, grid.direction)
 
@@ -73,7 +73,7 @@ class ChunkedVolume:
 
     @property
     def grid(self) -> Volume:
-        """The same voxels without values, which takes no memory."""
+        """The same grid with values of zero that take no memory."""
         return Volume(np.broadcast_to(np.float32(0.0), self.shape), self.spacing_mm, self.origin_mm, self.direction)
 
     def block(self, box: tuple[slice, slice, slice]) -> Volume:

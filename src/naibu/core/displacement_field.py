@@ -1,4 +1,4 @@
-"""A measured displacement field: vectors at points, how sure they are, and where there are none."""
+"""Displacement field: vectors at points, at the voxels of a grid or at the nodes of a mesh, with their covariance and validity."""
 
 from __future__ import annotations
 
@@ -7,30 +7,37 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from naibu.core.arrays import BoolArray, FloatArray
+from naibu.core.arrays import BoolArray, FloatArray, require_shape
 from naibu.core.errors import InputError
+from naibu.core.mesh import Mesh
+from naibu.core.volume import Volume
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DisplacementField:
-    """Displacement at points.
+    """Displacement u of the material: what is at x in the reference configuration is found at x + u(x).
+
+    Arrays have the shape of the support: ``(n,)`` at points and at the nodes of a mesh, ``(nz, ny, nx)`` at the voxels of a grid.
 
     Attributes
     ----------
-    points : ndarray, shape (n, d), float64
-        Where, in the undeformed body, mm.
-    vectors : ndarray, shape (n, d), float64
-        Displacement, mm; NaN where `valid` is false.
-    covariance : ndarray, shape (n, d, d), float64
-        Covariance of each vector, mm^2; zero for exact data.
-    valid : ndarray, shape (n,), bool
-        Where there is a measurement.
+    support : ndarray, shape (n, d), or Volume or Mesh
+        Positions of the vectors, mm: listed, or as the voxels of a grid or the nodes of a mesh, which store no positions of their own.
+    vectors : ndarray, shape (..., d), float64
+        Displacement along x, y, z, mm; NaN where there is none.
+    covariance : ndarray, shape (..., d, d), float64, or None
+        Covariance of each vector, mm^2: zero for exact data, None where it is not known.
+    valid : ndarray, shape (...), bool
+        Where the displacement was measured, not interpolated or filled in.
+    quality : ndarray, shape (...), or None
+        Quality of the match, in the units of the method that measured the field; NaN where there is none.
     """
 
-    points: FloatArray
+    support: FloatArray | Volume | Mesh
     vectors: FloatArray
-    covariance: FloatArray
+    covariance: FloatArray | None
     valid: BoolArray
+    quality: FloatArray | None = None
 
     @classmethod
     def from_arrays(
@@ -38,17 +45,17 @@ class DisplacementField:
         points: ArrayLike,
         vectors: ArrayLike,
         *,
-        sd_mm: ArrayLike = 0.0,
+        sd_mm: ArrayLike | None = None,
         covariance: ArrayLike | None = None,
         valid: ArrayLike | None = None,
     ) -> DisplacementField:
-        """Check the arrays and make a field of them.
+        """Return a field at points after checking the arrays.
 
         Parameters
         ----------
         points, vectors : array_like, shape (n, d)
             Positions and displacements, mm.
-        sd_mm : float or array_like, shape (d,) or (n, d)
+        sd_mm : float or array_like, shape (d,) or (n, d), optional
             Standard deviation of every component, mm, where no `covariance` is given.
         covariance : array_like, shape (n, d, d), optional
             Covariance of each vector, mm^2.
@@ -58,35 +65,159 @@ class DisplacementField:
         Raises
         ------
         InputError
-            Shapes that do not fit, a vector called valid that is not finite, or a covariance that is no covariance.
+            Shapes that do not fit, a valid vector that is not finite, or a covariance that is not positive semidefinite.
         """
         p, v = np.array(points, dtype=float), np.array(vectors, dtype=float)
         if p.ndim != 2 or p.shape != v.shape:
             raise InputError(f"points and vectors of a field must have one shape (n, d), not {p.shape} and {v.shape}")
         if not np.isfinite(p).all():
             raise InputError(f"point {int(np.flatnonzero(~np.isfinite(p).all(axis=1))[0])} of the field is not finite")
-        finite = np.isfinite(v).all(axis=1)
-        mask = finite if valid is None else np.array(valid, dtype=bool)
-        if mask.shape != (len(p),):
-            raise InputError(f"valid must have shape ({len(p)},), not {mask.shape}")
-        if (mask & ~finite).any():
-            bad = int(np.flatnonzero(mask & ~finite)[0])
-            raise InputError(f"vector {bad} of the field is {v[bad].tolist()}: mark points without data as not valid")
+        mask = _valid(v, valid)
         v[~mask] = np.nan
         return cls(p, v, _covariance(sd_mm, covariance, p.shape, mask), mask)
 
+    @classmethod
+    def on_grid(
+        cls,
+        grid: Volume,
+        vectors: ArrayLike,
+        *,
+        covariance: ArrayLike | None = None,
+        valid: ArrayLike | None = None,
+        quality: ArrayLike | None = None,
+    ) -> DisplacementField:
+        """Return a field at the voxels of a grid; the arrays are not copied, and the values of the volume are not kept.
+
+        Parameters
+        ----------
+        grid : Volume
+            Frame: shape, spacing, origin and direction of the voxels.
+        vectors : array_like, shape (nz, ny, nx, 3)
+            Displacement along x, y, z, mm; NaN where there is none.
+        covariance : array_like, shape (nz, ny, nx, 3, 3), optional
+            Covariance of each vector, mm^2.
+        valid : array_like, shape (nz, ny, nx), optional
+            Where the displacement was measured; by default where all components are finite.
+        quality : array_like, shape (nz, ny, nx), optional
+            Quality of the match.
+
+        Raises
+        ------
+        InputError
+            Shapes that do not fit the grid, or a valid vector that is not finite.
+        """
+        v = np.asarray(vectors, dtype=float)
+        require_shape("vectors", v, (*grid.shape, 3))
+        c = None if covariance is None else np.asarray(covariance, dtype=float)
+        if c is not None:
+            require_shape("covariance", c, (*grid.shape, 3, 3))
+        q = None if quality is None else np.asarray(quality, dtype=float)
+        if q is not None:
+            require_shape("quality", q, grid.shape)
+        return cls(grid.frame, v, c, _valid(v, valid), q)
+
+    @classmethod
+    def on_mesh(
+        cls,
+        mesh: Mesh,
+        vectors: ArrayLike,
+        *,
+        sd_mm: ArrayLike | None = None,
+        covariance: ArrayLike | None = None,
+        valid: ArrayLike | None = None,
+    ) -> DisplacementField:
+        """Return a field at the nodes of a mesh; arguments as in `from_arrays`, with one row for each node."""
+        v = np.array(vectors, dtype=float)
+        require_shape("vectors", v, mesh.points.shape)
+        mask = _valid(v, valid)
+        v[~mask] = np.nan
+        return cls(mesh, v, _covariance(sd_mm, covariance, v.shape, mask), mask)
+
     @property
-    def standard_deviation(self) -> FloatArray:
-        """Standard deviation of every component (n, d), mm."""
-        return np.asarray(np.sqrt(np.einsum("nii->ni", self.covariance)))
+    def points(self) -> FloatArray:
+        """Positions of all vectors (n, d), mm; computed anew for a grid, voxel by voxel with x fastest."""
+        if isinstance(self.support, Volume):
+            return self.support.positions().reshape(-1, 3)
+        return self.support.points if isinstance(self.support, Mesh) else self.support
+
+    @property
+    def grid(self) -> Volume:
+        """Frame of the voxels.
+
+        Raises
+        ------
+        InputError
+            The field does not lie on a grid.
+        """
+        if not isinstance(self.support, Volume):
+            raise InputError("the displacement field has no grid: its vectors lie at points; interpolate it to the voxels first")
+        return self.support
+
+    @property
+    def standard_deviation(self) -> FloatArray | None:
+        """Standard deviation of every component (..., d), mm; None where the covariance is not known."""
+        return None if self.covariance is None else np.asarray(np.sqrt(np.einsum("...ii->...i", self.covariance)))
+
+    @property
+    def largest_sd_mm(self) -> FloatArray | None:
+        """Standard deviation (...) along the least certain direction, mm; None where the covariance is not known."""
+        if self.covariance is None:
+            return None
+        known = np.isfinite(self.covariance).all(axis=(-2, -1))
+        out = np.full(known.shape, np.nan)
+        out[known] = np.sqrt(np.linalg.eigvalsh(self.covariance[known])[:, -1])
+        return out
+
+    def at_points(self, *, step: int = 1) -> DisplacementField:
+        """Return the field at listed points: the valid voxels of a grid, or all nodes of a mesh.
+
+        Parameters
+        ----------
+        step : int
+            On a grid, take every `step`-th voxel along each axis.
+
+        Raises
+        ------
+        InputError
+            A step below one, or another step than one for a field that is not on a grid.
+        """
+        if step < 1 or (step > 1 and not isinstance(self.support, Volume)):
+            raise InputError(f"step must be a whole number of voxels, 1 or more, and 1 for a field that is not on a grid; it is {step}")
+        if isinstance(self.support, Mesh):
+            return DisplacementField(self.support.points, self.vectors, self.covariance, self.valid, self.quality)
+        if not isinstance(self.support, Volume):
+            return self
+        some = np.zeros(self.valid.shape, dtype=bool)
+        some[::step, ::step, ::step] = True
+        some &= self.valid
+        points = self.support.to_physical(np.argwhere(some)[:, ::-1])
+        covariance = None if self.covariance is None else self.covariance[some]
+        quality = None if self.quality is None else self.quality[some]
+        return DisplacementField(points, self.vectors[some], covariance, np.ones(len(points), dtype=bool), quality)
 
 
-def _covariance(sd_mm: ArrayLike, covariance: ArrayLike | None, shape: tuple[int, ...], valid: BoolArray) -> FloatArray:
+def _valid(vectors: FloatArray, valid: ArrayLike | None) -> BoolArray:
+    """Return the mask of validity, which holds only finite vectors."""
+    finite = np.asarray(np.isfinite(vectors).all(axis=-1))
+    if valid is None:
+        return finite
+    mask = np.array(valid, dtype=bool)
+    require_shape("valid", mask, vectors.shape[:-1])
+    if (mask & ~finite).any():
+        bad = tuple(int(i) for i in np.argwhere(mask & ~finite)[0])
+        at = bad[0] if len(bad) == 1 else bad
+        raise InputError(f"vector {at} of the field is {vectors[bad].tolist()}: mark points without data as not valid")
+    return mask
+
+
+def _covariance(sd_mm: ArrayLike | None, covariance: ArrayLike | None, shape: tuple[int, ...], valid: BoolArray) -> FloatArray | None:
     n, d = shape
+    if covariance is None and sd_mm is None:
+        return None
     if covariance is None:
         sd = np.broadcast_to(np.asarray(sd_mm, dtype=float), shape)
         if not (sd >= 0.0).all():
-            raise InputError("standard deviations of a field must be numbers >= 0, mm")
+            raise InputError("sd_mm must hold standard deviations >= 0, mm")
         return np.asarray(np.einsum("ni,ij->nij", sd**2, np.eye(d)))
     c = np.array(covariance, dtype=float)
     if c.shape != (n, d, d):

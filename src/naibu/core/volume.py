@@ -1,4 +1,4 @@
-"""A scanned volume: voxels and where they lie in the scanner."""
+"""Image volume: intensities of voxels and their geometry in the frame of the scanner."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import AnyArray, FloatArray
 from naibu.core.errors import InputError
 
-NEARLY = 1e-4  # of a direction cosine, or of a voxel
+# difference of direction cosines, or of positions in voxels, at which grids count as one: files store rounded numbers
+NEARLY = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Volume:
-    """Voxels with their geometry, as SimpleITK gives it; the values are never rescaled.
+    """Image volume with its geometry, as SimpleITK defines it (LPS); intensities are never rescaled.
 
     Attributes
     ----------
     values : ndarray, shape (nz, ny, nx)
-        Grey values, in the type of the file.
+        Intensities, in the type of the file.
     spacing_mm : ndarray, shape (3,)
         Distance between the centres of voxels along x, y, z, mm.
     origin_mm : ndarray, shape (3,)
@@ -38,29 +39,41 @@ class Volume:
     def from_array(
         cls, values: ArrayLike, *, spacing_mm: ArrayLike, origin_mm: ArrayLike = (0.0, 0.0, 0.0), direction: ArrayLike | None = None
     ) -> Volume:
-        """Check the arrays and make a volume of them.
+        """Return a volume after checking the arrays.
+
+        Parameters
+        ----------
+        values : array_like, shape (nz, ny, nx)
+            Intensities, finite real numbers.
+        spacing_mm : array_like, shape (3,)
+            Distance between the centres of voxels along x, y, z, mm.
+        origin_mm : array_like, shape (3,)
+            Centre of the first voxel, mm.
+        direction : array_like, shape (3, 3), optional
+            Unit vectors along which x, y and z indices grow, as columns; by default the axes of space.
 
         Raises
         ------
         InputError
-            Values that are no three-dimensional array of real numbers, NaN, a spacing that is not positive, axes not orthonormal.
+            Values that are not a three-dimensional array of finite real numbers, a spacing that is not positive, or axes that are not
+            orthonormal.
         """
         v = np.asarray(values)
         if v.ndim != 3 or 0 in v.shape:
-            raise InputError(f"a volume has three axes z, y, x; the values have shape {v.shape}. Choose one time or one colour")
+            raise InputError(f"values must have three axes z, y, x, not shape {v.shape}; choose one time or one colour")
         if v.dtype.kind not in "biuf":
-            raise InputError(f"grey values must be real numbers, not {v.dtype}")
+            raise InputError(f"intensities must be real numbers, not {v.dtype}")
         if v.dtype.kind == "f" and not np.isfinite(v).all():
             bad = tuple(int(i) for i in np.argwhere(~np.isfinite(v))[0])
             raise InputError(f"voxel {bad} (z, y, x) is {v[bad]}; mask or repair it")
         spacing, origin = np.array(spacing_mm, dtype=float), np.array(origin_mm, dtype=float)
         axes = np.eye(3) if direction is None else np.array(direction, dtype=float).reshape(3, 3)
         if spacing.shape != (3,) or not (np.isfinite(spacing).all() and (spacing > 0.0).all()):
-            raise InputError(f"spacing must be three positive numbers (x, y, z), mm, not {spacing.tolist()}")
+            raise InputError(f"spacing_mm must be three positive numbers (x, y, z), mm, not {spacing.tolist()}")
         if origin.shape != (3,) or not np.isfinite(origin).all():
-            raise InputError(f"origin must be three numbers (x, y, z), mm, not {origin.tolist()}")
+            raise InputError(f"origin_mm must be three numbers (x, y, z), mm, not {origin.tolist()}")
         if np.abs(axes.T @ axes - np.eye(3)).max() > NEARLY:
-            raise InputError(f"the axes of the volume are not orthonormal: {axes.tolist()}; sheared slices must be resampled first")
+            raise InputError(f"direction is not orthonormal: {axes.tolist()}; resample sheared slices first")
         return cls(v, spacing, origin, axes)
 
     @property
@@ -68,6 +81,18 @@ class Volume:
         """Number of voxels along z, y, x."""
         nz, ny, nx = self.values.shape
         return int(nz), int(ny), int(nx)
+
+    @property
+    def frame(self) -> Volume:
+        """The same grid with values of zero that take no memory."""
+        return replace(self, values=np.broadcast_to(np.float32(0.0), self.values.shape))
+
+    def positions(self) -> FloatArray:
+        """Return the centres (nz, ny, nx, 3) of all voxels, mm."""
+        nz, ny, nx = self.shape
+        index = np.empty((nz, ny, nx, 3))
+        index[..., 0], index[..., 1], index[..., 2] = np.arange(nx), np.arange(ny)[:, None], np.arange(nz)[:, None, None]
+        return self.to_physical(index)
 
     def to_physical(self, index: ArrayLike) -> FloatArray:
         """Return positions (..., 3), mm, of continuous indices (..., 3) in the order x, y, z."""
@@ -78,7 +103,7 @@ class Volume:
         return np.asarray(((np.asarray(points_mm, dtype=float) - self.origin_mm) @ self.direction) / self.spacing_mm)
 
     def same_grid(self, other: Volume) -> bool:
-        """Whether the voxels of another volume lie at the same places."""
+        """Whether the voxels of another volume lie at the same positions."""
         return (
             self.shape == other.shape
             and bool(np.abs(self.spacing_mm - other.spacing_mm).max() < NEARLY * self.spacing_mm.min())

@@ -17,14 +17,13 @@ from naibu.core.volume import Volume
 from naibu.imaging.dense_matching.block_matching import block_matching
 from naibu.imaging.dense_matching.hybrid import hybrid_flow
 from naibu.imaging.dense_matching.optical_flow import horn_schunck, lucas_kanade
-from naibu.imaging.displacement.dense import DenseDisplacement
 from naibu.imaging.displacement.strain import displacement_gradient
 from naibu.imaging.feature_matching.correlation_matching import candidate_matches
 from naibu.imaging.feature_matching.harris import interest_points
 from naibu.imaging.feature_matching.relaxation_labelling import PotentialMatches, relaxed
 from naibu.imaging.feature_matching.scattered_interpolation import dense_from_sparse, sparse_displacement
 from naibu.imaging.preprocessing.object_mask import object_mask
-from naibu.imaging.preprocessing.resampling import positions, require_mask, resampled_to_grid
+from naibu.imaging.preprocessing.resampling import require_mask, resampled_to_grid
 from naibu.imaging.preprocessing.rigid_registration import rigid_from_points, total_displacement
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
 
@@ -45,14 +44,13 @@ class Sensed:
     ----------
     method : str
         One of `METHODS`.
-    displacement : DenseDisplacement
-        The whole motion, rigid part included, at the voxels of the volume before; NaN outside the mask.
+    displacement : DisplacementField
+        The whole motion, rigid part included, at the voxels of the reference; NaN outside the mask. Its covariance is None where the
+        method states none.
     mask : ndarray, shape (nz, ny, nx), bool
         The object before.
     gradient : ndarray, shape (nz, ny, nx, 3, 3)
         ``du_a / dx_b``.
-    covariance : ndarray, shape (nz, ny, nx, 3, 3), optional
-        Of every vector, mm^2; None where the method states none.
     rigid : RigidTransform, optional
         What was taken out first.
     matches : PotentialMatches, optional
@@ -62,31 +60,12 @@ class Sensed:
     """
 
     method: Method
-    displacement: DenseDisplacement
+    displacement: DisplacementField
     mask: BoolArray
     gradient: FloatArray
-    covariance: FloatArray | None = None
     rigid: RigidTransform | None = None
     matches: PotentialMatches | None = None
     facts: dict[str, float | int | str] = field(default_factory=dict)
-
-    @property
-    def sd_mm(self) -> FloatArray | None:
-        """Standard deviation (nz, ny, nx) along the least certain axis, mm."""
-        if self.covariance is None:
-            return None
-        known = np.isfinite(self.covariance).all(axis=(-2, -1))
-        out = np.full(known.shape, np.nan)
-        out[known] = np.sqrt(np.linalg.eigvalsh(self.covariance[known])[:, -1])
-        return out
-
-    def field(self, grid: Volume, *, step: int = 1) -> DisplacementField:
-        """Return the measured vectors at every `step`-th voxel along each axis, with their covariance where there is one."""
-        some = np.zeros(self.mask.shape, dtype=bool)
-        some[::step, ::step, ::step] = True
-        some &= self.displacement.valid & self.mask
-        covariance = None if self.covariance is None else self.covariance[some]
-        return DisplacementField.from_arrays(positions(grid)[some], self.displacement.vectors[some], covariance=covariance)
 
 
 def measure_displacement(
@@ -133,8 +112,8 @@ def measure_displacement(
     found = _still(reference) if method == "rigid" else _flow(method, reference, back, inside)
     vectors = total_displacement(found.vectors, rigid, reference)
     vectors[~inside] = np.nan
-    dense = DenseDisplacement(vectors, found.valid & inside, found.quality)
-    return Sensed(method, dense, inside, displacement_gradient(vectors, reference), rigid=rigid, facts={"matched points": len(matches)})
+    whole = DisplacementField.on_grid(reference, vectors, valid=found.valid & inside, quality=found.quality)
+    return Sensed(method, whole, inside, displacement_gradient(vectors, reference), rigid=rigid, facts={"matched points": len(matches)})
 
 
 def _grid(volume: Volume) -> str:
@@ -174,11 +153,11 @@ def _shared_motion(found: PotentialMatches) -> RigidTransform:
     return motion
 
 
-def _still(reference: Volume) -> DenseDisplacement:
-    return DenseDisplacement(np.zeros((*reference.shape, 3)), np.ones(reference.shape, dtype=bool), np.zeros(reference.shape))
+def _still(reference: Volume) -> DisplacementField:
+    return DisplacementField.on_grid(reference, np.zeros((*reference.shape, 3)))
 
 
-def _flow(method: Method, a: Volume, b: Volume, mask: BoolArray) -> DenseDisplacement:
+def _flow(method: Method, a: Volume, b: Volume, mask: BoolArray) -> DisplacementField:
     flat = np.array(a.shape[::-1]) > 1
     half = np.where(flat, np.clip(np.round(0.5 * BLOCK_MM / a.spacing_mm), 1, 4), 0).astype(int)
     block, search = 2 * half + 1, np.where(flat, np.ceil(REACH_MM / a.spacing_mm), 0).astype(int)
@@ -201,7 +180,7 @@ def _from_features(reference: Volume, matches: PotentialMatches, rigid: RigidTra
     facts: dict[str, float | int | str] = {"matched points": len(matches), "iterations": len(matches.energies), "stopped": matches.stop}
     return Sensed(
         "features",
-        DenseDisplacement(vectors, dense.valid & mask, dense.quality),
+        DisplacementField.on_grid(reference, vectors, valid=dense.valid & mask, quality=dense.quality),
         mask,
         displacement_gradient(vectors, reference),
         rigid=rigid,
@@ -221,8 +200,8 @@ def _correlated(reference: Volume, deformed: Volume, inside: BoolArray, given: B
     }
     valid = found.valid & inside
     outside = ~valid
-    vectors, gradient, covariance = found.vectors.copy(), found.gradient(), found.covariance().astype(np.float64)
+    vectors, gradient, covariance = found.displacement.vectors.copy(), found.gradient(), found.covariance().astype(np.float64)
     for values in (vectors, gradient, covariance):
         values[outside] = np.nan
-    dense = DenseDisplacement(vectors, valid, np.where(valid, 1.0, np.nan))
-    return Sensed("default", dense, inside, gradient, covariance=covariance, facts=facts)
+    field = DisplacementField.on_grid(reference, vectors, covariance=covariance, valid=valid)
+    return Sensed("default", field, inside, gradient, facts=facts)

@@ -20,12 +20,12 @@ from numpy.typing import ArrayLike
 
 from naibu.core.arrays import AnyArray, BoolArray, IntArray
 from naibu.core.chunked_volume import ChunkedVolume
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError, MissingDependencyError
 from naibu.core.optional_packages import optional_package
 from naibu.core.volume import Volume
 from naibu.imaging.dense_matching.block_matching import Measure, Search, grey_range, matched
 from naibu.imaging.dense_matching.optical_flow import horn_schunck
-from naibu.imaging.displacement.dense import DenseDisplacement
 from naibu.imaging.feature_matching.harris import Response, default_sigmas, known_grey, response_of
 from naibu.imaging.preprocessing.filters import REACH
 from naibu.imaging.preprocessing.volume_pair import shifted_grey, to_millimetres
@@ -52,18 +52,20 @@ class ChunkedDisplacement:
     packed: Any
     grid: Volume
 
-    def block(self, box: Box) -> DenseDisplacement:
+    def block(self, box: Box) -> DisplacementField:
         """Compute the voxels of a box of slices along z, y, x."""
-        return unpacked(np.asarray(self.packed[box].compute(**_scheduler())))
+        packed = np.asarray(self.packed[box].compute(**_scheduler()))
+        low, high = np.array([s.indices(n)[:2] for s, n in zip(box[::-1], self.grid.shape[::-1], strict=True)]).T
+        return unpacked(packed, self.grid.cropped(low, high))
 
-    def computed(self) -> DenseDisplacement:
+    def computed(self) -> DisplacementField:
         """Compute all voxels, into memory."""
         return self.block((slice(None), slice(None), slice(None)))
 
 
-def unpacked(packed: AnyArray) -> DenseDisplacement:
-    """Return displacement, validity and quality of packed ones (nz, ny, nx, 5)."""
-    return DenseDisplacement(packed[..., :3], packed[..., 3] > 0.0, packed[..., 4])
+def unpacked(packed: AnyArray, grid: Volume) -> DisplacementField:
+    """Return the displacement field of packed arrays (nz, ny, nx, 5) on the grid of their voxels."""
+    return DisplacementField.on_grid(grid, packed[..., :3], valid=packed[..., 3] > 0.0, quality=packed[..., 4])
 
 
 def map_overlapping(
@@ -399,8 +401,9 @@ def _flow(a: AnyArray, b: AnyArray, *, spacing_mm: AnyArray, direction: AnyArray
     return _packed(found.vectors, found.valid, found.quality)
 
 
-def _packed(vectors: AnyArray, valid: BoolArray, quality: AnyArray) -> AnyArray:
-    return np.concatenate([vectors, valid[..., None].astype(float), quality[..., None]], axis=-1)
+def _packed(vectors: AnyArray, valid: BoolArray, quality: AnyArray | None) -> AnyArray:
+    last = np.full(valid.shape, np.nan) if quality is None else quality
+    return np.concatenate([vectors, valid[..., None].astype(float), last[..., None]], axis=-1)
 
 
 def _chunks_divide(array: Any, target: Any) -> bool:

@@ -15,7 +15,6 @@ import numpy as np
 
 from naibu._version import __version__
 from naibu.core.arrays import BoolArray, FloatArray
-from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.markers import Markers
 from naibu.core.mesh import Mesh
@@ -188,7 +187,7 @@ def sense_pair(
 def figures(pair: Pair, sensed: Sensed) -> dict[str, float | int | str | None]:
     """Return what can be said of a displacement: size, what it leaves unexplained, folding, and errors where the truth is known."""
     u, inside = sensed.displacement.vectors, sensed.mask & sensed.displacement.valid
-    size = np.linalg.norm(u[inside], axis=1)
+    size, sd = np.linalg.norm(u[inside], axis=1), sensed.displacement.largest_sd_mm
     out: dict[str, float | int | str | None] = {
         "measured share": float(inside.sum() / sensed.mask.sum()),
         "displacement, median, mm": float(np.median(size)),
@@ -196,7 +195,7 @@ def figures(pair: Pair, sensed: Sensed) -> dict[str, float | int | str | None]:
         "grey RMS before": intensity_rms(pair.before, pair.after, np.zeros_like(u), region=sensed.mask, frame="initial"),
         "grey RMS after": intensity_rms(pair.before, pair.after, u, region=sensed.mask, frame="initial"),
         "folded share": folded_share(u, pair.before, sensed.mask),
-        "stated sd, median, mm": None if sensed.sd_mm is None else float(np.nanmedian(sensed.sd_mm[inside])),
+        "stated sd, median, mm": None if sd is None else float(np.nanmedian(sd[inside])),
     }
     if pair.truth is not None:
         e = end_point_error(u, pair.truth, sensed.mask)
@@ -213,12 +212,12 @@ def _written(pair: Pair, run: SenseRun, folder: Path) -> list[Path]:
         write_atomically(folder / "report.html", slices_html(slice_view(pair, run))),
         write_displacement(folder / "displacement.mha", sensed.displacement.vectors, grid),
     ]
-    sd = sensed.sd_mm
+    sd = sensed.displacement.largest_sd_mm
     if sd is not None:
         files.append(write_volume(folder / "standard_deviation.mha", grid.with_values(np.nan_to_num(sd).astype(np.float32))))
     if min(grid.shape) > 1:  # between the voxels of a single slice there are no cells
         files.append(_vtu(folder / "displacement.vtu", grid, sensed))
-    files.append(_npz(folder / "field.npz", sensed, grid))
+    files.append(_npz(folder / "field.npz", sensed))
     files += [
         write_markers(folder / f"{name}.csv", markers) for name, markers in zip(MARKER_TABLES, _as_markers(sensed, grid), strict=True)
     ]
@@ -264,28 +263,30 @@ def _vtu(path: Path, grid: Volume, sensed: Sensed) -> Path:
         "displacement_mm": sensed.displacement.vectors[some].reshape(-1, 3)[used],
         "green_lagrange_strain": strain,
     }
-    if sensed.covariance is not None:
-        data["displacement_covariance_mm2"] = sensed.covariance[some].reshape(-1, 3, 3)[used]
+    if (covariance := sensed.displacement.covariance) is not None:
+        data["displacement_covariance_mm2"] = covariance[some].reshape(-1, 3, 3)[used]
     write_vtu(path, mesh, data)
     return path
 
 
-def _npz(path: Path, sensed: Sensed, grid: Volume) -> Path:
+def _npz(path: Path, sensed: Sensed) -> Path:
     """The field as the identification takes it: `naibu.core.displacement_field.DisplacementField.from_arrays` on its arrays."""
     step = 1
     while (sensed.mask & sensed.displacement.valid)[::step, ::step, ::step].sum() > FIELD_POINTS:
         step += 1
-    field: DisplacementField = sensed.field(grid, step=step)
+    field = sensed.displacement.at_points(step=step)
     stream = io.BytesIO()
-    arrays = {"points": field.points, "vectors": field.vectors, "covariance": field.covariance, "valid": field.valid}
-    np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+    arrays: dict[str, Any] = {"points": field.points, "vectors": field.vectors, "valid": field.valid}
+    if field.covariance is not None:
+        arrays["covariance"] = field.covariance
+    np.savez_compressed(stream, **arrays)
     return write_atomically(path, stream.getvalue())
 
 
 def _as_markers(sensed: Sensed, grid: Volume) -> tuple[Markers, Markers]:
     """Some 250 places on a lattice in the object, before and after, as markers for `naibu import` and `naibu identify`."""
     good = sensed.mask & sensed.displacement.valid
-    if (sd := sensed.sd_mm) is not None:
+    if (sd := sensed.displacement.largest_sd_mm) is not None:
         good &= np.nan_to_num(sd, nan=np.inf) <= LEAST_CERTAIN * np.nanmedian(sd[good])
     apart = (good.sum() * float(np.prod(grid.spacing_mm)) / MARKERS) ** (1.0 / 3.0)
     every = np.maximum(1, np.round(apart / grid.spacing_mm)).astype(int)[::-1]
@@ -314,7 +315,7 @@ def slice_view(pair: Pair, run: SenseRun) -> SliceView:
         Overlay("smallest principal Green-Lagrange strain", principal[..., 0][box]),
         Overlay("volume ratio J", ratio[box], middle=1.0),
     ]
-    if (sd := sensed.sd_mm) is not None:
+    if (sd := sensed.displacement.largest_sd_mm) is not None:
         overlays.append(Overlay("standard deviation of the displacement, mm", np.where(sensed.mask, sd, np.nan)[box]))
     images = [("before", pair.before.values), ("after", pair.after.values), ("after, carried back", back)]
     return SliceView(

@@ -107,6 +107,6 @@ def test_doubled_points_and_points_without_data_do_no_harm() -> None:
     vectors[7] = np.nan
     found = dense_from_sparse(DisplacementField.from_arrays(points, vectors), frame)
     np.testing.assert_allclose(found.vectors[found.valid], affine(positions(frame))[found.valid], atol=1e-9)
-    some = found.field(frame, step=3, sd_mm=0.2)
+    some = found.at_points(step=3)
     assert len(some.points) == found.valid[::3, ::3, ::3].sum()
     np.testing.assert_allclose(some.vectors, affine(some.points), atol=1e-9)

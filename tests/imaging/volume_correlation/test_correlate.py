@@ -15,7 +15,7 @@ from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.object_mask import object_mask
 from naibu.imaging.preprocessing.resampling import positions
 from naibu.imaging.volume_correlation.correlate import CorrelationSettings, correlate_volumes
-from naibu.imaging.volume_correlation.result import CorrelatedDisplacement
+from naibu.imaging.volume_correlation.result import CorrelationResult
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid
 
 Array = np.ndarray
@@ -63,10 +63,10 @@ def affine(matrix: Array, shift: Array) -> tuple[Map, Map]:
     return lambda x: (x - MIDDLE) @ (matrix - np.eye(3)).T + shift, lambda x: (x - MIDDLE - shift) @ inverse.T + MIDDLE
 
 
-def errors(found: CorrelatedDisplacement, displacement: Map, least_depth: float = 0.0) -> Array:
+def errors(found: CorrelationResult, displacement: Map, least_depth: float = 0.0) -> Array:
     x = positions(found.volume)
     inside = found.valid & (depth(x) > least_depth)
-    return found.vectors[inside] - displacement(x[inside])
+    return found.displacement.vectors[inside] - displacement(x[inside])
 
 
 def waves() -> tuple[Map, Map]:
@@ -86,7 +86,7 @@ def waves() -> tuple[Map, Map]:
 
 
 @cache
-def waved() -> tuple[Volume, Volume, CorrelatedDisplacement]:
+def waved() -> tuple[Volume, Volume, CorrelationResult]:
     before, after = scans(frame(), waves()[1])
     return before, after, correlate_volumes(before, after)
 
@@ -154,7 +154,7 @@ def test_gain_and_offset_of_a_scan_do_not_matter() -> None:
     before, after, found = waved()
     bright = correlate_volumes(before, after.with_values(1.4 * after.values + 60.0))
     both = found.valid & bright.valid
-    assert np.percentile(np.linalg.norm(found.vectors - bright.vectors, axis=-1)[both], 99) < 0.05
+    assert np.percentile(np.linalg.norm(found.displacement.vectors - bright.displacement.vectors, axis=-1)[both], 99) < 0.05
     assert np.nanmedian(bright.gain) == pytest.approx(np.nanmedian(found.gain) / 1.4, rel=0.02)
 
 
@@ -166,7 +166,7 @@ def test_vectors_turn_with_the_axes_of_the_scanner() -> None:
     # the same grey values give the same numbers, to the last bit
     assert np.array_equal(other.coefficients, found.coefficients)
     at = np.argwhere(found.valid)[::97, ::-1]
-    assert np.allclose(other.vectors[other.valid], found.vectors[found.valid] @ turn.T, atol=1e-9)
+    assert np.allclose(other.displacement.vectors[other.valid], found.displacement.vectors[found.valid] @ turn.T, atol=1e-9)
     there = turned[0].to_physical(at)
     assert np.allclose(other.displacement_at(there), found.displacement_at(before.to_physical(at)) @ turn.T, atol=1e-6)
     expected = turn @ found.covariance_at(before.to_physical(at)) @ turn.T
@@ -187,18 +187,18 @@ def test_the_gradient_is_that_of_the_splines() -> None:
     x = found.volume.to_physical(at[:, ::-1])
     numeric = np.stack([(found.displacement_at(x + 0.01 * e) - found.displacement_at(x - 0.01 * e)) / 0.02 for e in np.eye(3)], axis=-1)
     assert np.allclose(found.gradient()[tuple(at.T)], numeric, atol=1e-6)
-    assert np.allclose(found.displacement_at(x), found.vectors[tuple(at.T)], atol=1e-9)
+    assert np.allclose(found.displacement_at(x), found.displacement.vectors[tuple(at.T)], atol=1e-9)
 
 
 def test_a_field_is_what_identification_takes() -> None:
     _, _, found = waved()
-    field = found.field()
+    field = found.at_points()
     assert field.valid.all() and len(field.points) < found.valid.sum() / 20
     assert np.allclose(field.vectors, found.displacement_at(field.points), atol=1e-9)
     assert np.linalg.eigvalsh(field.covariance).min() > 0.0
-    assert len(found.field(step=1).points) == found.valid.sum()
+    assert len(found.at_points(step=1).points) == found.valid.sum()
     with pytest.raises(InputError, match="1 or more"):
-        found.field(step=0)
+        found.at_points(step=0)
 
 
 def test_a_stiff_body_moves_as_one() -> None:
@@ -221,7 +221,7 @@ def test_a_stiff_body_moves_as_one() -> None:
     assert np.array_equal(found.bodies > 0, ball)
     f = np.eye(3) + found.gradient()[ball]
     assert np.allclose(f @ np.swapaxes(f, 1, 2), np.eye(3), atol=1e-9)
-    assert np.linalg.norm(found.vectors[ball] - np.array([0.6, -0.4, 0.3]), axis=1).max() < 0.1
+    assert np.linalg.norm(found.displacement.vectors[ball] - np.array([0.6, -0.4, 0.3]), axis=1).max() < 0.1
     assert np.linalg.norm(errors(found, displacement), axis=1).mean() < 0.15
 
 

@@ -67,12 +67,14 @@ def nodal_field(field: DisplacementField, mesh: Mesh) -> NodalField:
     InputError
         Too few valid points for simplices, or points on one plane.
     """
+    field = field.at_points()
     weights = _weights_of_same_points(field, mesh.points)
     if weights is None:
         weights = _interpolation_weights(field, mesh.points)
     d = mesh.dimension
-    vectors, covariance = np.where(field.valid[:, None], field.vectors, 0.0), np.where(field.valid[:, None, None], field.covariance, 0.0)
+    vectors = np.where(field.valid[:, None], field.vectors, 0.0)
     k = len(field.points)
+    covariance = np.zeros((k, d, d)) if field.covariance is None else np.where(field.valid[:, None, None], field.covariance, 0.0)
     of_points = sp.bsr_matrix((covariance, np.arange(k), np.arange(k + 1)), shape=(k * d, k * d))
     spread = sp.kron(weights, sp.identity(d), format="csr")
     return NodalField(np.asarray(weights @ vectors), weights, sp.csr_matrix(spread @ of_points @ spread.T))

@@ -91,7 +91,8 @@ def expected_accuracy(
     if young.shape != (zones.count,) or poisson.shape != (zones.count,):
         raise InputError(f"give Young's modulus and Poisson's ratio of the {zones.count} zones, not {young.shape} and {poisson.shape}")
     for trial in trials:
-        if not (trial.field.standard_deviation[trial.field.valid] > 0.0).all():
+        sd = trial.field.standard_deviation
+        if sd is None or not (sd[trial.field.valid] > 0.0).all():
             raise InputError(f"trial {trial.name!r}: a planned measurement needs the standard deviation it will have, sd_mm > 0")
     lame, shear = np.array([lame_parameters(e, nu) for e, nu in zip(young, poisson, strict=True)]).T
     model = FieldModel(mesh, trials, zones, law)

@@ -190,7 +190,8 @@ class Observed:
 
 def _whitening(field: DisplacementField, name: str) -> tuple[FloatArray, float, bool]:
     """Return the inverse square roots (k, d, d) of the covariances of the valid points, the RMS noise, mm, and whether it is nominal."""
-    covariance = field.covariance[field.valid]
+    k, d = field.vectors[field.valid].shape
+    covariance = np.zeros((k, d, d)) if field.covariance is None else field.covariance[field.valid]
     largest = float(np.abs(field.vectors[field.valid]).max())
     if not largest > 0.0:
         raise InputError(f"trial {name!r}: nothing moves; a field without displacement tells nothing of moduli")

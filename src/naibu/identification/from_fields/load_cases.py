@@ -26,7 +26,7 @@ class FieldTrial:
     name : str
         For messages.
     field : DisplacementField
-        Measured displacement, at any points inside the body.
+        Measured displacement, at any points inside the body; the voxels of a grid become a list of points.
     loaded : ndarray, shape (n, d), bool
         Components of the model's nodes at which forces act that nobody measured - floor, plates, clamps: balance says nothing there.
     external_force : ndarray, shape (n, d)
@@ -49,7 +49,7 @@ class FieldTrial:
         InputError
             Shapes that do not fit the mesh, a force that is not finite, or a field without a valid point.
         """
-        shape = mesh.points.shape
+        field, shape = field.at_points(), mesh.points.shape
         mask = np.asarray(loaded, dtype=bool)
         mask = np.repeat(mask[:, None], shape[1], axis=1) if mask.ndim == 1 else mask.copy()
         force = np.zeros(shape) if external_force is None else np.array(external_force, dtype=float)

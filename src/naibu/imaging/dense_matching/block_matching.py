@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray, Int32Array, IntArray
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.imaging.dense_matching._block_kernels import NCC, SAD, SSD, between_voxels, full_search
-from naibu.imaging.displacement.dense import DenseDisplacement
 from naibu.imaging.preprocessing.resampling import require_mask
 from naibu.imaging.preprocessing.volume_pair import grey_pair, to_millimetres
 
@@ -34,7 +34,7 @@ def block_matching(
     least_range: float = 0.0,
     unmeasured: Literal["nan", "zero"] = "nan",
     mask: ArrayLike | None = None,
-) -> DenseDisplacement:
+) -> DisplacementField:
     """Return the displacement of every voxel whose surroundings look most like its own (spec S7).
 
     Parameters
@@ -60,7 +60,7 @@ def block_matching(
 
     Returns
     -------
-    DenseDisplacement
+    DisplacementField
         Its quality is the mean absolute or squared difference, or the correlation. Voxels whose block leaves the volume are not measured.
 
     Raises
@@ -85,7 +85,7 @@ def block_matching(
     vectors, valid = to_millimetres(move, reference), np.isfinite(move[0])
     if unmeasured == "zero":
         vectors[~valid] = 0.0
-    return DenseDisplacement(vectors, valid, -cost if measure == "ncc" else cost)
+    return DisplacementField.on_grid(reference, vectors, valid=valid, quality=-cost if measure == "ncc" else cost)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.volume import Volume
 from naibu.imaging.dense_matching.block_matching import Measure, block_matching
 from naibu.imaging.dense_matching.optical_flow import horn_schunck
-from naibu.imaging.displacement.dense import DenseDisplacement
 from naibu.imaging.preprocessing.resampling import warped
 
 
@@ -27,7 +27,7 @@ def hybrid_flow(
     warps: int = 5,
     levels: int | None = None,
     mask: ArrayLike | None = None,
-) -> DenseDisplacement:
+) -> DisplacementField:
     """Return the displacement by block matching where the grey range of a block exceeds a limit, by Horn and Schunck elsewhere (spec S7).
 
     Parameters
@@ -45,7 +45,7 @@ def hybrid_flow(
 
     Returns
     -------
-    DenseDisplacement
+    DisplacementField
         Its quality is the grey difference that is left.
 
     Raises
@@ -68,4 +68,4 @@ def hybrid_flow(
     )
     vectors = np.where(blocks.valid[..., None], blocks.vectors, flow.vectors)
     left = np.abs(warped(deformed, vectors, reference) - reference.values)
-    return DenseDisplacement(vectors, blocks.valid | flow.valid, left)
+    return DisplacementField.on_grid(reference, vectors, valid=blocks.valid | flow.valid, quality=left)

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from naibu.core.arrays import BoolArray, Float32Array, IntArray
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.imaging.dense_matching._optical_flow_kernels import horn_schunck_step, linearize, lucas_kanade_step
-from naibu.imaging.displacement.dense import DenseDisplacement
 from naibu.imaging.preprocessing._filter_kernels import median, products
 from naibu.imaging.preprocessing._interpolation_kernels import warp
 from naibu.imaging.preprocessing.filters import box_mean
@@ -43,7 +43,7 @@ def horn_schunck(
     accelerated: bool = True,
     mask: ArrayLike | None = None,
     start: ArrayLike | None = None,
-) -> DenseDisplacement:
+) -> DisplacementField:
     """Return the smooth displacement that explains the change of grey values best (spec S7, equations 3.46-3.57).
 
     Parameters
@@ -73,7 +73,7 @@ def horn_schunck(
 
     Returns
     -------
-    DenseDisplacement
+    DisplacementField
         Valid where the displaced voxel lies inside the deformed volume, and in the mask. Its quality is the grey difference that is left.
 
     Raises
@@ -125,7 +125,7 @@ def lucas_kanade(
     median_filter: bool = True,
     mask: ArrayLike | None = None,
     start: ArrayLike | None = None,
-) -> DenseDisplacement:
+) -> DisplacementField:
     """Return the displacement that explains the change of grey values in a window about every voxel best (spec S7, 3.58-3.60).
 
     Parameters
@@ -154,7 +154,7 @@ def lucas_kanade(
 
     Returns
     -------
-    DenseDisplacement
+    DisplacementField
         Its quality is the least eigenvalue, (grey/mm)^2.
 
     Raises
@@ -188,7 +188,7 @@ def lucas_kanade(
     found = _result(u, reference, a, b, wanted)
     # a single direction has no eigenvalue but that of rounding
     fixed = eigenvalue > max(least_eigenvalue, 1e-6 * float(eigenvalue.max()))
-    return DenseDisplacement(found.vectors, found.valid & fixed, eigenvalue.astype(float))
+    return DisplacementField.on_grid(reference, found.vectors, valid=found.valid & fixed, quality=eigenvalue)
 
 
 @contextmanager
@@ -259,11 +259,12 @@ def _start(start: ArrayLike | None, reference: Volume, grids: list[Level]) -> Fl
     return coarsened(along.astype(np.float32), grids)
 
 
-def _result(u: Float32Array, reference: Volume, a: Float32Array, b: Float32Array, wanted: BoolArray) -> DenseDisplacement:
+def _result(u: Float32Array, reference: Volume, a: Float32Array, b: Float32Array, wanted: BoolArray) -> DisplacementField:
     voxels = u / reference.spacing_mm.astype(np.float32)[:, None, None, None]
     warped = np.empty_like(a)
     warp(b, voxels, warped)
-    return DenseDisplacement(to_millimetres(voxels, reference), np.isfinite(warped) & wanted, np.abs(warped - a).astype(float))
+    valid, residual = np.isfinite(warped) & wanted, np.abs(warped - a)
+    return DisplacementField.on_grid(reference, to_millimetres(voxels, reference), valid=valid, quality=residual)
 
 
 def _wanted(mask: ArrayLike | None, reference: Volume) -> BoolArray:

@@ -14,7 +14,6 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.rigid_transform import RigidTransform
 from naibu.core.volume import Volume
-from naibu.imaging.displacement.dense import DenseDisplacement
 from naibu.imaging.feature_matching._delaunay_kernels import fill_simplices
 from naibu.imaging.feature_matching.relaxation_labelling import PotentialMatches
 from naibu.imaging.preprocessing.resampling import positions
@@ -101,7 +100,7 @@ def triangulated(points_mm: ArrayLike, grid: Volume) -> Triangulation:
     return Triangulation(p, np.asarray(cells, dtype=np.int64))
 
 
-def dense_from_sparse(field: DisplacementField, grid: Volume, *, outside: Outside = "nan") -> DenseDisplacement:
+def dense_from_sparse(field: DisplacementField, grid: Volume, *, outside: Outside = "nan") -> DisplacementField:
     """Return the displacement at every voxel, linear in the Delaunay simplices of the points of a field (spec S6, 1.11, 1.12, 1.27).
 
     Parameters
@@ -116,7 +115,7 @@ def dense_from_sparse(field: DisplacementField, grid: Volume, *, outside: Outsid
 
     Returns
     -------
-    DenseDisplacement
+    DisplacementField
         Its quality is 1 inside the hull.
 
     Raises
@@ -144,7 +143,7 @@ def dense_from_sparse(field: DisplacementField, grid: Volume, *, outside: Outsid
     if outside != "nan":
         places = positions(grid)[~inside]
         vectors[~inside] = u[cKDTree(p).query(places)[1]] if outside == "nearest" else _affine(p, u, places)
-    return DenseDisplacement(vectors, inside, np.where(inside, 1.0, np.nan))
+    return DisplacementField.on_grid(grid, vectors, valid=inside, quality=np.where(inside, 1.0, np.nan))
 
 
 def _one_a_place(points: FloatArray, vectors: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -223,10 +223,7 @@ def warped(
 
 def positions(grid: Volume) -> FloatArray:
     """Return the centres (nz, ny, nx, 3) of all voxels, mm."""
-    nz, ny, nx = grid.shape
-    index = np.empty((nz, ny, nx, 3))
-    index[..., 0], index[..., 1], index[..., 2] = np.arange(nx), np.arange(ny)[:, None], np.arange(nz)[:, None, None]
-    return grid.to_physical(index)
+    return grid.positions()
 
 
 def masked(volume: Volume, mask: ArrayLike, fill: float = 0.0) -> Volume:

@@ -29,7 +29,7 @@ from naibu.imaging.volume_correlation.gauss_newton import Comparison, Correlatio
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.normal_equations import SplineSystem
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise
-from naibu.imaging.volume_correlation.result import CorrelatedDisplacement, collected
+from naibu.imaging.volume_correlation.result import CorrelationResult, collected
 from naibu.imaging.volume_correlation.rigid_inclusions import StiffBody, enclosed_bodies, rigid_among
 from naibu.imaging.volume_correlation.rigid_initialization import RigidStart, correlated_shift
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid
@@ -111,7 +111,7 @@ def correlate_volumes(
     stiff_mask: ArrayLike | None = None,
     settings: CorrelationSettings = DEFAULT,
     progress: Progress | None = None,
-) -> CorrelatedDisplacement:
+) -> CorrelationResult:
     """Return the displacement of an object between two scans, with its covariance and gradient.
 
     Parameters
@@ -129,7 +129,7 @@ def correlate_volumes(
 
     Returns
     -------
-    CorrelatedDisplacement
+    CorrelationResult
         Valid in the mask, where it lies in the deformed scan after its motion.
 
     Raises
@@ -271,7 +271,7 @@ class _Work:
             if self.swelling > 0.5 * before:
                 break
 
-    def result(self) -> CorrelatedDisplacement:
+    def result(self) -> CorrelationResult:
         """Draw the covariance and put everything together."""
         fit, system = self.fit, self.fit.system
         volume = self.swelling * system.watched

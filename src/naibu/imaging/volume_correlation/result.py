@@ -29,17 +29,14 @@ LEAST_SHARE = 0.003  # the data of so little are not asked: seven cells is as fa
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CorrelatedDisplacement:
-    """Displacement between two scans by volume correlation.
+class CorrelationResult:
+    """Displacement field between two volumes by digital volume correlation, with its splines, covariance and intensity model.
 
     Attributes
     ----------
-    vectors : ndarray, shape (nz, ny, nx, 3)
-        Displacement along x, y, z, mm: the material at x is found at x + u(x); NaN where it is not valid.
-    valid : ndarray, shape (nz, ny, nx), bool
-        The object, where it lies in the deformed scan after its motion.
-    volume : Volume
-        Geometry of the reference.
+    displacement : DisplacementField
+        At the voxels of the reference; valid in the object, where it lies in the deformed volume after its motion, NaN elsewhere. Its
+        covariance is not stored for all voxels: see `covariance`, `covariance_at` and `at_points`.
     grid : SplineGrid
         Where the coefficients stand, along the axes of the volume.
     coefficients : ndarray, shape (NZ, NY, NX, 3)
@@ -63,9 +60,7 @@ class CorrelatedDisplacement:
         How the iterations ended, and where they did not.
     """
 
-    vectors: FloatArray
-    valid: BoolArray
-    volume: Volume
+    displacement: DisplacementField
     grid: SplineGrid
     coefficients: FloatArray
     cell_covariance: FloatArray
@@ -78,6 +73,16 @@ class CorrelatedDisplacement:
     bodies: Int32Array
     motions: tuple[BodyMotion, ...]
     status: str
+
+    @property
+    def volume(self) -> Volume:
+        """Frame of the voxels of the reference."""
+        return self.displacement.grid
+
+    @property
+    def valid(self) -> BoolArray:
+        """Where the displacement was measured (nz, ny, nx)."""
+        return self.displacement.valid
 
     @property
     def unconverged_mm(self) -> FloatArray:
@@ -123,7 +128,7 @@ class CorrelatedDisplacement:
         out[self.valid] = self._covariance(np.argwhere(self.valid)[:, ::-1] * self.volume.spacing_mm)
         return out
 
-    def field(self, *, step: int | tuple[int, int, int] | None = None) -> DisplacementField:
+    def at_points(self, *, step: int | tuple[int, int, int] | None = None) -> DisplacementField:
         """Return points with displacement and covariance, as identification takes them.
 
         Parameters
@@ -150,7 +155,7 @@ class CorrelatedDisplacement:
         if not some.any():
             raise InputError(f"no voxel of the object is left at every {every.tolist()}-th voxel; give a smaller step")
         points = positions(self.volume)[some]
-        return DisplacementField.from_arrays(points, self.vectors[some], covariance=self.covariance_at(points))
+        return DisplacementField.from_arrays(points, self.displacement.vectors[some], covariance=self.covariance_at(points))
 
     def _local(self, points_mm: ArrayLike) -> FloatArray:
         return self.volume.to_index(points_mm) * self.volume.spacing_mm
@@ -194,7 +199,7 @@ class CorrelatedDisplacement:
 
 def collected(
     volume: Volume, mask: BoolArray, fit: Correlation, c: FloatArray, samples: Float32Array, bending: FloatArray, swelling: float
-) -> CorrelatedDisplacement:
+) -> CorrelationResult:
     """Return the result of a fit at full resolution; `samples` (n, 3, s) are random coefficients about c (behind volume correlation)."""
     system, level = fit.system, fit.level
     box = tuple(slice(int(a), int(b)) for a, b in zip(level.low, level.high, strict=True))
@@ -222,9 +227,10 @@ def collected(
     converged = np.ones(tuple(int(n) for n in system.grid.cells[::-1]), dtype=bool)
     still = np.linalg.norm(system.at_middles(fit.last_step), axis=1) <= STILL * np.prod(level.spacing) ** (1 / 3)
     converged[tuple(system.cells[system.inner, 2:].T)] = still
-    return CorrelatedDisplacement(
-        vectors, valid, volume, system.grid, c, volume.direction @ covariance @ volume.direction.T, _per_cell(system.grid, fit, bending),
-        swelling, fit.scatter, maps[0], maps[1], converged, bodies, motions, _status(system.grid, volume, converged),
+    return CorrelationResult(
+        DisplacementField.on_grid(volume, vectors, valid=valid), system.grid, c, volume.direction @ covariance @ volume.direction.T,
+        _per_cell(system.grid, fit, bending), swelling, fit.scatter, maps[0], maps[1], converged, bodies, motions,
+        _status(system.grid, volume, converged),
     )  # fmt: skip
 
 

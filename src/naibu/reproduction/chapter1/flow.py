@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.rigid_transform import RigidTransform
 from naibu.core.volume import Volume
 from naibu.imaging.dense_matching.block_matching import MEASURES, Measure, block_matching
 from naibu.imaging.dense_matching.hybrid import hybrid_flow
 from naibu.imaging.dense_matching.optical_flow import AS_REPORTED, REPORT_LEVELS, horn_schunck, lucas_kanade
 from naibu.imaging.displacement.accuracy import end_point_error
-from naibu.imaging.displacement.dense import DenseDisplacement
 from naibu.imaging.preprocessing.resampling import resampled_to_grid
 from naibu.imaging.preprocessing.rigid_registration import total_displacement
 from naibu.reproduction.chapter1 import figures as drawn
@@ -23,7 +23,7 @@ from naibu.reproduction.chapter1.matching import REPORT_PIXEL_MM, judged, picked
 from naibu.viewer.chapter import Figure, Section
 from naibu.viewer.tables import Cell, Table
 
-Flow = Callable[[Volume, Volume], DenseDisplacement]
+Flow = Callable[[Volume, Volume], DisplacementField]
 LEAST_RANGE, LOST_MM = 30.0, 5.0
 LAMBDA, ITERATIONS = AS_REPORTED["data_weight"], AS_REPORTED["iterations"]
 # of the report, voxels of its pixel size: image, volume
@@ -107,7 +107,7 @@ def _measured(case: CalfCase, kind: int) -> list[Measured]:
     return [_one(name, flow(case.initial, back), case, rigid) for name, flow in _flows(case, kind).items()]
 
 
-def _one(name: str, found: DenseDisplacement, case: CalfCase, rigid: RigidTransform) -> Measured:
+def _one(name: str, found: DisplacementField, case: CalfCase, rigid: RigidTransform) -> Measured:
     known = np.where(found.valid[..., None] & case.leg[..., None], found.vectors, np.nan)
     return _against(name, total_displacement(known, rigid, case.initial), case)
 
@@ -126,7 +126,7 @@ def _flows(case: CalfCase, kind: int) -> dict[str, Flow]:
             a, b, block=block, search=search, measure=measure, sub_voxel=False, least_range=LEAST_RANGE, mask=case.leg
         )
 
-    def hybrid(a: Volume, b: Volume) -> DenseDisplacement:
+    def hybrid(a: Volume, b: Volume) -> DisplacementField:
         return hybrid_flow(
             a, b, block=block, search=search, sub_voxel=False, least_range=LEAST_RANGE, mask=case.leg, data_weight=LAMBDA,
             full_scale=REPORT_LEVELS, iterations=ITERATIONS, warps=1, levels=1,

@@ -11,7 +11,6 @@ from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.rigid_transform import RigidTransform
 from naibu.core.volume import Volume
-from naibu.imaging.displacement.dense import DenseDisplacement
 from naibu.imaging.feature_matching.correlation_matching import Candidates, candidate_matches
 from naibu.imaging.feature_matching.harris import InterestPoints, interest_points
 from naibu.imaging.feature_matching.relaxation_labelling import STRENGTHS, PotentialMatches, Strength, relaxed
@@ -49,7 +48,7 @@ class Matched:
         How far every matched point lies from where its partner truly went, mm; in an image, within the slice.
     net : Triangulation
         Delaunay net of the points before.
-    dense : DenseDisplacement
+    dense : DisplacementField
         Its quality is 1 inside the net; outside it is continued by the affine motion that fits all points best.
     """
 
@@ -57,7 +56,7 @@ class Matched:
     matches: PotentialMatches
     errors_mm: FloatArray
     net: Triangulation
-    dense: DenseDisplacement
+    dense: DisplacementField
 
     @property
     def right_percent(self) -> float:

@@ -113,7 +113,7 @@ def examined(case: CalfCase, plane_points: tuple[int, int] = (200, 240), space_p
         found.append([matched(each, pairs, way) for way in (None, *WAYS)])
         numbers.append(len(pairs))
         points.append((len(before), len(after)))
-    default = correlate_volumes(case.initial, case.deformed).vectors
+    default = correlate_volumes(case.initial, case.deformed).displacement.vectors
     return Calf(case, image, found[0], found[1], (points[0], points[1]), (numbers[0], numbers[1]), rigid, default)
 
 
