@@ -24,21 +24,21 @@ from .out_of_core import ChunkedDisplacement, chunked_block_matching, chunked_ha
 from .preprocessing.bone_mask import bone_mask
 from .preprocessing.object_mask import object_mask
 from .preprocessing.resampling import cropped_to_mask, masked, resampled_to_grid, resampled_to_spacing, warped, with_slices_between
-from .preprocessing.rigid_registration import RigidMotion, register_rigid, rigid_from_points
+from .preprocessing.rigid_registration import RigidRegistration, register_rigid, rigid_from_points
 from .volume_correlation.correlate import CorrelationSettings, correlate_volumes
-from .volume_correlation.result import CorrelatedDisplacement
+from .volume_correlation.result import CorrelationResult
 
 __all__ = [
     "Candidates",
     "ChunkedDisplacement",
-    "CorrelatedDisplacement",
+    "CorrelationResult",
     "CorrelationSettings",
     "DetectedMarkers",
     "ErrorSummary",
     "InterestPoints",
     "Links",
     "PotentialMatches",
-    "RigidMotion",
+    "RigidRegistration",
     "Sensed",
     "SequenceSettings",
     "TrackedMarkers",
