@@ -458,7 +458,7 @@ def broken() -> dict[str, tuple[str, str, list[FieldTrial], Zones, dict[str, obj
         "method": ("field", "method 'svd' is not known", [one], zones, {"method": "svd"}),
         "law": ("field", "law 'rubber' is not known", [one], zones, {"law": "rubber"}),
         "about": ("field", "has no use for it", [one], zones, {"about": (1.0, 0.3)}),
-        "inverted": ("field", r"trial 'push 2': the displacement turns the cell of nodes", [replace(two, field=field)], zones,
+        "inverted": ("field", r"trial 'push 2': the displacement inverts the cell of nodes", [replace(two, field=field)], zones,
                      {"law": "neo_hookean"}),
         "points on a line": ("field", "lie on one plane or line", [replace(one, field=line)], zones, {}),
         "all loaded": ("field", "'held' gives no equation: 25 of 25 nodes have data", [nowhere], zones, {}),

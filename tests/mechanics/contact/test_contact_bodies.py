@@ -114,7 +114,7 @@ def test_relaxation_ends_in_the_same_equilibrium():
     body = problem(mesh, contacts=contacts)
     solution = solve(body)
     before, after = solution.states[-2:]
-    found = Newton(body, SolverSettings()).relax(before.displacement, before.anchors, after.load)
+    found = Newton(body, SolverSettings()).pseudo_transient(before.displacement, before.anchors, after.load)
     assert found is not None
     np.testing.assert_allclose(found[0], after.displacement, atol=1e-5)
 

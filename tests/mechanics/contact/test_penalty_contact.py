@@ -194,7 +194,7 @@ def test_bad_contacts_are_refused():
         Friction(-0.1)
     with pytest.raises(InputError, match="coinciding nodes"):
         interface("joint", mesh.points, np.array([[0, 1]]), np.ones(1), friction=Friction(), normal_stiffness=1.0)
-    with pytest.raises(InputError, match="node 9 does not exist"):
+    with pytest.raises(InputError, match="nodes has node 9; the mesh has nodes 0 to 7"):
         PrescribedDisplacement.none(8).and_also([9], (0, 0, 0))
     with pytest.raises(InputError, match="finite"):
         PrescribedDisplacement.none(8).and_also([1], (0, 0, np.nan))

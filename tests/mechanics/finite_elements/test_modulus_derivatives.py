@@ -104,7 +104,7 @@ def test_bad_input_is_named() -> None:
     body = one_cell(2, 0)
     inverted = np.zeros((3, 2))
     inverted[1, 0] = -3.0
-    with pytest.raises(InputError, match="nodes 0, 1, 2 inside out"):
+    with pytest.raises(InputError, match="inverts the cell of nodes 0, 1, 2"):
         unit_forces(body, inverted, "neo_hookean")
     with pytest.raises(InputError, match="'rubber' is not known"):
         unit_forces(body, inverted, "rubber")  # type: ignore[arg-type]

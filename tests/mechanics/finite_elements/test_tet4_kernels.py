@@ -7,7 +7,7 @@ import pytest
 from builders import assembler, distorted, of, problem, relative
 
 from naibu.mechanics.finite_elements import assembly
-from naibu.mechanics.finite_elements._tet4_kernels import shares
+from naibu.mechanics.finite_elements._tet4_kernels import partition
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.hyperelasticity import LAWS
 from naibu.mechanics.finite_strain.problem import SolverSettings
@@ -18,7 +18,7 @@ from naibu.meshing.surface import side_nodes
 def general(fast):
     """The same assembler with the kernel for groups of any kind."""
     order, start = assembly._colours(fast.elements.connectivity, fast.elements.n_points)
-    return replace(fast, _shares=None, _order=order, _colour_start=start)
+    return replace(fast, _partition=None, _order=order, _colour_start=start)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
@@ -26,7 +26,7 @@ def general(fast):
 def test_agrees_with_the_general_kernel(law, count):
     mesh = distorted("tetra", divisions=4)
     made = assembler(mesh, of(law), formulation="standard")
-    fast = replace(made, _shares=shares(made.elements.connectivity, made.pattern.indptr, made.pattern.indices, count))
+    fast = replace(made, _partition=partition(made.elements.connectivity, made.pattern.indptr, made.pattern.indices, count))
     u = np.random.default_rng(1).normal(size=mesh.points.shape) * 0.1
     for a, b in zip(fast.evaluate(u), general(made).evaluate(u), strict=True):
         assert relative(a, b) < 1e-13
@@ -36,7 +36,7 @@ def test_agrees_with_the_general_kernel(law, count):
 def test_owners_share_all_nodes_and_visit_all_their_cells():
     made = assembler(distorted("tetra", divisions=6), formulation="standard")
     cells = made.elements.connectivity
-    divided = shares(cells, made.pattern.indptr, made.pattern.indices, 3)
+    divided = partition(cells, made.pattern.indptr, made.pattern.indices, 3)
     assert np.ptp(np.bincount(divided.owner, minlength=3)) <= 1
     for p in range(3):
         visited = set(divided.cells[divided.start[p] : divided.start[p + 1]])

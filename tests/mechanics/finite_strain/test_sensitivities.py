@@ -137,7 +137,7 @@ def test_every_direction_against_finite_differences(case):
     assert not exact[0].any()
     for k, (name, (direction, h)) in enumerate(table.items()):
         up, down = (
-            solve(changed(body, direction, s * h), settings=PATH, hints=[(x.load, x.displacement) for x in solution.states[1:]])
+            solve(changed(body, direction, s * h), settings=PATH, warm_start=[(x.load, x.displacement) for x in solution.states[1:]])
             for s in (1, -1)
         )
         assert [s.load for s in up.states] == [s.load for s in down.states] == [s.load for s in solution.states]

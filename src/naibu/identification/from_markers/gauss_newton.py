@@ -25,7 +25,7 @@ from naibu.identification.from_markers.specimen_model import Specimen
 from naibu.mechanics.finite_strain.newton import Newton
 from naibu.mechanics.finite_strain.problem import SolverSettings
 from naibu.mechanics.finite_strain.sensitivities import sensitivities
-from naibu.mechanics.finite_strain.statics import Hint, Solution, solve
+from naibu.mechanics.finite_strain.statics import Solution, WarmStart, solve
 from naibu.mechanics.linear_algebra.direct import use_one_thread
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
 
@@ -145,11 +145,11 @@ class Matcher:
         with ThreadPoolExecutor(min(len(self.trials), os.cpu_count() or 1), initializer=use_one_thread) as pool:
             return list(pool.map(one, range(len(self.trials))))
 
-    def _evaluate_one(self, index: int, values: Mapping[str, float], hints: Sequence[Hint], pose: RigidTransform | None) -> TrialFit:
+    def _evaluate_one(self, index: int, values: Mapping[str, float], hints: Sequence[WarmStart], pose: RigidTransform | None) -> TrialFit:
         trial = self.trials[index]
         problem = trial.specimen.problem(values, trial.state)
         try:
-            solution = solve(problem, settings=_PATH, solver=self._solvers.get(index), hints=hints)
+            solution = solve(problem, settings=_PATH, solver=self._solvers.get(index), warm_start=hints)
         except ConvergenceError as error:
             raise ConvergenceError(f"{trial.label}: {error}") from error
         newton = Newton(problem, _PATH, self._solvers.get(index))

@@ -13,7 +13,7 @@ from naibu.core.parameters import ParameterSet
 from naibu.core.rigid_transform import RigidTransform
 from naibu.identification.from_markers.marker_grid import FILLED_SD_MM
 from naibu.identification.from_markers.specimen_model import Specimen
-from naibu.mechanics.finite_strain.statics import Hint, Solution
+from naibu.mechanics.finite_strain.statics import Solution, WarmStart
 
 HINT_SPACING = 0.05  # of the load, between states that the next evaluation starts from
 FAR_MM = 1.0
@@ -115,18 +115,18 @@ class Nearby:
     fit: TrialFit
     parameters: ParameterSet
 
-    def hints(self, values: Mapping[str, float]) -> list[Hint]:
+    def hints(self, values: Mapping[str, float]) -> list[WarmStart]:
         """Where the states of its path lie at other `values`."""
         change = np.array([values.get(q.name, q.value) - q.value for q in self.parameters.free])
         return _hints(self.fit, change)
 
 
-def _hints(previous: TrialFit, change: FloatArray) -> list[Hint]:
+def _hints(previous: TrialFit, change: FloatArray) -> list[WarmStart]:
     """Where the states of a path lie after a small `change` of the parameters; of states close together one is enough.
 
     After a large change the path is better followed anew: a poor guess costs more iterations than none.
     """
-    out: list[Hint] = []
+    out: list[WarmStart] = []
     if np.abs(previous.path[-1] @ change).max() > FAR_MM:
         return out
     states = previous.solution.states

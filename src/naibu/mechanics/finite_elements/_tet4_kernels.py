@@ -1,12 +1,12 @@
-"""Fast kernel for linear tetrahedra with one integration point each, whose dilatation is not shared.
+"""Assembly kernel for linear tetrahedra with one integration point each and no averaged dilatation.
 
 With one constant deformation gradient F in a tetrahedron every term of the tangent is an outer product of vectors of its nodes a, b,
 
     n_a = grad N_a,   h_a = F n_a,   g_a = F^-T n_a,   k_a = 2 (I1 h_a - F F^T h_a),
 
 so that no fourth-order tensor is formed. Threads own nodes, not elements: a thread visits all tetrahedra that touch its nodes and adds
-only to their rows. Elements on the border of two owners are computed twice; in return there is one parallel region, no colouring, and
-sums do not depend on the number of threads.
+only to their rows. Elements between two owners are computed twice; in return there is one parallel region, no colouring, and sums do not
+depend on the number of threads. The nodes are partitioned along the reverse Cuthill-McKee numbering :cite:p:`cuthill1969`.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shares:
-    """Which thread owns which nodes, and which tetrahedra it visits.
+class ThreadPartition:
+    """Partition of the nodes among threads, and the tetrahedra that each thread visits.
 
     Attributes
     ----------
@@ -46,21 +46,21 @@ class Shares:
     cells: IntArray
 
 
-def shares(connectivity: IntArray, indptr: Int32Array, indices: Int32Array, count: int) -> Shares:
-    """Divide the nodes into `count` layers of the graph (indptr, indices) of the mesh, as thin at their borders as a renumbering finds."""
+def partition(connectivity: IntArray, indptr: Int32Array, indices: Int32Array, count: int) -> ThreadPartition:
+    """Partition the nodes into `count` layers of the mesh graph (indptr, indices) along its reverse Cuthill-McKee numbering."""
     n = len(indptr) - 1
     if count == 1:
-        return Shares(np.zeros(n, dtype=np.int32), np.array([0, len(connectivity)]), np.arange(len(connectivity)))
+        return ThreadPartition(np.zeros(n, dtype=np.int32), np.array([0, len(connectivity)]), np.arange(len(connectivity)))
     graph = sp.csr_matrix((np.ones(len(indices), dtype=np.int8), indices, indptr), shape=(n, n))
     owner = np.empty(n, dtype=np.int32)
     owner[reverse_cuthill_mckee(graph, symmetric_mode=True)] = np.arange(n) * count // n
     touching = [np.flatnonzero((owner[connectivity] == p).any(axis=1)) for p in range(count)]
     start = np.concatenate([[0], np.cumsum([len(cells) for cells in touching])])
-    return Shares(owner, start, np.concatenate(touching))
+    return ThreadPartition(owner, start, np.concatenate(touching))
 
 
-def threads() -> int:
-    """Return how many threads a large mesh is divided among."""
+def thread_count() -> int:
+    """Return the number of threads among which a large mesh is divided."""
     return int(numba.get_num_threads())
 
 

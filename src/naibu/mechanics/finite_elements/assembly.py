@@ -9,7 +9,7 @@ from numba import prange
 
 from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
-from naibu.mechanics.finite_elements._tet4_kernels import Shares, shares, threads
+from naibu.mechanics.finite_elements._tet4_kernels import ThreadPartition, partition, thread_count
 from naibu.mechanics.finite_elements._tet4_kernels import assemble_large as _tetrahedra_large
 from naibu.mechanics.finite_elements._tet4_kernels import assemble_small as _tetrahedra_small
 from naibu.mechanics.finite_elements.elements import Elements
@@ -17,12 +17,12 @@ from naibu.mechanics.finite_elements.hyperelasticity import Material, inverse_tr
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern, block_pattern
 
 _CHUNK = 64
-LARGE = 4000  # groups from which the threads' hand-over costs less than it saves
+LARGE = 4000  # groups from which several threads are faster than one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assembler:
-    """Elements with materials, ready to be evaluated at any displacement.
+    """Internal forces and tangent stiffness of elements with materials, for any displacement.
 
     Attributes
     ----------
@@ -43,19 +43,36 @@ class Assembler:
     _positions: Int32Array
     _order: IntArray
     _colour_start: IntArray
-    _shares: Shares | None = None
+    _partition: ThreadPartition | None = None
 
     @classmethod
     def from_materials(
         cls, elements: Elements, regions: IntArray, materials: list[Material], pattern: BlockPattern | None = None
     ) -> Assembler:
-        """Combine elements with one material for each region; `pattern` may hold more couplings than the elements need."""
+        """Combine elements with one material for each region.
+
+        Parameters
+        ----------
+        elements : Elements
+            Groups of nodes and integration points.
+        regions : ndarray, shape (m,), int64
+            Region of every cell.
+        materials : list of Material
+            One for each region.
+        pattern : BlockPattern, optional
+            Sparsity of the tangent, where it must include more couplings than those of the elements (contacts).
+
+        Raises
+        ------
+        InputError
+            A region without a material.
+        """
         codes, parameters = parameter_table(materials, regions)
         chosen = block_pattern(elements.n_points, elements.connectivity) if pattern is None else pattern
         positions = chosen.positions(elements.connectivity)
         if elements.weights.shape[1] == 1 and elements.connectivity.shape[1] == 4 and not elements.shared_dilatation:
-            count = threads() if len(elements.connectivity) > LARGE else 1
-            divided = shares(elements.connectivity, chosen.indptr, chosen.indices, count)
+            count = thread_count() if len(elements.connectivity) > LARGE else 1
+            divided = partition(elements.connectivity, chosen.indptr, chosen.indices, count)
             none = np.empty(0, dtype=np.int64)
             return cls(elements, codes, parameters, chosen, positions, none, none, divided)
         order, start = _colours(elements.connectivity, elements.n_points)
@@ -91,8 +108,8 @@ class Assembler:
 
     def _run(self, displacement: FloatArray, parameters: FloatArray, blocks: FloatArray) -> tuple[float, FloatArray, float]:
         force = np.zeros((self.elements.n_points, 3))
-        if self._shares is not None:
-            return self._run_tetrahedra(self._shares, np.ascontiguousarray(displacement), parameters, force, blocks)
+        if self._partition is not None:
+            return self._run_tetrahedra(self._partition, np.ascontiguousarray(displacement), parameters, force, blocks)
         assemble = _assemble_large if len(self.elements.connectivity) > LARGE else _assemble_small
         energy, smallest = assemble(
             self._order, self._colour_start, self.elements.connectivity, self.elements.gradients, self.elements.weights,
@@ -103,26 +120,28 @@ class Assembler:
 
     def _run_tetrahedra(
         self,
-        shares: Shares,
+        parts: ThreadPartition,
         displacement: FloatArray,
         parameters: FloatArray,
         force: FloatArray,
         blocks: FloatArray,
     ) -> tuple[float, FloatArray, float]:
         e = self.elements
-        assemble = _tetrahedra_large if len(shares.start) > 2 else _tetrahedra_small
+        assemble = _tetrahedra_large if len(parts.start) > 2 else _tetrahedra_small
         energy, smallest = assemble(
-            shares.owner, shares.start, shares.cells, e.connectivity, e.gradients, e.weights, e.cell_of_point, self.law_codes, parameters,
+            parts.owner, parts.start, parts.cells, e.connectivity, e.gradients, e.weights, e.cell_of_point, self.law_codes, parameters,
             displacement, self._positions, force, blocks,
         )  # fmt: skip
         return float(energy), force, float(smallest)
 
 
 def body_force(elements: Elements, density_of_cell: FloatArray, acceleration: FloatArray) -> FloatArray:
-    """Return nodal forces (n, 3), mN, of the weight of the cells, lumped to their nodes.
+    """Return the nodal forces (n, 3), mN, of the weight of the cells, lumped to their nodes.
 
     Parameters
     ----------
+    elements : Elements
+        Groups of nodes and integration points.
     density_of_cell : ndarray, shape (m,)
         kg/mm3 (water: 1e-6).
     acceleration : ndarray, shape (3,)
@@ -130,8 +149,8 @@ def body_force(elements: Elements, density_of_cell: FloatArray, acceleration: Fl
     """
     weight = elements.weights * density_of_cell[elements.cell_of_point]
     used = np.any(elements.gradients != 0.0, axis=3)
-    share = weight[:, :, None] * used / np.maximum(used.sum(axis=2, keepdims=True), 1)
-    mass = np.bincount(elements.connectivity.ravel(), share.sum(axis=1).ravel(), minlength=elements.n_points)
+    nodal = weight[:, :, None] * used / np.maximum(used.sum(axis=2, keepdims=True), 1)
+    mass = np.bincount(elements.connectivity.ravel(), nodal.sum(axis=1).ravel(), minlength=elements.n_points)
     return mass[:, None] * acceleration
 
 

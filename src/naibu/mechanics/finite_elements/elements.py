@@ -1,10 +1,10 @@
-"""Finite elements as tables of gradients: which nodes meet, with which shape-function gradients, at which integration points.
+"""Finite elements with mean dilatation: nodes, shape-function gradients and integration points.
 
 An element here is a *group*: a set of nodes and integration points that may share one mean dilatation. A hexahedron is a group of
-8 nodes and 8 points; a patch of tetrahedra is a group too. One kernel (`assembly`) serves all of them. Sharing the dilatation
-(``F_bar = (Theta / J)^(1/3) F``, Theta the mean of J over the group) keeps nearly incompressible solids from locking: Simo, Taylor
-& Pister 1985 for hexahedra; de Souza Neto, Andrade Pires & Owen 2005 (F-bar patch) for tetrahedra, here in variational form, so that the
-tangent is symmetric.
+8 nodes and 8 points; a patch of tetrahedra is a group too. One kernel (`assembly`) serves all of them. Averaging the dilatation,
+``F_bar = (Theta / J)^(1/3) F`` with Theta the volume average of J over the group, prevents volumetric locking of nearly incompressible
+solids: the mean-dilatation method of :cite:t:`simo1985` for hexahedra, and the F-bar patch of :cite:t:`desouzaneto2005` for tetrahedra,
+here in variational form, so that the tangent is symmetric.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Elements:
     connectivity : ndarray, shape (m, k), int64
         Nodes of every group; a padded entry repeats a node and has zero gradients.
     gradients : ndarray, shape (m, q, k, 3), float64
-        Gradients of the shape functions in the free state, 1/mm.
+        Gradients of the shape functions in the reference configuration, 1/mm.
     weights : ndarray, shape (m, q), float64
         Volume of every integration point, mm3; 0 where padded.
     cell_of_point : ndarray, shape (m, q), int64
@@ -59,7 +59,7 @@ class Elements:
         return float(self.weights.sum())
 
     def moved(self, shift: FloatArray) -> Elements:
-        """Return the elements of the same mesh with its nodes moved by `shift` (n, 3), mm, in the free state."""
+        """Return the elements of the same mesh with its nodes moved by `shift` (n, 3), mm, in the reference configuration."""
         gradient = np.eye(3) + np.einsum("mai,mqaj->mqij", shift[self.connectivity], self.gradients)
         inverse = np.linalg.inv(gradient)
         gradients = np.ascontiguousarray(np.einsum("mqaj,mqji->mqai", self.gradients, inverse))
@@ -67,15 +67,15 @@ class Elements:
 
 
 def elements(mesh: Mesh, formulation: Formulation = "mean_dilatation") -> Elements:
-    """Make the elements of a mesh.
+    """Return the finite elements of a mesh.
 
     Parameters
     ----------
     mesh : Mesh
         Hexahedra, linear or quadratic tetrahedra.
     formulation : {"mean_dilatation", "standard"}
-        Whether the dilatation is averaged (over a hexahedron, a quadratic tetrahedron, or a patch of about 8 linear tetrahedra of
-        one region). ``"standard"`` locks near incompressibility and serves compressible solids and comparisons.
+        Whether the dilatation is averaged over a hexahedron, a quadratic tetrahedron, or a patch of about 8 linear tetrahedra of one
+        region. ``"standard"`` locks near incompressibility and serves compressible solids and comparisons.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def elements(mesh: Mesh, formulation: Formulation = "mean_dilatation") -> Elemen
     if determinant.min() <= 0.0:
         bad = int(np.argmin(determinant.min(axis=1)))
         raise InputError(
-            f"cell {bad} of the mesh is inverted or flat (Jacobian {determinant[bad].min():.3g}); reorder its nodes or mend the mesh"
+            f"cell {bad} of the mesh is inverted or flat (Jacobian {determinant[bad].min():.3g}); reorder its nodes or repair the mesh"
         )
     gradients = np.einsum("qaj,mqji->mqai", derivatives, np.linalg.inv(jacobian))
     weights = np.ascontiguousarray(determinant * quadrature)

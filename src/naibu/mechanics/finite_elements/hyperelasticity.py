@@ -1,9 +1,12 @@
-"""Hyperelastic laws, each a sum of parameters times basis energies.
+"""Hyperelastic laws: neo-Hookean, Mooney-Rivlin, Yeoh and Saint Venant-Kirchhoff, each linear in its parameters.
 
 Every law is written as ``W(F) = sum_k p_k W_k(I1, I2, J)`` with the invariants ``I1 = tr C``, ``I2 = (I1^2 - tr C^2) / 2`` of
 ``C = F^T F`` and ``J = det F``. A law supplies only the first and second derivatives of W with respect to the three invariants;
-stress and tangent follow from them once, for all laws. Because W is linear in the parameters, so is the force balance,
-and the derivative of the internal forces with respect to a parameter is the internal force of a unit parameter.
+stress and tangent follow from them once, for all laws. Because W is linear in the parameters, so are the internal forces, whose derivative
+with respect to a parameter is the internal force of a unit parameter.
+
+The compressible neo-Hookean law with ln J is that of :cite:t:`bonet2008`. The laws of :cite:t:`mooney1940` and :cite:t:`rivlin1948`, and of
+:cite:t:`yeoh1993`, are in the isochoric invariants, with the volumetric energy ``kappa (J^2 - 1 - 2 ln J) / 4``.
 """
 
 from __future__ import annotations
@@ -22,18 +25,18 @@ MAX_PARAMETERS = 4
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    """A hyperelastic law: its number for the kernels, and what its parameters are called.
+    """A hyperelastic law: its code in the kernels, and the names of its parameters.
 
     Attributes
     ----------
     name : str
-        The law's name in files and options.
+        Name of the law in files and options.
     code : int
-        Number by which compiled kernels know it.
+        Number of the law in compiled kernels.
     parameter_names : tuple of str
         Names in the order of the parameter vector; all in kPa.
     volumetric : str
-        The parameter that resists change of volume.
+        The parameter that resists a change of volume.
     """
 
     name: str
@@ -112,12 +115,12 @@ class Material:
 
 
 def law_named(name: str) -> Law:
-    """Return the law called `name`.
+    """Return the hyperelastic law called `name`.
 
     Raises
     ------
     InputError
-        There is no such law; the message lists those there are.
+        There is no such law; the message lists the names.
     """
     if name not in LAWS:
         raise InputError(f"law {name!r} is not known; use one of {', '.join(LAWS)}")
@@ -125,7 +128,7 @@ def law_named(name: str) -> Law:
 
 
 def lame_parameters(young_modulus: float, poisson_ratio: float) -> tuple[float, float]:
-    """Return (lame_lambda, shear_modulus), kPa, of an isotropic linear solid (report ch. 2).
+    """Return (lame_lambda, shear_modulus), kPa, of an isotropic linear elastic solid.
 
     Parameters
     ----------
@@ -148,7 +151,7 @@ def lame_parameters(young_modulus: float, poisson_ratio: float) -> tuple[float, 
 
 
 def material(law: str = "neo_hookean", *, young_modulus: float, poisson_ratio: float, shape: tuple[float, ...] = ()) -> Material:
-    """Make a material from its small-strain Young's modulus and Poisson's ratio.
+    """Return a hyperelastic material with given Young's modulus and Poisson's ratio at small strain.
 
     Parameters
     ----------
@@ -159,7 +162,7 @@ def material(law: str = "neo_hookean", *, young_modulus: float, poisson_ratio: f
     poisson_ratio : float
         In (-1, 0.5).
     shape : tuple of float
-        What the two moduli leave open: for ``mooney_rivlin`` the share of c01 in c10 + c01, for ``yeoh`` the ratios c20 / c10 and
+        What the two moduli leave open: for ``mooney_rivlin`` the fraction c01 / (c10 + c01), for ``yeoh`` the ratios c20 / c10 and
         c30 / c10; empty means zeros, which is neo-Hookean.
 
     Raises
@@ -173,16 +176,16 @@ def material(law: str = "neo_hookean", *, young_modulus: float, poisson_ratio: f
 
 
 def from_moduli(law: Law, shear_modulus: float, bulk_modulus: float, shape: tuple[float, ...] = ()) -> Material:
-    """Make a material from its small-strain shear and bulk moduli, kPa; `shape` as in `material`."""
+    """Return a hyperelastic material with given small-strain shear and bulk moduli, kPa; `shape` as in `material`."""
     return Material(law, parameter_vector(law, shear_modulus, bulk_modulus, shape))
 
 
 def parameter_vector(law: Law, shear_modulus: float, bulk_modulus: float, shape: tuple[float, ...] = ()) -> tuple[float, ...]:
     """Return the law's parameters, kPa, as a linear function of its small-strain moduli, kPa (also of their changes)."""
     if law.code == MOONEY_RIVLIN:
-        share = shape[0] if shape else 0.0
+        fraction = shape[0] if shape else 0.0
         half = 0.5 * shear_modulus
-        return (1.0 - share) * half, share * half, bulk_modulus
+        return (1.0 - fraction) * half, fraction * half, bulk_modulus
     if law.code == YEOH:
         c10 = 0.5 * shear_modulus
         second, third = (*shape, 0.0, 0.0)[:2]

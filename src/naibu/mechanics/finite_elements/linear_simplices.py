@@ -1,4 +1,8 @@
-"""Linear simplices - lines, triangles, tetrahedra: shape-function gradients, connection matrices and masses (spec M1)."""
+"""Linear simplex elements (lines, triangles, tetrahedra): shape-function gradients, stiffness and mass matrices.
+
+The stiffness of a cell is ``lambda J_lambda + mu J_mu`` with the connection matrices of :cite:t:`hirai2008` (chapter 3.2); for lumped and
+consistent masses see :cite:t:`hughes2000`.
+"""
 
 from __future__ import annotations
 
@@ -80,7 +84,7 @@ def simplices(mesh: Mesh, *, thickness_mm: float = 1.0, cross_section_mm2: float
     measures, gradients = (_tetrahedra if d == 3 else _lines_or_triangles)(mesh.points, mesh.cells)
     if not (measures > 0.0).all():
         bad = int(np.argmin(measures))
-        raise InputError(f"cell {bad} has volume {measures[bad]:g} mm^{d}; number its nodes the other way round, or mend the mesh")
+        raise InputError(f"cell {bad} has volume {measures[bad]:g} mm^{d}; number its nodes the other way round, or repair the mesh")
     extent = {1: cross_section_mm2, 2: thickness_mm, 3: 1.0}[d]
     return Simplices(mesh.cells, gradients, measures * extent, mesh.n_points)
 
@@ -90,7 +94,7 @@ def _lines_or_triangles(points: FloatArray, cells: IntArray) -> tuple[FloatArray
     corners = points[cells]
     edges = corners[:, 1:] - corners[:, :1]
     determinants = np.linalg.det(edges)
-    edges[~(determinants > 0.0)] = np.eye(points.shape[1])  # can be inverted; the caller refuses these cells
+    edges[~(determinants > 0.0)] = np.eye(points.shape[1])  # any invertible matrix; the caller refuses these cells
     inner = np.swapaxes(np.linalg.inv(edges), 1, 2)
     gradients = np.concatenate([-inner.sum(axis=1, keepdims=True), inner], axis=1)
     return determinants / factorial(points.shape[1]), np.ascontiguousarray(gradients)
@@ -130,8 +134,8 @@ def connection_matrices(body: Simplices) -> tuple[FloatArray, FloatArray]:
 
     Notes
     -----
-    ``J_lambda[i, l] = V g_i g_l^T`` and ``J_mu[i, l] = V ((g_i . g_l) I + g_l g_i^T)`` with the gradients g and the volume V (spec M1;
-    equation 3.3 of the report in two dimensions).
+    ``J_lambda[i, l] = V g_i g_l^T`` and ``J_mu[i, l] = V ((g_i . g_l) I + g_l g_i^T)`` with the gradients g and the volume V; in
+    two dimensions this is equation (3.3) of :cite:t:`hirai2008`.
     """
     g, d = body.gradients, body.dimension
     lame = np.einsum("m,mia,mlb->mialb", body.measures, g, g)
@@ -143,7 +147,8 @@ def connection_matrices(body: Simplices) -> tuple[FloatArray, FloatArray]:
 def parameter_forces(body: Simplices, displacement: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the elastic forces at the vertices of every cell for lambda = 1 kPa and for mu = 1 kPa, (m, d + 1, d) each, mN.
 
-    They are ``J_lambda u`` and ``J_mu u`` of :func:`connection_matrices`, without the matrices: the columns of force balance (spec I1).
+    They are ``J_lambda u`` and ``J_mu u`` of :func:`connection_matrices`, without the matrices:
+    the columns of the equilibrium-gap equations.
     """
     gradient = body.displacement_gradients(displacement)
     weighted = body.gradients * body.measures[:, None, None]
@@ -152,7 +157,7 @@ def parameter_forces(body: Simplices, displacement: FloatArray) -> tuple[FloatAr
 
 
 def elastic_forces(body: Simplices, lame_lambda: ArrayLike, shear_modulus: ArrayLike, displacement: FloatArray) -> FloatArray:
-    """Return the nodal forces (n, d), mN, that hold a displacement (n, d), mm; moduli in kPa, one number or one a cell."""
+    """Return the nodal elastic forces (n, d), mN, of a displacement (n, d), mm; moduli in kPa, one number or one a cell."""
     lame, shear = parameter_forces(body, displacement)
     return body.scattered(
         per_cell(lame_lambda, body.n_cells)[:, None, None] * lame + per_cell(shear_modulus, body.n_cells)[:, None, None] * shear
@@ -176,13 +181,16 @@ def per_cell(value: ArrayLike, n_cells: int, name: str = "a parameter") -> Float
 
 
 def lumped_mass(body: Simplices, density: ArrayLike) -> FloatArray:
-    """Return the mass of every node (n,), kg, of a density in kg/mm^3: ``rho V / (d + 1)`` at each vertex (printed (3.12) has S for V)."""
-    share = per_cell(density, body.n_cells, "the density") * body.measures / (body.dimension + 1)
-    return np.bincount(body.cells.ravel(), np.repeat(share, body.dimension + 1), minlength=body.n_points).astype(float)
+    """Return the lumped mass of every node (n,), kg, for a density in kg/mm^3: ``rho V / (d + 1)`` at each vertex.
+
+    Equation (3.12) of :cite:t:`hirai2008`, which prints the area S for the volume V.
+    """
+    nodal = per_cell(density, body.n_cells, "the density") * body.measures / (body.dimension + 1)
+    return np.bincount(body.cells.ravel(), np.repeat(nodal, body.dimension + 1), minlength=body.n_points).astype(float)
 
 
 def consistent_mass_matrices(body: Simplices, density: ArrayLike) -> FloatArray:
-    """Return the mass matrix of every cell (m, d + 1, d + 1), kg: ``rho V (1 + delta_ij) / ((d + 1)(d + 2))`` (spec M1)."""
+    """Return the consistent mass matrix of every cell (m, d + 1, d + 1), kg: ``rho V (1 + delta_ij) / ((d + 1)(d + 2))``."""
     d = body.dimension
     mass = per_cell(density, body.n_cells, "the density") * body.measures
     return np.asarray(mass[:, None, None] * (1.0 + np.eye(d + 1)) / ((d + 1) * (d + 2)))

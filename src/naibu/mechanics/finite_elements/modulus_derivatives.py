@@ -1,9 +1,9 @@
-"""Laws with two parameters on linear simplices: forces of a unit of lambda and of mu in every cell, energies and tangents (spec I6).
+"""Two-parameter elastic laws on linear simplices: nodal forces of unit lambda and mu in every cell, energies and tangents.
 
-All laws are ``W = lambda W_lambda(F) + mu W_mu(F)``, so that the balance of forces stays linear in lambda and mu at finite strain too:
+All laws are ``W = lambda W_lambda(F) + mu W_mu(F)``, so that equilibrium is linear in lambda and mu at finite strain as well:
 
 - ``linear``: ``P = lambda tr(e) 1 + 2 mu e`` with ``e = sym(F - 1)``;
-- ``neo_hookean``: ``P = lambda ln J F^-T + mu (F - F^-T)``;
+- ``neo_hookean``: ``P = lambda ln J F^-T + mu (F - F^-T)`` :cite:p:`bonet2008`;
 - ``saint_venant_kirchhoff``: ``P = F (lambda tr(E) 1 + 2 mu E)`` with ``2 E = F^T F - 1``.
 
 In two dimensions the strain is plane, in one uniaxial: the third stretch is 1, and the formulas hold as they are.
@@ -43,7 +43,7 @@ def unit_forces(body: Simplices, displacement: FloatArray, law: SimplexLaw = "li
     Raises
     ------
     InputError
-        An unknown law, or at finite strain a cell that is turned inside out.
+        An unknown law, or at finite strain an inverted cell.
     """
     if law == "linear":
         return parameter_forces(body, displacement)
@@ -129,7 +129,7 @@ def _deformation(body: Simplices, displacement: FloatArray, law: str) -> tuple[F
         bad = int(np.argmax(~(j > 0.0)))
         nodes = ", ".join(str(node) for node in body.cells[bad])
         raise InputError(
-            f"the displacement turns the cell of nodes {nodes} inside out (det F = {j[bad]:.3g}); mend the data there, use larger cells, "
+            f"the displacement inverts the cell of nodes {nodes} (det F = {j[bad]:.3g}); correct the data there, use larger cells, "
             "or law='linear'"
         )
     return f, j

@@ -1,8 +1,8 @@
-"""Elements that carry a given second Piola-Kirchhoff stress beside their law, and the stress of the law itself at their points.
+"""Assembly with a given second Piola-Kirchhoff history stress beside the hyperelastic law, and recovery of the law's stress.
 
-A stress H that is fixed in the free state's frame during a step, as the history of a viscoelastic solid is, acts like one more energy
-``H : C / 2``. It is evaluated at the same deformation gradient as the law, so that elements with a shared dilatation share that of H
-too, and the tangent stays symmetric.
+A stress H that is constant in the reference configuration during a step, such as that of the history variables of a viscoelastic solid,
+derives from the energy ``H : C / 2``. It is evaluated at the same deformation gradient F_bar as the law, so that the tangent of elements
+with mean dilatation remains symmetric.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _CHUNK = 64
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HistoryAssembler(Assembler):
-    """An assembler whose points carry a given stress beside that of their law.
+    """An assembler with a given history stress at its integration points, beside the stress of the law.
 
     Attributes
     ----------

@@ -1,4 +1,8 @@
-"""Equilibrium at one load: Newton's method with line search, and a relaxation for where it circles."""
+"""Equilibrium at one load: Newton's method with line search, and pseudo-transient continuation where it does not converge.
+
+Linear systems far from convergence are solved coarsely by iterative solvers, with the forcing terms of :cite:t:`eisenstat1996`; the line
+search looks for a zero of the work of the residual on the step; pseudo-transient continuation is that of :cite:t:`kelley1998`.
+"""
 
 from __future__ import annotations
 
@@ -16,21 +20,35 @@ from naibu.mechanics.linear_algebra.iterative import ApproximateFactorization
 from naibu.mechanics.linear_algebra.protocols import Factorization, LinearSolver
 from naibu.mechanics.linear_algebra.solver_selection import choose_solver
 
-RELAXATION_ITERATIONS = 40
-DRIFT = 100.0  # extents of the body
-DRAG = 0.01  # stiffness of the drag at first, as a fraction of the mean diagonal of the tangent
+PSEUDO_TRANSIENT_ITERATIONS = 40
+RIGID_MOTION = 100.0  # extents of the body: a longer Newton step is a rigid-body motion that nothing constrains
+PSEUDO_STIFFNESS = 0.01  # initial mass over pseudo-time step, as a fraction of the mean diagonal of the tangent
 _COARSE = 0.01  # relative tolerance of linear solves far from equilibrium, for solvers that can make use of it
 
 
 @dataclass(slots=True, eq=False)
 class Newton:
-    """Equilibrium iterations for one problem; keeps the analysed linear solver from step to step."""
+    """Newton's method for one problem; keeps the analysed linear solver from step to step.
+
+    Attributes
+    ----------
+    problem : Problem
+        What is solved.
+    settings : SolverSettings
+        Tolerances.
+    solver : LinearSolver or None
+        The linear solver; chosen at the first linearisation where it is None.
+    iterations : int
+        Iterations so far.
+    rigid_motion : bool
+        Whether the last Newton step was so long that a rigid-body motion must be unconstrained.
+    """
 
     problem: Problem
     settings: SolverSettings
     solver: LinearSolver | None = None
     iterations: int = 0
-    drifts: bool = False  # whether the last step would have thrown the body away: nothing holds it
+    rigid_motion: bool = False  # whether the last step was as long as an unconstrained rigid-body motion
 
     def residual(self, u: FloatArray, anchors: tuple[FloatArray, ...], load: float) -> tuple[FloatArray, float, float]:
         """Return the out-of-balance force (n, 3) mN, a force scale mN, and the smallest det F."""
@@ -55,7 +73,9 @@ class Newton:
     def linearised(
         self, u: FloatArray, anchors: tuple[FloatArray, ...], load: float
     ) -> tuple[FloatArray, float, Factorization, list[ContactResponse]]:
-        """Return residual, force scale, the factorized tangent (held rows and columns replaced by the identity) and contact responses.
+        """Return residual, force scale, the factorized tangent and contact responses.
+
+        Rows and columns of constrained components are replaced by those of a scaled identity.
 
         Raises
         ------
@@ -68,7 +88,7 @@ class Newton:
     def _tangent(
         self, u: FloatArray, anchors: tuple[FloatArray, ...], load: float, *, curvature: bool = True
     ) -> tuple[FloatArray, float, sp.bsr_matrix, list[ContactResponse]]:
-        """Return residual, force scale, the tangent of all nodes, held or not, and contact responses."""
+        """Return residual, force scale, the tangent of all nodes, constrained or not, and contact responses."""
         p = self.problem
         _, internal, blocks, smallest = p.assembler.evaluate(u)
         if not smallest > 0.0:
@@ -83,9 +103,9 @@ class Newton:
         residual, scale = self._balance(internal, contact)
         return residual, scale, p.assembler.pattern.matrix(blocks), responses
 
-    def _factorized(self, matrix: sp.bsr_matrix, drag: float = 0.0) -> Factorization:
+    def _factorized(self, matrix: sp.bsr_matrix, pseudo_stiffness: float = 0.0) -> Factorization:
         p = self.problem
-        matrix = with_dirichlet_rows(matrix, p.prescribed.constrained, self.settings.anchor_stiffness + drag)
+        matrix = with_dirichlet_rows(matrix, p.prescribed.constrained, self.settings.anchor_stiffness + pseudo_stiffness)
         if self.solver is None:
             self.solver = choose_solver(
                 matrix, p.points, p.prescribed.constrained, symmetric=not p.unsymmetric, solver=self.settings.linear_solver
@@ -93,11 +113,11 @@ class Newton:
         return self.solver.factorize(matrix)
 
     def solve(self, u: FloatArray, anchors: tuple[FloatArray, ...], load: float) -> tuple[FloatArray, float] | None:
-        """Return displacement and relative residual in equilibrium, starting from `u`; None where the iteration fails."""
-        struggles, previous = 0, 0.0
+        """Return displacement (n, 3) mm and relative residual in equilibrium, starting from `u`; None where Newton's method fails."""
+        poor, previous = 0, 0.0
         extent = float(np.ptp(self.problem.points, axis=0).max())
         try:
-            u = self._carried(u, anchors, load)
+            u = self._predicted(u, anchors, load)
             for _ in range(self.settings.max_iterations):
                 residual, scale, matrix, _ = self._tangent(u, anchors, load)
                 norm = float(np.abs(residual).sum())
@@ -105,11 +125,11 @@ class Newton:
                     return u, norm / scale
                 self.iterations += 1
                 step = -solved(self._factorized(matrix), residual, self._forcing(norm, previous, scale))
-                self.drifts = float(np.abs(step).max()) > DRIFT * extent
+                self.rigid_motion = float(np.abs(step).max()) > RIGID_MOTION * extent
                 found = self._line_search(u, step, anchors, load, residual)
-                struggles += found is None or found[1] < 0.15
-                if found is None or struggles > 2 or np.abs(step).max() > extent:
-                    return None  # a shorter load step costs less than a long fight
+                poor += found is None or found[1] < 0.15
+                if found is None or poor > 2 or np.abs(step).max() > extent:
+                    return None  # a shorter load step costs less than many poor iterations
                 u, previous = found[0], norm
                 if found[2] <= self.settings.tolerance:
                     return u, found[2]
@@ -117,25 +137,25 @@ class Newton:
             return None
         return None
 
-    def relax(self, u: FloatArray, anchors: tuple[FloatArray, ...], load: float) -> tuple[FloatArray, float] | None:
-        """Return displacement and relative residual in equilibrium, followed from `u` through a motion with drag; None where it stays away.
+    def pseudo_transient(self, u: FloatArray, anchors: tuple[FloatArray, ...], load: float) -> tuple[FloatArray, float] | None:
+        """Return displacement (n, 3) mm and relative residual in equilibrium by pseudo-transient continuation; None where it fails.
 
-        A contact point that slips over an edge jumps to another equilibrium, which Newton's method circles without end. Pseudo-transient
-        continuation (Kelley and Keyes 1998, SIAM J. Numer. Anal. 35:508) moves there: the drag falls with the residual.
+        A contact point that slips over an edge snaps through to another equilibrium, where Newton's method may cycle. An implicit step in
+        pseudo-time adds a multiple of the identity to the tangent, which falls with the residual :cite:p:`kelley1998`.
         """
         norms: list[float] = []
         try:
-            u = self._carried(u, anchors, load)
-            for _ in range(RELAXATION_ITERATIONS):
+            u = self._predicted(u, anchors, load)
+            for _ in range(PSEUDO_TRANSIENT_ITERATIONS):
                 residual, scale, matrix, _ = self._tangent(u, anchors, load, curvature=False)
                 norm = float(np.abs(residual).sum())
                 if norm <= self.settings.tolerance * scale:
                     return u, norm / scale
                 norms.append(norm)
                 self.iterations += 1
-                step = -solved(self._factorized(matrix, DRAG * min(norm / norms[0], 1.0)), residual, _COARSE)
+                step = -solved(self._factorized(matrix, PSEUDO_STIFFNESS * min(norm / norms[0], 1.0)), residual, _COARSE)
                 if len(norms) > 2 and norm > 0.8 * norms[-3]:
-                    step *= 0.5  # points that stick and slip in turn: meet in the middle
+                    step *= 0.5  # points alternate between stick and slip
                 for _ in range(6):
                     if self.residual(u + step, anchors, load)[2] > 0.0:
                         break
@@ -146,14 +166,14 @@ class Newton:
         return None
 
     def _forcing(self, norm: float, previous: float, scale: float) -> float:
-        """Relative tolerance of a linear solve: coarse while Newton's method is far away, and never finer than the end needs."""
-        hoped = 0.5 * (norm / previous) ** 1.5 if previous else _COARSE
-        return min(_COARSE, max(hoped, 0.3 * self.settings.tolerance * scale / norm, 1e-9))
+        """Relative tolerance of a linear solve: coarse far from convergence, and never finer than the last iteration needs."""
+        expected = 0.5 * (norm / previous) ** 1.5 if previous else _COARSE
+        return min(_COARSE, max(expected, 0.3 * self.settings.tolerance * scale / norm, 1e-9))
 
-    def _carried(self, u: FloatArray, anchors: tuple[FloatArray, ...], load: float) -> FloatArray:
-        """Return `u` with the held nodes where `load` puts them, and the others moved along by the tangent at `u`.
+    def _predicted(self, u: FloatArray, anchors: tuple[FloatArray, ...], load: float) -> FloatArray:
+        """Return the predictor: the constrained nodes displaced as `load` prescribes, the others by the tangent at `u`.
 
-        Moving the held nodes alone would flatten the elements next to them.
+        Displacing the constrained nodes alone would flatten the elements next to them.
         """
         p = self.problem
         target = np.where(p.prescribed.constrained, load * p.prescribed.values, u)
@@ -171,10 +191,8 @@ class Newton:
     ) -> tuple[FloatArray, float, float] | None:
         """Return ``u + a step``, a in (0, 1] and the relative residual there; None where all invert elements.
 
-        It ends where the residual's work on the step has fallen enough.
-
-        The work ``r . step`` vanishes at equilibrium along the step. Unlike the norm of r it may be trusted when points change their
-        contact status.
+        The search ends where the residual's work on the step, ``r . step``, has fallen enough: it vanishes at equilibrium along the step
+        and, unlike the norm of r, is reliable when points change their contact status.
         """
         before = float((residual * step).sum())  # not a BLAS dot product: the threads of some wait for milliseconds
         low, high, a = 0.0, 1.0, 1.0
@@ -202,7 +220,7 @@ class Newton:
 
 
 def solved(factorization: Factorization, residual: FloatArray, relative_tolerance: float) -> FloatArray:
-    """Return the solution (n, 3) for a residual (n, 3), as coarse as `relative_tolerance` allows where the solver can make use of that."""
+    """Return the solution (n, 3) for a residual (n, 3); iterative solvers stop at `relative_tolerance`."""
     b = residual.ravel()
     if isinstance(factorization, ApproximateFactorization):
         return factorization.solve(b, relative_tolerance).reshape(-1, 3)

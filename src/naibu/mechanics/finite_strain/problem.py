@@ -1,4 +1,4 @@
-"""A static problem at finite strain: what is solved, and how."""
+"""A static boundary value problem at finite strain, and the settings of its solution."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from naibu.mechanics.linear_algebra.solver_selection import SolverName
 
 @dataclass(frozen=True, slots=True)
 class SolverSettings:
-    """How to follow the load path.
+    """Settings of incremental loading and of Newton's method.
 
     Attributes
     ----------
     first_step, largest_step, smallest_step : float
         Fractions of the whole load.
     tolerance : float
-        Newton's method ends when the residual force has fallen below this fraction of the contact and support forces.
+        Newton's method has converged when the residual is below this fraction of the contact and support forces.
     max_iterations : int
-        Newton iterations of one load step before it is halved.
+        Most Newton iterations of one load step before it is halved.
     anchor_stiffness : float
-        Weak springs to the ground on every node, as a fraction of the mean diagonal of the tangent; they only keep a body that nothing
-        holds yet from drifting.
+        Stiffness of weak springs between every node and the ground, as a fraction of the mean diagonal of the tangent: they suppress
+        rigid-body motions of a body that is not in contact yet.
     linear_solver : {"automatic", "superlu", "pardiso", "recycled_cholesky", "multigrid"}
         See `naibu.mechanics.linear_algebra.solver_selection`.
     """
@@ -41,20 +41,20 @@ class SolverSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """A body, what it is made of, what holds and presses it.
+    """A static boundary value problem: mesh, materials, boundary conditions and loads.
 
     Attributes
     ----------
     points : ndarray, shape (n, 3)
-        Nodes in the free state, mm.
+        Nodes in the reference configuration, mm.
     assembler : Assembler
-        Elements and materials; its pattern must hold the contacts' couplings (`block_pattern` with their nodes).
+        Elements and materials; its pattern must include the contacts' couplings (`block_pattern` with their nodes).
     contacts : tuple of Contact
-        Rigid bodies and interfaces.
+        Contacts with rigid bodies, and interfaces.
     prescribed : PrescribedDisplacement
-        Given displacements.
+        Dirichlet boundary conditions.
     external_force : ndarray, shape (n, 3)
-        Dead load, mN, present from the beginning (weight).
+        Dead load, mN, applied in full from the beginning (weight).
     """
 
     points: FloatArray

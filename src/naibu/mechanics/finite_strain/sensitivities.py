@@ -1,7 +1,8 @@
-"""Derivatives of a quasi-static solution with respect to parameters, by direct differentiation along the load path.
+"""Sensitivities of a quasi-static solution to parameters, by direct differentiation along the load path :cite:p:`michaleris1994`.
 
-At every converged state the residual ``r(u, a, p) = 0`` is differentiated once: one factorization of the exact tangent and one solve for
-each parameter. Friction remembers, through the anchors `a` of the contact points; their derivatives are carried from step to step.
+At every converged state the residual ``r(u, a, p) = 0`` is differentiated once: one factorization of the consistent tangent and one solve
+for each parameter. Friction depends on history through the anchors `a` of the contact points, whose derivatives are propagated from step
+to step.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from naibu.mechanics.finite_strain.statics import LoadState
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Direction:
-    """A direction in the space of all that a problem depends on; unset parts are zero.
+    """A direction in the space of the data of a problem, along which its solution is differentiated; unset parts are zero.
 
     Attributes
     ----------
@@ -41,7 +42,7 @@ class Direction:
     tilt : ndarray, shape (3,), optional
         Change of the rotation that grows with the load, rad at full load.
     points : ndarray, shape (n, 3), optional
-        Change of the nodes' positions in the free state, mm.
+        Change of the nodes' positions in the reference configuration, mm.
     """
 
     materials: FloatArray | None = None
@@ -63,13 +64,13 @@ def sensitivities(
     Parameters
     ----------
     problem : Problem
-        The problem that was solved.
+        The problem solved.
     states : tuple of LoadState
-        Its solution path, the free state first.
+        Its states along the load path, the reference configuration first.
     directions : list of Direction
-        What to differentiate with respect to.
+        Directions of differentiation.
     newton : Newton, optional
-        The solver of the path, to reuse its analysed linear solver.
+        Solver of the load path, whose analysed linear solver is reused.
 
     Raises
     ------
@@ -108,7 +109,7 @@ def sensitivities(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Reshaped:
-    """Elements with their free nodes moved a little along a direction, forwards and backwards by `step`."""
+    """Elements with their reference nodes perturbed along a direction, forwards and backwards by `step`."""
 
     forward: Assembler
     backward: Assembler
@@ -187,7 +188,7 @@ class _BodyDirections:
         return self.moved(contact, contact.rest - contact.start, 0.0)
 
     def explicit(self, contact: Contact, response: ContactResponse, d_anchors: FloatArray, load: float) -> _Explicit:
-        """Change of local positions, tractions and forces while the nodes stay."""
+        """Change of local positions, tractions and forces at fixed nodes."""
         local = self.moved(contact, response.local @ response.orientation.T, load)
         area = contact.area[:, None, None]
         slipping = (response.slip_direction != 0.0).any(axis=1)

@@ -1,4 +1,4 @@
-"""Quasi-static equilibrium at finite strain: the load is followed in steps that adapt to how hard they are."""
+"""Quasi-static equilibrium at finite strain by incremental loading with adaptive load steps."""
 
 from __future__ import annotations
 
@@ -14,13 +14,24 @@ from naibu.mechanics.finite_strain.newton import Newton
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
 
-USUAL_ITERATIONS = 5.0  # of a load step of the right length
-Hint = tuple[float, FloatArray]  # a fraction of the load, and about where the nodes are then (n, 3)
+USUAL_ITERATIONS = 5.0  # Newton iterations of a load step of suitable length
+WarmStart = tuple[float, FloatArray]  # a fraction of the load, and an initial guess of the displacement there (n, 3), mm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadState:
-    """Equilibrium at one fraction of the load: displacement (n, 3) mm, and the contact anchors with which the next step starts."""
+    """Equilibrium at one fraction of the load.
+
+    Attributes
+    ----------
+    load : float
+        Fraction of the load, in [0, 1].
+    displacement : ndarray, shape (n, 3)
+        mm.
+    anchors : tuple of ndarray, shape (p, 3)
+        Frictional anchors of the points of every contact, in the frame of its body, mm: history variables with which the next load step
+        starts.
+    """
 
     load: float
     displacement: FloatArray
@@ -34,11 +45,11 @@ class Solution:
     Attributes
     ----------
     states : tuple of LoadState
-        The free state, then every converged step; the last one is at full load if `status` is converged.
+        The reference configuration, then every converged step; the last one is at full load if `status` is converged.
     status : Status
         How the solve ended.
     reactions : dict
-        Force (3,), mN, of every rigid body on the soft one at the last state, and ``"prescribed"`` for the held nodes.
+        Force (3,), mN, of every rigid body on the deformable one at the last state, and ``"prescribed"`` for the constrained nodes.
     iterations : int
         Newton iterations in all.
     residual : float
@@ -70,9 +81,9 @@ def solve(
     throw: bool = True,
     callback: Callable[[float], None] | None = None,
     solver: LinearSolver | None = None,
-    hints: Sequence[Hint] = (),
+    warm_start: Sequence[WarmStart] = (),
 ) -> Solution:
-    """Follow the load from the free state to its end.
+    """Solve for static equilibrium, following the load in steps from the reference configuration.
 
     Parameters
     ----------
@@ -86,27 +97,28 @@ def solve(
         Called with the fraction of the load after every step, for progress.
     solver : LinearSolver, optional
         A linear solver for the problem's pattern; chosen automatically by default.
-    hints : sequence of (load, displacement)
-        States (n, 3), mm, of a similar problem at increasing loads up to 1: the path then stops at these loads and starts from them.
+    warm_start : sequence of (load, displacement)
+        Displacements (n, 3), mm, of a similar problem at increasing loads up to 1: load steps then end at these loads and start from these
+        displacements.
 
     Raises
     ------
     ConvergenceError
-        The end of the load was not reached (only with `throw`).
+        The full load was not reached (only with `throw`).
     InputError
-        A displacement that is not finite was prescribed.
+        External forces that are not finite.
     """
     chosen = settings or SolverSettings()
     if not np.isfinite(problem.external_force).all():
-        raise InputError("external forces must be finite numbers")
+        raise InputError("problem.external_force must hold finite numbers, mN")
     newton = Newton(problem, chosen, solver)
     first = LoadState(0.0, np.zeros_like(problem.points), tuple(c.anchors_at_rest() for c in problem.contacts))
     states, residual = [first], 0.0
-    step, ceiling = 1.0 if hints else chosen.first_step, 1.0 if hints else chosen.largest_step
+    step, ceiling = 1.0 if warm_start else chosen.first_step, 1.0 if warm_start else chosen.largest_step
     while states[-1].load < 1.0 - 1e-12:
         last = states[-1]
-        passed = next((h for h in reversed(hints) if h[0] <= last.load + 1e-9), None)
-        ahead = next((h for h in hints if h[0] > last.load + 1e-9), None)
+        passed = next((h for h in reversed(warm_start) if h[0] <= last.load + 1e-9), None)
+        ahead = next((h for h in warm_start if h[0] > last.load + 1e-9), None)
         load = min(1.0 if ahead is None else ahead[0], last.load + step)
         found = None
         for guess in _guesses(states, load, passed, ahead):
@@ -115,16 +127,16 @@ def solve(
             if found is not None:
                 break
         if found is None and load - last.load < chosen.first_step:
-            found = newton.relax(last.displacement, last.anchors, load)
+            found = newton.pseudo_transient(last.displacement, last.anchors, load)
         if found is None:
             step = 0.5 * (load - last.load)
             ceiling = 1.6 * step
             if step < chosen.smallest_step:
-                return finished(newton, states, residual, Status.SINGULAR if newton.drifts else Status.STEP_TOO_SMALL, throw)
+                return finished(newton, states, residual, Status.SINGULAR if newton.rigid_motion else Status.STEP_TOO_SMALL, throw)
             continue
         residual = found[1]
         states.append(advanced(problem, found[0], last.anchors, load))
-        if hints:
+        if warm_start:
             step = min(1.0, 2.0 * step)
         else:
             ceiling = min(chosen.largest_step, 1.25 * ceiling)
@@ -139,13 +151,13 @@ def _growth(iterations: int) -> float:
     return float(np.clip(np.sqrt(USUAL_ITERATIONS / max(iterations, 1)), 0.6, 1.5))
 
 
-def _guesses(states: list[LoadState], load: float, before: Hint | None, ahead: Hint | None) -> list[FloatArray]:
-    """Displacements to start from at `load`: what the hints around it say, then the path extrapolated through its last states."""
+def _guesses(states: list[LoadState], load: float, before: WarmStart | None, ahead: WarmStart | None) -> list[FloatArray]:
+    """Initial guesses at `load`: interpolated from the warm start, then extrapolated through the last states."""
     out, last = [], states[-1]
     if ahead is not None:
-        missed = last.displacement - before[1] if before is not None and before[0] == last.load else 0.0
-        share = (load - last.load) / (ahead[0] - last.load)
-        out.append(ahead[1] + missed if share == 1.0 else last.displacement + share * (ahead[1] + missed - last.displacement))
+        correction = last.displacement - before[1] if before is not None and before[0] == last.load else 0.0
+        fraction = (load - last.load) / (ahead[0] - last.load)
+        out.append(ahead[1] + correction if fraction == 1.0 else last.displacement + fraction * (ahead[1] + correction - last.displacement))
     if len(states) > 2 or not out:
         known = states[-3:] if len(states) > 3 else states[-2:]
         guess = np.zeros_like(last.displacement)
@@ -157,13 +169,19 @@ def _guesses(states: list[LoadState], load: float, before: Hint | None, ahead: H
 
 
 def advanced(problem: Problem, u: FloatArray, anchors: tuple[FloatArray, ...], load: float) -> LoadState:
-    """Return the converged state `u` with the anchors for the next step."""
+    """Return the converged state with displacement `u` (n, 3), mm, and the anchors for the next load step."""
     moved = tuple(c.next_anchors(c.evaluate(u, a, load)) for c, a in zip(problem.contacts, anchors, strict=True))
     return LoadState(load, u, moved)
 
 
 def finished(newton: Newton, states: list[LoadState], residual: float, status: Status, throw: bool) -> Solution:
-    """Return the solution that ends with the last of `states`, with its reactions; raises a `ConvergenceError` if asked to."""
+    """Return the solution that ends with the last of `states`, with its reactions.
+
+    Raises
+    ------
+    ConvergenceError
+        `status` is not converged (only with `throw`).
+    """
     if throw and not status.ok:
         raise ConvergenceError(f"stopped at {100 * states[-1].load:.1f} % of the load. {status.value}")
     problem, last = newton.problem, states[-1]

@@ -1,27 +1,18 @@
-"""Finite-strain viscoelasticity: generalized Maxwell branches beside a hyperelastic law, and quasi-static problems in time.
+"""Finite-strain viscoelasticity: a generalized Maxwell model with a hyperelastic law, for quasi-static problems in time.
 
 The second Piola-Kirchhoff stress S_e of the law relaxes as a linear viscoelastic stress does,
 
     S(t) = S_rest(t) + g_inf S_e(t) + sum_i h_i(t),    h_i' + h_i / tau_i = g_i S_e',    g_inf = 1 - sum_i g_i,
 
-with S_e the isochoric part of the law and S_rest the volumetric one, or S_e the whole of it [1]_, [2]_. Being tensors of the free
-state, S and h_i do not notice a rotation of the body. The law given is that of the instantaneous response. Over a step in which S_e
-changes linearly in time the branches are integrated exactly [3]_:
+with S_e the isochoric part of the law and S_rest the volumetric one, or S_e the whole of it :cite:p:`simo1987,holzapfel1996`. As tensors
+of the reference configuration, S and h_i are objective. The law given is that of the instantaneous response. Over a step in which S_e
+changes linearly in time the branches are integrated exactly :cite:p:`taylor1970`:
 
     h_i(t + dt) = e_i h_i(t) + g_i a_i (S_e(t + dt) - S_e(t)),    e_i = exp(-dt / tau_i),    a_i = tau_i (1 - e_i) / dt.
 
 Within a step the stress is hence that of the law with scaled parameters, plus a stress known from the step before
-(`naibu.mechanics.finite_elements.stress_history`), and Newton's method has its exact tangent. A step of no duration is a jump: a_i = e_i =
-1.
-
-References
-----------
-.. [1] J. C. Simo, "On a fully three-dimensional finite-strain viscoelastic damage model: formulation and computational aspects", Comput.
-   Methods Appl. Mech. Eng. 60 (1987) 153-173.
-.. [2] G. A. Holzapfel, "On large strain viscoelasticity: continuum formulation and finite element applications to elastomeric structures",
-   Int. J. Numer. Methods Eng. 39 (1996) 3903-3926.
-.. [3] R. L. Taylor, K. S. Pister and G. L. Goudreau, "Thermomechanical analysis of viscoelastic solids", Int. J. Numer. Methods Eng. 2
-   (1970) 45-59.
+(`naibu.mechanics.finite_elements.stress_history`), and Newton's method has its consistent tangent. A step of zero duration is a jump:
+a_i = e_i = 1.
 """
 
 from __future__ import annotations
@@ -45,18 +36,18 @@ from naibu.mechanics.finite_strain.statics import LoadState, Solution, advanced,
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
 
 Relaxing = Literal["isochoric", "all"]
-SMALLEST_PART = 1.0 / 64.0  # of a time step, before the solve gives up
-RELAXED_PART = 1.0 / 8.0  # of a time step, from which a motion with drag is tried where Newton's method fails
+SMALLEST_PART = 1.0 / 64.0  # of a time step: the solve stops below it
+PSEUDO_TRANSIENT_PART = 1.0 / 8.0  # of a time step: from here on pseudo-transient continuation is tried where Newton's method fails
 
 
 @dataclass(frozen=True, slots=True)
 class PronySeries:
-    """How stress relaxes at constant strain: ``g(t) = 1 - sum_i g_i (1 - exp(-t / tau_i))``.
+    """Prony series of the stress relaxation at constant strain, ``g(t) = 1 - sum_i g_i (1 - exp(-t / tau_i))``.
 
     Attributes
     ----------
     weights : tuple of float
-        g_i, shares of the instantaneous stress that relax; positive, their sum below 1.
+        g_i, fractions of the instantaneous stress that relax; not negative, their sum below 1.
     times : tuple of float
         tau_i, relaxation times, s.
     """
@@ -74,7 +65,7 @@ class PronySeries:
 
     @property
     def long_term(self) -> float:
-        """Share of the stress that never relaxes, g_inf."""
+        """Fraction of the stress that never relaxes, g_inf."""
         return 1.0 - sum(self.weights)
 
     def relaxation(self, time: ArrayLike) -> FloatArray:
@@ -87,8 +78,8 @@ ELASTIC = PronySeries((), ())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Memory:
-    """What a viscoelastic body remembers of its past.
+class HistoryVariables:
+    """History variables (internal variables) of a viscoelastic body.
 
     Attributes
     ----------
@@ -104,7 +95,7 @@ class Memory:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViscoelasticBody:
-    """An assembler whose laws relax; `step` and `remembered` take it through a path of displacements.
+    """An assembler with viscoelastic laws; `step` and `updated` advance it through a history of displacements.
 
     Attributes
     ----------
@@ -130,19 +121,19 @@ class ViscoelasticBody:
         *,
         relaxing: Relaxing = "isochoric",
     ) -> ViscoelasticBody:
-        """Let the cells of `assembler` relax.
+        """Make the cells of `assembler` viscoelastic.
 
         Parameters
         ----------
         assembler : Assembler
             Elements and instantaneous laws.
         series : PronySeries or sequence of PronySeries
-            One for all cells, or one for each region (`ELASTIC` for one that does not relax).
+            One for all cells, or one for each region (`ELASTIC` for a region without relaxation).
         regions : ndarray, shape (m,), int64, optional
             Region of every cell, for several series.
         relaxing : {"isochoric", "all"}
-            Whether only the isochoric stress relaxes, which needs a law that is split into isochoric and volumetric parts and suits solids
-            that keep their volume, or the whole stress, with which Poisson's ratio stays what it is.
+            Whether only the isochoric stress relaxes, which needs a law that is split into isochoric and volumetric parts and suits nearly
+            incompressible solids, or the whole stress, with which Poisson's ratio does not change.
 
         Raises
         ------
@@ -165,13 +156,13 @@ class ViscoelasticBody:
         blank = HistoryAssembler.of(assembler, np.zeros((*assembler.elements.weights.shape, 3, 3)))
         return cls(blank, weights[:, of_cell], times[:, of_cell], mask)
 
-    def at_rest(self) -> Memory:
-        """Return the memory of a body that was never loaded."""
+    def at_rest(self) -> HistoryVariables:
+        """Return the history variables of a body that was never loaded: zeros."""
         shape = (*self.assembler.elements.weights.shape, 3, 3)
-        return Memory(np.zeros(shape), np.zeros((len(self.weights), *shape)))
+        return HistoryVariables(np.zeros(shape), np.zeros((len(self.weights), *shape)))
 
-    def step(self, past: Memory, duration: float) -> HistoryAssembler:
-        """Return the assembler of the forces and tangents at the end of a step of `duration` s after `past`."""
+    def step(self, past: HistoryVariables, duration: float) -> HistoryAssembler:
+        """Return the assembler of forces and tangents at the end of a step of `duration`, s, that starts from `past`."""
         decay, average = self._factors(duration)
         parameters = self.assembler.parameters
         factor = 1.0 - self.weights.sum(axis=0) + (self.weights * average).sum(axis=0)
@@ -179,13 +170,13 @@ class ViscoelasticBody:
         history = self._at_points(decay, past.branches) - self._at_points(self.weights * average, past.elastic[None])
         return HistoryAssembler.of(self.assembler, history, scaled)
 
-    def remembered(self, past: Memory, displacement: FloatArray, duration: float) -> Memory:
-        """Return the memory at the end of a step of `duration` s that has led from `past` to `displacement` (n, 3), mm."""
+    def updated(self, past: HistoryVariables, displacement: FloatArray, duration: float) -> HistoryVariables:
+        """Return the history variables after a step of `duration`, s, from `past` to the displacement (n, 3), mm."""
         decay, average = self._factors(duration)
         elastic = second_piola(self.assembler, np.where(self.relaxing, self.assembler.parameters, 0.0), displacement)
         cells = self.assembler.elements.cell_of_point
         gain = (self.weights * average)[:, cells, None, None]
-        return Memory(elastic, decay[:, cells, None, None] * past.branches + gain * (elastic - past.elastic))
+        return HistoryVariables(elastic, decay[:, cells, None, None] * past.branches + gain * (elastic - past.elastic))
 
     def _factors(self, duration: float) -> tuple[FloatArray, FloatArray]:
         """``exp(-dt / tau)`` and its mean over the step (terms, m)."""
@@ -206,7 +197,7 @@ def _relaxing_parameters(assembler: Assembler, relaxing: Relaxing) -> BoolArray:
         if not cells.any():
             continue
         if law.code == LINEAR_ELASTIC:
-            raise InputError("law 'linear_elastic' knows no rotation and cannot relax at finite strain; use neo_hookean or another law")
+            raise InputError("law 'linear_elastic' is not objective and cannot relax at finite strain; use 'neo_hookean' or another law")
         if relaxing == "isochoric":
             if law.volumetric != "bulk_modulus":
                 split = ", ".join(other.name for other in LAWS.values() if other.volumetric == "bulk_modulus")
@@ -229,7 +220,7 @@ class TimeStep:
     solution : Solution
         Displacement, reactions, residual; its states are those before and after the step.
     internal_force : ndarray, shape (n, 3)
-        Force of the body's stresses at its nodes, mN: at held nodes, what the support adds to other loads.
+        Internal force at the nodes, mN: at constrained nodes it is the reaction less the other loads.
     """
 
     time: float
@@ -239,21 +230,21 @@ class TimeStep:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViscoelasticSolution:
-    """Equilibrium at all times that were asked for, or until it was lost.
+    """Equilibrium at all requested times, or at those before the simulation stopped.
 
     Attributes
     ----------
     steps : tuple of TimeStep
-        In the order of time.
+        In order of time.
     status : Status
         How the simulation ended.
-    memory : Memory
-        Stresses at the last time.
+    history : HistoryVariables
+        Internal stresses at the last time.
     """
 
     steps: tuple[TimeStep, ...]
     status: Status
-    memory: Memory
+    history: HistoryVariables
 
     @property
     def times(self) -> FloatArray:
@@ -266,12 +257,12 @@ class ViscoelasticSolution:
         return np.array([s.solution.displacement for s in self.steps])
 
     def reaction(self, name: str) -> FloatArray:
-        """Return the force (k, 3), mN, of the support or rigid body `name` on the body.
+        """Return the force (k, 3), mN, of the rigid body called `name`, or of the ``"prescribed"`` nodes, on the body.
 
         Raises
         ------
         InputError
-            There is no such body; the message lists those there are.
+            There is no such body; the message lists the names.
         """
         known = self.steps[0].solution.reactions
         if name not in known:
@@ -293,21 +284,21 @@ def simulate_viscoelastic(
     callback: Callable[[float], None] | None = None,
     solver: LinearSolver | None = None,
 ) -> ViscoelasticSolution:
-    """Follow a quasi-static problem through time, implicitly; second order in the time step.
+    """Simulate a quasi-static viscoelastic problem in time, implicitly and to second order in the time step.
 
-    The body is at rest before the first time, at which it is loaded at once; of two equal times the second is a jump. A step that Newton's
-    method cannot take is divided.
+    The body is at rest before the first time, at which it is loaded at once; two equal times make a jump. A step for which Newton's method
+    fails is halved.
 
     Parameters
     ----------
     problem : Problem
-        Body with its instantaneous laws, supports, contacts. Inertia is left out.
+        Body with its instantaneous laws, boundary conditions and contacts. Inertia is neglected.
     series, regions, relaxing
         How the stress relaxes, as for `ViscoelasticBody.of`.
     times : array_like, shape (k,)
-        s, not decreasing.
+        Times, s, not decreasing.
     loads : array_like, shape (k,)
-        Fraction of the prescribed displacements and of the rigid bodies' paths at these times; linear in between.
+        Load factor of the prescribed displacements and of the rigid bodies' paths at these times; linear in between.
     force_factors : array_like, shape (k,), optional
         Factors of ``problem.external_force`` at these times; by default 1 from the first time on.
     settings : SolverSettings, optional
@@ -330,44 +321,44 @@ def simulate_viscoelastic(
     body = ViscoelasticBody.of(problem.assembler, series, regions, relaxing=relaxing)
     newton = Newton(problem, settings or SolverSettings(), solver)
     rest = LoadState(0.0, np.zeros_like(problem.points), tuple(c.anchors_at_rest() for c in problem.contacts))
-    at, memory = rest, body.at_rest()
+    at, history = rest, body.at_rest()
     steps: list[TimeStep] = []
     previous = np.array([path[0, 0], 0.0, 0.0])
     for target in path:
         newton.iterations = 0
-        found = _advance(newton, problem, body, (at, memory), previous, target)
+        found = _advance(newton, problem, body, (at, history), previous, target)
         if found is None:
             if throw:
                 raise ConvergenceError(f"stopped between {previous[0]:g} and {target[0]:g} s. {Status.STEP_TOO_SMALL.value}")
-            return ViscoelasticSolution(tuple(steps), Status.STEP_TOO_SMALL, memory)
-        before, (at, memory), residual = found
+            return ViscoelasticSolution(tuple(steps), Status.STEP_TOO_SMALL, history)
+        before, (at, history), residual = found
         solution = finished(newton, [before, at], residual, Status.CONVERGED, throw)
         steps.append(TimeStep(float(target[0]), solution, newton.problem.assembler.forces(at.displacement)[1]))
         previous = target
         if callback is not None:
             callback(float(target[0]))
-    return ViscoelasticSolution(tuple(steps), Status.CONVERGED, memory)
+    return ViscoelasticSolution(tuple(steps), Status.CONVERGED, history)
 
 
-_Point = tuple[LoadState, Memory]
+_Point = tuple[LoadState, HistoryVariables]
 
 
 def _advance(
     newton: Newton, problem: Problem, body: ViscoelasticBody, start: _Point, previous: FloatArray, target: FloatArray
 ) -> tuple[LoadState, _Point, float] | None:
-    """Go from `previous` to `target` (time, load, force factor) in as few parts as it takes.
+    """Go from `previous` to `target` (time, load, force factor) in as few parts as possible.
 
     Returns the state before the last part, the point reached, and its residual; None where a part would become too short.
     """
-    (at, memory), done, part, residual = start, 0.0, 1.0, 0.0
+    (at, history), done, part, residual = start, 0.0, 1.0, 0.0
     before = at
     while done < 1.0:
         now = previous + (done + part) * (target - previous) if done + part < 1.0 else target
         duration = part * float(target[0] - previous[0])
-        newton.problem = replace(problem, assembler=body.step(memory, duration), external_force=now[2] * problem.external_force)
+        newton.problem = replace(problem, assembler=body.step(history, duration), external_force=now[2] * problem.external_force)
         found = newton.solve(at.displacement, at.anchors, float(now[1]))
-        if found is None and part <= RELAXED_PART:
-            found = newton.relax(at.displacement, at.anchors, float(now[1]))
+        if found is None and part <= PSEUDO_TRANSIENT_PART:
+            found = newton.pseudo_transient(at.displacement, at.anchors, float(now[1]))
         if found is None:
             part *= 0.5
             if part < SMALLEST_PART:
@@ -375,10 +366,10 @@ def _advance(
             continue
         u, residual = found
         before = at
-        at, memory = advanced(problem, u, at.anchors, float(now[1])), body.remembered(memory, u, duration)
+        at, history = advanced(problem, u, at.anchors, float(now[1])), body.updated(history, u, duration)
         done += part
         part = min(2.0 * part, 1.0 - done)
-    return before, (at, memory), residual
+    return before, (at, history), residual
 
 
 def _path(times: ArrayLike, loads: ArrayLike, force_factors: ArrayLike | None) -> FloatArray:
