@@ -82,7 +82,7 @@ def test_encodings_of_spreadsheets_are_read(encoding: str, tmp_path: Path) -> No
     ("text", "told"),
     [
         ("", ["empty"]),
-        ("a,b,c\n1,2,3\n", ["cannot tell which columns", "a, b, c", "columns="]),
+        ("a,b,c\n1,2,3\n", ["cannot recognise the columns", "a, b, c", "columns="]),
         ("id,x,y,z\n", ["no rows follow"]),
         ("id,x,y,z\n1,abc,2,3\n", ["line 2, column 'x' = 'abc'", "not a number"]),
         ("id,x,y,z\n1,inf,2,3\n", ["column 'x' = 'inf'"]),
@@ -207,7 +207,7 @@ def test_folder_that_would_not_be_valid_is_not_left_behind(tmp_path: Path) -> No
 
 def test_folder_in_use_is_not_touched(tmp_path: Path) -> None:
     (tmp_path / "used.txt").write_text("mine")
-    with pytest.raises(InputError, match="not an empty folder"):
+    with pytest.raises(InputError, match="exists and is not empty"):
         write_experiment_folder(
             tmp_path, small(), {"pressed": small()}, title="t", shape=Shape("box", (30.0, 30.0, 30.0)), loading=Loading("plate")
         )

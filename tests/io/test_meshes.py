@@ -100,7 +100,7 @@ def test_vtu_with_appended_data(tmp_path, raw):
     path.write_bytes(text.encode() + f'<AppendedData encoding="{form}">\n _'.encode() + b"".join(pieces) + b"\n</AppendedData></VTKFile>")
     assert_is_the_mesh(read_mesh(path), ("region_5", "region_7"))
     path.write_bytes(path.read_bytes()[:-60])
-    with pytest.raises(InputError, match="cut off"):
+    with pytest.raises(InputError, match="truncated"):
         read_mesh(path)
 
 
@@ -184,7 +184,7 @@ def test_cut_off_gmsh_files_are_told(tmp_path, version, share):
     data = GMSH[version]()
     path = tmp_path / "a.msh"
     path.write_bytes(data[: int(share * len(data))])
-    with pytest.raises(InputError, match=r"a\.msh: .*(cut off|has no section|not a number)"):
+    with pytest.raises(InputError, match=r"a\.msh: .*(truncated|has no section|not a number)"):
         read_mesh(path)
 
 
@@ -205,10 +205,10 @@ def test_gmsh_tetra10_is_renumbered(tmp_path):
         ("a.vtu", vtu_text(as_ascii, types=(13, 10)), "'wedge'"),
         ("a.vtu", vtu_text(as_ascii, types=(5, 5)), "no volume cells"),
         ("a.vtu", vtu_text(as_ascii, types=(99, 10)), "VTK type 99"),
-        ("a.vtu", vtu_text(as_ascii)[:400], "cut off"),
+        ("a.vtu", vtu_text(as_ascii)[:400], "truncated"),
         ("a.vtu", vtu_text(as_ascii).replace("UnstructuredGrid", "PolyData"), "PolyData"),
         ("a.vtu", vtu_text(as_ascii, head='compressor="vtkLZ4DataCompressor"'), "vtkLZ4DataCompressor"),
-        ("a.vtu", vtu_text(lambda v: as_base64(v).replace("AAAA", "A")), "damaged or cut off"),
+        ("a.vtu", vtu_text(lambda v: as_base64(v).replace("AAAA", "A")), "damaged or truncated"),
         ("a.msh", "nothing", r"\$MeshFormat"),
         ("a.msh", "$MeshFormat\n4 0 8\n", "version 4, ascii"),
         ("a.msh", gmsh_22().decode().replace("3 4 3 6", "3 44 3 6"), "type 44"),
@@ -315,22 +315,22 @@ def test_vrml_clockwise_faces_are_turned(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "told"),
     [
-        ("a.stl", stl_binary()[:-7], "announces 4 facets but holds 3"),
-        ("a.stl", stl_ascii()[:-90], "cut off"),
+        ("a.stl", stl_binary()[:-7], "announces 4 facets but contains 3"),
+        ("a.stl", stl_ascii()[:-90], "truncated"),
         ("a.stl", b"solid facet endsolid", "no facet"),
         ("a.ply", b"plx", "no PLY header"),
-        ("a.ply", ply("binary_little_endian")[:-5], "cut off inside its 'face'"),
-        ("a.ply", ply("ascii")[:-9], "cut off inside its 'face'"),
+        ("a.ply", ply("binary_little_endian")[:-5], "truncated inside its 'face'"),
+        ("a.ply", ply("ascii")[:-9], "truncated inside its 'face'"),
         ("a.ply", ply("ascii").replace(b"property float z", b"property float w"), "lacks"),
         ("a.ply", ply("ascii").replace(b"float x", b"half x"), "'half'"),
-        ("a.obj", obj() + b"\nf 1 2 9", "names point 8"),
+        ("a.obj", obj() + b"\nf 1 2 9", "refers to point 8"),
         ("a.obj", b"v 1 2\n", "line 1"),
         ("a.obj", b"v 1 2 3\n", "no faces"),
         ("a.obj", b"v 1 2 x\n", "not a number"),
         ("a.wrl", vrml().replace(b"V2.0", b"V1.0"), "VRML 2.0"),
         ("a.wrl", vrml(field="translation 0 5 0 "), "translation"),
         ("a.wrl", vrml(field="rotation 0 0 1 1.57 "), "rotation"),
-        ("a.wrl", vrml()[:-40], "cut off"),
+        ("a.wrl", vrml()[:-40], "truncated"),
         ("a.vtu", b"", "read_mesh"),
     ],
 )

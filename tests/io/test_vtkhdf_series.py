@@ -78,7 +78,7 @@ def test_what_cannot_be_continued_is_told(tmp_path: Path) -> None:
         SeriesFile.continued(path, MESH, 1)
     with filled(path, range(2)) as series:
         series.finish()
-    with pytest.raises(InputError, match="holds 2 steps"):
+    with pytest.raises(InputError, match="contains 2 steps"):
         SeriesFile.continued(path, MESH, 3)
     other = Mesh.from_arrays(MESH.points, MESH.cells[:, ::-1], "hexahedron")
     with pytest.raises(InputError, match="another mesh"):
@@ -93,7 +93,7 @@ def test_arrays_that_change_their_shape_are_refused(tmp_path: Path) -> None:
     with filled(tmp_path / "a.vtkhdf", range(1)) as series:
         with pytest.raises(InputError, match="shape"):
             series.append(1.0, {"u": VALUES[0, :, :2]})
-        with pytest.raises(InputError, match="not in the steps before"):
+        with pytest.raises(InputError, match="not in the earlier steps"):
             series.append(1.0, {"w": VALUES[0]})
         with pytest.raises(InputError, match="8 points"):
             series.append(1.0, {"u": VALUES[0, :3]})

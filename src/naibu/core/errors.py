@@ -1,19 +1,19 @@
-"""Exceptions whose text tells the user what is wrong, with which value, and what to do about it."""
+"""Exceptions; their messages state what is wrong, the value, and what to do about it."""
 
 from __future__ import annotations
 
 
 class NaibuError(Exception):
-    """Base of every error that naibu raises on purpose; the command line prints its text without a traceback."""
+    """Base class of the errors that naibu raises deliberately; the command line prints them without a traceback."""
 
 
 class InputError(NaibuError, ValueError):
-    """The data, a file or an argument cannot be used as given."""
+    """Invalid data, file or argument."""
 
 
 class MissingDependencyError(NaibuError, ImportError):
-    """An optional package is needed for what was asked."""
+    """An optional package is required but not installed."""
 
 
 class ConvergenceError(NaibuError, RuntimeError):
-    """A solve stopped before it reached its tolerance."""
+    """A solver stopped before it reached its tolerance."""

@@ -1,4 +1,4 @@
-"""Packages that are loaded only by those who ask for what they do."""
+"""Optional dependencies, imported on demand."""
 
 from __future__ import annotations
 
@@ -9,21 +9,26 @@ from naibu.core.errors import MissingDependencyError
 
 
 def optional_package(name: str, purpose: str, install: str | None = None) -> Any:
-    """Import a package, or say what needs it and how to get it.
+    """Import an optional package, or raise an error that states what needs it and how to install it.
 
     Parameters
     ----------
     name : str
-        Name under which Python imports it.
+        Import name of the package.
     purpose : str
         What needs it, as the subject of a sentence: ``"reading NIfTI files"``.
     install : str, optional
-        What pip calls it, or the extra that brings it; by default `name`.
+        Name for pip, or the extra that includes it; by default `name`.
+
+    Returns
+    -------
+    module
+        The imported package.
 
     Raises
     ------
     MissingDependencyError
-        It is not installed, or does not load.
+        The package is not installed, or cannot be loaded.
     """
     try:
         return importlib.import_module(name)

@@ -1,4 +1,4 @@
-"""Quantities with a unit, as users write them at the edges: ``"222 kPa"``; inside, everything is in mm, kg, s, mN and kPa."""
+"""Parsing of quantities with a unit, such as ``"222 kPa"``; all other code uses mm, kg, s, mN and kPa."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _KILOPASCALS = {"Pa": 1e-3, "kPa": 1.0, "MPa": 1e3, "GPa": 1e6, "N/m^2": 1e-3, "
 
 
 def kilopascals(text: str) -> float:
-    """Return a pressure or modulus in kPa; a bare number is taken as kPa.
+    """Return a pressure or elastic modulus in kPa; a number without a unit is taken as kPa.
 
     Raises
     ------

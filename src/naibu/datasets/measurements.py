@@ -1,4 +1,4 @@
-"""The bundled measurements: markers inside gels before and after pushing, as printed in the 2008 report."""
+"""Bundled measurements: marker positions inside gels before and after loading, printed in the 2008 report :cite:p:`hirai2008`."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ def path(name: str) -> Path:
     Raises
     ------
     InputError
-        There is no such experiment; the message lists those there are.
+        There is no such experiment; the message lists those that exist.
     """
     known = names()
     if name not in known:
         close = difflib.get_close_matches(name, known, n=1)
         hint = f"did you mean {close[0]!r}? " if close else ""
-        raise InputError(f"no bundled experiment is called {name!r}; {hint}There are {', '.join(known)}")
+        raise InputError(f"no bundled experiment is called {name!r}; {hint}Available are {', '.join(known)}")
     return _DATA / name
 
 
@@ -47,6 +47,6 @@ def load(name: str) -> Experiment:
 
 
 def paper_tables() -> dict[str, Any]:
-    """Return the report's small tables: ``source`` (str) and ``tables``, a list of dicts with id, title, units, columns, rows and notes."""
+    """Return the small tables of the report: ``source`` and ``tables``, a list of dicts with id, title, units, columns, rows and notes."""
     tables: dict[str, Any] = json.loads((_DATA / "paper_tables.json").read_text(encoding="utf-8"))
     return tables

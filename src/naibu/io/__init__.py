@@ -1,4 +1,4 @@
-"""Reading and writing volumes, meshes, marker tables, experiments and results."""
+"""File formats: experiment folders, marker tables, image volumes, meshes and result files."""
 
 import lazy_loader
 

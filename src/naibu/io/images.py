@@ -1,7 +1,7 @@
-"""Reading and writing scanned volumes and displacement fields; the ending of the file name picks the format (spec S1).
+"""Read and write image volumes and displacement fields; the file name extension selects the format.
 
-Values are never rescaled: what is stored is what is returned, in its own type. Positions are in the frame of DICOM and SimpleITK, where
-x grows to the patient's left, y to the back and z to the head.
+Intensities are never rescaled: the stored values are returned in their stored type. Positions are in the LPS frame of DICOM and SimpleITK:
+x increases towards the patient's left, y towards posterior and z towards superior.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import FloatArray, require_positive
 from naibu.core.chunked_volume import ChunkedVolume
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
@@ -58,7 +58,7 @@ def read_volume(
     unit_mm: float | None = None,
     rescaled: bool = False,
 ) -> Volume:
-    """Read a scanned volume with its geometry (spec S1).
+    """Read an image volume with its geometry.
 
     Parameters
     ----------
@@ -67,25 +67,25 @@ def read_volume(
         see `naibu.io.image_formats.hdf5`), Zarr (``.zarr``, see `naibu.io.image_formats.zarr_store`), a DICOM file, or a folder with the
         slices of a DICOM series or of a TIFF stack.
     series : str, optional
-        Which series of a folder with several: its SeriesInstanceUID or its description.
+        Series to read from a folder with several: its SeriesInstanceUID or its description.
     spacing_mm : array_like, shape (3,), optional
-        Distance of voxels along x, y, z, mm, for files that do not say (most TIFF stacks).
+        Voxel spacing along x, y, z, mm, for files that do not state it (most TIFF stacks).
     unit_mm : float, optional
-        Length of the file's unit, mm: 1000 if it was written in metres. By default the unit the file states, or mm.
+        Length of the file's unit, mm: 1000 for metres. By default the unit that the file states, else mm.
     rescaled : bool
-        Whether the slope and intercept that DICOM and NIfTI files carry are applied (CT numbers in HU, for example). By default the
-        values are those stored.
+        Whether to apply the rescale slope and intercept of DICOM and NIfTI files (to obtain CT numbers in HU, for example). By default the
+        stored values are returned.
 
     Returns
     -------
     Volume
-        Values in the type of the file; a plane is a volume of one slice.
+        Intensities in the type of the file; a single plane gives a volume of one slice.
 
     Raises
     ------
     InputError
-        No such file, a format that is not read, a damaged file, several times or colours, a missing slice, mixed series, slices that are
-        not orthogonal, or no distance of voxels.
+        No such file, an unsupported format, a damaged file, several time points or channels, a missing slice, mixed series, slices that are
+        not orthogonal, or an unknown voxel spacing.
     MissingDependencyError
         The package that reads the format is not installed.
     """
@@ -94,27 +94,27 @@ def read_volume(
     spacing = None if spacing_mm is None else np.asarray(spacing_mm, dtype=float)
     if spacing is not None and (spacing.shape != (3,) or not (np.isfinite(spacing).all() and (spacing > 0.0).all())):
         raise InputError(f"spacing_mm must be three positive numbers (x, y, z), not {spacing.tolist()}")
-    if unit_mm is not None and not (np.isfinite(unit_mm) and unit_mm > 0.0):
-        raise InputError(f"unit_mm is {unit_mm!r}; give the length of the file's unit in mm, 1 for mm or 1000 for metres")
+    if unit_mm is not None:
+        require_positive("unit_mm, the length of the file's unit,", unit_mm, "mm (1000 for metres)")
     return reader(source, ReadOptions(unit_mm, spacing, series, rescaled))
 
 
 def write_volume(path: str | os.PathLike[str], volume: Volume, *, compressed: bool = True) -> Path:
-    """Write a volume with its geometry; an old file is replaced only when the new one is complete (spec S1).
+    """Write an image volume with its geometry; an existing file is replaced only when the new one is complete.
 
     Parameters
     ----------
     path : path-like
         ``.mha``, ``.mhd``, ``.nii``, ``.nii.gz``, ``.nrrd``, ``.tif``, ``.h5`` or ``.zarr``.
     volume : Volume
-        Voxels; truth values are stored as 0 and 1.
+        Image to write; booleans are stored as 0 and 1.
     compressed : bool
-        Whether the values are packed without loss, where the format leaves the choice.
+        Whether to compress the values (lossless), where the format leaves the choice.
 
     Raises
     ------
     InputError
-        A format that is not written, one that has no such type of values, or a file that cannot be written.
+        An unsupported format, a value type that the format lacks, or a file that cannot be written.
     MissingDependencyError
         The package that writes the format is not installed.
     """
@@ -127,25 +127,25 @@ def read_displacement(path: str | os.PathLike[str]) -> tuple[FloatArray, Volume]
     Parameters
     ----------
     path : path-like
-        ``.mha``, ``.mhd`` or ``.nrrd`` with three components a voxel, as ITK and 3D Slicer write them.
+        ``.mha``, ``.mhd`` or ``.nrrd`` with three components per voxel, as ITK and 3D Slicer write them.
 
     Returns
     -------
     displacement : ndarray, shape (nz, ny, nx, 3), float64
-        Displacement along x, y, z, mm; NaN where there is none.
+        Displacement along x, y, z, mm; NaN where undefined.
     grid : Volume
-        Where the voxels lie; its values tell where all components are finite.
+        Grid of the field; its values are true where all components are finite.
 
     Raises
     ------
     InputError
-        A file without vectors, or one that cannot be read.
+        A file without three-component vectors, or one that cannot be read.
     """
     return _of(_VECTOR_READERS, Path(path), "read displacement fields from")(Path(path), ReadOptions())
 
 
 def write_displacement(path: str | os.PathLike[str], displacement: ArrayLike, grid: Volume, *, compressed: bool = True) -> Path:
-    """Write a displacement field as an image of vectors, which opens in 3D Slicer and ParaView (spec S6).
+    """Write a displacement field as a vector image that opens in 3D Slicer and ParaView.
 
     Parameters
     ----------
@@ -154,14 +154,14 @@ def write_displacement(path: str | os.PathLike[str], displacement: ArrayLike, gr
     displacement : array_like, shape (nz, ny, nx, 3)
         Displacement along x, y, z, mm; stored in single precision.
     grid : Volume
-        Where the voxels lie.
+        Grid of the field.
     compressed : bool
-        Whether the values are packed without loss.
+        Whether to compress the values (lossless).
 
     Raises
     ------
     InputError
-        Another shape, a format that holds no vectors, or a file that cannot be written.
+        Another shape, a format without vector images, or a file that cannot be written.
     """
     vectors = np.asarray(displacement, dtype=np.float32)
     if vectors.shape != (*grid.shape, 3):
@@ -170,14 +170,14 @@ def write_displacement(path: str | os.PathLike[str], displacement: ArrayLike, gr
 
 
 def read_volume_box(path: str | os.PathLike[str], low: ArrayLike, high: ArrayLike) -> Volume:
-    """Read a part of a volume that was written as HDF5 or Zarr; the rest stays unread.
+    """Read a box of voxels from a volume stored as HDF5 or Zarr without reading the rest.
 
     Parameters
     ----------
     path : path-like
         ``.h5``, ``.hdf5`` or ``.zarr``.
     low, high : array_like, shape (3,)
-        First voxel, and the one after the last, along x, y, z.
+        Index of the first voxel, and of the one after the last, along x, y, z.
 
     Raises
     ------
@@ -186,12 +186,12 @@ def read_volume_box(path: str | os.PathLike[str], low: ArrayLike, high: ArrayLik
     """
     source = Path(path)
     if _ending(source) not in _BOX_READERS:
-        raise InputError(f"{source.name}: only HDF5 and Zarr volumes are read in parts; write it once with write_volume as .h5")
+        raise InputError(f"{source.name}: only HDF5 and Zarr volumes can be read in parts; convert it once with write_volume to .h5")
     return _BOX_READERS[_ending(source)](source, low, high, ReadOptions())
 
 
 def open_volume(path: str | os.PathLike[str]) -> ChunkedVolume:
-    """Open a volume that need not fit into memory; only what is sliced is read (see `naibu.imaging.out_of_core`).
+    """Open an out-of-core volume: only the voxels that are sliced are read (see `naibu.imaging.out_of_core`).
 
     Parameters
     ----------
@@ -207,12 +207,12 @@ def open_volume(path: str | os.PathLike[str]) -> ChunkedVolume:
     """
     source = Path(path)
     if _ending(source) != ".zarr":
-        raise InputError(f"{source.name}: only Zarr volumes are opened without being read; write it once with write_volume as .zarr")
+        raise InputError(f"{source.name}: only Zarr volumes can be opened out of core; convert it once with write_volume to .zarr")
     return zarr_store.open_chunked(source)
 
 
 def _reader(source: Path) -> Callable[[Path, ReadOptions], Volume]:
-    """Return what reads a file or folder."""
+    """Return the reader of a file or folder."""
     if source.is_dir() and _ending(source) != ".zarr":
         return dicom.read if _is_dicom(source) else tiff.read
     return dicom.read if _is_dicom(source) else _of(VOLUME_READERS, source, "read")
@@ -224,15 +224,15 @@ def _ending(path: Path) -> str:
 
 
 def _of(formats: dict[str, _Handler], path: Path, what: str) -> _Handler:
-    """Return what handles the ending of a file name."""
+    """Return the entry for the extension of a file name."""
     ending = _ending(path)
     if ending not in formats:
-        raise InputError(f"{path.name}: naibu does not {what} files ending in {ending!r}; it knows {', '.join(sorted(formats))}")
+        raise InputError(f"{path.name}: naibu does not {what} files ending in {ending!r}; supported are {', '.join(sorted(formats))}")
     return formats[ending]
 
 
 def _is_dicom(path: Path) -> bool:
-    """Whether a folder holds DICOM files, or a file is one whatever its ending."""
+    """Whether a folder contains DICOM files, or a file is one whatever its extension."""
     if path.is_dir() and _ending(path) != ".zarr":
         return any(dicom.is_dicom(file) for file in path.rglob("*") if file.is_file())
     return _ending(path) not in VOLUME_READERS and dicom.is_dicom(path)

@@ -1,4 +1,4 @@
-"""Bring marker tables of other programs in, and write naibu's own."""
+"""Import marker tables of other programs, and write naibu's marker tables and experiment folders."""
 
 from __future__ import annotations
 
@@ -44,32 +44,32 @@ def import_markers(
     delimiter: str | None = None,
     sheet: str | None = None,
 ) -> Markers:
-    """Read markers from a table that another program wrote.
+    """Read markers from a table written by another program.
 
     Parameters
     ----------
     path : path-like
-        Text with commas, semicolons or tabs between its cells (decimal commas are understood), or an Excel file (.xlsx).
+        Text table separated by commas, semicolons or tabs (decimal commas are recognised), or an Excel file (.xlsx).
         Lines above the header are skipped.
     columns : mapping, optional
-        Which column holds what, for example ``{"marker": "No.", "x_mm": "X [mm]", "y_mm": "Y [mm]", "z_mm": "Z [mm]"}``; ``"status"`` and
-        ``"note"`` may be named too, and ``"z_mm"`` left out for markers in one plane. By default the obvious columns are taken.
+        Column of each quantity, for example ``{"marker": "No.", "x_mm": "X [mm]", "y_mm": "Y [mm]", "z_mm": "Z [mm]"}``; ``"status"`` and
+        ``"note"`` are optional, and ``"z_mm"`` is omitted for markers in one plane. By default the columns are recognised by their names.
     unit : str, optional
-        Unit of the coordinates: mm, cm, m, um or inch. By default that in the column's name (``x_cm``, ``X [cm]``), else mm.
+        Unit of the coordinates: mm, cm, m, um or inch. By default the unit in the column name (``x_cm``, ``X [cm]``), else mm.
     delimiter : str, optional
-        What separates cells; by default a tab, a semicolon or a comma, whichever cuts the first lines evenly.
+        Cell separator; by default a tab, a semicolon or a comma, whichever gives the first lines equal numbers of cells.
     sheet : str, optional
         Sheet of an Excel file; by default the active one.
 
     Returns
     -------
     Markers
-        Positions in mm, shape (n, 3); NaN where a cell is blank.
+        Positions, shape (n, 3), mm; NaN where a cell is blank.
 
     Raises
     ------
     InputError
-        The file, a column, a unit or a cell cannot be used; the message names it and the mend.
+        The file, a column, a unit or a cell cannot be used; the message names it and the correction.
     MissingDependencyError
         An Excel file, and openpyxl is not installed.
     """
@@ -79,14 +79,14 @@ def import_markers(
     header = rows[start][1]
     body = [(line, row + [""] * (len(header) - len(row))) for line, row in rows[start + 1 :]]
     if not body:
-        raise InputError(f"{source}: no rows follow the header {', '.join(header)}; a table needs one row for each marker")
+        raise InputError(f"{source}: no rows follow the header {', '.join(header)}; a table needs one row per marker")
     factors = {name: _factor(source, header[at], unit) for name, at in where.items() if name in COORDINATES}
     mark = _decimal_mark(row[where[name]] for _, row in body for name in factors)
     ids = [_label(f"{source}: line {line}, column {header[where['marker']]!r}", row[where["marker"]]) for line, row in body]
     points = np.full((len(body), 3), math.nan)
     for name, factor in factors.items():
         values = [_number(f"{source}: line {line}, column {header[where[name]]!r}", row[where[name]], mark) for line, row in body]
-        # rounding removes the dust of the conversion (1.1 cm would be 11.000000000000002 mm), far below any measurement
+        # rounding removes the floating-point error of the conversion (1.1 cm would be 11.000000000000002 mm)
         points[:, COORDINATES.index(name)] = np.round(np.array(values) * factor, 9)
     trusted = [_trusted(source, line, row, where) for line, row in body]
     try:
@@ -96,14 +96,14 @@ def import_markers(
 
 
 def write_markers(path: str | os.PathLike[str], markers: Markers) -> Path:
-    """Write markers as naibu's own table ``marker,x_mm,y_mm,z_mm,status,note``; the file appears whole or not at all.
+    """Write markers as a table ``marker,x_mm,y_mm,z_mm,status,note``; the file is written atomically.
 
     Raises
     ------
     InputError
         The file cannot be written.
     """
-    # where no marker has a z, the markers lie in one plane and z is not missing
+    # where no marker has a z coordinate, the markers lie in one plane and z is not missing
     dimensions = 2 if np.isnan(markers.points[:, 2]).all() else 3
     stream = io.StringIO(newline="")
     writer = csv.writer(stream, lineterminator="\n")
@@ -133,24 +133,24 @@ def write_experiment_folder(
     xy_step_mm: float | None = None,
     z_step_mm: float | None = None,
 ) -> Path:
-    """Write an experiment folder that `read_experiment` reads: `meta.toml` and one table for each state.
+    """Write an experiment folder that `read_experiment` reads: `meta.toml` and one marker table per state.
 
     Parameters
     ----------
     folder : path-like
-        Folder to make; it must not exist, or be empty.
+        Folder to create; it must not exist, or be empty.
     initial : Markers
-        The free state.
+        Reference configuration (unloaded).
     states : mapping of str to Markers
         The loaded states by name, in order.
     title, source : str
-        What was measured, and where the numbers come from.
+        What was measured, and the origin of the numbers.
     shape, loading, layers, joined_at_mm, up_axis
         As in `naibu.core.experiment.Experiment`.
     stated_mm : mapping of str to float, optional
         Height of the plate or bar above the base, or distance of the side plates, mm, by name of the state.
     spacing_mm, xy_step_mm, z_step_mm : float, optional
-        Spacing of the marker lattice and steps of the coordinates, mm.
+        Spacing of the marker lattice and resolution of the coordinates, mm.
 
     Returns
     -------
@@ -160,11 +160,11 @@ def write_experiment_folder(
     Raises
     ------
     InputError
-        The folder is in use, or what was given does not make a valid experiment; nothing is left behind then.
+        The folder is not empty, or the arguments do not form a valid experiment; nothing is left behind then.
     """
     target = Path(folder)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise InputError(f"{target}: exists and is not an empty folder; choose a new name, or remove it first")
+        raise InputError(f"folder {target} exists and is not empty; choose a new name, or remove it first")
     key = "width_stated_mm" if loading.kind == "side_plates" else "height_stated_mm"
     heights = dict(stated_mm or {})
     for name in heights:
@@ -200,20 +200,20 @@ def _loading_table(loading: Loading) -> dict[str, object]:
 
 
 def _document(top: Mapping[str, object], *tables: tuple[str, Mapping[str, object]]) -> str:
-    """Return TOML text; keys whose value is None are left out."""
+    """Return TOML text; keys whose value is None are omitted."""
     blocks = [("", top), *tables]
-    # a JSON string, number or list of these is TOML too
+    # JSON strings, numbers and lists of these are valid TOML
     lines = ((head, [f"{k} = {json.dumps(v, ensure_ascii=False)}" for k, v in table.items() if v is not None]) for head, table in blocks)
     return "\n".join("\n".join([*([head] if head else []), *pairs, ""]) for head, pairs in lines)
 
 
 def _place_checked(target: Path, meta: str, states: Mapping[str, Markers]) -> None:
-    """Write into a folder aside, read it back, and only then give it its name."""
+    """Write into a temporary folder, read it back, and only then rename it."""
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         aside = Path(tempfile.mkdtemp(dir=target.parent, prefix=f".{target.name}."))
     except OSError as error:
-        raise InputError(f"{target}: cannot be made ({error.strerror}); choose a folder you may write to") from error
+        raise InputError(f"{target}: cannot be created ({error.strerror}); choose a folder you may write to") from error
     try:
         write_atomically(aside / META_FILE, meta)
         for name, markers in states.items():
@@ -245,7 +245,7 @@ def _text_rows(path: Path, delimiter: str | None) -> list[tuple[int, list[str]]]
 
 
 def _delimiter(text: str) -> str:
-    """Return the mark that cuts most of the first lines into the same number of cells; where two do, the one rarer within cells."""
+    """Return the separator that gives most of the first lines the same number of cells; of equals, the one rarer within cells."""
     lines = text.splitlines()[:_HEADER_WITHIN]
 
     def agreement(mark: str) -> int:
@@ -261,7 +261,7 @@ def _decoded(content: bytes) -> str:
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
-        # older Western spreadsheets; only names of columns and notes can hold such letters
+        # older Western spreadsheets; only column names and notes can contain such letters
         return content.decode("latin-1")
 
 
@@ -272,7 +272,7 @@ def _excel_rows(path: Path, sheet: str | None) -> list[tuple[int, list[str]]]:
         raise MissingDependencyError(f'{path}: reading Excel files needs openpyxl; run: pip install "naibu[excel]"') from error
     try:
         book = openpyxl.load_workbook(path, read_only=True, data_only=True)
-    # openpyxl raises whatever its zip and XML readers meet
+    # openpyxl's zip and XML readers raise exceptions of many types
     except Exception as error:
         raise InputError(
             f"{path}: cannot be read as .xlsx ({error}); open it in a spreadsheet program and save it again, or as CSV"
@@ -290,12 +290,12 @@ def _excel_rows(path: Path, sheet: str | None) -> list[tuple[int, list[str]]]:
 def _filled(path: Path, rows: Iterable[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
     kept = [(line, [cell.strip() for cell in row]) for line, row in rows if any(cell.strip() for cell in row)]
     if not kept:
-        raise InputError(f"{path}: the table is empty; it needs a header and one row for each marker")
+        raise InputError(f"{path}: the table is empty; it needs a header and one row per marker")
     return kept
 
 
 def _located(path: Path, rows: list[tuple[int, list[str]]], columns: Mapping[str, str] | None) -> tuple[int, dict[str, int]]:
-    """Return the number of the header among `rows`, and at which cell each of naibu's columns stands."""
+    """Return the index of the header among `rows`, and the cell index of each of naibu's columns."""
     for name in columns or {}:
         if name not in REQUIRED + OPTIONAL:
             raise InputError(f"columns names {name!r}; use {', '.join(REQUIRED + OPTIONAL)}")
@@ -307,12 +307,12 @@ def _located(path: Path, rows: list[tuple[int, list[str]]], columns: Mapping[str
     header = rows[0][1]
     if columns is None:
         raise InputError(
-            f"{path}: cannot tell which columns hold marker number, x, y and z among {', '.join(header)}; "
+            f"{path}: cannot recognise the columns of marker number, x, y and z among {', '.join(header)}; "
             'name them: columns={"marker": ..., "x_mm": ..., "y_mm": ..., "z_mm": ...}'
         )
     absent = next((n for n in wanted if n not in columns), None)
     if absent:
-        raise InputError(f"columns does not name {absent!r}; add which column of {path} holds it")
+        raise InputError(f"columns does not name {absent!r}; add the column of {path} that contains it")
     lost = next((c for c in columns.values() if c not in header), next(iter(columns.values())))
     close = difflib.get_close_matches(lost, header, n=1)
     mend = f"did you mean {close[0]!r}?" if close else f"it has {', '.join(header)}"
@@ -345,7 +345,7 @@ def _factor(path: Path, column: str, unit: str | None) -> float:
 
 
 def _decimal_mark(cells: Iterable[str]) -> str:
-    """Return what stands before the decimals: a comma where commas occur and no cell has a point but as thousands mark."""
+    """Return the decimal mark: a comma where commas occur and points occur only as thousands separators."""
     seen = [c for c in cells if "," in c or "." in c]
     return "," if any("," in c for c in seen) and all(c.rfind(",") > c.rfind(".") for c in seen) else "."
 
@@ -353,7 +353,7 @@ def _decimal_mark(cells: Iterable[str]) -> str:
 def _number(where: str, text: str, mark: str) -> float:
     if text.lower() in _ABSENT:
         return math.nan
-    # typographic minus, and blanks between thousands
+    # typographic minus sign, and spaces between thousands
     plain = re.sub(r"[\s\u00a0\u202f]", "", text).replace("\u2212", "-")
     other = "." if mark == "," else ","
     if re.fullmatch(rf"[+-]?\d{{1,3}}(\{other}\d{{3}})+(\{mark}\d*)?", plain):

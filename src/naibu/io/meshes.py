@@ -1,4 +1,4 @@
-"""Reading meshes and surfaces; the ending of the file name picks the format."""
+"""Read volume meshes and triangulated surfaces; the file name extension selects the format."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Surface(NamedTuple):
     points : ndarray, shape (n, 3)
         Positions, mm.
     triangles : ndarray, shape (t, 3), int64
-        Point numbers, counterclockwise seen from outside where the file keeps to that.
+    Point indices, counterclockwise seen from outside if the file follows that convention.
     """
 
     points: FloatArray
@@ -48,7 +48,7 @@ def read_mesh(path: str | os.PathLike[str], *, unit_mm: float = 1.0) -> Mesh:
     Parameters
     ----------
     path : path-like
-        VTK unstructured grid (``.vtu``: ascii, base64 or appended, plain, zlib or lzma) or Gmsh mesh (``.msh``: 4.1 ascii or binary, 2.2
+        VTK unstructured grid (``.vtu``: ascii, base64 or appended; plain, zlib or lzma) or Gmsh mesh (``.msh``: 4.1 ascii or binary, 2.2
         ascii).
     unit_mm : float
         Length of the file's unit, mm: 1000 if the file is in metres.
@@ -56,13 +56,13 @@ def read_mesh(path: str | os.PathLike[str], *, unit_mm: float = 1.0) -> Mesh:
     Returns
     -------
     Mesh
-        Tetrahedra (linear or quadratic) or hexahedra. Regions are the physical volumes (Gmsh), or the cell array ``region`` or one of
-        the usual names for it (VTK). Points that no volume cell uses, and cells without volume, are left out.
+        Linear or quadratic tetrahedra, or hexahedra, in mm. Regions are the physical volumes (Gmsh), or the cell array ``region`` or one of
+        its usual alternatives (VTK). Points that no volume cell uses, and cells of lower dimension, are dropped.
 
     Raises
     ------
     InputError
-        No such file, a format that is not read, a damaged or cut off file, or cell types that naibu has no elements for.
+        No such file, an unsupported format, a damaged or truncated file, or cell types that naibu has no elements for.
     """
     reader = _reader(path, MESH_READERS, SURFACE_READERS, "read_surface")
     mesh = reader(Path(path).name, _content(path))
@@ -82,24 +82,24 @@ def read_surface(path: str | os.PathLike[str], *, unit_mm: float = 1.0) -> Surfa
     Returns
     -------
     Surface
-        Points and triangles; polygons are cut into fans.
+        Points (mm) and triangles; polygons are triangulated as fans.
 
     Raises
     ------
     InputError
-        No such file, a format that is not read, or a damaged or cut off file.
+        No such file, an unsupported format, or a damaged or truncated file.
     """
     reader = _reader(path, SURFACE_READERS, MESH_READERS, "read_mesh")
     name = Path(path).name
     points, triangles = reader(name, _content(path))
     if len(triangles) == 0:
-        raise InputError(f"{name}: holds no faces, only {len(points)} points; export the surface as triangles")
+        raise InputError(f"{name}: contains no faces, only {len(points)} points; export the surface as triangles")
     if triangles.min() < 0 or triangles.max() >= len(points):
         bad = triangles.max() if triangles.max() >= len(points) else triangles.min()
-        raise InputError(f"{name}: a face names point {bad}, but the file has points 0 to {len(points) - 1}; write it again")
+        raise InputError(f"{name}: a face refers to point {bad}, but the file has points 0 to {len(points) - 1}; export it again")
     if not np.isfinite(points).all():
         bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-        raise InputError(f"{name}: point {bad} is {points[bad].tolist()}; every coordinate must be a finite number")
+        raise InputError(f"{name}: point {bad} is {points[bad].tolist()}; every coordinate must be finite")
     return Surface(points * _unit(unit_mm), triangles)
 
 
@@ -107,8 +107,10 @@ def _reader(path: str | os.PathLike[str], readers: dict[str, _Reader], others: d
     """Return the reader for the ending of the file name."""
     ending = Path(path).suffix.lower()
     if ending not in readers:
-        hint = f": read it with {instead}" if isinstance(others, dict) and ending in others else f"; naibu reads {sorted(readers)} here"
-        raise InputError(f"{Path(path).name}: files ending in {ending!r} are not of the kind asked for{hint}")
+        hint = (
+            f"use {instead}" if isinstance(others, dict) and ending in others else f"supported extensions are {', '.join(sorted(readers))}"
+        )
+        raise InputError(f"{Path(path).name}: the extension {ending!r} is not supported by this function; {hint}")
     return readers[ending]
 
 
@@ -121,7 +123,7 @@ def _content(path: str | os.PathLike[str]) -> bytes:
 
 
 def _unit(unit_mm: float) -> float:
-    """Return the length of the file's unit, refusing what is not one."""
+    """Return the length of the file's unit, mm, or raise an error."""
     if not (np.isfinite(unit_mm) and unit_mm > 0):
         raise InputError(f"unit_mm is {unit_mm!r}; give the length of the file's unit in mm, 1 for mm or 1000 for metres")
     return float(unit_mm)

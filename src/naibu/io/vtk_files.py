@@ -1,6 +1,6 @@
-"""Results for ParaView and other programs: one step as .vtu, a series as one VTKHDF file.
+"""VTK result files for ParaView and other programs: one time step as .vtu, a time series as one VTKHDF file.
 
-Both formats are described in "VTK File Formats", https://docs.vtk.org/en/latest/vtk_file_formats/index.html.
+Both formats are specified in "VTK File Formats", https://docs.vtk.org/en/latest/vtk_file_formats/index.html.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ def write_vtu(
     point_data: Mapping[str, ArrayLike] | None = None,
     cell_data: Mapping[str, ArrayLike] | None = None,
 ) -> None:
-    """Write a mesh and values on it as a VTK unstructured grid (appended raw data; opens in ParaView).
+    """Write a mesh with point and cell data as a VTK unstructured grid (``.vtu``, appended raw data).
 
-    The regions go along as cell array ``region`` and field data ``region_names``, so that `naibu.io.meshes.read_mesh` restores them.
+    The regions are stored as cell array ``region`` and field data ``region_names``, from which `naibu.io.meshes.read_mesh` restores them.
 
     Parameters
     ----------
     path : path-like
-        File to write, ``.vtu``; an old one is replaced only when the new one is complete.
+        File to write, ``.vtu``; an existing one is replaced only when the new one is complete.
     mesh : Mesh
         Mesh with n points and m cells, mm.
     point_data : mapping of str to array_like, shape (n,) or (n, d) or (n, d, d), optional
@@ -45,7 +45,7 @@ def write_vtu(
     Raises
     ------
     InputError
-        Arrays whose length does not fit, that are not numbers, or a file that cannot be written.
+        Arrays of the wrong length or not of real numbers, or a file that cannot be written.
     """
     points = {name: in_space(mesh, numbers(name, values, mesh.n_points, "points")) for name, values in (point_data or {}).items()}
     cells = {name: numbers(name, values, mesh.n_cells, "cells") for name, values in (cell_data or {}).items()}
@@ -80,16 +80,16 @@ def write_vtkhdf_series(
     point_data_steps: Mapping[str, Sequence[ArrayLike] | NDArray[np.generic]] | None = None,
     cell_data_steps: Mapping[str, Sequence[ArrayLike] | NDArray[np.generic]] | None = None,
 ) -> None:
-    """Write values on a mesh that does not change, at several times, as one VTKHDF file (opens in ParaView 5.12 and later).
+    """Write time-dependent data on a fixed mesh as one VTKHDF file (opens in ParaView 5.12 and later).
 
     Parameters
     ----------
     path : path-like
-        File to write, ``.vtkhdf``; an old one is replaced only when the new one is complete.
+        File to write, ``.vtkhdf``; an existing one is replaced only when the new one is complete.
     mesh : Mesh
         Mesh with n points and m cells, mm; stored once.
     times : array_like, shape (s,)
-        Increasing times (s), or numbers of the states.
+        Strictly increasing times, s, or numbers of the states.
     point_data_steps : mapping of str to s arrays of shape (n,) or (n, d) or (n, d, d), optional
         Values at the points in every step: an array (s, n, ...) or a sequence of arrays.
     cell_data_steps : mapping of str to s arrays of shape (m,) or (m, d) or (m, d, d), optional
@@ -102,7 +102,7 @@ def write_vtkhdf_series(
     """
     steps = np.asarray(times, dtype=np.float64)
     if steps.ndim != 1 or len(steps) == 0 or not np.isfinite(steps).all() or (np.diff(steps) <= 0).any():
-        raise InputError(f"times are {steps.tolist()}; give at least one, in one row, each greater than the one before")
+        raise InputError(f"times are {steps.tolist()}; give a one-dimensional array of at least one, strictly increasing")
     for data in (point_data_steps or {}, cell_data_steps or {}):
         for name, values in data.items():
             if len(values) != len(steps):
@@ -115,29 +115,29 @@ def write_vtkhdf_series(
 
 
 class _Appended:
-    """Arrays that follow the XML one after the other, each led by its length in bytes."""
+    """Appended data section: arrays in sequence, each preceded by its length in bytes."""
 
     def __init__(self) -> None:
         self.pieces: list[bytes] = []
         self.offset = 0
 
     def element(self, name: str, values: NDArray[np.generic]) -> str:
-        """Append an array (n,) or (n, d) and return the XML element that points at it."""
+        """Append an array (n,) or (n, d) and return the XML element that refers to it."""
         stored = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
         kind = f"{_NAMES[stored.dtype.kind]}{8 * stored.dtype.itemsize}"
-        # Left out for one component: meshio would read one column instead of a row.
+        # Omitted for one component: meshio would read a column instead of a row.
         components = f' NumberOfComponents="{stored.shape[1]}"' if stored.ndim == 2 else ""
         self.pieces += [np.uint64(stored.nbytes).astype("<u8").tobytes(), stored.tobytes()]
         at, self.offset = self.offset, self.offset + 8 + stored.nbytes
         return f'<DataArray type="{kind}" Name={quoteattr(name)}{components} format="appended" offset="{at}"/>'
 
     def section(self, tag: str, arrays: Mapping[str, NDArray[np.generic]]) -> str:
-        """Append several arrays and return the XML section that points at them."""
+        """Append several arrays and return the XML section that refers to them."""
         return f"<{tag}>\n" + "\n".join(self.element(name, values) for name, values in arrays.items()) + f"\n</{tag}>"
 
 
 def _names_field(mesh: Mesh) -> str:
-    """Return the region names as field data: their UTF-8 codes, each name ended by a zero, because meshio refuses VTK's own strings."""
+    """Return the region names as field data: zero-terminated UTF-8 codes, because meshio rejects VTK's own strings."""
     codes = b"".join(name.encode() + b"\0" for name in mesh.region_names)
     head = f'<DataArray type="UInt8" Name="region_names" NumberOfTuples="{len(codes)}" format="ascii">'
     return f"<FieldData>\n{head}{' '.join(map(str, codes))}</DataArray>\n</FieldData>"

@@ -1,4 +1,7 @@
-"""Series of results on one mesh, as a VTKHDF file that grows while a computation runs."""
+"""Time series on a fixed mesh as a VTKHDF file that is extended while a computation runs.
+
+The format is specified in "VTK File Formats", section "VTKHDF File Format".
+"""
 
 from __future__ import annotations
 
@@ -20,16 +23,16 @@ from naibu.core.mesh import Mesh
 from naibu.io.files.atomic import new_aside, put_in_place
 
 VTK_TYPES = {"line": 3, "triangle": 5, "tetra": 10, "hexahedron": 12, "tetra10": 24}
-_ROWS = "naibu"  # group of tables beside VTK's own
+_ROWS = "naibu"  # group of our own tables beside VTK's
 _CHUNK = 512  # rows of short tables
 _CHUNK_BYTES = 16_384
 
 
 @dataclass(eq=False)
 class SeriesFile:
-    """A VTKHDF file under a name of its own until it is finished; an old file of the final name stays untouched until then.
+    """A VTKHDF time series that is written under a temporary name and replaces an existing file only when finished.
 
-    Used as a context, it removes what was not finished.
+    As a context manager it removes an unfinished file on exit.
     """
 
     target: Path
@@ -39,7 +42,7 @@ class SeriesFile:
 
     @classmethod
     def begun(cls, path: str | os.PathLike[str], mesh: Mesh) -> SeriesFile:
-        """Begin a series on a mesh.
+        """Begin a new series on a mesh.
 
         Raises
         ------
@@ -56,12 +59,12 @@ class SeriesFile:
 
     @classmethod
     def continued(cls, path: str | os.PathLike[str], mesh: Mesh, steps: int) -> SeriesFile:
-        """Continue a finished series behind its first steps; the file keeps its name and content until the new one is finished.
+        """Continue a finished series after its first `steps` steps; the old file stays until the new one is finished.
 
         Raises
         ------
         InputError
-            There is no such file, it is damaged, has fewer steps, or holds another mesh.
+            There is no such file, it is damaged, has fewer steps, or contains another mesh.
         """
         target = Path(path)
         aside = new_aside(target)
@@ -69,36 +72,45 @@ class SeriesFile:
             shutil.copyfile(target, aside)
         except OSError as error:
             aside.unlink(missing_ok=True)
-            raise InputError(f"{target}: cannot be read ({error.strerror or error}); begin the series anew") from error
+            raise InputError(f"{target}: cannot be read ({error.strerror or error}); begin a new series") from error
         try:
             series = cls(target, aside, mesh, h5py.File(aside, "r+"))
             root = series.file["VTKHDF"]
             known, same = int(root["Steps"].attrs["NSteps"]), np.array_equal(root["Connectivity"][:], mesh.cells.ravel())
         except (OSError, KeyError) as error:
             aside.unlink(missing_ok=True)
-            raise InputError(f"{target}: is damaged ({error}); begin the series anew") from error
+            raise InputError(f"{target}: is damaged ({error}); begin a new series") from error
         if known < steps or not same:
             series.discard()
             raise InputError(
-                f"{target}: holds {known} steps{'' if same else ' on another mesh'}, not the {steps} to go on from; begin anew"
+                f"{target}: contains {known} steps{'' if same else ' on another mesh'}, not the {steps} needed; begin a new series"
             )
         series.truncate(steps)
         return series
 
     @property
     def steps(self) -> int:
-        """Number of whole steps."""
+        """Number of complete steps."""
         return int(self.file["VTKHDF/Steps"].attrs["NSteps"])
 
     def append(
         self, time: float, point_data: Mapping[str, ArrayLike] | None = None, cell_data: Mapping[str, ArrayLike] | None = None
     ) -> None:
-        """Append a step: values of points (n,), (n, d) or (n, d, d), and of cells (m, ...), the same names and shapes in every step.
+        """Append a time step; array names and shapes must be the same in every step.
+
+        Parameters
+        ----------
+        time : float
+            Time of the step, s.
+        point_data : mapping of str to array_like, shape (n,), (n, d) or (n, d, d), optional
+            Values at the points; state the unit in the name.
+        cell_data : mapping of str to array_like, shape (m,), (m, d) or (m, d, d), optional
+            Values of the cells.
 
         Raises
         ------
         InputError
-            Names or shapes that VTK does not know or that differ from those of the first step, or a full disk.
+            Names or shapes that VTK does not support or that differ from those of the first step, or a full disk.
         """
         root = self.file["VTKHDF"]
         steps, count = root["Steps"], self.steps
@@ -118,7 +130,7 @@ class SeriesFile:
             raise InputError(f"{self.target}: cannot be written ({error}); free some space or choose another folder") from error
 
     def append_rows(self, name: str, rows: ArrayLike, first: int) -> None:
-        """Put rows (k, ...) of a table beside VTK's own data at row `first`."""
+        """Write rows (k, ...) of a table of our own, beside VTK's data, from row `first` on."""
         values = np.asarray(rows)
         group = self.file.require_group(_ROWS)
         if name not in group:
@@ -128,20 +140,20 @@ class SeriesFile:
         group[name][first:] = values
 
     def rows(self, name: str) -> AnyArray:
-        """Return a table that `append_rows` filled."""
+        """Return a table that `append_rows` wrote, shape (rows, ...)."""
         return np.asarray(self.file[f"{_ROWS}/{name}"][:])
 
     def values(self, name: str, step: int) -> AnyArray:
-        """Return the values of the points in a step."""
+        """Return the point data `name` of a step, shape (n,) or (n, d)."""
         n = self.mesh.n_points
         return np.asarray(self.file[f"VTKHDF/PointData/{name}"][step * n : (step + 1) * n])
 
     def times(self) -> FloatArray:
-        """Return the times of all steps, s."""
+        """Return the times of all steps, shape (s,), s."""
         return np.asarray(self.file["VTKHDF/Steps/Values"][: self.steps])
 
     def truncate(self, steps: int) -> None:
-        """Drop all that follows the first steps."""
+        """Remove all but the first `steps` steps."""
         root = self.file["VTKHDF"]
         root["Steps"].attrs["NSteps"] = np.int64(steps)
         for name in ("PartOffsets", "PointOffsets", "NumberOfParts", "CellOffsets", "ConnectivityIdOffsets", "Values"):
@@ -153,7 +165,7 @@ class SeriesFile:
                     root[where][name].resize(steps * self._length(where), axis=0)
 
     def finish(self) -> Path:
-        """Close the file and give it its name.
+        """Close the file and rename it to its final name.
 
         Raises
         ------
@@ -167,7 +179,7 @@ class SeriesFile:
         return put_in_place(self.aside, self.target)
 
     def discard(self) -> None:
-        """Close and remove what was not finished."""
+        """Close and remove the unfinished file."""
         if self.file:
             self.file.close()
         self.aside.unlink(missing_ok=True)
@@ -188,23 +200,23 @@ class SeriesFile:
         own = in_space(self.mesh, numbers(name, values, n, "points" if where == "PointData" else "cells"))
         if name not in group:
             if step:
-                raise InputError(f"{name!r} is not in the steps before; give the same arrays in all")
+                raise InputError(f"{name!r} is not in the earlier steps; give the same arrays in all steps")
             rows = n * max(1, _CHUNK_BYTES // own.nbytes)  # small steps share a chunk
             group.create_dataset(name, (0, *own.shape[1:]), own.dtype, maxshape=(None, *own.shape[1:]), chunks=(rows, *own.shape[1:]))
         known = group[name].shape[1:]
         if own.shape[1:] != known:
-            raise InputError(f"{name!r} has shape {own.shape} in step {step}, but {(n, *known)} in step 0; give the same shape in all")
+            raise InputError(f"{name!r} has shape {own.shape} in step {step}, but {(n, *known)} in step 0; shapes must not change")
         group[name].resize((step + 1) * n, axis=0)
         group[name][step * n :] = own
 
 
 def numbers(name: str, values: ArrayLike, n: int, what: str) -> NDArray[np.generic]:
-    """Return values as (n,) or (n, d) numbers that VTK knows.
+    """Return values as an array (n,) or (n, d) of a type that VTK supports.
 
     Raises
     ------
     InputError
-        Another number of rows, or no real numbers.
+        Another number of rows, or values that are not real numbers.
     """
     array = np.asarray(values)
     if array.ndim not in (1, 2, 3) or len(array) != n:
@@ -219,7 +231,7 @@ def numbers(name: str, values: ArrayLike, n: int, what: str) -> NDArray[np.gener
 
 
 def in_space(mesh: Mesh, vectors: NDArray[np.generic]) -> NDArray[np.generic]:
-    """Return vectors of a plane or a line with the components that VTK, which knows only space, wants besides."""
+    """Return vectors of a plane or a line padded with zeros to the three components that VTK needs."""
     missing = 3 - mesh.dimension
     if missing == 0 or vectors.ndim != 2 or vectors.shape[1] != mesh.dimension:
         return vectors
@@ -227,10 +239,10 @@ def in_space(mesh: Mesh, vectors: NDArray[np.generic]) -> NDArray[np.generic]:
 
 
 def _write_static(root: h5py.Group, mesh: Mesh) -> None:
-    """Write the grid, which all steps share."""
+    """Write the mesh, which is common to all steps."""
     n, k = mesh.cells.shape
     root.attrs["Version"] = np.array([2, 0], dtype=np.int64)
-    # VTK's reader wants a string of fixed length here, not h5py's default.
+    # VTK's reader needs a fixed-length string here, not h5py's default.
     root.attrs["Type"] = np.bytes_("UnstructuredGrid")
     root["NumberOfPoints"] = np.array([mesh.n_points], dtype=np.int64)
     root["NumberOfCells"] = np.array([n], dtype=np.int64)
@@ -246,7 +258,7 @@ def _write_static(root: h5py.Group, mesh: Mesh) -> None:
 
 
 def _begin_steps(root: h5py.Group) -> None:
-    """Make the empty tables of times, and of offsets that send every step to the one grid."""
+    """Create the empty tables of times, and of offsets that refer every step to the one mesh."""
     group = root.create_group("Steps")
     group.attrs["NSteps"] = np.int64(0)
     group.create_group("PointDataOffsets")
@@ -254,7 +266,7 @@ def _begin_steps(root: h5py.Group) -> None:
 
 
 def _put(group: h5py.Group, name: str, at: int, value: Any) -> None:
-    """Put a row into a table that grows."""
+    """Write a row of an extensible table."""
     row = np.asarray(value)
     if name not in group:
         group.create_dataset(name, (0, *row.shape), row.dtype, maxshape=(None, *row.shape), chunks=(_CHUNK, *row.shape))

@@ -207,7 +207,7 @@ CSV_FAULTS = [
     ("x_mm", "X [cm]", ["'X [cm]' is not in mm"]),
     ("status", "stauts", ["unknown column 'stauts'", "did you mean 'status'?"]),
     ("note", "marker", ["'marker' appears 2 times"]),
-    ("2,20,10,10,ok,", "1,20,10,10,ok,", ["marker 1 stands in lines 2 and 3", "keep one"]),
+    ("2,20,10,10,ok,", "1,20,10,10,ok,", ["marker 1 is in lines 2 and 3", "keep one"]),
     ("2,20,10,10,ok,", "two,20,10,10,ok,", ["line 3", "'two'", "whole number"]),
     ("2,20,10,10,ok,", "99999999999999999999,20,10,10,ok,", ["line 3", "whole number"]),
     ("2,20,10,10,ok,", "2,abc,10,10,ok,", ["line 3, marker 2", "x_mm = 'abc'", "not a number"]),

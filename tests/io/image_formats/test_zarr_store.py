@@ -79,7 +79,7 @@ def test_what_is_no_volume_is_told(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="spacing_mm"):
         read_volume(tmp_path / "c.zarr")
     (tmp_path / "d.zarr").mkdir()
-    with pytest.raises(InputError, match="holds no volume"):
+    with pytest.raises(InputError, match="contains no volume"):
         read_volume(tmp_path / "d.zarr")
     with pytest.raises(InputError, match="only Zarr"):
         open_volume(tmp_path / "a.h5")

@@ -1,1 +1,1 @@
-"""Experiments as folders: a description in TOML and a table of markers for each state."""
+"""Experiment folders: a description in TOML and one marker table per state."""

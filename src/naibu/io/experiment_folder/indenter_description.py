@@ -1,4 +1,4 @@
-"""Read the loading of an experiment from its keys and, where keys are not given, from the words that describe the indenter."""
+"""Loading of an experiment, from its keys or, where a key is missing, from the free-text description of the indenter."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _NUMBER = r"(\d+(?:\.\d+)?)"
 
 
 def read_loading(path: Path, meta: Meta, up: Axis) -> Loading:
-    """Return the loading; every value taken from words instead of a key is told in `Loading.assumed`.
+    """Return the loading; every value taken from free text instead of a key is recorded in `Loading.assumed`.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def read_loading(path: Path, meta: Meta, up: Axis) -> Loading:
     Raises
     ------
     InputError
-        Neither the keys nor the words tell the kind, the width of a bar or its axis, or the axis is the vertical one.
+        Neither the keys nor the free text give the kind, the width of a bar or its axis, or the axis is vertical.
     """
     table, assumed = meta.loading, list[str]()
     kind = table.kind or _kind(path, table.indenter, assumed)
@@ -50,7 +50,7 @@ def read_loading(path: Path, meta: Meta, up: Axis) -> Loading:
 
 
 def read_joints(meta: Meta, assumed: list[str]) -> tuple[float, ...]:
-    """Return the heights at which blocks merely lie on each other, mm; a reading from words is appended to `assumed`."""
+    """Return the heights of unbonded interfaces between blocks, mm; a value taken from free text is recorded in `assumed`."""
     if meta.object.joined_at_mm is not None:
         return tuple(meta.object.joined_at_mm)
     found = re.search(rf"the two {_NUMBER} mm halves lie on each other", meta.loading.contact)
@@ -61,7 +61,7 @@ def read_joints(meta: Meta, assumed: list[str]) -> tuple[float, ...]:
 
 
 def read_up_axis(meta: Meta, assumed: list[str]) -> Axis:
-    """Return the axis that points up: that of the key, that of the words in `axes`, else z."""
+    """Return the vertical axis: from the key, else from the free text in `axes`, else z."""
     if meta.coordinates.up_axis:
         return meta.coordinates.up_axis
     found = re.search(r"\b([xyz]) up\b", meta.coordinates.axes)
@@ -77,7 +77,7 @@ def _kind(path: Path, indenter: str, assumed: list[str]) -> LoadingKind:
             assumed.append(f"The loading is taken as {kind!r}, because the indenter is described as {found[0]!r}.")
             return kind
     raise InputError(
-        f"{path}: [loading] indenter = {indenter!r} does not tell how the object is pressed; "
+        f"{path}: [loading] indenter = {indenter!r} does not name a known kind of loading; "
         'add kind = "plate", "bar", "side_plates" or "cylinder" under [loading]'
     )
 
@@ -94,7 +94,7 @@ def _width(path: Path, kind: str, indenter: str, assumed: list[str]) -> float:
 def _axis(path: Path, kind: str, meta: Meta, assumed: list[str]) -> Axis:
     indenter = meta.loading.indenter
     if kind == "bar":
-        # "lies along y ... its width is along x": what it lies along counts
+        # "lies along y ... its width is along x": the axis that it lies along counts
         found = re.search(r"\blies along ([xyz])\b", indenter) or re.search(r"\balong ([xyz])\b", indenter)
         source = "indenter"
     else:

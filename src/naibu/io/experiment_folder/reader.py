@@ -1,4 +1,4 @@
-"""Read an experiment folder: `meta.toml` and one marker table for each state."""
+"""Reader of experiment folders: `meta.toml` and one marker table per state."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ def read_experiment(folder: str | os.PathLike[str]) -> Experiment:
     Returns
     -------
     Experiment
-        Coordinates as they stand in the files, mm. What had to be read from words is told in `loading.assumed`.
+        Coordinates as stored in the files, mm. Values taken from free text are recorded in `loading.assumed`.
 
     Raises
     ------
     InputError
-        A file is missing or not readable, or holds something that cannot be; the message names file, field, value and mend.
+        A file is missing, unreadable or contains an impossible value; the message names file, field, value and correction.
     """
     root = Path(folder)
     hashes: dict[str, str] = {}
@@ -113,7 +113,7 @@ def _shape(path: Path, meta: Meta, up: Axis, assumed: list[str]) -> Shape:
         mend = f"did you mean {close[0]!r}?" if close else f"use one of {', '.join(_SHAPES)}"
         raise InputError(f"{path}: [object] shape = {words!r} is not known; {mend}")
     if axes is None and meta.dimensions == 2 and up == "y":
-        # plane data come with width, depth, height, the depth being the direction that was not measured
+        # plane data give width, depth, height; the depth is the direction that was not measured
         axes = ["x", "z", "y"]
         assumed.append(f"size_mm = {size} is taken as width (x), depth (z), height (y), as the markers lie in one vertical plane.")
     axes = axes or ["x", "y", "z"]
@@ -176,7 +176,7 @@ def _is_loaded(table: StateTable, assumed: list[str]) -> bool:
 
 
 def _with_heights(path: Path, loading: LoadingTable, sideways: bool, states: list[State], tables: list[StateTable]) -> tuple[State, ...]:
-    """Give every loaded state its stated and estimated height, or distance of the side plates."""
+    """Add to every loaded state its stated and estimated height, or distance between the side plates."""
     used, other = ("width", "height") if sideways else ("height", "width")
     for source in (loading, *tables):
         for key in (f"{other}_stated_mm", f"{other}_est_mm"):
@@ -209,7 +209,7 @@ def _one_per_state(path: Path, key: str, values: list[float] | None, loaded: lis
 
 
 def _check_positions(root: Path, meta: Meta, experiment: Experiment) -> None:
-    """Refuse positions that cannot be those of one object: too far apart, too close, or without markers in common."""
+    """Raise an error for positions that cannot belong to one object: too far apart, too close, or without common markers."""
     scale = np.array([experiment.xy_scale, experiment.xy_scale, 1.0])
     size = np.array(experiment.shape.size_mm)
     measures = " x ".join(f"{length:g}" for length in size)
@@ -227,9 +227,9 @@ def _check_positions(root: Path, meta: Meta, experiment: Experiment) -> None:
                 f"{root / file}: only {common} markers are complete and trusted both here and in {files[0]}, {_MIN_COMMON} are needed; "
                 "the same marker must have the same number in every state"
             )
-        # pressed flat, a body may spread; twice its longest side is out of reach
+        # a flattened body spreads, but not to twice its longest side
         limit = np.full(3, 2 * size.max() + _OUTSIDE_MM)
-        _refuse_outside(root / file, state.markers, scale, limit, f"the free object is {measures} mm")
+        _refuse_outside(root / file, state.markers, scale, limit, f"the undeformed object is {measures} mm")
 
 
 def _refuse_outside(path: Path, markers: Markers, scale: FloatArray, limit: FloatArray, why: str) -> None:
@@ -246,7 +246,7 @@ def _refuse_outside(path: Path, markers: Markers, scale: FloatArray, limit: Floa
 
 
 def _refuse_too_close(path: Path, experiment: Experiment) -> None:
-    """Refuse a free state whose neighbours stand at less than half the stated spacing: centimetres or metres called mm."""
+    """Raise an error if neighbouring markers are closer than half the stated spacing: centimetres or metres labelled mm."""
     nominal, dimensions = experiment.nominal_spacing_mm, experiment.dimensions
     points = experiment.initial.points[:, :dimensions]
     points = points[np.isfinite(points).all(axis=1)]

@@ -1,4 +1,4 @@
-"""What may stand in the `meta.toml` of an experiment folder, and how a mistake in it is told to the user."""
+"""Schema of the `meta.toml` of an experiment folder, and the error messages for mistakes in it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from naibu.core.experiment import Axis
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-# one number stands for a list of one, so that the rest of the code meets lists only
+# a single number is accepted as a list of one
 PositiveOrList = Annotated[list[Positive], BeforeValidator(lambda v: v if isinstance(v, list) else [v])]
 
 
@@ -33,7 +33,7 @@ def _gathered(data: Any, pattern: str, into: str) -> Any:
 
 
 class CoordinatesTable(_Table):
-    """``[coordinates]``: axes, resolution, and where the base lies."""
+    """``[coordinates]``: axes, resolution, and height of the base."""
 
     axes: str = ""
     up_axis: Axis | None = None
@@ -47,7 +47,7 @@ class CoordinatesTable(_Table):
 
 
 class ObjectTable(_Table):
-    """``[object]``: the body in its free state."""
+    """``[object]``: the undeformed body."""
 
     shape: str
     size_mm: Annotated[list[Positive], Field(min_length=3, max_length=3)]
@@ -59,7 +59,7 @@ class ObjectTable(_Table):
 
 
 class MarkersTable(_Table):
-    """``[markers]``: what the markers are and where they were meant to be."""
+    """``[markers]``: type and nominal positions of the markers."""
 
     kind: str = ""
     placing: str = ""
@@ -88,7 +88,7 @@ class LayerTable(_Table):
 
 
 class LoadingTable(_Table):
-    """``[loading]``: how the object is pressed, in words and, where the keys are there, in numbers."""
+    """``[loading]``: loading of the object, as keys or as free text."""
 
     kind: Literal["plate", "bar", "side_plates", "cylinder"] | None = None
     bar_width_mm: Positive | None = None
@@ -107,7 +107,7 @@ class LoadingTable(_Table):
 
 
 class ScannerTable(_Table):
-    """``[scanner]``: the instrument; kept with the experiment as it is."""
+    """``[scanner]``: the instrument; stored with the experiment unchanged."""
 
     instrument: str | None = None
     slice_area_mm: Positive | None = None
@@ -122,7 +122,7 @@ class ScannerTable(_Table):
 
 
 class GelTable(_Table):
-    """``[gel]``: what is known of the material beforehand."""
+    """``[gel]``: prior knowledge of the material."""
 
     product: str = ""
     nu_note: str = ""
@@ -135,7 +135,7 @@ class GelTable(_Table):
 
 
 class StateTable(_Table):
-    """``[[state]]``: one measured state; the first is the free one."""
+    """``[[state]]``: one measured state; the first is the reference configuration."""
 
     name: Annotated[str, Field(pattern=r"^[\w.-]+$")]
     what: str = ""
@@ -194,18 +194,18 @@ _MENDS = {
     "kind": 'write kind = "plate", "bar", "side_plates" or "cylinder"',
     "bar_axis": 'write bar_axis = "x", "y" or "z"',
     "up_axis": 'write up_axis = "x", "y" or "z"',
-    "state": 'add a [[state]] table with name = "initial" for the free state, and one for each loaded state',
+    "state": 'add a [[state]] table with name = "initial" for the unloaded state, and one for each loaded state',
     "name": 'give every state a name of letters, digits, "_", "-" and ".", for example name = "initial"',
 }
 
 
 def load_meta(path: Path, content: bytes) -> Meta:
-    """Parse and check the bytes of `meta.toml`; `path` is only named in errors.
+    """Parse and check the content of `meta.toml`; `path` is only used in messages.
 
     Raises
     ------
     InputError
-        The text is not UTF-8 or not TOML (the line is shown), or a key is unknown, missing or holds a value that cannot be.
+        The text is not UTF-8 or not TOML (the line is shown), or a key is unknown, missing or has an invalid value.
     """
     try:
         text = content.decode("utf-8-sig")
@@ -223,28 +223,28 @@ def load_meta(path: Path, content: bytes) -> Meta:
 
 
 def syntax_message(path: Path, text: str, error: tomllib.TOMLDecodeError) -> str:
-    """Return what is wrong with a text that is no TOML, with the line that it stands on."""
+    """Return the message for a text that is not valid TOML, with the faulty line."""
     found = re.search(r"at line (\d+)", str(error))
     lines = text.splitlines()
     number = int(found[1]) if found else len(lines)
     shown = lines[number - 1].strip() if 0 < number <= len(lines) else ""
-    return f"{path}: line {number} is not valid TOML: {shown!r} ({error}); mend this line: one key = value, text in quotes"
+    return f"{path}: line {number} is not valid TOML: {shown!r} ({error}); correct this line: one key = value, text in quotes"
 
 
 def _told(fault: dict[str, Any]) -> str:
-    """One fault of the check, in words that name the field, its value and the mend."""
-    place, key = _place(fault["loc"])
+    """Return the message for one validation error: the field, its value and the correction."""
+    field, key = _field(fault["loc"])
     if fault["type"] == "extra_forbidden":
-        return f"{place} is not a known key; {_known_instead(fault['loc'], key)}"
+        return f"{field} is not a known key; {_known_instead(fault['loc'], key)}"
     mend = _MENDS.get(key, "correct it in this file")
     if fault["type"] == "missing":
-        return f"{place} is missing; {_MENDS.get(key, 'add it')}"
+        return f"{field} is missing; {_MENDS.get(key, 'add it')}"
     what = "must be a finite number" if fault["type"] == "finite_number" else str(fault["msg"]).replace("Input should", "must")
-    return f"{place} = {fault['input']!r}: {what[:1].lower()}{what[1:]}; {mend}"
+    return f"{field} = {fault['input']!r}: {what[:1].lower()}{what[1:]}; {mend}"
 
 
-def _place(loc: tuple[int | str, ...]) -> tuple[str, str]:
-    """Return the place of a fault as the user sees it in the file, and the key at fault."""
+def _field(loc: tuple[int | str, ...]) -> tuple[str, str]:
+    """Return the faulty field as written in the file, and its key."""
     parts = list(loc)
     table = ""
     if parts[0] in _TABLES and len(parts) > 1:

@@ -33,19 +33,26 @@ class _Row:
 
 
 def parse_state_csv(path: Path, content: bytes, dimensions: int) -> Markers:
-    """Check the bytes of one state's table and make markers of them; `path` is only named in errors.
+    """Parse and check the marker table of one state.
 
     Parameters
     ----------
+    path : Path
+        File of the table, only used in messages.
     content : bytes
         UTF-8 text. A blank coordinate or ``NaN`` is missing. A blank status means ``ok`` or, where a coordinate is missing, ``missing``.
     dimensions : int
         2 when z is not measured (and NaN throughout), else 3.
 
+    Returns
+    -------
+    Markers
+        Positions, shape (n, 3), mm; NaN where missing.
+
     Raises
     ------
     InputError
-        A wrong header, row, label, number or status, or no position at all; the message names line, marker, value and mend.
+        A wrong header, row, label, number or status, or no position at all; the message names line, marker, value and correction.
     """
     lines = _numbered_lines(path, content)
     if not lines:
@@ -127,7 +134,7 @@ def _row(path: Path, line: int, cells: dict[str, str], dimensions: int) -> _Row:
 
 
 def is_trusted(status: str, note: str) -> bool:
-    """Tell whether the coordinates that a row has may be used: a partly legible row may, unless its note casts doubt on the rest."""
+    """Whether the coordinates of a row can be trusted: those of an incomplete row can, unless its note calls them suspect."""
     return status != "suspect" and not (status == "missing" and "suspect" in note.lower())
 
 
@@ -142,7 +149,7 @@ def _coordinate(where: str, cells: dict[str, str], name: str) -> float:
     if text == "" or text.lower() == "nan":
         return math.nan
     try:
-        # float() takes 1_000 for 1000, which is hardly what a table of measurements means
+        # float() accepts 1_000, which is not a number in a table of measurements
         value = float(text) if "_" not in text else None
     except ValueError:
         value = None
@@ -158,5 +165,5 @@ def _refuse_duplicates(path: Path, rows: list[_Row]) -> None:
     seen: dict[int, int] = {}
     for row in rows:
         if row.marker in seen:
-            raise InputError(f"{path}: marker {row.marker} stands in lines {seen[row.marker]} and {row.line}; keep one of them")
+            raise InputError(f"{path}: marker {row.marker} is in lines {seen[row.marker]} and {row.line}; keep one of them")
         seen[row.marker] = row.line

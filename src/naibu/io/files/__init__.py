@@ -1,1 +1,1 @@
-"""How files are written: whole or not at all, with a record of where they come from."""
+"""Atomic writing of files, and provenance records of input files."""

@@ -1,4 +1,4 @@
-"""Write a file so that a reader, or a crash, never meets half of it."""
+"""Atomic writing of files: a reader, or a crash, never sees a half-written one."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ def write_atomically(path: str | os.PathLike[str], data: str | bytes) -> Path:
     Parameters
     ----------
     path : path-like
-        File to write; its folder is made when it is not there.
+        File to write; its folder is created if needed.
     data : str or bytes
-        Content; text is stored as UTF-8 with its line ends unchanged.
+        Content; text is stored as UTF-8 with its line endings unchanged.
 
     Returns
     -------
@@ -45,7 +45,7 @@ def write_atomically(path: str | os.PathLike[str], data: str | bytes) -> Path:
 
 
 def new_aside(path: str | os.PathLike[str]) -> Path:
-    """Make an empty file beside `path`, for libraries that write files themselves; `put_in_place` gives it the name.
+    """Create an empty temporary file beside `path`, for libraries that write files themselves; `put_in_place` renames it.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def new_aside(path: str | os.PathLike[str]) -> Path:
 
 
 def put_in_place(aside: Path, path: str | os.PathLike[str]) -> Path:
-    """Give a finished file that `new_aside` made the name `path`, and the rights of an ordinary new file.
+    """Rename a finished file from `new_aside` to `path`, with the permissions of an ordinary new file.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Which files a result was made from."""
+"""Provenance of results: names and hashes of the input files."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from naibu.core.errors import InputError
 
 
 def sha256(path: str | os.PathLike[str]) -> str:
-    """Return the SHA-256 of a file, or of the files of a folder in order of their names, in hexadecimal digits.
+    """Return the SHA-256 of a file, or of the files of a folder in order of their names, as hexadecimal digits.
 
     Raises
     ------
     InputError
         The file cannot be read.
     """
-    place, digest = Path(path), hashlib.sha256()
+    source, digest = Path(path), hashlib.sha256()
     try:
-        for file in sorted(p for p in place.rglob("*") if p.is_file()) if place.is_dir() else [place]:
+        for file in sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [source]:
             digest.update(file.read_bytes())
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
@@ -28,5 +28,5 @@ def sha256(path: str | os.PathLike[str]) -> str:
 
 
 def input_record(files: Mapping[str, str | os.PathLike[str] | None]) -> dict[str, str]:
-    """Return names and hashes of files by the part they play, those that are None left out: ``before: scan.mha, SHA-256 ...``."""
+    """Return names and hashes of files by their role, such as ``"reference": "scan.mha, SHA-256 ..."``; None is skipped."""
     return {role: f"{Path(path).name}, SHA-256 {sha256(path)}" for role, path in files.items() if path is not None}

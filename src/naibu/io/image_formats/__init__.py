@@ -1,1 +1,1 @@
-"""One reader and writer a file format of volumes; `naibu.io.images` picks the one a file name asks for."""
+"""Image file formats, one module each; `naibu.io.images` selects one by the file name extension."""

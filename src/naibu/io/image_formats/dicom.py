@@ -1,6 +1,6 @@
-"""DICOM series through pydicom: slices sorted by where they lie, and refused where they make no volume.
+"""DICOM series (read with pydicom): slices are sorted by position and checked to form a regular volume.
 
-Geometry as in DICOM PS3.3, C.7.6.2 "Image Plane Module"; frames of enhanced files as in C.7.6.16.
+The geometry follows DICOM PS3.3, C.7.6.2 "Image Plane Module"; frames of enhanced files follow C.7.6.16.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ EVEN, ALIGNED = 0.02, 2e-3
 
 @dataclass(frozen=True)
 class _Slice:
-    """One image plane of a series and where it lies."""
+    """One image plane of a series with its position and orientation."""
 
     file: Path
     frame: int | None
@@ -54,7 +54,7 @@ def is_dicom(path: Path) -> bool:
 
 
 def read(path: Path, options: ReadOptions) -> Volume:
-    """Read the series of a folder, or the one a file belongs to (see `naibu.io.images.read_volume`)."""
+    """Read the series of a folder, or the one that a file belongs to (see `naibu.io.images.read_volume`)."""
     pydicom = optional_package("pydicom", f"{path.name}: reading DICOM files")
     slices = _one_series(path, _slices(pydicom, path), options.series)
     slices = _sorted_stack(path.name, slices)
@@ -91,7 +91,7 @@ def _slices(pydicom: Any, path: Path) -> list[_Slice]:
         if "Rows" in data:
             found += _planes(file, data)
     if not found:
-        raise InputError(f"{path.name}: holds no DICOM images; name the folder of the series, or one of its files")
+        raise InputError(f"{path.name}: contains no DICOM images; give the folder of the series, or one of its files")
     if not path.is_dir():
         own = {s.series for s in found if s.file == path}
         found = [s for s in found if s.series in own]
@@ -106,7 +106,7 @@ def _planes(file: Path, data: Any) -> list[_Slice]:
         return [_plane(file, None, data, [data])]
     if not frames:
         raise InputError(
-            f"{file.name}: holds {n} frames without their places (a film or an ultrasound sequence), which is no volume; export slices"
+            f"{file.name}: contains {n} frames without positions (a cine or ultrasound sequence), which do not form a volume; export slices"
         )
     shared = data.get("SharedFunctionalGroupsSequence") or [{}]
     return [_plane(file, i, data, [*_groups(frame), *_groups(shared[0]), data]) for i, frame in enumerate(frames)]
@@ -117,15 +117,15 @@ def _groups(items: Any) -> list[Any]:
     return [element.value[0] for element in items if element.VR == "SQ" and len(element.value)] if items else []
 
 
-def _plane(file: Path, frame: int | None, data: Any, places: Sequence[Any]) -> _Slice:
+def _plane(file: Path, frame: int | None, data: Any, groups: Sequence[Any]) -> _Slice:
     def stated(tag: str) -> Any:
-        return next((place.get(tag) for place in places if place.get(tag) is not None), None)
+        return next((group.get(tag) for group in groups if group.get(tag) is not None), None)
 
     name = file.name if frame is None else f"{file.name} frame {frame + 1}"
     position, turn, pixel = (stated(tag) for tag in ("ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing"))
     if position is None or turn is None or pixel is None:
         lacking = "ImagePositionPatient" if position is None else "ImageOrientationPatient" if turn is None else "PixelSpacing"
-        raise InputError(f"{name}: has no {lacking}, so it is not known where it lies; export the original series, not screen captures")
+        raise InputError(f"{name}: has no {lacking}, so its geometry is unknown; export the original series, not screen captures")
     apart = stated("SpacingBetweenSlices") or stated("SliceThickness")
     slope, intercept = stated("RescaleSlope"), stated("RescaleIntercept")
     return _Slice(
@@ -147,37 +147,38 @@ def _one_series(path: Path, slices: list[_Slice], wanted: str | None) -> list[_S
     """Return the slices of the one series there is, or of the one asked for."""
     series = {s.series: s.description for s in slices}
     if wanted is not None:
-        chosen = [uid for uid, told in series.items() if wanted in (uid, told)]
+        chosen = [uid for uid, description in series.items() if wanted in (uid, description)]
         if len(chosen) != 1:
-            raise InputError(f"{path.name}: {len(chosen)} series are called {wanted!r}; there are {_listed(slices, series)}")
+            raise InputError(f"{path.name}: {len(chosen)} series are called {wanted!r}; the folder contains {_listed(slices, series)}")
         return [s for s in slices if s.series == chosen[0]]
     if len(series) > 1:
-        raise InputError(f"{path.name}: mixes {len(series)} series, {_listed(slices, series)}; choose one with series=")
+        raise InputError(f"{path.name}: contains {len(series)} series, {_listed(slices, series)}; choose one with series=")
     return slices
 
 
 def _listed(slices: list[_Slice], series: dict[str, str]) -> str:
-    return "; ".join(f"{uid} ({told or 'no description'}, {sum(s.series == uid for s in slices)} slices)" for uid, told in series.items())
+    counts = {uid: sum(s.series == uid for s in slices) for uid in series}
+    return "; ".join(f"{uid} ({description or 'no description'}, {counts[uid]} slices)" for uid, description in series.items())
 
 
 def _sorted_stack(source: str, slices: list[_Slice]) -> list[_Slice]:
-    """Return slices of one size and orientation by their place along the normal."""
+    """Return slices of one size and orientation sorted by position along the normal."""
     first = slices[0]
     for s in slices:
         no_colours(s.name, s.samples)
         if s.size != first.size or np.abs(s.pixel_mm - first.pixel_mm).max() > 1e-4 * first.pixel_mm.min():
             raise InputError(
                 f"{source}: slices {first.name} and {s.name} differ in size or pixel spacing ({first.size}, {first.pixel_mm.tolist()} mm; "
-                f"{s.size}, {s.pixel_mm.tolist()} mm); keep one stack in a series"
+                f"{s.size}, {s.pixel_mm.tolist()} mm); a series must be one stack"
             )
         if np.abs(s.axes - first.axes).max() > ALIGNED:
-            raise InputError(f"{source}: slices {first.name} and {s.name} lie in different directions (a localizer?); take them apart")
+            raise InputError(f"{source}: slices {first.name} and {s.name} differ in orientation (a localizer?); separate them")
     normal = np.cross(*first.axes)
     return sorted(slices, key=lambda s: float(s.position @ normal))
 
 
 def _step(source: str, slices: list[_Slice]) -> FloatArray:
-    """Return the step (3,), mm, from one slice to the next."""
+    """Return the offset (3,), mm, from one slice to the next."""
     first = slices[0]
     normal = np.cross(*first.axes)
     if len(slices) == 1:
@@ -188,17 +189,17 @@ def _step(source: str, slices: list[_Slice]) -> FloatArray:
     twice = int(np.argmin(along))
     if along[twice] < 0.01 * max(usual, 0.01):
         raise InputError(
-            f"{source}: {slices[twice].name} and {slices[twice + 1].name} lie at the same place (several times, echoes or repetitions); "
-            "export the one you mean as a series of its own"
+            f"{source}: {slices[twice].name} and {slices[twice + 1].name} have the same position (several time points, echoes or "
+            "repetitions); export one of them as a series of its own"
         )
     worst = int(np.argmax(np.abs(along - usual)))
     if abs(along[worst] - usual) > EVEN * usual:
         between = f"between {slices[worst].name} and {slices[worst + 1].name} ({along[worst]:.3f} mm apart, the others {usual:.3f} mm)"
         lost = round(along[worst] / usual) - 1
-        what = f"{lost} slice{'s are' if lost > 1 else ' is'} missing" if lost > 0 else "the distance of the slices is uneven"
-        raise InputError(f"{source}: {what} {between}; export the whole series again, or resample it to even slices")
+        what = f"{lost} slice{'s are' if lost > 1 else ' is'} missing" if lost > 0 else "the slice spacing is uneven"
+        raise InputError(f"{source}: {what} {between}; export the whole series again, or resample it to evenly spaced slices")
     total = slices[-1].position - first.position
-    # the mean step: rounding of single positions averages out
+    # the mean offset: rounding of single positions averages out
     return np.asarray(total / (len(slices) - 1))
 
 
@@ -208,7 +209,7 @@ def _values(pydicom: Any, source: str, slices: list[_Slice]) -> AnyArray:
     planes = []
     for s in slices:
         if s.file not in pages:
-            # one file a slice, as most series have: keep only the last
+            # one file per slice, as in most series: keep only the last
             pages = {} if s.frame is None else pages
             try:
                 pages[s.file] = np.asarray(pydicom.dcmread(s.file).pixel_array)

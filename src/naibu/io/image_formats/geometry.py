@@ -1,4 +1,4 @@
-"""What the readers share: axes with lengths made into the geometry of a volume, units of length, and arrays that are no volumes."""
+"""Helpers of the image readers: volume geometry from axes and spacings, units of length, checks of array dimensions."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ _LONG_NAMES = {
     "nanometer": "nm",
     "nanometre": "nm",
 }
-# x and y grow to the left and the back in LPS, to the right and the front in RAS
+# x and y increase towards left and posterior in LPS, towards right and anterior in RAS
 FLIP_RAS = np.diag([-1.0, -1.0, 1.0])
 
 
 class ReadOptions(NamedTuple):
-    """What the user may say about a file.
+    """Options of the reader, given by the user.
 
     Attributes
     ----------
     unit_mm : float or None
-        Length of the file's unit, mm; None takes the unit the file states, or mm.
+        Length of the file's unit, mm; None takes the unit that the file states, else mm.
     spacing_mm : ndarray, shape (3,), or None
-        Distance of voxels along x, y, z, mm, for files that do not say.
+        Voxel spacing along x, y, z, mm, for files that do not state it.
     series : str or None
-        Series of a DICOM folder.
+        UID or description of the series to read from a DICOM folder.
     rescaled : bool
-        Whether slope and intercept of the file are applied to its values.
+        Whether to apply the rescale slope and intercept of the file.
     """
 
     unit_mm: float | None = None
@@ -58,48 +58,48 @@ def unit_length(source: str, name: str) -> float:
     Raises
     ------
     InputError
-        A name that is no unit of length.
+        The name is not a known unit of length.
     """
     short = name.strip().strip('"').lower()
     singular = short[:-1] if short.endswith("s") and len(short) > 2 else short
     key = _LONG_NAMES.get(singular, singular)
     if key not in MM_PER_UNIT:
-        raise InputError(f"{source}: states its lengths in {name!r}, which is no unit naibu knows; give unit_mm, the length of one in mm")
+        raise InputError(f"{source}: states its lengths in {name!r}, which is not a known unit; give unit_mm, its length in mm")
     return MM_PER_UNIT[key]
 
 
 def volume_with_axes(source: str, values: ArrayLike, origin: ArrayLike, axes: ArrayLike, unit_mm: float = 1.0) -> Volume:
-    """Return a volume of values, the centre of the first voxel, and one step along each index.
+    """Return a volume from its values, the centre of the first voxel and the voxel axes.
 
     Parameters
     ----------
     source : str
         Name of the file, for errors.
     values : array_like, shape (nz, ny, nx)
-        Grey values.
+        Intensities.
     origin : array_like, shape (3,)
         Centre of the first voxel, LPS, in the file's unit.
     axes : array_like, shape (3, 3)
-        Columns are the steps to the next voxel along x, y, z, LPS, in the file's unit.
+        Columns are the offsets to the next voxel along x, y, z, LPS, in the file's unit.
     unit_mm : float
         Length of the file's unit, mm.
 
     Raises
     ------
     InputError
-        Steps of no length, sheared axes (slices that are not orthogonal), or values that make no volume.
+        Axes of zero length, sheared axes (slices that are not orthogonal), or values that do not form a volume.
     """
     steps = np.asarray(axes, dtype=float)
     spacing = np.linalg.norm(steps, axis=0)
     if not (np.isfinite(steps).all() and (spacing > 0.0).all()):
-        raise InputError(f"{source}: the distance of its voxels is {spacing.tolist()} along x, y, z; the geometry of the file is damaged")
+        raise InputError(f"{source}: the voxel spacing is {spacing.tolist()} along x, y, z; the geometry stored in the file is damaged")
     direction = steps / spacing
     skew = np.abs(direction.T @ direction - np.eye(3))
     if skew.max() > NEARLY:
         degrees = np.degrees(np.arcsin(min(float(skew.max()), 1.0)))
         raise InputError(
-            f"{source}: its axes are {90.0 - degrees:.2f} degrees apart instead of 90 (slices that are not orthogonal, as with a tilted "
-            "gantry); resample it to orthogonal slices first"
+            f"{source}: the angle between its axes is {90.0 - degrees:.2f} degrees instead of 90 (slices that are not orthogonal, as with "
+            "a tilted gantry); resample it to orthogonal slices first"
         )
     try:
         return Volume.from_array(
@@ -110,7 +110,7 @@ def volume_with_axes(source: str, values: ArrayLike, origin: ArrayLike, axes: Ar
 
 
 def nearest_rotation(direction: FloatArray) -> FloatArray:
-    """Return the orthonormal axes (3, 3) nearest to axes that were rounded in a file; exact ones stay exact."""
+    """Return the orthonormal axes (3, 3) nearest to axes that a file stores rounded; exact ones are unchanged."""
     if np.abs(direction.T @ direction - np.eye(3)).max() < 1e-12:
         return direction
     u, _, vt = np.linalg.svd(direction)
@@ -118,12 +118,12 @@ def nearest_rotation(direction: FloatArray) -> FloatArray:
 
 
 def three_axes(source: str, values: AnyArray) -> AnyArray:
-    """Return values (nz, ny, nx) of an array whose further leading axes have length one; a plane becomes one slice.
+    """Return values of shape (nz, ny, nx); leading axes of length one are removed, a plane becomes one slice.
 
     Raises
     ------
     InputError
-        Several times, echoes or channels.
+        Several time points, echoes or channels.
     """
     v = values
     while v.ndim > 3 and v.shape[0] == 1:
@@ -132,14 +132,14 @@ def three_axes(source: str, values: AnyArray) -> AnyArray:
         v = v[None]
     if v.ndim != 3:
         raise InputError(
-            f"{source}: holds {values.ndim} axes with {values.shape[::-1]} samples (several times, echoes or channels); "
-            "save the one you mean as a volume of its own"
+            f"{source}: has {values.ndim} axes with {values.shape[::-1]} samples (several time points, echoes or channels); "
+            "save one of them as a volume of its own"
         )
     return v
 
 
-def no_colours(source: str, samples: int, what: str = "colour samples a voxel") -> None:
-    """Refuse more than one sample a voxel.
+def no_colours(source: str, samples: int, what: str = "colour samples per voxel") -> None:
+    """Raise an error for more than one sample per voxel.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def no_colours(source: str, samples: int, what: str = "colour samples a voxel") 
         `samples` is not one.
     """
     if samples != 1:
-        raise InputError(f"{source}: has {samples} {what} (RGB or vectors), not one grey value; convert it to grey values first")
+        raise InputError(f"{source}: has {samples} {what} (RGB or vectors), not one intensity; convert it to greyscale first")
 
 
 def content(path: str | os.PathLike[str]) -> bytes:
@@ -156,7 +156,7 @@ def content(path: str | os.PathLike[str]) -> bytes:
     Raises
     ------
     InputError
-        It is not there or may not be read.
+        The file does not exist or cannot be read.
     """
     try:
         return Path(path).read_bytes()

@@ -1,6 +1,6 @@
-"""Volumes in HDF5, in blocks, so that parts of one larger than memory can be read.
+"""Image volumes in HDF5, chunked, so that parts of a volume larger than memory can be read.
 
-The file holds a dataset ``values`` (nz, ny, nx) with the attributes ``spacing_mm``, ``origin_mm`` (x, y, z) and ``direction`` (3, 3).
+The file contains a dataset ``values`` (nz, ny, nx) with the attributes ``spacing_mm``, ``origin_mm`` (x, y, z) and ``direction`` (3, 3).
 """
 
 from __future__ import annotations
@@ -25,29 +25,29 @@ _ATTRIBUTES = ("spacing_mm", "origin_mm", "direction")
 
 
 def read(path: Path, options: ReadOptions) -> Volume:
-    """Read grey values (see `naibu.io.images.read_volume`)."""
+    """Read a volume (see `naibu.io.images.read_volume`)."""
     with _dataset(path) as stored:
         return _volume(path, stored, (0, 0, 0), stored.shape[::-1], options)
 
 
 def read_box(path: Path, low: ArrayLike, high: ArrayLike, options: ReadOptions) -> Volume:
-    """Read the voxels with indices from `low` up to, not including, `high`, in the order x, y, z; the rest of the file stays unread.
+    """Read the voxels with indices `low` <= index < `high` along x, y, z, without reading the rest of the file.
 
     Raises
     ------
     InputError
-        A box that is not inside the volume, or a file that is no volume.
+        The box is not inside the volume, or the file contains no volume.
     """
     with _dataset(path) as stored:
         a, b = np.asarray(low, dtype=int), np.asarray(high, dtype=int)
         size = np.array(stored.shape[::-1])
         if (a < 0).any() or (b > size).any() or (a >= b).any():
-            raise InputError(f"{path.name}: cannot read {a.tolist()}..{b.tolist()}: it has {size.tolist()} voxels along x, y, z")
+            raise InputError(f"{path.name}: cannot read {a.tolist()}..{b.tolist()}: the volume has {size.tolist()} voxels along x, y, z")
         return _volume(path, stored, tuple(a.tolist()), tuple(b.tolist()), options)
 
 
 def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Path:
-    """Write grey values (nz, ny, nx), or vectors (nz, ny, nx, 3), that stand on the grid of a volume, in blocks of 64 voxels an edge."""
+    """Write intensities (nz, ny, nx), or vectors (nz, ny, nx, 3), on the grid of a volume, in chunks of 64 voxels per edge."""
     aside = new_aside(path)
     try:
         with h5py.File(aside, "w") as file:
@@ -75,10 +75,10 @@ def _dataset(path: Path) -> Iterator[Any]:
     with file:
         stored = file.get("values")
         if not isinstance(stored, h5py.Dataset) or any(name not in stored.attrs for name in _ATTRIBUTES):
-            told = f"a dataset 'values' with the attributes {', '.join(_ATTRIBUTES)}"
-            raise InputError(f"{path.name}: holds no volume: naibu looks for {told}; it has {sorted(file)}")
+            expected = f"a dataset 'values' with the attributes {', '.join(_ATTRIBUTES)}"
+            raise InputError(f"{path.name}: contains no volume: naibu expects {expected}; the file has {sorted(file)}")
         if stored.ndim != 3:
-            raise InputError(f"{path.name}: its values have {stored.ndim} axes {stored.shape}, not z, y, x; choose one time or component")
+            raise InputError(f"{path.name}: its values have {stored.ndim} axes {stored.shape}, not (z, y, x); save one of its components")
         yield stored
 
 

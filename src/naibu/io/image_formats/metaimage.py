@@ -1,6 +1,6 @@
-"""MetaImage (``.mha``, ``.mhd``): the format of ITK, 3D Slicer and ParaView, grey values and vectors.
+"""MetaImage (``.mha``, ``.mhd``), the format of ITK, 3D Slicer and ParaView: scalar and vector images.
 
-Described in "MetaIO Documentation", https://docs.itk.org/en/latest/learn/metaio.html.
+The format is specified in "MetaIO Documentation", https://docs.itk.org/en/latest/learn/metaio.html.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _TYPES = {
     "MET_USHORT": "u2",
     "MET_INT": "i4",
     "MET_UINT": "u4",
-    # a "long" has 4 bytes in this format, whatever the machine
+    # a "long" has 4 bytes in this format on every platform
     "MET_LONG": "i4",
     "MET_ULONG": "u4",
     "MET_LONG_LONG": "i8",
@@ -36,24 +36,24 @@ _NAMES = {code: name for name, code in _TYPES.items() if name not in ("MET_LONG"
 
 
 def read(path: Path, options: ReadOptions) -> Volume:
-    """Read grey values (see `naibu.io.images.read_volume`)."""
+    """Read a scalar volume (see `naibu.io.images.read_volume`)."""
     header, values = _parts(path)
-    no_colours(path.name, int(header.get("ElementNumberOfChannels", "1")), "channels a voxel")
+    no_colours(path.name, int(header.get("ElementNumberOfChannels", "1")), "channels per voxel")
     return _with_geometry(path, header, values, options)
 
 
 def read_vectors(path: Path, options: ReadOptions) -> tuple[FloatArray, Volume]:
-    """Read vectors (nz, ny, nx, 3) and the grid they stand on, whose values tell where they are finite."""
+    """Read vectors (nz, ny, nx, 3) and their grid, whose values are true where all components are finite."""
     header, values = _parts(path)
     if int(header.get("ElementNumberOfChannels", "1")) != 3 or values.ndim != 4:
-        raise InputError(f"{path.name}: holds no vectors with three components; read it with read_volume")
+        raise InputError(f"{path.name}: contains no vectors of three components; use read_volume for scalar images")
     vectors = np.asarray(values, dtype=float)
     grid = _with_geometry(path, header, np.isfinite(vectors).all(axis=3), options)
     return vectors, grid
 
 
 def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Path:
-    """Write values (nz, ny, nx), or vectors (nz, ny, nx, 3), that stand on the grid of a volume."""
+    """Write intensities (nz, ny, nx), or vectors (nz, ny, nx, 3), on the grid of a volume."""
     stored = values.astype(np.uint8) if values.dtype == bool else values
     stored = stored.astype(np.float32) if stored.dtype == np.float16 else stored
     code = f"{stored.dtype.kind}{stored.dtype.itemsize}"
@@ -96,10 +96,10 @@ def _parts(path: Path) -> tuple[dict[str, str], AnyArray]:
     header, end = _header(path.name, raw)
     missing = [key for key in ("NDims", "DimSize", "ElementType", "ElementDataFile") if key not in header]
     if missing:
-        raise InputError(f"{path.name}: is no MetaImage file, or a damaged one: its header lacks {', '.join(missing)}")
+        raise InputError(f"{path.name}: is not a MetaImage file, or is damaged: its header lacks {', '.join(missing)}")
     kind = header["ElementType"].upper().removesuffix("_ARRAY")
     if kind not in _TYPES:
-        raise InputError(f"{path.name}: its values are of type {header['ElementType']}, which is none of {sorted(_TYPES)}")
+        raise InputError(f"{path.name}: its values are of type {header['ElementType']}; supported are {sorted(_TYPES)}")
     size = [int(n) for n in header["DimSize"].split()]
     channels = int(header.get("ElementNumberOfChannels", "1"))
     shape = (*size[::-1], *((channels,) if channels > 1 else ()))
@@ -116,7 +116,7 @@ def _header(source: str, raw: bytes) -> tuple[dict[str, str], int]:
         try:
             key, found, value = raw[at:end].decode("utf-8").partition("=")
         except UnicodeDecodeError as error:
-            raise InputError(f"{source}: is no MetaImage file: its header is not text") from error
+            raise InputError(f"{source}: is not a MetaImage file: its header is not text") from error
         if found:
             header[key.strip()] = value.strip()
         at = end + 1
@@ -124,10 +124,10 @@ def _header(source: str, raw: bytes) -> tuple[dict[str, str], int]:
 
 
 def _values(path: Path, header: dict[str, str], rest: bytes, dtype: np.dtype[Any], shape: tuple[int, ...]) -> AnyArray:
-    """Return the values that follow the header, or stand in the files it names."""
+    """Return the values that follow the header, or those of the data files that it names."""
     named = header["ElementDataFile"]
     if "%" in named:
-        raise InputError(f"{path.name}: spreads its slices over files {named!r}, which naibu does not read; save it as one .mha file")
+        raise InputError(f"{path.name}: stores its slices in separate files {named!r}, which is not supported; save it as one .mha file")
     if named.split()[0] == "LIST":
         data = b"".join(content(path.parent / name.strip()) for name in rest.decode().splitlines() if name.strip())
     else:
@@ -137,7 +137,7 @@ def _values(path: Path, header: dict[str, str], rest: bytes, dtype: np.dtype[Any
         try:
             data = zlib.decompress(data)
         except zlib.error as error:
-            raise InputError(f"{path.name}: its compressed values are damaged or cut off ({error}); copy the file again") from error
+            raise InputError(f"{path.name}: its compressed values are damaged or truncated ({error}); copy the file again") from error
     n = int(np.prod(shape))
     if not _true(header.get("BinaryData", "True")):
         return _counted(path.name, np.array(data.split()[:n]).astype(dtype), n).reshape(shape)
@@ -150,7 +150,7 @@ def _values(path: Path, header: dict[str, str], rest: bytes, dtype: np.dtype[Any
 
 def _counted(source: str, values: AnyArray, n: int) -> AnyArray:
     if len(values) != n:
-        raise InputError(f"{source}: holds {len(values)} of {n} values: the file was cut off; copy it again")
+        raise InputError(f"{source}: contains {len(values)} of {n} values: the file is truncated; copy it again")
     return values
 
 
@@ -160,14 +160,14 @@ def _true(text: str | None) -> bool:
 
 def _with_geometry(path: Path, header: dict[str, str], values: AnyArray, options: ReadOptions) -> Volume:
     n = int(header["NDims"])
-    place = next((header[key] for key in ("Offset", "Origin", "Position") if key in header), None)
-    turn = next((header[key] for key in ("TransformMatrix", "Rotation", "Orientation") if key in header), None)
+    position = next((header[key] for key in ("Offset", "Origin", "Position") if key in header), None)
+    orientation = next((header[key] for key in ("TransformMatrix", "Rotation", "Orientation") if key in header), None)
     length = header.get("ElementSpacing", header.get("ElementSize"))
     if length is None and options.spacing_mm is None:
-        raise InputError(f"{path.name}: does not say how far its voxels are apart; give spacing_mm")
+        raise InputError(f"{path.name}: does not state its voxel spacing; give spacing_mm")
     spacing = np.array(length.split(), dtype=float) if length is not None else np.asarray(options.spacing_mm, dtype=float)[:n]
-    origin = np.array(place.split(), dtype=float) if place else np.zeros(n)
-    direction = np.array(turn.split(), dtype=float).reshape(n, n).T if turn else np.eye(n)
+    origin = np.array(position.split(), dtype=float) if position else np.zeros(n)
+    direction = np.array(orientation.split(), dtype=float).reshape(n, n).T if orientation else np.eye(n)
     if n == 2:
         spacing, origin = np.append(spacing, 1.0), np.append(origin, 0.0)
         direction = np.block([[direction, np.zeros((2, 1))], [np.zeros((1, 2)), np.ones((1, 1))]])

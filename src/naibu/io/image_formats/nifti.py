@@ -1,4 +1,4 @@
-"""NIfTI (``.nii``, ``.nii.gz``) through nibabel; its axes run to the right, front and top (RAS), ours to the left, back and top (LPS)."""
+"""NIfTI (``.nii``, ``.nii.gz``) :cite:p:`cox2004`, read with nibabel; its frame is RAS and is converted to the LPS frame of naibu."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ _STORED = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 
 
 def read(path: Path, options: ReadOptions) -> Volume:
-    """Read grey values (see `naibu.io.images.read_volume`); they are those stored, unless `rescaled` is asked for."""
+    """Read a scalar volume (see `naibu.io.images.read_volume`); the stored values, unless `options.rescaled`."""
     nibabel = optional_package("nibabel", f"{path.name}: reading NIfTI files")
     if not path.is_file():
         content(path)
     try:
         image = nibabel.load(path)
         stored = np.asarray(image.dataobj) if options.rescaled else image.dataobj.get_unscaled()
-    # nibabel raises whatever its readers meet
+    # nibabel's readers raise exceptions of many types
     except Exception as error:
         raise InputError(f"{path.name}: cannot be read as NIfTI ({error}); copy the file again") from error
     if stored.dtype.kind not in "biuf":
         raise InputError(
-            f"{path.name}: holds colours or complex numbers ({stored.dtype}), not grey values; convert it to grey values first"
+            f"{path.name}: contains colours or complex numbers ({stored.dtype}), not intensities; convert it to greyscale first"
         )
     values = three_axes(path.name, np.asarray(stored).T)
     affine = np.asarray(image.affine, dtype=float)
@@ -40,12 +40,12 @@ def read(path: Path, options: ReadOptions) -> Volume:
 
 
 def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Path:
-    """Write grey values (nz, ny, nx) that stand on the grid of a volume; the ending of the name tells whether they are compressed."""
+    """Write intensities (nz, ny, nx) on the grid of a volume; ``.nii.gz`` is compressed, ``.nii`` is not."""
     nibabel = optional_package("nibabel", f"{path.name}: writing NIfTI files")
     stored = values.astype(np.uint8) if values.dtype == bool else values
     stored = stored.astype(np.float32) if stored.dtype == np.float16 else stored
     if stored.ndim != 3 or stored.dtype.str[1:] not in _STORED:
-        raise InputError(f"{path.name}: NIfTI files are written of grey values, not of {values.ndim}-dimensional {values.dtype}; use .mha")
+        raise InputError(f"{path.name}: NIfTI is written for scalar volumes, not for {values.ndim}-dimensional {values.dtype}; use .mha")
     affine = np.eye(4)
     affine[:3, :3] = FLIP_RAS @ (grid.direction * grid.spacing_mm)
     affine[:3, 3] = FLIP_RAS @ grid.origin_mm

@@ -1,6 +1,6 @@
-"""NRRD (``.nrrd``, ``.nhdr``) through pynrrd: grey values and vectors.
+"""NRRD (``.nrrd``, ``.nhdr``), read and written with pynrrd: scalar and vector images.
 
-Described in "Definition of NRRD File Format", https://teem.sourceforge.net/nrrd/format.html.
+The format is specified in "Definition of NRRD File Format", https://teem.sourceforge.net/nrrd/format.html.
 """
 
 from __future__ import annotations
@@ -28,35 +28,35 @@ _COLOURS = ("rgb", "rgba", "hsv", "xyz-color")
 
 
 def read(path: Path, options: ReadOptions) -> Volume:
-    """Read grey values (see `naibu.io.images.read_volume`)."""
+    """Read a scalar volume (see `naibu.io.images.read_volume`)."""
     values, header = _loaded(path)
     spatial = _spatial_axes(path.name, header, values.ndim)
     if len(spatial) < values.ndim and any(values.shape[a] != 1 for a in range(values.ndim) if a not in spatial):
         raise InputError(
-            f"{path.name}: has several samples a voxel or several times (axes {list(values.shape)}, kinds {header.get('kinds')}); "
-            "save the one you mean as a volume of its own"
+            f"{path.name}: has several samples per voxel or several time points (axes {list(values.shape)}, kinds {header.get('kinds')}); "
+            "save one of them as a volume of its own"
         )
     keep = values.reshape([values.shape[a] for a in spatial])
     return _with_geometry(path, header, three_axes(path.name, keep.T), spatial, options)
 
 
 def read_vectors(path: Path, options: ReadOptions) -> tuple[FloatArray, Volume]:
-    """Read vectors (nz, ny, nx, 3) and the grid they stand on, whose values tell where they are finite."""
+    """Read vectors (nz, ny, nx, 3) and their grid, whose values are true where all components are finite."""
     values, header = _loaded(path)
     spatial = _spatial_axes(path.name, header, values.ndim)
     if values.ndim != 4 or len(spatial) != 3 or values.shape[({0, 1, 2, 3} - set(spatial)).pop()] != 3:
-        raise InputError(f"{path.name}: holds no vectors with three components; read it with read_volume")
+        raise InputError(f"{path.name}: contains no vectors of three components; use read_volume for scalar images")
     vectors = np.asarray(np.moveaxis(values, spatial, (2, 1, 0)), dtype=float)
     grid = _with_geometry(path, header, np.isfinite(vectors).all(axis=3), spatial, options)
-    turn = _TO_LPS[str(header.get("space", "")).lower()]
-    return vectors @ turn.T, grid
+    to_lps = _TO_LPS[str(header.get("space", "")).lower()]
+    return vectors @ to_lps.T, grid
 
 
 def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Path:
-    """Write values (nz, ny, nx), or vectors (nz, ny, nx, 3), that stand on the grid of a volume."""
+    """Write intensities (nz, ny, nx), or vectors (nz, ny, nx, 3), on the grid of a volume."""
     nrrd = optional_package("nrrd", f"{path.name}: writing NRRD files", "pynrrd")
     if path.suffix.lower() != ".nrrd":
-        raise InputError(f"{path.name}: NRRD is written as one file; let its name end in .nrrd")
+        raise InputError(f"{path.name}: NRRD is written as one file; give a name that ends in .nrrd")
     stored = values.astype(np.uint8) if values.dtype == bool else values
     steps = (grid.direction * grid.spacing_mm).T
     vectors = values.ndim == 4
@@ -83,17 +83,17 @@ def _loaded(path: Path) -> tuple[AnyArray, dict[str, Any]]:
         content(path)
     try:
         values, header = nrrd.read(str(path))
-    # pynrrd raises whatever its parsers and zlib meet
+    # pynrrd and zlib raise exceptions of many types
     except Exception as error:
         raise InputError(f"{path.name}: cannot be read as NRRD ({error}); copy the file again") from error
     return np.asarray(values), dict(header)
 
 
 def _spatial_axes(source: str, header: dict[str, Any], n: int) -> list[int]:
-    """Return which axes lie in space: those with a direction, or, where none is given, of kind domain or space."""
+    """Return the spatial axes: those with a space direction, or, if the file has none, those of kind domain or space."""
     kinds = [str(kind).lower() for kind in header.get("kinds") or ["domain"] * n]
     if any(kind in _COLOURS or kind.endswith("-color") for kind in kinds):
-        raise InputError(f"{source}: holds colours ({kinds}), not grey values; convert it to grey values first")
+        raise InputError(f"{source}: contains colours ({kinds}), not intensities; convert it to greyscale first")
     directions = header.get("space directions")
     if directions is not None:
         return [a for a, row in enumerate(directions) if row is not None and np.isfinite(np.asarray(row, dtype=float)).all()]
@@ -105,7 +105,7 @@ def _with_geometry(path: Path, header: dict[str, Any], values: AnyArray, spatial
     space = str(header.get("space", "")).lower()
     if space not in _TO_LPS:
         raise InputError(
-            f"{path.name}: lies in space {header['space']!r}; naibu reads left-posterior-superior, RAS and LAS: resave it in one"
+            f"{path.name}: is in the space {header['space']!r}; supported are left-posterior-superior, RAS and LAS: save it in one of these"
         )
     if header.get("space directions") is not None:
         axes = np.array([np.asarray(header["space directions"][a], dtype=float) for a in spatial]).T
@@ -114,7 +114,7 @@ def _with_geometry(path: Path, header: dict[str, Any], values: AnyArray, spatial
         length = spacings[spatial] if spacings.shape[0] > max(spatial) else np.full(n, np.nan)
         if not np.isfinite(length).all():
             if options.spacing_mm is None:
-                raise InputError(f"{path.name}: does not say how far its voxels are apart; give spacing_mm")
+                raise InputError(f"{path.name}: does not state its voxel spacing; give spacing_mm")
             length = np.asarray(options.spacing_mm, dtype=float)[:n]
         axes = np.diag(length)
     origin = np.asarray(header.get("space origin", np.zeros(n)), dtype=float)
@@ -123,5 +123,5 @@ def _with_geometry(path: Path, header: dict[str, Any], values: AnyArray, spatial
         origin = np.append(origin[:2], 0.0)
     units = header.get("space units") or header.get("units")
     unit = options.unit_mm or (unit_length(path.name, str(units[-1])) if units is not None and str(units[-1]).strip('"') else 1.0)
-    turn = _TO_LPS[space]
-    return volume_with_axes(path.name, values, turn @ origin, turn @ axes, unit)
+    to_lps = _TO_LPS[space]
+    return volume_with_axes(path.name, values, to_lps @ origin, to_lps @ axes, unit)

@@ -1,4 +1,4 @@
-"""Stacks of TIFF pages, or a folder of TIFF files, through tifffile."""
+"""TIFF stacks, multi-page files or folders of slices, read and written with tifffile."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _NUMBER = re.compile(r"(\d+)(?!.*\d)")
 
 
 def read(path: Path, options: ReadOptions) -> Volume:
-    """Read grey values (see `naibu.io.images.read_volume`) of one file, or of a folder with one slice a file."""
+    """Read a scalar volume from one file, or from a folder with one slice per file (see `naibu.io.images.read_volume`)."""
     tifffile = optional_package("tifffile", f"{path.name}: reading TIFF files")
     if path.is_dir():
         files = slices_of_folder(path)
         parts = [_loaded(tifffile, file) for file in files]
         different = next((f.name for f, p in zip(files, parts, strict=True) if p[0].shape != parts[0][0].shape), None)
         if different:
-            raise InputError(f"{path.name}: slice {different} has another size than {files[0].name}; keep one stack in a folder")
+            raise InputError(f"{path.name}: slice {different} differs in size from {files[0].name}; a folder must contain one stack")
         values, stated = np.stack([part[0] for part in parts]), parts[0][1]
     else:
         values, stated = _loaded(tifffile, path)
@@ -38,17 +38,17 @@ def read(path: Path, options: ReadOptions) -> Volume:
     steps = np.asarray(stated["steps"], dtype=float)
     if not np.isfinite(steps).all():
         raise InputError(
-            f"{path.name}: does not say how far its voxels are apart (stated along x, y, z: {stated['told']}); give spacing_mm, for "
-            "example (0.8, 0.8, 2.0)"
+            f"{path.name}: does not state its voxel spacing (stated along x, y, z: {stated['spacing']}); give spacing_mm, for example "
+            "(0.8, 0.8, 2.0)"
         )
     return volume_with_axes(path.name, values, stated["origin"], steps, options.unit_mm or 1.0)
 
 
 def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Path:
-    """Write grey values (nz, ny, nx); the geometry goes along as JSON in the description, where `read` finds it."""
+    """Write intensities (nz, ny, nx) with the geometry as JSON in the image description, where `read` finds it."""
     tifffile = optional_package("tifffile", f"{path.name}: writing TIFF files")
     if values.ndim != 3:
-        raise InputError(f"{path.name}: TIFF stacks are written of grey values; write vectors as .mha")
+        raise InputError(f"{path.name}: TIFF is written for scalar volumes only; write vectors as .mha")
     stored = values.astype(np.uint8) if values.dtype == bool else values
     metadata = {
         "spacing_mm": grid.spacing_mm.tolist(),
@@ -69,34 +69,34 @@ def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Pa
 
 
 def slices_of_folder(folder: Path) -> list[Path]:
-    """Return the TIFF files of a folder by the last number in their names.
+    """Return the TIFF files of a folder, sorted by the last number in their names.
 
     Raises
     ------
     InputError
-        No such files, names without numbers, or a number that is missing or there twice.
+        No such files, names without numbers, or a number that is missing or occurs twice.
     """
     files = sorted(file for file in folder.iterdir() if file.suffix.lower() in _ENDINGS)
     if not files:
-        raise InputError(f"{folder.name}: holds neither DICOM nor TIFF slices; name the folder with the slices, or a file")
+        raise InputError(f"{folder.name}: contains neither DICOM nor TIFF slices; give the folder of the slices, or a file")
     found = [_NUMBER.search(file.stem) for file in files]
     if not all(found):
         nameless = next(file.name for file, match in zip(files, found, strict=True) if not match)
-        raise InputError(f"{folder.name}: {nameless} has no number in its name, so its place among the slices is open; number the files")
+        raise InputError(f"{folder.name}: {nameless} has no number in its name, so the slice order is unknown; number the files")
     numbers = [int(match.group(1)) for match in found if match]
     order = np.argsort(numbers, kind="stable")
     steps = np.diff(np.array(numbers)[order])
     if len(steps) and (steps != steps[0]).any():
         bad = int(np.flatnonzero(steps != np.median(steps))[0])
         raise InputError(
-            f"{folder.name}: between {files[order[bad]].name} and {files[order[bad + 1]].name} slices are missing or named twice; "
+            f"{folder.name}: between {files[order[bad]].name} and {files[order[bad + 1]].name} slices are missing or duplicated; "
             "complete the stack"
         )
     return [files[i] for i in order]
 
 
 def _loaded(tifffile: Any, path: Path) -> tuple[AnyArray, dict[str, Any]]:
-    """Return the values of a file and what it says of the distance of its voxels."""
+    """Return the values of a file and the voxel geometry that it states."""
     if not path.is_file():
         content(path)
     try:
@@ -108,23 +108,23 @@ def _loaded(tifffile: Any, path: Path) -> tuple[AnyArray, dict[str, Any]]:
             values = np.asarray(series.asarray()) if samples == 1 else np.zeros((1, 1, 1))
     except InputError:
         raise
-    # tifffile raises whatever its decoders meet
+    # tifffile's decoders raise exceptions of many types
     except Exception as error:
         raise InputError(f"{path.name}: cannot be read as TIFF ({error}); copy the file again") from error
     no_colours(path.name, samples)
     if n_series > 1:
-        raise InputError(f"{path.name}: holds {n_series} images of different size or kind; save the stack you mean as a file of its own")
+        raise InputError(f"{path.name}: contains {n_series} images of different size or type; save one stack as a file of its own")
     if any(axis in axes and values.shape[axes.index(axis)] > 1 for axis in "TCS"):
-        raise InputError(f"{path.name}: holds several times or channels (axes {axes}, {values.shape}); save the one you mean as a stack")
+        raise InputError(f"{path.name}: contains several time points or channels (axes {axes}, {values.shape}); save one as a stack")
     return values, stated
 
 
 def _stated_geometry(source: str, file: Any, page: Any) -> dict[str, Any]:
-    """Return the steps along x, y, z as columns (NaN where the file does not say), and the origin, mm."""
+    """Return the voxel offsets along x, y, z as columns (NaN where the file states none), and the origin, mm."""
     shaped: dict[str, Any] = (file.shaped_metadata or ({},))[0] if file.is_shaped else {}
     if "spacing_mm" in shaped:
         axes = np.asarray(shaped.get("direction", np.eye(3)), dtype=float) * np.asarray(shaped["spacing_mm"], dtype=float)
-        return {"steps": axes, "origin": shaped.get("origin_mm", (0.0, 0.0, 0.0)), "told": shaped["spacing_mm"]}
+        return {"steps": axes, "origin": shaped.get("origin_mm", (0.0, 0.0, 0.0)), "spacing": shaped["spacing_mm"]}
     imagej = file.imagej_metadata or {}
     named = str(imagej.get("unit", "")).replace("\\u00B5", "u")
     resolution_unit = {2: "inch", 3: "cm"}.get(int(getattr(page, "resolutionunit", 1) or 1))
@@ -137,4 +137,4 @@ def _stated_geometry(source: str, file: Any, page: Any) -> dict[str, Any]:
     if "spacing" in imagej:
         step[2] = plane * float(imagej["spacing"])
     steps = np.diag(step)
-    return {"steps": np.where(np.eye(3, dtype=bool), steps, 0.0), "origin": (0.0, 0.0, 0.0), "told": step.tolist()}
+    return {"steps": np.where(np.eye(3, dtype=bool), steps, 0.0), "origin": (0.0, 0.0, 0.0), "spacing": step.tolist()}

@@ -1,4 +1,4 @@
-"""Volumes in Zarr, in chunks: for volumes larger than memory, and for several processes that read and write parts of one.
+"""Image volumes in Zarr, chunked: for volumes larger than memory, and for several processes that read and write parts of one.
 
 The store is a group with an array ``values`` (nz, ny, nx) and the attributes ``spacing_mm``, ``origin_mm`` (x, y, z) and ``direction``
 (3 x 3, columns are the axes). Needs the package zarr (extra ``naibu[cluster]``).
@@ -26,24 +26,24 @@ _ATTRIBUTES = ("spacing_mm", "origin_mm", "direction")
 
 
 def read(path: Path, options: ReadOptions) -> Volume:
-    """Read grey values (see `naibu.io.images.read_volume`)."""
+    """Read a volume (see `naibu.io.images.read_volume`)."""
     stored = open_chunked(path, options)
     return _part(path, stored, np.zeros(3, dtype=int), np.array(stored.shape[::-1]))
 
 
 def read_box(path: Path, low: ArrayLike, high: ArrayLike, options: ReadOptions) -> Volume:
-    """Read the voxels with indices from `low` up to, not including, `high`, in the order x, y, z; other chunks stay unread.
+    """Read the voxels with indices `low` <= index < `high` along x, y, z, without reading the other chunks.
 
     Raises
     ------
     InputError
-        A box that is not inside the volume, or a store that is no volume.
+        The box is not inside the volume, or the store contains no volume.
     """
     stored = open_chunked(path, options)
     a, b = np.asarray(low, dtype=int), np.asarray(high, dtype=int)
     size = np.array(stored.shape[::-1])
     if (a < 0).any() or (b > size).any() or (a >= b).any():
-        raise InputError(f"{path.name}: cannot read {a.tolist()}..{b.tolist()}: it has {size.tolist()} voxels along x, y, z")
+        raise InputError(f"{path.name}: cannot read {a.tolist()}..{b.tolist()}: the volume has {size.tolist()} voxels along x, y, z")
     return _part(path, stored, a, b)
 
 
@@ -53,7 +53,7 @@ def open_chunked(path: Path, options: ReadOptions | None = None) -> ChunkedVolum
     Raises
     ------
     InputError
-        No such store, one that is no volume, or one with other axes than z, y, x.
+        No such store, one without a volume, or one with axes other than z, y, x.
     MissingDependencyError
         The package zarr is not installed.
     """
@@ -64,12 +64,12 @@ def open_chunked(path: Path, options: ReadOptions | None = None) -> ChunkedVolum
         group = zarr.open_group(str(path), mode="r")
         stored = group["values"]
     except (KeyError, ValueError, OSError) as error:
-        raise InputError(f"{path.name}: holds no volume: naibu looks for a Zarr group with an array 'values' ({error})") from error
+        raise InputError(f"{path.name}: contains no volume: naibu expects a Zarr group with an array 'values' ({error})") from error
     missing = [name for name in _ATTRIBUTES if name not in group.attrs]
     if missing or not hasattr(stored, "chunks"):
-        raise InputError(f"{path.name}: holds no volume: its group lacks the attributes {', '.join(missing) or 'of an array'}")
+        raise InputError(f"{path.name}: contains no volume: its group lacks the attributes {', '.join(missing) or 'of an array'}")
     if stored.ndim != 3:
-        raise InputError(f"{path.name}: its values have {stored.ndim} axes {stored.shape}, not z, y, x; choose one time or component")
+        raise InputError(f"{path.name}: its values have {stored.ndim} axes {stored.shape}, not (z, y, x); save one time point or component")
     unit = (options.unit_mm if options else None) or 1.0
     origin, spacing = (unit * np.asarray(group.attrs[name], dtype=float) for name in ("origin_mm", "spacing_mm"))
     return ChunkedVolume.from_array(stored, spacing_mm=spacing, origin_mm=origin, direction=group.attrs["direction"])
@@ -78,25 +78,25 @@ def open_chunked(path: Path, options: ReadOptions | None = None) -> ChunkedVolum
 def create_chunked(
     path: Path, grid: Volume | ChunkedVolume, *, dtype: Any = np.float32, components: int | None = None, chunk: int = CHUNK
 ) -> Any:
-    """Make an empty volume, or one of vectors (nz, ny, nx, components), that can be written part by part; an old one is removed.
+    """Create an empty scalar or vector volume that can be written part by part; an existing one is removed.
 
     Parameters
     ----------
     path : Path
         Folder of the store, ``NAME.zarr``.
     grid : Volume or ChunkedVolume
-        Where the voxels lie.
+        Grid of the voxels.
     dtype : dtype
-        Of the values.
+        Type of the values.
     components : int, optional
-        Length of a fourth axis.
+        Number of components of a vector volume, shape (nz, ny, nx, components); by default a scalar volume.
     chunk : int
-        Voxels along an edge of a chunk.
+        Edge length of a chunk, voxels.
 
     Returns
     -------
     zarr.Array
-        To be assigned to by slices, for example by `naibu.imaging.out_of_core.stored`.
+        Array to be assigned to by slices, for example by `naibu.imaging.out_of_core.stored`.
     """
     zarr = _zarr()
     try:
@@ -113,9 +113,9 @@ def create_chunked(
 
 
 def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Path:
-    """Write grey values (nz, ny, nx), or vectors (nz, ny, nx, 3); chunks are always packed, without loss.
+    """Write intensities (nz, ny, nx), or vectors (nz, ny, nx, 3); chunks are always compressed (lossless).
 
-    An old store is replaced when the new one is complete.
+    An existing store is replaced when the new one is complete.
     """
     _zarr()
     try:

@@ -1,1 +1,1 @@
-"""One reader a file format; `naibu.io.meshes` picks the one a file name asks for."""
+"""Mesh file formats, one module each; `naibu.io.meshes` selects one by the file name extension."""

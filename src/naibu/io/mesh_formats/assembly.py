@@ -1,4 +1,4 @@
-"""What the readers share: blocks of cells gathered into one mesh, and polygons cut into triangles."""
+"""Helpers of the mesh readers: assembly of cell blocks into one mesh, triangulation of polygons, parsing of numbers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import NODES_PER_CELL, Mesh
 
-# Kinds without volume: files carry them beside the volume cells, as boundary or geometry.
+# Cell types without volume, which files may contain beside the volume cells: boundaries and geometry.
 FLAT_KINDS = frozenset(
     {"vertex", "poly_vertex", "line", "poly_line", "triangle", "triangle_strip", "polygon", "pixel", "quad"}
     | {"line3", "triangle6", "quad8", "quad9", "triangle7", "line4"}
@@ -28,7 +28,7 @@ class Block(NamedTuple):
     cells : ndarray, shape (m, k), int64
         Indices of points, in VTK order.
     tags : ndarray, shape (m,), int64
-        The file's number for the region of every cell.
+        Region tag of every cell, as numbered in the file.
     """
 
     kind: str
@@ -37,16 +37,16 @@ class Block(NamedTuple):
 
 
 def volume_mesh(source: str, points: FloatArray, blocks: Sequence[Block], names: Mapping[int, str]) -> Mesh:
-    """Gather the volume cells of a file into one mesh; points that none of them uses are left out.
+    """Assemble the volume cells of a file into one mesh; points that none of them uses are dropped.
 
     Parameters
     ----------
     source : str
         Name of the file, for errors.
     points : ndarray, shape (n, 3)
-        All points of the file.
+        All points of the file, in its unit of length.
     blocks : sequence of Block
-        All cells of the file; those without volume are passed over.
+        All cells of the file; those without volume are ignored.
     names : mapping of int to str
         Region name of each tag. A tag without one is called ``"region_<tag>"`` (``"volume_<n>"`` for the tag -n, which the Gmsh reader
         gives to volumes in no physical group), or ``"body"`` if it is the only one.
@@ -54,21 +54,23 @@ def volume_mesh(source: str, points: FloatArray, blocks: Sequence[Block], names:
     Raises
     ------
     InputError
-        No volume cells, kinds that naibu has no elements for, two kinds in one file, or cells that name missing points.
+        No volume cells, types that naibu has no elements for, several types in one file, or cells that refer to missing points.
     """
     volume = [block for block in blocks if block.kind not in FLAT_KINDS and len(block.cells)]
     if not volume:
         kinds = sorted({block.kind for block in blocks})
-        raise InputError(f"{source}: holds no volume cells (only {kinds or 'points'}); read a closed surface with read_surface and mesh it")
+        raise InputError(
+            f"{source}: contains no volume cells (only {kinds or 'points'}); mesh it with volume cells, or use read_surface for a surface"
+        )
     for block in volume:
         if block.kind not in NODES_PER_CELL:
             found = f"{len(block.cells)} cells of type {block.kind!r}"
-            raise InputError(f"{source}: holds {found}; naibu has elements for {sorted(NODES_PER_CELL)}: mesh it again with those")
+            raise InputError(f"{source}: contains {found}; naibu has elements for {sorted(NODES_PER_CELL)}: mesh it again with those")
     if len(kinds := sorted({block.kind for block in volume})) > 1:
-        raise InputError(f"{source}: mixes volume cells of types {kinds}; naibu needs one type: convert all cells to tetrahedra")
+        raise InputError(f"{source}: mixes volume cells of types {kinds}; only one type is supported: convert all cells to tetrahedra")
     cells = np.concatenate([block.cells for block in volume])
     if cells.min() < 0 or cells.max() >= len(points):
-        raise InputError(f"{source}: cells name points {cells.min()} to {cells.max()}, but the file has points 0 to {len(points) - 1}")
+        raise InputError(f"{source}: cells refer to points {cells.min()} to {cells.max()}, but the file has points 0 to {len(points) - 1}")
     tags, regions = np.unique(np.concatenate([block.tags for block in volume]), return_inverse=True)
     unnamed = ["body" if len(tags) == 1 else (f"region_{tag}" if tag >= 0 else f"volume_{-tag}") for tag in tags.tolist()]
     region_names = [names.get(tag, other) for tag, other in zip(tags.tolist(), unnamed, strict=True)]
@@ -79,14 +81,14 @@ def volume_mesh(source: str, points: FloatArray, blocks: Sequence[Block], names:
 
 
 def fan_triangles(corners: IntArray, counts: IntArray) -> IntArray:
-    """Cut polygons into triangles (t, 3) that share each polygon's first corner.
+    """Triangulate polygons as fans about their first corner, shape (t, 3).
 
     Parameters
     ----------
     corners : ndarray, shape (sum of counts,), int64
-        Corners of all polygons, one after the other.
+        Corners of all polygons, concatenated.
     counts : ndarray, shape (f,), int64
-        Number of corners of each; those with fewer than three are left out.
+        Number of corners of each; polygons with fewer than three are dropped.
     """
     starts = np.cumsum(counts) - counts
     triangles = np.maximum(counts - 2, 0)
@@ -96,9 +98,9 @@ def fan_triangles(corners: IntArray, counts: IntArray) -> IntArray:
 
 
 def numbers(source: str, what: str, text: bytes | str) -> FloatArray:
-    """Return the numbers in a piece of text, naming the file and the piece if one is not a number."""
+    """Parse whitespace-separated numbers; an error names the file and the part of it."""
     tokens = text.split()
     try:
         return np.array(tokens, dtype=np.float64)
     except ValueError as error:
-        raise InputError(f"{source}: {what} holds something that is not a number ({error}); the file is damaged or cut off") from error
+        raise InputError(f"{source}: {what} contains something that is not a number ({error}); the file is damaged or truncated") from error

@@ -1,6 +1,6 @@
-"""Gmsh meshes (.msh): version 4.1, ascii and binary, and version 2.2, ascii.
+"""Gmsh meshes (.msh) :cite:p:`geuzaine2009`: version 4.1, ascii and binary, and version 2.2, ascii.
 
-The format is described in the Gmsh reference manual, https://gmsh.info/doc/texinfo/gmsh.html#MSH-file-format.
+The format is specified in the Gmsh reference manual, https://gmsh.info/doc/texinfo/gmsh.html#MSH-file-format.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _TETRA10_TO_VTK = [0, 1, 2, 3, 4, 5, 6, 7, 9, 8]
 
 @dataclass(slots=True)
 class _Stream:
-    """Numbers of one section, taken one after the other, from text or from binary.
+    """Sequential reader of the numbers of one section, text or binary.
 
     `position` counts tokens (text) or bytes (binary).
     """
@@ -49,7 +49,7 @@ class _Stream:
             values = np.frombuffer(self.data[self.position : self.position + count * width], dtype=self.order + code)
             self.position += count * width
         if len(values) < count:
-            raise InputError(f"{self.source}: section ${self.section} is cut off; write the file again")
+            raise InputError(f"{self.source}: section ${self.section} is truncated; write the file again")
         return values
 
     def ints(self, count: int) -> IntArray:
@@ -66,7 +66,7 @@ class _Stream:
 
 
 def read(source: str, data: bytes) -> Mesh:
-    """Read the volume cells of a Gmsh file; physical volumes become regions.
+    """Read the volume cells of a Gmsh file; physical volumes become regions, lengths stay in the file's unit.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def read(source: str, data: bytes) -> Mesh:
     Raises
     ------
     InputError
-        Another version, a missing or cut off section, or cells that naibu has no elements for.
+        Another version, a missing or truncated section, or cells that naibu has no elements for.
     """
     head = re.match(rb"\s*(?:\$Comments.*?\$EndComments\s*)?\$MeshFormat\s+(\S+)\s+(\d)\s+(\d+)[ \t]*\r?\n", data, re.DOTALL)
     if head is None:
@@ -114,7 +114,7 @@ def _section(source: str, data: bytes, name: str, binary: bool, order: str) -> _
     start = re.search(rb"(?:^|\n)\$" + name.encode() + rb"[ \t]*\r?\n", data)
     end = data.find(b"$End" + name.encode())
     if start is None or end < 0:
-        what = "has no" if start is None else "is cut off inside its"
+        what = "has no" if start is None else "is truncated inside"
         raise InputError(f"{source}: {what} section ${name}; write the file again")
     content = data[start.end() : end]
     if binary:
@@ -166,7 +166,7 @@ def _read_2(source: str, data: bytes) -> Mesh:
         rows = starts[(codes == code) & (n_tags == count)]
         indices = rows[:, None] + 3 + count + np.arange(width)
         if indices.max() >= len(flat):
-            raise InputError(f"{source}: section $Elements is cut off; write the file again")
+            raise InputError(f"{source}: section $Elements is truncated; write the file again")
         cell_tags = flat[rows + 3] if count else np.zeros(len(rows), dtype=np.int64)
         if count > 1:
             # The first tag is the physical group, 0 for none; the second the volume itself.
@@ -184,7 +184,7 @@ def _element_starts(source: str, flat: IntArray) -> IntArray:
             starts.append(at)
             at += 3 + tokens[at + 2] + _kind(source, tokens[at + 1])[1]
     except IndexError as error:
-        raise InputError(f"{source}: section $Elements is cut off after {len(starts)} elements; write the file again") from error
+        raise InputError(f"{source}: section $Elements is truncated after {len(starts)} elements; write the file again") from error
     return np.array(starts, dtype=np.int64)
 
 
@@ -207,7 +207,7 @@ def _indices(source: str, tags: IntArray, named: IntArray) -> IntArray:
     rows: IntArray = order[at] if len(tags) else at
     if len(tags) == 0 or (tags[rows] != named).any():
         missing = named[tags[rows] != named] if len(tags) else named.ravel()
-        raise InputError(f"{source}: elements name node {int(missing[0])}, which section $Nodes does not have; write the file again")
+        raise InputError(f"{source}: elements refer to node {int(missing[0])}, which section $Nodes does not have; write the file again")
     return rows
 
 

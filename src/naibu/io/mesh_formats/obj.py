@@ -1,4 +1,4 @@
-"""Wavefront surfaces (.obj): vertices and faces; everything else is passed over."""
+"""Wavefront surfaces (.obj): vertices and faces; everything else is ignored."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from naibu.io.mesh_formats.assembly import fan_triangles, numbers
 
 
 def read(source: str, data: bytes) -> tuple[FloatArray, IntArray]:
-    """Read points (n, 3) and triangles (t, 3); polygons are cut into fans.
+    """Read points (n, 3), in the file's unit, and triangles (t, 3); polygons are triangulated as fans.
 
     Parameters
     ----------
@@ -27,13 +27,13 @@ def read(source: str, data: bytes) -> tuple[FloatArray, IntArray]:
     vertices: list[bytes] = []
     corners: list[int] = []
     counts: list[int] = []
-    # A backslash at the end of a line carries it on.
+    # A backslash at the end of a line continues it.
     for number, line in enumerate(data.replace(b"\\\n", b" ").splitlines(), start=1):
         words = line.split()
         if words[:1] == [b"v"] and len(words) >= 4:
             vertices += words[1:4]
         elif words[:1] == [b"v"]:
-            raise InputError(f"{source}: line {number} is a vertex with fewer than three coordinates; the file is cut off or damaged")
+            raise InputError(f"{source}: line {number} is a vertex with fewer than three coordinates; the file is truncated or damaged")
         elif words[:1] == [b"f"]:
             corners += _corners(source, number, words[1:], len(vertices) // 3)
             counts.append(len(words) - 1)
@@ -48,5 +48,5 @@ def _corners(source: str, number: int, words: list[bytes], known: int) -> list[i
     except ValueError as error:
         raise InputError(f"{source}: line {number} is a face that cannot be read ({error}); write the file again") from error
     if 0 in written:
-        raise InputError(f"{source}: line {number} names point 0, but points count from 1; write the file again")
+        raise InputError(f"{source}: line {number} refers to point 0, but points are numbered from 1; write the file again")
     return [index - 1 if index > 0 else known + index for index in written]

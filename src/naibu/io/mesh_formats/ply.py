@@ -1,4 +1,4 @@
-"""Polygon files (.ply), ascii and binary of both byte orders."""
+"""Polygon files (.ply) :cite:p:`turk1994`, ascii and binary of both byte orders."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class _Element(NamedTuple):
 
 
 def read(source: str, data: bytes) -> tuple[FloatArray, IntArray]:
-    """Read points (n, 3) and triangles (t, 3); polygons are cut into fans.
+    """Read points (n, 3), in the file's unit, and triangles (t, 3); polygons are triangulated as fans.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def read(source: str, data: bytes) -> tuple[FloatArray, IntArray]:
     Raises
     ------
     InputError
-        A header that cannot be read, or a file that is cut off.
+        A header that cannot be read, or a truncated file.
     """
     order, elements, body = _header(source, data)
     points, triangles = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
@@ -63,7 +63,7 @@ def read(source: str, data: bytes) -> tuple[FloatArray, IntArray]:
                 name = next(name for name in _FACES if name in columns)
                 triangles = fan_triangles(columns[name].astype(np.int64), columns[name + " count"].astype(np.int64))
     except (ValueError, IndexError) as error:
-        raise InputError(f"{source}: is cut off inside its {element.name!r} data ({error}); write it again") from error
+        raise InputError(f"{source}: is truncated inside its {element.name!r} data ({error}); write it again") from error
     except (KeyError, StopIteration) as error:
         raise InputError(f"{source}: element {element.name!r} lacks x, y, z or vertex_indices; export the surface again") from error
     return points, triangles
@@ -73,7 +73,7 @@ def _header(source: str, data: bytes) -> tuple[str, list[_Element], bytes]:
     """Return the byte order ("" for text), the tables announced, and what follows the header."""
     head, mark, body = data.partition(b"end_header")
     if not data.startswith(b"ply") or not mark:
-        raise InputError(f"{source}: has no PLY header; it is not a PLY file, or is cut off")
+        raise InputError(f"{source}: has no PLY header; it is not a PLY file, or is truncated")
     body = body[body.find(b"\n") + 1 :]
     order, elements = "?", list[_Element]()
     for line in head.decode("ascii", "replace").splitlines():
@@ -88,7 +88,7 @@ def _header(source: str, data: bytes) -> tuple[str, list[_Element], bytes]:
                 raise InputError(f"{source}: property {words[-1]!r} is of type {unknown[0]!r}; naibu reads {sorted(_TYPES)}")
             elements[-1].properties.append(_Property(words[-1], _TYPES[kinds[-1]], _TYPES[kinds[0]] if words[1] == "list" else ""))
     if order == "?":
-        raise InputError(f"{source}: tells no format that naibu reads; save it as one of {sorted(_ORDERS)}")
+        raise InputError(f"{source}: states no supported format; save it as one of {sorted(_ORDERS)}")
     return order, elements, body
 
 

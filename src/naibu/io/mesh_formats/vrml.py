@@ -1,4 +1,7 @@
-"""VRML 2.0 surfaces (.wrl): the IndexedFaceSet nodes of a scene, joined."""
+"""VRML 2.0 surfaces (.wrl): the IndexedFaceSet nodes of a scene, merged.
+
+The format is specified in ISO/IEC 14772-1:1997, "The Virtual Reality Modeling Language".
+"""
 
 from __future__ import annotations
 
@@ -11,12 +14,12 @@ from naibu.core.errors import InputError
 from naibu.io.mesh_formats.assembly import fan_triangles, numbers
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-# Fields of a Transform and the values that change nothing.
+# Fields of a Transform and their identity values.
 _IDENTITY = {"translation": [0.0, 0.0, 0.0], "scale": [1.0, 1.0, 1.0], "rotation": None}
 
 
 def read(source: str, data: bytes) -> tuple[FloatArray, IntArray]:
-    """Read points (n, 3) and triangles (t, 3); polygons are cut into fans.
+    """Read points (n, 3), in the file's unit, and triangles (t, 3); polygons are triangulated as fans.
 
     Parameters
     ----------
@@ -28,7 +31,7 @@ def read(source: str, data: bytes) -> tuple[FloatArray, IntArray]:
     Raises
     ------
     InputError
-        Another version, a scene that moves its shapes, or one without an IndexedFaceSet.
+        Another version, a scene that transforms its shapes, or one without an IndexedFaceSet.
     """
     text = data.decode("utf-8", "replace")
     if not text.startswith("#VRML V2.0"):
@@ -43,7 +46,7 @@ def read(source: str, data: bytes) -> tuple[FloatArray, IntArray]:
         triangles.append(faces + n)
         n += len(own)
     if n == 0:
-        raise InputError(f"{source}: holds no IndexedFaceSet; export the surface as triangles")
+        raise InputError(f"{source}: contains no IndexedFaceSet; export the surface as triangles")
     return np.concatenate(points), np.concatenate(triangles)
 
 
@@ -55,7 +58,7 @@ def _face_set(source: str, text: str, start: int) -> tuple[FloatArray, IntArray]
     point = re.search(r"\bpoint\s*\[([^\]]*)\]", own)
     index = re.search(r"\bcoordIndex\s*\[([^\]]*)\]", own)
     if point is None or index is None:
-        raise InputError(f"{source}: an IndexedFaceSet has no points or no coordIndex (shared by USE, or cut off); export it again")
+        raise InputError(f"{source}: an IndexedFaceSet has no points or no coordIndex (shared by USE, or truncated); export it again")
     flat = numbers(source, "coordIndex", index[1]).astype(np.int64)
     coordinates = numbers(source, "point", point[1])
     if len(coordinates) % 3:
@@ -69,7 +72,7 @@ def _face_set(source: str, text: str, start: int) -> tuple[FloatArray, IntArray]
 
 
 def _refuse_moved(source: str, text: str) -> None:
-    """Raise an error if a Transform moves, turns or scales shapes: passing over it would put the surface elsewhere."""
+    """Raise an error if a Transform translates, rotates or scales shapes: ignoring it would misplace the surface."""
     for match in re.finditer(rf"\b(translation|scale|rotation)\s+((?:{_NUMBER}\s+){{3,4}})", text):
         values = [float(word) for word in match[2].split()]
         still = values[3:4] == [0.0] if match[1] == "rotation" else values[:3] == _IDENTITY[match[1]]

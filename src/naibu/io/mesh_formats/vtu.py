@@ -1,6 +1,6 @@
 """VTK XML unstructured grids (.vtu): ascii, inline base64 and appended data, raw or compressed.
 
-The format is described in "VTK File Formats", https://docs.vtk.org/en/latest/vtk_file_formats/vtkxml_file_format.html.
+The format is specified in "VTK File Formats", https://docs.vtk.org/en/latest/vtk_file_formats/vtkxml_file_format.html.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _KINDS = {
 }  # fmt: skip
 _NODES = {10: 4, 11: 8, 12: 8, 24: 10}
 _VOXEL_TO_HEXAHEDRON = [0, 1, 3, 2, 4, 5, 7, 6]
-# Names under which meshing programs store the material of a cell, most telling first.
+# Names under which meshing programs store the material of a cell, the most specific first.
 _REGION_ARRAYS = ("region", "regions", "material", "MaterialIds", "gmsh:physical", "PhysicalIds", "medit:ref", "CellEntityIds")
 _DECOMPRESSORS: dict[str, Callable[[bytes], bytes]] = {"vtkZLibDataCompressor": zlib.decompress, "vtkLZMADataCompressor": lzma.decompress}
 
@@ -50,7 +50,7 @@ class _File:
 
 
 def read(source: str, data: bytes) -> Mesh:
-    """Read the volume cells of a .vtu file.
+    """Read the volume cells of a .vtu file; lengths stay in the file's unit.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def read(source: str, data: bytes) -> Mesh:
     Raises
     ------
     InputError
-        Not an unstructured grid, cut off, or holding cells that naibu has no elements for.
+        Not an unstructured grid, a truncated file, or cells that naibu has no elements for.
     """
     file = _opened(source, data)
     points, blocks, n = [], [], 0
@@ -72,23 +72,23 @@ def read(source: str, data: bytes) -> Mesh:
         points.append(own)
         n += len(own)
     if not points:
-        raise InputError(f"{source}: holds no piece of an unstructured grid; write it again")
+        raise InputError(f"{source}: contains no piece of an unstructured grid; write it again")
     return volume_mesh(source, np.concatenate(points), blocks, _names(file))
 
 
 def _opened(source: str, data: bytes) -> _File:
-    """Cut the appended bytes, which are not XML, from the rest and parse that."""
+    """Split off the appended bytes, which are not XML, and parse the rest."""
     appended, raw = b"", False
     if match := re.search(rb"<AppendedData([^>]*)>\s*_", data):
         raw = b'"raw"' in match[1]
         end = data.rfind(b"</AppendedData>")
         if end < 0:
-            raise InputError(f"{source}: is cut off inside its appended data; copy or write it again")
+            raise InputError(f"{source}: is truncated inside its appended data; copy or write it again")
         appended, data = data[match.end() : end], data[: match.start()] + b"</VTKFile>"
     try:
         root = ElementTree.fromstring(data)
     except ElementTree.ParseError as error:
-        raise InputError(f"{source}: is not complete XML ({error}); it is damaged or cut off: write it again") from error
+        raise InputError(f"{source}: is not complete XML ({error}); it is damaged or truncated: write it again") from error
     if root.tag != "VTKFile" or root.get("type") != "UnstructuredGrid":
         raise InputError(f"{source}: is a {root.get('type') or root.tag}, not a VTK UnstructuredGrid; save it as .vtu")
     order = ">" if root.get("byte_order") == "BigEndian" else "<"
@@ -100,7 +100,7 @@ def _opened(source: str, data: bytes) -> _File:
 
 
 def _blocks(file: _File, piece: Element, shift: int) -> list[Block]:
-    """Return the cells of one piece, one block a type, with `shift` added to the indices of its points."""
+    """Return the cells of one piece, one block per type, with `shift` added to their point indices."""
     own = {element.get("Name"): element for element in piece.iterfind("Cells/DataArray")}
     connectivity, offsets, types = (
         _array(file, own.get(name), f"Cells/{name}").astype(np.int64) for name in ("connectivity", "offsets", "types")
@@ -109,7 +109,7 @@ def _blocks(file: _File, piece: Element, shift: int) -> list[Block]:
     tags = _tags(file, piece, len(types))
     if len(offsets) != len(types) or (len(offsets) and offsets[-1] > len(connectivity)):
         sizes = f"{len(types)} types and {len(connectivity)} indices"
-        raise InputError(f"{file.source}: its cell offsets do not fit its {sizes}; write the file again")
+        raise InputError(f"{file.source}: the cell offsets do not match the {sizes}; write the file again")
     blocks = []
     for code in np.unique(types).tolist():
         of_type = np.flatnonzero(types == code)
@@ -124,19 +124,19 @@ def _blocks(file: _File, piece: Element, shift: int) -> list[Block]:
 
 
 def _tags(file: _File, piece: Element, n: int) -> IntArray:
-    """Return the region number of every cell of a piece, zero where the file tells none."""
+    """Return the region tag of every cell of a piece, zero where the file has none."""
     own = {element.get("Name"): element for element in piece.iterfind("CellData/DataArray")}
     name = next((name for name in _REGION_ARRAYS if name in own), None)
     if name is None:
         return np.zeros(n, dtype=np.int64)
     tags = _array(file, own[name], f"CellData/{name}")
     if len(tags) != n:
-        raise InputError(f"{file.source}: CellData/{name} has {len(tags)} values for {n} cells; one a cell is needed")
+        raise InputError(f"{file.source}: CellData/{name} has {len(tags)} values for {n} cells; one per cell is needed")
     return tags.astype(np.int64)
 
 
 def _names(file: _File) -> dict[int, str]:
-    """Return the region names of the field data: character codes, each name ended by a zero, as an array or as VTK's strings."""
+    """Return the region names of the field data: zero-terminated character codes, as an array or as VTK strings."""
     for element in file.root.iterfind("UnstructuredGrid/FieldData/*"):
         if element.get("Name") == "region_names":
             codes = _bytes_of(file, element, np.dtype("u1"), "FieldData/region_names").tobytes()
@@ -145,7 +145,7 @@ def _names(file: _File) -> dict[int, str]:
 
 
 def _array(file: _File, element: Element | None, what: str) -> FloatArray | IntArray:
-    """Return the values of one DataArray, in one row."""
+    """Return the values of one DataArray, flattened."""
     if element is None:
         raise InputError(f"{file.source}: has no array {what}; write it again")
     kind = element.get("type", "")
@@ -155,7 +155,7 @@ def _array(file: _File, element: Element | None, what: str) -> FloatArray | IntA
 
 
 def _bytes_of(file: _File, element: Element, dtype: np.dtype[np.generic], what: str) -> FloatArray:
-    """Return the values of an array wherever and however they are stored."""
+    """Return the values of an array in any of VTK's encodings."""
     form = element.get("format", "ascii")
     if form == "ascii":
         return numbers(file.source, f"array {what}", element.text or "").astype(dtype)
@@ -167,11 +167,11 @@ def _bytes_of(file: _File, element: Element, dtype: np.dtype[np.generic], what: 
         content = _content(file, stored, raw)
         return np.frombuffer(content, dtype=dtype)
     except (ValueError, IndexError, zlib.error, lzma.LZMAError, binascii.Error) as error:
-        raise InputError(f"{file.source}: array {what} is damaged or cut off ({error}); copy or write the file again") from error
+        raise InputError(f"{file.source}: array {what} is damaged or truncated ({error}); copy or write the file again") from error
 
 
 def _content(file: _File, stored: bytes, raw: bool) -> bytes:
-    """Return the plain bytes of an array that starts at the head of `stored`."""
+    """Return the decoded bytes of an array that starts at the beginning of `stored`."""
     if file.decompress is None:
         size = int(_taken(file, stored, 1, raw)[0])
         return _after(file, stored, 1, size, raw)
@@ -196,7 +196,7 @@ def _after(file: _File, stored: bytes, count: int, size: int, raw: bool) -> byte
     skip = count * file.header.itemsize
     if raw:
         content = stored[skip : skip + size]
-    # Some writers encode the header apart from the data, which shows in its padding; others encode both in one go.
+    # Some writers encode header and data separately, which shows in the padding; others encode both together.
     elif b"=" in stored[: _encoded(skip)]:
         content = base64.b64decode(stored[_encoded(skip) : _encoded(skip) + _encoded(size)])[:size]
     else:
