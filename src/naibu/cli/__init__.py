@@ -9,6 +9,7 @@ from cyclopts import CycloptsError
 from naibu.cli import experiments, imaging, studies  # noqa: F401  they bring their verbs
 from naibu.cli.console import BAD_INPUT, INTERRUPTED, NO_SOLUTION, app, errors, fail, print_table
 from naibu.cli.installation import doctor_rows, healthy
+from naibu.cli.option_names import in_options
 from naibu.core.errors import ConvergenceError, NaibuError
 
 
@@ -28,10 +29,8 @@ def main() -> None:
         app(sys.argv[1:], exit_on_error=False, print_error=False)
     except CycloptsError as error:
         fail(f"{' '.join(str(error).split())} See naibu --help, or naibu VERB --help.", BAD_INPUT)
-    except ConvergenceError as error:
-        fail(str(error), NO_SOLUTION)
     except NaibuError as error:
-        fail(str(error), BAD_INPUT)
+        fail(in_options(str(error), app, sys.argv[1:]), NO_SOLUTION if isinstance(error, ConvergenceError) else BAD_INPUT)
     except KeyboardInterrupt:
         errors.print("Interrupted; every file written is whole. An identification goes on with the same command.", soft_wrap=True)
         sys.exit(INTERRUPTED)

@@ -1,4 +1,4 @@
-"""What several verbs take: a pair of scans with what goes with them, and the description of an object."""
+"""Options shared by several verbs: those of a pair of scans, and the description of an object."""
 
 from __future__ import annotations
 
@@ -19,48 +19,48 @@ if TYPE_CHECKING:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class PairOptions:
-    """What goes with two scans.
+    """Options for a pair of scans.
 
     Parameters
     ----------
     mask
-        Volume on the grid of the first scan, not zero where the object is; by default it is found.
-    spacing
-        Distance of voxels along x, y, z, mm, for files that do not say.
+        Volume on the grid of the reference scan, nonzero inside the object; by default it is segmented.
+    spacing_mm
+        Voxel spacing along x, y, z, mm, for files that do not state it.
     truth
-        Known displacement (.mha, .nrrd), to be compared with.
+        Known displacement (.mha, .nrrd) to compare with.
     check_points
-        Two tables of points, before and after, to be compared with.
+        Two tables of points, reference and deformed, to compare with.
     """
 
     mask: Path | None = None
-    spacing: tuple[float, float, float] | None = None
+    spacing_mm: tuple[float, float, float] | None = None
     truth: Path | None = None
     check_points: tuple[Path, Path] | None = None
 
     @property
     def arguments(self) -> dict[str, Any]:
         """As `naibu.workflows.sense.read_pair` takes them."""
-        return {"mask": self.mask, "spacing_mm": self.spacing, "truth": self.truth, "check_points": self.check_points}
+        return {"mask": self.mask, "spacing_mm": self.spacing_mm, "truth": self.truth, "check_points": self.check_points}
 
 
 @Parameter(name="*")
 @dataclass(frozen=True)
 class ObjectOptions:
-    """What an object is made of and what presses it.
+    """Shape, layers and loading of an object.
 
     Parameters
     ----------
     shape
         Outer shape of the object.
     loading
-        What presses it.
+        What loads it.
     bar_width_mm
-        How wide a bar is.
+        Width of the bar.
     layer
         A layer of one material, 'NAME=FROM..TO' with heights from the base in mm. May be repeated.
     stated_mm
-        Height of the plate or bar in a state, or distance of the side plates, 'STATE=HEIGHT' in mm. May be repeated.
+        Height of the plate or bar in a state, or distance between the side plates, 'STATE=HEIGHT' in mm. May be repeated.
     """
 
     shape: Literal["box", "half_ellipsoid", "cylinder", "hemisphere"] = "box"

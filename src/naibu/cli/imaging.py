@@ -1,4 +1,4 @@
-"""Verbs that start from images: ``sense``, ``compare-methods``, ``track``, ``track-sequence``."""
+"""Verbs that take images: ``sense``, ``compare-methods``, ``track``, ``track-sequence``."""
 
 from __future__ import annotations
 
@@ -17,54 +17,54 @@ Spacing = tuple[float, float, float]
 
 @app.command
 def sense(
-    before: Path,
-    after: Path,
+    reference: Path,
+    deformed: Path,
     *,
     method: Method = "default",
     pair: PairOptions | None = None,
     out: Path = Path("naibu-sense"),
 ) -> None:
-    """Find how the inside of an object moved between two scans, with standard deviations, strains and a page of slices.
+    """Measure the displacement inside an object between two scans by digital volume correlation (DVC), with its uncertainty.
 
     Parameters
     ----------
-    before
-        Scan before: MetaImage, NIfTI, NRRD, TIFF stack, HDF5, Zarr, or a folder with a DICOM series.
-    after
-        Scan after, on the same grid.
+    reference
+        Scan of the reference configuration: MetaImage, NIfTI, NRRD, TIFF stack, HDF5, Zarr, or a folder with a DICOM series.
+    deformed
+        Scan of the deformed configuration, on the same grid.
     method
-        How: volume correlation regularised by mechanics (default), or one of the classic ways.
+        Digital volume correlation regularised by mechanics (default), or a classic method.
     out
         Folder for displacement.mha, standard_deviation.mha, displacement.vtu, field.npz, sense.json and report.html.
     """
     from naibu.workflows.sense import read_pair, sense_pair
 
     with stages() as tell:
-        scans = read_pair(before, after, **(pair or PairOptions()).arguments)
+        scans = read_pair(reference, deformed, **(pair or PairOptions()).arguments)
         run = sense_pair(scans, method=method, out=out, progress=tell)
-    print_table(f"{before.name} -> {after.name}, {run.sensed.method}", ("what", "value"), list(run.figures.items()))
+    print_table(f"{reference.name} -> {deformed.name}, {run.sensed.method}", ("what", "value"), list(run.figures.items()))
     say(f"{run.seconds:.1f} s. Page: {run.files[0]}   fields: {', '.join(str(p.name) for p in run.files[1:])}")
 
 
 @app.command
 def compare_methods(
-    before: Path,
-    after: Path,
+    reference: Path,
+    deformed: Path,
     *,
     method: list[Method] | None = None,
     pair: PairOptions | None = None,
     out: Path = Path("naibu-methods"),
 ) -> None:
-    """Sense one pair of scans by every method, and set errors, times and pictures side by side.
+    """Measure the displacement between two scans by every method, and compare errors, times and images.
 
     Parameters
     ----------
-    before
-        Scan before.
-    after
-        Scan after, on the same grid.
+    reference
+        Scan of the reference configuration.
+    deformed
+        Scan of the deformed configuration, on the same grid.
     method
-        Only this one; may be repeated.
+        Use only this method. May be repeated.
     out
         Folder for methods.html and methods.json.
     """
@@ -73,9 +73,9 @@ def compare_methods(
     from naibu.workflows.sense import read_pair
 
     with stages() as tell:
-        scans = read_pair(before, after, **(pair or PairOptions()).arguments)
+        scans = read_pair(reference, deformed, **(pair or PairOptions()).arguments)
         result = compared(scans, method or METHODS, out=out, tell=tell)
-    print_table(f"{before.name} -> {after.name}", result.columns, result.rows)
+    print_table(f"{reference.name} -> {deformed.name}", result.columns, result.rows)
     say(f"Page: {result.page}   numbers: {result.numbers}")
 
 
@@ -88,34 +88,34 @@ def track(
     polarity: Polarity = "auto",
     count: int | None = None,
     mask: Path | None = None,
-    spacing: Spacing | None = None,
+    spacing_mm: Spacing | None = None,
     size_mm: tuple[float, float, float] | None = None,
     described: ObjectOptions | None = None,
     title: str = "Markers followed through scans",
     out: Path = Path("naibu-markers"),
 ) -> None:
-    """Find markers in scans of several states, tell which is which, and make an experiment folder for 'naibu identify'.
+    """Detect markers in scans of several states, match them between the states, and make an experiment folder for 'naibu identify'.
 
     Parameters
     ----------
     scans
-        Scans of the states, the free one first, then in the order in which they were reached.
+        Scans of the states, the unloaded one first, then in the order in which they were reached.
     diameter_mm
         Diameter of the markers.
     thickness_mm
-        Thickness of washers or discs; beads have none.
+        Thickness of washers or discs; omit it for beads.
     polarity
-        Whether markers are bright or dark; by default whichever stands out.
+        Whether markers are brighter or darker than their surroundings; by default whichever has more contrast.
     count
-        How many markers there are, where that is known.
+        Number of markers, if known.
     mask
-        Volume on the grid of the scans, not zero where markers may lie.
-    spacing
-        Distance of voxels along x, y, z, mm, for files that do not say.
+        Volume on the grid of the scans, nonzero where markers may lie.
+    spacing_mm
+        Voxel spacing along x, y, z, mm, for files that do not state it.
     size_mm
-        Extents of the object along x, y, z; without them only the tables of markers are written.
+        Dimensions of the object along x, y, z; without them only the tables of markers are written.
     title
-        What the experiment is.
+        Title of the experiment.
     out
         Folder to make: the experiment, with tracking.html and tracking.json beside its tables.
     """
@@ -126,12 +126,12 @@ def track(
     if size_mm is not None:
         description = tracking.ObjectDescription(**options.described(size_mm), title=title)
     elif options.layer or options.stated_mm:
-        raise InputError("--layer and --stated-mm describe an object: give its extents too, --size-mm X Y Z")
+        raise InputError("--layer and --stated-mm describe an object: give its dimensions too, --size-mm X Y Z")
     with stages() as tell:
         tell("finding markers and linking them")
         run = tracking.track(
             scans, out=out, diameter_mm=diameter_mm, thickness_mm=thickness_mm, polarity=polarity, count=count, mask=mask,
-            spacing_mm=spacing, description=description,
+            spacing_mm=spacing_mm, description=description,
         )  # fmt: skip
     print_table("Markers", run.columns, run.rows)
     say(f"Wrote {out}. Page: {run.page}")
@@ -153,24 +153,24 @@ def track_sequence(
     polarity: Literal["bright", "dark"] = "bright",
     out: Path = Path("naibu-tracks"),
 ) -> None:
-    """Follow markers through a sequence of images, such as ultrasound.
+    """Track markers through a sequence of images, such as B-mode ultrasound.
 
     Parameters
     ----------
     frames
-        Stack of images (TIFF, MetaImage, NRRD, ...), the times along its third axis.
+        Stack of images (TIFF, MetaImage, NRRD, ...), with time along its third axis.
     pixel_mm
-        Size of a pixel.
+        Pixel size.
     diameter_mm
-        How large a marker looks.
+        Apparent diameter of the markers.
     frame_rate_hz
-        Frames a second.
+        Frames per second.
     region_mm
-        Least x, greatest x, least y, greatest y of the part of the image in which markers may lie.
+        Smallest x, largest x, smallest y and largest y of the region in which markers may lie.
     count
-        How many markers there are, where that is known.
+        Number of markers, if known.
     polarity
-        Whether markers are brighter or darker than what lies around.
+        Whether markers are brighter or darker than their surroundings.
     out
         Folder for tracks.csv, tracks.html and tracks.json.
     """

@@ -92,18 +92,18 @@ def parse_known(known: Sequence[str]) -> KnownMaterials | None:
     names = [name for name, _ in pairs]
     for name in names:
         if not name or names.count(name) > 1:
-            raise InputError(f"--known names {name!r} {names.count(name)} times; write each material once, such as 'hardness 5=222 kPa'")
+            raise InputError(f"known names {name!r} {names.count(name)} times; write each material once, such as 'hardness 5=222 kPa'")
     without = [text for text in known if "=" not in text]
     if without and len(without) < len(known):
-        raise InputError(f"--known gives a modulus for some materials but none for {', '.join(without)}; give one for each")
+        raise InputError(f"known gives a modulus for some materials but none for {', '.join(without)}; give one for each")
     if len(without) > 1:
-        raise InputError("without moduli only one material can set the scale; write for instance --known 'hardness 5=222 kPa'")
+        raise InputError("without moduli only one material can set the scale; write for instance known='hardness 5=222 kPa'")
     if without:
         return KnownMaterials({names[0]: RATIO_REFERENCE_KPA}, scale_is_absolute=False)
     try:
         return KnownMaterials({name: kilopascals(value) for name, value in pairs})
     except InputError as error:
-        raise InputError(f"--known {', '.join(repr(text) for text in known)}: {error}") from error
+        raise InputError(f"known: {', '.join(repr(text) for text in known)}: {error}") from error
 
 
 def provenance_of(

@@ -56,7 +56,7 @@ def predict(
     name = state or _only_state(loaded)
     require_loaded(loaded, name)
     if height_mm is not None and heights_from_markers:
-        raise InputError("--height-mm and --heights-from-markers exclude each other; give one of them")
+        raise InputError("height_mm and heights_from_markers exclude each other; give one of them")
     folder = None if out is None else result_folder(out)
     try:
         prediction = predict_state(calibrated, loaded, name, platen_position_mm=height_mm, heights_from_markers=heights_from_markers)
@@ -70,5 +70,5 @@ def predict(
 def _only_state(experiment: Experiment) -> str:
     loaded = [s.name for s in experiment.states[1:] if s.loaded]
     if len(loaded) != 1:
-        raise InputError(f"{experiment.name} has {len(loaded)} loaded states ({loaded_names(experiment)}); choose one with --state")
+        raise InputError(f"{experiment.name} has {len(loaded)} loaded states ({loaded_names(experiment)}); choose one with `state`")
     return loaded[0]

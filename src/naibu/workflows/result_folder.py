@@ -52,7 +52,7 @@ def result_folder(out: str | os.PathLike[str]) -> Path:
             pass
     except OSError as error:
         reason = "a file stands in its way" if isinstance(error, FileExistsError | NotADirectoryError) else error.strerror
-        raise InputError(f"{folder}: cannot be used as a folder for results ({reason}); choose another with --out") from error
+        raise InputError(f"{folder}: cannot be used as a folder for results ({reason}); choose another as `out`") from error
     return folder
 
 
@@ -121,9 +121,9 @@ def _compared(folder: Path) -> list[dict[str, Any]]:
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise InputError(f"{file} cannot be read ({error}); delete it, or choose another folder with --out") from error
+        raise InputError(f"{file} cannot be read ({error}); delete it, or choose another folder as `out`") from error
     if not isinstance(data, list) or not all(isinstance(entry, dict) and {"provenance", "result"} <= entry.keys() for entry in data):
-        raise InputError(f"{file} is not a comparison of models; delete it, or choose another folder with --out")
+        raise InputError(f"{file} is not a comparison of models; delete it, or choose another folder as `out`")
     return data
 
 

@@ -80,7 +80,7 @@ def simulate(
     if name != SQUARES_TOGETHER and name not in SLUGS:
         return simulate_lattice(study, out, resume=resume, tell=tell)
     if resume:
-        raise InputError(f"resume: {name} takes seconds and keeps nothing to resume from; run it without")
+        raise InputError(f"{name} takes seconds and keeps nothing to resume from; run it without `resume`")
     files = simulate_study(name, out, tell=tell)
     count = sum(path.suffix == ".vtkhdf" for path in files)
     return SimulationRun(tuple(files), count, count)

@@ -280,7 +280,7 @@ def _packed(state: StudyState, fingerprint: str) -> bytes:
 
 def _read_checkpoint(path: Path, prepared: PreparedStudy) -> StudyState:
     if not path.is_file():
-        raise InputError(f"{path}: is not there, so that there is nothing to resume; run without --resume")
+        raise InputError(f"{path}: does not exist, so there is nothing to resume; run without `resume`")
     try:
         with np.load(path, allow_pickle=False) as file:
             data = {name: file[name] for name in file.files}
@@ -292,10 +292,10 @@ def _read_checkpoint(path: Path, prepared: PreparedStudy) -> StudyState:
         speed, external_work, unsettled = data["numbers"].tolist()
         state = StudyState(int(data["frame"]), lattice, contact, speed, data["places"], data["work"], external_work, int(unsettled))
     except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
-        raise InputError(f"{path}: is damaged ({error}); run without --resume") from error
+        raise InputError(f"{path}: is damaged ({error}); run without `resume`") from error
     if not same:
         raise InputError(
             f"{path}: was kept with other settings, inputs or another version of naibu than {prepared.source} now; put them back, or run "
-            "without --resume"
+            "without `resume`"
         )
     return state

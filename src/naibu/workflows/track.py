@@ -89,7 +89,7 @@ def track(
     """
     target = Path(out)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise InputError(f"{target}: exists and is not an empty folder; choose a new name with --out, or remove it first")
+        raise InputError(f"{target}: exists and is not an empty folder; choose a new folder as `out`, or remove this one first")
     names = _states(scans)
     volumes = [read_volume(path, spacing_mm=spacing_mm) for path in scans]
     masks = None
