@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from naibu.cli.console import app, print_table, say, stages
+from naibu.cli.console import app, print_table, progress_display, say, stages
 from naibu.cli.described import ObjectOptions, PairOptions
 from naibu.core.errors import InputError
 
@@ -176,11 +176,10 @@ def track_sequence(
     """
     from naibu.workflows.track_sequence import track_sequence_file
 
-    with stages() as tell:
-        tell("following markers")
+    with progress_display() as progress:
         run = track_sequence_file(
             frames, out=out, pixel_mm=pixel_mm, diameter_mm=diameter_mm, frame_rate_hz=frame_rate_hz, region_mm=region_mm, count=count,
-            polarity=polarity,
+            polarity=polarity, progress=progress,
         )  # fmt: skip
     print_table("Markers", run.columns, run.rows)
     say(f"Table: {run.table}   page: {run.page}")

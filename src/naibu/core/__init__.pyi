@@ -3,7 +3,7 @@ from .errors import ConvergenceError, InputError, MissingDependencyError, NaibuE
 from .experiment import Layer, Loading, Shape, State
 from .parameters import Parameter, ParameterSet
 from .progress import ProgressReport
-from .rigid_transform import Pose, registration
+from .rigid_transform import RigidTransform, registration
 from .status import Status
 
 __all__ = [
@@ -16,8 +16,8 @@ __all__ = [
     "NaibuError",
     "Parameter",
     "ParameterSet",
-    "Pose",
     "ProgressReport",
+    "RigidTransform",
     "Shape",
     "State",
     "Status",

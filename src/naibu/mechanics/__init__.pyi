@@ -2,7 +2,7 @@ from .contact.contact_surfaces import Friction, interface, rigid_contact
 from .contact.penalty_contact import Contact, RigidSurface, bar, plane
 from .contact.rigid_indenters import RigidIndenter, box_indenter, cylindrical_indenter, spherical_indenter
 from .finite_elements.assembly import Assembler, body_force
-from .finite_elements.boundary_conditions import Prescribed
+from .finite_elements.boundary_conditions import PrescribedDisplacement
 from .finite_elements.elements import Elements, elements
 from .finite_elements.hyperelasticity import Law, Material, lame_parameters, law_named, material
 from .finite_strain.problem import Problem, SolverSettings
@@ -33,12 +33,13 @@ from .linear_algebra.direct import direct_solver
 from .linear_algebra.multigrid import MultigridSolver, rigid_body_modes
 from .linear_algebra.protocols import Factorization, LinearSolver
 from .linear_algebra.solver_selection import choose_solver
+from .prescribed_motion import PrescribedMotion
 from .small_strain.dynamics import Series, simulate_motion
 from .small_strain.implicit_integrators import MotionState
 from .small_strain.linear_elasticity import LinearBody
-from .small_strain.prescribed_motion import Guide, Support
 from .small_strain.rheology import Rheology, elastic, maxwell, per_region, three_element, voigt
 from .small_strain.sensitivities import MaterialChange, SeriesDerivatives, simulate_motion_with_derivatives
+from .small_strain.supports import Support
 
 __all__ = [
     "Assembler",
@@ -49,7 +50,6 @@ __all__ = [
     "Elements",
     "Factorization",
     "Friction",
-    "Guide",
     "Lattice",
     "LatticeEngine",
     "LatticeParameters",
@@ -66,7 +66,8 @@ __all__ = [
     "MotionState",
     "MultigridSolver",
     "ParameterGradient",
-    "Prescribed",
+    "PrescribedDisplacement",
+    "PrescribedMotion",
     "Problem",
     "PronySeries",
     "RecordedPush",

@@ -1,0 +1,51 @@
+"""Arguments of library functions in messages become the options of the verb that runs."""
+
+from __future__ import annotations
+
+import pytest
+
+from naibu.cli import app
+from naibu.cli.option_names import OTHER_NAMES, in_options
+
+SAID = {
+    "predict": [
+        (
+            "height_mm and heights_from_markers exclude each other; give one",
+            "--height-mm and --heights-from-markers exclude each other; give one",
+        ),
+        ("platen_position_mm must be positive, not -3", "--height-mm must be positive, not -3"),
+        ("press has 2 loaded states; choose one with `state`", "press has 2 loaded states; choose one with --state"),
+        ("folder/height_mm.csv: the state is unknown", "folder/height_mm.csv: the state is unknown"),
+        ("`model` must be a file", "MODEL must be a file"),
+    ],
+    "identify": [
+        ("known names 'hard' 2 times", "--known names 'hard' 2 times"),
+        ("known='x': no modulus", "--known='x': no modulus"),
+        ("states of 'cube' are chosen with `states`", "states of 'cube' are chosen with --state"),
+        ("element_size_mm=-3: must be positive", "--element-size-mm=-3: must be positive"),
+        ("the material is not known: is it new?", "the material is not known: is it new?"),
+    ],
+    "track": [
+        ("mask is empty", "--mask is empty"),
+        ("the mask is empty", "the mask is empty"),
+        ("stated_mm gives no height", "--stated-mm gives no height"),
+        ("scans must be at least two", "SCANS must be at least two"),
+    ],
+}
+
+
+@pytest.mark.parametrize("verb", SAID)
+def test_messages_name_the_options_of_the_verb(verb: str) -> None:
+    for text, shown in SAID[verb]:
+        assert in_options(text, app, [verb, "somewhere"]) == shown
+
+
+def test_without_a_verb_a_message_stays() -> None:
+    assert in_options("height_mm must be positive", app, ["nonsense"]) == "height_mm must be positive"
+    assert in_options("height_mm must be positive", app, ["--help"]) == "height_mm must be positive"
+
+
+def test_other_names_stand_for_options_there_are() -> None:
+    for verb, names in OTHER_NAMES.items():
+        options = {a.field_info.name for a in app[verb].assemble_argument_collection()}
+        assert set(names.values()) <= options, verb
