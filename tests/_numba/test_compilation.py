@@ -6,6 +6,8 @@ import os
 import shutil
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,7 +15,6 @@ import pytest
 import naibu
 from naibu._numba import cache_folder
 from naibu._numba.cache_folder import VARIABLE
-from naibu._numba.source_digest import source_digest
 
 INNER = "from naibu._numba.compilation import njit\n\n\n@njit(cache=True)\ndef inner(x):\n    return x + {}\n"
 OUTER = (
@@ -64,7 +65,21 @@ def test_an_edit_compiles_what_depends_on_it_and_nothing_else(tmp_path: Path) ->
     assert finished(started(tmp_path, "import numba")) == (2, folder, [])
     (package / "inner.py").write_text(INNER.format(5))
     assert finished(started(tmp_path)) == (6, folder, ["naibu.inner.inner", "naibu.outer.outer"])
-    assert len(list(folder.glob("inner-*"))) == 1  # those of the old source are gone
+
+
+def test_what_no_process_uses_is_removed_after_a_while(tmp_path: Path) -> None:
+    package = small_package(tmp_path)
+    folder = finished(started(tmp_path))[1]
+    kept = {path.name.rpartition("-")[0] for path in folder.glob("*.nbc")}
+    long_ago = time.time() - 15 * 86400
+    for path in folder.iterdir():
+        os.utime(path, (long_ago, long_ago))
+    (package / "inner.py").write_text(INNER.format(5))
+    finished(started(tmp_path))
+    for path in folder.iterdir():
+        assert time.time() - path.stat().st_mtime < 86400  # used, or new
+    assert {path.name.rpartition("-")[0] for path in folder.iterdir()} == kept
+    assert len(list(folder.iterdir())) == 3
 
 
 def test_two_processes_compile_a_kernel_once(tmp_path: Path) -> None:
@@ -90,20 +105,108 @@ def test_installations_with_the_same_sources_share_kernels(tmp_path: Path) -> No
 
 def test_only_what_kernels_depend_on_counts(tmp_path: Path) -> None:
     package = small_package(tmp_path)
-    before = source_digest(package / "outer.py", package)
+    finished(started(tmp_path))
+    (package / "outer.py").write_text('"""Words."""\n\n' + OUTER.replace("return inner(x)", "# why\n    return inner(x)"))
     (package / "words.py").write_text("SAID = 1\n")
-    assert _fresh_digest(package) == before
-    (package / "inner.py").write_text(INNER.format(3))
-    assert _fresh_digest(package) != before
+    assert finished(started(tmp_path))[2] == []
 
 
-def test_constants_of_other_modules_count(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda outer: outer.replace("cache=True", "cache=True, error_model='numpy'"),
+        lambda outer: outer.replace("def outer(x)", "def outer(x, more=1)"),
+        lambda outer: "from naibu.numbers import offset\n" + outer.replace("inner(x)", "inner(x) + offset - 1"),
+        lambda outer: "import naibu.numbers as n\n" + outer.replace("inner(x)", "inner(x) + n.offset - 1"),
+        lambda outer: "from naibu.door import inner as indirect\n" + outer.replace("inner(x)", "indirect(x)"),
+    ],
+    ids=["options", "defaults", "constant", "constant of a module", "name at another door"],
+)
+def test_what_changes_machine_code_counts(change: Callable[[str], str], tmp_path: Path) -> None:
     package = small_package(tmp_path)
-    (package / "numbers.py").write_text("OFFSET = 1\n")
-    (package / "outer.py").write_text("from naibu.numbers import OFFSET\n" + OUTER)
-    before = _fresh_digest(package)
-    (package / "numbers.py").write_text("OFFSET = 2\n")
-    assert _fresh_digest(package) != before
+    (package / "numbers.py").write_text("offset = 1\n")
+    (package / "door.py").write_text("from naibu.inner import inner\n")
+    finished(started(tmp_path))
+    (package / "outer.py").write_text(change(OUTER))
+    assert finished(started(tmp_path))[2] == ["naibu.outer.outer"]
+
+
+def test_a_constant_elsewhere_compiles_anew(tmp_path: Path) -> None:
+    package = small_package(tmp_path)
+    (package / "numbers.py").write_text("offset = 1\n")
+    (package / "outer.py").write_text("from naibu.numbers import offset\n" + OUTER.replace("inner(x)", "inner(x) + offset"))
+    assert finished(started(tmp_path))[0] == 3
+    (package / "numbers.py").write_text("offset = 2\n")
+    value, _, compiled = finished(started(tmp_path))
+    assert (value, compiled) == (4, ["naibu.outer.outer"])
+
+
+def test_one_function_compiled_both_ways_has_two_kernels(tmp_path: Path) -> None:
+    """Neither is taken for the other, by this process or by the next one."""
+    package = small_package(tmp_path)
+    both = "\nfrom numba import prange\n\n\ndef total(x):\n    s = 0\n    for i in prange(x):\n        s += i\n    return s\n\n\n"
+    both += "alone = njit(cache=True)(total)\ntogether = njit(cache=True, parallel=True)(total)\n"
+    (package / "apart.py").write_text(APART + both)
+    ask = "from naibu.apart import alone, together; assert alone(5) == together(5) == 10"
+    finished(started(tmp_path, ask))
+    folder = package / "__pycache__" / "kernels"
+    assert {"naibu.apart.total", "naibu.apart.total__parallel"} <= {path.name.rpartition("-")[0] for path in folder.glob("*.nbc")}
+    assert finished(started(tmp_path, ask))[2] == []
+
+
+def test_a_damaged_file_is_compiled_again(tmp_path: Path) -> None:
+    small_package(tmp_path)
+    folder = finished(started(tmp_path))[1]
+    whole = {path: path.read_bytes() for path in folder.glob("*.nbc")}
+    for path, content in whole.items():
+        path.write_bytes(content[: len(content) // 2])
+    assert len(finished(started(tmp_path))[2]) == 3
+    assert finished(started(tmp_path))[2] == []
+
+
+def test_a_full_disk_costs_the_cache_and_not_the_result(tmp_path: Path) -> None:
+    small_package(tmp_path)
+    limit = "import resource, numba; resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))"
+    value, folder, compiled = finished(started(tmp_path, limit))
+    assert (value, len(compiled)) == (2, 3)
+    assert list(folder.iterdir()) == []
+    assert len(finished(started(tmp_path))[2]) == 3
+
+
+def test_a_kernel_that_does_not_compile_keeps_nobody_waiting(tmp_path: Path) -> None:
+    """The lock is released, in the same process and for others."""
+    package = small_package(tmp_path)
+    (package / "apart.py").write_text(APART.replace("2 * x", "2 * x if x != x + 0 else x.missing"))
+    fails = """
+import numba
+from naibu._numba.cache_folder import cache_folder
+from naibu.apart import apart
+for _ in range(2):
+    try:
+        apart(1)
+    except numba.TypingError:
+        continue
+    raise SystemExit(1)
+raise SystemExit(len(list(cache_folder().glob('*.lock'))))
+"""
+    start = time.monotonic()
+    assert started(tmp_path, fails).wait(timeout=100) == 0
+    assert started(tmp_path, fails).wait(timeout=100) == 0
+    assert time.monotonic() - start < 100
+
+
+def test_threads_compile_a_kernel_once(tmp_path: Path) -> None:
+    small_package(tmp_path)
+    threads = (
+        "from threading import Thread\nfrom naibu.outer import outer\nfrom naibu._numba.compilation import reported_compilation\n"
+        "seen, found = [], []\n"
+        "with reported_compilation(lambda kernel, done: seen.append((kernel, done))):\n"
+        "    threads = [Thread(target=lambda: found.append(outer(1))) for _ in range(4)]\n"
+        "    [t.start() for t in threads]; [t.join() for t in threads]\n"
+        "assert found == [2] * 4 and len(seen) == 4, seen\n"
+        "assert seen[0] == ('naibu.outer.outer', False) and seen[-1] == ('naibu.outer.outer', True), seen\n"
+    )
+    assert finished(started(tmp_path, threads))[2] == ["naibu.apart.apart"]
 
 
 def test_without_a_home_and_a_writable_package_kernels_go_to_a_private_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -115,13 +218,3 @@ def test_without_a_home_and_a_writable_package_kernels_go_to_a_private_folder(mo
     folder.chmod(0o777)  # anybody could put code there
     other = cache_folder.cache_folder.__wrapped__()
     assert other != folder and other.stat().st_mode & 0o077 == 0
-
-
-def _fresh_digest(package: Path) -> str:
-    """The digest as a new process computes it: within one, sources are read once."""
-    command = (
-        "import sys; from pathlib import Path; from naibu._numba.source_digest import source_digest\n"
-        "package = Path(sys.argv[1]); print(source_digest(package / 'outer.py', package))"
-    )
-    done = subprocess.run([sys.executable, "-c", command, str(package)], capture_output=True, text=True, check=True)
-    return done.stdout.strip()

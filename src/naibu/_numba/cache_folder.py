@@ -19,8 +19,8 @@ VARIABLE = "NUMBA_CACHE_DIR"
 def cache_folder() -> Path:
     """Return the folder of all compiled kernels, which exists and can be written to.
 
-    The first that can be used of: the folder that the environment variable NUMBA_CACHE_DIR names, the package's own ``__pycache__``, the
-    user's cache folder, and a private one among the temporary files.
+    The first that can be written to of: the folder that the environment variable NUMBA_CACHE_DIR names, the package's own ``__pycache__``,
+    the user's cache folder, and a private one among the temporary files.
     """
     for folder in candidates():
         if usable(folder):
@@ -28,12 +28,27 @@ def cache_folder() -> Path:
     return _private_folder()
 
 
+@cache
+def readable_folders() -> tuple[Path, ...]:
+    """Return where compiled kernels are looked for: in `cache_folder`, and where this is not named by the user, in the package's own too.
+
+    The latter may have been filled by an administrator, for users who cannot write there.
+    """
+    first = cache_folder()
+    own = _package_folder()
+    return (first,) if first == own or os.environ.get(VARIABLE) else (first, own)
+
+
+def _package_folder() -> Path:
+    return Path(__file__).resolve().parents[1] / "__pycache__" / "kernels"
+
+
 def candidates() -> Iterator[Path]:
     """Give the folders that may be used, the first choice first; without the temporary one."""
     given = os.environ.get(VARIABLE)
     if given:
         yield Path(given) / "naibu"
-    yield Path(__file__).resolve().parents[1] / "__pycache__" / "kernels"
+    yield _package_folder()
     user = _user_cache()
     if user is not None:
         yield user / "naibu" / "kernels"

@@ -1,37 +1,40 @@
 # mypy: disallow-untyped-calls=False, warn-unused-ignores=False
-"""Compilation of kernels: `njit` as Numba's own, with a cache that knows what machine code depends on.
+"""Compilation of kernels: `njit` as Numba's own, with a cache that knows everything that machine code depends on.
 
-Kernels are kept in folders named by a digest of all sources they are made of (`naibu._numba.source_digest`), so that an edit compiles anew
-what depends on it and nothing else, and installations with the same sources can share one folder. Where several processes need the same
-kernel, one compiles and the others wait for it.
+Files are named by a digest of a kernel and all that it depends on (`naibu._numba.kernel_digest`), so that an edit compiles anew what
+depends on it and nothing else, and installations with the same sources can share one folder. Where several processes need the same kernel,
+one compiles it and the others wait.
 """
 
 from __future__ import annotations
 
 import contextlib
-import shutil
-import time
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
+from functools import cache as cached
 from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core import caching
 
-from naibu._numba.cache_folder import cache_folder
-from naibu._numba.process_lock import ProcessLock
-from naibu._numba.source_digest import source_digest
+from naibu._numba.kernel_digest import kernel_digest, named_apart
+from naibu._numba.versions import passes
 
-PACKAGE = Path(__file__).resolve().parents[1]
-FORGOTTEN_S = 30 * 86400.0  # kernels of other sources that nobody has touched for so long are removed
-LONGEST_WAIT_S = 120.0  # for another process that compiles the same kernel
+try:
+    from naibu._numba.kernel_files import KernelFile
+except Exception:  # whatever a changed interface raises
+    KernelFile = None  # type: ignore[assignment,misc]
 
-_listeners: list[Callable[[str, bool], None]] = []
+Listener = Callable[[str, bool], None]
+_listeners: list[Listener] = []
 
 
 @contextlib.contextmanager
-def reported_compilation(listener: Callable[[str, bool], None]) -> Any:
-    """Within this context, call ``listener(kernel, done)`` before and after each compilation of a kernel."""
+def reported_compilation(listener: Listener) -> Iterator[None]:
+    """Within this context, call ``listener(kernel, done)`` before and after each compilation of a kernel, in the thread that compiles.
+
+    Kernels that another kernel calls are compiled within it.
+    """
     _listeners.append(listener)
     try:
         yield
@@ -53,103 +56,98 @@ def njit(function: Callable[..., Any] | None = None, *, cache: bool = False, **o
     """
 
     def decorated(function: Callable[..., Any]) -> Any:
-        compiled = numba.njit(**options)(function)
-        if cache and hasattr(compiled, "enable_caching"):  # not where NUMBA_DISABLE_JIT is set
-            with contextlib.suppress(AttributeError, TypeError, OSError, RuntimeError):
-                compiled._cache = KernelCache(function)  # on an untested Numba: compiled in every process
+        # one function may be compiled both ways: machine code of the same name would be taken for the same
+        compiled = numba.njit(**options)(named_apart(function, "__parallel") if options.get("parallel") else function)
+        compiler = getattr(compiled, "_compiler", None)  # None where NUMBA_DISABLE_JIT is set, or on an untested Numba
+        if cache and compiler is not None and hasattr(compiler, "compile"):
+            compiler.compile = CachedCompiler(compiled, compiler.compile)
         return compiled
 
     return decorated if function is None else decorated(function)
 
 
-class KernelLocator(caching._CacheLocator):
-    """Tells Numba the folder of a kernel, by the digest of its sources."""
+class CachedCompiler:
+    """What compiles a kernel: in place of that of a Numba dispatcher, which it calls where a kernel is not kept yet.
 
-    def __init__(self, function: Callable[..., Any], file: str) -> None:
-        path = Path(file).resolve()
-        name = ".".join(path.relative_to(PACKAGE).with_suffix("").parts) if path.is_relative_to(PACKAGE) else path.stem
-        package = PACKAGE if path.is_relative_to(PACKAGE) else path.parent
-        self._digest = source_digest(path, package)
-        self._line = function.__code__.co_firstlineno
-        self._folder = cache_folder() / f"{name}-{self._digest}"
+    Numba calls it under its lock of the compiler, so that one thread is in it at a time.
 
-    def get_cache_path(self) -> str:
-        """Return the folder."""
-        if not self._folder.exists():
-            _forget(self._folder)
-            self._folder.mkdir(parents=True, exist_ok=True)
-        return str(self._folder)
+    Parameters
+    ----------
+    kernel : numba dispatcher
+        Whose compiler it becomes.
+    compile : callable
+        Compiles the kernel for types of arguments and of the result (or None).
+    """
 
-    def get_source_stamp(self) -> str:
-        """Return what tells sources apart."""
-        return self._digest
+    def __init__(self, kernel: Any, compile: Callable[[Any, Any], Any]) -> None:
+        self._kernel, self._compile = kernel, compile
+        self._label = f"{kernel.py_func.__module__}.{kernel.py_func.__qualname__}"
+        self._digest: str | None = None
 
-    def get_disambiguator(self) -> str:
-        """Return what tells functions of one name apart."""
-        return str(self._line)
-
-    @classmethod
-    def from_function(cls, function: Callable[..., Any], file: str) -> KernelLocator | None:
-        """Return the locator of a function."""
-        return cls(function, file) if Path(file).is_file() else None
-
-
-class KernelCacheImpl(caching.CompileResultCacheImpl):
-    """How compiled kernels become files: as Numba's own, elsewhere."""
-
-    _locator_classes: list[type[object]] = [KernelLocator]  # noqa: RUF012  as Numba declares it
-
-
-class KernelCache(caching.FunctionCache):
-    """Numba's cache of one function; one process compiles, the others wait."""
-
-    _impl_class = KernelCacheImpl
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        super().__init__(function)
-        self._label = f"{function.__module__}.{function.__qualname__}"
-        self._lock: ProcessLock | None = None
-
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the compiled function, or None where this process is to compile it."""
-        found = super().load_overload(sig, target_context)
+    def __call__(self, args: Any, return_type: Any) -> Any:
+        """Return the compile result, from its file where there is one."""
+        file = self._file(args, return_type)
+        if file is None:
+            return self._reported(args, return_type)
+        found = self._loaded(file)
         if found is None:
-            self._release()
-            lock = ProcessLock(Path(self._cache_path) / f"{self._py_func.__name__}.lock", LONGEST_WAIT_S)
-            if lock.acquire():  # another process may have compiled it while this one waited
-                found = super().load_overload(sig, target_context)
-            if found is not None:
-                lock.release()
-                return found
-            self._lock = lock
-            _tell(self._label, False)
+            with file.lock():
+                found = self._loaded(file)  # another process may have compiled it meanwhile
+                if found is None:
+                    found = self._reported(args, return_type)
+                    file.save(found)
         return found
 
-    def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep a compiled function."""
+    def _file(self, args: Any, return_type: Any) -> Any:
+        if not cache_works():
+            return None
         try:
-            with contextlib.suppress(OSError):  # a full disk costs the cache, not the result
-                super().save_overload(sig, data)
+            self._digest = self._digest or kernel_digest(self._kernel)
+        except OSError:  # no sources, as in a frozen application
+            return None
+        return KernelFile.of(self._label, self._digest, (tuple(args), return_type), self._kernel.targetctx)
+
+    def _loaded(self, file: Any) -> Any:
+        target = self._kernel.targetctx
+        found = file.load(target)
+        if found is not None and not found.objectmode:
+            target.insert_user_function(found.entry_point, found.fndesc, [found.library])
+        return found
+
+    def _reported(self, args: Any, return_type: Any) -> Any:
+        _tell(self._label, False)
+        try:
+            return self._compile(args, return_type)
         finally:
-            self._release()
             _tell(self._label, True)
 
-    def _release(self) -> None:
-        if self._lock is not None:
-            self._lock.release()
-            self._lock = None
+
+@cached
+def cache_works() -> bool:
+    """Tell whether compiled kernels can be kept with this version of Numba: always on tested ones, else after a trial."""
+    return KernelFile is not None and passes(_trial)
+
+
+def _trial() -> bool:
+    """Tell whether a compiled function can be written, read and called."""
+    from naibu._numba import kernel_files
+
+    def kernel(x: Any) -> Any:
+        return 2.0 * x + 1.0
+
+    first: Any = numba.njit(kernel)
+    second: Any = numba.njit(kernel)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "kernel"
+        path.write_bytes(kernel_files.packed(_compiled(first)))
+        second.add_overload(kernel_files.unpacked(second.targetctx, path.read_bytes()))
+    return bool(second(3.0) == 7.0 and hasattr(second, "targetoptions"))
+
+
+def _compiled(kernel: Any) -> Any:
+    return kernel._compiler.compile((numba.types.float64,), None)
 
 
 def _tell(kernel: str, done: bool) -> None:
     for listener in tuple(_listeners):
         listener(kernel, done)
-
-
-def _forget(folder: Path) -> None:
-    """Remove the kernels that the same module had with other sources and that were not used for long."""
-    name = folder.name.rpartition("-")[0]
-    within_package = PACKAGE in folder.parents
-    for other in folder.parent.glob(f"{name}-*"):
-        with contextlib.suppress(OSError):  # another process was faster
-            if other.name.rpartition("-")[0] == name and (within_package or time.time() - other.stat().st_mtime > FORGOTTEN_S):
-                shutil.rmtree(other, ignore_errors=True)

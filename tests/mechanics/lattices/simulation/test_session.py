@@ -8,8 +8,8 @@ from time import sleep
 import numpy as np
 import pytest
 
+from naibu._numba import thread_pool
 from naibu.core.errors import ConvergenceError, InputError
-from naibu.mechanics.lattices.cpu import _thread_pool
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, explicit_step_limit
@@ -71,7 +71,7 @@ def test_who_takes_a_part_changes_nothing():
     for alone in (False, True):
         session = LatticeSession.of(engine(method="euler", step=1e-4, threads=4), constrained=CONSTRAINED)
         if alone:
-            session.stepper.control[_thread_pool.REST] = 10_000
+            session.stepper.control[thread_pool.ALONE] = 10_000
         for _ in range(20):
             session.advance(PUSH, 10)
         found.append(session.state())
@@ -97,85 +97,85 @@ def test_helpers_are_asked_only_while_steps_take_most_of_the_time():
 
 
 def test_the_team_rests_longer_after_each_stall_and_forgets_them():
-    control = _thread_pool.new_control(2)
+    control = thread_pool.new_control(2)
     rests = []
     for _ in range(9):
-        _thread_pool.judge(control, _thread_pool.STALL)
-        rests.append(int(control[_thread_pool.REST]))
-        while control[_thread_pool.REST]:
-            _thread_pool.judge(control, 0)
+        thread_pool.adapt(control, thread_pool.STALL)
+        rests.append(int(control[thread_pool.ALONE]))
+        while control[thread_pool.ALONE]:
+            thread_pool.adapt(control, 0)
     assert rests == [200, 600, 1400, 3000, 6200, 12600, 12800, 12800, 12800]
     for _ in range(7_000):
-        _thread_pool.judge(control, 0)
-    _thread_pool.judge(control, _thread_pool.STALL)
-    assert control[_thread_pool.REST] == 2 * (12800 >> 7) + 200
-    _thread_pool.judge(_thread_pool.new_control(2), _thread_pool.STALL - 1)
-    assert not _thread_pool.new_control(2)[_thread_pool.REST]
+        thread_pool.adapt(control, 0)
+    thread_pool.adapt(control, thread_pool.STALL)
+    assert control[thread_pool.ALONE] == 2 * (12800 >> 7) + 200
+    thread_pool.adapt(thread_pool.new_control(2), thread_pool.STALL - 1)
+    assert not thread_pool.new_control(2)[thread_pool.ALONE]
 
 
 def test_a_helper_that_is_late_is_waited_for_and_stalls_the_team():
-    control = _thread_pool.new_control(2)
-    control[_thread_pool.DONE] = 2
+    control = thread_pool.new_control(2)
+    control[thread_pool.DONE] = 2
     assert nogil_wait(control) == 0  # compiled before the helper begins
-    _thread_pool.publish(control, 7)
-    assert control[_thread_pool.JOB] == 7
-    assert {_thread_pool.claim(control), _thread_pool.claim(control)} == {0, 1}
-    assert _thread_pool.claim(control) == -1
-    _thread_pool.finish(control)
+    thread_pool.publish(control, 7)
+    assert control[thread_pool.JOB] == 7
+    assert {thread_pool.claim(control), thread_pool.claim(control)} == {0, 1}
+    assert thread_pool.claim(control) == -1
+    thread_pool.finish(control)
 
     def late() -> None:
         sleep(0.05)
-        _thread_pool.finish(control)
+        thread_pool.finish(control)
 
     helper = Thread(target=late)
     helper.start()
     naps = nogil_wait(control)
     helper.join()
-    assert control[_thread_pool.DONE] == 2
-    _thread_pool.judge(control, naps)
-    assert control[_thread_pool.REST] > 0
+    assert control[thread_pool.DONE] == 2
+    thread_pool.adapt(control, naps)
+    assert control[thread_pool.ALONE] > 0
 
 
-@_thread_pool.njit(nogil=True)
+@thread_pool.njit(nogil=True)
 def nogil_wait(control):
-    return _thread_pool.wait(control)
+    return thread_pool.wait(control)
 
 
 def test_parts_are_taken_once_by_many_helpers():
     """A thousand jobs of many parts, each of which counts itself."""
-    control, counts = _thread_pool.new_control(60), np.zeros(60, dtype=np.int64)
-    help_count(_thread_pool.new_control(1) + stopped(), counts)  # compiles
-    _thread_pool.lend(help_count, control, counts)
+    control, counts = thread_pool.new_control(60), np.zeros(60, dtype=np.int64)
+    count_worker(thread_pool.new_control(1) + stopped(), counts)  # compiles
+    thread_pool.start_workers(count_worker, control, counts)
     count_parts(control, counts, 1000)
-    _thread_pool.dismiss(control)
+    thread_pool.stop_workers(control)
     np.testing.assert_array_equal(counts, 1000)
 
 
 def stopped():
-    control = np.zeros_like(_thread_pool.new_control(1))
-    control[_thread_pool.STOP] = 1
+    control = np.zeros_like(thread_pool.new_control(1))
+    control[thread_pool.STOP] = 1
     return control
 
 
-@_thread_pool.njit(nogil=True)
+@thread_pool.njit(nogil=True)
 def count_parts(control, counts, jobs):
     for _ in range(jobs):
-        _thread_pool.publish(control, 0)
-        part = _thread_pool.claim(control)
+        thread_pool.publish(control, 0)
+        part = thread_pool.claim(control)
         while part >= 0:
             counts[part] += 1
-            _thread_pool.finish(control)
-            part = _thread_pool.claim(control)
-        _thread_pool.wait(control)
+            thread_pool.finish(control)
+            part = thread_pool.claim(control)
+        thread_pool.wait(control)
 
 
-@_thread_pool.njit(nogil=True)
-def help_count(control, counts):
-    part = _thread_pool.expect(control)
+@thread_pool.njit(nogil=True)
+def count_worker(control, counts):
+    part = thread_pool.next_part(control)
     while part >= 0:
         counts[part] += 1
-        _thread_pool.finish(control)
-        part = _thread_pool.expect(control)
+        thread_pool.finish(control)
+        part = thread_pool.next_part(control)
 
 
 def test_a_session_that_blows_up_says_so():

@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 from naibu._numba.compilation import njit
-from naibu.mechanics.lattices.cpu._simd import WIDTH, inverse_root, load, splat, store
-from naibu.mechanics.lattices.cpu._thread_pool import JOB, PARTS, REST, claim, expect, finish, judge, publish, wait
+from naibu._numba.simd import WIDTH, inverse_root, load, splat, store
+from naibu._numba.thread_pool import ALONE, JOB, PARTS, adapt, claim, finish, next_part, publish, wait
 
 _FAST = {"contract", "nsz"}
 FORCES = 0  # the first job of a step; the second one moves the masses
@@ -113,7 +113,7 @@ def _part(job, p, data):  # type: ignore[no-untyped-def]  # pragma: no cover
 @njit(cache=True)
 def _share(control, job, data):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Have all parts of a job done; return how many naps it took to wait for helpers."""
-    alone, part = control[PARTS] == 1 or control[REST] > 0, 0
+    alone, part = control[PARTS] == 1 or control[ALONE] > 0, 0
     if not alone:
         publish(control, job)
         part = claim(control)
@@ -128,13 +128,13 @@ def _share(control, job, data):  # type: ignore[no-untyped-def]  # pragma: no co
 
 
 @njit(cache=True, nogil=True)
-def help_explicit(control, data):  # type: ignore[no-untyped-def]  # pragma: no cover
+def explicit_worker(control, data):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Take parts of the jobs of `explicit_steps` while there are some."""
-    part = expect(control)
+    part = next_part(control)
     while part >= 0:
         _part(control[JOB], part, data)
         finish(control)
-        part = expect(control)
+        part = next_part(control)
 
 
 @njit(cache=True, nogil=True)
@@ -155,7 +155,7 @@ def explicit_steps(control, data, velocity, reaction):  # type: ignore[no-untype
         naps = 0
         for job in range(2):
             naps += _share(control, job, data)
-        judge(control, naps)
+        adapt(control, naps)
         reaction[n] = 0.0
         for p in range(len(shares)):
             reaction[n] += shares[p]

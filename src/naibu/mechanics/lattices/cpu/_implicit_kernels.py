@@ -16,9 +16,9 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import njit
+from naibu._numba.simd import WIDTH, inverse_root, load, single, splat, store, total
 from naibu.mechanics.lattices.cpu._coarse_kernels import begin_with, follow
 from naibu.mechanics.lattices.cpu._pcg_kernels import dot, multiply, project, solve
-from naibu.mechanics.lattices.cpu._simd import WIDTH, inverse_root, load, single, splat, store, total
 
 _FAST = {"contract", "nsz"}
 

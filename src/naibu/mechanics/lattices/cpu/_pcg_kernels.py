@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import njit
+from naibu._numba.simd import WIDTH, double, load, splat, store, total
 from naibu.mechanics.lattices.cpu._coarse_kernels import CREDIT, correct, gather, turn_with
-from naibu.mechanics.lattices.cpu._simd import WIDTH, double, load, splat, store, total
 
 _FAST = {"contract", "nsz"}
 

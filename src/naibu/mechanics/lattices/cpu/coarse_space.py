@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from naibu._numba.simd import WIDTH, aligned
 from naibu.core.arrays import AnyFloatArray, FloatArray, IntArray
 from naibu.mechanics.lattices.cpu._coarse_kernels import NODES, PRICE, assemble, build
-from naibu.mechanics.lattices.cpu._simd import WIDTH, aligned
 from naibu.mechanics.lattices.cpu.scratch import KernelTuple
 from naibu.mechanics.lattices.model.lattice import Lattice
 

@@ -7,8 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from naibu._numba.simd import WIDTH, aligned
 from naibu.core.arrays import AnyFloatArray, FloatArray, IntArray
-from naibu.mechanics.lattices.cpu._simd import WIDTH, aligned
 from naibu.mechanics.lattices.cpu.coarse_space import coarse_space
 from naibu.mechanics.lattices.cpu.scratch import KernelTuple, ScratchPool
 from naibu.mechanics.lattices.model.coefficients import explicit_coefficients, implicit_coefficients

@@ -9,10 +9,10 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
+from naibu._numba.simd import WIDTH, aligned
+from naibu._numba.thread_pool import MOST_PARTS
 from naibu.core.arrays import AnyFloatArray, FloatArray
 from naibu.core.errors import ConvergenceError, InputError
-from naibu.mechanics.lattices.cpu._simd import WIDTH, aligned
-from naibu.mechanics.lattices.cpu._thread_pool import MOST_PARTS
 from naibu.mechanics.lattices.cpu.element_blocks import Blocks, explicit_kernel, implicit_kernel
 from naibu.mechanics.lattices.cpu.scratch import KernelTuple, Scratch, ScratchPool
 from naibu.mechanics.lattices.cpu.stepper import ExplicitStepper, ImplicitStepper, Stepper

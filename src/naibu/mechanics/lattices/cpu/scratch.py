@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from naibu._numba.simd import aligned
 from naibu.core.arrays import AnyArray, AnyFloatArray
-from naibu.mechanics.lattices.cpu._simd import aligned
 
 KernelTuple = tuple[Any, ...]  # arrays and numbers as kernels take them, in nested tuples, whose types Numba works out
 Scratch = tuple[KernelTuple, KernelTuple]

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from naibu._numba.thread_pool import ALONE, PARTS, STOP, new_control, start_workers, stop_workers
 from naibu.core.arrays import FloatArray
-from naibu.mechanics.lattices.cpu._explicit_kernels import explicit_steps, help_explicit
+from naibu.mechanics.lattices.cpu._explicit_kernels import explicit_steps, explicit_worker
 from naibu.mechanics.lattices.cpu._implicit_kernels import implicit_steps
-from naibu.mechanics.lattices.cpu._thread_pool import PARTS, REST, STOP, dismiss, lend, new_control
 from naibu.mechanics.lattices.cpu.scratch import KernelTuple, Scratch
 
 MOST_ITERATIONS = 20_000
@@ -76,23 +76,23 @@ class ExplicitStepper(Stepper):
         self.data = (blocks, (*parts, mine), tables, state, masses, self.external, constrained, driven, forces, how)
         self.control = new_control(count)
         if count > 1:  # returns at once, compiled, lest helpers compile while steps wait
-            dismiss(self.control)
-            help_explicit(self.control, self.data)
+            stop_workers(self.control)
+            explicit_worker(self.control, self.data)
 
     def advance(self, velocity: FloatArray, reaction: FloatArray, *, alone: bool = False) -> tuple[int, int]:
         """Take steps and fill the reactions."""
         if self.control[STOP]:  # closed in between; helpers may still be on their way out
             self.control = new_control(int(self.control[PARTS]))
         if alone:
-            self.control[REST] = max(self.control[REST], len(velocity))
-        lend(help_explicit, self.control, self.data)
+            self.control[ALONE] = max(self.control[ALONE], len(velocity))
+        start_workers(explicit_worker, self.control, self.data)
         explicit_steps(self.control, self.data, velocity, reaction)
         return 0, 0
 
     def close(self) -> None:
         """Send helpers away."""
         if self.control is not None:
-            dismiss(self.control)
+            stop_workers(self.control)
 
 
 @dataclass(slots=True, eq=False)

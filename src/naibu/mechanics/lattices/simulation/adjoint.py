@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from naibu._numba.compilation import njit
+from naibu._numba.simd import WIDTH, aligned, inverse_root, load, splat, store
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.mechanics.lattices.cpu._explicit_kernels import drive, element_forces, move
-from naibu.mechanics.lattices.cpu._simd import WIDTH, aligned, inverse_root, load, splat, store
 from naibu.mechanics.lattices.cpu.element_blocks import explicit_tables
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import LatticeParameters

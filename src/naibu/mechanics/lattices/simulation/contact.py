@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from naibu._numba.simd import aligned
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.mechanics.contact.rigid_indenters import KINDS, RigidIndenter
-from naibu.mechanics.lattices.cpu._simd import aligned
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import Lattice
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState, checked_velocity, require_numbers

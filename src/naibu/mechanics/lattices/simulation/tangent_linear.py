@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from naibu._numba.compilation import njit
+from naibu._numba.simd import WIDTH, aligned, inverse_root, load, splat, store
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.mechanics.lattices.cpu._coarse_kernels import begin_with
 from naibu.mechanics.lattices.cpu._implicit_kernels import add_momenta, add_reactions, advance, constrain, new_velocity
 from naibu.mechanics.lattices.cpu._pcg_kernels import multiply, solve
-from naibu.mechanics.lattices.cpu._simd import WIDTH, aligned, inverse_root, load, splat, store
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.coefficients import implicit_coefficients
 from naibu.mechanics.lattices.model.lattice import LatticeParameters

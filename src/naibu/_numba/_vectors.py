@@ -1,25 +1,15 @@
-"""Eight numbers at a time in Numba kernels: vectors of the compiler, since it finds none in loops whose arrays may overlap.
-
-Works on every processor; the compiler splits the vectors where registers are shorter. Use inside `numba.njit` functions only::
-
-    distance = load(x, j) - load(x, i)     # x[j : j + 8] - x[i : i + 8]
-    store(x, i, load(x, i) + distance)
-
-The operators ``+``, ``-`` and ``*`` join two vectors of one precision; `splat` makes one of a number.
-"""
+"""Vectors of eight numbers in Numba kernels, as LLVM vector types: see `naibu._numba.simd`, which is to be imported instead."""
 
 from __future__ import annotations
 
 import operator
 from typing import Any
 
+import numba
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
-from numba.core import cgutils
-from numba.core.datamodel import models
-from numba.core.extending import intrinsic, lower_builtin, register_model
-from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
 
 WIDTH = 8
 _FLOAT, _DOUBLE = ir.FloatType(), ir.DoubleType()
@@ -139,8 +129,9 @@ def _inverse_root(typingcontext, value):  # type: ignore[no-untyped-def]
         least = constant(here, 1e-30 if not is_single else float.fromhex("0x1.4484bep-100"))
         bounded = builder.select(builder.fcmp_ordered(">", args[0], least), args[0], least)
         start = bounded if is_single else builder.fptrunc(bounded, single)
-        name, kind = f"llvm.sqrt.v{WIDTH}f32", ir.FunctionType(single, [single])
-        root = builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [start])  # type: ignore[no-untyped-call]
+        name = f"llvm.sqrt.v{WIDTH}f32"
+        square_root = builder.module.globals.get(name) or ir.Function(builder.module, ir.FunctionType(single, [single]), name)
+        root = builder.call(square_root, [start])
         guess = builder.fdiv(constant(single, 1.0), root)
         if is_single:
             return guess
@@ -150,14 +141,6 @@ def _inverse_root(typingcontext, value):  # type: ignore[no-untyped-def]
         return builder.fadd(y, builder.fmul(builder.fmul(y, gap), series))
 
     return value(value), codegen
-
-
-def aligned(shape: tuple[int, ...], kind: Any) -> Any:
-    """Return zeros that begin where a line of the cache does."""
-    size = int(np.prod(shape)) * np.dtype(kind).itemsize
-    raw = np.zeros(size + 64, dtype=np.uint8)
-    start = -raw.ctypes.data % 64
-    return raw[start : start + size].view(kind).reshape(shape)
 
 
 # known to the type checker as anything: it takes the typing context for an argument
@@ -171,13 +154,13 @@ inverse_root: Any = intrinsic(_inverse_root)
 
 
 def _operator(function: Any, name: str) -> None:
-    class Typing(AbstractTemplate):
-        def generic(self, args: Any, kws: Any) -> Any:
-            if len(args) == 2 and isinstance(args[0], Vector) and args[0] == args[1]:
-                return signature(args[0], *args)  # type: ignore[no-untyped-call]
-            return None
+    def typing(context: Any) -> Any:
+        def typed(left: Any, right: Any) -> Any:
+            return left if isinstance(left, Vector) and left == right else None
 
-    infer_global(function)(Typing)  # type: ignore[no-untyped-call]
+        return typed
+
+    type_callable(function)(typing)
 
     def lowered(context, builder, sig, args):  # type: ignore[no-untyped-def]
         return getattr(builder, name)(*args)
@@ -187,3 +170,16 @@ def _operator(function: Any, name: str) -> None:
 
 for _function, _name in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
     _operator(_function, _name)
+
+
+def trial() -> bool:
+    """Tell whether a kernel with every operation compiles and is right."""
+
+    def kernel(x: Any, y: Any) -> Any:
+        value = load(x, 1)
+        store(y, 0, inverse_root(value) * value + (value - splat(2.0)))
+        return total(double(single(value)))
+
+    x, y = np.arange(1.0, WIDTH + 2), np.zeros(WIDTH)
+    found = numba.njit(kernel)(x, y)
+    return bool(np.isclose(found, x[1:].sum()) and np.allclose(y, np.sqrt(x[1:]) + x[1:] - 2.0))

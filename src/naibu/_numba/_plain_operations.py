@@ -1,0 +1,39 @@
+"""Plain operations for one thread: the substitute of `naibu._numba._atomic_intrinsics` where its intrinsics do not work."""
+
+from __future__ import annotations
+
+from naibu._numba.compilation import njit
+
+
+@njit(cache=True)
+def look(array, index):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return array[index]."""
+    return array[index]
+
+
+@njit(cache=True)
+def post(array, index, value):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set array[index]."""
+    array[index] = value
+
+
+@njit(cache=True)
+def add(array, index, value):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add to array[index] and return what it was."""
+    before = array[index]
+    array[index] = before + value
+    return before
+
+
+@njit(cache=True)
+def swap(array, index, old, new):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set array[index] to `new` if it is `old`, and return whether it was."""
+    same = array[index] == old
+    if same:
+        array[index] = new
+    return same
+
+
+@njit(cache=True)
+def nap(microseconds):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return at once: no other thread is waited for."""
