@@ -165,7 +165,7 @@ def test_a_step_is_the_solution_of_the_internal_equation(young: float, first: fl
     whole, half = law.over(step), law.over(0.5 * step)
     assert half.decay**2 == pytest.approx(whole.decay, rel=1e-9, abs=1e-300)
     assert half.decay * half.gain + half.gain == pytest.approx(whole.gain, rel=1e-9)
-    assert (whole.effective <= law.dashpot + law.spring * law.share * step + 1e-9).all()
+    assert (whole.effective <= law.dashpot + law.spring * law.viscosity_ratio * step + 1e-9).all()
     assert (whole.effective <= law.series * (1.0 + 1e-9)).all()  # no faster than the series damper lets it
 
 

@@ -1,4 +1,4 @@
-"""Nodal forces and internal strains of three-element cells, without a matrix (spec M2)."""
+"""Matrix-free nodal forces and internal strains of three-element (Jeffreys) solids :cite:p:`hirai2008` (chapter 2)."""
 
 from __future__ import annotations
 
@@ -88,8 +88,8 @@ def rates(
         flow.zero,
         flow.spring,
         flow.dashpot,
-        flow.fading,
-        flow.share,
+        flow.decay_rate,
+        flow.viscosity_ratio,
         trace_rate,
         strain_rate,
         True,
@@ -100,7 +100,7 @@ def rates(
 
 def elastic_energy(body: Simplices, law: CellRheology, trace: FloatArray, strain: FloatArray) -> float:
     """Return the energy stored in the springs, mN mm."""
-    lame = law.elastic[:, 0] * np.where(law.share[:, 0] > 0.0, trace, 0.0) ** 2
+    lame = law.elastic[:, 0] * np.where(law.viscosity_ratio[:, 0] > 0.0, trace, 0.0) ** 2
     shear = 2.0 * law.elastic[:, 1] * np.einsum("mab,mab->m", strain, strain)
     return float(0.5 * ((lame + shear) * body.measures).sum())
 

@@ -1,4 +1,4 @@
-"""Constraint stabilisation: supports as differential equations whose multipliers are the contact forces (spec M3).
+"""Baumgarte constraint stabilisation: supports as differential equations whose multipliers are the contact forces :cite:p:`baumgarte1972`.
 
 Instead of ``A^T u = g(t)`` the system obeys ``A^T u'' + 2 w A^T u' + w^2 A^T u = g'' + 2 w g' + w^2 g``: the gap ``A^T u - g`` decays like
 a critically damped oscillator of angular frequency w. The equations of motion ``M u'' = f + A l`` then hold together with::
@@ -6,7 +6,8 @@ a critically damped oscillator of angular frequency w. The equations of motion `
     [ M    -A ] [ u'' ]   [ f                                        ]
     [ -A^T    ] [ l   ] = [ 2 w (A^T u' - g') + w^2 (A^T u - g) - g'' ]
 
-which is equation (9) of the report's paper for a plate at rest, g = 0. (Its Japanese text prints ``M u`` for ``w^2 u`` and loses signs.)
+which is equation (9) of :cite:t:`hirai2008` (chapter 2) for a plate at rest, g = 0. (Equation (3.9) there prints ``M u`` for
+``w^2 u`` and loses signs.)
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from naibu.core.errors import ConvergenceError, InputError
 
 @dataclass(frozen=True, slots=True)
 class Stabilization:
-    """How fast a support's gap closes.
+    """Rate at which the gap of a support closes.
 
     Attributes
     ----------
@@ -38,7 +39,7 @@ class Stabilization:
             raise InputError(f"the frequency of constraint stabilisation must be positive, not {self.frequency:g} 1/s")
 
     def acceleration(self, gap: FloatArray, gap_rate: FloatArray, path_acceleration: FloatArray) -> FloatArray:
-        """Return u'' of held components for a gap ``u - g``, mm, its rate ``u' - g'``, mm/s, and g'', mm/s^2."""
+        """Return u'' of constrained components for a gap ``u - g``, mm, its rate ``u' - g'``, mm/s, and g'', mm/s^2."""
         w = self.frequency
         return path_acceleration - 2.0 * w * gap_rate - w**2 * gap
 
@@ -59,7 +60,7 @@ def stabilized_accelerations(
     frequency: float,
     path: tuple[FloatArray, FloatArray, FloatArray] | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Solve the report's system (9) for any linear constraint.
+    """Solve the stabilised equations of motion for any linear constraint.
 
     Parameters
     ----------
@@ -74,7 +75,7 @@ def stabilized_accelerations(
     frequency : float
         w, 1/s.
     path : tuple of ndarray, shape (c,), optional
-        g, g' and g''; a plate at rest by default.
+        g, mm, g', mm/s, and g'', mm/s^2; a plate at rest by default.
 
     Returns
     -------
@@ -86,7 +87,7 @@ def stabilized_accelerations(
     InputError
         Shapes that do not fit.
     ConvergenceError
-        Constraints that depend on each other.
+        Linearly dependent constraints.
     """
     a = sp.csc_matrix(constraint)
     n, c = a.shape
@@ -98,5 +99,5 @@ def stabilized_accelerations(
         upper, lower = sp.hstack([sp.csc_matrix(mass), -a]), sp.hstack([-a.T, sp.csc_matrix((c, c))])
         found = spla.splu(sp.csc_matrix(sp.vstack([upper, lower]))).solve(np.concatenate([force, -rule]))
     except RuntimeError as error:
-        raise ConvergenceError(f"the constraints depend on each other ({error}): leave the redundant ones out") from error
+        raise ConvergenceError(f"the constraints are linearly dependent ({error}): leave the redundant ones out") from error
     return found[:n], found[n:]

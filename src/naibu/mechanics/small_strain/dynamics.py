@@ -1,4 +1,4 @@
-"""Motion of rheological bodies under supports and loads that change in time: one call from a body to a time series (spec M2, M3, M4)."""
+"""Dynamics of linear viscoelastic bodies under time-dependent supports and loads :cite:p:`hirai2008` (chapter 2)."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ Load = Callable[[float], FloatArray]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Series:
-    """A motion at chosen times.
+    """Time series of a motion.
 
     Attributes
     ----------
     times : ndarray, shape (k,)
         s.
     displacement, velocity : ndarray, shape (k, n, d)
-        mm and mm/s. Where a support jumps in speed, the velocity just before is told.
+        mm and mm/s. Where the velocity of a support jumps, the one just before.
     reaction : ndarray, shape (k, n, d)
         Forces of the supports on the nodes, mN; the multipliers of constraint stabilisation.
     kinetic, elastic, work : ndarray, shape (k,)
-        Energy of motion, energy in the springs, and work of supports and loads so far, mN mm.
+        Kinetic energy, elastic energy, and work of supports and loads so far, mN mm.
     supports : tuple of Support
         As given.
     final : MotionState
-        From which `simulate_motion` can go on.
+        Last state, from which `simulate_motion` can continue.
     method : str
-        Its name.
+        Name of the integration method.
     steps, factorizations : int
-        How many there were.
+        Numbers of time steps and of factorizations.
     """
 
     times: FloatArray
@@ -64,12 +64,12 @@ class Series:
 
     @property
     def dissipated(self) -> FloatArray:
-        """Energy lost in dampers, and by the method, since the first time (k,), mN mm."""
+        """Energy dissipated in dashpots, and numerically, since the first time (k,), mN mm."""
         stored = self.kinetic + self.elastic
         return np.asarray(self.work - self.work[0] - (stored - stored[0]))
 
     def force(self, name: str) -> FloatArray:
-        """Return the force (k, d), mN, of the support called `name` on the body; zero where it does not act.
+        """Return the force (k, d), mN, of the support called `name` on the body; zero while it is inactive.
 
         Raises
         ------
@@ -102,38 +102,38 @@ def simulate_motion(
     spectral_radius: float = 0.8,
     tolerance: float = 1e-6,
 ) -> Series:
-    """Move a body through time.
+    """Simulate the motion of a viscoelastic body.
 
     Parameters
     ----------
     body : LinearBody
-        Lines, triangles or tetrahedra; made once, it serves any number of materials.
+        Mesh of lines, triangles or tetrahedra.
     materials : Rheology or CellRheology
         One for all cells, or a table.
     density : array_like or None
-        kg/mm^3 (water: 1e-6), one number or one a cell; None leaves inertia out: a body in equilibrium at any time.
+        kg/mm^3 (water: 1e-6), one number or one a cell; None neglects inertia (quasi-static).
     supports : sequence of Support
-        What holds and moves nodes, and when.
+        Constrained nodes, their prescribed motion and when it applies.
     times : array_like, shape (k,)
-        Increasing times, s, at which the motion is returned; it starts at the first.
+        Increasing output times, s; the simulation starts at the first.
     step : float, optional
         Longest step, s; by default the spacing of `times`. Steps also end wherever a support or its speed changes.
     method : {"sdirk2", "backward_euler", "generalized_alpha", "rk4", "rkf45"}
         See `naibu.mechanics.small_strain.implicit_integrators`.
     mass : {"lumped", "consistent"}
-        Inertia at the nodes, or of the shape functions.
+        Mass matrix.
     load : array_like, shape (n, d), or callable, optional
         Forces on the nodes, mN, constant or as a function of time.
     breaks : sequence of float
         Times, s, at which the load jumps.
     initial : MotionState, optional
-        Where to start from; the free shape at rest by default.
+        Initial state; the reference configuration at rest by default.
     stabilization : float, optional
-        Keep supports by constraint stabilisation with this frequency, 1/s, instead of exactly.
+        Frequency, 1/s, of constraint stabilisation; supports are enforced exactly by default.
     spectral_radius : float
-        Of ``"generalized_alpha"``.
+        Spectral radius at infinite frequency of ``"generalized_alpha"``.
     tolerance : float
-        Of ``"rkf45"``.
+        Relative local error of ``"rkf45"``.
 
     Returns
     -------
@@ -143,18 +143,18 @@ def simulate_motion(
     Raises
     ------
     InputError
-        An argument that cannot be used; a body without inertia that can move freely.
+        An argument that cannot be used; a body without inertia whose rigid-body motions are not constrained.
     ConvergenceError
-        Explicit steps that blow up.
+        Unstable explicit integration.
     """
     integrator = _integrator(method, spectral_radius, tolerance)
-    return driven(
+    return integrate_motion(
         integrator, body, materials, density, supports, times,
         step=step, mass=mass, load=load, breaks=breaks, initial=initial, stabilization=stabilization,
     )  # fmt: skip
 
 
-def driven(
+def integrate_motion(
     integrator: Integrator,
     body: LinearBody,
     materials: Rheology | CellRheology,
@@ -169,12 +169,12 @@ def driven(
     initial: MotionState | None = None,
     stabilization: float | None = None,
 ) -> Series:
-    """Move a body through time by an integrator of one's own; otherwise as `simulate_motion`."""
+    """Simulate the motion of a viscoelastic body by a given integrator; other arguments as in `simulate_motion`."""
     output = _checked_times(times, step)
     law = CellRheology.of(body.simplices.n_cells, materials)
     inertia = None if density is None else mass_of(body, density, mass)
     if inertia is None and (integrator.needs_inertia or stabilization is not None):
-        raise InputError("without inertia use 'sdirk2' or 'backward_euler', and no constraint stabilisation")
+        raise InputError("density=None needs method 'sdirk2' or 'backward_euler', without constraint stabilisation")
     names = [s.name for s in supports]
     if len(set(names)) < len(names):
         raise InputError(f"supports need different names, not {', '.join(names)}")
@@ -198,22 +198,22 @@ def driven(
 
 
 def explicit_step_limit(body: LinearBody, materials: Rheology | CellRheology, density: ArrayLike) -> float:
-    """Return a step, s, with which ``"rk4"`` is stable: short against the fastest mode of any cell alone with its lumped mass.
+    """Return a step, s, with which ``"rk4"`` is stable, from the fastest mode of any single cell with its lumped mass.
 
-    The largest eigenvalue of an assembled body is at most the largest of its cells, so the limit is on the safe side.
+    The largest eigenvalue of an assembled body is at most the largest of its cells, so the limit is conservative.
     """
     cells = body.simplices
     law = CellRheology.of(cells.n_cells, materials)
     lame, shear = connection_matrices(cells)
     mass = per_cell(density, cells.n_cells, "the density") * cells.measures / (cells.dimension + 1)
-    stiff = law.spring * law.share
+    stiff = law.spring * law.viscosity_ratio
     fastest = [np.linalg.eigvalsh(m[:, 0, None, None] * lame + m[:, 1, None, None] * shear)[:, -1] / mass for m in (stiff, law.dashpot)]
     rate, damping = np.maximum(fastest[0], 0.0), 0.5 * np.maximum(fastest[1], 0.0)
     return float(2.6 / (damping + np.sqrt(damping**2 + rate)).max())
 
 
 class _Run:
-    """One simulation under way."""
+    """One simulation in progress."""
 
     def __init__(
         self, body: LinearBody, law: CellRheology, mass: Mass | None, load: Load, supports: tuple[Support, ...],
@@ -227,15 +227,15 @@ class _Run:
         self.active: tuple[Support, ...] | None = None
 
     def through(self, output: FloatArray, longest: float, breaks: list[float], start: MotionState) -> list[MotionState]:
-        """Step from event to event and keep the states asked for."""
+        """Step from event to event and keep the states at the output times."""
         self.state = start
         events = sorted({t for s in self.supports for t in s.events()} | set(breaks))
         events = [t for t in events if output[0] < t < output[-1]]
         stops = _merged(output, events)
         abrupt = {float(output[0]), *events}
         phase, kept = None, [start]
-        self.integrator.told(start)
-        for begin, end, told in zip(stops[:-1], stops[1:], [stop[1] for stop in stops[1:]], strict=True):
+        self.integrator.record(start)
+        for begin, end, wanted in zip(stops[:-1], stops[1:], [stop[1] for stop in stops[1:]], strict=True):
             span = end[0] - begin[0]
             count = max(1, int(np.ceil(span / longest * (1.0 - 1e-9))))
             active = tuple(s for s in self.supports if s.acts_at(0.5 * (begin[0] + end[0])))
@@ -248,9 +248,9 @@ class _Run:
             for i in range(1, count + 1):
                 until = end[0] if i == count else begin[0] + span * i / count
                 self.state = self.integrator.step(phase, self.state, until)
-            if told:
+            if wanted:
                 kept.append(self.state)
-                self.integrator.told(self.state)
+                self.integrator.record(self.state)
         return kept
 
     def _phase(self, active: tuple[Support, ...]) -> Phase:
@@ -259,8 +259,8 @@ class _Run:
                 path = support.motion.displacement(self.state.time) if support.motion is not None else 0.0
                 self.offsets[support.name] = self.state.displacement[support.nodes] - path
         self.active = active
-        guide = ActiveSupports(active, self.body.points.shape, self.offsets)
-        return Phase(self.body, self.law, self.flow, self.mass, self.load, guide, self.rule)
+        supports = ActiveSupports(active, self.body.points.shape, self.offsets)
+        return Phase(self.body, self.law, self.flow, self.mass, self.load, supports, self.rule)
 
 
 def _within(load: Load, begin: float, end: float) -> Load:
@@ -270,7 +270,7 @@ def _within(load: Load, begin: float, end: float) -> Load:
 
 
 def _merged(output: FloatArray, events: list[float]) -> list[tuple[float, bool]]:
-    """Return all times at which steps end, and whether the state is asked for; an event replaces an output time that it rounds to."""
+    """Return all times at which steps end, and whether they are output times; an event replaces an output time that it rounds to."""
     close = 1e-10 * float(output[-1] - output[0])
     stops = [(float(t), True) for t in output]
     for event in events:
@@ -284,7 +284,7 @@ def _merged(output: FloatArray, events: list[float]) -> list[tuple[float, bool]]
 
 def _integrator(method: str, spectral_radius: float, tolerance: float) -> Integrator:
     if method not in METHODS:
-        raise InputError(f"there is no method {method!r}; use one of {', '.join(METHODS)}")
+        raise InputError(f"method={method!r} is not known; use one of {', '.join(METHODS)}")
     if method == "generalized_alpha":
         return GeneralizedAlpha(spectral_radius)
     if method == "rkf45":

@@ -1,7 +1,6 @@
-"""Generalized-alpha: second order, with the damping of fast modes as an argument (spec M4).
+"""Generalized-alpha method :cite:p:`chung1993`: second order, with adjustable numerical dissipation of high frequencies.
 
-See J. Chung and G. M. Hulbert, "A time integration algorithm for structural dynamics with improved numerical dissipation", J. Appl. Mech.
-60, 1993; the internal strain takes its exact step for the mean strain rate.
+The internal strain takes its exact step for the mean strain rate.
 """
 
 from __future__ import annotations
@@ -18,12 +17,12 @@ from naibu.mechanics.small_strain.rheology import CellRheology, StepCoefficients
 
 
 class GeneralizedAlpha(Integrator):
-    """Balance at ``t + (1 - alpha_f) h``, inertia at ``t + (1 - alpha_m) h``.
+    """Generalized-alpha method: forces at ``t + (1 - alpha_f) h``, inertia at ``t + (1 - alpha_m) h``.
 
     Parameters
     ----------
     spectral_radius : float
-        Of modes much faster than the steps, in [0, 1]: 1 keeps their energy, 0 damps them at once.
+        Spectral radius at infinite frequency, in [0, 1]: 1 is without dissipation, 0 annihilates these modes in one step.
     """
 
     name = "generalized_alpha"
@@ -42,7 +41,7 @@ class GeneralizedAlpha(Integrator):
         self._power = 0.0
 
     def begin(self, phase: Phase, state: MotionState, step_s: float, changed: bool) -> MotionState:
-        """Return the state after an impulse, and remember its acceleration."""
+        """Return the state after an impulse, and store its acceleration."""
         state = super().begin(phase, state, step_s, changed)
         a, reaction = _accelerated(phase, state, 1)
         self._acceleration, self._power = a, _power(phase, state.time, state.velocity, reaction)
@@ -50,7 +49,7 @@ class GeneralizedAlpha(Integrator):
 
     def step(self, phase: Phase, state: MotionState, until: float) -> MotionState:
         """Return the state at `until`."""
-        h, constrained, law, body = until - state.time, phase.guide.constrained, phase.law, phase.body.simplices
+        h, constrained, law, body = until - state.time, phase.supports.constrained, phase.law, phase.body.simplices
         at, b, g, a_old = 1.0 - self.alpha_f, self.beta * h**2, self.gamma * h, self._acceleration
         predicted = (
             state.displacement + h * state.velocity + (0.5 * h**2 - b) * a_old,
@@ -59,7 +58,10 @@ class GeneralizedAlpha(Integrator):
         a = np.where(constrained, self._constrained_acceleration(phase, state, predicted, h), a_old)
         u, v = predicted[0] + b * a, predicted[1] + g * a
         if phase.stabilization is None:
-            u, v = np.where(constrained, phase.guide.displacement(until), u), np.where(constrained, phase.guide.velocity(until, -1), v)
+            u, v = (
+                np.where(constrained, phase.supports.displacement(until), u),
+                np.where(constrained, phase.supports.velocity(until, -1), v),
+            )
         full, part = self.factorizations.over(law, h), self.factorizations.over(law, at * h)
         now = _without_springs(law)
         inner = replace(part, dashpot=np.zeros_like(part.dashpot))
@@ -82,7 +84,7 @@ class GeneralizedAlpha(Integrator):
         return end
 
     def _constrained_acceleration(self, phase: Phase, state: MotionState, predicted: tuple[FloatArray, FloatArray], h: float) -> FloatArray:
-        """Return that at the end for which the mean over the step is right at the time of balance, as it is for the free nodes."""
+        """Return the accelerations (n, d) at the end of the step for which the weighted mean is the prescribed one."""
         at, middle = 1.0 - self.alpha_f, state.time + (1.0 - self.alpha_f) * h
         u = at * predicted[0] + self.alpha_f * state.displacement
         v = at * predicted[1] + self.alpha_f * state.velocity
@@ -99,8 +101,8 @@ def _without_springs(law: CellRheology) -> StepCoefficients:
 def _accelerated(phase: Phase, state: MotionState, side: int) -> tuple[FloatArray, FloatArray]:
     """Return accelerations (n, d) and reactions (n, d) of a state with inertia."""
     if phase.mass is None:
-        raise InputError("without inertia use 'sdirk2' or 'backward_euler'")
-    constrained = phase.guide.constrained
+        raise InputError("density=None needs method 'sdirk2' or 'backward_euler'")
+    constrained = phase.supports.constrained
     force = phase.load(state.time) - rates(phase.body.simplices, phase.flow, state.velocity, state.trace, state.strain)[0]
     known = phase.constrained_acceleration(state.time, side, state.displacement, state.velocity)
     a = phase.mass.accelerations(force, constrained, known)

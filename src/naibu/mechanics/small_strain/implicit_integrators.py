@@ -1,27 +1,23 @@
-"""Steps in time of rheological bodies: implicit ones with one factorization a step size, and Runge-Kutta (spec M4).
+"""Implicit time integration of linear viscoelastic bodies, with one factorization for each step size.
 
-Every implicit method takes a step of the internal strain exactly for a constant strain rate (an exponential, see
-`naibu.mechanics.small_strain.rheology`), so what is left to solve is ``(M / h + K) v = ...`` with one stiffness K for all steps of one
-length: it is factorized once, and a step is a pass over the cells and a back-substitution for each stage.
+Every implicit method integrates the internal strain exactly for a constant strain rate (an exponential, see
+`naibu.mechanics.small_strain.rheology`), which leaves ``(M / h + K) v = ...`` with one stiffness K for all steps of one length: it is
+factorized once, and a step is a pass over the cells and a back-substitution for each stage.
 
 ``"sdirk2"``, the default
-    Two stages of backward Euler of length ``g h``, ``g = 1 - 1/sqrt(2)``, the second from where the first points to [1]_. Second order;
-    no energy is made at any step length, and what is too fast for the steps is damped out. (For internal strains advanced by the method's
-    own rational function this is von Neumann's theorem on A-stable methods; for the exponential it is tested on random mixtures.)
+    Singly diagonally implicit Runge-Kutta method of two stages of length ``g h``, ``g = 1 - 1/sqrt(2)`` :cite:p:`alexander1977`. Second
+    order and L-stable: energy does not grow at any step length, and modes that the steps do not resolve are damped. (For internal strains
+    advanced by the method's own rational function this is von Neumann's theorem on A-stable methods; for the exponential it is tested on
+    random mixtures.)
 ``"backward_euler"``
     First order; the same stability, more damping.
 ``"generalized_alpha"``
-    Second order, with the damping of fast modes as an argument [2]_; stable, but a start or a jump that the steps do not resolve
-    overshoots in energy. Needs inertia.
+    Second order with adjustable numerical dissipation :cite:p:`chung1993`; stable, but energy overshoots after a start or a jump that the
+    steps do not resolve. Needs inertia.
 ``"rk4"`` and ``"rkf45"``
-    As in the report: Runge-Kutta of fourth order with the given step, and Runge-Kutta-Fehlberg, which chooses its own. Both are explicit:
-    their steps must be short for the stiffest cell (`naibu.mechanics.small_strain.dynamics.explicit_step_limit`).
-
-References
-----------
-.. [1] R. Alexander, "Diagonally implicit Runge-Kutta methods for stiff O.D.E.'s", SIAM J. Numer. Anal. 14, 1977.
-.. [2] J. Chung and G. M. Hulbert, "A time integration algorithm for structural dynamics with improved numerical dissipation: the
-   generalized-alpha method", J. Appl. Mech. 60, 1993.
+    The explicit methods of :cite:t:`hirai2008` (chapters 2 and 5): the classical Runge-Kutta method with the given step, and
+    Runge-Kutta-Fehlberg with step size control :cite:p:`fehlberg1969`. Their steps are limited by the stiffest cell
+    (`naibu.mechanics.small_strain.dynamics.explicit_step_limit`).
 """
 
 from __future__ import annotations
@@ -47,13 +43,13 @@ from naibu.mechanics.small_strain.rheology import CellRheology, FlowCoefficients
 from naibu.mechanics.small_strain.supports import ActiveSupports
 
 STAGE = 1.0 - np.sqrt(0.5)
-INSTANT = 1e-8  # of a step: how long a jump of a body without inertia takes
-KEPT = 8  # factorizations
+INSTANT = 1e-8  # of a step: duration of a jump of a body without inertia
+KEPT = 8  # factorizations in the cache
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionState:
-    """All that the future of a body depends on, and the forces that hold it.
+    """State of a body in motion: displacement, velocity and internal strain, with reactions and work.
 
     Attributes
     ----------
@@ -62,11 +58,11 @@ class MotionState:
     displacement, velocity : ndarray, shape (n, d)
         mm and mm/s.
     trace, strain : ndarray, shape (m,) and (m, d, d)
-        Strain of the Voigt parts: trace for the lambda part, tensor for the mu part.
+        Internal strain, that of the Voigt parts: trace for the lambda part, tensor for the mu part.
     reaction : ndarray, shape (n, d)
         Forces of the supports on the body, mN.
     work : float
-        Of supports and loads so far, mN mm.
+        Work of supports and loads so far, mN mm.
     """
 
     time: float
@@ -79,14 +75,14 @@ class MotionState:
 
     @classmethod
     def at_rest(cls, body: Simplices, time: float = 0.0) -> MotionState:
-        """Return the free shape."""
+        """Return the reference configuration at rest."""
         zero, d = np.zeros((body.n_points, body.dimension)), body.dimension
         return cls(time, zero, zero, np.zeros(body.n_cells), np.zeros((body.n_cells, d, d)), zero, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Phase:
-    """The equations while the same supports act.
+    """The equations of motion while the same supports are active.
 
     Attributes
     ----------
@@ -95,15 +91,15 @@ class Phase:
     law : CellRheology
         Materials.
     flow : FlowCoefficients
-        Their internal equation.
+        Rate equations of their internal strain.
     mass : Mass or None
-        Inertia; None for a body that is in equilibrium at any time.
+        Mass matrix; None for a quasi-static body.
     load : callable
         From a time, s, to the forces on the nodes (n, d), mN.
-    guide : ActiveSupports
-        Where the held components go.
+    supports : ActiveSupports
+        Constrained components and their prescribed motion.
     stabilization : Stabilization or None
-        How supports are kept; None: exactly, their components are eliminated.
+        How supports are enforced; None: exactly, by elimination of the constrained components.
     """
 
     body: LinearBody
@@ -111,7 +107,7 @@ class Phase:
     flow: FlowCoefficients
     mass: Mass | None
     load: Callable[[float], FloatArray]
-    guide: ActiveSupports
+    supports: ActiveSupports
     stabilization: Stabilization | None
 
     def momentum(self, velocity: FloatArray) -> FloatArray:
@@ -119,21 +115,21 @@ class Phase:
         return np.zeros_like(velocity) if self.mass is None else self.mass.apply(velocity)
 
     def constrained_acceleration(self, time: float, side: int, displacement: FloatArray, velocity: FloatArray) -> FloatArray:
-        """Return the acceleration (n, d), mm/s^2, of the held components; meaningless elsewhere."""
-        second = self.guide.acceleration(time)
+        """Return the acceleration (n, d), mm/s^2, of the constrained components; meaningless elsewhere."""
+        second = self.supports.acceleration(time)
         if self.stabilization is None:
             return second
-        gap, gap_rate = displacement - self.guide.displacement(time), velocity - self.guide.velocity(time, side)
+        gap, gap_rate = displacement - self.supports.displacement(time), velocity - self.supports.velocity(time, side)
         return self.stabilization.acceleration(gap, gap_rate, second)
 
 
 class Factorizations:
-    """Factorized step matrices by held components and step length; the latest few are kept.
+    """Cache of factorized step matrices, by constrained components and step length.
 
     Attributes
     ----------
     made : int
-        How many there have been.
+        Number of factorizations so far.
     """
 
     def __init__(self) -> None:
@@ -142,7 +138,7 @@ class Factorizations:
         self._steps: OrderedDict[str, StepCoefficients] = OrderedDict()
 
     def over(self, law: CellRheology, step_s: float) -> StepCoefficients:
-        """Return what a step does to the internal strain; computed once for steps of one length."""
+        """Return the step coefficients of the internal strain; computed once for steps of one length."""
         key = f"{step_s:.10g}"
         if key not in self._steps:
             self._steps[key] = law.over(step_s)
@@ -151,14 +147,14 @@ class Factorizations:
         return self._steps[key]
 
     def of(self, phase: Phase, name: str, moduli: FloatArray, mass_factor: float) -> Factorization:
-        """Return that of ``K(moduli) + mass_factor M`` with the held components taken out.
+        """Return the factorization of ``K(moduli) + mass_factor M`` with the constrained components eliminated.
 
         Raises
         ------
         InputError
-            A body without inertia that can move freely.
+            A body without inertia whose rigid-body motions are not constrained.
         """
-        constrained = phase.guide.constrained
+        constrained = phase.supports.constrained
         key = constrained.tobytes(), name
         if key in self._kept:
             self._kept.move_to_end(key)
@@ -181,7 +177,7 @@ class Factorizations:
 
 
 class Integrator(ABC):
-    """A method; `begin` is called where supports or loads change abruptly, then `step` as often as needed."""
+    """A time integration method; `begin` is called where supports or loads change abruptly, then `step` as often as needed."""
 
     name = ""
     needs_inertia = False
@@ -193,21 +189,21 @@ class Integrator(ABC):
     def begin(self, phase: Phase, state: MotionState, step_s: float, changed: bool) -> MotionState:
         """Return the state just after an event.
 
-        Held nodes take on the speed of their supports, by an impulse. `changed` tells of supports or loads that changed, not only their
-        speed.
+        Constrained nodes take on the velocity of their supports by an impulse. `changed` is true where supports or loads changed, not only
+        a velocity.
         """
         if phase.mass is None or phase.stabilization is not None:
             return state
-        constrained = phase.guide.constrained
-        change = np.where(constrained, phase.guide.velocity(state.time, 1) - state.velocity, 0.0)
+        constrained = phase.supports.constrained
+        change = np.where(constrained, phase.supports.velocity(state.time, 1) - state.velocity, 0.0)
         if not change.any():
             return state
         velocity = state.velocity + phase.mass.accelerations(np.zeros_like(change), constrained, change)
         before, after = (0.5 * float((v * phase.mass.apply(v)).sum()) for v in (state.velocity, velocity))
         return replace(state, velocity=velocity, work=state.work + after - before)
 
-    def told(self, state: MotionState) -> None:  # noqa: B027 - most have nothing to remember
-        """Take note that the series keeps this state."""
+    def record(self, state: MotionState) -> None:  # noqa: B027 - most methods have nothing to record
+        """Record a state at an output time."""
 
     @abstractmethod
     def step(self, phase: Phase, state: MotionState, until: float) -> MotionState:
@@ -215,26 +211,26 @@ class Integrator(ABC):
 
 
 class Staged(Integrator):
-    """What the methods made of backward-Euler stages share."""
+    """Base of the methods with backward-Euler stages."""
 
     def begin(self, phase: Phase, state: MotionState, step_s: float, changed: bool) -> MotionState:
         """Return the state just after an event; a body without inertia whose supports or loads changed jumps to its new equilibrium."""
         if phase.mass is not None or not changed:
             return super().begin(phase, state, step_s, changed)
-        instant, constrained, load = INSTANT * step_s, phase.guide.constrained, phase.load(state.time)
-        known = (phase.guide.displacement(state.time) - state.displacement) / instant
+        instant, constrained, load = INSTANT * step_s, phase.supports.constrained, phase.load(state.time)
+        known = (phase.supports.displacement(state.time) - state.displacement) / instant
         if not (known[constrained].any() or state.reaction.any() or load.any() or state.strain.any()):
             return state
         start = state.displacement, np.zeros_like(state.velocity), state.trace, state.strain
-        self._aimed(phase, instant)
+        self._expect(phase, instant)
         velocity, trace, strain, reaction, _ = self._stage(phase, start, instant, state.time, known)
         moved = instant * velocity
         mean = np.where(constrained, 0.5 * (state.reaction + reaction), 0.0) + load
         work = state.work + float((moved * mean).sum())
         return _ended(phase, state.time, state.displacement + moved, state.velocity, trace, strain, reaction, work)
 
-    def _aimed(self, phase: Phase, span: float) -> None:
-        """Take note that what is held reaches its path within this time, s."""
+    def _expect(self, phase: Phase, span: float) -> None:
+        """Prepare for stages after which constrained components are back on their prescribed motion, within this time, s."""
 
     def _stage(
         self,
@@ -247,7 +243,7 @@ class Staged(Integrator):
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
         """Return velocity, internal strain (over `ahead`, if given, instead of h), reaction and power of a stage."""
         _, before, trace, strain = start
-        constrained, over = phase.guide.constrained, self.factorizations.over(phase.law, h)
+        constrained, over = phase.supports.constrained, self.factorizations.over(phase.law, h)
         body, load = phase.body.simplices, phase.load(until)
         guess = np.where(constrained, known, before)
         residual = phase.momentum(guess - before) / h + stage_forces(body, over, guess, trace, strain) - load
@@ -266,7 +262,7 @@ class Staged(Integrator):
 
 
 class BackwardEuler(Staged):
-    """One stage a step."""
+    """Backward Euler method: one stage a step."""
 
     name = "backward_euler"
 
@@ -275,17 +271,17 @@ class BackwardEuler(Staged):
         h = until - state.time
         start = state.displacement, state.velocity, state.trace, state.strain
         if phase.stabilization is None:
-            known = (phase.guide.displacement(until) - state.displacement) / h
+            known = (phase.supports.displacement(until) - state.displacement) / h
         else:
             known = _stabilized(phase, phase.stabilization, start, h, until)
-        self._aimed(phase, h)
+        self._expect(phase, h)
         velocity, trace, strain, reaction, power = self._stage(phase, start, h, until, known)
         self.steps += 1
         return _ended(phase, until, state.displacement + h * velocity, velocity, trace, strain, reaction, state.work + h * power)
 
 
 class Sdirk2(Staged):
-    """Two backward-Euler stages a step."""
+    """SDIRK2 method: two backward-Euler stages a step."""
 
     name = "sdirk2"
 
@@ -295,14 +291,14 @@ class Sdirk2(Staged):
         first, rest, middle = STAGE * h, (1.0 - STAGE) * h, state.time + STAGE * h
         start = state.displacement, state.velocity, state.trace, state.strain
         known = second = np.zeros_like(state.displacement)
-        if exact:  # stage velocities whose quadrature is the path, and that are those of a path of constant acceleration
-            mean = (phase.guide.displacement(until) - state.displacement) / h
-            change = phase.guide.velocity(until, -1) - phase.guide.velocity(state.time, 1)
+        if exact:  # stage velocities whose quadrature is the prescribed motion, exact for constant acceleration
+            mean = (phase.supports.displacement(until) - state.displacement) / h
+            change = phase.supports.velocity(until, -1) - phase.supports.velocity(state.time, 1)
             known, second = mean + (STAGE - 0.5) * change, mean + 0.5 * change
         elif phase.stabilization is not None:
             known = _stabilized(phase, phase.stabilization, start, first, middle)
         ahead = self.factorizations.over(phase.law, rest)
-        self._aimed(phase, h)
+        self._expect(phase, h)
         velocity, trace, strain, _, power = self._stage(phase, start, first, middle, known, ahead)
         extrapolated = state.velocity + rest / first * (velocity - state.velocity)
         work = state.work + rest * power
@@ -315,18 +311,18 @@ class Sdirk2(Staged):
 
 
 def _stabilized(phase: Phase, rule: Stabilization, start: tuple[FloatArray, ...], h: float, until: float) -> FloatArray:
-    guide = phase.guide
-    path = guide.displacement(until), guide.velocity(until, -1), guide.acceleration(until)
+    supports = phase.supports
+    path = supports.displacement(until), supports.velocity(until, -1), supports.acceleration(until)
     return rule.stage_velocity((start[0], start[1]), h, path)
 
 
 def _on_path(phase: Phase, time: float, acceleration: FloatArray) -> FloatArray:
-    """Return accelerations (n, d) with those of held nodes made those of their path, and the free ones what this makes of them.
+    """Return accelerations (n, d) with those of constrained nodes replaced by the prescribed ones, and the free ones corrected accordingly.
 
-    Stage velocities on a path are good to second order, their quotients are not.
+    Stage velocities of a prescribed motion are second-order accurate, their difference quotients are not.
     """
-    constrained = phase.guide.constrained
-    wrong = np.where(constrained, phase.guide.acceleration(time) - acceleration, 0.0)
+    constrained = phase.supports.constrained
+    wrong = np.where(constrained, phase.supports.acceleration(time) - acceleration, 0.0)
     if phase.mass is None or not wrong.any():
         return acceleration
     return acceleration + phase.mass.accelerations(np.zeros_like(wrong), constrained, wrong)
@@ -343,5 +339,5 @@ def _ended(
     work: float,
 ) -> MotionState:
     if phase.stabilization is None:  # no drift by rounding
-        displacement = np.where(phase.guide.constrained, phase.guide.displacement(time), displacement)
+        displacement = np.where(phase.supports.constrained, phase.supports.displacement(time), displacement)
     return MotionState(time, displacement, velocity, trace, strain, reaction, work)

@@ -1,4 +1,4 @@
-"""Small-strain elasticity on linear simplices: assembled stiffness, reduced to free unknowns and factorized (spec M1)."""
+"""Small-strain linear elasticity on simplex elements: stiffness matrix, Dirichlet conditions and solution."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from naibu.mechanics.linear_algebra.solver_selection import SolverName, choose_s
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearBody:
-    """Simplices and the fixed pattern of their stiffness; moduli are arguments, so that identification may change them.
+    """A linear elastic body: simplex elements and the fixed sparsity of their stiffness; moduli are arguments.
 
     Attributes
     ----------
@@ -43,7 +43,20 @@ class LinearBody:
 
     @classmethod
     def of(cls, mesh: Mesh, *, thickness_mm: float = 1.0, cross_section_mm2: float = 1.0) -> LinearBody:
-        """Prepare a mesh of lines, triangles or tetrahedra (see `naibu.mechanics.finite_elements.linear_simplices.simplices`)."""
+        """Return the body of a mesh.
+
+        Parameters
+        ----------
+        mesh : Mesh
+            Lines, triangles (plane strain) or linear tetrahedra.
+        thickness_mm, cross_section_mm2 : float
+            Thickness of triangles, mm, and cross-section of lines, mm^2.
+
+        Raises
+        ------
+        InputError
+            Another cell type, a cell without positive volume, or a thickness that is not positive.
+        """
         body = simplices(mesh, thickness_mm=thickness_mm, cross_section_mm2=cross_section_mm2)
         pattern = block_pattern(mesh.n_points, mesh.cells)
         return cls(mesh.points, body, pattern, pattern.positions(mesh.cells))
@@ -57,7 +70,7 @@ class LinearBody:
         return self.pattern.matrix(blocks)
 
     def forces(self, lame_lambda: ArrayLike, shear_modulus: ArrayLike, displacement: FloatArray) -> FloatArray:
-        """Return the nodal forces (n, d), mN, that hold a displacement (n, d), mm."""
+        """Return the nodal elastic forces (n, d), mN, of a displacement (n, d), mm."""
         return elastic_forces(self.simplices, lame_lambda, shear_modulus, displacement)
 
     def factorized(

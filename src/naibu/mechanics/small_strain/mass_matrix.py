@@ -1,4 +1,4 @@
-"""Inertia of nodes: lumped, one number a node, or consistent, a sparse matrix (spec M1)."""
+"""Mass matrices: lumped (one mass a node) or consistent (sparse) :cite:p:`hughes2000`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 
 
 class Mass(Protocol):
-    """Inertia of a body; the same in every direction."""
+    """Mass matrix of a body; the same for every displacement component."""
 
     def apply(self, velocity: FloatArray) -> FloatArray:
         """Return the momentum (n, d), kg mm/s, of a velocity (n, d), mm/s."""
@@ -32,7 +32,7 @@ class Mass(Protocol):
 
 
 class LumpedMass:
-    """A third (quarter, half) of a triangle's (tetrahedron's, line's) mass at each of its vertices."""
+    """Lumped mass: every vertex has an equal fraction of the mass of its cells."""
 
     def __init__(self, body: LinearBody, density: FloatArray) -> None:
         self.of_node = lumped_mass(body.simplices, density)
@@ -54,7 +54,7 @@ class LumpedMass:
 
 
 class ConsistentMass:
-    """The mass matrix of the shape functions, equation 5.4 of the report in one dimension."""
+    """Consistent mass matrix; in one dimension equation (5.4) of :cite:t:`hirai2008`."""
 
     def __init__(self, body: LinearBody, density: FloatArray) -> None:
         pattern = body.pattern

@@ -1,14 +1,16 @@
-"""Elastic, Voigt, Maxwell and three-element solids at small strain, one set of moduli and viscosities a cell (spec M2).
+"""Linear viscoelasticity at small strain: elastic, Kelvin-Voigt, Maxwell and three-element (Jeffreys) materials.
 
-A spring E with a damper C1 beside it (Voigt) stands in series with a damper C2. For each of the lambda and mu parts, with the strain e and
-the strain e1 of the Voigt part, ``sigma = E e1 + C1 e1' = C2 (e' - e1')``. Without e2 = e - e1 this reads::
+A spring E and a dashpot C1 in parallel (Voigt part) are in series with a dashpot C2 :cite:p:`hirai2008` (chapter 2). For each of the lambda
+and mu parts, with the strain e and the strain e1 of the Voigt part, ``sigma = E e1 + C1 e1' = C2 (e' - e1')``. Eliminating e2 = e - e1
+gives::
 
     e1'   = r e' - e1 / tau        r = C2 / (C1 + C2),  tau = (C1 + C2) / E
     sigma = Cbar e' + r E e1       Cbar = C1 C2 / (C1 + C2)
 
-and the report's internal variable is ``w = r E e1``. C2 -> inf gives Voigt, C1 = 0 Maxwell, both elasticity, E = 0 two dampers in series.
-The state kept here is e1: its trace for the lambda part, the whole tensor for the mu part, because their times tau differ where the Poisson
-ratios of the three elements do.
+and the internal variable of :cite:t:`hirai2008` is ``w = r E e1``. C2 -> inf gives Voigt, C1 = 0 Maxwell, both elasticity, E = 0 two
+dashpots in series.
+The internal strain stored here is e1: its trace for the lambda part, the whole tensor for the mu part, because their times tau differ where
+the Poisson ratios of the three elements do.
 """
 
 from __future__ import annotations
@@ -27,18 +29,18 @@ from naibu.mechanics.finite_elements.linear_simplices import per_cell
 
 @dataclass(frozen=True, slots=True)
 class Rheology:
-    """A three-element solid; `elastic`, `voigt`, `maxwell` and `three_element` make the common ones.
+    """A three-element (Jeffreys) solid; `elastic`, `voigt`, `maxwell` and `three_element` return the common ones.
 
     Attributes
     ----------
     young_modulus : float
-        E of the spring, kPa; zero leaves two dampers in series.
+        E of the spring, kPa; zero leaves two dashpots in series.
     voigt_viscosity : float
-        C1, of the damper beside the spring, kPa s.
+        C1, of the dashpot parallel to the spring, kPa s.
     series_viscosity : float
-        C2, of the damper in series, kPa s; infinite where nothing flows.
+        C2, of the dashpot in series, kPa s; infinite for a solid without permanent flow.
     poisson_ratio, voigt_poisson_ratio, series_poisson_ratio : float
-        Of the spring and of the two dampers, in (-1, 0.5).
+        Of the spring and of the two dashpots, in (-1, 0.5).
     """
 
     young_modulus: float
@@ -53,12 +55,12 @@ class Rheology:
 
     @property
     def relaxation_time(self) -> float:
-        """(C1 + C2) / E, s: how fast stress fades at constant strain where the three Poisson ratios agree."""
+        """Relaxation time (C1 + C2) / E, s, of the stress at constant strain where the three Poisson ratios agree."""
         return np.inf if self.young_modulus == 0.0 else (self.voigt_viscosity + self.series_viscosity) / self.young_modulus
 
     @property
     def retardation_time(self) -> float:
-        """C1 / E, s: how fast strain comes back when the stress is gone."""
+        """Retardation time C1 / E, s, of the strain recovery without stress."""
         return np.inf if self.young_modulus == 0.0 else self.voigt_viscosity / self.young_modulus
 
 
@@ -71,7 +73,7 @@ def three_element(
     voigt_poisson_ratio: float | None = None,
     series_poisson_ratio: float | None = None,
 ) -> Rheology:
-    """Return a Voigt solid in series with a damper: it creeps, recovers in part, and keeps the rest.
+    """Return a three-element (Jeffreys) solid, a Voigt solid in series with a dashpot: it creeps, and recovers in part.
 
     Parameters
     ----------
@@ -80,7 +82,7 @@ def three_element(
     voigt_viscosity, series_viscosity : float
         C1 and C2, kPa s.
     poisson_ratio : float
-        Of the spring, and of the dampers unless they have their own.
+        Of the spring, and of the dashpots unless they have their own.
 
     Raises
     ------
@@ -93,17 +95,17 @@ def three_element(
 
 
 def elastic(young_modulus: float, poisson_ratio: float) -> Rheology:
-    """Return a solid without viscosity; E in kPa."""
+    """Return a linear elastic solid; E in kPa."""
     return three_element(young_modulus, 0.0, np.inf, poisson_ratio)
 
 
 def voigt(young_modulus: float, viscosity: float, poisson_ratio: float, *, voigt_poisson_ratio: float | None = None) -> Rheology:
-    """Return a viscoelastic solid that comes back wholly; E in kPa, C1 in kPa s."""
+    """Return a Kelvin-Voigt solid, which recovers completely; E in kPa, C1 in kPa s."""
     return three_element(young_modulus, viscosity, np.inf, poisson_ratio, voigt_poisson_ratio=voigt_poisson_ratio)
 
 
 def maxwell(young_modulus: float, viscosity: float, poisson_ratio: float, *, series_poisson_ratio: float | None = None) -> Rheology:
-    """Return a viscoplastic solid that flows under any load; E in kPa, C2 in kPa s."""
+    """Return a Maxwell solid, which flows under any load; E in kPa, C2 in kPa s."""
     return three_element(young_modulus, 0.0, viscosity, poisson_ratio, series_poisson_ratio=series_poisson_ratio)
 
 
@@ -116,7 +118,7 @@ class CellRheology:
     elastic : ndarray, shape (m, 2)
         lambda and mu of the spring, kPa.
     voigt, series : ndarray, shape (m, 2)
-        lambda and mu parts of C1 and C2, kPa s; `series` is infinite where nothing flows.
+        lambda and mu parts of C1 and C2, kPa s; `series` is infinite where there is no permanent flow.
     """
 
     elastic: FloatArray
@@ -125,7 +127,13 @@ class CellRheology:
 
     @classmethod
     def of(cls, n_cells: int, materials: Rheology | CellRheology) -> CellRheology:
-        """Return the table of one material for all cells; a table comes back as it is, if it has the right length."""
+        """Return the table of one material for all cells, or a given table of the right length.
+
+        Raises
+        ------
+        InputError
+            A table for another number of cells.
+        """
         if isinstance(materials, CellRheology):
             if len(materials.elastic) != n_cells:
                 raise InputError(f"the materials are for {len(materials.elastic)} cells, the body has {n_cells}")
@@ -146,7 +154,7 @@ class CellRheology:
         voigt_poisson_ratio: ArrayLike | None = None,
         series_poisson_ratio: ArrayLike | None = None,
     ) -> CellRheology:
-        """Make the table of one number or one a cell each; units as in `Rheology`, and the dampers' Poisson ratios default to the spring's.
+        """Return the table of one number or one a cell each, in the units of `Rheology`; by default all Poisson ratios are the spring's.
 
         Raises
         ------
@@ -162,7 +170,7 @@ class CellRheology:
         nu_2 = nu if series_poisson_ratio is None else per_cell(series_poisson_ratio, n_cells, "series_poisson_ratio")
         _require(e >= 0.0, "Young's modulus must not be negative", e, "kPa")
         _require(first >= 0.0, "the Voigt viscosity C1 must not be negative", first, "kPa s")
-        _require(finite > 0.0, "the series viscosity C2 must be positive, or infinite where nothing flows", finite, "kPa s")
+        _require(finite > 0.0, "the series viscosity C2 must be positive, or infinite without permanent flow", finite, "kPa s")
         _require((e > 0.0) | (first > 0.0), "a solid needs a Young's modulus or a Voigt viscosity; both are zero", e, "kPa")
         for values in (nu, nu_1, nu_2):
             _require((values > -1.0) & (values < 0.5), "Poisson's ratio must lie in (-1, 0.5), 0.499 if nearly incompressible", values, "")
@@ -173,21 +181,21 @@ class CellRheology:
         return cls(_lame(e, nu), _lame(first, nu_1), series)
 
     @property
-    def share(self) -> FloatArray:
-        """``r = C2 / (C1 + C2)`` (m, 2): how much of a fast strain the Voigt part takes; 0 where neither damper carries stress."""
+    def viscosity_ratio(self) -> FloatArray:
+        """Fraction ``r = C2 / (C1 + C2)`` (m, 2) of an instantaneous strain taken by the Voigt part; 0 where both viscosities are zero."""
         with np.errstate(invalid="ignore"):
-            share = self.series / (self.voigt + self.series)
-        return np.where(np.isposinf(self.series), 1.0, np.where(self.voigt + self.series == 0.0, 0.0, share))
+            ratio = self.series / (self.voigt + self.series)
+        return np.where(np.isposinf(self.series), 1.0, np.where(self.voigt + self.series == 0.0, 0.0, ratio))
 
     @property
     def dashpot(self) -> FloatArray:
-        """``Cbar = C1 C2 / (C1 + C2)`` (m, 2), kPa s: resistance to a fast strain."""
-        return np.asarray(self.voigt * self.share)
+        """``Cbar = C1 C2 / (C1 + C2)`` (m, 2), kPa s: instantaneous viscosity."""
+        return np.asarray(self.voigt * self.viscosity_ratio)
 
     @property
     def spring(self) -> FloatArray:
-        """``r E`` (m, 2), kPa: stress for each unit of the Voigt part's strain."""
-        return np.asarray(self.share * self.elastic)
+        """``r E`` (m, 2), kPa: stress per unit strain of the Voigt part."""
+        return np.asarray(self.viscosity_ratio * self.elastic)
 
     @property
     def relaxation_rate(self) -> FloatArray:
@@ -197,31 +205,31 @@ class CellRheology:
             return np.where(total == 0.0, 0.0, self.elastic / total)
 
     def over(self, step_s: float) -> StepCoefficients:
-        """Return what a step of this length does to the internal strain."""
+        """Return the coefficients of a step of this length, s."""
         x = self.relaxation_rate * step_s
         with np.errstate(divide="ignore", invalid="ignore"):
             mean = np.where(x == 0.0, 1.0, -np.expm1(-x) / x)
-        return StepCoefficients(np.exp(-x), self.share * step_s * mean, self.spring, self.dashpot)
+        return StepCoefficients(np.exp(-x), self.viscosity_ratio * step_s * mean, self.spring, self.dashpot)
 
     def flow(self) -> FlowCoefficients:
-        """Return what the rates of a state need."""
+        """Return the coefficients of the rate equations."""
         one, zero = np.ones_like(self.elastic), np.zeros_like(self.elastic)
-        return FlowCoefficients(one, zero, self.spring, self.dashpot, -self.relaxation_rate, self.share)
+        return FlowCoefficients(one, zero, self.spring, self.dashpot, -self.relaxation_rate, self.viscosity_ratio)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlowCoefficients:
-    """The internal equation itself: ``e1' = share e' + fading e1``, ``sigma = dashpot e' + spring e1``.
+    """Rate equations of the internal strain: ``e1' = viscosity_ratio e' + decay_rate e1``, ``sigma = dashpot e' + spring e1``.
 
     Attributes
     ----------
     one, zero : ndarray, shape (m, 2)
-        Of a step of no length.
+        Coefficients of a step of zero length.
     spring, dashpot : ndarray, shape (m, 2)
         ``r E``, kPa, and ``Cbar``, kPa s.
-    fading : ndarray, shape (m, 2)
+    decay_rate : ndarray, shape (m, 2)
         ``-1 / tau``, 1/s.
-    share : ndarray, shape (m, 2)
+    viscosity_ratio : ndarray, shape (m, 2)
         ``r``.
     """
 
@@ -229,8 +237,8 @@ class FlowCoefficients:
     zero: FloatArray
     spring: FloatArray
     dashpot: FloatArray
-    fading: FloatArray
-    share: FloatArray
+    decay_rate: FloatArray
+    viscosity_ratio: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -259,7 +267,7 @@ class StepCoefficients:
 
 
 def per_region(mesh: Mesh, materials: Mapping[str, Rheology]) -> CellRheology:
-    """Return the table of a mesh whose regions have their own materials.
+    """Return the table of materials of a mesh with one material for each region.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Explicit steps: classical Runge-Kutta, and Runge-Kutta-Fehlberg with step control, as the report takes them (spec M4)."""
+"""Explicit integrators: classical Runge-Kutta, and Runge-Kutta-Fehlberg 4(5) with step size control :cite:p:`fehlberg1969`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _FIFTH = np.array([16 / 135, 0.0, 6656 / 12825, 28561 / 56430, -9 / 50, 2 / 55])
 
 
 class Explicit(Integrator):
-    """What Runge-Kutta methods share: the state as one vector (u, v, internal strain, work) and its rate."""
+    """Base of the Runge-Kutta methods: the state as one vector (u, v, internal strain, work) and its rate."""
 
     needs_inertia = True
 
@@ -33,7 +33,7 @@ class Explicit(Integrator):
         self._last: tuple[MotionState, FloatArray] | None = None
 
     def begin(self, phase: Phase, state: MotionState, step_s: float, changed: bool) -> MotionState:
-        """Return the state just after an event, whose rates are new."""
+        """Return the state just after an event, where rates are discontinuous."""
         self._last = None
         return super().begin(phase, state, step_s, changed)
 
@@ -44,13 +44,13 @@ class Explicit(Integrator):
         return self._rate(phase, state.time, 1, y)
 
     def _rate(self, phase: Phase, time: float, side: int, y: FloatArray) -> FloatArray:
-        """Return dy/dt and remember the reaction."""
+        """Return dy/dt and store the reaction."""
         if phase.mass is None:
-            raise InputError("without inertia use 'sdirk2' or 'backward_euler'")
-        constrained, body = phase.guide.constrained, phase.body.simplices
+            raise InputError("density=None needs method 'sdirk2' or 'backward_euler'")
+        constrained, body = phase.supports.constrained, phase.body.simplices
         u, v, trace, strain = _unpacked(y, constrained.shape, body.n_cells)
         if phase.stabilization is None:
-            v = np.where(constrained, phase.guide.velocity(time, side), v)
+            v = np.where(constrained, phase.supports.velocity(time, side), v)
         internal, trace_rate, strain_rate = rates(body, phase.flow, v, trace, strain)
         load = phase.load(time)
         a = phase.mass.accelerations(load - internal, constrained, phase.constrained_acceleration(time, side, u, v))
@@ -59,23 +59,23 @@ class Explicit(Integrator):
         return np.concatenate([v.ravel(), a.ravel(), trace_rate, strain_rate.ravel(), [power]])
 
     def _state(self, phase: Phase, time: float, y: FloatArray) -> MotionState:
-        """Return the state with its reaction, held components where they belong, and remember its rate."""
+        """Return the state with its reaction, its constrained components set to their prescribed values, and store its rate."""
         rate = self._rate(phase, time, -1, y)
-        constrained, guide = phase.guide.constrained, phase.guide
+        constrained, supports = phase.supports.constrained, phase.supports
         u, v, trace, strain = _unpacked(y, constrained.shape, phase.body.simplices.n_cells)
         if not (np.isfinite(y).all() and np.abs(u).max() < 1e6 * np.ptp(phase.body.points, axis=0).max()):
             raise ConvergenceError(
-                f"the explicit steps blew up at {time:g} s: take shorter ones (see explicit_step_limit), or the method 'sdirk2'"
+                f"the explicit integration is unstable at {time:g} s: take shorter steps (see explicit_step_limit), or method='sdirk2'"
             )
         if phase.stabilization is None:
-            u, v = np.where(constrained, guide.displacement(time), u), np.where(constrained, guide.velocity(time, -1), v)
+            u, v = np.where(constrained, supports.displacement(time), u), np.where(constrained, supports.velocity(time, -1), v)
         state = MotionState(time, u, v, trace, strain, self._reaction, float(y[-1]))
         self._last = state, rate
         return state
 
 
 class RungeKutta4(Explicit):
-    """Four stages a step, fourth order."""
+    """Classical Runge-Kutta method: four stages a step, fourth order."""
 
     name = "rk4"
 
@@ -93,12 +93,12 @@ class RungeKutta4(Explicit):
 
 
 class RungeKuttaFehlberg(Explicit):
-    """Fehlberg's pair of fourth and fifth order; the fourth is kept, their difference chooses the step.
+    """Runge-Kutta-Fehlberg 4(5): the fourth-order solution is kept, the difference from the fifth order controls the step.
 
     Parameters
     ----------
     tolerance : float
-        Error of a step in displacement, velocity and internal strain, over the largest of each so far.
+        Local error of displacement, velocity and internal strain, each relative to its largest magnitude so far.
     """
 
     name = "rkf45"
@@ -113,7 +113,7 @@ class RungeKuttaFehlberg(Explicit):
         self._largest = np.zeros(0)
 
     def step(self, phase: Phase, state: MotionState, until: float) -> MotionState:
-        """Return the state at `until`, in as many steps as the tolerance asks for."""
+        """Return the state at `until`, in as many steps as the tolerance needs."""
         t, y, span = state.time, _packed(state), until - state.time
         while t < until:
             h = min(self._length, until - t)

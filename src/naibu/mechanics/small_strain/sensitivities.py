@@ -1,8 +1,8 @@
-"""Derivatives of a motion with respect to moduli and viscosities, by the linearised steps of the default method (spec M2, M4, I6).
+"""Sensitivities of a motion to moduli and viscosities, by direct differentiation of the steps of the default method.
 
 A step solves ``K v = ...``; its derivative along a change of the materials solves the same system, ``K v' = ...``, with another right side.
-So all derivatives together cost one factorization, as the motion does, and some passes over the cells for each; they are exact for
-the computed motion, not only for its limit.
+So all derivatives together need one factorization, as the motion does, and some passes over the cells for each; they are exact for
+the discrete motion.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.mechanics.finite_elements.linear_simplices import Simplices
 from naibu.mechanics.small_strain._rheology_kernels import advanced, stage_forces
-from naibu.mechanics.small_strain.dynamics import Load, Series, driven
+from naibu.mechanics.small_strain.dynamics import Load, Series, integrate_motion
 from naibu.mechanics.small_strain.implicit_integrators import STAGE, MotionState, Phase, Sdirk2
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.mechanics.small_strain.rheology import CellRheology, Rheology, StepCoefficients
@@ -47,11 +47,11 @@ class MaterialChange:
         Parameters
         ----------
         law : CellRheology
-            The materials about which is differentiated.
+            The materials at which derivatives are taken.
         name : {"young_modulus", "voigt_viscosity", "series_viscosity"}
             Which parameter; its Poisson ratio is kept.
         cells : array_like, optional
-            Where.
+            Cells whose parameter changes; all by default.
 
         Raises
         ------
@@ -72,7 +72,7 @@ class MaterialChange:
 
     @classmethod
     def between(cls, lower: CellRheology, upper: CellRheology, width: float) -> MaterialChange:
-        """Return the direction from one table to another nearby, over the difference `width` of any parameter that tells them apart.
+        """Return the direction from one table to another nearby, over the difference `width` of the parameter by which they differ.
 
         Differences of tables cost nothing beside those of motions: so a Poisson ratio, a ramp of moduli or any other parametrisation is
         differentiated.
@@ -80,12 +80,12 @@ class MaterialChange:
         Raises
         ------
         InputError
-            Tables for different numbers of cells, no width, or a damper that only one of them has.
+            Tables for different numbers of cells, a zero width, or a dashpot that only one of them has.
         """
         if len(lower.elastic) != len(upper.elastic) or width == 0.0 or not np.isfinite(width):
             raise InputError(f"a direction needs two tables for the same cells and a width, not {width:g}")
         if (np.isposinf(lower.series) != np.isposinf(upper.series)).any():
-            raise InputError("a damper without flow has no neighbours: leave C2 infinite in both tables, or finite")
+            raise InputError("C2 must be infinite in both tables, or finite in both")
         with np.errstate(invalid="ignore"):
             series = np.where(np.isposinf(lower.series), 0.0, (upper.series - lower.series) / width)
         return cls((upper.elastic - lower.elastic) / width, (upper.voigt - lower.voigt) / width, series)
@@ -93,23 +93,23 @@ class MaterialChange:
     def over(self, law: CellRheology, step_s: float) -> StepCoefficients:
         """Return the rate of change of `CellRheology.over`."""
         total, flows = law.voigt + law.series, np.isfinite(law.series) & (law.voigt + law.series != 0.0)
-        share, x, now = law.share, law.relaxation_rate * step_s, law.over(step_s)
+        ratio, x, now = law.viscosity_ratio, law.relaxation_rate * step_s, law.over(step_s)
         with np.errstate(divide="ignore", invalid="ignore"):
-            of_share = np.where(flows, (self.series * law.voigt - law.series * self.voigt) / total**2, 0.0)
+            of_ratio = np.where(flows, (self.series * law.voigt - law.series * self.voigt) / total**2, 0.0)
             of_rate = np.where(flows, (self.elastic - law.relaxation_rate * (self.voigt + self.series)) / total, 0.0)
             mean = np.where(x == 0.0, 1.0, -np.expm1(-x) / x)
             slope = np.where(x < 1e-4, -0.5 + x / 3.0, (now.decay - mean) / x)
         return StepCoefficients(
             decay=-step_s * of_rate * now.decay,
-            gain=step_s * (of_share * mean + share * slope * step_s * of_rate),
-            spring=of_share * law.elastic + share * self.elastic,
-            dashpot=self.voigt * share + law.voigt * of_share,
+            gain=step_s * (of_ratio * mean + ratio * slope * step_s * of_rate),
+            spring=of_ratio * law.elastic + ratio * self.elastic,
+            dashpot=self.voigt * ratio + law.voigt * of_ratio,
         )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeriesDerivatives:
-    """Derivatives of a series, one for each direction.
+    """Derivatives of a time series, one for each direction.
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ class SeriesDerivatives:
     reaction: FloatArray
 
     def force(self, support: Support) -> FloatArray:
-        """Return the derivatives (p, k, d) of the force of a support while it acts, mN."""
+        """Return the derivatives (p, k, d) of the force of a support while it is active, mN."""
         axes = range(self.reaction.shape[3]) if support.axes is None else support.axes
         out = np.zeros((*self.reaction.shape[:2], self.reaction.shape[3]))
         out[..., list(axes)] = self.reaction[:, :, support.nodes].sum(axis=2)[..., list(axes)]
@@ -141,7 +141,7 @@ def simulate_motion_with_derivatives(
     load: ArrayLike | Load | None = None,
     breaks: Sequence[float] = (),
 ) -> tuple[Series, SeriesDerivatives]:
-    """Move a body through time by ``"sdirk2"`` from its free shape, and differentiate the motion along changes of its materials.
+    """Simulate a motion by ``"sdirk2"`` from the reference configuration, with its derivatives along changes of the materials.
 
     Parameters
     ----------
@@ -151,15 +151,15 @@ def simulate_motion_with_derivatives(
     Raises
     ------
     InputError
-        No direction, one for another body, or a support whose path is relative.
+        No direction, one for another body, or a support with relative displacements.
     """
     m = body.simplices.n_cells
     if not directions or any(table.shape != (m, 2) for d in directions for table in (d.elastic, d.voigt, d.series)):
         raise InputError(f"derivatives need one or more directions with tables of shape {(m, 2)}")
     if any(support.relative for support in supports):
-        raise InputError("derivatives are for supports whose paths count from the free shape; give them without relative=True")
+        raise InputError("derivatives need supports with displacements from the reference configuration; give them without relative=True")
     integrator = _Linearised(body.simplices, directions)
-    series = driven(integrator, body, materials, density, supports, times, step=step, mass=mass, load=load, breaks=breaks)
+    series = integrate_motion(integrator, body, materials, density, supports, times, step=step, mass=mass, load=load, breaks=breaks)
     displacement, reaction = (np.stack(kept, axis=1) for kept in (integrator.displacements, integrator.reactions))
     return series, SeriesDerivatives(displacement, reaction)
 
@@ -176,7 +176,7 @@ class _Tangent:
 
 
 class _Linearised(Sdirk2):
-    """The default method, which carries the derivatives of its state along."""
+    """The default method, which also advances the derivatives of its state."""
 
     def __init__(self, body: Simplices, directions: Sequence[MaterialChange]) -> None:
         super().__init__()
@@ -189,27 +189,27 @@ class _Linearised(Sdirk2):
         self._constrained_rate = zero
         self._changes: dict[str, list[StepCoefficients]] = {}
 
-    def told(self, state: MotionState) -> None:
-        """Keep the derivatives of a state that the series keeps."""
+    def record(self, state: MotionState) -> None:
+        """Record the derivatives of a state at an output time."""
         self.displacements.append(self.tangent.displacement)
         self.reactions.append(self.tangent.reaction)
 
     def begin(self, phase: Phase, state: MotionState, step_s: float, changed: bool) -> MotionState:
-        """Return the state after an event; the speed of what is held no longer depends on the materials."""
+        """Return the state after an event; the velocity of constrained components does not depend on the materials."""
         kept = self.tangent.velocity
         after = super().begin(phase, state, step_s, changed)
         if phase.mass is None:
             velocity = kept
         else:
-            wrong = np.where(phase.guide.constrained, -kept, 0.0)
+            wrong = np.where(phase.supports.constrained, -kept, 0.0)
             inertia, zero = phase.mass, np.zeros(kept.shape[1:])
-            velocity = np.array([v + inertia.accelerations(zero, phase.guide.constrained, w) for v, w in zip(kept, wrong, strict=True)])
+            velocity = np.array([v + inertia.accelerations(zero, phase.supports.constrained, w) for v, w in zip(kept, wrong, strict=True)])
         self.tangent = replace(self.tangent, velocity=velocity)
         return after
 
-    def _aimed(self, phase: Phase, span: float) -> None:
-        """What is held shall end on its path, wherever the materials had let it go."""
-        self._constrained_rate = np.where(phase.guide.constrained, -self.tangent.displacement / span, 0.0)
+    def _expect(self, phase: Phase, span: float) -> None:
+        """Set the rates that bring the constrained components back on their prescribed motion, whatever the materials."""
+        self._constrained_rate = np.where(phase.supports.constrained, -self.tangent.displacement / span, 0.0)
 
     def _stage(
         self,
@@ -226,10 +226,10 @@ class _Linearised(Sdirk2):
         last, span = (over, h) if ahead is None else (ahead, rest)
         velocity, internal, t = done[0], start[2:], self.tangent
         changes, later = self._changed(phase, h), self._changed(phase, span)
-        guess = np.where(phase.guide.constrained, self._constrained_rate, t.velocity)
+        guess = np.where(phase.supports.constrained, self._constrained_rate, t.velocity)
         direct = [stage_forces(body, _of_change(over, change), velocity, *internal) for change in changes]
         residual = self._residual(phase, over, guess, h, direct)
-        free = np.where(phase.guide.constrained, 0.0, residual)
+        free = np.where(phase.supports.constrained, 0.0, residual)
         found = self._factor(phase, h).solve(np.ascontiguousarray(free.reshape(len(free), -1).T))
         rate = guess - found.T.reshape(guess.shape)
         ends = [advanced(body, last, v, e, f) for v, e, f in zip(rate, t.trace, t.strain, strict=True)]
@@ -249,8 +249,8 @@ class _Linearised(Sdirk2):
         return np.array([phase.momentum(v - before) / h + stage_forces(body, over, v, e, f) + extra for v, before, e, f, extra in parts])
 
     def _reaction(self, phase: Phase, over: StepCoefficients, rate: FloatArray, h: float, direct: list[FloatArray]) -> FloatArray:
-        out, constrained = self._residual(phase, over, rate, h, direct), phase.guide.constrained
-        if phase.mass is not None:  # as for the motion: the path's acceleration, which does not depend on the materials
+        out, constrained = self._residual(phase, over, rate, h, direct), phase.supports.constrained
+        if phase.mass is not None:  # as for the motion: the prescribed acceleration, which does not depend on the materials
             for i, acceleration in enumerate((rate - self.tangent.velocity) / h):
                 wrong = np.where(constrained, -acceleration, 0.0)
                 out[i] += phase.mass.apply(phase.mass.accelerations(np.zeros_like(wrong), constrained, wrong))
