@@ -60,7 +60,7 @@ html_theme = "alabaster"
 html_static_path = ["_static"]
 html_css_files = ["naibu.css"]
 html_theme_options = {
-    "description": "Parameters of soft objects from the motion of their inside, without a force sensor.",
+    "description": "Mechanical parameters of soft objects from images of their inside, without a force sensor.",
     "fixed_sidebar": True,
     "page_width": "1240px",
     "sidebar_width": "230px",

@@ -15,9 +15,9 @@ from naibu.core.errors import ConvergenceError, NaibuError
 
 @app.command
 def doctor() -> None:
-    """Tell what is installed, what is missing, what that is for, and how to get it."""
+    """List what is installed, what is missing, what it is needed for, and how to install it."""
     rows = doctor_rows()
-    columns = ("what", "status", "found", "for", "remedy")
+    columns = ("component", "status", "found", "needed for", "remedy")
     print_table("naibu doctor", columns, [(r.name, r.status, r.found, r.purpose, r.remedy) for r in rows], left=True)
     if not healthy(rows):
         sys.exit(1)
@@ -32,5 +32,5 @@ def main() -> None:
     except NaibuError as error:
         fail(in_options(str(error), app, sys.argv[1:]), NO_SOLUTION if isinstance(error, ConvergenceError) else BAD_INPUT)
     except KeyboardInterrupt:
-        errors.print("Interrupted; every file written is whole. An identification goes on with the same command.", soft_wrap=True)
+        errors.print("Interrupted; every file written is complete. The same command resumes an identification.", soft_wrap=True)
         sys.exit(INTERRUPTED)

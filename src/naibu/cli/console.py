@@ -31,7 +31,7 @@ from naibu.core.progress import Progress, ProgressReport
 
 app = App(
     name="naibu",
-    help="Find the mechanical parameters of soft objects from what was measured inside them.",
+    help="Identify the mechanical parameters of soft objects from CT, MR or ultrasound images of their inside.",
     version=__version__,
     default_parameter=Parameter(negative_iterable=()),
 )
@@ -137,12 +137,12 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def say(text: str, style: str | None = None) -> None:
-    """Print a line as it is, unbroken, so that paths can be copied."""
+    """Print a line verbatim and unwrapped, so that paths can be copied."""
     console.print(escape(text), style=style, soft_wrap=True, highlight=False)
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[object]], *, left: bool = False) -> None:
-    """Print a table with numbers to the right."""
+    """Print a table with right-aligned numbers."""
     table = Table(title=title, title_justify="left")
     for i, column in enumerate(columns):
         table.add_column(column, justify="left" if i == 0 or left else "right", overflow="fold")
@@ -158,6 +158,6 @@ def _cell(value: object) -> str:
 
 
 def fail(text: str, code: int) -> NoReturn:
-    """Say what went wrong and leave with an exit code."""
+    """Print an error message and exit with a code."""
     errors.print(f"[bold red]error[/bold red] {escape(text)}", soft_wrap=True, highlight=False)
     sys.exit(code)

@@ -1,4 +1,4 @@
-"""Verbs for objects with measured markers: ``demo``, ``identify``, ``predict``, ``compare``, ``report``, ``import``."""
+"""Verbs for experiments with markers: ``demo``, ``identify``, ``predict``, ``compare``, ``report``, ``import``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from naibu.cli.console import INTERRUPTED, app, print_table, progress_lines, say
 from naibu.cli.described import ObjectOptions
 from naibu.core.errors import InputError
 
-# other parts are imported where they are used: --help answers at once, and doctor also runs where numpy itself is broken
+# imported where used, so that --help is immediate and doctor runs even if numpy is broken
 if TYPE_CHECKING:
     from naibu.identification.from_markers.specimen_model import ModelSettings
     from naibu.workflows.identify import Identification
@@ -30,7 +30,7 @@ Law = Literal["neo_hookean", "neo_hookean_isochoric", "mooney_rivlin", "yeoh", "
 
 @app.command
 def demo(*, out: Path = Path("naibu-demo")) -> None:
-    """Calibrate both gels of the bundled two-material experiments, predict each from the others, and write a report.
+    """Calibrate both gels of the bundled two-material experiments, predict each experiment from the others, and write a report.
 
     Parameters
     ----------
@@ -56,14 +56,14 @@ def identify(
     cross_validate: bool = False,
     resume: bool = True,
 ) -> None:
-    """Identify materials, friction and boundary conditions from measured experiments.
+    """Identify material parameters, friction and boundary conditions by finite element model updating (FEMU).
 
     Parameters
     ----------
     experiments
-        Folders with a meta.toml and a CSV for each state, or names of bundled datasets.
+        Folders with a meta.toml and a CSV table for each state, or names of bundled datasets.
     known
-        A material with known Young's modulus, 'hardness 5=222 kPa'; or just its name, to get ratios. May be repeated.
+        A material with known Young's modulus, 'hardness 5=222 kPa', or only its name, to obtain ratios. May be repeated.
     state
         Use only this state, 'EXPERIMENT/STATE'. May be repeated.
     out
@@ -71,17 +71,17 @@ def identify(
     law
         Hyperelastic law.
     contact
-        What plates and table do to the surface sideways: rub (coulomb), hold it (stick), or hold it by springs.
+        Tangential contact of plates and table: Coulomb friction, sticking, or springs.
     joined
-        Whether blocks that were cast apart are tied or may slide.
+        Whether blocks that were cast separately are tied or may slide on each other.
     pixel_scale
-        Whether the size of a pixel along x and y is that of the file (given) or an unknown of every experiment (sought).
+        Whether the pixel size along x and y is taken from the file (given) or identified for every experiment (sought).
     element_size_mm
-        Edge of the elements; 0 chooses.
+        Edge length of the elements; 0 selects it automatically.
     cross_validate
         Also predict every experiment from the others.
     resume
-        Continue an interrupted search in the same folder.
+        Resume an interrupted identification in the same folder.
     """
     from naibu.identification.from_markers.specimen_model import ModelSettings
 
@@ -91,7 +91,7 @@ def identify(
 
 
 def _states(experiments: Sequence[str], chosen: Sequence[str]) -> dict[str, list[str]] | None:
-    """States by experiment; an experiment of which none is named keeps all."""
+    """Return states by experiment; all states of an experiment are used if none is named."""
     out: dict[str, list[str]] = {}
     for text in chosen:
         experiment, _, name = text.rpartition("/")
@@ -129,7 +129,7 @@ def _identify(
 
 
 def _show(result: Identification) -> None:
-    """Print what was assumed, how well the markers fit, and the parameters."""
+    """Print assumptions, residuals of the markers, and the parameters."""
     from naibu.workflows.report_content import accuracy_table, parameter_rows, shared_names, undetermined
 
     calibration, model = result.calibration, result.model
@@ -164,13 +164,13 @@ def predict(
     model
         The model.json that 'naibu identify' wrote, or its folder.
     experiment
-        Folder or name of a bundled dataset; its free state is needed, the loaded one may be missing.
+        Folder or name of a bundled dataset; its unloaded state is needed, the loaded one may be missing.
     state
-        Name of the loaded state; needed where there are several.
+        Name of the loaded state; required if there are several.
     height_mm
-        Height of the plate or bar above the base, or distance of the side plates.
+        Height of the plate or bar above the base, or distance between the side plates.
     heights_from_markers
-        Take the height from the mean z of the lowest and the highest marker layer of the measured state, and from nothing else of it.
+        Take the height from the mean z of the lowest and the highest marker layer of the measured state, the only data used of it.
     out
         Folder for predicted.csv, summary.json, predicted.html and files for ParaView; may be that of the model.
     """
@@ -200,24 +200,24 @@ def compare(
     element_size_mm: float = 0.0,
     out: Path = Path("naibu-comparison"),
 ) -> None:
-    """Compare laws and contacts: calibrate each combination, and predict each experiment from the others.
+    """Compare material laws and contact models: calibrate each combination, and predict each experiment from the others.
 
     Parameters
     ----------
     experiments
         Folders or names of bundled datasets.
     known
-        A material with known Young's modulus, or just its name. May be repeated.
+        A material with known Young's modulus, or only its name. May be repeated.
     law
         Hyperelastic law to try. May be repeated; neo_hookean and mooney_rivlin by default.
     contact
-        What plates and table do to the surface sideways. May be repeated; coulomb and stick by default.
+        Tangential contact model of plates and table. May be repeated; coulomb and stick by default.
     joined
-        What holds blocks together that were cast apart. May be repeated; tied by default.
+        Joint between blocks that were cast separately. May be repeated; tied by default.
     element_size_mm
-        Edge of the elements; 0 chooses.
+        Edge length of the elements; 0 selects it automatically.
     out
-        Folder for comparison.json; models that it holds already are not repeated.
+        Folder for comparison.json; models that it already contains are not repeated.
     """
     from naibu.identification.from_markers.specimen_model import ModelSettings
     from naibu.workflows import compare as compare_workflow
@@ -239,12 +239,12 @@ def compare(
 
 @app.command
 def report(folder: Path) -> None:
-    """Write the HTML pages anew from the results in a folder; nothing is solved again.
+    """Write the HTML pages again from the results in a folder, without solving.
 
     Parameters
     ----------
     folder
-        Where 'naibu identify' or 'naibu predict' wrote its results.
+        Folder with results of 'naibu identify' or 'naibu predict'.
     """
     from naibu.workflows import report as report_workflow
 
@@ -271,23 +271,23 @@ def import_tables(
     Parameters
     ----------
     initial
-        Table of the free state, with columns for label, x, y and z.
+        Table of the unloaded state, with columns for label, x, y and z.
     loaded
-        Tables of the loaded states; their file names become the states' names.
+        Tables of the loaded states, which are named after their files.
     out
         Folder to make.
     size_mm
-        Extents of the object along x, y, z.
+        Dimensions of the object along x, y, z.
     title
-        What the experiment is.
+        Title of the experiment.
     unit
-        Unit of the coordinates where the column names do not tell it.
+        Unit of the coordinates, if the column names do not state it.
     spacing_mm
         Spacing of a regular marker lattice.
     xy_step_mm
-        Step of the coordinates across the slices, such as the pixel; the identification takes from it how certain they are.
+        Resolution of the in-plane coordinates, such as the pixel size, from which their uncertainty is computed.
     z_step_mm
-        Step of the heights, such as the distance of slices.
+        Resolution of the heights, such as the slice spacing.
     """
     from naibu.io.marker_tables import import_markers, write_experiment_folder
 

@@ -1,4 +1,4 @@
-"""What this installation has, what it lacks, what that is for, and the command that gets it."""
+"""Examination of the installation: what is there, what is missing, what it is needed for, and how to install it."""
 
 from __future__ import annotations
 
@@ -36,6 +36,7 @@ _REQUIRED = {
     "pydicom": "volumes in DICOM series",
     "pynrrd": "volumes in NRRD files",
     "tifffile": "volumes in TIFF stacks",
+    "lazy-loader": "public names, loaded when first used",
 }
 _OPTIONAL = {
     "openpyxl": "importing marker tables from Excel files",
@@ -43,10 +44,10 @@ _OPTIONAL = {
     "dask": "volumes larger than memory, block by block",
     "distributed": "the same on several processes or computers",
     "pyvista": "looking at .vtu and VTKHDF results from Python (ParaView reads them too)",
-    "SimpleITK": "rigid registration by grey values",
+    "SimpleITK": "rigid registration of intensities",
 }
 # where the package that is imported has another name than the distribution that is installed
-_MODULES = {"pynrrd": "nrrd"}
+_MODULES = {"pynrrd": "nrrd", "lazy-loader": "lazy_loader"}
 _PROBE_TIMEOUT_S = 60.0
 # the last line is the answer: Warp greets on the standard output
 _CUDA_DEVICES = "import warp; warp.init(); print('CUDA:', *(f'{d.name} ({d.alias}),' for d in warp.get_cuda_devices()))"

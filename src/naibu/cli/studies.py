@@ -1,4 +1,4 @@
-"""Verbs that work with what naibu brings along: ``reproduce``, ``simulate``."""
+"""Verbs for simulations and for the 2008 report: ``reproduce``, ``simulate``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ChapterName = Literal["ch1", "ch2", "ch3", "ch4-lattice", "ch4-cube", "ch4-octre
 
 @app.command
 def reproduce(chapter: ChapterName, *, out: Path = Path("naibu-reproduction"), seed: int = 0) -> None:
-    """Compute the tables and figures of a chapter of the 2008 report anew, and set them beside the printed ones.
+    """Recompute the tables and figures of a chapter of the 2008 report, and compare them with the printed ones.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ def reproduce(chapter: ChapterName, *, out: Path = Path("naibu-reproduction"), s
     out
         Folder for the page (ch3.html) and the numbers (ch3.json).
     seed
-        Of all random numbers.
+        Seed of the random numbers.
     """
     from naibu.reproduction.chapters import CHAPTERS
     from naibu.viewer.chapter_page import write_chapter
@@ -88,15 +88,15 @@ def simulate(study: str = "", *, out: Path = Path("naibu-simulation"), resume: b
 
 @contextmanager
 def stopped_gently() -> Iterator[Callable[[], bool]]:
-    """Whether Ctrl-C, or the end of a job on a cluster (SIGTERM), asked to stop; what is at work may end. A second one stops at once."""
+    """Yield whether Ctrl-C, or the end of a cluster job (SIGTERM), requested a stop after the current frame; a second one stops at once."""
     asked: list[int] = []
 
     def stop(number: int, frame: object) -> None:
-        # the first one raises nothing: Python drops what is raised while it clears objects away
+        # the first one raises nothing: Python drops exceptions raised while objects are deleted
         if asked:
             raise KeyboardInterrupt
         asked.append(number)
-        errors.print("Stopping behind this frame; once more stops at once.")
+        errors.print("Stopping after this frame; press again to stop at once.")
 
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
