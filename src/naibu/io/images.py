@@ -18,6 +18,7 @@ from naibu.core.arrays import FloatArray, require_positive
 from naibu.core.chunked_volume import ChunkedVolume
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
+from naibu.io.files.reading import guarded_reading
 from naibu.io.image_formats import dicom, hdf5, metaimage, nifti, nrrd, tiff, zarr_store
 from naibu.io.image_formats.geometry import ReadOptions
 
@@ -96,7 +97,8 @@ def read_volume(
         raise InputError(f"spacing_mm must be three positive numbers (x, y, z), not {spacing.tolist()}")
     if unit_mm is not None:
         require_positive("unit_mm, the length of the file's unit,", unit_mm, "mm (1000 for metres)")
-    return reader(source, ReadOptions(unit_mm, spacing, series, rescaled))
+    with guarded_reading(source):
+        return reader(source, ReadOptions(unit_mm, spacing, series, rescaled))
 
 
 def write_volume(path: str | os.PathLike[str], volume: Volume, *, compressed: bool = True) -> Path:
@@ -141,7 +143,9 @@ def read_displacement(path: str | os.PathLike[str]) -> tuple[FloatArray, Volume]
     InputError
         A file without three-component vectors, or one that cannot be read.
     """
-    return _of(_VECTOR_READERS, Path(path), "read displacement fields from")(Path(path), ReadOptions())
+    reader = _of(_VECTOR_READERS, Path(path), "read displacement fields from")
+    with guarded_reading(path):
+        return reader(Path(path), ReadOptions())
 
 
 def write_displacement(path: str | os.PathLike[str], displacement: ArrayLike, grid: Volume, *, compressed: bool = True) -> Path:
@@ -187,7 +191,8 @@ def read_volume_box(path: str | os.PathLike[str], low: ArrayLike, high: ArrayLik
     source = Path(path)
     if _ending(source) not in _BOX_READERS:
         raise InputError(f"{source.name}: only HDF5 and Zarr volumes can be read in parts; convert it once with write_volume to .h5")
-    return _BOX_READERS[_ending(source)](source, low, high, ReadOptions())
+    with guarded_reading(source):
+        return _BOX_READERS[_ending(source)](source, low, high, ReadOptions())
 
 
 def open_volume(path: str | os.PathLike[str]) -> ChunkedVolume:
@@ -208,7 +213,8 @@ def open_volume(path: str | os.PathLike[str]) -> ChunkedVolume:
     source = Path(path)
     if _ending(source) != ".zarr":
         raise InputError(f"{source.name}: only Zarr volumes can be opened out of core; convert it once with write_volume to .zarr")
-    return zarr_store.open_chunked(source)
+    with guarded_reading(source, "Zarr"):
+        return zarr_store.open_chunked(source)
 
 
 def _reader(source: Path) -> Callable[[Path, ReadOptions], Volume]:

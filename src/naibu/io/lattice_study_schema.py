@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import tomllib
 from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -13,7 +12,8 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from naibu.core.errors import InputError
-from naibu.io.experiment_folder.schema import Finite, NotNegative, Positive, syntax_message
+from naibu.io.experiment_folder.schema import Finite, NotNegative, Positive
+from naibu.io.files.parsing import parsed_toml
 
 Three = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 ThreePositive = Annotated[list[Positive], Field(min_length=3, max_length=3)]
@@ -35,9 +35,13 @@ def _by_class(zero: bool, infinite: bool) -> Any:
             return {key: checked(inner) for key, inner in value.items()}
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise ValueError("must be a number, or a table such as {short = 60.0, normal = 40.0, long = 25.0}")
-        if np.isnan(value) or (np.isinf(value) and not infinite) or value < 0.0 or (value == 0.0 and not zero):
+        try:
+            number = float(value)
+        except OverflowError:  # a whole number of more than 308 digits
+            number = np.nan
+        if np.isnan(number) or (np.isinf(number) and not infinite) or number < 0.0 or (number == 0.0 and not zero):
             raise ValueError("must be positive, or inf for none" if infinite else "must be finite and not negative")
-        return float(value)
+        return number
 
     return Annotated[Any, AfterValidator(checked)]
 
@@ -246,7 +250,7 @@ class StudyFile(_Table):
         ]
         for name, value, of, part in whole:
             parts = value / part
-            if abs(parts - round(parts)) > 1e-6 or round(parts) < 1:
+            if not np.isfinite(parts) or abs(parts - round(parts)) > 1e-6 or round(parts) < 1:
                 raise ValueError(f"{name} = {value:g} is no whole number of times {of} = {part:g}; choose numbers that divide")
 
     def _contacts(self) -> None:
@@ -312,14 +316,7 @@ def load_study(path: Path | str, content: bytes) -> StudyFile:
         The text is not UTF-8 or not TOML (the line is shown), or a key is unknown, missing or holds a value that cannot be.
     """
     source = Path(path)
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{source}: byte {error.start} is not UTF-8 text; save the file as UTF-8") from error
-    try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(syntax_message(source, text, error)) from error
+    data = parsed_toml(source, content)
     try:
         return StudyFile.model_validate(data)
     except ValidationError as error:

@@ -22,6 +22,7 @@ from naibu.core.markers import Markers
 from naibu.io.experiment_folder.reader import META_FILE, read_experiment
 from naibu.io.experiment_folder.state_csv import COORDINATES, OPTIONAL, REQUIRED, STATUSES, is_trusted
 from naibu.io.files.atomic import write_atomically
+from naibu.io.files.reading import guarded_reading, read_bytes, require_regular
 
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "in": 25.4, "inch": 25.4}
 _UNIT = re.compile(r"(?:[\s_,/]+|[\s_]*[\[(]\s*)(mm|cm|m|um|µm|μm|inch|in)\s*[\])]?$", re.IGNORECASE)
@@ -74,7 +75,8 @@ def import_markers(
         An Excel file, and openpyxl is not installed.
     """
     source = Path(path)
-    rows = _excel_rows(source, sheet) if source.suffix.lower() == ".xlsx" else _text_rows(source, delimiter)
+    with guarded_reading(source, "a table"):
+        rows = _excel_rows(source, sheet) if source.suffix.lower() == ".xlsx" else _text_rows(source, delimiter)
     start, where = _located(source, rows, columns)
     header = rows[start][1]
     body = [(line, row + [""] * (len(header) - len(row))) for line, row in rows[start + 1 :]]
@@ -228,13 +230,10 @@ def _place_checked(target: Path, meta: str, states: Mapping[str, Markers]) -> No
 
 
 def _text_rows(path: Path, delimiter: str | None) -> list[tuple[int, list[str]]]:
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give the path of a CSV, TSV or .xlsx table") from error
+    content = read_bytes(path)
     if b"\0" in content[:4096] and not content.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise InputError(f"{path}: is not a text table; save it as CSV, or as .xlsx")
-    text = _decoded(content)
+    text = _decoded(path, content)
     if delimiter is not None and len(delimiter) != 1:
         raise InputError(f"delimiter = {delimiter!r} must be one character, for example ';'")
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter or _delimiter(text))
@@ -255,9 +254,12 @@ def _delimiter(text: str) -> str:
     return max("\t;,", key=agreement)
 
 
-def _decoded(content: bytes) -> str:
+def _decoded(path: Path, content: bytes) -> str:
     if content.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return content.decode("utf-16")
+        try:
+            return content.decode("utf-16")
+        except UnicodeDecodeError as error:
+            raise InputError(f"{path}: byte {error.start} is not UTF-16 text; the file was truncated, or save it as UTF-8") from error
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -270,6 +272,7 @@ def _excel_rows(path: Path, sheet: str | None) -> list[tuple[int, list[str]]]:
         import openpyxl
     except ImportError as error:
         raise MissingDependencyError(f'{path}: reading Excel files needs openpyxl; run: pip install "naibu[excel]"') from error
+    require_regular(path)
     try:
         book = openpyxl.load_workbook(path, read_only=True, data_only=True)
     # openpyxl's zip and XML readers raise exceptions of many types

@@ -12,6 +12,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
+from naibu.io.files.reading import guarded_reading, read_bytes
 from naibu.io.mesh_formats import msh, obj, ply, stl, vrml, vtu
 
 _Reader = TypeVar("_Reader")
@@ -65,7 +66,8 @@ def read_mesh(path: str | os.PathLike[str], *, unit_mm: float = 1.0) -> Mesh:
         No such file, an unsupported format, a damaged or truncated file, or cell types that naibu has no elements for.
     """
     reader = _reader(path, MESH_READERS, SURFACE_READERS, "read_surface")
-    mesh = reader(Path(path).name, _content(path))
+    with guarded_reading(path):
+        mesh = reader(Path(path).name, read_bytes(path))
     return Mesh(mesh.points * _unit(unit_mm), mesh.cells, mesh.cell_type, mesh.regions, mesh.region_names)
 
 
@@ -91,7 +93,8 @@ def read_surface(path: str | os.PathLike[str], *, unit_mm: float = 1.0) -> Surfa
     """
     reader = _reader(path, SURFACE_READERS, MESH_READERS, "read_mesh")
     name = Path(path).name
-    points, triangles = reader(name, _content(path))
+    with guarded_reading(path):
+        points, triangles = reader(name, read_bytes(path))
     if len(triangles) == 0:
         raise InputError(f"{name}: contains no faces, only {len(points)} points; export the surface as triangles")
     if triangles.min() < 0 or triangles.max() >= len(points):
@@ -112,14 +115,6 @@ def _reader(path: str | os.PathLike[str], readers: dict[str, _Reader], others: d
         )
         raise InputError(f"{Path(path).name}: the extension {ending!r} is not supported by this function; {hint}")
     return readers[ending]
-
-
-def _content(path: str | os.PathLike[str]) -> bytes:
-    """Return the bytes of a file."""
-    try:
-        return Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
 
 
 def _unit(unit_mm: float) -> float:

@@ -21,6 +21,7 @@ from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.volume import Volume
 from naibu.io.files.provenance import sha256
+from naibu.io.files.reading import read_bytes
 from naibu.io.images import read_volume
 from naibu.io.lattice_study_schema import FloorTable, IndenterTable, ObjectTable, StudyFile, load_study
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter, box_indenter, cylindrical_indenter, plane, spherical_indenter
@@ -110,11 +111,9 @@ def prepared_study(source: str | os.PathLike[str]) -> PreparedStudy:
         content, folder, name = study_text(str(source)).encode(), Path(), str(source)
     else:
         try:
-            content = path.read_bytes()
-        except OSError as error:
-            raise InputError(
-                f"{path}: cannot be read ({error.strerror or error}); give a file STUDY.toml, or one of the studies {', '.join(NAMED)}"
-            ) from error
+            content = read_bytes(path)
+        except InputError as error:
+            raise InputError(f"{error}; give a file STUDY.toml, or one of the studies {', '.join(NAMED)}") from error
         folder, name = path.parent, path.stem
     settings = load_study(path, content)
     mask, inputs = _mask(path, folder, settings)

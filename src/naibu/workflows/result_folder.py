@@ -22,6 +22,8 @@ from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.cross_validation import LeftOut, ModelRow
 from naibu.identification.prediction.prediction import Prediction, rms
 from naibu.io.files.atomic import write_atomically
+from naibu.io.files.parsing import read_json
+from naibu.io.files.reading import guarded_reading, read_bytes
 from naibu.io.vtk_files import write_vtkhdf_series, write_vtu
 from naibu.mechanics.finite_strain.statics import Solution
 from naibu.viewer.json_values import jsonable
@@ -68,17 +70,16 @@ def read_model(path: str | os.PathLike[str]) -> CalibratedModel:
     file = file / MODEL_FILE if file.is_dir() else file
     mend = f"name the {MODEL_FILE} that 'naibu identify' wrote, or its folder"
     try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error.strerror}); {mend}") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: is not JSON ({error}); {mend}") from error
+        data = read_json(file)
+    except InputError as error:
+        raise InputError(f"{error}; {mend}") from error
     if not isinstance(data, dict):
         raise InputError(f"{file}: holds a {type(data).__name__}, not a model; {mend}")
     try:
-        return CalibratedModel.from_dict(data)
+        with guarded_reading(file, "a model"):
+            return CalibratedModel.from_dict(data)
     except InputError as error:
-        raise InputError(f"{file}: {error}") from error
+        raise InputError(f"{file}: {str(error).removeprefix(f'{file}: ')}; {mend}") from error
 
 
 def read_checkpoint(folder: Path, provenance: Mapping[str, Any]) -> dict[str, float] | None:
@@ -119,9 +120,9 @@ def _compared(folder: Path) -> list[dict[str, Any]]:
     if not file.exists():
         return []
     try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file} cannot be read ({error}); delete it, or choose another folder as `out`") from error
+        data = read_json(file)
+    except InputError as error:
+        raise InputError(f"{error}; delete it, or choose another folder as `out`") from error
     if not isinstance(data, list) or not all(isinstance(entry, dict) and {"provenance", "result"} <= entry.keys() for entry in data):
         raise InputError(f"{file} is not a comparison of models; delete it, or choose another folder as `out`")
     return data
@@ -267,9 +268,10 @@ def rewrite_reports(folder: Path) -> list[Path]:
         if not stored.is_file():
             continue
         try:
-            page = report_html(report_from_json(stored.read_text(encoding="utf-8")))
-        except (OSError, UnicodeDecodeError, InputError) as error:
-            raise InputError(f"{stored}: {error}; run the command that made it again") from error
+            with guarded_reading(stored, "a report"):
+                page = report_html(report_from_json(read_bytes(stored).decode()))
+        except InputError as error:
+            raise InputError(f"{stored}: {str(error).removeprefix(f'{stored}: ')}; run the command that made it again") from error
         pages.append(write_atomically(stored.with_suffix(".html"), page))
     if not pages:
         stored_as = f"{REPORT_STEM}.json or {PREDICTED_STEM}.json"

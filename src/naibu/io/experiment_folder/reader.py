@@ -19,6 +19,7 @@ from naibu.core.markers import Markers
 from naibu.io.experiment_folder.indenter_description import read_joints, read_loading, read_up_axis
 from naibu.io.experiment_folder.schema import LoadingTable, Meta, StateTable, load_meta
 from naibu.io.experiment_folder.state_csv import COORDINATES, parse_state_csv
+from naibu.io.files.reading import guarded_reading, read_bytes
 
 META_FILE = "meta.toml"
 _SHAPES: dict[str, ShapeKind] = {
@@ -53,6 +54,11 @@ def read_experiment(folder: str | os.PathLike[str]) -> Experiment:
         A file is missing, unreadable or contains an impossible value; the message names file, field, value and correction.
     """
     root = Path(folder)
+    with guarded_reading(root):
+        return _read(root)
+
+
+def _read(root: Path) -> Experiment:
     hashes: dict[str, str] = {}
     meta = load_meta(root / META_FILE, _content(root, META_FILE, hashes, f"an experiment is a folder with a {META_FILE} in it"))
     experiment = _experiment(root, meta, hashes)
@@ -96,11 +102,9 @@ def _experiment(root: Path, meta: Meta, hashes: dict[str, str]) -> Experiment:
 def _content(root: Path, file: str, hashes: dict[str, str], mend: str) -> bytes:
     path = root / file
     try:
-        content = path.read_bytes()
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: there is no such file; {mend}") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); {mend}") from error
+        content = read_bytes(path)
+    except InputError as error:
+        raise InputError(f"{path}: there is no such file; {mend}" if not path.exists() else f"{error}; {mend}") from error
     hashes[file] = hashlib.sha256(content).hexdigest()
     return content
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import re
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,6 +11,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from naibu.core.errors import InputError
 from naibu.core.experiment import Axis
+from naibu.io.files.parsing import parsed_toml
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -207,28 +207,12 @@ def load_meta(path: Path, content: bytes) -> Meta:
     InputError
         The text is not UTF-8 or not TOML (the line is shown), or a key is unknown, missing or has an invalid value.
     """
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: byte {error.start} is not UTF-8 text; save the file as UTF-8") from error
-    try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(syntax_message(path, text, error)) from error
+    data = parsed_toml(path, content)
     try:
         return Meta.model_validate(data)
     except ValidationError as error:
         faults = [f"{path}: {_told(dict(fault))}" for fault in error.errors(include_url=False)]
         raise InputError("\n".join(dict.fromkeys(faults))) from error
-
-
-def syntax_message(path: Path, text: str, error: tomllib.TOMLDecodeError) -> str:
-    """Return the message for a text that is not valid TOML, with the faulty line."""
-    found = re.search(r"at line (\d+)", str(error))
-    lines = text.splitlines()
-    number = int(found[1]) if found else len(lines)
-    shown = lines[number - 1].strip() if 0 < number <= len(lines) else ""
-    return f"{path}: line {number} is not valid TOML: {shown!r} ({error}); correct this line: one key = value, text in quotes"
 
 
 def _told(fault: dict[str, Any]) -> str:

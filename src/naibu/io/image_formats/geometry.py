@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -148,17 +146,3 @@ def no_colours(source: str, samples: int, what: str = "colour samples per voxel"
     """
     if samples != 1:
         raise InputError(f"{source}: has {samples} {what} (RGB or vectors), not one intensity; convert it to greyscale first")
-
-
-def content(path: str | os.PathLike[str]) -> bytes:
-    """Return the bytes of a file.
-
-    Raises
-    ------
-    InputError
-        The file does not exist or cannot be read.
-    """
-    try:
-        return Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error

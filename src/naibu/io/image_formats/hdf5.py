@@ -18,7 +18,8 @@ from naibu.core.arrays import AnyArray
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.io.files.atomic import new_aside, put_in_place
-from naibu.io.image_formats.geometry import ReadOptions, content, volume_with_axes
+from naibu.io.files.reading import require_plausible, require_regular
+from naibu.io.image_formats.geometry import ReadOptions, volume_with_axes
 
 BLOCK = 64
 _ATTRIBUTES = ("spacing_mm", "origin_mm", "direction")
@@ -66,19 +67,24 @@ def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Pa
 @contextmanager
 def _dataset(path: Path) -> Iterator[Any]:
     """Open the dataset with the values of a file."""
-    if not path.is_file():
-        content(path)
+    require_regular(path)
     try:
         file = h5py.File(path, "r")
     except OSError as error:
         raise InputError(f"{path.name}: cannot be read as HDF5 ({error}); copy the file again") from error
     with file:
+        link = file.get("values", getlink=True) if "values" in file else None
+        if isinstance(link, h5py.ExternalLink):
+            raise InputError(f"{path.name}: its values are a link to {link.filename!r}; copy them into the file")
         stored = file.get("values")
         if not isinstance(stored, h5py.Dataset) or any(name not in stored.attrs for name in _ATTRIBUTES):
             expected = f"a dataset 'values' with the attributes {', '.join(_ATTRIBUTES)}"
             raise InputError(f"{path.name}: contains no volume: naibu expects {expected}; the file has {sorted(file)}")
         if stored.ndim != 3:
             raise InputError(f"{path.name}: its values have {stored.ndim} axes {stored.shape}, not (z, y, x); save one of its components")
+        if stored.external or stored.is_virtual:
+            raise InputError(f"{path.name}: its values stand in other files (external or virtual storage); copy them into one file")
+        require_plausible(path.name, stored.nbytes, stored.id.get_storage_size(), compressed=stored.chunks is not None)
         yield stored
 
 

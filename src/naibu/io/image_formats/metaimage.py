@@ -5,6 +5,7 @@ The format is specified in "MetaIO Documentation", https://docs.itk.org/en/lates
 
 from __future__ import annotations
 
+import math
 import zlib
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,8 @@ from naibu.core.arrays import AnyArray, FloatArray
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.io.files.atomic import write_atomically
-from naibu.io.image_formats.geometry import ReadOptions, content, no_colours, three_axes, unit_length, volume_with_axes
+from naibu.io.files.reading import file_beside, inflated, read_bytes, require_plausible
+from naibu.io.image_formats.geometry import ReadOptions, no_colours, three_axes, unit_length, volume_with_axes
 
 _TYPES = {
     "MET_CHAR": "i1",
@@ -38,14 +40,14 @@ _NAMES = {code: name for name, code in _TYPES.items() if name not in ("MET_LONG"
 def read(path: Path, options: ReadOptions) -> Volume:
     """Read a scalar volume (see `naibu.io.images.read_volume`)."""
     header, values = _parts(path)
-    no_colours(path.name, int(header.get("ElementNumberOfChannels", "1")), "channels per voxel")
+    no_colours(path.name, _channels(path.name, header), "channels per voxel")
     return _with_geometry(path, header, values, options)
 
 
 def read_vectors(path: Path, options: ReadOptions) -> tuple[FloatArray, Volume]:
     """Read vectors (nz, ny, nx, 3) and their grid, whose values are true where all components are finite."""
     header, values = _parts(path)
-    if int(header.get("ElementNumberOfChannels", "1")) != 3 or values.ndim != 4:
+    if _channels(path.name, header) != 3 or values.ndim != 4:
         raise InputError(f"{path.name}: contains no vectors of three components; use read_volume for scalar images")
     vectors = np.asarray(values, dtype=float)
     grid = _with_geometry(path, header, np.isfinite(vectors).all(axis=3), options)
@@ -92,7 +94,7 @@ def _numbers(values: FloatArray) -> str:
 
 def _parts(path: Path) -> tuple[dict[str, str], AnyArray]:
     """Return the header of a file and its values, (nz, ny, nx) or (nz, ny, nx, channels)."""
-    raw = content(path)
+    raw = read_bytes(path)
     header, end = _header(path.name, raw)
     missing = [key for key in ("NDims", "DimSize", "ElementType", "ElementDataFile") if key not in header]
     if missing:
@@ -100,8 +102,13 @@ def _parts(path: Path) -> tuple[dict[str, str], AnyArray]:
     kind = header["ElementType"].upper().removesuffix("_ARRAY")
     if kind not in _TYPES:
         raise InputError(f"{path.name}: its values are of type {header['ElementType']}; supported are {sorted(_TYPES)}")
-    size = [int(n) for n in header["DimSize"].split()]
-    channels = int(header.get("ElementNumberOfChannels", "1"))
+    size = _whole_numbers(path.name, header, "DimSize", least=1)
+    dimensions = _whole_numbers(path.name, header, "NDims", least=2)
+    if dimensions != [len(size)]:
+        raise InputError(
+            f"{path.name}: NDims = {header['NDims']!r} but DimSize = {header['DimSize']!r}; one number per dimension is needed"
+        )
+    channels = _channels(path.name, header)
     shape = (*size[::-1], *((channels,) if channels > 1 else ()))
     return header, _values(path, header, raw[end:], np.dtype(_TYPES[kind]), shape)
 
@@ -128,18 +135,21 @@ def _values(path: Path, header: dict[str, str], rest: bytes, dtype: np.dtype[Any
     named = header["ElementDataFile"]
     if "%" in named:
         raise InputError(f"{path.name}: stores its slices in separate files {named!r}, which is not supported; save it as one .mha file")
-    if named.split()[0] == "LIST":
-        data = b"".join(content(path.parent / name.strip()) for name in rest.decode().splitlines() if name.strip())
+    if named.split()[:1] == ["LIST"]:
+        listed = [name.strip() for name in rest.decode("utf-8", "replace").splitlines() if name.strip()]
+        data = b"".join(read_bytes(file_beside(path, name)) for name in listed)
     else:
-        data = rest if named == "LOCAL" else content(path.parent / named)
-    skip = int(header.get("HeaderSize", "0"))
-    if _true(header.get("CompressedData")):
+        data = rest if named == "LOCAL" else read_bytes(file_beside(path, named))
+    skip = _whole_numbers(path.name, header, "HeaderSize", least=-1)[0] if "HeaderSize" in header else 0
+    n = math.prod(shape)
+    packed, text = _true(header.get("CompressedData")), not _true(header.get("BinaryData", "True"))
+    require_plausible(path.name, n if text else n * dtype.itemsize, len(data), compressed=packed)
+    if packed:
         try:
-            data = zlib.decompress(data)
-        except zlib.error as error:
-            raise InputError(f"{path.name}: its compressed values are damaged or truncated ({error}); copy the file again") from error
-    n = int(np.prod(shape))
-    if not _true(header.get("BinaryData", "True")):
+            data = inflated(data, (32 if text else 1) * n * dtype.itemsize + max(skip, 0))
+        except InputError as error:
+            raise InputError(f"{path.name}: its {error}") from error
+    if text:
         return _counted(path.name, np.array(data.split()[:n]).astype(dtype), n).reshape(shape)
     data = data[-n * dtype.itemsize :] if skip < 0 else data[skip:]
     msb = header.get("BinaryDataByteOrderMSB", header.get("ElementByteOrderMSB"))
@@ -154,6 +164,32 @@ def _counted(source: str, values: AnyArray, n: int) -> AnyArray:
     return values
 
 
+def _whole_numbers(source: str, header: dict[str, str], key: str, least: int) -> list[int]:
+    """Return the whole numbers of a field of the header."""
+    try:
+        found = [int(word) for word in header[key].split()]
+    except ValueError as error:
+        raise InputError(f"{source}: {key} = {header[key][:60]!r} must be whole numbers; the header is damaged") from error
+    if not found or min(found) < least:
+        raise InputError(f"{source}: {key} = {header[key][:60]!r} must be whole numbers of at least {least}; the header is damaged")
+    return found
+
+
+def _channels(source: str, header: dict[str, str]) -> int:
+    return _whole_numbers(source, header, "ElementNumberOfChannels", least=1)[0] if "ElementNumberOfChannels" in header else 1
+
+
+def _numbers_in(source: str, key: str, text: str, count: int) -> FloatArray:
+    """Return the numbers of a field of the header, of which there must be `count`."""
+    try:
+        found = np.array(text.split(), dtype=float)
+    except ValueError as error:
+        raise InputError(f"{source}: {key} = {text[:60]!r} must be numbers; the header is damaged") from error
+    if found.shape != (count,) or not np.isfinite(found).all():
+        raise InputError(f"{source}: {key} = {text[:60]!r} must be {count} finite numbers; the header is damaged")
+    return found
+
+
 def _true(text: str | None) -> bool:
     return text is not None and text.strip().lower() in ("true", "1", "t")
 
@@ -165,9 +201,10 @@ def _with_geometry(path: Path, header: dict[str, str], values: AnyArray, options
     length = header.get("ElementSpacing", header.get("ElementSize"))
     if length is None and options.spacing_mm is None:
         raise InputError(f"{path.name}: does not state its voxel spacing; give spacing_mm")
-    spacing = np.array(length.split(), dtype=float) if length is not None else np.asarray(options.spacing_mm, dtype=float)[:n]
-    origin = np.array(position.split(), dtype=float) if position else np.zeros(n)
-    direction = np.array(orientation.split(), dtype=float).reshape(n, n).T if orientation else np.eye(n)
+    name = path.name
+    spacing = _numbers_in(name, "ElementSpacing", length, n) if length is not None else np.asarray(options.spacing_mm, dtype=float)[:n]
+    origin = _numbers_in(name, "Offset", position, n) if position else np.zeros(n)
+    direction = _numbers_in(name, "TransformMatrix", orientation, n * n).reshape(n, n).T if orientation else np.eye(n)
     if n == 2:
         spacing, origin = np.append(spacing, 1.0), np.append(origin, 0.0)
         direction = np.block([[direction, np.zeros((2, 1))], [np.zeros((1, 2)), np.ones((1, 1))]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import math
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,8 @@ from naibu.core.errors import InputError
 from naibu.core.optional_packages import optional_package
 from naibu.core.volume import Volume
 from naibu.io.files.atomic import write_atomically
-from naibu.io.image_formats.geometry import FLIP_RAS, ReadOptions, content, three_axes, unit_length, volume_with_axes
+from naibu.io.files.reading import require_plausible, require_regular
+from naibu.io.image_formats.geometry import FLIP_RAS, ReadOptions, three_axes, unit_length, volume_with_axes
 
 _STORED = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 
@@ -20,11 +22,15 @@ _STORED = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 def read(path: Path, options: ReadOptions) -> Volume:
     """Read a scalar volume (see `naibu.io.images.read_volume`); the stored values, unless `options.rescaled`."""
     nibabel = optional_package("nibabel", f"{path.name}: reading NIfTI files")
-    if not path.is_file():
-        content(path)
+    require_regular(path)
     try:
         image = nibabel.load(path)
+        packed = path.name.lower().endswith(".gz")
+        announced = math.prod(image.shape) * image.header.get_data_dtype().itemsize
+        require_plausible(path.name, announced, _stored_bytes(path), compressed=packed)
         stored = np.asarray(image.dataobj) if options.rescaled else image.dataobj.get_unscaled()
+    except InputError:
+        raise
     # nibabel's readers raise exceptions of many types
     except Exception as error:
         raise InputError(f"{path.name}: cannot be read as NIfTI ({error}); copy the file again") from error
@@ -37,6 +43,12 @@ def read(path: Path, options: ReadOptions) -> Volume:
     named = image.header.get_xyzt_units()[0] if hasattr(image.header, "get_xyzt_units") else "unknown"
     unit = options.unit_mm or (1.0 if named == "unknown" else unit_length(path.name, named))
     return volume_with_axes(path.name, values, FLIP_RAS @ affine[:3, 3], FLIP_RAS @ affine[:3, :3], unit)
+
+
+def _stored_bytes(path: Path) -> int:
+    """Return the size of the file with the values: that of the header, or the image of a pair."""
+    image = path.with_suffix(".img")
+    return (image if path.suffix.lower() == ".hdr" and image.is_file() else path).stat().st_size
 
 
 def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Path:

@@ -5,6 +5,8 @@ The format is specified in "Definition of NRRD File Format", https://teem.source
 
 from __future__ import annotations
 
+import io
+import math
 import os
 import tempfile
 from pathlib import Path
@@ -17,13 +19,15 @@ from naibu.core.errors import InputError
 from naibu.core.optional_packages import optional_package
 from naibu.core.volume import Volume
 from naibu.io.files.atomic import write_atomically
-from naibu.io.image_formats.geometry import FLIP_RAS, ReadOptions, content, three_axes, unit_length, volume_with_axes
+from naibu.io.files.reading import file_beside, guarded_reading, inflated, require_plausible, require_regular
+from naibu.io.image_formats.geometry import FLIP_RAS, ReadOptions, three_axes, unit_length, volume_with_axes
 
 _TO_LPS = {
     **dict.fromkeys(("left-posterior-superior", "lps", "scanner-xyz", "3d-right-handed", ""), np.eye(3)),
     **dict.fromkeys(("right-anterior-superior", "ras"), FLIP_RAS),
     **dict.fromkeys(("left-anterior-superior", "las"), np.diag([1.0, -1.0, 1.0])),
 }
+_PACKED = {"gzip": "gzip", "gz": "gzip", "bzip2": "bz2", "bz2": "bz2"}
 _COLOURS = ("rgb", "rgba", "hsv", "xyz-color")
 
 
@@ -79,14 +83,30 @@ def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Pa
 
 def _loaded(path: Path) -> tuple[AnyArray, dict[str, Any]]:
     nrrd = optional_package("nrrd", f"{path.name}: reading NRRD files", "pynrrd")
-    if not path.is_file():
-        content(path)
-    try:
-        values, header = nrrd.read(str(path))
-    # pynrrd and zlib raise exceptions of many types
-    except Exception as error:
-        raise InputError(f"{path.name}: cannot be read as NRRD ({error}); copy the file again") from error
-    return np.asarray(values), dict(header)
+    require_regular(path)
+    with guarded_reading(path.name, "NRRD"), path.open("rb") as stream:
+        header = dict(nrrd.read_header(stream))
+        holder = _data_file(path, header)
+        count = math.prod(int(n) for n in header["sizes"])
+        method = _PACKED.get(str(header.get("encoding", "raw")).lower())
+        # a value takes a byte at least, and eight at most
+        require_plausible(path.name, count, holder.stat().st_size, compressed=method is not None)
+        if method is None or holder != path or header.get("line skip") or header.get("byte skip"):
+            return np.asarray(nrrd.read_data(header, stream, str(path))), header
+        content = inflated(stream.read(), 8 * count, method)
+        return np.asarray(nrrd.read_data(header | {"encoding": "raw"}, io.BytesIO(content))), header
+
+
+def _data_file(path: Path, header: dict[str, Any]) -> Path:
+    """Return the file with the values: that of the header, or one beside it."""
+    apart = header.get("data file", header.get("datafile"))
+    if apart is None:
+        return path
+    if not isinstance(apart, str) or "%" in apart or apart.split()[:1] == ["LIST"]:
+        raise InputError(f"{path.name}: stores its values in several files ({apart!r}), which is not supported; save it as one .nrrd")
+    holder = file_beside(path, apart)
+    require_regular(holder)
+    return holder
 
 
 def _spatial_axes(source: str, header: dict[str, Any], n: int) -> list[int]:

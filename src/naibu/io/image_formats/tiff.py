@@ -14,7 +14,8 @@ from naibu.core.errors import InputError
 from naibu.core.optional_packages import optional_package
 from naibu.core.volume import Volume
 from naibu.io.files.atomic import write_atomically
-from naibu.io.image_formats.geometry import MM_PER_UNIT, ReadOptions, content, no_colours, three_axes, unit_length, volume_with_axes
+from naibu.io.files.reading import require_regular
+from naibu.io.image_formats.geometry import MM_PER_UNIT, ReadOptions, no_colours, three_axes, unit_length, volume_with_axes
 
 _ENDINGS = (".tif", ".tiff")
 _NUMBER = re.compile(r"(\d+)(?!.*\d)")
@@ -97,8 +98,7 @@ def slices_of_folder(folder: Path) -> list[Path]:
 
 def _loaded(tifffile: Any, path: Path) -> tuple[AnyArray, dict[str, Any]]:
     """Return the values of a file and the voxel geometry that it states."""
-    if not path.is_file():
-        content(path)
+    require_regular(path)
     try:
         with tifffile.TiffFile(path) as file:
             series, page = file.series[0], file.pages[0]

@@ -22,6 +22,7 @@ from naibu.core.volume import Volume
 from naibu.io.image_formats.geometry import ReadOptions, volume_with_axes
 
 CHUNK = 64
+ALL_CHUNKS = "every_chunk_is_stored"
 _ATTRIBUTES = ("spacing_mm", "origin_mm", "direction")
 
 
@@ -70,6 +71,11 @@ def open_chunked(path: Path, options: ReadOptions | None = None) -> ChunkedVolum
         raise InputError(f"{path.name}: contains no volume: its group lacks the attributes {', '.join(missing) or 'of an array'}")
     if stored.ndim != 3:
         raise InputError(f"{path.name}: its values have {stored.ndim} axes {stored.shape}, not (z, y, x); save one time point or component")
+    if group.attrs.get(ALL_CHUNKS):
+        there = sum(file.is_file() for file in (path / "values" / "c").rglob("*"))
+        if there < stored.nchunks:
+            lost = f"{stored.nchunks - there} of its {stored.nchunks} chunks are missing, or were not written yet"
+            raise InputError(f"{path.name}: {lost}; copy the store again")
     unit = (options.unit_mm if options else None) or 1.0
     origin, spacing = (unit * np.asarray(group.attrs[name], dtype=float) for name in ("origin_mm", "spacing_mm"))
     return ChunkedVolume.from_array(stored, spacing_mm=spacing, origin_mm=origin, direction=group.attrs["direction"])
@@ -106,10 +112,12 @@ def create_chunked(
         group = zarr.create_group(str(path))
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose a folder you may write to") from error
-    group.attrs.update({"spacing_mm": grid.spacing_mm.tolist(), "origin_mm": grid.origin_mm.tolist(), "direction": grid.direction.tolist()})
+    frame = {"spacing_mm": grid.spacing_mm.tolist(), "origin_mm": grid.origin_mm.tolist(), "direction": grid.direction.tolist()}
+    group.attrs.update({ALL_CHUNKS: True, **frame})
     shape = (*grid.shape, *(() if components is None else (components,)))
     chunks = (*(min(n, chunk) for n in grid.shape), *shape[3:])
-    return group.create_array("values", shape=shape, chunks=chunks, dtype=np.dtype(dtype))
+    # every chunk becomes a file, so that a lost one is noticed and not taken for zeros
+    return group.create_array("values", shape=shape, chunks=chunks, dtype=np.dtype(dtype), config={"write_empty_chunks": True})
 
 
 def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Path:

@@ -16,6 +16,7 @@ _TYPES = {
     "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
 }  # fmt: skip
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
+_WORDS = {"format": 2, "element": 3, "property": 3}  # of a line of the header, at least
 _FACES = ("vertex_indices", "vertex_index")
 
 
@@ -78,11 +79,15 @@ def _header(source: str, data: bytes) -> tuple[str, list[_Element], bytes]:
     order, elements = "?", list[_Element]()
     for line in head.decode("ascii", "replace").splitlines():
         words = line.split()
+        if words[:1] and words[0] in _WORDS and len(words) < _WORDS[words[0]] + (words[1:2] == ["list"]) * 2:
+            raise InputError(f"{source}: the line {line.strip()[:60]!r} of its header is truncated; write the file again")
         if words[:1] == ["format"]:
             order = _ORDERS.get(words[1], "?")
         elif words[:1] == ["element"]:
-            elements.append(_Element(words[1], int(words[2]), []))
+            elements.append(_Element(words[1], _rows(source, words[1], words[2], len(body)), []))
         elif words[:1] == ["property"]:
+            if not elements:
+                raise InputError(f"{source}: property {words[-1]!r} stands before any element; write the file again")
             kinds = words[2:4] if words[1] == "list" else words[1:2]
             if unknown := [kind for kind in kinds if kind not in _TYPES]:
                 raise InputError(f"{source}: property {words[-1]!r} is of type {unknown[0]!r}; naibu reads {sorted(_TYPES)}")
@@ -90,6 +95,15 @@ def _header(source: str, data: bytes) -> tuple[str, list[_Element], bytes]:
     if order == "?":
         raise InputError(f"{source}: states no supported format; save it as one of {sorted(_ORDERS)}")
     return order, elements, body
+
+
+def _rows(source: str, name: str, text: str, most: int) -> int:
+    """Return the announced number of rows of an element, each of which takes at least a byte of the body."""
+    if not text.isdecimal() or len(text) > 18 or int(text) > most:
+        raise InputError(
+            f"{source}: announces {text[:30]} rows of {name!r}, but {most} bytes follow the header; it is damaged or truncated"
+        )
+    return int(text)
 
 
 def _binary_rows(element: _Element, body: bytes, at: int, order: str) -> tuple[dict[str, NDArray[np.generic]], int]:

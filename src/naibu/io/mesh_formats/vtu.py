@@ -7,11 +7,8 @@ from __future__ import annotations
 
 import base64
 import binascii
-import lzma
 import re
 import xml.etree.ElementTree as ElementTree
-import zlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from xml.etree.ElementTree import Element
 
@@ -21,6 +18,7 @@ from numpy.typing import NDArray
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
+from naibu.io.files.reading import inflated, require_plausible
 from naibu.io.mesh_formats.assembly import Block, numbers, volume_mesh
 
 _DTYPES = {f"{kind}{bits}": f"{kind[0].lower()}{bits // 8}" for kind in ("Int", "UInt", "Float") for bits in (8, 16, 32, 64)}
@@ -33,7 +31,7 @@ _NODES = {10: 4, 11: 8, 12: 8, 24: 10}
 _VOXEL_TO_HEXAHEDRON = [0, 1, 3, 2, 4, 5, 7, 6]
 # Names under which meshing programs store the material of a cell, the most specific first.
 _REGION_ARRAYS = ("region", "regions", "material", "MaterialIds", "gmsh:physical", "PhysicalIds", "medit:ref", "CellEntityIds")
-_DECOMPRESSORS: dict[str, Callable[[bytes], bytes]] = {"vtkZLibDataCompressor": zlib.decompress, "vtkLZMADataCompressor": lzma.decompress}
+_DECOMPRESSORS = {"vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +44,7 @@ class _File:
     appended_raw: bool
     order: str
     header: np.dtype[np.unsignedinteger]
-    decompress: Callable[[bytes], bytes] | None
+    compression: str | None
 
 
 def read(source: str, data: bytes) -> Mesh:
@@ -166,22 +164,27 @@ def _bytes_of(file: _File, element: Element, dtype: np.dtype[np.generic], what: 
     try:
         content = _content(file, stored, raw)
         return np.frombuffer(content, dtype=dtype)
-    except (ValueError, IndexError, zlib.error, lzma.LZMAError, binascii.Error) as error:
+    except (ValueError, IndexError, binascii.Error) as error:
         raise InputError(f"{file.source}: array {what} is damaged or truncated ({error}); copy or write the file again") from error
 
 
 def _content(file: _File, stored: bytes, raw: bool) -> bytes:
     """Return the decoded bytes of an array that starts at the beginning of `stored`."""
-    if file.decompress is None:
+    if file.compression is None:
         size = int(_taken(file, stored, 1, raw)[0])
         return _after(file, stored, 1, size, raw)
     n_blocks = int(_taken(file, stored, 1, raw)[0])
     if n_blocks == 0:
         return b""
-    sizes = _taken(file, stored, 3 + n_blocks, raw)[3:].astype(np.int64)
+    if n_blocks > len(stored):
+        raise ValueError(f"{n_blocks} blocks announced in {len(stored)} bytes")
+    head = _taken(file, stored, 3 + n_blocks, raw).astype(np.int64)
+    sizes, largest = head[3:], int(head[1])
     packed = _after(file, stored, 3 + n_blocks, int(sizes.sum()), raw)
     ends = np.cumsum(sizes)
-    return b"".join(file.decompress(packed[end - size : end]) for size, end in zip(sizes.tolist(), ends.tolist(), strict=True))
+    require_plausible(file.source, largest * n_blocks, len(packed), compressed=True)
+    parts = (packed[end - size : end] for size, end in zip(sizes.tolist(), ends.tolist(), strict=True))
+    return b"".join(inflated(part, largest, file.compression) for part in parts)
 
 
 def _taken(file: _File, stored: bytes, count: int, raw: bool) -> NDArray[np.unsignedinteger]:

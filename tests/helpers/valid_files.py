@@ -1,0 +1,261 @@
+"""A small valid file of every format that is read, and the reader that a user would call on it."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from naibu import datasets
+from naibu.core.parameters import Parameter, ParameterSet
+from naibu.core.volume import Volume
+from naibu.identification.from_markers.known_materials import KnownMaterials
+from naibu.identification.from_markers.observations import NoiseModel
+from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.prediction.calibrated_model import CalibratedModel
+from naibu.io.experiment_folder.reader import read_experiment
+from naibu.io.images import read_displacement, read_volume, write_displacement, write_volume
+from naibu.io.lattice_study_schema import load_study
+from naibu.io.marker_tables import import_markers
+from naibu.io.meshes import read_mesh, read_surface
+from naibu.io.vtk_files import write_vtu
+from naibu.meshing.element_conversion import to_tetra
+from naibu.meshing.primitives import box
+from naibu.workflows.result_folder import read_model
+
+
+@dataclass(frozen=True)
+class ValidFile:
+    """One valid input.
+
+    Attributes
+    ----------
+    kind : str
+        Format, and the variant of it.
+    target : Path
+        The file whose bytes may be changed.
+    read : callable
+        Reads the whole input of which `target` is a part.
+    """
+
+    kind: str
+    target: Path
+    read: Callable[[], object]
+
+
+def valid_files(folder: Path) -> list[ValidFile]:
+    """Write every input into a folder of its own below `folder`."""
+    return [*_volumes(folder), *_dicom(folder), *_meshes(folder), *_surfaces(folder), *_tables(folder), *_texts(folder)]
+
+
+def _volume() -> Volume:
+    values = np.arange(5 * 6 * 7, dtype=np.int16).reshape(5, 6, 7)
+    return Volume.from_array(values, spacing_mm=(1.0, 1.5, 2.0), origin_mm=(-3.0, 4.0, 5.5))
+
+
+def _volumes(folder: Path) -> list[ValidFile]:
+    volume, out = _volume(), []
+    for name, compressed in (
+        ("plain.mha", False),
+        ("packed.mha", True),
+        ("plain.mhd", False),
+        ("plain.nii", False),
+        ("packed.nii.gz", True),
+        ("plain.nrrd", False),
+        ("packed.nrrd", True),
+        ("plain.tif", False),
+        ("packed.tif", True),
+        ("plain.h5", False),
+        ("packed.h5", True),
+    ):
+        path = write_volume(folder / f"volume-{name}" / name, volume, compressed=compressed)
+        out.append(ValidFile(f"volume {name}", path, lambda path=path: read_volume(path)))
+    raw = folder / "volume-plain.mhd" / "plain.mhd"
+    out.append(ValidFile("volume values beside plain.mhd", raw.with_suffix(".raw"), lambda: read_volume(raw)))
+    field = np.zeros((*volume.shape, 3))
+    for name in ("field.mha", "field.nrrd"):
+        path = write_displacement(folder / f"vectors-{name}" / name, field, volume)
+        out.append(ValidFile(f"displacement {name}", path, lambda path=path: read_displacement(path)))
+    store = write_volume(folder / "volume-store" / "store.zarr", volume)
+    out += [
+        ValidFile(f"volume store.zarr {file.relative_to(store).as_posix()}", file, lambda: read_volume(store))
+        for file in sorted(store.rglob("*"))
+        if file.is_file()
+    ]
+    return out
+
+
+def _dicom(folder: Path) -> list[ValidFile]:
+    import pydicom
+    from pydicom.dataset import FileDataset, FileMetaDataset
+    from pydicom.uid import ExplicitVRLittleEndian
+
+    series = folder / "dicom"
+    series.mkdir(parents=True)
+    for k in range(3):
+        meta = FileMetaDataset()
+        meta.MediaStorageSOPClassUID = pydicom.uid.CTImageStorage
+        meta.MediaStorageSOPInstanceUID = f"1.2.3.{k + 1}"
+        meta.TransferSyntaxUID = ExplicitVRLittleEndian
+        slice_ = FileDataset(None, {}, file_meta=meta, preamble=b"\0" * 128)
+        slice_.SeriesInstanceUID, slice_.SOPInstanceUID = "1.2.3", f"1.2.3.{k + 1}"
+        slice_.SOPClassUID = pydicom.uid.CTImageStorage
+        slice_.Rows, slice_.Columns, slice_.SamplesPerPixel = 4, 5, 1
+        slice_.PhotometricInterpretation, slice_.PixelRepresentation = "MONOCHROME2", 0
+        slice_.BitsAllocated, slice_.BitsStored, slice_.HighBit = 16, 16, 15
+        slice_.PixelSpacing, slice_.ImageOrientationPatient = [1.0, 1.0], [1, 0, 0, 0, 1, 0]
+        slice_.ImagePositionPatient, slice_.SliceThickness = [0.0, 0.0, 2.0 * k], 2.0
+        slice_.PixelData = np.full((4, 5), k, dtype=np.uint16).tobytes()
+        slice_.save_as(series / f"{k}.dcm", enforce_file_format=True)
+    return [ValidFile("dicom slice", series / "1.dcm", lambda: read_volume(series))]
+
+
+def _meshes(folder: Path) -> list[ValidFile]:
+    mesh = to_tetra(box((2.0, 2.0, 1.0), (2, 2, 1)))
+    out = []
+    path = folder / "mesh-vtu" / "body.vtu"
+    write_vtu(path, mesh)
+    out.append(ValidFile("mesh body.vtu", path, lambda path=path: read_mesh(path)))
+    points = "\n".join(" ".join(map(str, p)) for p in mesh.points.tolist())
+    cells = " ".join(str(i) for row in mesh.cells.tolist() for i in row)
+    ascii_vtu = (
+        '<VTKFile type="UnstructuredGrid" version="1.0" byte_order="LittleEndian"><UnstructuredGrid>'
+        f'<Piece NumberOfPoints="{len(mesh.points)}" NumberOfCells="{len(mesh.cells)}"><Points>'
+        f'<DataArray type="Float64" NumberOfComponents="3" format="ascii">{points}</DataArray></Points><Cells>'
+        f'<DataArray type="Int64" Name="connectivity" format="ascii">{cells}</DataArray>'
+        f'<DataArray type="Int64" Name="offsets" format="ascii">{" ".join(str(4 * (i + 1)) for i in range(len(mesh.cells)))}</DataArray>'
+        f'<DataArray type="UInt8" Name="types" format="ascii">{" ".join(["10"] * len(mesh.cells))}</DataArray>'
+        "</Cells></Piece></UnstructuredGrid></VTKFile>"
+    )
+    nodes = "\n".join(f"{i + 1} {' '.join(map(str, p))}" for i, p in enumerate(mesh.points.tolist()))
+    elements = "\n".join(f"{i + 1} 4 2 1 1 {' '.join(str(j + 1) for j in row)}" for i, row in enumerate(mesh.cells.tolist()))
+    msh2 = (
+        f'$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$PhysicalNames\n1\n3 1 "gel"\n$EndPhysicalNames\n$Nodes\n{len(mesh.points)}\n{nodes}\n'
+        f"$EndNodes\n$Elements\n{len(mesh.cells)}\n{elements}\n$EndElements\n"
+    )
+    tags = "\n".join(str(i + 1) for i in range(len(mesh.points)))
+    numbered = "\n".join(f"{i + 1} {' '.join(str(j + 1) for j in row)}" for i, row in enumerate(mesh.cells.tolist()))
+    n, m = len(mesh.points), len(mesh.cells)
+    msh4 = (
+        "$MeshFormat\n4.1 0 8\n$EndMeshFormat\n$Entities\n0 0 0 1\n1 0 0 0 2 2 1 0 0\n$EndEntities\n"
+        f"$Nodes\n1 {n} 1 {n}\n3 1 0 {n}\n{tags}\n{points}\n$EndNodes\n$Elements\n1 {m} 1 {m}\n3 1 4 {m}\n{numbered}\n$EndElements\n"
+    )
+    binary = io.BytesIO()
+    binary.write(b"$MeshFormat\n4.1 1 8\n" + np.int32(1).tobytes() + b"\n$EndMeshFormat\n$Nodes\n")
+    binary.write(np.array([1, n, 1, n], dtype="<u8").tobytes() + np.array([3, 1, 0], dtype="<i4").tobytes() + np.uint64(n).tobytes())
+    binary.write(np.arange(1, n + 1, dtype="<u8").tobytes() + mesh.points.astype("<f8").tobytes() + b"\n$EndNodes\n$Elements\n")
+    binary.write(np.array([1, m, 1, m], dtype="<u8").tobytes() + np.array([3, 1, 4], dtype="<i4").tobytes() + np.uint64(m).tobytes())
+    rows = np.column_stack([np.arange(1, m + 1), mesh.cells + 1]).astype("<u8")
+    binary.write(rows.tobytes() + b"\n$EndElements\n")
+    for name, content in (
+        ("text.vtu", ascii_vtu.encode()),
+        ("old.msh", msh2.encode()),
+        ("new.msh", msh4.encode()),
+        ("binary.msh", binary.getvalue()),
+    ):
+        path = _written(folder / f"mesh-{name}" / name, content)
+        out.append(ValidFile(f"mesh {name}", path, lambda path=path: read_mesh(path)))
+    return out
+
+
+def _surfaces(folder: Path) -> list[ValidFile]:
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    corner = "\n".join(f"{x} {y} {z}" for x, y, z in points.tolist())
+    face = "\n".join(f"3 {a} {b} {c}" for a, b, c in faces.tolist())
+    head = (
+        "ply\nformat {} 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nelement face 4\n"
+        "property list uchar int vertex_indices\nend_header\n"
+    )
+    packed_faces = b"".join(b"\x03" + np.array(f, dtype="<i4").tobytes() for f in faces)
+    facets = "".join(
+        "facet normal 0 0 1\nouter loop\n" + "".join(f"vertex {x} {y} {z}\n" for x, y, z in points[f].tolist()) + "endloop\nendfacet\n"
+        for f in faces
+    )
+    binary_stl = b"\0" * 80 + np.uint32(4).tobytes()
+    binary_stl += b"".join(np.concatenate([np.zeros(3), points[f].ravel()]).astype("<f4").tobytes() + b"\0\0" for f in faces)
+    indices = ", ".join(f"{a}, {b}, {c}, -1" for a, b, c in faces.tolist())
+    contents = {
+        "text.ply": (head.format("ascii") + corner + "\n" + face + "\n").encode(),
+        "binary.ply": head.format("binary_little_endian").encode() + points.astype("<f4").tobytes() + packed_faces,
+        "text.stl": f"solid s\n{facets}endsolid s\n".encode(),
+        "binary.stl": binary_stl,
+        "text.obj": (
+            "".join(f"v {x} {y} {z}\n" for x, y, z in points.tolist())
+            + "".join(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in faces.tolist())
+        ).encode(),
+        "text.wrl": (
+            "#VRML V2.0 utf8\nShape { geometry IndexedFaceSet { coord Coordinate { point [ "
+            + ", ".join(f"{x} {y} {z}" for x, y, z in points.tolist())
+            + f" ] }} coordIndex [ {indices} ] }} }}\n"
+        ).encode(),
+    }
+    out = []
+    for name, content in contents.items():
+        path = _written(folder / f"surface-{name}" / name, content)
+        out.append(ValidFile(f"surface {name}", path, lambda path=path: read_surface(path)))
+    return out
+
+
+def _tables(folder: Path) -> list[ValidFile]:
+    import openpyxl
+
+    rows = [("marker", "x_mm", "y_mm", "z_mm"), *((k, 1.0 * k, 2.0 * k, 3.5 * k) for k in range(1, 9))]
+    text = "\n".join(",".join(map(str, row)) for row in rows) + "\n"
+    contents = {"comma.csv": text.encode(), "tab.tsv": text.replace(",", "\t").encode(), "wide.csv": text.encode("utf-16")}
+    book = openpyxl.Workbook()
+    for row in rows:
+        book.active.append(row)
+    stream = io.BytesIO()
+    book.save(stream)
+    contents["sheet.xlsx"] = stream.getvalue()
+    out = []
+    for name, content in contents.items():
+        path = _written(folder / f"table-{name}" / name, content)
+        out.append(ValidFile(f"table {name}", path, lambda path=path: import_markers(path)))
+    experiment = folder / "experiment"
+    shutil.copytree(datasets.path("ct_cube_plate"), experiment)
+    out += [
+        ValidFile(f"experiment {name}", experiment / name, lambda: read_experiment(experiment))
+        for name in ("meta.toml", "initial.csv", "height_45.csv")
+    ]
+    return out
+
+
+def _texts(folder: Path) -> list[ValidFile]:
+    study = _written(folder / "study" / "mine.toml", _study().encode())
+    model = _written(folder / "model" / "model.json", json.dumps(_model()).encode())
+    return [
+        ValidFile("lattice study", study, lambda: load_study(study, study.read_bytes())),
+        ValidFile("model.json", model, lambda: read_model(model)),
+    ]
+
+
+def _study() -> str:
+    from lattice_studies import STUDY
+
+    return STUDY
+
+
+def _model() -> dict[str, object]:
+    """A calibrated model as it is stored, with two materials."""
+    parameters = ParameterSet.of(
+        [
+            Parameter("soft: young_modulus", 100.0, "kPa", "log"),
+            Parameter("soft: poisson_ratio", 0.48, "", "incompressibility", prior_sd=1.0),
+            Parameter("firm: young_modulus", 200.0, "kPa", "log", fixed=True),
+        ]
+    )
+    known = KnownMaterials({"firm": 200.0}, scale_is_absolute=True)
+    return CalibratedModel(ModelSettings(), parameters, 0.01 * np.eye(2), NoiseModel(), 1.0, known, ("press/pressed",)).to_dict()
+
+
+def _written(path: Path, content: bytes) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)
+    return path
