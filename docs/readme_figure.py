@@ -24,10 +24,10 @@ TITLES = {
 def draw(axes: plt.Axes, scene: Scene) -> None:
     """Draw the markers of one state seen from the front, with the model's outline."""
     last = scene.steps[-1]
-    front = scene.free_surface[:, 1] < scene.free_surface[:, 1].min() + 1e-6
+    front = scene.reference_surface[:, 1] < scene.reference_surface[:, 1].min() + 1e-6
     for face in scene.faces[front[scene.faces].all(axis=1)]:
         axes.fill(*last.surface[face][:, [0, 2]].T, color="0.93", lw=0, zorder=0)
-    axes.plot(scene.initial_markers[:, 0], scene.initial_markers[:, 2], ".", color="0.7", ms=3, label="free state")
+    axes.plot(scene.initial_markers[:, 0], scene.initial_markers[:, 2], ".", color="0.7", ms=3, label="unloaded")
     axes.plot(scene.measured[:, 0], scene.measured[:, 2], "o", mfc="none", mec="#0072B2", ms=6, label="measured under load")
     axes.plot(last.markers[:, 0], last.markers[:, 2], "x", color="#D55E00", ms=4, label="model")
     residual = scene.residual_mm

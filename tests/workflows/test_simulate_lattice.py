@@ -186,7 +186,7 @@ def test_the_page_is_complete_and_small_and_holds_the_motion(whole: Path) -> Non
     moved = unpacked(packed)
     found = series_of(whole / "out" / "mine.vtkhdf")
     full = found["VTKHDF/PointData/displacement_mm"].reshape(FRAMES + 1, -1, 3)
-    rest = np.array(packed["rest"]).reshape(-1, 3)
+    rest = np.array(packed["reference"]).reshape(-1, 3)
     points = found["VTKHDF/Points"]
     nodes = [int(np.argmin(np.linalg.norm(points - p, axis=1))) for p in rest]
     np.testing.assert_allclose(moved, full[:, nodes], atol=np.abs(full).max() / STEPS)
@@ -220,8 +220,8 @@ def test_frames_are_left_out_of_a_page_that_would_be_too_large() -> None:
     np.testing.assert_allclose(unpacked(packed), moved[::2], atol=np.abs(moved).max() / STEPS)
     with pytest.raises(InputError, match=r"limit is 0\.1 MB"):
         motion_html(page, 100_000)
-    with pytest.raises(InputError, match="places must have the shape"):
-        MotionPage(**{name: getattr(page, name) for name in page.__slots__} | {"places": np.zeros((s, 2, 3))})
+    with pytest.raises(InputError, match="positions must have the shape"):
+        MotionPage(**{name: getattr(page, name) for name in page.__slots__} | {"positions": np.zeros((s, 2, 3))})
 
 
 def verb(*arguments: object) -> list[str]:

@@ -1,4 +1,4 @@
-// The soft body: translucent skin, its sharp edges, the free shape's outline, the indenters and the grid under it.
+// The soft body: translucent skin, its sharp edges, the undeformed outline, the indenters and the grid below.
 import {
   BoxGeometry, BufferAttribute, BufferGeometry, Color, DoubleSide, EdgesGeometry, Group, LineBasicMaterial, LineDashedMaterial,
   LineSegments, Mesh, MeshBasicMaterial, ShaderMaterial, Vector3,
@@ -23,7 +23,7 @@ void main() {
   gl_FragColor = vec4(colour * (0.82 + 0.18 * abs(n.y)), opacity * (0.55 + 1.6 * edgeOn * edgeOn));
 }`;
 
-/** Node pairs of edges where two faces meet at more than `degrees`, or that only one face has. */
+/** Node pairs of sharp edges: the normals of two faces differ by more than `degrees`, or the edge belongs to one face only. */
 export function sharpEdges(points, faces, degrees) {
   const limit = Math.cos((degrees * Math.PI) / 180);
   const seen = new Map();
@@ -53,12 +53,12 @@ export function lines(points, index, material) {
   return out;
 }
 
-export function gridLines(free, spacing) {
+export function gridLines(reference, spacing) {
   const low = [Infinity, Infinity, Infinity];
   const high = [-Infinity, -Infinity];
-  for (let i = 0; i < free.length; i += 1) {
-    low[i % 3] = Math.min(low[i % 3], free[i]);
-    if (i % 3 < 2) high[i % 3] = Math.max(high[i % 3], free[i]);
+  for (let i = 0; i < reference.length; i += 1) {
+    low[i % 3] = Math.min(low[i % 3], reference[i]);
+    if (i % 3 < 2) high[i % 3] = Math.max(high[i % 3], reference[i]);
   }
   const from = [0, 1].map((k) => spacing * (Math.floor(low[k] / spacing) - 1));
   const to = [0, 1].map((k) => spacing * (Math.ceil(high[k] / spacing) + 1));
@@ -72,18 +72,18 @@ export function gridLines(free, spacing) {
 
 export class Body {
   constructor(scene, gridSpacing) {
-    this.position = new BufferAttribute(new Float32Array(scene.free), 3);
+    this.position = new BufferAttribute(new Float32Array(scene.reference), 3);
     this.skin = this.#skin(scene.faces);
-    const edges = sharpEdges(scene.free, scene.faces, 35);
+    const edges = sharpEdges(scene.reference, scene.faces, 35);
     this.edges = lines(this.position, edges, new LineBasicMaterial());
-    this.free = lines(new BufferAttribute(scene.free, 3), edges, new LineDashedMaterial({ dashSize: 2, gapSize: 1.5 }));
-    this.free.geometry = this.free.geometry.toNonIndexed();
-    this.free.computeLineDistances();
-    this.grid = gridLines(scene.free, gridSpacing);
+    this.reference = lines(new BufferAttribute(scene.reference, 3), edges, new LineDashedMaterial({ dashSize: 2, gapSize: 1.5 }));
+    this.reference.geometry = this.reference.geometry.toNonIndexed();
+    this.reference.computeLineDistances();
+    this.grid = gridLines(scene.reference, gridSpacing);
     this.boxes = new Group();
     const count = Math.max(...scene.steps.map((s) => s.boxes.length));
     for (let i = 0; i < count; i += 1) this.boxes.add(this.#box());
-    this.objects = [this.grid, this.free, this.edges, this.skin, this.boxes];
+    this.objects = [this.grid, this.reference, this.edges, this.skin, this.boxes];
   }
 
   #skin(faces) {
@@ -134,7 +134,7 @@ export class Body {
     this.skin.material.uniforms.colour.value.set(skin.r, skin.g, skin.b);
     this.skin.material.uniforms.opacity.value = colours.skinOpacity;
     this.edges.material.color.set(colours.edge);
-    this.free.material.color.set(colours.free);
+    this.reference.material.color.set(colours.reference);
     this.grid.material.color.set(colours.grid);
     for (const box of this.boxes.children) box.children.forEach((part) => part.material.color.set(colours.box));
   }

@@ -26,13 +26,13 @@ export function niceCeiling(value) {
   return step * power;
 }
 
-// Two-sided map of equal lightness on both sides (ColorBrewer RdBu), for what may be more or less than zero.
-const TWO_SIDED = ["#2166ac", "#67a9cf", "#d1e5f0", "#f7f7f7", "#fddbc7", "#ef8a62", "#b2182b"]
+// Diverging map of equal lightness on both sides (ColorBrewer RdBu), for values of either sign.
+const DIVERGING = ["#2166ac", "#67a9cf", "#d1e5f0", "#f7f7f7", "#fddbc7", "#ef8a62", "#b2182b"]
   .map((hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16) / 255));
 
-/** 256 colours as RGBA bytes: viridis from dark to bright, or two-sided about the middle. */
-export function colourTable(twoSided) {
-  const stops = twoSided ? TWO_SIDED : VIRIDIS;
+/** 256 colours as RGBA bytes: viridis from dark to bright, or diverging about the middle. */
+export function colourTable(diverging) {
+  const stops = diverging ? DIVERGING : VIRIDIS;
   const out = new Uint8Array(4 * 256);
   for (let i = 0; i < 256; i += 1) {
     const s = (i / 255) * (stops.length - 1);
@@ -44,8 +44,8 @@ export function colourTable(twoSided) {
 }
 
 /** The same map as a CSS gradient. */
-export function tableGradient(twoSided) {
-  const table = colourTable(twoSided);
+export function tableGradient(diverging) {
+  const table = colourTable(diverging);
   const stops = Array.from({ length: 17 }, (_, i) => Math.round((255 * i) / 16)).map((i) => `rgb(${table.slice(4 * i, 4 * i + 3).join(",")})`);
   return `linear-gradient(to right, ${stops.join(", ")})`;
 }

@@ -1,4 +1,4 @@
-// Scenes as naibu/viewer/result_page/packing.py writes them -> typed arrays in mm.
+// Decoding of the scenes that naibu/viewer/result_page/packing.py writes, into typed arrays in mm.
 
 /** base64 of gzip of JSON -> object. */
 export async function inflate(base64) {
@@ -11,7 +11,7 @@ function scaled(integers, quantum) {
   return Float32Array.from(integers, (v) => (v === null ? NaN : v * quantum));
 }
 
-/** Undo the differences along the steps: d0 = p0 - start, d1 = p1 - p0, di = pi - 2 p(i-1) + p(i-2). */
+/** Sum the differences along the steps: d0 = p0 - start, d1 = p1 - p0, di = pi - 2 p(i-1) + p(i-2). */
 function accumulated(start, differences, quantum) {
   const out = [];
   let before = start;
@@ -43,7 +43,7 @@ function residuals(predicted, measured) {
 /** One packed scene -> the scene that SceneView.show takes. */
 export function decodeScene(packed) {
   const { surface: qs, marker: qm } = packed.quantum_mm;
-  const surfaces = accumulated(packed.free_surface, packed.surfaces, qs);
+  const surfaces = accumulated(packed.reference_surface, packed.surfaces, qs);
   const markers = accumulated(packed.initial_markers, packed.markers, qm);
   const measured = scaled(packed.measured, qm);
   const { vector, length } = residuals(markers[markers.length - 1], measured);
@@ -52,7 +52,7 @@ export function decodeScene(packed) {
     experiment: packed.experiment,
     state: packed.state,
     faces: running(packed.faces),
-    free: scaled(packed.free_surface, qs),
+    reference: scaled(packed.reference_surface, qs),
     steps: packed.steps.map((s, i) => ({ ...s, surface: surfaces[i], markers: markers[i] })),
     ids: packed.marker_ids,
     layers: packed.layer,
@@ -86,8 +86,8 @@ function summed(differences, width) {
 /** A motion as naibu/viewer/motion_page.py packs it -> what MotionView.show takes. */
 export async function decodeMotion(packed) {
   const frames = packed.times.length;
-  const rest = Float32Array.from(packed.rest);
-  const displacement = summed(joined(await unzip(packed.displacement)), rest.length);
+  const reference = Float32Array.from(packed.reference);
+  const displacement = summed(joined(await unzip(packed.displacement)), reference.length);
   const fields = await Promise.all(packed.fields.map(async (field) => ({ ...field, levels: await unzip(field.levels) })));
-  return { ...packed, frames, rest, displacement, fields, faces: Uint32Array.from(packed.faces) };
+  return { ...packed, frames, reference, displacement, fields, faces: Uint32Array.from(packed.faces) };
 }

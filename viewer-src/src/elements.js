@@ -1,4 +1,4 @@
-// Small things that all pages need: making elements, and saying why there is no 3-D view.
+// Helpers of all pages: creating elements, and explaining why there is no 3-D view.
 import { canDraw } from "./view.js";
 
 /** Make an element: h("p", {class: "note"}, "text", child). */
@@ -13,11 +13,11 @@ export function h(name, attributes = {}, ...children) {
   return element;
 }
 
-/** True if the browser can show the 3-D view; else the reason stands in `root`. */
+/** True if the browser can show the 3-D view; otherwise `root` shows the reason. */
 export function canDrawOr(root) {
   const explain = (text) => root.replaceChildren(h("p", { class: "no-3d", role: "status" }, text));
   if (!canDraw()) {
-    explain("This browser cannot draw in 3-D (WebGL 2 is missing or switched off). Everything else on this page is complete.");
+    explain("This browser cannot draw in 3-D (WebGL 2 is missing or disabled). Everything else on this page is complete.");
     return false;
   }
   if (!("DecompressionStream" in window)) {

@@ -7,7 +7,7 @@ import {
 const UP = new Vector3(0, 1, 0);
 const HIDDEN = new Matrix4().makeScale(0, 0, 0);
 
-/** The twelve edges of an octahedron of radius 1 as thin three-sided bars: a cage in which the measured ball can be seen. */
+/** The twelve edges of an octahedron of radius 1 as thin three-sided bars: a cage that leaves the measured sphere visible. */
 function cageGeometry(thickness) {
   const corners = [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]].map((c) => new Vector3(...c));
   const positions = [];
@@ -53,8 +53,8 @@ export function predictedGlyphs(count) {
   return instanced(cageGeometry(0.09), new MeshLambertMaterial(), count);
 }
 
-/** Put glyph i at points[3i..3i+2]; a NaN coordinate hides it. */
-export function place(mesh, points, radius) {
+/** Move glyph i to points[3i..3i+2]; a NaN coordinate hides it. */
+export function setPositions(mesh, points, radius) {
   const matrix = new Matrix4();
   for (let i = 0; i < mesh.count; i += 1) {
     const [x, y, z] = [points[3 * i], points[3 * i + 1], points[3 * i + 2]];
@@ -63,7 +63,7 @@ export function place(mesh, points, radius) {
   mesh.instanceMatrix.needsUpdate = true;
 }
 
-/** Arrows: one instanced shaft and one instanced head for each marker. */
+/** Arrows: one instanced shaft and one instanced head per marker. */
 export class Arrows {
   constructor(count) {
     this.shafts = instanced(new CylinderGeometry(1, 1, 1, 8).translate(0, 0.5, 0), new MeshBasicMaterial(), count);
@@ -72,7 +72,7 @@ export class Arrows {
   }
 
   /** Arrow i starts at starts[3i..] and is vectors[3i..] times `factor`; its line has radius `radius` mm. */
-  place(starts, vectors, factor, radius) {
+  setVectors(starts, vectors, factor, radius) {
     const at = new Vector3();
     const v = new Vector3();
     const turn = new Quaternion();

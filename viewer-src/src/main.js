@@ -1,3 +1,3 @@
-// The bundle: every page takes from it what its elements ask for.
+// The bundle: each part acts on the elements of its own page, if present.
 import "./motion-page.js";
 import "./page.js";

@@ -1,4 +1,4 @@
-// The page of a simulated motion: puts the 3-D view and its controls into #naibu-motion, and moves the time mark of the force curves.
+// The page of a simulated motion: adds the 3-D view and its controls to #naibu-motion, and moves the time marker of the force curves.
 import { tableGradient } from "./colormap.js";
 import { decodeMotion } from "./decode.js";
 import { canDrawOr, h } from "./elements.js";
@@ -28,20 +28,20 @@ class MotionPage {
     return this.data.times[this.data.times.length - 1];
   }
 
-  /** Time of the largest displacement: what the page shows first. */
+  /** Time of the largest displacement, which the page shows first. */
   #mostMoved() {
-    const { displacement, frames, rest, times } = this.data;
+    const { displacement, frames, reference, times } = this.data;
     let [best, most] = [0, -1];
     for (let f = 0; f < frames; f += 1) {
       let largest = 0;
-      for (let k = f * rest.length; k < (f + 1) * rest.length; k += 1) largest = Math.max(largest, Math.abs(displacement[k]));
+      for (let k = f * reference.length; k < (f + 1) * reference.length; k += 1) largest = Math.max(largest, Math.abs(displacement[k]));
       if (largest > most) [best, most] = [f, largest];
     }
     return times[best];
   }
 
   #build(root) {
-    this.stage = h("div", { class: "stage", tabindex: 0, role: "application", "aria-label": "3-D view. Arrow keys turn it, plus and minus zoom, R resets, space plays." });
+    this.stage = h("div", { class: "stage", tabindex: 0, role: "application", "aria-label": "3-D view. Arrow keys rotate, plus and minus zoom, R resets, space plays." });
     this.choice = h("select", { id: "naibu-field", onchange: () => this.colourBy(Number(this.choice.value)) },
       ...this.data.fields.map((field, i) => h("option", { value: i }, field.name)));
     const views = h("div", { class: "buttons", role: "group", "aria-label": "View from" },
@@ -57,10 +57,10 @@ class MotionPage {
       h("div", { class: "bar" }, views),
       this.stage,
       this.#timeControls(),
-      h("div", { class: "load shown" }, toggle("mesh", "edges of voxels"), toggle("bodies", "indenters"), toggle("free", "outline at rest")),
-      h("div", { class: "bar" }, h("label", { for: "naibu-field" }, "Colours"), this.choice),
+      h("div", { class: "load shown" }, toggle("mesh", "voxel edges"), toggle("bodies", "indenters"), toggle("reference", "undeformed outline")),
+      h("div", { class: "bar" }, h("label", { for: "naibu-field" }, "Colour by"), this.choice),
       h("div", { class: "motion-scale" }, this.gradient, this.ticks),
-      h("p", { class: "hint" }, "Drag to turn, right-drag or two fingers to move. Click the view, then scroll to zoom."));
+      h("p", { class: "hint" }, "Drag to rotate, right-drag or drag with two fingers to pan. Click the view, then scroll to zoom."));
   }
 
   #timeControls() {
@@ -77,7 +77,7 @@ class MotionPage {
   colourBy(index) {
     const field = this.data.fields[index];
     this.view.colourBy(index);
-    this.gradient.style.background = tableGradient(field.two_sided);
+    this.gradient.style.background = tableGradient(field.diverging);
     this.ticks.replaceChildren(...[0, 1, 2, 3, 4].map((k) => h("span", {}, digits(field.low + (k / 4) * (field.high - field.low)))));
   }
 

@@ -1,4 +1,4 @@
-// The 3-D view of a motion: the coloured surface of an object that deforms, the rigid bodies that push it, and time.
+// The 3-D view of a simulated motion: the coloured surface of a deforming object, rigid indenters, and time.
 import {
   Box3, BoxGeometry, BufferAttribute, BufferGeometry, CylinderGeometry, DataTexture, DirectionalLight, DoubleSide, EdgesGeometry, Group,
   HemisphereLight, LineBasicMaterial, LineDashedMaterial, LineSegments, LinearFilter, Matrix4, Mesh, MeshLambertMaterial, Scene,
@@ -53,13 +53,13 @@ function shapeOf({ kind, size }) {
   return new CylinderGeometry(size[0], size[0], 2 * size[1], 40).rotateX(Math.PI / 2);
 }
 
-/** Corners of a box around a rigid body at a place, as a flat list. */
-function cornersOf({ kind, size, axes }, place) {
+/** Corners of a box around a rigid body at a position, as a flat list. */
+function cornersOf({ kind, size, axes }, position) {
   const half = { box: size, sphere: [size[0], size[0], size[0]], cylinder: [size[0], size[0], size[1]] }[kind];
   const out = [];
   for (let corner = 0; corner < 8; corner += 1) {
     const signs = [0, 1, 2].map((k) => ((corner >> k) & 1 ? half[k] : -half[k]));
-    for (let a = 0; a < 3; a += 1) out.push(place[a] + signs[0] * axes[a] + signs[1] * axes[3 + a] + signs[2] * axes[6 + a]);
+    for (let a = 0; a < 3; a += 1) out.push(position[a] + signs[0] * axes[a] + signs[1] * axes[3 + a] + signs[2] * axes[6 + a]);
   }
   return out;
 }
@@ -72,35 +72,35 @@ export class MotionView extends View {
     this.world = new Scene();
     this.extent = this.#extent();
     this.sun = new DirectionalLight(0xffffff, 1.4);
-    this.position = new BufferAttribute(data.rest.slice(), 3);
-    this.level = new BufferAttribute(new Float32Array(data.rest.length / 3), 1);
+    this.position = new BufferAttribute(data.reference.slice(), 3);
+    this.level = new BufferAttribute(new Float32Array(data.reference.length / 3), 1);
     this.skin = this.#skin();
-    this.mesh = lines(this.position, squareEdges(data.rest, data.faces), new LineBasicMaterial({ transparent: true, opacity: 0.35 }));
-    this.free = lines(new BufferAttribute(data.rest, 3), sharpEdges(data.rest, data.faces, 35), new LineDashedMaterial({ dashSize: 2, gapSize: 1.5 }));
-    this.free.geometry = this.free.geometry.toNonIndexed();
-    this.free.computeLineDistances();
-    this.grid = gridLines(data.rest, niceCeiling(this.extent.radius / 6.5));
+    this.mesh = lines(this.position, squareEdges(data.reference, data.faces), new LineBasicMaterial({ transparent: true, opacity: 0.35 }));
+    this.reference = lines(new BufferAttribute(data.reference, 3), sharpEdges(data.reference, data.faces, 35), new LineDashedMaterial({ dashSize: 2, gapSize: 1.5 }));
+    this.reference.geometry = this.reference.geometry.toNonIndexed();
+    this.reference.computeLineDistances();
+    this.grid = gridLines(data.reference, niceCeiling(this.extent.radius / 6.5));
     this.frameful.push(this.grid.geometry.attributes.position.array);
     this.bodies = data.bodies.map((body) => (body.kind === "plane" ? null : this.#body(body)));
-    this.world.add(this.grid, this.free, this.skin, this.mesh, ...this.bodies.filter(Boolean), new HemisphereLight(0xffffff, 0x8a8a8a, 2.0), this.sun);
+    this.world.add(this.grid, this.reference, this.skin, this.mesh, ...this.bodies.filter(Boolean), new HemisphereLight(0xffffff, 0x8a8a8a, 2.0), this.sun);
     this.applyTheme();
     this.colourBy(0);
     this.setFrame(0);
     this.look("oblique");
   }
 
-  /** What must be seen: the object and the bodies at all times. */
+  /** Bounding sphere of the object and the rigid bodies at all times. */
   #extent() {
-    const { rest, displacement, quantum, frames, bodies, places } = this.data;
-    const n = rest.length;
-    const box = new Box3().setFromArray(rest);
+    const { reference, displacement, quantum, frames, bodies, positions } = this.data;
+    const n = reference.length;
+    const box = new Box3().setFromArray(reference);
     const moved = new Float32Array(n);
     for (let f = 0; f < frames; f += 1) {
-      for (let i = 0; i < n; i += 1) moved[i] = rest[i] + quantum * displacement[f * n + i];
+      for (let i = 0; i < n; i += 1) moved[i] = reference[i] + quantum * displacement[f * n + i];
       box.union(new Box3().setFromArray(moved));
     }
     this.frameful = [[box.min, box.max].flatMap((p) => [box.min, box.max].flatMap((q) => [box.min, box.max].flatMap((r) => [p.x, q.y, r.z])))];
-    const rigid = bodies.flatMap((body, k) => (body.kind === "plane" ? [] : places.map((at) => cornersOf(body, at.slice(3 * k, 3 * k + 3)))));
+    const rigid = bodies.flatMap((body, k) => (body.kind === "plane" ? [] : positions.map((at) => cornersOf(body, at.slice(3 * k, 3 * k + 3)))));
     this.frameful.push(...rigid);
     rigid.forEach((corners) => box.union(new Box3().setFromArray(corners)));
     return box.getBoundingSphere(new Sphere());
@@ -138,16 +138,16 @@ export class MotionView extends View {
 
   /** @param {number} frame 0 to number of frames - 1; fractions are interpolated */
   setFrame(frame) {
-    const { rest, displacement, quantum, frames, places } = this.data;
+    const { reference, displacement, quantum, frames, positions } = this.data;
     this.frame = Math.min(frames - 1, Math.max(0, frame));
     const i = Math.min(frames - 1, Math.floor(this.frame));
     const j = Math.min(frames - 1, i + 1);
     const t = this.frame - i;
     const out = this.position.array;
-    const n = rest.length;
-    for (let k = 0; k < n; k += 1) out[k] = rest[k] + quantum * (displacement[i * n + k] * (1 - t) + displacement[j * n + k] * t);
+    const n = reference.length;
+    for (let k = 0; k < n; k += 1) out[k] = reference[k] + quantum * (displacement[i * n + k] * (1 - t) + displacement[j * n + k] * t);
     this.position.needsUpdate = true;
-    this.bodies.forEach((group, b) => group?.position.set(...[0, 1, 2].map((a) => places[i][3 * b + a] * (1 - t) + places[j][3 * b + a] * t)));
+    this.bodies.forEach((group, b) => group?.position.set(...[0, 1, 2].map((a) => positions[i][3 * b + a] * (1 - t) + positions[j][3 * b + a] * t)));
     this.#colour(i, j, t);
     this.requestRender();
   }
@@ -155,7 +155,7 @@ export class MotionView extends View {
   /** Colour by field number `index`; -1 + the number of fields is the last one. */
   colourBy(index) {
     this.field = this.data.fields[index];
-    const texture = new DataTexture(colourTable(this.field.two_sided), 256, 1);
+    const texture = new DataTexture(colourTable(this.field.diverging), 256, 1);
     texture.minFilter = texture.magFilter = LinearFilter;
     texture.needsUpdate = true;
     this.skin.material.uniforms.colours.value?.dispose();
@@ -171,7 +171,7 @@ export class MotionView extends View {
   }
 
   setVisible(what, on) {
-    const shown = { mesh: [this.mesh], free: [this.free], bodies: this.bodies.filter(Boolean) }[what];
+    const shown = { mesh: [this.mesh], reference: [this.reference], bodies: this.bodies.filter(Boolean) }[what];
     shown.forEach((object) => { object.visible = on; });
     this.requestRender();
   }
@@ -181,7 +181,7 @@ export class MotionView extends View {
     const theme = readTheme(this.host);
     this.renderer.setClearColor(theme.background);
     this.mesh.material.color.set(theme.dark ? "#000000" : "#1b1f23");
-    this.free.material.color.set(theme.edge);
+    this.reference.material.color.set(theme.edge);
     this.grid.material.color.set(theme.grid);
     this.bodies.filter(Boolean).forEach((group) => group.children.forEach((part) => part.material.color.set(theme.box)));
     this.requestRender();

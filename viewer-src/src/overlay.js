@@ -1,4 +1,4 @@
-// What is drawn over the canvas in SVG: axes triad, scale bar, ring round the chosen marker. It stays sharp and follows the page's colours.
+// SVG overlay of the canvas: axes triad, scale bar, ring around the selected marker.
 import { Vector3 } from "three";
 
 const NS = "http://www.w3.org/2000/svg";
@@ -59,7 +59,7 @@ export class Overlay {
     ends.sort((p, q) => p.depth - q.depth).forEach(({ axis }) => this.triad.append(axis.group));
   }
 
-  /** Put the ring at `at` ({x, y} in px), or hide it with null. */
+  /** Show the ring at `at` ({x, y} in px), or hide it with null. */
   mark(at) {
     this.ring.setAttribute("visibility", at ? "visible" : "hidden");
     if (!at) return;

@@ -1,4 +1,4 @@
-// The result page: puts the 3-D view and its controls into #naibu-viewer. All tables and figures are already in the HTML.
+// The result page: adds the 3-D view and its controls to #naibu-viewer. All tables and figures are already in the HTML.
 import { residualGradient } from "./colormap.js";
 import { decodeScene, inflate } from "./decode.js";
 import { canDrawOr, h } from "./elements.js";
@@ -34,13 +34,13 @@ class ViewerPage {
       h("button", { type: "button", "aria-label": "Zoom in", onclick: () => this.view.zoomBy(1.25) }, "+"),
       h("button", { type: "button", "aria-label": "Zoom out", onclick: () => this.view.zoomBy(0.8) }, "−"),
       h("button", { type: "button", onclick: () => this.view.look("oblique") }, "Reset view"));
-    this.stage = h("div", { class: "stage", tabindex: 0, role: "application", "aria-label": "3-D view. Arrow keys turn it, plus and minus zoom, R resets, N and P step through the markers by residual." });
+    this.stage = h("div", { class: "stage", tabindex: 0, role: "application", "aria-label": "3-D view. Arrow keys rotate, plus and minus zoom, R resets, N and P step through the markers by residual." });
     this.tip = h("div", { class: "tip", hidden: true });
     this.live = h("p", { class: "visually-hidden", "aria-live": "polite" });
     this.root.replaceChildren(
       h("div", { class: "bar" }, h("label", { for: "naibu-scene" }, "Experiment and state"), this.choice, views),
       this.stage,
-      h("p", { class: "hint" }, "Drag to turn, right-drag or two fingers to move. Click the view, then scroll to zoom. Point at a marker for its numbers."),
+      h("p", { class: "hint" }, "Drag to rotate, right-drag or drag with two fingers to pan. Click the view, then scroll to zoom. Point at a marker for its values."),
       this.#loadControls(), this.#legend(), this.#worst(), this.live);
   }
 
@@ -56,7 +56,7 @@ class ViewerPage {
     this.play = h("button", { type: "button", class: "play", onclick: () => (this.timer ? this.stop() : this.start()) }, "▶ Play");
     this.stepLabel = h("output", { for: "naibu-load", class: "steplabel" });
     return h("div", { class: "load" }, this.play, h("div", { class: "slide" }, h("label", { for: "naibu-load" }, "Load"),
-      h("span", { class: "end" }, "free"), this.slider, h("span", { class: "end" }, "full")), this.stepLabel);
+      h("span", { class: "end" }, "none"), this.slider, h("span", { class: "end" }, "full")), this.stepLabel);
   }
 
   #toggle(what, icon, ...text) {
@@ -77,11 +77,11 @@ class ViewerPage {
       this.#toggle("predicted", '<path d="M10 2 18 10 10 18 2 10Z" class="g-predicted"/>', "predicted marker"),
       this.#toggle("arrows", '<path d="M3 17 15 5M8 4.5H15.5V12" class="g-arrow"/>', "residual arrow"),
       this.#toggle("skin", '<rect x="3" y="5" width="14" height="11" class="g-skin"/>', "predicted surface"),
-      this.#toggle("free", '<rect x="3" y="4" width="14" height="13" class="g-free"/>', "outline of the free shape"),
-      this.#toggle("boxes", '<rect x="2" y="8" width="16" height="5" class="g-box"/>', "plate, bar"));
+      this.#toggle("reference", '<rect x="3" y="4" width="14" height="13" class="g-reference"/>', "undeformed outline"),
+      this.#toggle("boxes", '<rect x="2" y="8" width="16" height="5" class="g-box"/>', "indenters"));
     return h("div", { class: "legend" }, toggles, h("div", { class: "colourbar" },
-      h("p", { class: "barlabel" }, "Residual (mm): length of measured → predicted, its true value"), this.gradient, this.ticks,
-      h("div", { class: "factor" }, h("label", { for: "naibu-factor" }, "Arrows drawn"), this.factor, this.factorLabel), this.arrowNote));
+      h("p", { class: "barlabel" }, "Residual, measured → predicted (mm)"), this.gradient, this.ticks,
+      h("div", { class: "factor" }, h("label", { for: "naibu-factor" }, "Arrow scale"), this.factor, this.factorLabel), this.arrowNote));
   }
 
   #worst() {
@@ -112,8 +112,8 @@ class ViewerPage {
     const missing = this.scene.ids.length - this.ranked.length;
     this.worst.replaceChildren(...(known ? [h("span", {}, "Largest residuals:"),
       ...this.ranked.slice(0, 5).map((i) => h("button", { type: "button", onclick: () => this.#showMarker(i) },
-        `marker ${this.scene.ids[i]}: ${mm(this.scene.residualLength[i])} mm`))] : [h("span", {}, "No marker of this state was measured: the view shows the prediction alone.")]),
-    ...(known && missing ? [h("span", {}, `${missing} of ${this.scene.ids.length} markers lack a measured coordinate here.`)] : []));
+        `marker ${this.scene.ids[i]}: ${mm(this.scene.residualLength[i])} mm`))] : [h("span", {}, "No marker of this state was measured; only the prediction is shown.")]),
+    ...(known && missing ? [h("span", {}, `${missing} of ${this.scene.ids.length} markers lack a measured coordinate in this state.`)] : []));
   }
 
   #showMarker(i) {
@@ -142,7 +142,7 @@ class ViewerPage {
   }
 
   #noteArrows() {
-    this.arrowNote.textContent = this.view.atFullLoad ? "" : "Residuals exist only where both sides are known: move the load to full.";
+    this.arrowNote.textContent = this.view.atFullLoad ? "" : "Residuals are shown at full load only, where markers were measured.";
   }
 
   #theme() {
@@ -179,7 +179,7 @@ class ViewerPage {
     const r = [0, 1, 2].map((k) => scene.residual[3 * i + k]);
     const head = `Marker ${scene.ids[i]}, layer ${scene.layers[i] + 1}`;
     const lines = Number.isFinite(length)
-      ? [`residual ${mm(length)} mm`, `x ${signed(r[0])}  y ${signed(r[1])}  z ${signed(r[2])} mm`, `noise sd ${mm(scene.sd[i])} mm in each axis`]
+      ? [`residual ${mm(length)} mm`, `x ${signed(r[0])}  y ${signed(r[1])}  z ${signed(r[2])} mm`, `noise SD ${mm(scene.sd[i])} mm along each axis`]
       : ["not measured in this state", ...(r.some(Number.isFinite) ? [`x ${signed(r[0])}  y ${signed(r[1])}  z ${signed(r[2])} mm`] : [])];
     this.tip.replaceChildren(h("strong", {}, head), ...lines.map((line) => h("span", {}, line)));
     this.live.textContent = [head, ...lines].join(", ");

@@ -1,8 +1,8 @@
-// The 3-D view of a result: markers, residuals, body. Result page, live page and notebook use the same class.
+// The 3-D view of a result: markers, residuals and body, for the result page, the live page and the notebook.
 import { Box3, DirectionalLight, HemisphereLight, Scene, Sphere, Vector3 } from "three";
 import { Body } from "./body.js";
 import { niceCeiling, residualColour } from "./colormap.js";
-import { Arrows, measuredGlyphs, place, predictedGlyphs } from "./glyphs.js";
+import { Arrows, measuredGlyphs, predictedGlyphs, setPositions } from "./glyphs.js";
 import { readTheme, View } from "./view.js";
 
 const PICK_RADIUS_PX = 16;
@@ -32,7 +32,7 @@ export class SceneView extends View {
   constructor(host, events = {}) {
     super(host);
     this.onPick = events.onPick ?? (() => {});
-    this.visible = { measured: true, predicted: true, arrows: true, skin: true, free: true, boxes: true };
+    this.visible = { measured: true, predicted: true, arrows: true, skin: true, reference: true, boxes: true };
     this.load = 0;
     this.magnification = 1;
     this.selected = null;
@@ -53,8 +53,8 @@ export class SceneView extends View {
     this.extent = new Sphere();
     const box = new Box3();
     const full = data.steps[data.steps.length - 1];
-    this.frameful = [data.free, full.surface, ...full.boxes.map(boxCorners)];
-    for (const points of [data.free, full.surface]) box.union(new Box3().setFromArray(points));
+    this.frameful = [data.reference, full.surface, ...full.boxes.map(boxCorners)];
+    for (const points of [data.reference, full.surface]) box.union(new Box3().setFromArray(points));
     box.getBoundingSphere(this.extent);
     this.spacing = medianSpacing(full.markers);
     this.glyph = Math.min(0.0145 * this.extent.radius, 0.105 * this.spacing);
@@ -77,7 +77,7 @@ export class SceneView extends View {
     return this.load >= this.data.steps.length - 1 - FULL;
   }
 
-  /** Largest round factor with which a typical arrow stays short beside the object and the markers' spacing. */
+  /** Largest round factor at which a typical arrow stays short relative to the object and the marker spacing. */
   suggestedMagnification() {
     const known = [...this.data.residualLength].filter(Number.isFinite);
     if (known.length === 0) return 1;
@@ -86,7 +86,7 @@ export class SceneView extends View {
     return [20, 10, 5, 2, 1].find((m) => m * rms < longest) ?? 1;
   }
 
-  /** @param {number} step 0 (free) to number of steps - 1 (full load); fractions are interpolated */
+  /** @param {number} step 0 (unloaded) to number of steps - 1 (full load); fractions are interpolated */
   setLoad(step) {
     const { steps } = this.data;
     this.load = Math.min(steps.length - 1, Math.max(0, step));
@@ -108,9 +108,9 @@ export class SceneView extends View {
   #placeGlyphs() {
     this.placedZoom = this.camera.zoom;
     const radius = this.glyph * Math.max(1, this.camera.zoom) ** -0.7;
-    place(this.measured, this.data.measured, radius);
-    if (this.markers) place(this.predicted, this.markers, 2 * radius);
-    this.arrows.place(this.data.measured, this.data.residual, this.magnification, 0.36 * radius);
+    setPositions(this.measured, this.data.measured, radius);
+    if (this.markers) setPositions(this.predicted, this.markers, 2 * radius);
+    this.arrows.setVectors(this.data.measured, this.data.residual, this.magnification, 0.36 * radius);
   }
 
   setVisible(what, on) {
@@ -124,7 +124,7 @@ export class SceneView extends View {
     this.predicted.visible = this.visible.predicted;
     this.arrows.visible = this.visible.arrows && this.atFullLoad;
     this.body.skin.visible = this.body.edges.visible = this.visible.skin;
-    this.body.free.visible = this.visible.free;
+    this.body.reference.visible = this.visible.reference;
     this.body.boxes.visible = this.visible.boxes;
     this.requestRender();
   }
@@ -147,7 +147,7 @@ export class SceneView extends View {
     this.overlay.mark(this.selected === null ? null : this.screenPoint(this.selected));
   }
 
-  /** Where marker i is seen, px from the host's upper left corner. */
+  /** Screen position of marker i, px from the host's upper left corner. */
   screenPoint(i) {
     const points = this.atFullLoad && Number.isFinite(this.data.residualLength[i]) ? this.data.measured : this.markers;
     const v = new Vector3().fromArray(points, 3 * i).project(this.camera);
@@ -167,7 +167,7 @@ export class SceneView extends View {
     this.select(best);
   }
 
-  /** Move marker i into the middle if it lies outside the frame. */
+  /** Centre the view on marker i if it lies outside the frame. */
   reveal(i) {
     const { x, y } = this.screenPoint(i);
     if (x > 20 && y > 20 && x < this.host.clientWidth - 20 && y < this.host.clientHeight - 20) return;
@@ -178,7 +178,7 @@ export class SceneView extends View {
     this.camera.updateMatrixWorld();
   }
 
-  /** Choose marker number i (its place in the list), or none with null. */
+  /** Select marker i (its index in the list), or none with null. */
   select(i) {
     if (i === null && this.selected === null) return;
     this.selected = i;

@@ -1,4 +1,4 @@
-// A 3-D view without content: camera, turning, fitting into the frame, axes and scale bar. What it shows is put in by its subclasses.
+// Base class of the 3-D views: camera, rotation, fitting into the frame, axes and scale bar. Subclasses add the content.
 import { OrthographicCamera, Vector3, WebGLRenderer } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { Overlay } from "./overlay.js";
@@ -10,7 +10,7 @@ export const VIEWS = {
   top: { label: "Top (x, y)", from: [0, 0, 1] },
 };
 
-/** True if the browser can draw: asked on a canvas of its own, so that a refusal leaves no error in the console. */
+/** True if the browser can draw: asked on a canvas of its own, so that a failure leaves no error in the console. */
 export function canDraw() {
   try {
     const context = document.createElement("canvas").getContext("webgl2");
@@ -33,13 +33,13 @@ export function readTheme(element) {
     skin: of("skin"),
     skinOpacity: Number(of("skin-opacity")),
     edge: of("edge"),
-    free: of("free"),
+    reference: of("reference"),
     grid: of("grid"),
     box: of("box"),
   };
 }
 
-/** Subclasses set `world` (Scene), `extent` (Sphere), `frameful` (lists of points that must be seen) and `sun` (a light), then call look(). */
+/** Subclasses set `world` (Scene), `extent` (Sphere), `frameful` (lists of points that must be visible) and `sun` (a light), then call look(). */
 export class View {
   /** @param {HTMLElement} host empty, positioned element */
   constructor(host) {
@@ -71,7 +71,7 @@ export class View {
     this.host.addEventListener("mouseleave", () => { clicked = false; });
   }
 
-  /** Keys that turn and zoom, and more of them: name -> action. */
+  /** Bind the keys that rotate and zoom, and more of them: name -> action. */
   listenToKeys(more = {}) {
     const actions = {
       ArrowLeft: () => this.turn(-0.1, 0),
@@ -92,12 +92,12 @@ export class View {
     });
   }
 
-  /** Throw away what was shown before. */
+  /** Dispose of the previous content. */
   clear() {
     this.world?.traverse((o) => { o.geometry?.dispose(); o.material?.dispose(); });
   }
 
-  /** Look from one of VIEWS and fit what is shown into the frame. */
+  /** View from one of VIEWS and fit the content into the frame. */
   look(name) {
     const { center, radius } = this.extent;
     const forward = new Vector3(...VIEWS[name].from).normalize();
@@ -112,7 +112,7 @@ export class View {
     this.resize();
   }
 
-  /** Half extents of all that is drawn, as the camera now sees it, and the point in their middle as the new target. */
+  /** Centre the content as the camera sees it, and set `half`, its half extents. */
   #frame() {
     const [right, up] = [0, 1].map((k) => new Vector3().setFromMatrixColumn(this.camera.matrixWorld, k));
     const low = [Infinity, Infinity];

@@ -1,1 +1,1 @@
-"""What the reader sees: result pages, and the 3-D scene that they, the live page and the notebook share."""
+"""HTML pages of results: identification, prediction, simulated motion, image slices and reproduced chapters."""

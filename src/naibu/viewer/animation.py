@@ -1,4 +1,4 @@
-"""An animation of plane meshes as one self-contained page: several bodies side by side, one clock, colours with a scale."""
+"""Animation of plane meshes as a self-contained page: several bodies side by side, coloured, with one time slider."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ import numpy as np
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 
-STEPS = 32_000  # of a 16-bit number that the page stores, from the smallest to the largest value
+STEPS = 32_000  # quantisation levels of the 16-bit numbers that the page stores
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MovingBody:
-    """A plane mesh over time.
+    """A deforming plane mesh over time.
 
     Attributes
     ----------
     title : str
-        Shown above it.
+        Caption of the body.
     points : ndarray, shape (n, 2)
-        Nodes at rest, mm.
+        Node positions in the reference configuration, mm.
     triangles : ndarray, shape (m, 3), int
         Node numbers.
     displacement : ndarray, shape (s, n, 2)
-        In every step, mm.
+        Displacement of the nodes at every time step, mm.
     values : ndarray, shape (s, n)
-        What the colours show.
+        Node values shown as colours.
     marks : tuple of (name, ndarray of shape (s, 2))
-        Points to follow, mm, such as measured markers.
+        Names and paths of points, such as measured markers, mm; NaN where unknown.
     """
 
     title: str
@@ -54,16 +54,16 @@ def animation_html(title: str, times_s: FloatArray, bodies: tuple[MovingBody, ..
     times_s : ndarray, shape (s,)
         Times of the steps, s.
     bodies : tuple of MovingBody
-        Shown side by side, on one scale of lengths and colours.
+        Bodies, shown side by side at one scale of length and colour.
     value_name : str
-        What the colours show, with its unit.
+        Quantity shown as colours, with its unit.
     note : str
-        A sentence below the title.
+        Text below the title.
 
     Raises
     ------
     InputError
-        No body, or steps that do not fit the times.
+        No body, or a number of steps that differs from the number of times.
     """
     if not bodies:
         raise InputError("an animation needs at least one body")

@@ -1,4 +1,4 @@
-"""A simulated motion as one self-contained page: a coloured surface that deforms, rigid bodies, force curves, one clock."""
+"""Simulated motion as a self-contained page: a coloured deforming surface, rigid indenters and force curves over time."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from naibu.viewer.page_frame import asset, page_html
 from naibu.viewer.tables import Table, provenance_section, table_html
 from naibu.viewer.ticks import ticks_between
 
-STEPS = 4000  # whole multiples from no displacement to the largest
-LEVELS = 255  # of colours
+STEPS = 4000  # quantisation levels from zero to the largest displacement
+LEVELS = 255  # quantisation levels of the colours
 POINTS_OF_A_CURVE = 600
 WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 420.0, 330.0, 66.0, 12.0, 14.0, 44.0
-CURVES = 5  # colours of the style sheet
+CURVES = 5  # curve colours in the style sheet
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigidShape:
-    """A rigid body of the view.
+    """A rigid indenter or floor in the 3-D view.
 
     Attributes
     ----------
     name : str
-        For the key of the curves.
+        Name in the legend of the force curves.
     kind : str
-        ``"box"``, ``"cylinder"``, ``"sphere"``, or ``"plane"``, which is not drawn: the grid stands for it.
+        ``"box"``, ``"cylinder"``, ``"sphere"``, or ``"plane"``, which is not drawn because the grid represents it.
     size : ndarray, shape (3,)
-        Half edges of a box; radius and half length of a cylinder; radius of a sphere, mm.
+        Half edge lengths of a box; radius and half length of a cylinder; radius of a sphere; mm.
     axes : ndarray, shape (3, 3)
-        Rows are the body's axes, the third a cylinder's.
+        Rows are the axes of the body; the third is the axis of a cylinder.
     """
 
     name: str
@@ -48,75 +48,75 @@ class RigidShape:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ColourField:
-    """Values that colours show.
+    """A scalar field shown as colours.
 
     Attributes
     ----------
     name : str
-        With its unit.
+        Quantity with its unit.
     values : ndarray, shape (s, n)
-        Of the points in every frame.
-    two_sided : bool
-        Whether they may be more or less than zero, which then has a colour of its own.
+        Values at the points in every frame.
+    diverging : bool
+        Whether to use a diverging colour map centred on zero.
     """
 
     name: str
     values: FloatArray
-    two_sided: bool = False
+    diverging: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionPage:
-    """What the page shows.
+    """The content of the page.
 
     Attributes
     ----------
     title : str
         Heading.
     sentences : sequence of str
-        Below it.
+        Paragraphs below the heading.
     times : ndarray, shape (s,)
-        Of the frames, s.
+        Times of the frames, s.
     faces : ndarray, shape (f, 3), int
-        Triangles of the surface.
-    rest : ndarray, shape (n, 3)
-        Points of the surface, mm.
+        Triangles of the surface, point numbers.
+    reference : ndarray, shape (n, 3)
+        Points of the surface in the reference configuration, mm.
     displacement : ndarray, shape (s, n, 3)
-        mm.
+        Displacement of the points in every frame, mm.
     fields : sequence of ColourField
-        The first one is shown first.
+        Fields to choose from; the first one is shown initially.
     bodies : sequence of RigidShape
         Indenters and floor.
-    places : ndarray, shape (s, b, 3)
-        Their centres, mm.
+    positions : ndarray, shape (s, b, 3)
+        Centres of the bodies in every frame, mm.
     force_times, force : ndarray, shape (k,) and (k, b, 3)
-        Forces of the bodies on the object, mN, and when, s.
+        Times, s, and forces of the bodies on the object, mN.
     tables : sequence of Table
-        Below the view.
+        Tables below the view.
     provenance : mapping
-        How it was computed.
+        How the motion was computed.
     """
 
     title: str
     sentences: Sequence[str]
     times: FloatArray
     faces: IntArray
-    rest: FloatArray
+    reference: FloatArray
     displacement: FloatArray
     fields: Sequence[ColourField]
     bodies: Sequence[RigidShape]
-    places: FloatArray
+    positions: FloatArray
     force_times: FloatArray
     force: FloatArray
     tables: Sequence[Table] = ()
     provenance: Mapping[str, object] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        s, n, b = len(self.times), len(self.rest), len(self.bodies)
+        s, n, b = len(self.times), len(self.reference), len(self.bodies)
         shapes = {
-            "rest": (self.rest, (n, 3)),
+            "reference": (self.reference, (n, 3)),
             "displacement": (self.displacement, (s, n, 3)),
-            "places": (self.places, (s, b, 3)),
+            "positions": (self.positions, (s, b, 3)),
             "force": (self.force, (len(self.force_times), b, 3)),
             **{f.name: (f.values, (s, n)) for f in self.fields},
         }
@@ -124,16 +124,16 @@ class MotionPage:
             if np.shape(array) != shape:
                 raise InputError(f"{self.title!r}: {name} must have the shape {shape}, not {np.shape(array)}")
         if not s or not self.fields:
-            raise InputError(f"{self.title!r}: a motion needs at least one frame, and something for its colours to show")
+            raise InputError(f"{self.title!r}: a motion needs at least one frame and at least one field")
 
 
 def motion_html(page: MotionPage, max_bytes: int) -> str:
-    """Return the page as text; every second frame is left out until it is small enough, the first and the last one never.
+    """Return the page as text; every second frame is dropped, except the first and the last, until the page is small enough.
 
     Raises
     ------
     InputError
-        Two frames alone are too large.
+        The page is too large even with two frames.
     """
     while True:
         text = _html(page)
@@ -141,8 +141,8 @@ def motion_html(page: MotionPage, max_bytes: int) -> str:
             return text
         if len(page.times) <= 2:
             raise InputError(
-                f"a page of {len(page.rest)} surface points would have {len(text) / 1e6:.1f} MB, the limit is {max_bytes / 1e6:.1f} MB; "
-                "look at the series in ParaView"
+                f"the page of {len(page.reference)} surface points has {len(text) / 1e6:.1f} MB, the limit is {max_bytes / 1e6:.1f} MB; "
+                "open the series in ParaView instead"
             )
         page = _thinned(page)
 
@@ -151,7 +151,7 @@ def _thinned(page: MotionPage) -> MotionPage:
     last = len(page.times) - 1
     kept = np.append(np.arange(0, last, 2), last)
     fields = [replace(f, values=f.values[kept]) for f in page.fields]
-    return replace(page, times=page.times[kept], displacement=page.displacement[kept], fields=fields, places=page.places[kept])
+    return replace(page, times=page.times[kept], displacement=page.displacement[kept], fields=fields, positions=page.positions[kept])
 
 
 def _html(page: MotionPage) -> str:
@@ -171,27 +171,27 @@ def _html(page: MotionPage) -> str:
 
 
 def _packed(page: MotionPage) -> dict[str, object]:
-    """Return the frames as whole numbers; ``viewer-src/src/decode.js`` undoes it."""
+    """Return the frames as integers; ``viewer-src/src/decode.js`` is the inverse."""
     quantum = (float(np.abs(page.displacement).max(initial=0.0)) or 1.0) / STEPS
     whole = np.rint(page.displacement / quantum).astype(np.int16).reshape(len(page.times), -1)
     return {
         "times": [round(float(t), 6) for t in page.times],
         "faces": page.faces.ravel().tolist(),
-        "rest": np.round(page.rest, 3).ravel().tolist(),
+        "reference": np.round(page.reference, 3).ravel().tolist(),
         "quantum": quantum,
         "displacement": _zipped(_differences(whole)),
         "fields": [_levels(f) for f in page.fields],
         "bodies": [
             {"name": b.name, "kind": b.kind, "size": b.size.tolist(), "axes": np.round(b.axes, 6).ravel().tolist()} for b in page.bodies
         ],
-        "places": np.round(page.places.reshape(len(page.times), -1), 3).tolist(),
+        "positions": np.round(page.positions.reshape(len(page.times), -1), 3).tolist(),
     }
 
 
 def _differences(rows: Int16Array) -> bytes:
-    """Return second differences down the rows, which are small as motions are smooth: all low bytes, then all high bytes."""
+    """Return second differences along the rows, small for smooth motions: all low bytes, then all high bytes."""
     out = rows.copy()
-    out[1:] = rows[1:] - rows[:-1]  # wraps around, as the sums will
+    out[1:] = rows[1:] - rows[:-1]  # overflow wraps around, and so do the sums
     second = out.copy()
     second[2:] = out[2:] - out[1:-1]
     pairs = second.astype("<i2").reshape(-1, 1).view(np.uint8)
@@ -200,12 +200,12 @@ def _differences(rows: Int16Array) -> bytes:
 
 def _levels(colours: ColourField) -> dict[str, object]:
     low, high = float(colours.values.min()), float(colours.values.max())
-    if colours.two_sided:
+    if colours.diverging:
         high = max(-low, high)
         low = -high
     span = (high - low) or 1.0
     levels = np.rint((colours.values - low) / span * LEVELS).astype(np.uint8)
-    return {"name": colours.name, "low": low, "high": low + span, "two_sided": colours.two_sided, "levels": _zipped(levels.tobytes())}
+    return {"name": colours.name, "low": low, "high": low + span, "diverging": colours.diverging, "levels": _zipped(levels.tobytes())}
 
 
 def _zipped(data: bytes) -> str:
@@ -213,7 +213,7 @@ def _zipped(data: bytes) -> str:
 
 
 def force_curves(page: MotionPage) -> str:
-    """Return the force of every body over time as SVG, each along the axis in which it is strongest, with a mark that the page moves."""
+    """Return the force-time curve of every body as SVG, along the axis of its largest force, with a time marker that the page moves."""
     t, curves = page.force_times, [_strongest(page.force[:, k]) for k in range(len(page.bodies))]
     values = np.concatenate([v for v, _ in curves])
     low, high = min(float(values.min()), 0.0), max(float(values.max()), 0.0)
@@ -245,20 +245,20 @@ def force_curves(page: MotionPage) -> str:
         f'<g id="naibu-now" data-from="{LEFT:g}" data-to="{WIDTH - RIGHT:g}" transform="translate({LEFT:g} 0)">'
         f'<path d="M0 {TOP:g}V{HEIGHT - BOTTOM:g}" class="now"/></g>'
     )
-    said = f"Forces of {', '.join(b.name for b in page.bodies)} on the object over time"
-    svg = f'<svg viewBox="0 0 {WIDTH:.0f} {HEIGHT:.0f}" role="img" aria-label="{escape(said)}">{body}</svg>'
+    label = f"Forces of {', '.join(b.name for b in page.bodies)} on the object over time"
+    svg = f'<svg viewBox="0 0 {WIDTH:.0f} {HEIGHT:.0f}" role="img" aria-label="{escape(label)}">{body}</svg>'
     return f'<p class="fig-title">Forces on the object</p>{svg}<ul class="curve-key">{keys}</ul>'
 
 
 def _strongest(force: FloatArray) -> tuple[FloatArray, str]:
-    """Return the component (k,) along the axis and the way in which a force is strongest, and that way's name."""
+    """Return the component (k,) along the signed axis of the largest force, and the name of that axis."""
     axis = int(np.argmax(np.abs(force).sum(axis=0)))
     sign = -1.0 if force[:, axis].sum() < 0.0 else 1.0
     return sign * force[:, axis], f"{'+' if sign > 0 else '−'}{'xyz'[axis]}"
 
 
 def _thin_curve(times: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return at most about `POINTS_OF_A_CURVE` points, the extremes of every stretch among them."""
+    """Return at most about `POINTS_OF_A_CURVE` points, including the extremes of every interval."""
     if len(times) <= POINTS_OF_A_CURVE:
         return times, values
     kept = {0, len(times) - 1}

@@ -1,4 +1,4 @@
-"""The frame that the pages share: one HTML document that loads nothing from outside."""
+"""HTML frame of the pages: one self-contained document that loads nothing from the network."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A pair of volumes and the displacement between them as one page: slices along three axes, arrows, strain, uncertainty."""
+"""A pair of volumes and the displacement between them as a page of slices, with arrows, strain and uncertainty."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from naibu.core.arrays import AnyFloatArray
 from naibu.core.errors import InputError
 from naibu.viewer.tables import Table, table_html
 
-GREYS = 255
-LEVELS = 254  # of an overlay; 255 says that nothing is known
+GREY_LEVELS = 255
+LEVELS = 254  # of an overlay; 255 means undefined
 FEW_VOXELS = 1_500_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Overlay:
-    """Values that colours show.
+    """A scalar field shown as colours over the image.
 
     Attributes
     ----------
     name : str
-        With its unit, ``"displacement, mm"``.
+        Quantity with its unit, ``"displacement, mm"``.
     values : ndarray, shape (nz, ny, nx)
-        NaN where nothing is known.
+        Values on the voxel grid; NaN where undefined.
     middle : float, optional
-        Value that two colours meet at, for what may be more or less than that; by default one scale from the least to the most.
+        Centre of a diverging colour map; by default a sequential map from the smallest to the largest value.
     """
 
     name: str
@@ -42,26 +42,26 @@ class Overlay:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SliceView:
-    """What the page shows.
+    """The content of the page.
 
     Attributes
     ----------
     title : str
         Heading.
     sentences : sequence of str
-        What was found, in words.
+        Paragraphs below the heading.
     spacing_mm : ndarray, shape (3,)
-        Distance of voxels along x, y, z, mm.
+        Voxel spacing along x, y, z, mm.
     images : sequence of (str, ndarray of shape (nz, ny, nx))
-        Grey volumes on one grid, on one grey scale: before, after, after carried back.
+        Names and intensities on one grid, shown on one intensity scale: reference, deformed, deformed warped back.
     displacement : ndarray, shape (nz, ny, nx, 3)
-        Along the axes of the grid, mm; NaN where there is none.
+        Displacement along the axes of the grid, mm; NaN where undefined.
     overlays : sequence of Overlay
-        What colours may show.
+        Fields to choose from.
     tables : sequence of Table
-        Below the slices.
+        Tables below the slices.
     difference : tuple of (str, int, int), optional
-        Differences that are offered too: a name, and the numbers of two images.
+        Further images to choose from, as differences: name, and the numbers of two images.
     """
 
     title: str
@@ -75,7 +75,7 @@ class SliceView:
 
 
 def slices_html(view: SliceView) -> str:
-    """Return the page; volumes of more voxels than a page should carry are shown at every second, third, ... voxel.
+    """Return the page as text; large volumes are subsampled to every second, third, ... voxel.
 
     Raises
     ------
@@ -107,7 +107,7 @@ def slices_html(view: SliceView) -> str:
 
 
 def _stride(shape: tuple[int, ...], spacing: AnyFloatArray) -> list[int]:
-    """Every how many voxels along x, y, z: finer axes are thinned first."""
+    """Return the subsampling factors along x, y, z; the finest axis is subsampled first."""
     size, every = np.array(shape[::-1]), np.ones(3, dtype=int)
     while np.prod(-(-size // every)) > FEW_VOXELS:
         every[np.argmin(np.where(size // every > 1, spacing * every, np.inf))] += 1
@@ -115,12 +115,12 @@ def _stride(shape: tuple[int, ...], spacing: AnyFloatArray) -> list[int]:
 
 
 def _images(images: Sequence[tuple[str, AnyFloatArray]]) -> list[dict[str, object]]:
-    """On the grey scale of the first one; what is not known is black."""
+    """Return the images on the intensity scale of the first; undefined voxels are black."""
     known = images[0][1][np.isfinite(images[0][1])]
     low, high = (float(q) for q in np.percentile(known, (0.2, 99.8)))
     span = high - low or 1.0
     return [
-        {"name": name, "low": low, "high": high, "data": _packed(np.clip((np.nan_to_num(v, nan=low) - low) / span, 0.0, 1.0) * GREYS)}
+        {"name": name, "low": low, "high": high, "data": _packed(np.clip((np.nan_to_num(v, nan=low) - low) / span, 0.0, 1.0) * GREY_LEVELS)}
         for name, v in images
     ]
 
@@ -139,7 +139,7 @@ def _overlay(overlay: Overlay, values: AnyFloatArray) -> dict[str, object]:
 
 
 def _arrows(displacement: AnyFloatArray) -> dict[str, object]:
-    """Whole multiples of a length; -32768 where nothing is known."""
+    """Return displacements as integer multiples of a length; -32768 where undefined."""
     known = np.asarray(np.isfinite(displacement).all(axis=-1))
     largest = float(np.abs(displacement[known]).max()) if known.any() else 1.0
     quantum = (largest or 1.0) / 32000.0

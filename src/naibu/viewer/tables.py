@@ -1,4 +1,4 @@
-"""Tables of a page: their type, and how they are written as HTML."""
+"""Tables of a page and their HTML."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def table_html(table: Table, *, shortest: bool = False) -> str:
     inner = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
     note = f'<p class="note">{escape(table.note)}</p>' if table.note else ""
     caption = f' <span class="what">{escape(table.caption)}</span>' if table.caption else ""
-    # The heading stands outside of what scrolls, so that a phone shows all of it.
+    # the heading is outside of the scrolling part, so that a phone shows all of it
     return f'<p class="caption">{escape(table.title)}{caption}</p>{scrollable(table.title, inner)}{note}'
 
 
@@ -111,7 +111,7 @@ def _number(value: float, shortest: bool) -> str:
 
 
 def scrollable(label: str, inner: str, kind: str = "") -> str:
-    """Wrap what may be wider than a phone, so that it scrolls by touch and by keyboard."""
+    """Wrap wide content so that it scrolls horizontally, by touch and by keyboard."""
     return f'<div class="scroll {kind}" role="region" tabindex="0" aria-label="{escape(label, quote=True)}">{inner}</div>'
 
 
@@ -127,7 +127,7 @@ def provenance_table(provenance: Mapping[str, object]) -> str:
 
 
 def provenance_section(provenance: Mapping[str, object]) -> str:
-    """Return the section of a page that tells how its numbers were computed, folded up."""
+    """Return the collapsed section of a page that states how its numbers were computed."""
     return f'<section id="provenance"><details><summary>How this was computed</summary>{provenance_table(provenance)}</details></section>\n'
 
 

@@ -209,7 +209,7 @@ def _page(prepared: PreparedStudy, series: SeriesFile, state: StudyState) -> Mot
     fields = [ColourField("displacement, mm", np.linalg.norm(moved, axis=2))]
     if "stretch" in prepared.settings.output.quantities:
         stretch = np.stack([series.values(ARRAYS["stretch"], int(k))[nodes] for k in frames]).astype(float)
-        fields.append(ColourField("mean stretch of the elements, %", 100.0 * stretch, two_sided=True))
+        fields.append(ColourField("mean stretch of the elements, %", 100.0 * stretch, diverging=True))
     bodies = [RigidShape(b.name, KINDS[b.indenter.kind], np.asarray(b.indenter.size), np.asarray(b.indenter.axes)) for b in study.bodies]
     count = state.frame * study.samples
     force = series.rows("force_mN")[:count]

@@ -84,7 +84,7 @@ def fake_scene(
         experiment=name,
         state=f"plate at {height_mm:.0f} mm",
         faces=faces,
-        free_surface=free,
+        reference_surface=free,
         steps=tuple(steps),
         marker_ids=np.arange(1, 101),
         initial_markers=initial,
@@ -232,7 +232,7 @@ def test_scenes_survive_the_page(page: str, report: Report) -> None:
     assert [p["name"] for p in packed] == ["two_material_2", "cube_plate"]
     for p, scene in zip(packed, report.scenes, strict=True):
         assert np.array_equal(np.cumsum(p["faces"]).reshape(-1, 3), scene.faces)
-        for got, step in zip(unpacked(p, "free_surface", "surfaces", 0.01), scene.steps, strict=True):
+        for got, step in zip(unpacked(p, "reference_surface", "surfaces", 0.01), scene.steps, strict=True):
             assert np.abs(got - step.surface).max() <= 0.00501
         for got, step in zip(unpacked(p, "initial_markers", "markers", 0.001), scene.steps, strict=True):
             assert np.abs(got - step.markers).max() <= 0.000501
@@ -317,7 +317,7 @@ def test_wrong_shapes_are_named() -> None:
     scene = fake_scene("x", 45.0, 1, cells=2, n_steps=2)
     with pytest.raises(InputError, match=r"measured must have shape \(100, 3\)"):
         Scene(**{**{f: getattr(scene, f) for f in scene.__slots__}, "measured": np.zeros((3, 3))})
-    with pytest.raises(InputError, match="faces name nodes"):
+    with pytest.raises(InputError, match="faces refer to nodes"):
         Scene(**{**{f: getattr(scene, f) for f in scene.__slots__}, "faces": np.array([[0, 1, 999]])})
     with pytest.raises(InputError, match="no steps"):
         Scene(**{**{f: getattr(scene, f) for f in scene.__slots__}, "steps": ()})

@@ -1,1 +1,1 @@
-"""The page of an identification or a prediction."""
+"""Result page of an identification or a prediction."""

@@ -1,4 +1,4 @@
-"""The result page: one HTML document that needs nothing from outside."""
+"""Sections of the result page as HTML."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ def _section(key: str, title: str, inner: str) -> str:
 
 
 def _sections(report: Report) -> list[tuple[str, str, str]]:
-    """Return key, title and inner HTML of what the report has, in reading order."""
+    """Return key, title and inner HTML of the sections that the report has, in reading order."""
     found = [
         ("view", "Predicted and measured markers in 3-D", _viewer() if report.scenes else ""),
         ("accuracy", "Accuracy", table_html(report.accuracy) if report.accuracy else ""),
         ("residuals", "Residuals by marker layer", _residuals(report.residuals)),
         ("parameters", "Parameters", _parameters(report)),
-        ("limits", "What the data cannot tell", _limits(report.undetermined)),
+        ("limits", "What the data do not determine", _limits(report.undetermined)),
         ("tables", "Further tables", "".join(table_html(t) for t in report.tables)),
     ]
     return [entry for entry in found if entry[2]]
@@ -65,8 +65,8 @@ def _residuals(sets: Sequence[ResidualSet]) -> str:
     if not plots:
         return ""
     key = (
-        "Predicted minus measured, along each axis. Each dot is a marker, the upright stroke is the layer's median; the lowest layer "
-        "is at the bottom. The grey band is twice the noise's standard deviation: noise alone leaves 95 % of the dots inside."
+        "Predicted minus measured position along each axis. Dots: markers; vertical line: median of the layer; the lowest layer is at the "
+        "bottom. Grey band: ±2 standard deviations of the measurement noise, which noise alone would leave in 5 % of the cases."
     )
     return f'<p class="note">{key}</p>{plots}'
 
@@ -74,10 +74,10 @@ def _residuals(sets: Sequence[ResidualSet]) -> str:
 def _parameters(report: Report) -> str:
     out = ""
     if report.parameters:
-        key = "Circle: estimate. Line: 95 % interval; an arrowhead or “?” marks a side that the data do not bound."
+        key = "Circle: estimate. Line: 95 % confidence interval; an arrowhead or “?” marks a side that the data do not bound."
         out += parameter_table(report.parameters) + f'<p class="note">{key}</p>'
     if report.correlation is not None:
-        key = "Near ±1 only a combination of the two parameters is known, not each one by itself. Column numbers are those of the rows."
+        key = "Near ±1 only a combination of the two parameters is determined, not each one separately. Columns are numbered like the rows."
         out += f'<h3>Correlation of the estimates</h3><p class="note">{key}</p>{correlation_table(report.correlation)}'
     return out
 

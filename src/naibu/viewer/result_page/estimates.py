@@ -1,4 +1,4 @@
-"""Estimates as HTML: the table of parameters with their intervals, and the matrix of correlations."""
+"""Parameter estimates as HTML: table of confidence intervals, and correlation matrix (colours after :cite:t:`ottosson2020`)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LOG_SPAN = 30.0
 
 
 class _Scale:
-    """Where on a track, per cent, a value of one unit lies; logarithmic where values differ much."""
+    """Horizontal scale of an interval plot, per cent of its width; logarithmic where values differ by more than `LOG_SPAN`."""
 
     def __init__(self, rows: Sequence[ParameterRow]) -> None:
         ends = [v for r in rows for v in (r.estimate, r.lower, r.upper) if math.isfinite(v)] or [0.0, 1.0]
@@ -44,7 +44,7 @@ class _Scale:
 
 
 def parameter_table(rows: Sequence[ParameterRow]) -> str:
-    """Return estimates with 95 % intervals in numbers and drawn; parameters of one unit share a scale."""
+    """Return the table of estimates with 95 % confidence intervals, in numbers and drawn; parameters of one unit have a common scale."""
     units = list(dict.fromkeys(r.unit for r in rows))
     body = ""
     for unit in units:
@@ -52,7 +52,7 @@ def parameter_table(rows: Sequence[ParameterRow]) -> str:
         scale = _Scale(group)
         body += _unit_row(unit, scale) + "".join(_parameter_row(r, scale) for r in group)
     columns = '<colgroup><col class="c-name"><col class="c-value"><col class="c-plot"><col></colgroup>'
-    head = "".join(f'<th scope="col">{t}</th>' for t in ("Parameter", "Estimate [95 % interval]", "Drawn, one scale a unit", "Note"))
+    head = "".join(f'<th scope="col">{t}</th>' for t in ("Parameter", "Estimate [95 % interval]", "Interval (one scale per unit)", "Note"))
     inner = f'<table class="params">{columns}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
     return scrollable("Parameters", inner, "wide-params")
 
@@ -80,7 +80,7 @@ def _parameter_row(row: ParameterRow, scale: _Scale) -> str:
 
 
 def _to_width(value: float, width: float) -> str:
-    """Return a value with as many decimals as two significant digits of its interval's width need."""
+    """Return a value with the decimals of two significant digits of its interval's width."""
     if not (math.isfinite(value) and math.isfinite(width) and width > 0) or not 1e-3 <= abs(value) < 1e5:
         return cell_text(value)
     digits = min(6, max(0, 1 - math.floor(math.log10(width))))
@@ -104,7 +104,7 @@ def _interval(row: ParameterRow, scale: _Scale) -> str:
 
 
 def diverging_colour(value: float) -> tuple[str, str]:
-    """Return background and text colour of a correlation: blue for -1, pale for 0, brown-red for 1, even steps in OKLab."""
+    """Return background and text colour of a correlation: blue for -1, pale for 0, brown-red for 1, uniform in OKLab."""
     end = POSITIVE if value >= 0 else NEGATIVE
     t = min(1.0, abs(value))
     linear = _linear_rgb(*(a + t * (b - a) for a, b in zip(NEUTRAL, end, strict=True)))
@@ -115,7 +115,7 @@ def diverging_colour(value: float) -> tuple[str, str]:
 
 
 def _linear_rgb(lightness: float, a: float, b: float) -> FloatArray:
-    """Return linear sRGB of an OKLab colour (B. Ottosson 2020), clipped to what a screen can show."""
+    """Return linear sRGB of an OKLab colour, clipped to the gamut."""
     cones = np.array(
         [
             lightness + 0.3963377774 * a + 0.2158037573 * b,
@@ -134,7 +134,7 @@ def _linear_rgb(lightness: float, a: float, b: float) -> FloatArray:
 
 
 def correlation_table(correlation: Correlation) -> str:
-    """Return the correlation matrix as a heat map with readable values; columns carry the rows' numbers."""
+    """Return the correlation matrix as a heat map with values; columns are numbered like the rows."""
     names, matrix = correlation.names, np.asarray(correlation.matrix, dtype=np.float64)
     head = '<th scope="col"><span class="name">Parameter</span></th>' + "".join(
         f'<th scope="col" title="{escape(n, quote=True)}">{i}</th>' for i, n in enumerate(names, 1)
@@ -147,7 +147,7 @@ def correlation_table(correlation: Correlation) -> str:
     stops = ", ".join(diverging_colour(v)[0] for v in np.linspace(-1, 1, 21).tolist())
     ramp = f'<span class="ramp" style="background:linear-gradient(to right, {stops})"></span>'
     key = f'<div class="corr-key"><span>−1</span>{ramp}<span>1</span></div>'
-    # On a phone the rows carry numbers only, and this list their names.
+    # On a phone the rows show numbers only, and this list their names.
     listed = f'<ol class="corr-names">{"".join(f"<li>{escape(n)}</li>" for n in names)}</ol>'
     return key + scrollable("Correlation of the parameters", inner) + listed
 

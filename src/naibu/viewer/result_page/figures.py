@@ -1,4 +1,4 @@
-"""Figures of the page as inline SVG that takes its colours from the page."""
+"""Figures of the result page as inline SVG, coloured by the style sheet."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ AXES = ("x", "y", "z")
 
 
 def short(value: float, digits: int = 1) -> str:
-    """Return a coordinate with few characters."""
+    """Return a short text of an SVG coordinate."""
     text = f"{value:.{digits}f}".rstrip("0").rstrip(".") if digits else f"{value:.0f}"
     return "0" if text in ("-0", "") else text
 
 
 def rms_bars(scenes: Sequence[Scene]) -> str:
-    """Return bars of the RMS 3-D residual of every state, mm, with the RMS that noise alone would give as a tick."""
+    """Return bars of the RMS 3-D residual of every state, mm, with a tick at the RMS expected from noise alone."""
     rows = [(s, *_rms_3d(s)) for s in scenes]
     known = [v for _, rms, noise, _ in rows for v in (rms, noise) if math.isfinite(v)]
     if not known:
@@ -33,7 +33,7 @@ def rms_bars(scenes: Sequence[Scene]) -> str:
     items = "".join(_rms_row(scene, rms, noise, count, limit) for scene, rms, noise, count in rows)
     bar = '<svg class="key" width="18" height="12" aria-hidden="true"><rect width="18" height="12" rx="2" class="bar-fill"/></svg>'
     tick = '<svg class="key" width="6" height="14" aria-hidden="true"><path d="M3 0v14" class="tick-noise"/></svg>'
-    key = f"{bar} RMS distance between predicted and measured markers (mm). {tick} what measurement noise alone would give."
+    key = f"{bar} RMS distance between predicted and measured markers (mm). {tick} RMS expected from measurement noise alone."
     return f'<ul class="rms">{items}</ul><p class="note">{key}</p>'
 
 
@@ -64,7 +64,7 @@ def _rms_row(scene: Scene, rms: float, noise: float, count: int, limit: float) -
 
 
 def residual_panels(residuals: ResidualSet) -> str:
-    """Return three strip plots, one an axis: residual in mm against marker layer, with the band of noise (two sd)."""
+    """Return three strip plots, one per axis: residual, mm, against marker layer, with a noise band of two standard deviations."""
     finite = np.abs(residuals.residual_mm[np.isfinite(residuals.residual_mm)])
     band = np.abs(residuals.sd_mm[np.isfinite(residuals.sd_mm)])
     if finite.size == 0:
@@ -81,13 +81,13 @@ def _panel(residuals: ResidualSet, axis: int, limit: float) -> str:
     ok = np.isfinite(values)
     rms = math.sqrt(float(np.mean(values[ok] ** 2))) if ok.any() else math.nan
     body = _panel_axes(axis, rms, limit, len(layers))
-    # The lowest layer is drawn lowest, as it lies in the object.
+    # the lowest layer of the object is drawn at the bottom
     for row, layer in enumerate(reversed(layers.tolist())):
         here = ok & (residuals.layer == layer)
         body += _layer_row(values[here], residuals.sd_mm[residuals.layer == layer], TOP + ROW_HEIGHT * (row + 0.5), limit, layer)
     name = AXES[axis]
-    said = f"{residuals.title}: residual along {name} by marker layer, RMS {rms:.2f} mm"
-    return f'<svg viewBox="0 0 {PANEL_WIDTH:.0f} {height:.0f}" role="img" aria-label="{escape(said)}">{body}</svg>'
+    label = f"{residuals.title}: residual along {name} by marker layer, RMS {rms:.2f} mm"
+    return f'<svg viewBox="0 0 {PANEL_WIDTH:.0f} {height:.0f}" role="img" aria-label="{escape(label)}">{body}</svg>'
 
 
 def _across(value: float, limit: float) -> float:
@@ -123,7 +123,7 @@ def _layer_row(values: FloatArray, sd: FloatArray, y: float, limit: float, layer
 
 
 def _spread(values: FloatArray, y: float, limit: float) -> tuple[list[float], list[float]]:
-    """Place dots of nearly the same value at alternating heights, in the same way every time."""
+    """Return positions of the dots, offset vertically in a fixed pattern so that equal values stay visible."""
     order: IntArray = np.argsort(values, kind="stable")
     heights = np.empty(len(values))
     heights[order] = np.array([0.0, 4.5, -4.5, 8.5, -8.5])[np.arange(len(values)) % 5]

@@ -1,6 +1,6 @@
-"""Scenes as the few bytes that the page carries: whole multiples of a length, differences along the steps, gzip.
+"""Compact encoding of scenes for the page: quantised positions, differences along the load steps, gzip.
 
-``viewer-src/src/decode.js`` undoes it.
+``viewer-src/src/decode.js`` is the inverse.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ MARKER_QUANTUM_MM = 0.001
 
 
 def packed_scene(scene: Scene) -> dict[str, object]:
-    """Return a scene as whole numbers.
+    """Return a scene as integers.
 
-    Points become multiples of ``quantum_mm``; along the steps first and second differences are stored, which are small because
-    the motion is smooth. Faces become differences of neighbouring entries. What is not measured is None.
+    Positions become multiples of ``quantum_mm``; along the steps first and second differences are stored, which are small because
+    the motion is smooth. Faces become differences of neighbouring entries. Unmeasured coordinates are None.
     """
-    free = _multiples(scene.free_surface, SURFACE_QUANTUM_MM)
+    reference = _multiples(scene.reference_surface, SURFACE_QUANTUM_MM)
     initial = _multiples(scene.initial_markers, MARKER_QUANTUM_MM)
     surfaces = [_multiples(s.surface, SURFACE_QUANTUM_MM) for s in scene.steps]
     markers = [_multiples(s.markers, MARKER_QUANTUM_MM) for s in scene.steps]
@@ -38,8 +38,8 @@ def packed_scene(scene: Scene) -> dict[str, object]:
         "role": scene.role,
         "quantum_mm": {"surface": SURFACE_QUANTUM_MM, "marker": MARKER_QUANTUM_MM},
         "faces": np.diff(np.asarray(scene.faces, dtype=np.int64).ravel(), prepend=0).tolist(),
-        "free_surface": free.tolist(),
-        "surfaces": _differences(free, surfaces),
+        "reference_surface": reference.tolist(),
+        "surfaces": _differences(reference, surfaces),
         "initial_markers": initial.tolist(),
         "markers": _differences(initial, markers),
         "steps": [
@@ -58,13 +58,13 @@ def packed_scene(scene: Scene) -> dict[str, object]:
 
 
 def packed_scenes(scenes: Sequence[Scene]) -> str:
-    """Return all scenes as base64 of gzip of JSON; the same scenes always give the same text."""
+    """Return all scenes as base64-encoded, gzipped JSON; equal scenes give equal text."""
     text = json.dumps({"scenes": [packed_scene(s) for s in scenes]}, separators=(",", ":"), allow_nan=False, ensure_ascii=False)
     return base64.b64encode(gzip.compress(text.encode(), compresslevel=9, mtime=0)).decode("ascii")
 
 
 def thinned(scene: Scene) -> Scene:
-    """Return the scene with every other step left out, never the first or the last."""
+    """Return the scene without every other load step; the first and the last are kept."""
     steps = scene.steps
     kept = tuple(s for i, s in enumerate(steps) if i % 2 == 0 or i == len(steps) - 1)
     return replace(scene, steps=kept)

@@ -1,4 +1,4 @@
-"""One self-contained HTML page for a result: readable without a network, without naibu, and on a phone."""
+"""Result page as one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def report_html(report: Report, max_bytes: int = MAX_BYTES) -> str:
     Parameters
     ----------
     report : Report
-        What the page shows; lengths in mm.
+        Content of the page; lengths in mm.
     max_bytes : int
-        Limit of the page's size. If it is exceeded, intermediate load steps of the 3-D view are left out (the view interpolates).
+        Largest size of the page, bytes. If it is exceeded, intermediate load steps of the 3-D view are dropped (the view interpolates).
 
     Raises
     ------
     InputError
-        The page is too large even with the free and the fully loaded step alone.
+        The page is too large even with the first and the last load step alone.
     """
     scenes = report.scenes
     while True:
@@ -44,14 +44,14 @@ def report_html(report: Report, max_bytes: int = MAX_BYTES) -> str:
 
 
 def write_report(path: str | os.PathLike[str], report: Report) -> Path:
-    """Write the page of a result; an existing file is replaced only when the new one is complete.
+    """Write the result page; an existing file is replaced only when the new one is complete.
 
     Parameters
     ----------
     path : path-like
-        File to write, usually ``report.html``; its folder is made when it is not there.
+        File to write, usually ``report.html``; its folder is created if needed.
     report : Report
-        What the page shows; lengths in mm.
+        Content of the page; lengths in mm.
 
     Returns
     -------

@@ -1,6 +1,6 @@
-"""What a report shows, as plain frozen records of arrays, text and numbers.
+"""Content of the result page: plain frozen records of arrays, text and numbers.
 
-Lengths are in mm. Residual means predicted minus measured position, everywhere.
+Lengths are in mm. A residual is predicted minus measured position.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from naibu.viewer.tables import Table
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A plate or bar drawn as an upright box: centre and half its extent along x, y, z, mm."""
+    """A plate or bar, drawn as an axis-aligned box: centre and half edge lengths along x, y, z, mm."""
 
     centre_mm: tuple[float, float, float]
     half_size_mm: tuple[float, float, float]
@@ -28,20 +28,20 @@ class Box:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """The model at one load.
+    """The deformed model at one load step.
 
     Attributes
     ----------
     label : str
-        What the reader sees beside the slider, e.g. ``"plate at 43.2 mm"``.
+        Label beside the slider, e.g. ``"plate at 43.2 mm"``.
     load_mm : float
-        How far the load has come, mm.
+        Displacement of the indenter so far, mm.
     surface : ndarray, shape (n, 3)
-        Predicted nodes of the outer surface, mm.
+        Predicted positions of the surface nodes, mm.
     markers : ndarray, shape (k, 3)
-        Predicted markers, mm.
+        Predicted marker positions, mm.
     indenters : tuple of Box
-        Plates or bar at this load; the same number, in the same order, in every step.
+        Plates or bar at this load; the same number and order in every step.
     """
 
     label: str
@@ -53,39 +53,39 @@ class Step:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """One measured state of one experiment as the 3-D view shows it.
+    """One measured state of one experiment, for the 3-D view.
 
     Attributes
     ----------
     name : str
-        Key of the scene, unique in a report.
+        Identifier of the scene, unique in a report.
     experiment, state : str
-        What the reader sees in the selector.
+        Labels in the selector.
     faces : ndarray, shape (f, 3), int
         Triangles of the object's outer surface, wound outwards.
-    free_surface : ndarray, shape (n, 3)
-        Surface nodes in the free state, mm.
+    reference_surface : ndarray, shape (n, 3)
+        Surface nodes in the reference configuration, mm.
     steps : tuple of Step
-        From free to fully loaded; the last one is compared with `measured`.
+        Load steps from unloaded to fully loaded; the last is compared with `measured`.
     marker_ids : ndarray, shape (k,), int
-        Labels.
+        Marker numbers.
     initial_markers : ndarray, shape (k, 3)
-        Markers in the free state, mm.
+        Marker positions in the reference configuration, mm.
     measured : ndarray, shape (k, 3)
-        Markers measured in the loaded state, mm; NaN where a coordinate is not known.
+        Marker positions measured in the loaded state, mm; NaN where a coordinate is unknown.
     sd_mm : ndarray, shape (k,)
-        Standard deviation of a residual along one axis that noise alone would give, mm.
+        Standard deviation of a residual along one axis expected from noise alone, mm.
     layer : ndarray, shape (k,), int
         Number of the marker layer, 0 for the lowest.
     role : str
-        In a word or two whether the state was used, e.g. ``"fitted"`` or ``"predicted unseen"``.
+        Use of the state, in a word or two, e.g. ``"fitted"`` or ``"predicted unseen"``.
     """
 
     name: str
     experiment: str
     state: str
     faces: IntArray
-    free_surface: FloatArray
+    reference_surface: FloatArray
     steps: tuple[Step, ...]
     marker_ids: IntArray
     initial_markers: FloatArray
@@ -97,17 +97,17 @@ class Scene:
     def __post_init__(self) -> None:
         if not self.steps:
             raise InputError(f"scene {self.name!r} has no steps; give at least the fully loaded one")
-        n, k = len(self.free_surface), len(self.marker_ids)
+        n, k = len(self.reference_surface), len(self.marker_ids)
         self._check_shapes(n, k)
         if len(self.faces) and (self.faces.min() < 0 or self.faces.max() >= n):
             raise InputError(
-                f"scene {self.name!r}: faces name nodes {self.faces.min()} to {self.faces.max()}, the surface has 0 to {n - 1}"
+                f"scene {self.name!r}: faces refer to nodes {self.faces.min()} to {self.faces.max()}, the surface has 0 to {n - 1}"
             )
-        if not np.isfinite(self.free_surface).all() or not all(np.isfinite(s.surface).all() for s in self.steps):
+        if not np.isfinite(self.reference_surface).all() or not all(np.isfinite(s.surface).all() for s in self.steps):
             raise InputError(f"scene {self.name!r}: every surface coordinate must be a finite number of mm")
         if not np.isfinite(self.initial_markers).all() or not all(np.isfinite(s.markers).all() for s in self.steps):
             raise InputError(
-                f"scene {self.name!r}: predicted and initial markers must be finite; leave out markers that cannot be predicted"
+                f"scene {self.name!r}: markers of the steps and initial_markers must be finite; omit markers that cannot be predicted"
             )
         if len({len(s.indenters) for s in self.steps}) > 1:
             raise InputError(f"scene {self.name!r}: every step must have the same number of indenters")
@@ -115,7 +115,7 @@ class Scene:
     def _check_shapes(self, n: int, k: int) -> None:
         shapes = {
             "faces": (self.faces, (len(self.faces), 3)),
-            "free_surface": (self.free_surface, (n, 3)),
+            "reference_surface": (self.reference_surface, (n, 3)),
             "initial_markers": (self.initial_markers, (k, 3)),
             "measured": (self.measured, (k, 3)),
             "sd_mm": (self.sd_mm, (k,)),
@@ -141,7 +141,7 @@ class Scene:
 
 @dataclass(frozen=True, slots=True)
 class ParameterRow:
-    """An estimated parameter with its 95 % interval; an infinite or NaN bound means that the data do not bound it."""
+    """An estimated parameter with its 95 % confidence interval; an infinite or NaN limit means that the data do not bound it."""
 
     name: str
     label: str
@@ -154,7 +154,7 @@ class ParameterRow:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Correlation:
-    """Correlation of the parameter estimates: names (p) and matrix (p, p)."""
+    """Correlation matrix (p, p) of the parameter estimates, and their names (p)."""
 
     names: tuple[str, ...]
     matrix: FloatArray
@@ -167,7 +167,7 @@ class Correlation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResidualSet:
-    """Residuals of one state for the plots by marker layer.
+    """Residuals of one state, for the plots by marker layer.
 
     Attributes
     ----------
@@ -176,7 +176,7 @@ class ResidualSet:
     residual_mm : ndarray, shape (k, 3)
         Predicted minus measured, mm; NaN where not measured.
     sd_mm : ndarray, shape (k,)
-        Standard deviation along one axis that noise alone would give, mm.
+        Standard deviation along one axis expected from noise alone, mm.
     layer : ndarray, shape (k,), int
         Marker layer, 0 for the lowest.
     """
@@ -195,26 +195,26 @@ class ResidualSet:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Report:
-    """Everything on one result page, in the order a reader meets it.
+    """Content of one result page, in reading order.
 
     Attributes
     ----------
     title : str
         Heading of the page.
     headline : tuple of str
-        The result in plain sentences; the first is set larger.
+        The main results in sentences; the first is set larger.
     scenes : tuple of Scene
-        States for the 3-D view; also give the RMS bars under the headline.
+        States for the 3-D view and for the RMS bars below the headline.
     accuracy : Table or None
-        Experiment, state, markers, RMS along x, y, z and in 3-D, in mm and in units of the noise, and the baselines.
+        Experiment, state, markers, RMS along x, y, z and in 3-D, in mm and in noise units, and the baselines.
     residuals : tuple of ResidualSet
-        Plots by layer.
+        Plots by marker layer.
     parameters : tuple of ParameterRow
-        Estimates with intervals; rows of one unit share a scale.
+        Estimates with intervals; rows of one unit have a common scale.
     correlation : Correlation or None
-        Of the estimates.
+        Correlation of the estimates.
     undetermined : tuple of str
-        What the data cannot tell, one sentence each.
+        What the data do not determine, one sentence each.
     tables : tuple of Table
         Further tables, e.g. the comparison of models.
     provenance : mapping
@@ -234,5 +234,5 @@ class Report:
 
 
 def report_json(report: Report, digits: int = 6) -> str:
-    """Return the whole report as JSON text, e.g. to store it beside the page."""
+    """Return the report as JSON text, floats rounded to `digits` significant digits."""
     return json.dumps(jsonable(report, digits), allow_nan=False, ensure_ascii=False)

@@ -1,4 +1,4 @@
-"""Read back a report that `naibu.viewer.result_page.payload.report_json` stored, so that its page can be written again without a solve."""
+"""Reading of reports stored by `naibu.viewer.result_page.payload.report_json`, to rewrite the page without solving again."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from naibu.core.errors import InputError
 from naibu.viewer.result_page.payload import Report
 from naibu.viewer.tables import Cell
 
-# arrays of positions, whose second axis JSON forgets where there are none
-_OF_POINTS = {"faces", "free_surface", "surface", "markers", "initial_markers", "measured", "residual_mm"}
+# arrays of positions, whose second axis is lost in JSON when they are empty
+_OF_POINTS = {"faces", "reference_surface", "surface", "markers", "initial_markers", "measured", "residual_mm"}
 
 
 def report_from_json(text: str) -> Report:
-    """Return the report that `naibu.viewer.result_page.payload.report_json` wrote; null stands for NaN where a number is needed.
+    """Return the report that `naibu.viewer.result_page.payload.report_json` wrote; null becomes NaN where a number is needed.
 
     Raises
     ------
     InputError
-        Not JSON, or not a whole report; the message names the part.
+        Not JSON, or not a complete report; the message names the part.
     """
     try:
         data = json.loads(text)
@@ -36,7 +36,7 @@ def report_from_json(text: str) -> Report:
 
 
 def _record(kind: Any, data: object, where: str) -> Any:
-    """Return the record `kind`, every field of which must be in `data`."""
+    """Return the record of type `kind`, every field of which must be in `data`."""
     hints = get_type_hints(kind)
     names = [f.name for f in fields(kind)]
     if not isinstance(data, Mapping) or set(data) != set(names):
@@ -45,7 +45,7 @@ def _record(kind: Any, data: object, where: str) -> Any:
 
 
 def _value(kind: Any, data: Any, where: str) -> Any:
-    """Return what stands in a field of type `kind`."""
+    """Return the value of a field of type `kind`."""
     if kind == Cell or get_origin(kind) is Mapping:
         return data
     if get_origin(kind) in (UnionType, Union):
