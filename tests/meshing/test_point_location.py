@@ -108,7 +108,7 @@ def test_bad_points_are_named():
     mesh = box((1, 1, 1), (1, 1, 1))
     with pytest.raises(InputError, match="shape"):
         locate(mesh, [0, 0, 0])
-    with pytest.raises(InputError, match="point 1 is"):
+    with pytest.raises(InputError, match=r"points_mm\[1, 1\] is nan"):
         locate(mesh, [[0, 0, 0], [0, np.nan, 0]])
     assert locate(mesh, np.zeros((0, 3))).weights.shape == (0, 8)
 

@@ -61,7 +61,7 @@ def test_curved_quadratic_volume_is_exact():
 def test_the_first_inverted_cell_is_named(cell_type):
     mesh = MESHES[cell_type]
     mirrored = mesh.moved(mesh.points * [-1, 1, 1] - mesh.points)
-    with pytest.raises(InputError, match=r"cell 0 of .* inside out"):
+    with pytest.raises(InputError, match=r"cell 0 of .* inverted"):
         check(mirrored)
 
 

@@ -1,4 +1,4 @@
-"""A grid wrapped in shells: how round solids are meshed with hexahedra and no degenerate cell (an O-grid)."""
+"""O-grids: hexahedral meshes of round solids, a core grid wrapped in shells without degenerate cells."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from naibu.meshing.surface import faces_of_cells
 
 _EDGES = np.array([[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]])
 
-# Sweeps without a better worst cell after which smoothing has done what it can.
+# Sweeps without improvement of the worst cell after which smoothing stops.
 _PATIENCE = 8
 
 
@@ -27,9 +27,9 @@ class WrappedGrid:
     cells : ndarray, shape (m, 8), int64
         Core cells, then shell by shell.
     owner : ndarray, shape (m,), int64
-        The core cell under every cell.
+        The core cell beneath every cell.
     base : ndarray, shape (n,), int64
-        The core node under every node.
+        The core node beneath every node.
     shell : ndarray, shape (n,), int64
         Number of the shell of every node; 0 in the core.
     """
@@ -41,14 +41,14 @@ class WrappedGrid:
 
 
 def wrapped(core: IntArray, bare: BoolArray, n_shells: int) -> WrappedGrid:
-    """Extrude the outside of a hexahedral core, where not all nodes of a face are `bare`, by `n_shells` layers of cells.
+    """Extrude the boundary of a hexahedral core by `n_shells` layers of cells, except the faces all of whose nodes are `bare`.
 
     Parameters
     ----------
     core : ndarray, shape (m, 8), int64
         Cells of the core.
     bare : ndarray, shape (s, n), bool
-        One row for each side that stays uncovered: the core nodes on it.
+        One row for each side without shells: the core nodes on it.
     n_shells : int
         Number of shells.
     """
@@ -70,12 +70,12 @@ def wrapped(core: IntArray, bare: BoolArray, n_shells: int) -> WrappedGrid:
 
 
 def round_positions(cube: FloatArray, shell: IntArray, core: float, bulge: float) -> FloatArray:
-    """Place the nodes of a wrapped grid in the unit ball (or disc).
+    """Return the positions of the nodes of a wrapped grid in the unit ball (or disc).
 
     Parameters
     ----------
     cube : ndarray, shape (n, d)
-        Position in [-1, 1]^d of the core node under every node.
+        Position in [-1, 1]^d of the core node beneath every node.
     shell : ndarray, shape (n,)
         Shell of every node, 0 in the core; the last shell is the sphere.
     core : float
@@ -95,7 +95,7 @@ def round_positions(cube: FloatArray, shell: IntArray, core: float, bulge: float
 
 
 def smoothed(points: FloatArray, cells: IntArray, free: BoolArray, *, sweeps: int = 60) -> FloatArray:
-    """Move nodes towards the mean of their neighbours for as long as the worst cell gets better.
+    """Laplacian smoothing: move nodes towards the mean of their neighbours while the worst cell improves.
 
     Parameters
     ----------
@@ -106,12 +106,12 @@ def smoothed(points: FloatArray, cells: IntArray, free: BoolArray, *, sweeps: in
     free : ndarray, shape (n, 3), bool
         Coordinates that may change.
     sweeps : int
-        Most sweeps tried.
+        Maximum number of sweeps.
 
     Returns
     -------
     ndarray, shape (n, 3)
-        The best positions met; never worse than `points` by the least scaled Jacobian.
+        The best positions found; their smallest scaled Jacobian is not below that of `points`.
     """
     mean = _neighbour_mean(cells, len(points))
     best, best_quality, trial, last = points, _worst(points, cells), points, 0
@@ -126,7 +126,7 @@ def smoothed(points: FloatArray, cells: IntArray, free: BoolArray, *, sweeps: in
 
 
 def _worst(points: FloatArray, cells: IntArray) -> float:
-    """Return the least scaled Jacobian."""
+    """Return the smallest scaled Jacobian."""
     return float(scaled_jacobians(Mesh(points, cells, "hexahedron", np.zeros(len(cells), dtype=np.int64), ("body",))).min())
 
 

@@ -1,5 +1,5 @@
 # mypy: disallow-untyped-decorators=False
-"""Numba kernels behind `naibu.meshing.point_location`: shape functions, their inverse, and the search over bins."""
+"""Numba kernels of point location: shape functions, their inverse by Newton's method, and the search over bins."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def shape(k: int, u: FloatArray, n: FloatArray, dn: FloatArray) -> None:
 
 @njit(cache=True)
 def excess(k: int, u: FloatArray) -> float:
-    """Return by how much the reference point lies outside the cell, as a share of its size; negative inside."""
+    """Return the distance of the reference point from the cell as a fraction of its size; negative inside."""
     if k == 8:
         return float((max(abs(u[0]), abs(u[1]), abs(u[2])) - 1.0) / 2)
     return float(-min(u[0], u[1], u[2], 1.0 - u[0] - u[1] - u[2]))
@@ -57,7 +57,7 @@ def excess(k: int, u: FloatArray) -> float:
 
 @njit(cache=True)
 def clamp(k: int, u: FloatArray, v: FloatArray) -> None:
-    """Fill v with a point of the cell near u: cut off in a cube; in a tetrahedron without its negative barycentric parts."""
+    """Fill v with a point of the cell near u: clipped to the cube, or without the negative barycentric coordinates of a tetrahedron."""
     if k == 8:
         for d in range(3):
             v[d] = min(1.0, max(-1.0, u[d]))
@@ -71,7 +71,7 @@ def clamp(k: int, u: FloatArray, v: FloatArray) -> None:
 
 @njit(cache=True)
 def invert(p: FloatArray, x: FloatArray, u: FloatArray, n: FloatArray, dn: FloatArray) -> bool:
-    """Find by Newton the reference point u of x in the cell with nodes p (k, 3); return whether it converged."""
+    """Find the reference point u of x in the cell with nodes p (k, 3) by Newton's method; return whether it converged."""
     k = p.shape[0]
     u[:] = 0.0 if k == 8 else 0.25
     for _ in range(_MAX_NEWTON):

@@ -1,4 +1,4 @@
-"""Cells made of other cells: hexahedra split into tetrahedra, and tetrahedra given mid-edge nodes."""
+"""Element conversion: hexahedra to tetrahedra, and linear to quadratic tetrahedra."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ TETRA_EDGES = np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]])
 
 
 def split_hexahedra(cells: IntArray) -> IntArray:
-    """Split hexahedra into six tetrahedra each, so that neighbours agree on every shared face.
+    """Split hexahedra into six tetrahedra each, which conform across every shared face :cite:p:`dompierre1999`.
 
-    The diagonal of a face leaves its node of lowest number [1]_, which both neighbours know; the cell is then the cone of its own
-    lowest node over the three faces that do not touch it. On a tensor grid this is Kuhn's triangulation.
+    The diagonal of a face starts at its node of lowest number, which is the same for both neighbours; the cell is then the cone of its own
+    lowest node over the three faces that do not touch it. On a tensor grid this is Kuhn's triangulation :cite:p:`kuhn1960`.
 
     Parameters
     ----------
@@ -43,11 +43,6 @@ def split_hexahedra(cells: IntArray) -> IntArray:
     -------
     ndarray, shape (6 m, 4), int64
         Tetrahedra, positively oriented where the hexahedra are; cell ``i`` becomes rows ``6 i`` to ``6 i + 5``.
-
-    References
-    ----------
-    .. [1] J. Dompierre et al., "How to subdivide pyramids, prisms and hexahedra into tetrahedra", 8th International Meshing
-       Roundtable, 1999.
     """
     turned = np.take_along_axis(cells, _TURNS[cells.argmin(axis=1)], axis=1)
     faces = turned[:, _FAR_FACES]
@@ -58,7 +53,7 @@ def split_hexahedra(cells: IntArray) -> IntArray:
 
 
 def to_tetra(mesh: Mesh) -> Mesh:
-    """Return a hexahedral mesh as linear tetrahedra on the same nodes (six a cell); a tetrahedral mesh comes back as it is.
+    """Return a hexahedral mesh as linear tetrahedra on the same nodes (six a cell), or a tetrahedral mesh unchanged.
 
     Parameters
     ----------

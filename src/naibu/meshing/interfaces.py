@@ -1,4 +1,4 @@
-"""Interfaces where the two sides of a mesh may slide or open."""
+"""Interfaces with duplicated nodes, at which the two sides of a mesh may slide or separate."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from naibu.core.mesh import Mesh
 
 
 def split_at_plane(mesh: Mesh, z_mm: float, *, tolerance_mm: float | None = None) -> tuple[Mesh, IntArray]:
-    """Cut a mesh along a horizontal plane of nodes, so that what lies above has nodes of its own.
+    """Split a mesh along a horizontal plane of nodes; the cells above get nodes of their own.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def split_at_plane(mesh: Mesh, z_mm: float, *, tolerance_mm: float | None = None
     split : Mesh
         The n points of `mesh`, then one copy for every node of the plane. Cells below keep their nodes; cells above use the copies.
     pairs : ndarray, shape (k, 2), int64
-        Nodes that were one: lower, upper.
+        Coinciding nodes: lower, upper.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Where points lie in a mesh, and the operator that interpolates nodal values at them."""
+"""Point location in a mesh, and the interpolation operator of nodal values at points."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.arrays import FloatArray, IntArray, as_points
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.meshing._point_location_kernels import count_bins, list_bins, search_bins, search_nearest, weights_at
 from naibu.meshing.quality import mean_edge_length
 
-# A point this share of a cell outside it still counts as inside: rounding must not open gaps between neighbours.
+# A point outside a cell by this fraction of its size still counts as inside: rounding must not open gaps between neighbours.
 _SLACK = 1e-9
-# Nodes near a point outside whose cells are tried for the nearest one.
+# Nearest nodes of a point outside the mesh whose cells are candidates.
 _NEAR_NODES = 8
 _BLOCK = 256  # points located at a time
-# Most bins a cell of the search grid may cost: bounds memory on slender meshes.
+# Bins of the search grid for each cell at most: bounds memory on slender meshes.
 _BINS_PER_CELL = 2.0
 
 
 class Location(NamedTuple):
-    """Where n points lie in a mesh of k-node cells.
+    """Cells and shape functions of n points in a mesh of k-node cells.
 
     Attributes
     ----------
     cells : ndarray, shape (n,), int64
-        The cell around every point, or the nearest one.
+        The cell that contains every point, or the nearest one.
     weights : ndarray, shape (n, k)
         Shape functions of the cell's nodes at the point; they sum to 1.
     distance_mm : ndarray, shape (n,)
@@ -43,7 +43,7 @@ class Location(NamedTuple):
 
 
 def locate(mesh: Mesh, points_mm: ArrayLike, *, tolerance_mm: float | None = None) -> Location:
-    """Find the cell around every point and its shape functions there.
+    """Find the cell that contains every point, and its shape functions there.
 
     Parameters
     ----------
@@ -52,8 +52,8 @@ def locate(mesh: Mesh, points_mm: ArrayLike, *, tolerance_mm: float | None = Non
     points_mm : array_like, shape (n, d)
         Points, mm.
     tolerance_mm : float, optional
-        How far outside a point may lie; it is then extrapolated from the nearest cell, so that linear fields stay exact. Default: a tenth
-        of the mean edge, enough for points between a curved body and its facets.
+        Largest distance of a point outside the mesh; values there are extrapolated from the nearest cell, which is exact for linear fields.
+        Default: a tenth of the mean edge length, enough for points between a curved body and its facets.
 
     Returns
     -------
@@ -63,7 +63,7 @@ def locate(mesh: Mesh, points_mm: ArrayLike, *, tolerance_mm: float | None = Non
     Raises
     ------
     InputError
-        Points that are not (n, d) finite numbers, or that lie farther outside than the tolerance: they are listed.
+        Points that are not (n, d) finite numbers, or that lie farther outside than the tolerance: the message lists them.
     """
     points = _checked(points_mm, mesh.dimension)
     if mesh.dimension < 3:
@@ -81,7 +81,7 @@ def locate(mesh: Mesh, points_mm: ArrayLike, *, tolerance_mm: float | None = Non
 
 
 def interpolation_operator(mesh: Mesh, points_mm: ArrayLike, *, tolerance_mm: float | None = None) -> csr_array:
-    """Return the sparse matrix that takes nodal values to values at points.
+    """Return the sparse interpolation matrix from nodal values to values at points.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def interpolation_operator(mesh: Mesh, points_mm: ArrayLike, *, tolerance_mm: fl
 
 
 def operator_of(mesh: Mesh, location: Location) -> csr_array:
-    """Return the interpolation matrix (n, mesh.n_points) of points that are located already."""
+    """Return the interpolation matrix (n, mesh.n_points) of located points."""
     n, k = location.weights.shape
     columns = mesh.cells[location.cells].ravel()
     operator = csr_array((location.weights.ravel(), columns, np.arange(0, n * k + 1, k)), shape=(n, mesh.n_points))
@@ -111,7 +111,7 @@ def operator_of(mesh: Mesh, location: Location) -> csr_array:
 
 
 def _in_simplices(mesh: Mesh, points: FloatArray, tolerance_mm: float | None) -> Location:
-    """Locate points among triangles or lines: all against all, a block of points at a time, for such meshes are small."""
+    """Locate points among triangles or lines: by brute force, a block of points at a time, as such meshes are small."""
     corners = mesh.points[mesh.cells]
     inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1])
     edge = float(np.abs(corners[:, 1:] - corners[:, :1]).max(axis=2).mean())
@@ -119,9 +119,9 @@ def _in_simplices(mesh: Mesh, points: FloatArray, tolerance_mm: float | None) ->
     for start in range(0, len(points), _BLOCK):
         here = points[start : start + _BLOCK]
         inner = np.einsum("pmd,mdk->pmk", here[:, None] - corners[None, :, 0], inverse)
-        shares = np.concatenate([1.0 - inner.sum(axis=2, keepdims=True), inner], axis=2)
-        cell = shares.min(axis=2).argmax(axis=1)
-        found[start : start + _BLOCK], weights[start : start + _BLOCK] = cell, shares[np.arange(len(here)), cell]
+        barycentric = np.concatenate([1.0 - inner.sum(axis=2, keepdims=True), inner], axis=2)
+        cell = barycentric.min(axis=2).argmax(axis=1)
+        found[start : start + _BLOCK], weights[start : start + _BLOCK] = cell, barycentric[np.arange(len(here)), cell]
     inside = np.clip(weights, 0.0, None)
     nearest = np.einsum("pk,pkd->pd", inside / inside.sum(axis=1, keepdims=True), corners[found])
     distance = np.where(weights.min(axis=1) < -_SLACK, np.linalg.norm(points - nearest, axis=1), 0.0)
@@ -131,16 +131,11 @@ def _in_simplices(mesh: Mesh, points: FloatArray, tolerance_mm: float | None) ->
 
 def _checked(points_mm: ArrayLike, dimension: int) -> FloatArray:
     """Return the points as (n, d) floats."""
-    points = np.ascontiguousarray(points_mm, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != dimension:
-        raise InputError(f"points to locate must have shape (n, {dimension}), not {points.shape}")
-    if len(bad := np.flatnonzero(~np.isfinite(points).all(axis=1))):
-        raise InputError(f"point {int(bad[0])} is {points[bad[0]].tolist()} ({len(bad)} such points); leave unseen points out")
-    return points
+    return np.ascontiguousarray(as_points("points_mm", points_mm, dimension))
 
 
 def _search(mesh: Mesh, points: FloatArray, found: IntArray, local: FloatArray) -> None:
-    """Fill `found` and `local` for the points inside, by way of a grid of bins that lists the cells touching each."""
+    """Fill `found` and `local` for the points inside, by a grid of bins that lists the cells touching each bin."""
     corners = mesh.points[mesh.cells]
     low, high = corners.min(axis=1), corners.max(axis=1)
     # Edges of quadratic cells may bulge a little out of the box of their nodes.
@@ -169,8 +164,8 @@ def _nearest(mesh: Mesh, points: FloatArray) -> tuple[IntArray, FloatArray, Floa
     _, near = cKDTree(mesh.points[used]).query(points, k=min(_NEAR_NODES, len(used)))
     incidence = csr_array((np.ones(n * k), (order.ravel(), np.repeat(np.arange(n), k))), shape=(len(used), n))
     near = near.reshape(len(points), -1)
-    asked = csr_array((np.ones(near.size), near.ravel(), np.arange(0, near.size + 1, near.shape[1])), shape=(len(points), len(used)))
-    around = (asked @ incidence).tocsr()
+    query = csr_array((np.ones(near.size), near.ravel(), np.arange(0, near.size + 1, near.shape[1])), shape=(len(points), len(used)))
+    around = (query @ incidence).tocsr()
     found, local, distance = np.zeros(len(points), dtype=np.int64), np.zeros((len(points), 3)), np.zeros(len(points))
     search_nearest(mesh.points, mesh.cells, points, around.indices.astype(np.int64), around.indptr.astype(np.int64), found, local, distance)
     return found, local, distance

@@ -1,4 +1,4 @@
-"""Meshes of simple solids made from their measures: boxes, layered boxes, half ellipsoids, hemispheres and cylinders."""
+"""Meshes of simple solids from their dimensions: boxes, layered boxes, half ellipsoids, hemispheres and cylinders."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from naibu.meshing._o_grid import round_positions, smoothed, wrapped
 from naibu.meshing.element_conversion import to_tetra
 
 _AXES = ("x", "y", "z")
-# Half width and bulge of the core of round solids: the best least scaled Jacobian over half ellipsoids of ratios 1 to 4.
+# Half width and bulge of the core of round solids: they maximise the smallest scaled Jacobian of half ellipsoids of ratios 1 to 4.
 _CORE, _BULGE = 0.5, 0.7
-# Half the cells of the core's side for one cell size of radius: makes the cells of the core a bit smaller than asked, the outermost larger.
+# Half the cells of the core's side for one cell size of radius: cells are slightly smaller than requested in the core, larger outside.
 _CORE_CELLS = 0.6
 
 
 def box_from_coordinates(
     x: ArrayLike, y: ArrayLike, z: ArrayLike, *, cell_type: str = "hexahedron", region_of_slab: Sequence[str] | None = None
 ) -> Mesh:
-    """Mesh the box spanned by the given coordinates, one node at each of their combinations.
+    """Mesh a box with given coordinates of its grid lines.
 
     Parameters
     ----------
     x, y, z : array_like, shape (nx,), (ny,), (nz,)
         Strictly increasing node coordinates, mm.
     cell_type : {"hexahedron", "tetra"}
-        ``"tetra"`` splits every cell into Kuhn's six tetrahedra, which conform between cells.
+        ``"tetra"`` splits every cell into Kuhn's six tetrahedra, which conform across cells :cite:p:`kuhn1960`.
     region_of_slab : sequence of str, length nz - 1, optional
         Region name of every slab of cells, from the lowest z up. Names may repeat. Default: one region, ``"body"``.
 
@@ -115,7 +115,7 @@ def half_ellipsoid(size_mm: Sequence[float], element_size_mm: float, *, cell_typ
     size_mm : sequence of 3 floats
         Full extent along x, full extent along y, and height, mm.
     element_size_mm : float
-        Size of the cells aimed at, mm.
+        Target size of the cells, mm.
     cell_type : {"hexahedron", "tetra"}
         ``"tetra"`` splits every hexahedron into six.
 
@@ -168,9 +168,9 @@ def cylinder(
     Parameters
     ----------
     diameter_mm, height_mm : float
-        Measures of the cylinder, mm.
+        Dimensions of the cylinder, mm.
     element_size_mm : float
-        Size of the cells aimed at, mm.
+        Target size of the cells, mm.
     layers : sequence of (name, thickness), optional
         Regions from the base up, with their thickness, mm; they must add up to the height. Default: one region, ``"body"``.
     grading : float
@@ -216,14 +216,14 @@ def grid_cells(nx: int, ny: int, nz: int) -> IntArray:
 
 
 def _as_type(mesh: Mesh, cell_type: str) -> Mesh:
-    """Return the hexahedral mesh as cells of the type asked for."""
+    """Return the hexahedral mesh as cells of the requested type."""
     if cell_type not in ("hexahedron", "tetra"):
         raise InputError(f"cell_type is {cell_type!r}; use 'hexahedron' or 'tetra' (and to_quadratic for 'tetra10')")
     return to_tetra(mesh) if cell_type == "tetra" else mesh
 
 
 def _checked_coordinates(name: str, values: ArrayLike) -> FloatArray:
-    """Return one axis of node coordinates as floats, refusing what cannot make cells."""
+    """Return one axis of node coordinates as floats, after checks."""
     axis = np.asarray(values, dtype=np.float64)
     if axis.ndim != 1 or len(axis) < 2:
         raise InputError(f"{name} coordinates have shape {axis.shape}; give at least two values in one row")
@@ -290,7 +290,7 @@ def _graded(name: str, low: float, high: float, count: float, ratio: float, brea
     """Return node coordinates from `low` to `high` that meet every break, with cells `ratio` times smaller at the ends."""
     inner = np.unique(np.asarray(breaks, dtype=np.float64))
     inner = inner[(np.abs(inner - low) > 1e-9 * scale) & (np.abs(inner - high) > 1e-9 * scale)]
-    # Two breaks told with different rounding (a layer's top and a bar's edge) are one.
+    # Two breaks that differ by rounding (the top of a layer and the edge of a bar) are one.
     inner = inner[np.diff(inner, prepend=-np.inf) > 1e-9 * scale]
     if len(inner) and not (low < inner[0] and inner[-1] < high):
         raise InputError(f"breaks along {name} are {inner.tolist()} mm, but the box reaches from {low:g} to {high:g} mm")
@@ -299,10 +299,10 @@ def _graded(name: str, low: float, high: float, count: float, ratio: float, brea
     rate = np.log(ratio)
     u = 2 * (knots - low) / (high - low) - 1
     s = u if abs(rate) < 1e-9 else -np.sign(u) * np.log1p(-np.abs(u) * -np.expm1(-rate)) / rate
-    shares = np.maximum(np.floor(np.diff(s) / 2 * count + 0.5 + 1e-9), 1).astype(int)
-    parts = [np.linspace(s[i], s[i + 1], n, endpoint=False) for i, n in enumerate(shares)]
+    cells = np.maximum(np.floor(np.diff(s) / 2 * count + 0.5 + 1e-9), 1).astype(int)
+    parts = [np.linspace(s[i], s[i + 1], n, endpoint=False) for i, n in enumerate(cells)]
     s_nodes = np.concatenate([*parts, [1.0]])
     u_nodes = s_nodes if abs(rate) < 1e-9 else np.sign(s_nodes) * np.expm1(-rate * np.abs(s_nodes)) / np.expm1(-rate)
     nodes = low + (u_nodes + 1) / 2 * (high - low)
-    nodes[np.concatenate([[0], np.cumsum(shares)])] = knots
+    nodes[np.concatenate([[0], np.cumsum(cells)])] = knots
     return np.asarray(nodes, dtype=np.float64)

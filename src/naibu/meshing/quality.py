@@ -1,4 +1,4 @@
-"""Measures of how good a mesh is, and the check that stops a bad one before a solver meets it."""
+"""Mesh quality: volumes, Jacobians, aspect ratios and a check for cells that no solver can use."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TETRA_WEIGHTS = np.array([-0.8, 0.45, 0.45, 0.45, 0.45])
 
 
 def signed_volumes(mesh: Mesh) -> FloatArray:
-    """Return the volume (m,) of every cell, mm^3, exact for its shape functions; negative where the cell is turned inside out."""
+    """Return the volume (m,) of every cell, mm^3, exact for its shape functions; negative for inverted cells."""
     if mesh.cell_type == "tetra":
         p = mesh.points[mesh.cells]
         return np.asarray(np.linalg.det(p[:, 1:] - p[:, :1]) / 6, dtype=np.float64)
@@ -46,13 +46,8 @@ def min_jacobians(mesh: Mesh) -> FloatArray:
 def scaled_jacobians(mesh: Mesh) -> FloatArray:
     """Return the scaled Jacobian (m,) of every cell: 1 is a cube or a regular tetrahedron, 0 a flat cell, negative an inverted one.
 
-    The least triple product of the unit edges at a corner [1]_, times the square root of 2 for tetrahedra. Quadratic tetrahedra are
-    judged by their corners.
-
-    References
-    ----------
-    .. [1] P. M. Knupp, "Achieving finite element mesh quality via optimization of the Jacobian matrix norm and associated
-       quantities, part II", Int. J. Numer. Meth. Engng 48, 2000.
+    The smallest triple product of the unit edges at a corner :cite:p:`knupp2000`, times the square root of 2 for tetrahedra. Quadratic
+    tetrahedra are assessed by their corners.
     """
     kind, corners = _linear_part(mesh)
     p = mesh.points[corners]
@@ -89,7 +84,7 @@ def unused_nodes(mesh: Mesh) -> IntArray:
 def duplicate_points(mesh: Mesh, *, tolerance_mm: float | None = None) -> IntArray:
     """Return the pairs (k, 2) of nodes that lie within `tolerance_mm` of each other (default: 1e-9 of the diagonal of the mesh).
 
-    Sliding interfaces have them on purpose; elsewhere they are a crack.
+    Sliding interfaces have them on purpose; elsewhere they are cracks.
     """
     limit = 1e-9 * float(np.linalg.norm(np.ptp(mesh.points, axis=0))) if tolerance_mm is None else tolerance_mm
     pairs = cKDTree(mesh.points).query_pairs(limit, output_type="ndarray")
@@ -97,14 +92,14 @@ def duplicate_points(mesh: Mesh, *, tolerance_mm: float | None = None) -> IntArr
 
 
 def check(mesh: Mesh, *, min_scaled_jacobian: float = 1e-6) -> None:
-    """Refuse a mesh that no solver can use.
+    """Check that a mesh has no inverted, flat or unused parts.
 
     Parameters
     ----------
     mesh : Mesh
         Any mesh.
     min_scaled_jacobian : float
-        Cells below this are flat.
+        Cells below this value are flat.
 
     Raises
     ------
@@ -115,11 +110,11 @@ def check(mesh: Mesh, *, min_scaled_jacobian: float = 1e-6) -> None:
     bad = np.flatnonzero(~((jacobians > 0) & (scaled >= min_scaled_jacobian)))
     if len(bad):
         i = int(bad[0])
-        what = "turned inside out" if jacobians[i] < 0 else "flat"
+        what = "inverted" if jacobians[i] < 0 else "flat"
         raise InputError(
             f"cell {i} of {mesh.n_cells} ({mesh.cell_type}, nodes {mesh.cells[i].tolist()}) is {what}: its smallest Jacobian is "
             f"{jacobians[i]:.3g} mm^3 and its scaled Jacobian {scaled[i]:.3g} ({len(bad)} such cells); number its nodes in VTK order "
-            "or mesh that place again"
+            "or remesh that region"
         )
     if len(unused := unused_nodes(mesh)):
         raise InputError(f"no cell uses node {int(unused[0])} ({len(unused)} such nodes); remove the nodes that belong to no cell")

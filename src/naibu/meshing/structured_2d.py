@@ -1,4 +1,4 @@
-"""Meshes of lines and triangles: an interval, and a rectangle whose cells are cut along diagonals (spec M5, I4, P1)."""
+"""Structured meshes in one and two dimensions: intervals of lines, and rectangles of triangles."""
 
 from __future__ import annotations
 
@@ -34,22 +34,22 @@ def rectangle(size_mm: Sequence[float], divisions: Sequence[int], *, diagonals: 
     size_mm : sequence of 2 floats
         Width and height, mm.
     divisions : sequence of 2 ints
-        Cells across and upwards; each is cut into two triangles.
+        Cells across and upwards; each is split into two triangles.
     diagonals : {"alternating", "one_way"}
-        Diagonals of neighbouring cells in turn one way and the other, or all from lower left to upper right.
+        Diagonals that alternate between neighbouring cells, or all from lower left to upper right.
     centred : bool
         Whether x = 0 is the middle or the left side.
 
     Raises
     ------
     InputError
-        A size or a number of divisions that is not positive, or another word for `diagonals`.
+        A size or a number of divisions that is not positive, or an unknown value of `diagonals`.
     """
     (width, height), (nx, ny) = size_mm, divisions
     if not (np.isfinite([width, height]).all() and min(width, height) > 0.0) or min(nx, ny) < 1:
         raise InputError(f"a rectangle needs positive sizes and divisions, not {list(size_mm)} mm in {list(divisions)}")
     if diagonals not in DIAGONALS:
-        raise InputError(f"diagonals are {' or '.join(map(repr, DIAGONALS))}, not {diagonals!r}")
+        raise InputError(f"diagonals must be {' or '.join(map(repr, DIAGONALS))}, not {diagonals!r}")
     x = np.linspace(0.0, width, nx + 1) - (0.5 * width if centred else 0.0)
     gx, gy = np.meshgrid(x, np.linspace(0.0, height, ny + 1))
     i, j = (a.ravel() for a in np.meshgrid(np.arange(nx), np.arange(ny)))

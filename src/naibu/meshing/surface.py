@@ -1,4 +1,4 @@
-"""The boundary of a mesh: its faces, the area that belongs to every node, and selections by plane and by direction."""
+"""The boundary of a mesh: faces, tributary areas of nodes, and selection by plane and by direction."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def faces_of_cells(cells: IntArray, cell_type: str) -> Boundary:
     counts = np.diff(np.concatenate([starts, [len(faces)]]))
     if counts.max() > 2:
         bad = keys[order[starts[counts.argmax()]]]
-        raise InputError(f"{counts.max()} cells share the face with nodes {bad.tolist()}; at most two can: remove the doubled cells")
+        raise InputError(f"{counts.max()} cells share the face with nodes {bad.tolist()}; at most two can: remove duplicate cells")
     single = np.sort(order[starts[counts == 1]])
     return Boundary(faces[single], (single // len(local)).astype(np.int64))
 
@@ -111,12 +111,12 @@ def node_areas(mesh: Mesh, faces: IntArray | None = None) -> FloatArray:
     """
     faces = boundary_faces(mesh).faces if faces is None else faces
     if faces.shape[1] == 4:
-        shares = _quad_shares(mesh.points[faces])
+        parts = _quad_areas(mesh.points[faces])
     else:
         area = np.linalg.norm(face_normals(mesh.points, faces), axis=1)
         weights = np.full(3, 1 / 3) if faces.shape[1] == 3 else np.repeat([0, 1 / 3], 3)
-        shares = area[:, None] * weights
-    return np.asarray(np.bincount(faces.ravel(), weights=shares.ravel(), minlength=mesh.n_points), dtype=np.float64)
+        parts = area[:, None] * weights
+    return np.asarray(np.bincount(faces.ravel(), weights=parts.ravel(), minlength=mesh.n_points), dtype=np.float64)
 
 
 def nodes_on_plane(mesh: Mesh, point_mm: ArrayLike, normal: ArrayLike, *, tolerance_mm: float | None = None) -> IntArray:
@@ -163,7 +163,7 @@ def side_nodes(mesh: Mesh, side: str, *, tolerance_mm: float | None = None) -> I
     Raises
     ------
     InputError
-        `side` is not one of the six names.
+        Another value of `side`.
     """
     if side not in _SIDES:
         raise InputError(f"side is {side!r}; use one of {sorted(_SIDES)}")
@@ -204,13 +204,13 @@ def _unit(vector: ArrayLike) -> FloatArray:
     return array / length
 
 
-def _quad_shares(p: FloatArray) -> FloatArray:
+def _quad_areas(p: FloatArray) -> FloatArray:
     """Return the integral (f, 4) of each bilinear shape function over quadrilaterals p (f, 4, 3), by 2 x 2 Gauss points."""
     signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=np.float64)
-    shares = np.zeros(p.shape[:2])
+    parts = np.zeros(p.shape[:2])
     for r, s in signs * _GAUSS:
         shape = (1 + r * signs[:, 0]) * (1 + s * signs[:, 1]) / 4
         along_r = np.einsum("i,fix->fx", signs[:, 0] * (1 + s * signs[:, 1]) / 4, p)
         along_s = np.einsum("i,fix->fx", signs[:, 1] * (1 + r * signs[:, 0]) / 4, p)
-        shares += np.linalg.norm(np.cross(along_r, along_s), axis=1)[:, None] * shape
-    return shares
+        parts += np.linalg.norm(np.cross(along_r, along_s), axis=1)[:, None] * shape
+    return parts

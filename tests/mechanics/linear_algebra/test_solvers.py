@@ -101,7 +101,7 @@ def test_singular_systems_are_refused(symmetric):
         for matrix in (free, loose):
             if isinstance(solver, SuperLUSolver) and matrix is free:
                 continue  # its last pivot is rounding, not zero
-            with pytest.raises(ConvergenceError, match=r"singular.*held"):
+            with pytest.raises(ConvergenceError, match=r"singular.*constrained"):
                 solver.factorize(matrix)
         constrained = stiffness()
         np.testing.assert_allclose(constrained @ solver.factorize(constrained).solve(np.ones(constrained.shape[0])), 1, atol=1e-9)
@@ -122,7 +122,7 @@ def test_multigrid_agrees_with_direct_solvers_also_with_an_aged_hierarchy():
 def test_multigrid_says_when_it_does_not_converge():
     mesh, constrained = body(9)
     matrix = stiffness(constrained=constrained, mesh=mesh)
-    with pytest.raises(ConvergenceError, match="in 2 iterations"):
+    with pytest.raises(ConvergenceError, match="in 2 CG iterations"):
         MultigridSolver(mesh.points, constrained, max_iterations=2).factorize(matrix).solve(np.ones(matrix.shape[0]))
 
 
@@ -208,7 +208,7 @@ def test_recycled_cholesky_becomes_direct_where_the_tangent_is_indefinite_and_re
         solver.factorize(first)
         for m in (shifted, matrix):
             assert relative(solver.factorize(m).solve(b), np.linalg.solve(m.toarray(), b)) < 1e-8
-    with pytest.raises(ConvergenceError, match=r"singular.*held"):
+    with pytest.raises(ConvergenceError, match=r"singular.*constrained"):
         RecycledCholesky(matrix).factorize(stiffness(constrained=np.zeros_like(CONSTRAINED), squeeze=0.0)).solve(b)
 
 

@@ -1,4 +1,4 @@
-"""Sparse matrices of 3 x 3 blocks: their pattern from a mesh, and prescribed rows and columns taken out."""
+"""Block sparse matrices: their pattern from a mesh, and the elimination of constrained rows and columns."""
 
 from __future__ import annotations
 
@@ -12,9 +12,16 @@ from naibu.core.arrays import BoolArray, FloatArray, Int32Array, IntArray
 
 
 def with_dirichlet_rows(matrix: sp.bsr_matrix, constrained: BoolArray, anchor_stiffness: float = 0.0) -> sp.bsr_matrix:
-    """Return `matrix` with held rows and columns replaced by a scaled identity, and weak springs on the diagonal.
+    """Return `matrix` with constrained rows and columns replaced by those of a scaled identity.
 
-    Changes the blocks of `matrix` in place.
+    Parameters
+    ----------
+    matrix : bsr_matrix, shape (n d, n d)
+        Changed in place.
+    constrained : ndarray, shape (n, d), bool
+        Constrained components.
+    anchor_stiffness : float
+        Weak springs added to the diagonal of the other components, as a fraction of its mean.
     """
     _set_dirichlet_rows(matrix.indptr, matrix.indices, matrix.data, constrained, anchor_stiffness)
     return matrix
@@ -42,7 +49,7 @@ def _set_dirichlet_rows(indptr, indices, blocks, constrained, anchor_stiffness):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockPattern:
-    """Sparsity of a matrix of d x d blocks, one row of blocks a node.
+    """Sparsity pattern of a matrix of d x d blocks, one row of blocks a node.
 
     Attributes
     ----------
@@ -69,12 +76,12 @@ class BlockPattern:
         return sp.bsr_matrix((blocks, self.indices, self.indptr), shape=(n, n))
 
     def positions(self, connectivity: IntArray) -> Int32Array:
-        """Return (m, k, k): where the block of local nodes (a, b) of every group is stored."""
+        """Return the indices (m, k, k) of the blocks of local nodes (a, b) of all groups (m, k)."""
         return np.asarray(_block_positions(self.indptr, self.indices, connectivity))
 
 
 def block_pattern(n_points: int, *connectivities: IntArray) -> BlockPattern:
-    """Return the pattern in which all nodes of a group couple, for several tables of groups (m, k)."""
+    """Return the pattern in which all nodes of a group are coupled, for one or more tables of groups (m, k)."""
     incidence = []
     for table in connectivities:
         rows = np.repeat(np.arange(len(table)), table.shape[1])

@@ -1,4 +1,4 @@
-"""Direct solvers: PARDISO where MKL is installed, else SuperLU."""
+"""Direct sparse solvers: PARDISO :cite:p:`schenk2004` where oneMKL is installed, else SuperLU :cite:p:`demmel1999`."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from naibu.mechanics.linear_algebra.protocols import Factorization, LinearSolver
 @functools.cache
 def pardiso_library() -> ctypes.CDLL | None:
     """Return the oneMKL runtime library if its wheel is installed, else None."""
-    os.environ.setdefault("KMP_BLOCKTIME", "0")  # idle threads sleep at once instead of spinning beside Numba's
+    os.environ.setdefault("KMP_BLOCKTIME", "0")  # idle threads sleep at once instead of spinning beside those of Numba
     names = ("libmkl_rt.so.3", "libmkl_rt.so.2", "libmkl_rt.so.1", "libmkl_rt.2.dylib", "mkl_rt.3.dll", "mkl_rt.2.dll")
     folders = [Path(sys.prefix) / "lib", Path(sys.prefix) / "Library" / "bin"]
-    try:  # wherever pip put it: a user's own site, a base environment below a virtual one
+    try:  # any place of installation by pip: a user site, a base environment below a virtual one
         files = metadata.files("mkl") or []
         folders += [Path(str(file.locate())).resolve().parent for file in files if file.name in names]
     except metadata.PackageNotFoundError:
@@ -40,14 +40,29 @@ def pardiso_library() -> ctypes.CDLL | None:
 
 
 def use_one_thread() -> None:
-    """Let the direct solver use one thread when called from the present one; for problems solved side by side."""
+    """Restrict the direct solver to one thread when called from the present thread; for problems solved in parallel."""
     library = pardiso_library()
     if library is not None:
         library.MKL_Set_Num_Threads_Local(1)
 
 
 class PardisoSolver:
-    """Supernodal factorization by oneMKL PARDISO; the analysis of the pattern is kept between factorizations."""
+    """Supernodal factorization by oneMKL PARDISO; the symbolic analysis is kept between factorizations.
+
+    Parameters
+    ----------
+    matrix : bsr_matrix, shape (n, n)
+        A matrix with the pattern of those to be factorized.
+    symmetric : bool
+        Whether to use a Cholesky factorization (LDL^T where the matrix turns out indefinite) rather than LU.
+    single_precision : bool
+        Whether to factorize in single precision.
+
+    Raises
+    ------
+    InputError
+        oneMKL is not installed.
+    """
 
     name = "PARDISO (oneMKL)"
 
@@ -96,16 +111,16 @@ class PardisoSolver:
             self._call(11, empty, empty, 1)
             self._analysed = True
         error = self._call(22, empty, empty, 1)
-        if error == -4 and self._type == 2:  # not positive definite: an indefinite factorization serves
+        if error == -4 and self._type == 2:  # not positive definite: use the indefinite factorization
             self._release()
             self._type = -2
             self._set_parameters()
             self._call(11, empty, empty, 1)
             error = self._call(22, empty, empty, 1)
-        perturbed = int(self._parameters[13])  # vanishing pivots, which PARDISO replaces by tiny ones without a word
+        perturbed = int(self._parameters[13])  # vanishing pivots, which PARDISO silently replaces by tiny ones
         if error != 0 or perturbed:
             what = f"PARDISO error {error}, {perturbed} vanishing pivots"
-            raise ConvergenceError(f"the linear system is singular ({what}): is every body held against rigid motion?")
+            raise ConvergenceError(f"the linear system is singular ({what}): are all rigid-body motions constrained?")
         return self
 
     def solve(self, b: FloatArray) -> FloatArray:
@@ -144,7 +159,7 @@ class PardisoSolver:
 
 
 class SuperLUSolver:
-    """SciPy's SuperLU in symmetric mode; needs nothing but SciPy."""
+    """SciPy's SuperLU in symmetric mode."""
 
     name = "SuperLU (SciPy)"
 
@@ -159,7 +174,7 @@ class SuperLUSolver:
         try:
             return spla.splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=1e-3, options={"SymmetricMode": True})
         except RuntimeError as error:
-            raise ConvergenceError(f"the linear system is singular ({error}): is every body held against rigid motion?") from error
+            raise ConvergenceError(f"the linear system is singular ({error}): are all rigid-body motions constrained?") from error
 
 
 def direct_solver(matrix: sp.bsr_matrix, *, symmetric: bool) -> LinearSolver:

@@ -1,4 +1,4 @@
-"""Conjugate gradients preconditioned by an earlier factorization."""
+"""Preconditioned conjugate gradients :cite:p:`hestenes1952` with a preconditioner recycled from an earlier matrix."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from naibu.mechanics.linear_algebra.protocols import Factorization, LinearSolver
 
 
 class RecyclingSolver(ABC):
-    """Conjugate gradients with a preconditioner that is kept from an earlier matrix for as long as that is cheaper than a new one.
+    """Conjugate gradients with a recycled preconditioner, kept from an earlier matrix while that is cheaper than a new one.
 
     Parameters
     ----------
     relative_tolerance : float
-        Of the residual of each solve, unless it asks for another.
+        Relative residual of a solve, unless another is given to it.
     max_iterations : int
-        After which a preconditioner is given up.
+        After which a preconditioner is made anew.
     """
 
     name = "CG"
-    iterations_per_build = 12.0  # how many iterations cost as much as a new preconditioner
-    falls_back = False  # on a direct solver where the iteration fails, rather than to say so
+    iterations_per_build = 12.0  # cost of a new preconditioner in iterations
+    falls_back = False  # to a direct solver where the iteration fails, rather than raising
 
     def __init__(self, *, relative_tolerance: float = 1e-8, max_iterations: int = 400) -> None:
         self.tolerance = relative_tolerance
@@ -43,7 +43,7 @@ class RecyclingSolver(ABC):
         """Return a map from residuals (n, r) to corrections made for `matrix`."""
 
     def factorize(self, matrix: sp.bsr_matrix) -> Factorization:
-        """Prepare for `matrix`, keeping what was made for an earlier one while it still serves."""
+        """Prepare for `matrix`, keeping the preconditioner of an earlier one while it is still efficient."""
         if self._rebuild and self._exact is None:
             self._build(matrix)
         return ApproximateFactorization(self, matrix) if self._exact is None else self._exact.factorize(matrix)
@@ -75,19 +75,19 @@ class RecyclingSolver(ABC):
                 digits = max(-np.log10(tolerance), 0.1)
                 self._spent += iterations
                 self._digits += digits
-                # the mean price of a digit since the last build has its minimum where the last digit costs as much as the mean
+                # the mean cost of a digit since the last build is minimal where the last digit costs as much as the mean
                 self._rebuild = iterations / digits > self._spent / self._digits
                 return x
         if not self.falls_back:
             raise ConvergenceError(
-                f"conjugate gradients did not reach {tolerance:g} in {self.max_iterations} iterations; is every body held?"
+                f"no convergence to {tolerance:g} in {self.max_iterations} CG iterations; are all rigid-body motions constrained?"
             )
         self._exact, self._apply = self._exact or direct_solver(matrix, symmetric=True), None
         return self._exact.factorize(matrix).solve(b)
 
 
 class ApproximateFactorization:
-    """A matrix with a preconditioner that may have been made for an earlier one; solves as accurately as asked."""
+    """A matrix with a preconditioner that may stem from an earlier one; solves to the requested accuracy."""
 
     def __init__(self, solver: RecyclingSolver, matrix: sp.bsr_matrix) -> None:
         self._solver, self._matrix = solver, matrix
@@ -103,7 +103,7 @@ def conjugate_gradients(
 ) -> tuple[FloatArray | None, int]:
     """Return the solution (n, r) and the number of iterations; None where they do not converge or something is not positive definite.
 
-    Every right-hand side has its own iteration; those of one call are advanced together.
+    Every right-hand side has its own iteration; all are advanced together.
     """
     x, r = np.zeros_like(b), b.copy()
     target = tolerance * np.linalg.norm(b, axis=0)
@@ -129,7 +129,7 @@ def conjugate_gradients(
 
 
 class RecycledCholesky(RecyclingSolver):
-    """PARDISO in single precision, corrected by conjugate gradients in double precision; one factorization serves several tangents."""
+    """Conjugate gradients in double precision, preconditioned by a single-precision Cholesky factor that serves several tangents."""
 
     name = "CG + PARDISO (oneMKL) in single precision"
     falls_back = True

@@ -1,4 +1,4 @@
-"""What every linear solver offers: factorize once, solve many times."""
+"""Protocols of linear solvers: factorize once, solve many times."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from naibu.core.arrays import FloatArray
 
 
 class Factorization(Protocol):
-    """Something that solves ``A x = b`` for many b."""
+    """A factorized matrix A: solves ``A x = b`` for many b."""
 
     def solve(self, b: FloatArray) -> FloatArray:
         """Return x for b of shape (n,) or (n, r)."""
@@ -18,7 +18,7 @@ class Factorization(Protocol):
 
 
 class LinearSolver(Protocol):
-    """Something that factorizes matrices of one pattern."""
+    """A linear solver for matrices of one sparsity pattern."""
 
     name: str
 
