@@ -15,7 +15,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from naibu.mechanics.contact.contact_surfaces import Friction, rigid_contact
-from naibu.mechanics.contact.penalty_contact import Contact, plane
+from naibu.mechanics.contact.indenter_geometry import plane_geometry
+from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements
@@ -43,7 +44,7 @@ def pressed(coefficient: float) -> Solution:
     def body_of(name: str, normal: tuple[float, float, float], start_mm: float, stop_mm: float) -> Contact:
         path = {"start": (0.0, 0.0, start_mm), "stop": (0.0, 0.0, stop_mm)}
         rub = Friction(coefficient)
-        return rigid_contact(name, mesh.points, faces, plane(normal), **path, friction=rub, normal_stiffness=2e4)
+        return rigid_contact(name, mesh.points, faces, plane_geometry(normal), **path, friction=rub, normal_stiffness=2e4)
 
     contacts = (body_of("table", (0, 0, 1), 0.0, 0.0), body_of("plate", (0, 0, -1), SIDE_MM, PRESSED_MM))
     body = elements(mesh)

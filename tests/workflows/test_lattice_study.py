@@ -17,7 +17,7 @@ from naibu.io.lattice_study_schema import load_study
 from naibu.mechanics.lattices.model.hexahedra import lattice_mesh
 from naibu.mechanics.lattices.model.lattice import classic_lattice
 from naibu.mechanics.lattices.model.octree import octree_lattice
-from naibu.mechanics.lattices.model.surface import hull_of
+from naibu.mechanics.lattices.model.surface import surface_of
 from naibu.validation.specimens.lattice_twin import CUBE_PUSHING, FIRST, SECOND, dough_lattice, dough_parameters
 from naibu.workflows.lattice_study import BASES, NAMED, class_ratios, prepared_study, resampled_mask, study_text
 
@@ -80,7 +80,7 @@ def test_the_hexahedra_fill_the_object(kind: str | int) -> None:
     assert np.linalg.det(edges).sum() == pytest.approx(8.0 * mask.sum())  # positive: VTK's order
     assert (np.linalg.det(edges) > 0.0).all()
     np.testing.assert_allclose(x[:, 6], x[:, 0] + edges.sum(axis=1))
-    assert set(np.unique(hull_of(lattice).triangles)) <= set(np.unique(mesh.cells))
+    assert set(np.unique(surface_of(lattice).triangles)) <= set(np.unique(mesh.cells))
 
 
 @given(

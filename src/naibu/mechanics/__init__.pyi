@@ -1,6 +1,25 @@
 from .contact.contact_surfaces import Friction, interface, rigid_contact
-from .contact.penalty_contact import Contact, RigidSurface, bar, plane
-from .contact.rigid_indenters import RigidIndenter, box_indenter, cylindrical_indenter, spherical_indenter
+from .contact.indenter_geometry import (
+    IndenterGeometry,
+    bar_geometry,
+    box_geometry,
+    capsule_geometry,
+    cylinder_geometry,
+    mesh_geometry,
+    plane_geometry,
+    sphere_geometry,
+)
+from .contact.penalty_contact import Contact
+from .contact.rigid_indenters import (
+    RigidIndenter,
+    bar_indenter,
+    box_indenter,
+    capsule_indenter,
+    cylindrical_indenter,
+    mesh_indenter,
+    plane_indenter,
+    spherical_indenter,
+)
 from .finite_elements.assembly import Assembler, body_force
 from .finite_elements.boundary_conditions import PrescribedDisplacement
 from .finite_elements.elements import Elements, elements
@@ -50,6 +69,7 @@ __all__ = [
     "Elements",
     "Factorization",
     "Friction",
+    "IndenterGeometry",
     "Lattice",
     "LatticeEngine",
     "LatticeParameters",
@@ -73,7 +93,6 @@ __all__ = [
     "RecordedPush",
     "Rheology",
     "RigidIndenter",
-    "RigidSurface",
     "Series",
     "SeriesDerivatives",
     "Solution",
@@ -84,13 +103,18 @@ __all__ = [
     "Support",
     "ViscoelasticSolution",
     "WarpLatticeEngine",
-    "bar",
+    "bar_geometry",
+    "bar_indenter",
     "block_pattern",
     "body_force",
+    "box_geometry",
     "box_indenter",
     "box_mask",
+    "capsule_geometry",
+    "capsule_indenter",
     "choose_solver",
     "classic_lattice",
+    "cylinder_geometry",
     "cylindrical_indenter",
     "direct_solver",
     "elastic",
@@ -103,9 +127,12 @@ __all__ = [
     "law_named",
     "material",
     "maxwell",
+    "mesh_geometry",
+    "mesh_indenter",
     "octree_lattice",
     "per_region",
-    "plane",
+    "plane_geometry",
+    "plane_indenter",
     "push",
     "push_by_force",
     "push_gradient",
@@ -118,6 +145,7 @@ __all__ = [
     "simulate_motion_with_derivatives",
     "simulate_viscoelastic",
     "solve",
+    "sphere_geometry",
     "spherical_indenter",
     "three_element",
     "voigt",

@@ -24,7 +24,7 @@ from naibu.io.files.provenance import sha256
 from naibu.io.files.reading import read_bytes
 from naibu.io.images import read_volume
 from naibu.io.lattice_study_schema import FloorTable, IndenterTable, ObjectTable, StudyFile, load_study
-from naibu.mechanics.contact.rigid_indenters import RigidIndenter, box_indenter, cylindrical_indenter, plane, spherical_indenter
+from naibu.mechanics.contact.rigid_indenters import RigidIndenter, box_indenter, cylindrical_indenter, plane_indenter, spherical_indenter
 from naibu.mechanics.lattices.model.hexahedra import lattice_mesh
 from naibu.mechanics.lattices.model.lattice import CLASSES, Lattice, box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.octree import octree_lattice
@@ -293,7 +293,7 @@ def _surface(table: FloorTable | IndenterTable) -> dict[str, float]:
 def _floor(table: FloorTable, lattice: Lattice) -> StudyBody:
     low, high = lattice.points.min(axis=0), lattice.points.max(axis=0)
     middle = 0.5 * (low + high)
-    ground = plane((middle[0], middle[1], low[2]), **_surface(table))
+    ground = plane_indenter((middle[0], middle[1], low[2]), **_surface(table))
     return StudyBody("floor", ground, tied_until_s=np.inf if table.contact == "sticking" else None)
 
 

@@ -18,9 +18,8 @@ from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.io.files.atomic import write_atomically
 from naibu.io.vtkhdf_series import SeriesFile
-from naibu.mechanics.contact.rigid_indenters import KINDS
 from naibu.mechanics.lattices.model.state import LatticeState
-from naibu.mechanics.lattices.model.surface import hull_of
+from naibu.mechanics.lattices.model.surface import surface_of
 from naibu.mechanics.lattices.simulation.contact import ContactState
 from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy, StudyFrame, StudyState, run_study
 from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, motion_html
@@ -201,7 +200,7 @@ def _plain(value: Any) -> Any:
 
 def _page(prepared: PreparedStudy, series: SeriesFile, state: StudyState) -> MotionPage:
     study = prepared.study
-    triangles = hull_of(study.lattice).triangles
+    triangles = surface_of(study.lattice).triangles
     nodes, faces = np.unique(triangles, return_inverse=True)
     most = max(2, min(PAGE_FRAMES, PAGE_POINTS // len(nodes)))
     frames = np.unique(np.linspace(0, state.frame, min(most, state.frame + 1)).round().astype(int))
@@ -210,7 +209,8 @@ def _page(prepared: PreparedStudy, series: SeriesFile, state: StudyState) -> Mot
     if "stretch" in prepared.settings.output.quantities:
         stretch = np.stack([series.values(ARRAYS["stretch"], int(k))[nodes] for k in frames]).astype(float)
         fields.append(ColourField("mean stretch of the elements, %", 100.0 * stretch, diverging=True))
-    bodies = [RigidShape(b.name, KINDS[b.indenter.kind], np.asarray(b.indenter.size), np.asarray(b.indenter.axes)) for b in study.bodies]
+    shapes = [(b.name, b.indenter.geometry) for b in study.bodies]
+    bodies = [RigidShape(name, shape.name, shape.size, shape.axes) for name, shape in shapes]
     count = state.frame * study.samples
     force = series.rows("force_mN")[:count]
     places = series.rows("place_mm")[frames].reshape(len(frames), len(bodies), 3)

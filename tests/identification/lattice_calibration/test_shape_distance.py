@@ -11,16 +11,17 @@ from scipy.optimize import minimize
 
 from naibu.core.errors import InputError
 from naibu.identification.lattice_calibration.shape_distance import closest_points, force_difference, shape_difference
+from naibu.mechanics.contact.triangle_tree import TriangleTree
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice
 from naibu.mechanics.lattices.model.octree import octree_lattice
-from naibu.mechanics.lattices.model.surface import Hull, hull_of
+from naibu.mechanics.lattices.model.surface import surface_of
 
 Array = NDArray[np.float64]
 
 
-def block() -> tuple[Hull, Array]:
+def block() -> tuple[TriangleTree, Array]:
     lattice = classic_lattice(box_mask((4, 3, 2)), 10.0, density=1e-6)
-    return hull_of(lattice), lattice.points
+    return surface_of(lattice), lattice.points
 
 
 def deformed(points: Array, seed: int, size: float = 1.5) -> Array:
@@ -45,7 +46,7 @@ def test_the_hull_of_a_box_is_closed_and_has_its_volume() -> None:
 @pytest.mark.parametrize("kind", [0, 1, 2])
 def test_octree_lattices_have_the_hull_of_their_cube(kind: int) -> None:
     lattice = octree_lattice(box_mask((8, 8, 8)), 10.0, kind, density=1e-6)
-    hull = hull_of(lattice)
+    hull = surface_of(lattice)
     a, b, c = lattice.points[hull.triangles].transpose(1, 0, 2)
     np.testing.assert_allclose((np.cross(a, b) * c).sum() / 6.0, 80.0**3)
 

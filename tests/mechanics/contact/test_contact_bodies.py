@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from naibu.core.errors import ConvergenceError
 from naibu.core.status import Status
 from naibu.mechanics.contact.contact_surfaces import Friction, interface, rigid_contact
-from naibu.mechanics.contact.penalty_contact import RAMP_MM, STICK, Contact, bar, plane
+from naibu.mechanics.contact.indenter_geometry import bar_geometry, plane_geometry
+from naibu.mechanics.contact.penalty_contact import RAMP_MM, STICK, Contact
 from naibu.mechanics.finite_elements.assembly import body_force
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements
@@ -24,7 +25,7 @@ from naibu.meshing.surface import faces_among, faces_towards, node_areas, side_n
 from naibu.validation.analytic.finite_strain import critical_slope, plate_penetration, uniaxial
 
 K_N, K_T = 2e4, 200.0
-FLAT = plane((0.0, 0.0, -1.0))
+FLAT = plane_geometry((0.0, 0.0, -1.0))
 TILT = Rotation.from_rotvec([0.1, -0.15, 0.05]).as_matrix()
 SIZE = 20.0
 
@@ -36,7 +37,7 @@ def plates(mesh, *, stop, mu_base=STICK, mu_top=STICK, surface=FLAT, start=None,
         "base",
         mesh.points,
         faces_towards(mesh, (0, 0, -1)),
-        plane((0, 0, 1)),
+        plane_geometry((0, 0, 1)),
         start=(0, 0, 0),
         stop=(0, 0, 0),
         friction=Friction(mu_base, stiffness),
@@ -80,7 +81,7 @@ def test_frictionless_compression_is_uniaxial(cell_type):
     assert solution.penetration_mm == pytest.approx(plate_penetration(-state.nominal_stress[2], K_N, RAMP_MM), rel=1e-5)
 
 
-@pytest.mark.parametrize("surface", [FLAT, bar("y", 10.0)], ids=["plate", "bar"])
+@pytest.mark.parametrize("surface", [FLAT, bar_geometry("y", 10.0)], ids=["plate", "bar"])
 @pytest.mark.parametrize("mu", [0.15, STICK], ids=["coulomb", "stick"])
 def test_reactions_balance(surface, mu):
     mesh = block()
@@ -110,7 +111,7 @@ def test_a_body_that_nothing_holds_is_told():
 
 def test_relaxation_ends_in_the_same_equilibrium():
     mesh = block()
-    contacts = plates(mesh, stop=(0.5, 0.0, 0.8 * SIZE), mu_top=0.2, surface=bar("y", 10.0), rotation=TILT, start=(0, 0, SIZE + 2))
+    contacts = plates(mesh, stop=(0.5, 0.0, 0.8 * SIZE), mu_top=0.2, surface=bar_geometry("y", 10.0), rotation=TILT, start=(0, 0, SIZE + 2))
     body = problem(mesh, contacts=contacts)
     solution = solve(body)
     before, after = solution.states[-2:]

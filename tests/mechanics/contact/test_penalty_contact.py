@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from naibu.core.errors import InputError
 from naibu.mechanics.contact.contact_surfaces import Friction, face_quadrature, interface, rigid_contact
-from naibu.mechanics.contact.penalty_contact import RAMP_MM, STICK, Contact, bar, plane
+from naibu.mechanics.contact.indenter_geometry import bar_geometry, plane_geometry
+from naibu.mechanics.contact.penalty_contact import RAMP_MM, STICK, Contact
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.meshing.primitives import box
 from naibu.meshing.surface import face_normals, faces_towards
@@ -16,7 +17,7 @@ from naibu.validation.analytic.finite_strain import plate_penetration
 
 SEED = st.integers(0, 2**32 - 1)
 K_N, K_T = 2e4, 200.0
-FLAT, BAR = plane((0.0, 0.0, -1.0)), bar("y", 12.0, corner_radius_mm=2.0)
+FLAT, BAR = plane_geometry((0.0, 0.0, -1.0)), bar_geometry("y", 12.0, corner_radius_mm=2.0)
 TILT = Rotation.from_rotvec([0.1, -0.15, 0.05]).as_matrix()
 
 
@@ -52,7 +53,7 @@ def distance_to_bar(x, z, half=6.0, radius=2.0):
 def test_gap_to_a_bar_is_its_distance(x, y, z):
     response = points([[x, y, z]], surface=BAR).evaluate(np.zeros((1, 3)), np.zeros((1, 3)), 0.0)
     assert response.gap[0] == pytest.approx(distance_to_bar(np.array([x]), np.array([z]))[0], abs=1e-12)
-    along_x = points([[y, x, z]], surface=bar("x", 12.0, corner_radius_mm=2.0)).evaluate(np.zeros((1, 3)), np.zeros((1, 3)), 0.0)
+    along_x = points([[y, x, z]], surface=bar_geometry("x", 12.0, corner_radius_mm=2.0)).evaluate(np.zeros((1, 3)), np.zeros((1, 3)), 0.0)
     assert along_x.gap[0] == pytest.approx(response.gap[0])
 
 
@@ -183,9 +184,9 @@ def test_bad_contacts_are_refused():
     top = faces_towards(mesh, (0, 0, 1))
     common = {"start": (0, 0, 1), "stop": (0, 0, 1), "friction": Friction()}
     with pytest.raises(InputError, match="normal of a plane"):
-        plane((0, 0, 0))
+        plane_geometry((0, 0, 0))
     with pytest.raises(InputError, match="corner radius"):
-        bar("x", 10.0, corner_radius_mm=6.0)
+        bar_geometry("x", 10.0, corner_radius_mm=6.0)
     with pytest.raises(InputError, match="lid: no faces"):
         rigid_contact("lid", mesh.points, top[:0], FLAT, normal_stiffness=1.0, **common)
     with pytest.raises(InputError, match="lid: the normal stiffness"):

@@ -8,7 +8,8 @@ from builders import GEL, of, problem
 from scipy.spatial.transform import Rotation
 
 from naibu.mechanics.contact.contact_surfaces import Friction, interface, rigid_contact
-from naibu.mechanics.contact.penalty_contact import STICK, Contact, RigidSurface, bar, plane
+from naibu.mechanics.contact.indenter_geometry import IndenterGeometry, bar_geometry, plane_geometry
+from naibu.mechanics.contact.penalty_contact import STICK, Contact
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
 from naibu.mechanics.finite_strain.sensitivities import Direction, sensitivities
 from naibu.mechanics.finite_strain.statics import Solution, solve
@@ -23,7 +24,7 @@ MATERIALS = (GEL, of("neo_hookean", 0.4, 35.0))
 TILT = np.array([0.02, -0.03, 0.01])
 
 
-def pressed(surface: RigidSurface, mu: float, *, joined: bool = True) -> Problem:
+def pressed(surface: IndenterGeometry, mu: float, *, joined: bool = True) -> Problem:
     """Two layers between a table and a tilted plate or bar that also moves sideways."""
     mesh, joints = MESH, []
     if not joined:
@@ -45,7 +46,7 @@ def pressed(surface: RigidSurface, mu: float, *, joined: bool = True) -> Problem
             rotation=rotation,
         )
         for name, side, face, start, stop, rotation in (
-            ("base", -1, plane((0, 0, 1)), (0, 0, 0), (0, 0, 0), None),
+            ("base", -1, plane_geometry((0, 0, 1)), (0, 0, 0), (0, 0, 0), None),
             ("top", 1, surface, (0.2, 0.07, SIZE + 0.5), (0.7, -0.43, 0.8 * SIZE), turn),
         )
     )
@@ -117,10 +118,10 @@ def slipping(solution: Solution, body: Problem) -> np.ndarray:
 
 
 CASES = {
-    "plate": (plane((0, 0, -1)), 0.15, True),
-    "bar": (bar("y", 10.0, corner_radius_mm=2.0), 0.15, True),
-    "plate, sliding joint": (plane((0, 0, -1)), 0.3, False),
-    "bar, stick": (bar("x", 10.0, corner_radius_mm=2.0), STICK, True),
+    "plate": (plane_geometry((0, 0, -1)), 0.15, True),
+    "bar": (bar_geometry("y", 10.0, corner_radius_mm=2.0), 0.15, True),
+    "plate, sliding joint": (plane_geometry((0, 0, -1)), 0.3, False),
+    "bar, stick": (bar_geometry("x", 10.0, corner_radius_mm=2.0), STICK, True),
 }
 
 
@@ -158,7 +159,7 @@ def test_sum_of_directions_is_the_direction_of_the_sum():
 
 def test_scaling_all_stiffnesses_changes_nothing_but_penetration():
     """Where only displacements are given, the answer depends on ratios of moduli; what remains is due to the penalty."""
-    body = pressed(plane((0, 0, -1)), 0.15)
+    body = pressed(plane_geometry((0, 0, -1)), 0.15)
     states = solve(body, settings=PATH).states
     table = [Direction(materials=body.assembler.parameters), Direction(materials=body.assembler.parameters * (MESH.regions == 1)[:, None])]
     overall, ratio = np.moveaxis(sensitivities(body, states, table)[-1], 2, 0)

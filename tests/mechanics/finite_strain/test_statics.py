@@ -8,7 +8,7 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
 from naibu.core.status import Status
 from naibu.mechanics.contact.contact_surfaces import Friction, rigid_contact
-from naibu.mechanics.contact.penalty_contact import plane
+from naibu.mechanics.contact.indenter_geometry import plane_geometry
 from naibu.mechanics.finite_elements.assembly import body_force
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements
@@ -200,7 +200,7 @@ def test_a_body_that_nothing_loads_stays():
         "base",
         mesh.points,
         faces_towards(mesh, (0, 0, -1)),
-        plane((0, 0, 1)),
+        plane_geometry((0, 0, 1)),
         start=ZERO,
         stop=ZERO,
         friction=Friction(),
@@ -227,7 +227,7 @@ def pressed(n=4) -> tuple:
             name,
             mesh.points,
             faces_towards(mesh, (0, 0, side)),
-            plane((0, 0, -side)),
+            plane_geometry((0, 0, -side)),
             start=(0, 0, 10 + 10 * side),
             stop=stop,
             friction=Friction(0.2),

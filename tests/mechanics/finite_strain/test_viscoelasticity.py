@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.status import Status
 from naibu.mechanics.contact.contact_surfaces import Friction, rigid_contact
-from naibu.mechanics.contact.penalty_contact import plane
+from naibu.mechanics.contact.indenter_geometry import plane_geometry
 from naibu.mechanics.finite_elements import stress_history
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.hyperelasticity import LAWS, Material, from_moduli
@@ -334,7 +334,7 @@ def test_a_plate_feels_the_body_relax():
     mesh = box((SIDE,) * 3, (1, 1, 2), centred=False)
     faces = faces_towards(mesh, (0, 0, 1))
     plate = rigid_contact(
-        "plate", mesh.points, faces, plane((0, 0, -1)), start=(0, 0, SIDE), stop=(0, 0, 0.8 * SIDE),
+        "plate", mesh.points, faces, plane_geometry((0, 0, -1)), start=(0, 0, SIDE), stop=(0, 0, 0.8 * SIDE),
         friction=Friction(0.0), normal_stiffness=1e6,
     )  # fmt: skip
     p = problem(mesh, m, contacts=[plate], prescribed=p.prescribed)

@@ -9,7 +9,8 @@ from naibu.core.arrays import IntArray
 from naibu.core.experiment import Experiment
 from naibu.core.mesh import Mesh
 from naibu.mechanics.contact.contact_surfaces import Friction, interface, rigid_contact
-from naibu.mechanics.contact.penalty_contact import STICK, Contact, RigidSurface, bar, plane
+from naibu.mechanics.contact.indenter_geometry import IndenterGeometry, bar_geometry, plane_geometry
+from naibu.mechanics.contact.penalty_contact import STICK, Contact
 from naibu.meshing.interfaces import split_at_plane
 from naibu.meshing.surface import faces_among, node_areas
 
@@ -39,23 +40,23 @@ def rigid_bodies(
     stick = Friction(STICK, tangential_stiffness)
     loading, size = experiment.loading, experiment.shape.size_mm
 
-    def body(name: str, surface: RigidSurface, start: ArrayLike) -> Contact:
+    def body(name: str, surface: IndenterGeometry, start: ArrayLike) -> Contact:
         return rigid_contact(name, mesh.points, faces, surface, start=start, stop=start, friction=stick, normal_stiffness=normal_stiffness)
 
     # where only its weight holds the object down, it starts pressed into the table by a hair, for the contact to have a stiffness
     ground = 1e-4 if loading.kind == "side_plates" else 0.0
-    bodies = [body(f"base of {loading.base_material}", plane((0.0, 0.0, 1.0)), (0.0, 0.0, ground))]
+    bodies = [body(f"base of {loading.base_material}", plane_geometry((0.0, 0.0, 1.0)), (0.0, 0.0, ground))]
     counter = loading.counter_material
     if loading.kind == "side_plates":
         axis = "xyz".index(loading.bar_axis)
         for sign, side in ((-1.0, "low"), (1.0, "high")):
             inward = (-sign, 0.0, 0.0) if axis == 0 else (0.0, -sign, 0.0)
-            bodies.append(body(f"indenter ({side} side) of {counter}", plane(inward), -0.5 * size[axis] * np.array(inward)))
+            bodies.append(body(f"indenter ({side} side) of {counter}", plane_geometry(inward), -0.5 * size[axis] * np.array(inward)))
     elif loading.kind == "bar":
-        surface = bar(loading.bar_axis, loading.bar_width_mm or 0.0)
+        surface = bar_geometry(loading.bar_axis, loading.bar_width_mm or 0.0)
         bodies.append(body(f"indenter of {counter}", surface, (0.0, 0.0, size[2])))
     else:
-        bodies.append(body(f"indenter of {counter}", plane((0.0, 0.0, -1.0)), (0.0, 0.0, size[2])))
+        bodies.append(body(f"indenter of {counter}", plane_geometry((0.0, 0.0, -1.0)), (0.0, 0.0, size[2])))
     return bodies
 
 

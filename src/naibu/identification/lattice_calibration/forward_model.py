@@ -13,10 +13,11 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.identification.lattice_calibration.shape_distance import checked_points, closest_points
+from naibu.mechanics.contact.triangle_tree import TriangleTree
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters, require_positive
 from naibu.mechanics.lattices.model.state import ConstrainedNodes
-from naibu.mechanics.lattices.model.surface import Hull, hull_of
+from naibu.mechanics.lattices.model.surface import surface_of
 from naibu.mechanics.lattices.simulation.tangent_linear import Loads, ParameterChange, driven_steps, rest_change
 
 PushMode = Literal["displacement", "force"]
@@ -130,7 +131,7 @@ class Capture:
             raise InputError(
                 f"{pushing.name}: {len(points)} sets of points for {len(pushing.capture_s)} times of capture; give one for each"
             )
-        hull, reach = hull_of(lattice), float(np.linalg.norm(np.ptp(lattice.points, axis=0)))
+        hull, reach = surface_of(lattice), float(np.linalg.norm(np.ptp(lattice.points, axis=0)))
         seen = tuple(checked_points(p, f"points of capture {k} of {pushing.name}") for k, p in enumerate(points))
         for k, cloud in enumerate(seen):
             far = np.abs(closest_points(cloud, hull, lattice.points).signed)
@@ -184,7 +185,7 @@ class PushedLattice:
     ----------
     lattice : Lattice
         The object.
-    hull : Hull
+    hull : TriangleTree
         Its surface.
     pushing : Pushing
         What is done.
@@ -197,7 +198,7 @@ class PushedLattice:
     """
 
     lattice: Lattice
-    hull: Hull
+    hull: TriangleTree
     pushing: Pushing
     mode: PushMode
     step: float
@@ -255,7 +256,7 @@ class PushedLattice:
                 constrained = constrained + ConstrainedNodes.of(np.setdiff1d(nodes, ground), k)
         else:
             raise InputError(f"pushing is by 'displacement' or 'force', not {mode!r}")
-        return cls(lattice, hull_of(lattice), pushing, mode, float(step), float(longest), floor, floor + constrained, loads, measured)
+        return cls(lattice, surface_of(lattice), pushing, mode, float(step), float(longest), floor, floor + constrained, loads, measured)
 
     def run(self, parameters: LatticeParameters, changes: Sequence[ParameterChange] = (), *, tolerance: float = 1e-2) -> Reproduced:
         """Return the motion with these parameters, and its derivatives along changes of them."""
@@ -311,7 +312,7 @@ def tributary_shares(lattice: Lattice, nodes: IntArray) -> FloatArray:
 
     Rigid points in the middle of every face of a voxel take equal forces and hand a quarter to each corner (bilinear weights).
     """
-    faces = hull_of(lattice).triangles
+    faces = surface_of(lattice).triangles
     mine = np.isin(faces, nodes).all(axis=1)
     if not mine.any():
         return np.full(len(nodes), 1.0 / len(nodes))

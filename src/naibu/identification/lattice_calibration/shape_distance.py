@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.errors import InputError
-from naibu.identification.lattice_calibration import _bvh_kernels as kernels
-from naibu.mechanics.lattices.model.surface import Hull
+from naibu.mechanics.contact import _triangle_kernels as kernels
+from naibu.mechanics.contact.triangle_tree import TriangleTree
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,14 +58,14 @@ class ShapeDifference:
     counted: BoolArray
 
 
-def closest_points(points: ArrayLike, hull: Hull, positions: ArrayLike) -> Closest:
+def closest_points(points: ArrayLike, hull: TriangleTree, positions: ArrayLike) -> Closest:
     """Return the closest points of a deformed surface, exactly.
 
     Parameters
     ----------
     points : array_like, shape (k, 3)
         mm.
-    hull : Hull
+    hull : TriangleTree
         The surface.
     positions : array_like, shape (n, 3)
         Deformed positions of its masses, mm.
@@ -79,8 +79,7 @@ def closest_points(points: ArrayLike, hull: Hull, positions: ArrayLike) -> Close
     deformed = np.ascontiguousarray(positions, dtype=float)
     if np.isnan(deformed).any():
         raise InputError(f"{int(np.isnan(deformed).any(axis=1).sum())} masses have positions that are NaN; the computed motion blew up")
-    boxes = np.empty((len(hull.start), 6))
-    kernels.fit_boxes(deformed, hull.triangles, hull.order, hull.start, boxes)
+    boxes = hull.boxes(deformed)
     k = len(asked)
     found = Closest(np.empty(k), np.zeros(k, dtype=np.int64), np.empty((k, 3)), np.empty((k, 3)))
     kernels.closest(
@@ -106,7 +105,7 @@ def checked_points(points: ArrayLike, what: str) -> FloatArray:
     return asked
 
 
-def shape_difference(points: ArrayLike, hull: Hull, positions: ArrayLike, *, threshold_mm: float = 0.5) -> ShapeDifference:
+def shape_difference(points: ArrayLike, hull: TriangleTree, positions: ArrayLike, *, threshold_mm: float = 0.5) -> ShapeDifference:
     """Return S_shape of captured points: the sum of their distances from the deformed surface.
 
     Parameters

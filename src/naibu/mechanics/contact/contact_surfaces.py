@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
-from naibu.mechanics.contact.penalty_contact import STICK, Contact, RigidSurface, plane
+from naibu.mechanics.contact.indenter_geometry import IndenterGeometry, plane_geometry
+from naibu.mechanics.contact.penalty_contact import STICK, Contact
 
 QUADRATURE_ORDER = 3  # Gauss points a side of a quadrilateral face: contact edges cross faces, so more than elasticity needs
 
@@ -37,7 +38,7 @@ class Friction:
 
 
 def rigid_contact(
-    name: str, points: FloatArray, faces: IntArray, surface: RigidSurface, *, start: ArrayLike, stop: ArrayLike,
+    name: str, points: FloatArray, faces: IntArray, surface: IndenterGeometry, *, start: ArrayLike, stop: ArrayLike,
     friction: Friction | list[Friction], normal_stiffness: float, tied: bool = False, rotation: FloatArray | None = None,
 ) -> Contact:  # fmt: skip
     """Let boundary faces touch a rigid body.
@@ -50,7 +51,7 @@ def rigid_contact(
         Nodes of the mesh in the free state, mm.
     faces : ndarray, shape (f, 3) or (f, 4), int64
         Boundary faces that may touch.
-    surface : RigidSurface
+    surface : IndenterGeometry
         Shape of the body.
     start, stop : array_like, shape (3,)
         Path of the body's reference point, mm.
@@ -102,7 +103,7 @@ def interface(
         raise InputError(f"{name}: an interface needs pairs of coinciding nodes; split the mesh with split_at_plane")
     k = len(pairs)
     return Contact(
-        name, pairs, np.tile([-1.0, 1.0], (k, 1)), np.zeros((k, 3)), area, plane((0.0, 0.0, 1.0)), np.zeros(3), np.zeros(3), np.eye(3),
+        name, pairs, np.tile([-1.0, 1.0], (k, 1)), np.zeros((k, 3)), area, plane_geometry(), np.zeros(3), np.zeros(3), np.eye(3),
         normal_stiffness, np.full(k, friction.stiffness), np.full(k, friction.coefficient), tied,
     )  # fmt: skip
 

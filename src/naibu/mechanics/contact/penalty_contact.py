@@ -15,62 +15,13 @@ import numpy as np
 
 from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
-from naibu.core.errors import InputError
 from naibu.core.rigid_transform import rotation_matrix
+from naibu.mechanics.contact._geometry_kernels import distance_with_derivatives
+from naibu.mechanics.contact.indenter_geometry import IndenterGeometry, packed_geometries
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 
-PLANE, BAR = 0, 1
 RAMP_MM = 0.01  # width of the rounded start of the contact pressure
 STICK = 1e3  # a friction coefficient that never slips in practice
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RigidSurface:
-    """The surface of a rigid body, in a frame that moves with the body.
-
-    Attributes
-    ----------
-    kind : int
-        `PLANE` or `BAR`.
-    normal : ndarray, shape (3,)
-        Out of the body, towards the soft object: of the plane, or of the bar's face.
-    lateral : ndarray, shape (3,)
-        Across the bar (unused for a plane).
-    half_width, corner_radius : float
-        Of the bar, mm.
-    """
-
-    kind: int
-    normal: FloatArray
-    lateral: FloatArray
-    half_width: float = 0.0
-    corner_radius: float = 0.0
-
-    def packed(self) -> FloatArray:
-        """Return the eight numbers that the kernels read."""
-        return np.concatenate([self.normal, self.lateral, [self.half_width, self.corner_radius]])
-
-
-def plane(normal: tuple[float, float, float]) -> RigidSurface:
-    """Return a flat surface with outward `normal` (any length but 0)."""
-    n = np.asarray(normal, dtype=float)
-    if not np.linalg.norm(n) > 0.0:
-        raise InputError("the normal of a plane must not be zero")
-    return RigidSurface(PLANE, n / np.linalg.norm(n), np.zeros(3))
-
-
-def bar(axis: str, width_mm: float, *, corner_radius_mm: float = 1.0) -> RigidSurface:
-    """Return a bar with its face downwards, lying along ``"x"`` or ``"y"``, with rounded edges.
-
-    Raises
-    ------
-    InputError
-        The corner radius is not between 0 and half of the width.
-    """
-    if not 0.0 < corner_radius_mm <= 0.5 * width_mm:
-        raise InputError(f"the bar's corner radius must lie between 0 and half of its width {width_mm:g} mm, not {corner_radius_mm:g} mm")
-    lateral = np.array([0.0, 1.0, 0.0]) if axis == "x" else np.array([1.0, 0.0, 0.0])
-    return RigidSurface(BAR, np.array([0.0, 0.0, -1.0]), lateral, 0.5 * width_mm, corner_radius_mm)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +40,7 @@ class Contact:
         Position of the point in the free state, mm (for a pair of nodes: their difference).
     area : ndarray, shape (p,)
         Area of the free state that a point stands for, mm2.
-    surface : RigidSurface
+    surface : IndenterGeometry
         The body's surface.
     start, stop : ndarray, shape (3,)
         Where the body's reference point is at the beginning and at the end of loading, mm.
@@ -111,7 +62,7 @@ class Contact:
     shape: FloatArray
     rest: FloatArray
     area: FloatArray
-    surface: RigidSurface
+    surface: IndenterGeometry
     start: FloatArray
     stop: FloatArray
     rotation: FloatArray
@@ -149,7 +100,7 @@ class Contact:
         vectors, matrices = np.zeros((3, n, 3)), np.zeros((3, n, 3, 3))
         response = ContactResponse(self.orientation(load), y, np.empty(n), *vectors, *matrices)
         _tractions(
-            self.surface.kind, self.surface.packed(), y, anchors, self.normal_stiffness, self.tangential_stiffness,
+            packed_geometries([self.surface]), self.surface.axes, y, anchors, self.normal_stiffness, self.tangential_stiffness,
             self.friction_coefficient, self.tied, float(curvature), response.gap, response.force, response.tangential,
             response.slip_direction, response.stiffness, response.tangential_stiffness, response.anchor_stiffness,
         )  # fmt: skip
@@ -212,43 +163,30 @@ class ContactResponse:
     anchor_stiffness: FloatArray
 
 
-@njit(cache=True)
-def _gap(kind, s, y, n, h):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Signed distance of `y` to the surface; puts its gradient into `n` and its second derivative into `h`."""
-    h[:] = 0.0
-    down = y[0] * s[0] + y[1] * s[1] + y[2] * s[2]
-    if kind == PLANE:
-        n[:] = s[:3]
-        return down
-    across = y[0] * s[3] + y[1] * s[4] + y[2] * s[5]
-    side = 1.0 if across >= 0.0 else -1.0
-    radius = s[7]
-    d1, d2 = side * across - (s[6] - radius), down + radius
-    if d1 > 0.0 and d2 > 0.0:
-        distance = np.sqrt(d1 * d1 + d2 * d2)
-        for i in range(3):
-            n[i] = (d1 * side * s[3 + i] + d2 * s[i]) / distance
-        for i in range(3):
-            for j in range(3):
-                h[i, j] = (s[i] * s[j] + s[3 + i] * s[3 + j] - n[i] * n[j]) / distance
-        return distance - radius
-    if d1 > d2:
-        for i in range(3):
-            n[i] = side * s[3 + i]
-        return d1 - radius
-    n[:] = s[:3]
-    return d2 - radius
-
-
 @njit(cache=True, nogil=True)
 def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
-    kind, s, y, anchors, k_n, k_t, mu, tied, curvature, gap, force, tangential, slip, stiffness, tangential_stiffness, anchor_stiffness
+    geometry,
+    axes,
+    y,
+    anchors,
+    k_n,
+    k_t,
+    mu,
+    tied,
+    curvature,
+    gap,
+    force,
+    tangential,
+    slip,
+    stiffness,
+    tangential_stiffness,
+    anchor_stiffness,
 ):
     """Tractions of all points and their derivatives (per unit of area); see the module's text for the law."""
     n, e = np.empty(3), np.empty(3)
     h, d_trial = np.empty((3, 3)), np.empty((3, 3))
     for q in range(len(y)):
-        g = _gap(kind, s, y[q], n, h)
+        g = distance_with_derivatives(geometry, axes, y[q], n, h)
         gap[q] = g
         if tied:
             p, dp = -k_n * g, -k_n

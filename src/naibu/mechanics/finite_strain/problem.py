@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from naibu.core.arrays import FloatArray, Int32Array
-from naibu.mechanics.contact.penalty_contact import PLANE, Contact
+from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.linear_algebra.solver_selection import SolverName
@@ -71,7 +71,7 @@ class Problem:
     @property
     def unsymmetric(self) -> bool:
         """Whether Coulomb friction makes the tangent unsymmetric."""
-        curved = any(c.surface.kind != PLANE for c in self.contacts)  # friction turns with the normal
+        curved = any(not c.surface.flat for c in self.contacts)  # friction turns with the normal
         return curved or any(not c.tied and float(c.friction_coefficient.min()) < 100.0 for c in self.contacts)
 
     def with_changes(self, *, assembler: Assembler | None = None, contacts: tuple[Contact, ...] | None = None) -> Problem:

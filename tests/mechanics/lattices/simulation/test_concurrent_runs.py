@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from naibu.core.arrays import FloatArray
-from naibu.mechanics.contact.rigid_indenters import plane, spherical_indenter
+from naibu.mechanics.contact.rigid_indenters import plane_indenter, spherical_indenter
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes
@@ -17,7 +17,7 @@ from naibu.mechanics.lattices.simulation.contact import push
 
 LATTICE = classic_lattice(box_mask((9, 9, 8)), 5.0, total_mass_kg=0.3)
 TOP = ConstrainedNodes.of(np.flatnonzero(LATTICE.points[:, 2] > 39.0))
-INDENTERS = [plane((0.0, 0.0, 0.0), static_friction=0.4, kinetic_friction=0.3), spherical_indenter((22.0, 22.0, 50.1), 10.0)]
+INDENTERS = [plane_indenter((0.0, 0.0, 0.0), static_friction=0.4, kinetic_friction=0.3), spherical_indenter((22.0, 22.0, 50.1), 10.0)]
 
 
 def engine(stiffness: float = 20.0) -> LatticeEngine:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from naibu.core.errors import InputError
-from naibu.mechanics.contact.rigid_indenters import box_indenter, cylindrical_indenter, plane, spherical_indenter
+from naibu.mechanics.contact.rigid_indenters import box_indenter, cylindrical_indenter, plane_indenter, spherical_indenter
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, general_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState
@@ -55,12 +55,12 @@ def test_gaps_and_normals_of_bodies(kind):
         "box": box_indenter((1.0, 2.0, 3.0), (4.0, 6.0, 8.0)),
         "cylinder": cylindrical_indenter((1.0, 2.0, 3.0), 2.0, 5.0, (1.0, 1.0, 0.0)),
         "sphere": spherical_indenter((1.0, 2.0, 3.0), 2.5),
-        "plane": plane((1.0, 2.0, 3.0), (0.0, 1.0, 1.0)),
+        "plane": plane_indenter((1.0, 2.0, 3.0), (0.0, 1.0, 1.0)),
     }[kind]
     rng = np.random.default_rng(0)
     points = rng.uniform(-6.0, 9.0, (200, 3))
     gap = body.gap(points)
-    local = (points - body.centre) @ body.axes.T
+    local = (points - body.centre) @ body.geometry.axes.T
     surface = local.copy()
     if kind == "box":
         surface = np.clip(local, [-2, -3, -4], [2, 3, 4])
@@ -81,7 +81,12 @@ def test_a_block_at_rest_is_carried_by_the_floor():
     weight = lattice.total_mass * GRAVITY
     forces = -np.outer(lattice.node_mass, [0.0, 0.0, GRAVITY])
     motion = push(
-        engine, engine.rest(), [plane((0, 0, 0), static_friction=0.5, kinetic_friction=0.4)], 0.0, steps=1500, external_force=forces
+        engine,
+        engine.rest(),
+        [plane_indenter((0, 0, 0), static_friction=0.5, kinetic_friction=0.4)],
+        0.0,
+        steps=1500,
+        external_force=forces,
     )
     np.testing.assert_allclose(motion.reaction[-1, 0], [0.0, 0.0, weight], rtol=1e-4, atol=1e-4 * weight)
     assert motion.unsettled == 0
@@ -90,7 +95,7 @@ def test_a_block_at_rest_is_carried_by_the_floor():
 def test_momentum_balances_with_the_reactions():
     lattice, engine = block()
     bodies = [
-        plane((0, 0, 0), static_friction=0.3, kinetic_friction=0.2),
+        plane_indenter((0, 0, 0), static_friction=0.3, kinetic_friction=0.2),
         spherical_indenter((15.0, 15.0, 41.0), 10.0, static_friction=0.5, kinetic_friction=0.3),
     ]
     motion = push(engine, engine.rest(), bodies, [[0, 0, 0], [10.0, 0, -30.0]], steps=200)
@@ -105,7 +110,7 @@ def test_momentum_balances_with_the_reactions():
 def test_static_friction_holds_until_its_limit(pull, slides):
     """A block under its weight, pulled sideways by less and by more than mu_s m g: it stays, or goes off with (pull - mu_k m g) / m."""
     lattice, engine = block((2, 2, 2), k=200.0, c1=5.0)
-    floor = [plane((0, 0, 0), static_friction=0.4, kinetic_friction=0.3)]
+    floor = [plane_indenter((0, 0, 0), static_friction=0.4, kinetic_friction=0.3)]
     gravity = -np.outer(lattice.node_mass, [0.0, 0.0, GRAVITY])
     rest = push(engine, engine.rest(), floor, 0.0, steps=600, external_force=gravity)
     sideways = np.zeros_like(gravity)
@@ -131,7 +136,7 @@ def pair(gap, speed):
 @pytest.mark.parametrize(("speed", "expected"), [(2.0, 3.0 * 0.5 + 0.2 * 2.0), (8.0, 0.0), (-2.0, 0.0)])
 def test_pull_off_acts_on_masses_that_leave_slowly(speed, expected):
     lattice, engine, state = pair(0.5, speed)
-    floor = [plane((0, 0, 0), pull_stiffness=3.0, pull_damping=0.2, pull_speed=5.0)]
+    floor = [plane_indenter((0, 0, 0), pull_stiffness=3.0, pull_damping=0.2, pull_speed=5.0)]
     contact = begin_contact(lattice, floor, state)
     contact.touched[:] = np.array([[True], [False]])
     motion = push(engine, state, floor, 0.0, steps=1, contact=contact)
@@ -142,7 +147,7 @@ def test_pull_off_acts_on_masses_that_leave_slowly(speed, expected):
 
 def test_pull_off_never_turns_a_mass_around():
     lattice, engine, state = pair(0.5, 2.0)
-    floor = [plane((0, 0, 0), pull_stiffness=1e6, pull_damping=1e6, pull_speed=5.0)]
+    floor = [plane_indenter((0, 0, 0), pull_stiffness=1e6, pull_damping=1e6, pull_speed=5.0)]
     contact = begin_contact(lattice, floor, state)
     contact.touched[:] = True
     motion = push(engine, state, floor, 0.0, steps=1, contact=contact)
@@ -152,7 +157,7 @@ def test_pull_off_never_turns_a_mass_around():
 def test_a_released_plate_leaves_the_object():
     _, engine = block(c2=50.0)
     bodies = [
-        plane((0, 0, 0), static_friction=0.5, kinetic_friction=0.5),
+        plane_indenter((0, 0, 0), static_friction=0.5, kinetic_friction=0.5),
         box_indenter((15, 15, 35), (30, 30, 10), static_friction=0.5, kinetic_friction=0.5),
     ]
     path = np.zeros((300, 2, 3))
@@ -166,7 +171,7 @@ def test_a_released_plate_leaves_the_object():
 
 def test_a_body_driven_by_a_force_comes_to_balance():
     _, engine = block(k=50.0, c1=2.0)
-    bodies = [plane((0, 0, 0)), box_indenter((15, 15, 35), (30, 30, 10))]
+    bodies = [plane_indenter((0, 0, 0)), box_indenter((15, 15, 35), (30, 30, 10))]
     force = np.full(250, 800.0)
     motion = push_by_force(engine, engine.rest(), bodies, force, driven=1, direction=[0, 0, -1], indenter_mass=0.05)
     assert -motion.reaction[-1, 1, 2] == pytest.approx(800.0, rel=1e-2)
@@ -183,15 +188,15 @@ def test_a_body_driven_by_a_force_comes_to_balance():
     [
         (lambda: begin_contact(block()[0], [spherical_indenter((15, 15, 30), 5.0)]), "begins inside the object"),
         (lambda: begin_contact(block()[0], []), "no body"),
-        (lambda: plane((0, 0, 0), (0, 0, 0)), "length"),
-        (lambda: plane((0, 0, 0), static_friction=0.2, kinetic_friction=0.3), "0.3 (kinetic)"),
+        (lambda: plane_indenter((0, 0, 0), (0, 0, 0)), "length"),
+        (lambda: plane_indenter((0, 0, 0), static_friction=0.2, kinetic_friction=0.3), "0.3 (kinetic)"),
         (lambda: box_indenter((0, 0, 0), (1, -1, 1)), "-1"),
-        (lambda: spherical_indenter((np.nan, 0, 0), 1.0), "NaN"),
+        (lambda: spherical_indenter((np.nan, 0, 0), 1.0), "centre[0] is nan"),
         (lambda: hand_over(block()[0], "+z", [[40.0, 5.0, 0.0]]), "beside the face"),
         (lambda: hand_over(block()[0], "top", [[4.0, 5.0, 0.0]]), "'top'"),
-        (lambda: push(block(method="euler", step=1e-5)[1], block()[1].rest(), [plane((0, 0, 0))], 0.0, steps=1), "implicit"),
-        (lambda: push(block()[1], block()[1].rest(), [plane((0, 0, 0))], np.nan, steps=1), "NaN"),
-        (lambda: push(block()[1], block()[1].rest(), [plane((0, 0, 0))], np.zeros((4, 2, 3))), "2 bodies"),
+        (lambda: push(block(method="euler", step=1e-5)[1], block()[1].rest(), [plane_indenter((0, 0, 0))], 0.0, steps=1), "implicit"),
+        (lambda: push(block()[1], block()[1].rest(), [plane_indenter((0, 0, 0))], np.nan, steps=1), "NaN"),
+        (lambda: push(block()[1], block()[1].rest(), [plane_indenter((0, 0, 0))], np.zeros((4, 2, 3))), "2 bodies"),
     ],
 )
 def test_bad_input_is_named(call, said):
@@ -205,7 +210,7 @@ def test_bad_input_is_named(call, said):
 def test_a_soft_block_slides_down_a_slope_as_coulomb_says(friction, slope):
     """Set upon a slope at once, it bounces and leans; it still gains (tan - mu) g on the mean, with equal coefficients too."""
     lattice, engine = block((4, 4, 2), mass=0.04, k=40.0, c1=20.0, c2=60.0)
-    floor = [plane((0, 0, 0), static_friction=friction, kinetic_friction=friction)]
+    floor = [plane_indenter((0, 0, 0), static_friction=friction, kinetic_friction=friction)]
     forces = GRAVITY * np.outer(lattice.node_mass, [slope, 0.0, -1.0])
     motion = push(engine, engine.rest(), floor, 0.0, steps=300, external_force=forces)
     speed = (lattice.node_mass @ motion.state.velocity[:, 0]) / lattice.total_mass
@@ -218,7 +223,7 @@ def test_a_soft_block_slides_down_a_slope_as_coulomb_says(friction, slope):
 def test_a_thrown_block_stops_and_stays():
     """It slides v^2 / (2 mu g) and then sticks."""
     lattice, engine = block((4, 4, 1), mass=0.04, k=400.0, c1=20.0)
-    floor = [plane((0, 0, 0), static_friction=0.4, kinetic_friction=0.4)]
+    floor = [plane_indenter((0, 0, 0), static_friction=0.4, kinetic_friction=0.4)]
     weight = GRAVITY * np.outer(lattice.node_mass, [0.0, 0.0, -1.0])
     rest = push(engine, engine.rest(), floor, 0.0, steps=500, external_force=weight)
     thrown = replace(rest.state, velocity=rest.state.velocity + np.array([300.0, 0.0, 0.0]))

@@ -10,7 +10,7 @@ import pytest
 
 from naibu.core.errors import InputError
 from naibu.identification.lattice_calibration.forward_model import PushedFace, PushedLattice, Pushing
-from naibu.mechanics.contact.rigid_indenters import RigidIndenter, box_indenter, plane, spherical_indenter
+from naibu.mechanics.contact.rigid_indenters import RigidIndenter, box_indenter, plane_indenter, spherical_indenter
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.simulation.loading_history import Drive, LatticeStudy, StudyBody, StudyFrame, run_study
 from naibu.mechanics.prescribed_motion import PrescribedMotion
@@ -33,7 +33,7 @@ def moving(name: str, indenter: RigidIndenter, rows: list[list[float]], **more: 
 def tied(**changes: object) -> LatticeStudy:
     box = box_indenter((-2.5, 15.0, 10.0), (5.0, 10.0, 10.0))
     path = [[0, 0, 0, 0], [0.1, 2, 0, 0], [0.2, 2, 0, 0], [0.3, -5, 0, 0]]
-    bodies = (still("floor", plane((0, 0, 0)), tied_until_s=np.inf), moving("box", box, path, tied_until_s=0.15))
+    bodies = (still("floor", plane_indenter((0, 0, 0)), tied_until_s=np.inf), moving("box", box, path, tied_until_s=0.15))
     return replace(LatticeStudy(LATTICE, SOFT, bodies, 0.002, 10, 4, 4), **changes)
 
 
@@ -41,7 +41,7 @@ def touching(**changes: object) -> LatticeStudy:
     ball = spherical_indenter(
         (15.0, 15.0, 31.0), 10.0, static_friction=0.4, kinetic_friction=0.3, pull_stiffness=10.0, pull_damping=1.0, pull_speed=50.0
     )
-    floor = plane((0, 0, 0), static_friction=0.5, kinetic_friction=0.4)
+    floor = plane_indenter((0, 0, 0), static_friction=0.5, kinetic_friction=0.4)
     path = [[0, 0, 0, 0], [0.1, 1, 0, -5], [0.2, 1, 0, 4]]
     weight = np.outer(LATTICE.node_mass, [0.0, 0.0, -GRAVITY])
     study = LatticeStudy(LATTICE, SOFT, (still("floor", floor), moving("ball", ball, path)), 0.002, 10, 4, 3, external_force=weight)
@@ -51,7 +51,7 @@ def touching(**changes: object) -> LatticeStudy:
 def driven(**changes: object) -> LatticeStudy:
     drive = Drive(np.array([0.0, 0.1]), np.array([0.0, 400.0]), np.array([0.0, 0.0, -1.0]), 0.05)
     box = box_indenter((15.0, 15.0, 25.0), (40.0, 40.0, 10.0), static_friction=0.4, kinetic_friction=0.4)
-    floor = plane((0, 0, 0), static_friction=0.5, kinetic_friction=0.4)
+    floor = plane_indenter((0, 0, 0), static_friction=0.5, kinetic_friction=0.4)
     study = LatticeStudy(LATTICE, SOFT, (still("floor", floor), still("box", box, drive=drive)), 0.002, 6, 5, 5)
     return replace(study, **changes)
 
@@ -62,7 +62,7 @@ def test_a_study_is_the_pushing_that_calibration_computes() -> None:
     expected = PushedLattice.of(LATTICE, pushing).run(SOFT, tolerance=1e-6)
     box = box_indenter((-2.5, 15.0, 15.0), (5.0, 10.0, 10.0))
     bodies = (
-        still("floor", plane((0, 0, 0)), tied_until_s=np.inf),
+        still("floor", plane_indenter((0, 0, 0)), tied_until_s=np.inf),
         moving("box", box, [[0, 0, 0, 0], [0.1, 2, 0, 0]], tied_until_s=0.2),
     )
     frames = list(run_study(LatticeStudy(LATTICE, SOFT, bodies, 0.002, 16, 10, 1, tolerance=1e-6)))
@@ -135,7 +135,7 @@ def test_a_body_lets_go_when_it_is_to() -> None:
 
 def test_what_cannot_be_run_is_told() -> None:
     ball = spherical_indenter((15.0, 15.0, 31.0), 10.0)
-    floor = still("floor", plane((0, 0, 0)))
+    floor = still("floor", plane_indenter((0, 0, 0)))
     path = [[0.0, 0, 0, 0], [1.0, 0, 0, -5]]
     for study, words in (
         (touching(method="euler"), "needs method 'implicit'"),

@@ -1,14 +1,11 @@
-"""The triangulated surface of a lattice, with a bounding volume hierarchy for closest points."""
+"""The triangulated surface of a lattice, from the faces of its cubes."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.typing import ArrayLike
 
-from naibu.core.arrays import IntArray
 from naibu.core.errors import InputError
+from naibu.mechanics.contact.triangle_tree import TriangleTree
 from naibu.mechanics.lattices.model.lattice import Lattice
 
 _FACES = (  # corners of a cube, numbered x fastest, counter-clockwise seen from outside, and the way outwards
@@ -19,46 +16,9 @@ _FACES = (  # corners of a cube, numbered x fastest, counter-clockwise seen from
     ((0, 2, 3, 1), (0, 0, -1)),
     ((4, 5, 7, 6), (0, 0, 1)),
 )
-_LEAF = 4  # triangles in a leaf of the tree, at most
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Hull:
-    """The triangulated surface of a lattice, and a tree of its triangles that serves all deformed positions.
-
-    Attributes
-    ----------
-    triangles : ndarray, shape (t, 3), int64
-        Masses, counter-clockwise seen from outside.
-    order : ndarray, shape (t,), int64
-        Triangles in the order of the leaves.
-    start : ndarray, shape (nodes, 2), int64
-        First and past-the-last place in `order` of every node of a complete binary tree.
-    """
-
-    triangles: IntArray
-    order: IntArray
-    start: IntArray
-
-    @classmethod
-    def of(cls, triangles: ArrayLike, positions: ArrayLike) -> Hull:
-        """Build the tree of triangles (t, 3) from positions at rest (n, 3), mm."""
-        corners, points = np.array(triangles, dtype=np.int64), np.asarray(positions, dtype=float)
-        centre = points[corners].mean(axis=1)
-        levels = max(int(np.ceil(np.log2(max(len(corners) / _LEAF, 1.0)))), 0)
-        order, start = np.arange(len(corners)), np.zeros((2 ** (levels + 1) - 1, 2), dtype=np.int64)
-        start[0, 1] = len(corners)
-        for node in range(2**levels - 1):
-            low, high = start[node]
-            mine = order[low:high]
-            axis = int(np.argmax(np.ptp(centre[mine], axis=0)))
-            order[low:high] = mine[np.argsort(centre[mine, axis], kind="stable")]
-            middle = (low + high) // 2
-            start[2 * node + 1], start[2 * node + 2] = (low, middle), (middle, high)
-        return cls(corners, order, start)
-
-
-def hull_of(lattice: Lattice) -> Hull:
+def surface_of(lattice: Lattice) -> TriangleTree:
     """Return the outer faces of a lattice's cubes as triangles.
 
     Raises
@@ -72,7 +32,7 @@ def hull_of(lattice: Lattice) -> Hull:
     diagonal = (reach > 0).all(axis=1) & (reach.max(axis=1) == reach.min(axis=1))
     if not diagonal.any():
         raise InputError(
-            "the lattice has no space diagonals, hence no cubes whose faces could be its surface; give its triangles to Hull.of"
+            "the lattice has no space diagonals, hence no cubes whose faces could be its surface; give its triangles to TriangleTree.of"
         )
     cubes, which = np.unique(ends[diagonal].min(axis=1), axis=0, return_index=True)
     sizes = reach[diagonal].max(axis=1)[which]
@@ -92,4 +52,4 @@ def hull_of(lattice: Lattice) -> Hull:
         open_face = ~filled[tuple(beyond.T)]
         a, b, c, d = corners[open_face][:, face].T
         triangles += [np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]
-    return Hull.of(np.concatenate(triangles), lattice.points)
+    return TriangleTree.of(np.concatenate(triangles), lattice.points)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import njit
-from naibu.mechanics.contact.rigid_indenters import surface_gap
+from naibu.mechanics.contact._geometry_kernels import outward_normal_and_gap
 from naibu.mechanics.lattices.cpu._coarse_kernels import begin
 from naibu.mechanics.lattices.cpu._implicit_kernels import add_momenta, advance, new_velocity
 
@@ -23,13 +23,13 @@ AGREED = 0.01  # relative error of the friction at which a step is settled
 @njit(cache=True)
 def _look(shapes, places, x, candidates, pad, near):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Set near (c, bodies, 4) to normals and gaps of candidates at x from bodies at `places`."""
-    kinds, axes, sizes = shapes
+    geometry, axes = shapes
     d = np.empty(3)
     for c in range(len(candidates)):
-        for k in range(len(kinds)):
+        for k in range(len(places)):
             for a in range(3):
                 d[a] = x[a * pad + candidates[c]] - places[k, a]
-            surface_gap(kinds[k], axes[k], sizes[k], d, near[c, k])
+            outward_normal_and_gap(geometry, k, axes[k], d, near[c, k])
 
 
 @njit(cache=True)
@@ -281,7 +281,7 @@ def _settle(engine, constrained, modes, seen, shapes, places, friction, candidat
 def contact_steps(blocks, tables, x, v, y, lengths, mass, external, work, inner, bodies, memory, velocity, step, solver, reaction, limit):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Take len(velocity) steps in contact; x, v, y, lengths, `memory` and places are changed, reaction (steps, bodies, 3) is filled.
 
-    `bodies` are shapes (kinds, axes, sizes), places (bodies, 3), friction (bodies, 2), pull-off (bodies, 3) and the masses that may touch;
+    `bodies` are shapes (geometry, axes), places (bodies, 3), friction (bodies, 2), pull-off (bodies, 3) and the masses that may touch;
     `memory` mode (c, bodies), friction of sliding masses (c, bodies, 3) and whether they ever touched (c, bodies); `limit` the most passes
     and the speed, mm/s, below which masses stick. Returns iterations, passes and the steps whose contacts did not settle.
     """

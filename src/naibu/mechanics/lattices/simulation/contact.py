@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 from naibu._numba.simd import aligned
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.errors import InputError
-from naibu.mechanics.contact.rigid_indenters import KINDS, RigidIndenter
+from naibu.mechanics.contact.indenter_geometry import packed_geometries
+from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import Lattice
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState, checked_velocity, require_numbers
@@ -111,7 +112,7 @@ def begin_contact(
         if inside.min() < -_TOUCH_MM:
             at = np.concatenate([points[chosen], middles])[int(np.argmin(inside))]
             raise InputError(
-                f"body {k}, a {KINDS[indenter.kind]}, begins inside the object: ({at[0]:.4g}, {at[1]:.4g}, {at[2]:.4g}) mm lies "
+                f"body {k}, a {indenter.geometry.name}, begins inside the object: ({at[0]:.4g}, {at[1]:.4g}, {at[2]:.4g}) mm lies "
                 f"{-inside.min():.4g} mm deep in it; move it back by that"
             )
     mode = np.where(gaps < _TOUCH_MM, [2 if p.static_friction == 0.0 else 1 for p in indenters], 0).astype(np.int64)
@@ -195,8 +196,8 @@ def push(
 
 
 def _stored_bodies(indenters: Sequence[RigidIndenter], places: FloatArray, nodes: IntArray) -> tuple[Any, ...]:
-    kinds = np.array([p.kind for p in indenters], dtype=np.int64)
-    shapes = (kinds, np.array([p.axes for p in indenters], dtype=float), np.array([p.size for p in indenters], dtype=float))
+    geometries = [p.geometry for p in indenters]
+    shapes = (packed_geometries(geometries), np.array([shape.axes for shape in geometries], dtype=float))
     friction = np.array([(p.static_friction, p.kinetic_friction) for p in indenters])
     pull = np.array([(p.pull_stiffness, p.pull_damping, p.pull_speed) for p in indenters])
     return shapes, places, friction, pull, nodes

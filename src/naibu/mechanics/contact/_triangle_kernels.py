@@ -1,5 +1,5 @@
 # mypy: disallow-untyped-decorators=False
-"""Numba kernels behind `naibu.identification.lattice_calibration.shape_distance`: closest points on triangles, found in a tree of boxes."""
+"""Numba kernels of closest points on triangles, found in a tree of bounding boxes :cite:p:`ericson2005`."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from naibu.core.arrays import FloatArray, IntArray
 
 Triple = tuple[float, float, float]
 
-_STACK = 128
-_TIE = 1e-9  # share of a squared distance within which two triangles are as near as each other: they meet in the closest point
+STACK = 128  # depth of a tree of more triangles than fit in memory
+_TIE = 1e-9  # fraction of a squared distance within which two triangles are as near as each other: they meet in the closest point
 
 
 @njit(cache=True)
@@ -91,49 +91,59 @@ def _at(positions: FloatArray, node: int) -> Triple:
     return positions[node, 0], positions[node, 1], positions[node, 2]
 
 
+@njit(cache=True)
+def closest_point(
+    p: Triple, positions: FloatArray, triangles: IntArray, order: IntArray, start: IntArray, boxes: FloatArray,
+    stack: IntArray, direction: FloatArray,
+) -> tuple[float, int, Triple]:  # fmt: skip
+    """Return the signed distance of a point, the closest triangle and the weights of its corners; `direction` (3,) points away from it.
+
+    Of triangles that meet in the closest point the one whose plane is farthest from the point tells on which side it is.
+    """
+    nodes = len(start)
+    best, faced, depth = np.inf, -1.0, 1
+    signed, triangle, weights = np.inf, -1, (0.0, 0.0, 0.0)
+    stack[0] = 0
+    while depth:
+        depth -= 1
+        node = stack[depth]
+        if _gap(p, boxes[node]) > best * (1.0 + _TIE):
+            continue
+        left = 2 * node + 1
+        if left < nodes:
+            left_last = _gap(p, boxes[left]) <= _gap(p, boxes[left + 1])  # the nearer child is looked into first
+            stack[depth], stack[depth + 1] = (left + 1, left) if left_last else (left, left + 1)
+            depth += 2
+            continue
+        for t in range(start[node, 0], start[node, 1]):
+            corner = triangles[order[t]]
+            a, b, c = _at(positions, corner[0]), _at(positions, corner[1]), _at(positions, corner[2])
+            u, v, w = _weights(p, a, b, c)
+            away = (
+                p[0] - u * a[0] - v * b[0] - w * c[0], p[1] - u * a[1] - v * b[1] - w * c[1], p[2] - u * a[2] - v * b[2] - w * c[2],
+            )  # fmt: skip
+            square = _dot(away, away)
+            if square > best * (1.0 + _TIE):
+                continue
+            normal = _normal(a, b, c)
+            height = _dot(away, normal)
+            if square < best * (1.0 - _TIE) or abs(height) > faced:
+                faced, distance = abs(height), np.sqrt(square)
+                side = 1.0 if height >= 0.0 else -1.0
+                signed, triangle, weights = side * distance, order[t], (u, v, w)
+                for axis in range(3):
+                    direction[axis] = side * away[axis] / distance if distance > 1e-12 else normal[axis]
+                best = min(best, square)
+    return signed, triangle, weights
+
+
 @njit(cache=True, nogil=True)
 def closest(
     points: FloatArray, positions: FloatArray, triangles: IntArray, order: IntArray, start: IntArray, boxes: FloatArray,
     signed: FloatArray, triangle: IntArray, weights: FloatArray, direction: FloatArray,
 ) -> None:  # fmt: skip
-    """Fill for every point (k, 3) the signed distance, the closest triangle, the weights of its corners and the direction away from it.
-
-    Of triangles that meet in the closest point the one that looks at the point most directly tells on which side it is.
-    """
-    stack = np.empty(_STACK, dtype=np.int64)
-    nodes = len(start)
+    """Fill for every point (k, 3) the signed distance, the closest triangle, the weights of its corners and the direction away from it."""
+    stack = np.empty(STACK, dtype=np.int64)
     for k in range(len(points)):
-        p = _at(points, k)
-        best, faced, depth = np.inf, -1.0, 1
-        stack[0] = 0
-        while depth:
-            depth -= 1
-            node = stack[depth]
-            if _gap(p, boxes[node]) > best * (1.0 + _TIE):
-                continue
-            left = 2 * node + 1
-            if left < nodes:
-                left_last = _gap(p, boxes[left]) <= _gap(p, boxes[left + 1])  # the nearer child is looked into first
-                stack[depth], stack[depth + 1] = (left + 1, left) if left_last else (left, left + 1)
-                depth += 2
-                continue
-            for t in range(start[node, 0], start[node, 1]):
-                corner = triangles[order[t]]
-                a, b, c = _at(positions, corner[0]), _at(positions, corner[1]), _at(positions, corner[2])
-                u, v, w = _weights(p, a, b, c)
-                away = (
-                    p[0] - u * a[0] - v * b[0] - w * c[0], p[1] - u * a[1] - v * b[1] - w * c[1], p[2] - u * a[2] - v * b[2] - w * c[2],
-                )  # fmt: skip
-                square = _dot(away, away)
-                if square > best * (1.0 + _TIE):
-                    continue
-                normal = _normal(a, b, c)
-                height = _dot(away, normal)
-                if square < best * (1.0 - _TIE) or abs(height) > faced:
-                    faced, distance = abs(height), np.sqrt(square)
-                    side = 1.0 if height >= 0.0 else -1.0
-                    signed[k], triangle[k] = side * distance, order[t]
-                    weights[k, 0], weights[k, 1], weights[k, 2] = u, v, w
-                    for axis in range(3):
-                        direction[k, axis] = side * away[axis] / distance if distance > 1e-12 else normal[axis]
-                    best = min(best, square)
+        signed[k], triangle[k], found = closest_point(_at(points, k), positions, triangles, order, start, boxes, stack, direction[k])
+        weights[k, 0], weights[k, 1], weights[k, 2] = found
