@@ -21,6 +21,7 @@ from naibu.core.arrays import AnyArray, FloatArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.io.files.atomic import new_aside, put_in_place
+from naibu.io.files.hdf5_stream import Hdf5File
 
 VTK_TYPES = {"line": 3, "triangle": 5, "tetra": 10, "hexahedron": 12, "tetra10": 24}
 _ROWS = "naibu"  # group of our own tables beside VTK's
@@ -38,7 +39,7 @@ class SeriesFile:
     target: Path
     aside: Path
     mesh: Mesh
-    file: h5py.File
+    output: Hdf5File
 
     @classmethod
     def begun(cls, path: str | os.PathLike[str], mesh: Mesh) -> SeriesFile:
@@ -51,10 +52,15 @@ class SeriesFile:
         """
         target = Path(path)
         aside = new_aside(target)
-        series = cls(target, aside, mesh, h5py.File(aside, "w"))
-        root = series.file.create_group("VTKHDF")
-        _write_static(root, mesh)
-        _begin_steps(root)
+        series = cls(target, aside, mesh, Hdf5File(aside))
+        try:
+            root = series.file.create_group("VTKHDF")
+            _write_static(root, mesh)
+            _begin_steps(root)
+            series._require_written()
+        except BaseException:
+            series.discard()
+            raise
         return series
 
     @classmethod
@@ -74,7 +80,7 @@ class SeriesFile:
             aside.unlink(missing_ok=True)
             raise InputError(f"{target}: cannot be read ({error.strerror or error}); begin a new series") from error
         try:
-            series = cls(target, aside, mesh, h5py.File(aside, "r+"))
+            series = cls(target, aside, mesh, Hdf5File(aside, keep=True))
             root = series.file["VTKHDF"]
             known, same = int(root["Steps"].attrs["NSteps"]), np.array_equal(root["Connectivity"][:], mesh.cells.ravel())
         except (OSError, KeyError) as error:
@@ -87,6 +93,11 @@ class SeriesFile:
             )
         series.truncate(steps)
         return series
+
+    @property
+    def file(self) -> h5py.File:
+        """The open HDF5 file."""
+        return self.output.file
 
     @property
     def steps(self) -> int:
@@ -114,20 +125,18 @@ class SeriesFile:
         """
         root = self.file["VTKHDF"]
         steps, count = root["Steps"], self.steps
-        try:
-            for where, data in (("PointData", point_data or {}), ("CellData", cell_data or {})):
-                for name, values in data.items():
-                    self._append_values(where, name, values, count)
-                    _put(steps[f"{where}Offsets"], name, count, np.int64(count * self._length(where)))
-            for name in ("PartOffsets", "PointOffsets", "NumberOfParts"):
-                _put(steps, name, count, np.int64(name == "NumberOfParts"))
-            for name in ("CellOffsets", "ConnectivityIdOffsets"):
-                _put(steps, name, count, np.zeros(1, np.int64))
-            _put(steps["CellDataOffsets"], "region", count, np.int64(0))
-            _put(steps, "Values", count, np.float64(time))
-            steps.attrs["NSteps"] = np.int64(count + 1)  # last: a step counts when all of it is there
-        except OSError as error:
-            raise InputError(f"{self.target}: cannot be written ({error}); free some space or choose another folder") from error
+        for where, data in (("PointData", point_data or {}), ("CellData", cell_data or {})):
+            for name, values in data.items():
+                self._append_values(where, name, values, count)
+                _put(steps[f"{where}Offsets"], name, count, np.int64(count * self._length(where)))
+        for name in ("PartOffsets", "PointOffsets", "NumberOfParts"):
+            _put(steps, name, count, np.int64(name == "NumberOfParts"))
+        for name in ("CellOffsets", "ConnectivityIdOffsets"):
+            _put(steps, name, count, np.zeros(1, np.int64))
+        _put(steps["CellDataOffsets"], "region", count, np.int64(0))
+        _put(steps, "Values", count, np.float64(time))
+        steps.attrs["NSteps"] = np.int64(count + 1)  # last: a step counts when all of it is there
+        self._require_written()
 
     def append_rows(self, name: str, rows: ArrayLike, first: int) -> None:
         """Write rows (k, ...) of a table of our own, beside VTK's data, from row `first` on."""
@@ -172,16 +181,13 @@ class SeriesFile:
         InputError
             It cannot be written.
         """
-        try:
-            self.file.close()
-        except OSError as error:
-            raise InputError(f"{self.target}: cannot be written ({error}); free some space or choose another folder") from error
+        self.output.close()
+        self._require_written()
         return put_in_place(self.aside, self.target)
 
     def discard(self) -> None:
         """Close and remove the unfinished file."""
-        if self.file:
-            self.file.close()
+        self.output.close()
         self.aside.unlink(missing_ok=True)
 
     def __enter__(self) -> SeriesFile:
@@ -189,6 +195,13 @@ class SeriesFile:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.discard()
+
+    def _require_written(self) -> None:
+        try:
+            self.output.require_written()
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise InputError(f"{self.target}: cannot be written ({reason}); free some space or choose another folder") from error
 
     def _length(self, where: str) -> int:
         return self.mesh.n_points if where == "PointData" else self.mesh.n_cells

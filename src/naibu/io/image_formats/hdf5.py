@@ -18,6 +18,7 @@ from naibu.core.arrays import AnyArray
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.io.files.atomic import new_aside, put_in_place
+from naibu.io.files.hdf5_stream import Hdf5File
 from naibu.io.files.reading import require_plausible, require_regular
 from naibu.io.image_formats.geometry import ReadOptions, volume_with_axes
 
@@ -51,12 +52,16 @@ def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Pa
     """Write intensities (nz, ny, nx), or vectors (nz, ny, nx, 3), on the grid of a volume, in chunks of 64 voxels per edge."""
     aside = new_aside(path)
     try:
-        with h5py.File(aside, "w") as file:
+        output = Hdf5File(aside)
+        try:
             chunks = tuple(min(n, BLOCK) for n in values.shape[:3]) + values.shape[3:]
             packed = {"compression": "gzip", "compression_opts": 1, "shuffle": True} if compressed else {}
-            stored = file.create_dataset("values", data=values, chunks=chunks, **packed)
+            stored = output.file.create_dataset("values", data=values, chunks=chunks, **packed)
             stored.attrs["spacing_mm"], stored.attrs["origin_mm"] = grid.spacing_mm, grid.origin_mm
             stored.attrs["direction"] = grid.direction
+        finally:
+            output.close()
+        output.require_written()
         return put_in_place(aside, path)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error}); free some space or choose another folder") from error

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import io
 import math
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -72,13 +70,9 @@ def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Pa
         "kinds": (["vector"] if vectors else []) + ["domain"] * 3,
         "encoding": "gzip" if compressed else "raw",
     }
-    handle, aside = tempfile.mkstemp(suffix=".nrrd")
-    os.close(handle)
-    try:
-        nrrd.write(aside, np.ascontiguousarray(stored).T, header, compression_level=1)
-        return write_atomically(path, Path(aside).read_bytes())
-    finally:
-        Path(aside).unlink(missing_ok=True)
+    buffer = io.BytesIO()
+    nrrd.write(buffer, np.ascontiguousarray(stored).T, header, compression_level=1)
+    return write_atomically(path, buffer.getvalue())
 
 
 def _loaded(path: Path) -> tuple[AnyArray, dict[str, Any]]:
