@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 
 import naibu
-from naibu._numba import cache_folder
 from naibu._numba.cache_folder import VARIABLE
 
 INNER = "from naibu._numba.compilation import njit\n\n\n@njit(cache=True)\ndef inner(x):\n    return x + {}\n"
@@ -207,14 +206,3 @@ def test_threads_compile_a_kernel_once(tmp_path: Path) -> None:
         "assert seen[0] == ('naibu.outer.outer', False) and seen[-1] == ('naibu.outer.outer', True), seen\n"
     )
     assert finished(started(tmp_path, threads))[2] == ["naibu.apart.apart"]
-
-
-def test_without_a_home_and_a_writable_package_kernels_go_to_a_private_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(cache_folder, "candidates", lambda: iter([tmp_path / "file" / "folder"]))
-    (tmp_path / "file").touch()
-    monkeypatch.setattr(cache_folder.tempfile, "gettempdir", lambda: str(tmp_path))
-    folder = cache_folder.cache_folder.__wrapped__()
-    assert folder.parent == tmp_path and folder.stat().st_mode & 0o777 == 0o700
-    folder.chmod(0o777)  # anybody could put code there
-    other = cache_folder.cache_folder.__wrapped__()
-    assert other != folder and other.stat().st_mode & 0o077 == 0

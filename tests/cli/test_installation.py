@@ -6,9 +6,11 @@ import importlib.metadata
 import sys
 from pathlib import Path
 
+import numba
 import pytest
 
 from naibu import datasets
+from naibu._numba import simd
 from naibu.cli import installation
 from naibu.core.errors import InputError
 from naibu.mechanics.linear_algebra import direct
@@ -159,3 +161,29 @@ def test_a_cache_folder_that_does_not_exist_yet_is_fine(monkeypatch: pytest.Monk
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "new" / "folder"))
     assert row("cache").status == "ok"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_folder_to_write_to_kernels_are_temporary(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("not a folder", encoding="utf-8")
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setattr(installation, "candidates", lambda: iter([tmp_path / "file" / "kernels"]))
+    found = row("cache")
+    assert found.status == "missing" and "temporary" in found.found and "NUMBA_CACHE_DIR" in found.remedy
+    assert installation.healthy([found])
+
+
+def test_compiled_kernels_are_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    (tmp_path / "naibu").mkdir()
+    for name in ("one.nbc", "two.nbc", "three.nbc.lock"):
+        (tmp_path / "naibu" / name).touch()
+    assert row("cache").found == f"{tmp_path / 'naibu'}, 2 compiled kernels"
+
+
+def test_what_an_untested_numba_lacks_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert row("kernels").status == "ok"
+    monkeypatch.setattr(simd, "VECTORS", False)
+    monkeypatch.setattr(numba, "__version__", "0.99.0")
+    found = row("kernels")
+    assert found.status == "missing" and "not tested" in found.found and "no SIMD vectors" in found.found
+    assert found.remedy == 'pip install "numba>=0.59,<0.69"' and installation.healthy([found])

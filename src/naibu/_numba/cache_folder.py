@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import os
 import shutil
 import stat
@@ -16,8 +17,8 @@ VARIABLE = "NUMBA_CACHE_DIR"
 
 
 @cache
-def cache_folder() -> Path:
-    """Return the folder of all compiled kernels, which exists and can be written to.
+def cache_folder() -> Path | None:
+    """Return the folder of all compiled kernels, which exists and can be written to; None where there is no such folder at all.
 
     The first that can be written to of: the folder that the environment variable NUMBA_CACHE_DIR names, the package's own ``__pycache__``,
     the user's cache folder, and a private one among the temporary files.
@@ -34,9 +35,9 @@ def readable_folders() -> tuple[Path, ...]:
 
     The latter may have been filled by an administrator, for users who cannot write there.
     """
-    first = cache_folder()
-    own = _package_folder()
-    return (first,) if first == own or os.environ.get(VARIABLE) else (first, own)
+    first, own = cache_folder(), _package_folder()
+    folders = [] if first is None else [first]
+    return tuple(folders if own in folders or os.environ.get(VARIABLE) else [*folders, own])
 
 
 def _package_folder() -> Path:
@@ -76,17 +77,18 @@ def _user_cache() -> Path | None:
         return None
 
 
-def _private_folder() -> Path:
-    """A folder that only this user can write to: kernels are code, which nobody else may put there."""
-    if sys.platform != "win32":
-        folder = Path(tempfile.gettempdir()) / f"naibu-kernels-{os.getuid()}"
-        try:
-            folder.mkdir(mode=0o700, exist_ok=True)
-            found = folder.lstat()
-            if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022 and usable(folder):
-                return folder
-        except OSError:
-            pass
-    folder = Path(tempfile.mkdtemp(prefix="naibu-kernels-"))
+def _private_folder() -> Path | None:
+    """Return a folder that only this user can write to: kernels are code, which nobody else may put there."""
+    try:
+        if sys.platform != "win32":
+            folder = Path(tempfile.gettempdir()) / f"naibu-kernels-{os.getuid()}"
+            with contextlib.suppress(OSError):
+                folder.mkdir(mode=0o700, exist_ok=True)
+                found = folder.lstat()
+                if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022 and usable(folder):
+                    return folder
+        folder = Path(tempfile.mkdtemp(prefix="naibu-kernels-"))
+    except OSError:  # no temporary files either
+        return None
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder

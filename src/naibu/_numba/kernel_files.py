@@ -54,9 +54,10 @@ class KernelFile:
         """Return the name of the file."""
         return f"{self.label.replace('<', '').replace('>', '')}-{self.key}{SUFFIX}"
 
-    def lock(self) -> ProcessLock:
+    def lock(self) -> contextlib.AbstractContextManager[object]:
         """Return the lock of the process that compiles this kernel."""
-        return ProcessLock(cache_folder() / f"{self.name}.lock", LONGEST_WAIT_S)
+        folder = cache_folder()
+        return contextlib.nullcontext() if folder is None else ProcessLock(folder / f"{self.name}.lock", LONGEST_WAIT_S)
 
     def load(self, target: Any) -> Any:
         """Return the compiled kernel, or None where there is none or its file is damaged."""
@@ -74,7 +75,10 @@ class KernelFile:
         """Keep a compiled kernel; a full or unwritable disk costs the cache, not the result."""
         if any(not lifted.can_cache for lifted in result.lifted) or result.library.has_dynamic_globals:
             return
-        path = cache_folder() / self.name
+        folder = cache_folder()
+        if folder is None:
+            return
+        path = folder / self.name
         part = path.with_name(f"{self.name}.{os.getpid()}.part")
         with contextlib.suppress(OSError):
             try:
@@ -82,7 +86,7 @@ class KernelFile:
                 part.replace(path)
             finally:
                 part.unlink(missing_ok=True)
-            _forget(path.parent, path.name.rpartition("-")[0])
+            _forget(folder, path.name.rpartition("-")[0])
 
 
 def packed(result: Any) -> bytes:

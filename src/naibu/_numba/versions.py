@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numba
 
 FIRST_TESTED, FIRST_UNTESTED = (0, 59), (0, 69)
+TESTED = ">=0.59,<0.69"  # as in pyproject.toml
 
 
 def tested() -> bool:

@@ -91,7 +91,7 @@ def doctor_rows() -> list[DoctorRow]:
     """
     rows = [_python_row(), DoctorRow("naibu", "ok", __version__, "this package")]
     rows += [_required_row(name, purpose) for name, purpose in _REQUIRED.items()]
-    rows += [_threading_row(), _cache_row(), _data_row(), _solver_row()]
+    rows += [_threading_row(), _kernels_row(), _cache_row(), _data_row(), _solver_row()]
     return [*rows, *(_optional_row(name, purpose) for name, purpose in _OPTIONAL.items()), _gpu_row()]
 
 
@@ -189,14 +189,36 @@ def _has_layer(layer: str) -> bool:
     return True
 
 
+def _kernels_row() -> DoctorRow:
+    name, purpose = "kernels", "Numba's inner interfaces: vectors and threads of lattices, the cache"
+    try:
+        from naibu._numba.atomics import ATOMIC
+        from naibu._numba.compilation import cache_works
+        from naibu._numba.simd import VECTORS
+        from naibu._numba.versions import TESTED, tested
+
+        parts = {"SIMD vectors": VECTORS, "thread pool": ATOMIC, "cache": cache_works()}
+    except Exception as error:
+        return DoctorRow(name, "broken", _first_line(error), purpose, "mend the packages above that are not ok")
+    version = f"Numba {_version('numba')}{'' if tested() else ' (not tested)'}"
+    lacking = [part for part, works in parts.items() if not works]
+    if lacking:
+        found = f"{version}: no {', no '.join(lacking)}; slower"
+        return DoctorRow(name, "missing", found, purpose, f'pip install "numba{TESTED}"', optional=True)
+    return DoctorRow(name, "ok", f"{version}: {', '.join(parts)}", purpose)
+
+
 def _cache_row() -> DoctorRow:
     name, purpose = "cache", "keeps compiled kernels, so that only the first run compiles"
     folders = cache_folders()
     found = next((folder for folder in folders if _writable(folder)), None)
-    if found is None:
-        where, remedy = " or ".join(str(folder) for folder in folders), "set NUMBA_CACHE_DIR to a folder you may write to"
+    if found is not None:
+        kept = sum(1 for _ in found.glob("*.nbc"))
+        return DoctorRow(name, "ok", f"{found}, {kept} compiled kernels", purpose)
+    where, remedy = " or ".join(str(folder) for folder in folders), f"set {VARIABLE} to a folder you may write to"
+    if os.environ.get(VARIABLE):
         return DoctorRow(name, "broken", f"cannot write to {where}", purpose, remedy)
-    return DoctorRow(name, "ok", str(found), purpose)
+    return DoctorRow(name, "missing", f"cannot write to {where}; kernels go to temporary files", purpose, remedy, optional=True)
 
 
 def cache_folders() -> list[Path]:
