@@ -19,11 +19,11 @@ CUBES = ("ct_two_material_1", "ct_two_material_2", "ct_two_material_3")
 
 
 def fitted(calibration: Calibration) -> dict[str, float]:
-    """RMS of every trial of a calibration, mm."""
+    """RMS of every load case of a calibration, mm."""
     out = {}
-    for trial, fit in zip(calibration.trials, calibration.match.fits, strict=True):
-        whole = np.isfinite(fit.residual).all(axis=1) & ~trial.specimen.marker_filled.any(axis=1)
-        out[trial.label] = float(np.sqrt((fit.residual[whole] ** 2).sum(axis=1).mean()))
+    for load_case, fit in zip(calibration.load_cases, calibration.match.fits, strict=True):
+        whole = np.isfinite(fit.residual).all(axis=1) & ~load_case.specimen.marker_filled.any(axis=1)
+        out[load_case.label] = float(np.sqrt((fit.residual[whole] ** 2).sum(axis=1).mean()))
     return out
 
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.estimate import FieldEstimate, identify_field
-from naibu.identification.from_fields.load_cases import FieldTrial, Zones
+from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.regularization import cell_volumes
 from naibu.identification.from_fields.sensitivities import logarithms, young_and_poisson
 from naibu.identification.from_fields.uncertainty import cramer_rao_bound
@@ -43,14 +43,14 @@ UNSEEN = (4.0, 4.0, -8.0)
 TRUTH = np.array(list(LAYERS.values()))  # Young's modulus, kPa, and Poisson's ratio of both layers
 
 
-def noisy(body: PushedBody, states: Sequence[Array], noise: float, seed: int) -> list[FieldTrial]:
+def noisy(body: PushedBody, states: Sequence[Array], noise: float, seed: int) -> list[FieldLoadCase]:
     """Trials measured at the nodes; without noise they are called exact."""
     rng = np.random.default_rng(seed)
     out = []
     for k, u in enumerate(states):
         sd = noise * float(np.linalg.norm(u, axis=1).max())
         field = DisplacementField.from_arrays(body.mesh.points, u + sd * rng.standard_normal(u.shape), sd_mm=sd)
-        out.append(FieldTrial.of(f"push {k + 1}", field, body.mesh, loaded=body.constrained))
+        out.append(FieldLoadCase.of(f"push {k + 1}", field, body.mesh, loaded=body.constrained))
     return out
 
 
@@ -157,7 +157,7 @@ def ball(mesh: Mesh, radius: float, transition: float) -> Array:
 
 def pressed_ball(
     cells: int, fine: int, *, radius: float = 11.0, transition: float = 3.0, noise: float = 0.005, seed: int = 0
-) -> tuple[Mesh, list[FieldTrial], Zones, Array]:
+) -> tuple[Mesh, list[FieldLoadCase], Zones, Array]:
     """Three pushes of a cube of 40 mm (10 kPa, 0.4) with a ball in it under a known pad, measured every 2 mm, solved on a finer mesh."""
     rng = np.random.default_rng(seed)
     layers = [("body", 40.0), ("pad", 10.0)]
@@ -172,7 +172,7 @@ def pressed_ball(
         u = body.solve(lame, shear, PrescribedDisplacement.none(truth.n_points).and_also(floor, (0, 0, 0)).and_also(top, push))
         sd = noise * float(np.linalg.norm(u, axis=1).max())
         vectors = where @ u + sd * rng.standard_normal(points.shape)
-        trials.append(FieldTrial.of(f"push {k + 1}", DisplacementField.from_arrays(points, vectors, sd_mm=sd), mesh, loaded=loaded))
+        trials.append(FieldLoadCase.of(f"push {k + 1}", DisplacementField.from_arrays(points, vectors, sd_mm=sd), mesh, loaded=loaded))
     zones = Zones.of(mesh, known={"pad": (10.0, 0.4)}, each_cell=True)
     return mesh, trials, zones, ball(mesh, radius, transition)[zones.of_cell >= 0]
 

@@ -43,7 +43,7 @@ def stop_at(patch: pytest.MonkeyPatch, call: int) -> None:
     calls: list[bool] = []
 
     def interrupted(self: Matcher, *arguments: object) -> object:
-        calls.append(self.trials[0].specimen.settings.element_size_mm == COARSE.element_size_mm)
+        calls.append(self.load_cases[0].specimen.settings.element_size_mm == COARSE.element_size_mm)
         if calls[-1] and sum(calls) == call:
             raise KeyboardInterrupt
         return evaluate(self, *arguments)  # type: ignore[arg-type]

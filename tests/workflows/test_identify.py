@@ -18,7 +18,7 @@ from naibu.io.files import atomic
 from naibu.viewer.result_page.payload import report_json
 from naibu.viewer.result_page.reading import report_from_json
 from naibu.workflows import identify, predict, report
-from naibu.workflows.report_content import prediction_scene, trial_scene
+from naibu.workflows.report_content import load_case_scene, prediction_scene
 from naibu.workflows.result_folder import CHECKPOINT_FILE, MODEL_FILE, read_model
 
 STATE = {"press": ["pressed"]}
@@ -50,7 +50,7 @@ def test_results_are_complete(press: Press) -> None:
     expected = {"model.json", "identification.json", "residuals.csv", "report.html", "report.json", "press_pressed.vtkhdf"}
     assert names(press.results) == expected
     summary = json.loads((press.results / "identification.json").read_text(encoding="utf-8"))
-    trial = summary["trials"]["press/pressed"]
+    trial = summary["load_cases"]["press/pressed"]
     assert summary["status"] == "CONVERGED" and trial["markers"] == 125
     assert 0.8 < summary["noise_factor"] < 1.3
     assert trial["rms_3d_mm"] == pytest.approx(np.sqrt(sum(trial[f"rms_{a}_mm"] ** 2 for a in "xyz")))
@@ -61,11 +61,11 @@ def test_results_are_complete(press: Press) -> None:
 
 def test_files_and_page_tell_predicted_minus_measured(press: Press) -> None:
     calibration = press.identification.calibration
-    fit, trial = calibration.match.fits[0], calibration.trials[0]
+    fit, trial = calibration.match.fits[0], calibration.load_cases[0]
     table = rows(press.results / "residuals.csv")
     written = np.array([[float(r[f"residual_{a}_mm"]) for a in "xyz"] for r in table])
     np.testing.assert_allclose(written, fit.predicted - trial.measured, atol=1e-4)
-    scene = trial_scene(trial, fit, press.identification.model.parameters.values())
+    scene = load_case_scene(trial, fit, press.identification.model.parameters.values())
     # the scene stands in the object's frame; distances do not care
     np.testing.assert_allclose(np.linalg.norm(scene.residual_mm, axis=1), np.linalg.norm(fit.residual, axis=1), atol=1e-9)
     np.testing.assert_allclose(fit.pose.inverse().applied(fit.predicted), scene.steps[-1].markers, atol=1e-9)

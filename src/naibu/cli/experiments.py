@@ -133,7 +133,7 @@ def _show(result: Identification) -> None:
     from naibu.workflows.report_content import accuracy_table, parameter_rows, shared_names, undetermined
 
     calibration, model = result.calibration, result.model
-    experiments = {t.specimen.experiment.name: t.specimen.experiment for t in calibration.trials}
+    experiments = {t.specimen.experiment.name: t.specimen.experiment for t in calibration.load_cases}
     for experiment in experiments.values():
         for line in experiment.loading.assumed:
             say(f"{experiment.name}: {line}", "dim")

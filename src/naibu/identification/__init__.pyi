@@ -1,16 +1,16 @@
-from .force_balance.batch import BalanceEstimate, field_balance
-from .force_balance.incremental import IncrementalEstimate, incremental_balance
-from .force_balance.weighted import whitened_balance
+from .equilibrium_gap.batch import EquilibriumGapEstimate, batch_equilibrium_gap
+from .equilibrium_gap.incremental import IncrementalEstimate, incremental_equilibrium_gap
+from .equilibrium_gap.weighted import weighted_equilibrium_gap
 from .from_fields.estimate import FieldEstimate, identify_field
 from .from_fields.experiment_design import Accuracy, expected_accuracy
-from .from_fields.load_cases import FieldTrial, Zones
+from .from_fields.load_cases import FieldLoadCase, Zones
 from .from_fields.uncertainty import cramer_rao_bound
 from .from_markers.calibration import Calibration, calibrate
 from .from_markers.gauss_newton import MatchingSettings
 from .from_markers.known_materials import KnownMaterials
 from .from_markers.observations import NoiseModel
 from .from_markers.specimen_model import ModelSettings
-from .from_motion.rheology import MotionEstimate, MotionTrial, identify_motion
+from .from_motion.rheology import MotionEstimate, MotionLoadCase, identify_motion
 from .lattice_calibration.evolutionary import search_cma_es, search_genetic
 from .lattice_calibration.forward_model import Capture, PushedFace, Pushing
 from .lattice_calibration.gauss_newton import CalibrationProblem, LatticeEstimate, ReportIndices, calibrate_lattice, indices
@@ -25,14 +25,14 @@ from .prediction.prediction import Prediction, predict_state
 
 __all__ = [
     "Accuracy",
-    "BalanceEstimate",
     "CalibratedModel",
     "Calibration",
     "CalibrationProblem",
     "Capture",
     "CompressionTest",
+    "EquilibriumGapEstimate",
     "FieldEstimate",
-    "FieldTrial",
+    "FieldLoadCase",
     "IncrementalEstimate",
     "KnownMaterials",
     "LatticeEstimate",
@@ -43,7 +43,7 @@ __all__ = [
     "ModelRow",
     "ModelSettings",
     "MotionEstimate",
-    "MotionTrial",
+    "MotionLoadCase",
     "NoiseModel",
     "PoissonRatio",
     "Prediction",
@@ -54,17 +54,17 @@ __all__ = [
     "SpecimenMean",
     "Zones",
     "baselines",
+    "batch_equilibrium_gap",
     "calibrate",
     "calibrate_lattice",
     "compare_models",
     "compression_test",
     "cramer_rao_bound",
     "expected_accuracy",
-    "field_balance",
     "force_difference",
     "identify_field",
     "identify_motion",
-    "incremental_balance",
+    "incremental_equilibrium_gap",
     "indices",
     "leave_one_out",
     "marker_strain",
@@ -75,5 +75,5 @@ __all__ = [
     "search_genetic",
     "shape_difference",
     "specimen_mean",
-    "whitened_balance",
+    "weighted_equilibrium_gap",
 ]

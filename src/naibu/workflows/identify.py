@@ -12,9 +12,9 @@ from naibu.core.experiment import Experiment
 from naibu.core.rigid_transform import registration
 from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration, calibrate
-from naibu.identification.from_markers.observations import Trial
+from naibu.identification.from_markers.observations import MarkerLoadCase
 from naibu.identification.from_markers.specimen_model import ModelSettings
-from naibu.identification.prediction.baselines import affine, balanced, baselines
+from naibu.identification.prediction.baselines import affine, baselines, equilibrium_gap_baseline
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.cross_validation import LeftOut, leave_one_out
 from naibu.identification.prediction.prediction import rms
@@ -177,9 +177,9 @@ def _compared(
 
     try:
         if not interrupted:
-            compared = {t.label: _baselines(t, values) for t in calibration.trials}
-            for label, distance in balanced(calibration).items():
-                compared[label]["force balance"] = distance
+            compared = {t.label: _baselines(t, values) for t in calibration.load_cases}
+            for label, distance in equilibrium_gap_baseline(calibration).items():
+                compared[label]["equilibrium gap"] = distance
         if not interrupted and left_in_turn:
             found = leave_one_out(
                 left_in_turn,
@@ -196,10 +196,10 @@ def _compared(
     return Identification(model, calibration, compared, left_out, interrupted), trouble
 
 
-def _baselines(trial: Trial, values: Mapping[str, float]) -> dict[str, float]:
+def _baselines(load_case: MarkerLoadCase, values: Mapping[str, float]) -> dict[str, float]:
     """Simple descriptions of a state; without the linear one where it does not apply."""
     try:
-        return baselines(trial, values)
+        return baselines(load_case, values)
     except NaibuError:
-        free, measured = trial.specimen.marker_points, trial.measured
+        free, measured = load_case.specimen.marker_points, load_case.measured
         return {"rigid": rms(measured - registration(free, measured).applied(free)), "affine": rms(measured - affine(free, measured))}

@@ -10,7 +10,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.parameters import Parameter
 from naibu.identification.from_markers.calibration import Calibration
-from naibu.identification.from_markers.observations import Trial, TrialFit
+from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase
 from naibu.identification.from_markers.specimen_model import Specimen
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.cross_validation import LeftOut, ModelRow
@@ -44,7 +44,7 @@ class Accuracy:
     noise_units: float
 
 
-def accuracy(specimen: Specimen, fit: TrialFit, residual: FloatArray | None = None) -> Accuracy:
+def accuracy(specimen: Specimen, fit: LoadCaseFit, residual: FloatArray | None = None) -> Accuracy:
     """Return the accuracy of a fit; of another `residual` (k, 3), mm, where the fit itself is not registered to the measured markers."""
     r = fit.residual if residual is None else residual
     whole = np.isfinite(r).all(axis=1) & ~np.any(specimen.marker_filled, axis=1)
@@ -57,14 +57,16 @@ def accuracy(specimen: Specimen, fit: TrialFit, residual: FloatArray | None = No
 
 
 def accuracy_table(calibration: Calibration, baselines: Mapping[str, Mapping[str, float]], left_out: Sequence[LeftOut] = ()) -> Table:
-    """Return RMS of every trial, of its prediction when left out, and of simple baselines."""
+    """Return RMS of every load case, of its prediction when left out, and of simple baselines."""
     names = list(dict.fromkeys(k for row in baselines.values() for k in row))
     unseen = {f"{r.experiment}/{r.state}": r.rms_mm for r in left_out}
     rows = []
-    for trial, fit in zip(calibration.trials, calibration.match.fits, strict=True):
-        compared = baselines.get(trial.label, {})
-        extra = ([unseen.get(trial.label)] if unseen else []) + [compared.get(n) for n in names]
-        rows.append((*_accuracy_row(trial.label, accuracy(trial.specimen, fit)), *(None if v is None else round(v, 3) for v in extra)))
+    for load_case, fit in zip(calibration.load_cases, calibration.match.fits, strict=True):
+        compared = baselines.get(load_case.label, {})
+        extra = ([unseen.get(load_case.label)] if unseen else []) + [compared.get(n) for n in names]
+        rows.append(
+            (*_accuracy_row(load_case.label, accuracy(load_case.specimen, fit)), *(None if v is None else round(v, 3) for v in extra))
+        )
     columns = (*_ACCURACY_COLUMNS, *(["left out mm"] if unseen else []), *(f"{n} mm" for n in names))
     note = "Root mean square over markers measured completely in both states."
     if unseen:
@@ -94,7 +96,7 @@ def _accuracy_row(label: str, a: Accuracy) -> tuple[Cell, ...]:
     return (label, a.markers, *(round(v, 3) for v in (a.x, a.y, a.z, a.total, a.noise_units)))
 
 
-def scene(specimen: Specimen, state: str, fit: TrialFit, measured: FloatArray, values: Mapping[str, float], role: str) -> Scene:
+def scene(specimen: Specimen, state: str, fit: LoadCaseFit, measured: FloatArray, values: Mapping[str, float], role: str) -> Scene:
     """Return one state for the 3-D view, in the object's frame.
 
     Parameters
@@ -103,7 +105,7 @@ def scene(specimen: Specimen, state: str, fit: TrialFit, measured: FloatArray, v
         The meshed experiment.
     state : str
         Name of the state.
-    fit : TrialFit
+    fit : LoadCaseFit
         Its solution.
     measured : ndarray, shape (k, 3)
         Measured markers in the object's frame, mm; NaN where not measured.
@@ -151,10 +153,10 @@ def _box(specimen: Specimen, position: FloatArray, normal: FloatArray) -> Box:
     return Box((x, y, z), (a, b, c))
 
 
-def trial_scene(trial: Trial, fit: TrialFit, values: Mapping[str, float], role: str = "fitted") -> Scene:
-    """Return a fitted trial for the 3-D view."""
-    measured = fit.pose.inverse().applied(trial.measured * trial.specimen.enlargement(values))
-    return scene(trial.specimen, trial.state, fit, measured, values, role)
+def load_case_scene(load_case: MarkerLoadCase, fit: LoadCaseFit, values: Mapping[str, float], role: str = "fitted") -> Scene:
+    """Return a fitted load case for the 3-D view."""
+    measured = fit.pose.inverse().applied(load_case.measured * load_case.specimen.enlargement(values))
+    return scene(load_case.specimen, load_case.state, fit, measured, values, role)
 
 
 def prediction_scene(prediction: Prediction, role: str = "predicted unseen") -> Scene:
@@ -165,7 +167,7 @@ def prediction_scene(prediction: Prediction, role: str = "predicted unseen") -> 
 
 def shared_names(model: CalibratedModel) -> tuple[str, ...]:
     """Return the names of the free parameters of materials and friction, which hold beyond the experiments used."""
-    own = {label.partition("/")[0] for label in model.trials}
+    own = {label.partition("/")[0] for label in model.load_cases}
     return tuple(p.name for p in model.parameters.free if p.name.partition(":")[0].partition("/")[0] not in own)
 
 
@@ -209,10 +211,12 @@ def build_report(
 ) -> Report:
     """Gather everything that a calibration's page shows."""
     names, values = shared_names(model), model.parameters.values()
-    scenes = tuple(trial_scene(t, f, values) for t, f in zip(calibration.trials, calibration.match.fits, strict=True))
-    assumed = dict.fromkeys(f"{t.specimen.experiment.name}: {s}" for t in calibration.trials for s in t.specimen.experiment.loading.assumed)
+    scenes = tuple(load_case_scene(t, f, values) for t, f in zip(calibration.load_cases, calibration.match.fits, strict=True))
+    assumed = dict.fromkeys(
+        f"{t.specimen.experiment.name}: {s}" for t in calibration.load_cases for s in t.specimen.experiment.loading.assumed
+    )
     return Report(
-        title="Calibration of " + ", ".join(dict.fromkeys(t.specimen.experiment.name for t in calibration.trials)),
+        title="Calibration of " + ", ".join(dict.fromkeys(t.specimen.experiment.name for t in calibration.load_cases)),
         headline=_calibration_headline(calibration, model, left_out),
         scenes=scenes,
         accuracy=accuracy_table(calibration, baselines, left_out),
@@ -226,7 +230,7 @@ def build_report(
 
 
 def _calibration_headline(calibration: Calibration, model: CalibratedModel, left_out: Sequence[LeftOut]) -> tuple[str, ...]:
-    found = [accuracy(t.specimen, f).total for t, f in zip(calibration.trials, calibration.match.fits, strict=True)]
+    found = [accuracy(t.specimen, f).total for t, f in zip(calibration.load_cases, calibration.match.fits, strict=True)]
     states = f"{len(found)} loaded states" if len(found) > 1 else "one loaded state"
     out = [
         f"One set of parameters predicts the markers of {states} to {np.nanmax(found):.2f} mm{' or better' * (len(found) > 1)} (RMS, 3-D)."
@@ -263,7 +267,7 @@ def prediction_report(model: CalibratedModel, prediction: Prediction) -> Report:
     """Gather everything that a prediction's page shows."""
     p, names = prediction, shared_names(model)
     label = f"{p.specimen.experiment.name}/{p.state}"
-    view = prediction_scene(p, "also used to identify" if label in model.trials else "predicted unseen")
+    view = prediction_scene(p, "also used to identify" if label in model.load_cases else "predicted unseen")
     table = Table("Measured against predicted markers", _ACCURACY_COLUMNS, (_accuracy_row(label, accuracy(p.specimen, p.fit, p.residual)),))
     return Report(
         title=f"Prediction of {label}",

@@ -136,10 +136,10 @@ def write_identification(
     write_atomically(folder / RESIDUALS_FILE, _residual_csv(calibration))
     write_atomically(folder / IDENTIFICATION_FILE, _text(_identification_summary(calibration, model, baselines, left_out)))
     values = model.parameters.values()
-    for trial, fit in zip(calibration.trials, calibration.match.fits, strict=True):
-        series = folder / f"{trial.label.replace('/', '_')}.vtkhdf"
+    for load_case, fit in zip(calibration.load_cases, calibration.match.fits, strict=True):
+        series = folder / f"{load_case.label.replace('/', '_')}.vtkhdf"
         states = fit.solution.states
-        mesh = trial.specimen.reshaped(values).mesh
+        mesh = load_case.specimen.reshaped(values).mesh
         write_vtkhdf_series(series, mesh, [s.load for s in states], {"displacement_mm": [s.displacement for s in states]})
     _write_report(folder, REPORT_STEM, build_report(calibration, model, baselines, left_out))
 
@@ -147,10 +147,10 @@ def write_identification(
 def _identification_summary(
     calibration: Calibration, model: CalibratedModel, baselines: Baselines, left_out: Sequence[LeftOut]
 ) -> dict[str, Any]:
-    trials = {}
-    for trial, fit in zip(calibration.trials, calibration.match.fits, strict=True):
-        trials[trial.label] = _figures(accuracy(trial.specimen, fit)) | {
-            "baselines_rms_3d_mm": dict(baselines.get(trial.label, {})),
+    load_cases = {}
+    for load_case, fit in zip(calibration.load_cases, calibration.match.fits, strict=True):
+        load_cases[load_case.label] = _figures(accuracy(load_case.specimen, fit)) | {
+            "baselines_rms_3d_mm": dict(baselines.get(load_case.label, {})),
             "linear_solver": fit.solution.linear_solver,
             "reactions_mN": _reactions(fit.solution),
         }
@@ -160,7 +160,7 @@ def _identification_summary(
         "status": calibration.match.status.name,
         "message": calibration.match.status.value,
         "noise_factor": model.noise_factor,
-        "trials": trials,
+        "load_cases": load_cases,
         "left_out": rows,
         "parameters_95": found,
         "provenance": dict(model.provenance),
@@ -196,12 +196,12 @@ def _residual_csv(calibration: Calibration) -> str:
     writer = csv.writer(text, lineterminator="\n")
     axes = [f"residual_{a}_mm" for a in "xyz"] + [f"sd_{a}_mm" for a in "xyz"]
     writer.writerow(["experiment", "state", "marker", *axes, "initial_completed"])
-    for trial, fit in zip(calibration.trials, calibration.match.fits, strict=True):
-        for i, marker in enumerate(trial.specimen.marker_ids):
+    for load_case, fit in zip(calibration.load_cases, calibration.match.fits, strict=True):
+        for i, marker in enumerate(load_case.specimen.marker_ids):
             # a file, like the page, tells predicted minus measured
             numbers = [_number(v, 4) for v in (*-fit.residual[i], *fit.sd[i])]
             writer.writerow(
-                [trial.specimen.experiment.name, trial.state, int(marker), *numbers, int(trial.specimen.marker_filled[i].any())]
+                [load_case.specimen.experiment.name, load_case.state, int(marker), *numbers, int(load_case.specimen.marker_filled[i].any())]
             )
     return text.getvalue()
 
@@ -217,7 +217,7 @@ def write_prediction(folder: Path, model: CalibratedModel, prediction: Predictio
     summary = {
         "experiment": p.specimen.experiment.name,
         "state": p.state,
-        "used_to_identify": f"{p.specimen.experiment.name}/{p.state}" in model.trials,
+        "used_to_identify": f"{p.specimen.experiment.name}/{p.state}" in model.load_cases,
         "platen_position_mm": p.platen_position_mm,
         "registered_to_measured": p.registered,
         **_figures(accuracy(p.specimen, p.fit, p.residual)),

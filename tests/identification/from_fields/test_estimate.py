@@ -13,7 +13,7 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.estimate import FieldEstimate, identify_field
 from naibu.identification.from_fields.gauss_newton import Bounds, Objective, SearchSettings, exact_step, first_point, search
-from naibu.identification.from_fields.load_cases import FieldTrial, Zones
+from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.regularization import Laplacian, TotalVariation, ZoneGraph
 from naibu.identification.from_fields.sensitivities import FieldModel, Linearised, Point, logarithms, moduli_of, young_and_poisson
 from naibu.identification.from_fields.truncated_newton import RegularizedSystem, conjugate_gradients, truncated_step
@@ -34,10 +34,10 @@ def layered(law: str = "linear", pushes: Sequence[tuple[float, ...]] = (PRESS,))
     return cube(LAYERS, law=law, pushes=pushes)  # type: ignore[arg-type]
 
 
-def with_noise(body: PushedBody, states: Sequence[np.ndarray], sd_mm: float, seed: int) -> list[FieldTrial]:
+def with_noise(body: PushedBody, states: Sequence[np.ndarray], sd_mm: float, seed: int) -> list[FieldLoadCase]:
     rng = np.random.default_rng(seed)
     fields = [DisplacementField.from_arrays(body.mesh.points, u + sd_mm * rng.standard_normal(u.shape), sd_mm=sd_mm) for u in states]
-    return [FieldTrial.of(f"push {k}", field, body.mesh, loaded=body.constrained) for k, field in enumerate(fields)]
+    return [FieldLoadCase.of(f"push {k}", field, body.mesh, loaded=body.constrained) for k, field in enumerate(fields)]
 
 
 def true_theta(body: PushedBody, zones: Zones) -> np.ndarray:
@@ -50,7 +50,7 @@ def at_some_point(law: str, *, each_cell: bool = False, seed: int = 0) -> tuple[
     """A point away from the best one, so that residuals are large, with two trials."""
     body = layered(law, (PRESS, SHEAR))
     zones = body.zones(each_cell=each_cell)
-    model = FieldModel(body.mesh, body.trials(sd_mm=0.1, seed=seed), zones, law)  # type: ignore[arg-type]
+    model = FieldModel(body.mesh, body.load_cases(sd_mm=0.1, seed=seed), zones, law)  # type: ignore[arg-type]
     rng = np.random.default_rng(seed)
     point = first_point(model, true_theta(body, zones) + 0.1 * rng.standard_normal(2 * zones.count))
     return model, point
@@ -136,7 +136,7 @@ def test_product_with_the_hessian_is_that_of_the_explicit_matrices() -> None:
 @pytest.mark.parametrize("law", LAWS)
 def test_exact_fields_give_exact_moduli_of_regions(law: str) -> None:
     body = layered(law)
-    found = identify_field(body.mesh, body.trials(), body.zones(), law=law)  # type: ignore[arg-type]
+    found = identify_field(body.mesh, body.load_cases(), body.zones(), law=law)  # type: ignore[arg-type]
     assert found.young_modulus == pytest.approx(TRUE_YOUNG, rel=1e-8)
     assert found.poisson_ratio == pytest.approx(TRUE_POISSON, rel=1e-8)
     assert found.status.ok
@@ -144,7 +144,7 @@ def test_exact_fields_give_exact_moduli_of_regions(law: str) -> None:
 
 def test_the_wrong_law_is_told_by_the_misfit() -> None:
     body = layered("neo_hookean")
-    trials = body.trials(sd_mm=0.05)
+    trials = body.load_cases(sd_mm=0.05)
     right = identify_field(body.mesh, trials, body.zones(), law="neo_hookean")
     wrong = identify_field(body.mesh, trials, body.zones(), law="linear")
     assert right.noise_factor < 1.2 < 2.0 < wrong.noise_factor
@@ -184,13 +184,13 @@ def test_errors_are_those_of_the_cramer_rao_bound(law: str) -> None:
 def every_element() -> tuple[PushedBody, Zones, FieldEstimate]:
     body = layered()
     zones = body.zones(each_cell=True)
-    return body, zones, identify_field(body.mesh, body.trials(sd_mm=0.01), zones)
+    return body, zones, identify_field(body.mesh, body.load_cases(sd_mm=0.01), zones)
 
 
 def test_layers_are_found_without_being_told(every_element: tuple[PushedBody, Zones, FieldEstimate]) -> None:
     """Noise of 0.1 % of the push, one trial, a pair of moduli an element: as good as being told the layers."""
     body, zones, found = every_element
-    told = identify_field(body.mesh, body.trials(sd_mm=0.01), body.zones())
+    told = identify_field(body.mesh, body.load_cases(sd_mm=0.01), body.zones())
     layer = body.mesh.regions[zones.of_cell >= 0]
     of_cell = found.zones.of_cell[zones.of_cell >= 0]
     for k in range(2):
@@ -218,7 +218,7 @@ def test_what_total_variation_shrinks_regions_restore(every_element: tuple[Pushe
 def test_exact_fields_give_every_element() -> None:
     body = layered()
     zones = body.zones(each_cell=True)
-    found = identify_field(body.mesh, body.trials(), zones)
+    found = identify_field(body.mesh, body.load_cases(), zones)
     for sought, true in zip(found.lame_of_cells(), body.moduli, strict=True):
         assert sought == pytest.approx(true, rel=1e-8)
 
@@ -275,7 +275,7 @@ def test_the_preconditioner_of_loaded_components_serves_other_moduli() -> None:
     assert np.abs(solution[1]).max() > 0.0
 
 
-def ball_from_a_finer_mesh(cells: int, fine: int, noise: float = 0.005) -> tuple[Mesh, list[FieldTrial], Zones, np.ndarray]:
+def ball_from_a_finer_mesh(cells: int, fine: int, noise: float = 0.005) -> tuple[Mesh, list[FieldLoadCase], Zones, np.ndarray]:
     """A ball of 40 kPa in 10 kPa under a known pad, solved on a finer mesh and measured on a grid of points."""
     rng = np.random.default_rng(0)
     layers = [("body", 40.0), ("pad", 10.0)]
@@ -295,7 +295,7 @@ def ball_from_a_finer_mesh(cells: int, fine: int, noise: float = 0.005) -> tuple
         sd = noise * np.abs(u).max()
         field = DisplacementField.from_arrays(points, where @ u + sd * rng.standard_normal(points.shape), sd_mm=sd)
         height = mesh.points[:, 2]
-        trials.append(FieldTrial.of(f"push {k}", field, mesh, loaded=(height < 1e-9) | (height > 50 - 1e-9)))
+        trials.append(FieldLoadCase.of(f"push {k}", field, mesh, loaded=(height < 1e-9) | (height > 50 - 1e-9)))
     zones = Zones.of(mesh, known={"pad": (10.0, 0.4)}, each_cell=True)
     return mesh, trials, zones, profile(mesh)[zones.of_cell >= 0]
 
@@ -313,7 +313,7 @@ def test_a_smooth_inclusion_is_found_on_another_mesh_by_conjugate_gradients() ->
 
 def test_bounds_hold_and_a_bound_that_binds_is_reached() -> None:
     body = layered()
-    trials = body.trials(sd_mm=0.1)
+    trials = body.load_cases(sd_mm=0.1)
     found = identify_field(body.mesh, trials, body.zones(), bounds=Bounds(poisson_ratio=(0.0, 0.42)))
     assert found.poisson_ratio[0] == pytest.approx(0.42, abs=1e-9)
     assert 0.0 < found.poisson_ratio[1] < 0.42
@@ -323,7 +323,7 @@ def test_bounds_hold_and_a_bound_that_binds_is_reached() -> None:
 
 def test_the_start_does_not_matter() -> None:
     body = layered(pushes=(PRESS, SHEAR))
-    trials = body.trials(sd_mm=0.05)
+    trials = body.load_cases(sd_mm=0.05)
     one = identify_field(body.mesh, trials, body.zones())
     far = tuple(np.array(v) for v in zip(*(lame_parameters(e, 0.2) for e in (2.0, 0.05)), strict=True))
     other = identify_field(body.mesh, trials, body.zones(), start=far)  # type: ignore[arg-type]
@@ -341,7 +341,7 @@ def test_a_known_force_gives_the_scale() -> None:
     u = LinearBody.of(body.mesh).solve(lame, shear, PrescribedDisplacement(floor, np.zeros_like(weight)), weight)
     zones = Zones.of(body.mesh, known={})
     for factor in (1.0, 3.0):
-        trial = FieldTrial.of(
+        trial = FieldLoadCase.of(
             "push", DisplacementField.from_arrays(body.mesh.points, u), body.mesh, loaded=floor, external_force=factor * weight
         )
         found = identify_field(body.mesh, [trial], zones)
@@ -353,14 +353,14 @@ def test_triangles_in_plane_strain() -> None:
     from naibu.reproduction.chapter3.bodies import square
 
     body = square()
-    found = identify_field(body.mesh, body.trials(), body.zones())
+    found = identify_field(body.mesh, body.load_cases(), body.zones())
     assert found.young_modulus == pytest.approx(5.0, rel=1e-8)
     assert found.poisson_ratio == pytest.approx(0.43, rel=1e-8)
 
 
 def test_progress_and_steps_are_the_same_story() -> None:
     body, told = layered(), []
-    found = identify_field(body.mesh, body.trials(sd_mm=0.1), body.zones(), progress=told.append)
+    found = identify_field(body.mesh, body.load_cases(sd_mm=0.1), body.zones(), progress=told.append)
     assert tuple(told) == found.steps and "homogeneous start" in told[0]
 
 
@@ -373,8 +373,8 @@ def test_moduli_and_logarithms_are_inverse() -> None:
 
 def test_bad_input_is_named() -> None:
     body = layered()
-    trials, zones = body.trials(sd_mm=0.1), body.zones()
-    with pytest.raises(InputError, match="at least one trial"):
+    trials, zones = body.load_cases(sd_mm=0.1), body.zones()
+    with pytest.raises(InputError, match="at least one load case"):
         identify_field(body.mesh, [], zones)
     with pytest.raises(InputError, match="law 'rubber'"):
         identify_field(body.mesh, trials, zones, law="rubber")  # type: ignore[arg-type]
@@ -397,7 +397,7 @@ def test_bad_input_is_named() -> None:
 def test_fields_that_say_too_little_are_told(points: int, message: str) -> None:
     body = layered()
     few = DisplacementField.from_arrays(body.mesh.points[60 : 60 + points], np.full((points, 3), 1.0), sd_mm=0.1)
-    trial = FieldTrial.of("push", few, body.mesh, loaded=body.constrained)
+    trial = FieldLoadCase.of("push", few, body.mesh, loaded=body.constrained)
     with pytest.raises(ConvergenceError, match=message):
         identify_field(body.mesh, [trial], body.zones())
 

@@ -9,7 +9,7 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.identification.from_fields.experiment_design import expected_accuracy
 from naibu.identification.from_fields.gauss_newton import Objective, first_point, search
-from naibu.identification.from_fields.load_cases import FieldTrial
+from naibu.identification.from_fields.load_cases import FieldLoadCase
 from naibu.identification.from_fields.sensitivities import FieldModel, logarithms, young_and_poisson
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.reproduction.chapter3.bodies import cube
@@ -21,7 +21,7 @@ def plan(sd_mm: float, noise: np.ndarray | float = 0.0):
     body = cube({"below": (0.25, 0.4)}, known=(0.3, 0.4), divisions=4)
     u = body.displacement((0.0, 0.0, -10.0)) + noise
     return body, [
-        FieldTrial.of("push", DisplacementField.from_arrays(body.mesh.points, u, sd_mm=sd_mm), body.mesh, loaded=body.constrained)
+        FieldLoadCase.of("push", DisplacementField.from_arrays(body.mesh.points, u, sd_mm=sd_mm), body.mesh, loaded=body.constrained)
     ]
 
 

@@ -27,11 +27,11 @@ def bound(body: PushedBody, zones: Zones, sd_mm: float) -> Uncertainty:
     lame, shear = body.moduli
     first = [int(np.flatnonzero(zones.of_cell == z)[0]) for z in range(zones.count)]
     states = [body.displacement(p) for p in body.pushes]
-    return cramer_rao_bound(body.mesh, body.trials(sd_mm=sd_mm), zones, lame[first], shear[first], states)
+    return cramer_rao_bound(body.mesh, body.load_cases(sd_mm=sd_mm), zones, lame[first], shear[first], states)
 
 
 def linearised(body: PushedBody, zones: Zones) -> Linearised:
-    model = FieldModel(body.mesh, body.trials(sd_mm=0.1), zones)
+    model = FieldModel(body.mesh, body.load_cases(sd_mm=0.1), zones)
     lame, shear = body.moduli
     first = [int(np.flatnonzero(zones.of_cell == z)[0]) for z in range(zones.count)]
     return model.linearised(first_point(model, logarithms(lame[first], shear[first])))
@@ -55,7 +55,7 @@ def test_standard_errors_are_proportional_to_noise_and_fall_with_trials() -> Non
     assert twice == pytest.approx(large / np.sqrt(2.0), rel=1e-3)
 
 
-def test_information_is_whitened_force_balance_where_every_node_is_measured() -> None:
+def test_information_is_that_of_the_weighted_equilibrium_gap_where_every_node_is_measured() -> None:
     """With one measurement a component of noise s: C^T (s^2 K_F K_F^T)^-1 C, the rows being the balances of the nodes without loads."""
     body = cube(LAYERS)
     zones = body.zones()

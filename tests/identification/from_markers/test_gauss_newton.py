@@ -13,7 +13,7 @@ from naibu.identification.from_markers import gauss_newton, observations
 from naibu.identification.from_markers.calibration import calibrate, initial_parameters
 from naibu.identification.from_markers.gauss_newton import Matcher
 from naibu.identification.from_markers.known_materials import KnownMaterials
-from naibu.identification.from_markers.observations import Nearby, NoiseModel, Trial
+from naibu.identification.from_markers.observations import MarkerLoadCase, NoiseModel, SolvedLoadCase
 from naibu.identification.from_markers.parameter_names import (
     base_offset,
     batch_stiffness,
@@ -52,13 +52,13 @@ def test_derivatives_of_predicted_markers(
     body = specimen(experiment, ModelSettings(element_size_mm=size, law=law, pixel_scale="sought"))
     known = KNOWN if "hardness 5" in experiment.materials else KnownMaterials()
     parameters = initial_parameters([body], {name: [state]}, known)
-    matcher = Matcher([Trial.of(body, state, NoiseModel())], parameters)
+    matcher = Matcher([MarkerLoadCase.of(body, state, NoiseModel())], parameters)
     values = parameters.values() | {base_offset(experiment): 0.3, pixel_scale(experiment): 1.01}
     values |= dict.fromkeys(body.shift_names, 0.4)
     if body.has_unknown_base:
         values[straight_base(experiment)] = 15.0
     fit = matcher.evaluate(values)[0]
-    near = [Nearby(fit, parameters.with_values({p.name: values[p.name] for p in parameters.free}))]
+    near = [SolvedLoadCase(fit, parameters.with_values({p.name: values[p.name] for p in parameters.free}))]
     for k, p in enumerate(parameters.free):
         h = 1e-6 if p.scale == "incompressibility" else 1e-4 * max(1.0, abs(values[p.name]))
         ends = [matcher.evaluate(values | {p.name: values[p.name] + s * h}, near, [fit.pose])[0].predicted for s in (1.0, -1.0)]
@@ -79,7 +79,7 @@ def test_pixels_of_another_size_are_the_same_object() -> None:
     for scan, scale in ((experiment, experiment.xy_scale), (replace(experiment, states=states), 1.02 * experiment.xy_scale)):
         body = specimen(scan, ModelSettings(element_size_mm=20.0, pixel_scale="sought"))
         parameters = initial_parameters([body], {scan.name: ["height_45"]}, KnownMaterials())
-        matcher = Matcher([Trial.of(body, "height_45", NoiseModel())], parameters)
+        matcher = Matcher([MarkerLoadCase.of(body, "height_45", NoiseModel())], parameters)
         fits.append(matcher.evaluate(parameters.values() | {pixel_scale(scan): scale})[0])
     np.testing.assert_allclose(fits[1].predicted * shrink, fits[0].predicted, atol=1e-4)
     np.testing.assert_allclose(fits[1].residual * shrink, fits[0].residual, atol=1e-4)
@@ -142,7 +142,7 @@ def plate_model() -> CalibratedModel:
 def test_the_measured_cube_is_predicted_far_better_than_by_an_affine_map(plate_model: CalibratedModel) -> None:
     experiment = datasets.load("ct_cube_plate")
     prediction = predict_state(plate_model, experiment, "height_35", heights_from_markers=True)
-    trial = Trial.of(prediction.specimen, "height_35", NoiseModel())
+    trial = MarkerLoadCase.of(prediction.specimen, "height_35", NoiseModel())
     mapped = affine(prediction.specimen.marker_points, trial.measured)
     assert rms(prediction.residual) < 0.5 * rms(trial.measured - mapped)
     assert rms(prediction.residual) < 0.6
@@ -168,7 +168,7 @@ def test_heights_come_from_nothing_but_the_mean_z_of_two_layers(plate_model: Cal
 def test_a_missing_coordinate_leaves_the_others_in_use() -> None:
     experiment = datasets.load("ct_two_material_2")
     body = specimen(experiment, ModelSettings(element_size_mm=20.0))
-    trial = Trial.of(body, "deformed", NoiseModel())
+    trial = MarkerLoadCase.of(body, "deformed", NoiseModel())
     partly = np.isfinite(trial.measured).any(axis=1) & ~np.isfinite(trial.measured).all(axis=1)
     assert partly.sum() >= 19  # the loaded state lacks y of 20 markers
     fit = Matcher([trial], initial_parameters([body], {experiment.name: ["deformed"]}, KNOWN)).evaluate(

@@ -9,7 +9,7 @@ from naibu import datasets
 from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, Loading
 from naibu.core.mesh import Mesh
-from naibu.identification.from_markers.initial_guess import balanced, force_balance
+from naibu.identification.from_markers.initial_guess import equilibrium_gap, equilibrium_gap_of_meshes
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.marker_mesh import MarkerMesh, marker_mesh
 from naibu.identification.from_markers.parameter_names import poisson_ratio, young_modulus
@@ -45,12 +45,14 @@ def solved(sign: float = 1.0) -> MarkerMesh:
 
 @pytest.mark.parametrize("sweeps", [0, 2])
 def test_parameters_come_back_from_a_solution_on_the_same_mesh(sweeps: int) -> None:
-    found = balanced([solved(), solved(-1.0)], [np.full(3, 0.1)] * 2, {"hard": 222.0}, poisson_ratios={"hard": 0.4}, sweeps=sweeps)
+    found = equilibrium_gap_of_meshes(
+        [solved(), solved(-1.0)], [np.full(3, 0.1)] * 2, {"hard": 222.0}, poisson_ratios={"hard": 0.4}, sweeps=sweeps
+    )
     np.testing.assert_allclose(found["soft"], SOFT, rtol=1e-6)
 
 
 def test_the_poisson_ratio_of_the_known_material_is_found_too() -> None:
-    found = balanced([solved(), solved(-1.0)], [np.full(3, 0.1)] * 2, {"hard": 222.0}, sweeps=30)
+    found = equilibrium_gap_of_meshes([solved(), solved(-1.0)], [np.full(3, 0.1)] * 2, {"hard": 222.0}, sweeps=30)
     np.testing.assert_allclose(found["soft"], SOFT, rtol=1e-6)
 
 
@@ -71,7 +73,7 @@ def between() -> VirtualSpecimen:
 
 
 def estimate(body: VirtualSpecimen, scanner: Scanner | None = None, seed: int = 1, sweeps: int = 2) -> tuple[float, float]:
-    return force_balance([body.scanned(seed=seed, scanner=scanner).experiment], KNOWN, sweeps=sweeps)["soft"]
+    return equilibrium_gap([body.scanned(seed=seed, scanner=scanner).experiment], KNOWN, sweeps=sweeps)["soft"]
 
 
 def test_markers_on_the_interface_without_noise_leave_the_error_of_a_coarse_mesh(aligned: VirtualSpecimen) -> None:
@@ -113,7 +115,7 @@ def test_rigid_motion_of_the_scan_does_not_count() -> None:
 
 def test_bundled_cubes_give_a_start_of_the_right_size() -> None:
     experiments = [datasets.load(f"ct_two_material_{k}") for k in (2, 3)]
-    e, nu = force_balance(experiments, KnownMaterials({"hardness 5": 222.0}))["hardness 0"]
+    e, nu = equilibrium_gap(experiments, KnownMaterials({"hardness 5": 222.0}))["hardness 0"]
     assert 60.0 < e < 222.0
     assert 0.0 < nu < 0.5
 
@@ -135,7 +137,7 @@ def lone(experiment: Experiment) -> Experiment:
 )  # fmt: skip
 def test_what_cannot_be_balanced_is_said(experiments: list[Experiment], known: dict[str, float], words: str) -> None:
     with pytest.raises(InputError, match=words):
-        force_balance(experiments, KnownMaterials(known))
+        equilibrium_gap(experiments, KnownMaterials(known))
 
 
 def test_a_state_that_holds_no_positions_is_named() -> None:

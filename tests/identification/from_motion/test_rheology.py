@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from naibu.core.errors import InputError
-from naibu.identification.from_motion.rheology import MotionTrial, _Problem, identify_motion, rheology_parameters
+from naibu.identification.from_motion.rheology import MotionLoadCase, _Problem, identify_motion, rheology_parameters
 from naibu.mechanics.prescribed_motion import PrescribedMotion
 from naibu.mechanics.small_strain.dynamics import simulate_motion
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
@@ -39,7 +39,7 @@ def weight(mesh) -> np.ndarray:
     return mass_of(body, DENSITY, "lumped").apply(down)
 
 
-def measured(*, heavy: bool = False, force: bool = False, seed: int = 0) -> MotionTrial:
+def measured(*, heavy: bool = False, force: bool = False, seed: int = 0) -> MotionLoadCase:
     """Simulate on 36 x 18 cells with steps of 1/64 s, add noise, and give it a model of 24 x 12 cells."""
     rng = np.random.default_rng(seed)
     fine, supports = body_of((36, 18))
@@ -51,7 +51,7 @@ def measured(*, heavy: bool = False, force: bool = False, seed: int = 0) -> Moti
     u += SD_MM * rng.standard_normal(u.shape)
     pressed = series.force("plate") + SD_MN * rng.standard_normal((len(TIMES), 2))
     coarse, own = body_of((24, 12))
-    return MotionTrial.of(
+    return MotionLoadCase.of(
         "push", coarse, own, TIMES, POINTS, u, sd_mm=SD_MM, thickness_mm=20.0, density=DENSITY, load=weight(coarse) if heavy else None,
         force={"plate": pressed} if force else None, force_sd_mn=SD_MN if force else np.nan, step_s=1.0 / 16.0,
     )  # fmt: skip
@@ -100,11 +100,11 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(InputError, match="all parameters are known"):
         identify_motion([trial], rheology_parameters(START, known=["body"]))
     with pytest.raises(InputError, match="force_sd_mn"):
-        MotionTrial.of(
+        MotionLoadCase.of(
             "a", trial.mesh, trial.supports, TIMES, POINTS, trial.displacement, sd_mm=0.1, force={"plate": np.zeros((len(TIMES), 2))}
         )
     with pytest.raises(InputError, match="times, points, axes"):
-        MotionTrial.of("a", trial.mesh, trial.supports, TIMES, POINTS, trial.displacement[1:], sd_mm=0.1)
+        MotionLoadCase.of("a", trial.mesh, trial.supports, TIMES, POINTS, trial.displacement[1:], sd_mm=0.1)
 
 
 def test_derivatives_against_differences_of_motions() -> None:

@@ -10,21 +10,21 @@ from naibu.core.errors import InputError
 from naibu.core.experiment import Loading
 from naibu.identification.from_markers.calibration import calibrate
 from naibu.identification.from_markers.known_materials import KnownMaterials
-from naibu.identification.from_markers.observations import NoiseModel, Trial
+from naibu.identification.from_markers.observations import MarkerLoadCase, NoiseModel
 from naibu.identification.from_markers.parameter_names import platen_position, poisson_ratio, young_modulus
 from naibu.identification.from_markers.specimen_model import ModelSettings, specimen
-from naibu.identification.prediction.baselines import affine, balanced, baselines, linear_parameters
+from naibu.identification.prediction.baselines import affine, baselines, equilibrium_gap_baseline, linear_parameters
 from naibu.identification.prediction.prediction import rms
 from naibu.validation.specimens.marker_phantoms import Scanner, box_experiment, phantom
 
 COARSE = ModelSettings(element_size_mm=12.0)
 
 
-def trial(name: str, state: str = "deformed") -> Trial:
-    return Trial.of(specimen(datasets.load(name), COARSE), state, NoiseModel())
+def trial(name: str, state: str = "deformed") -> MarkerLoadCase:
+    return MarkerLoadCase.of(specimen(datasets.load(name), COARSE), state, NoiseModel())
 
 
-def values_of(t: Trial, platen_position_mm: float, nu: float = 0.45) -> dict[str, float]:
+def values_of(t: MarkerLoadCase, platen_position_mm: float, nu: float = 0.45) -> dict[str, float]:
     """Identified parameters as far as the baselines use them."""
     e = t.specimen.experiment
     moduli = {name(m): value for m in e.materials for name, value in ((young_modulus, 200.0), (poisson_ratio, nu))}
@@ -32,11 +32,11 @@ def values_of(t: Trial, platen_position_mm: float, nu: float = 0.45) -> dict[str
 
 
 @pytest.fixture(scope="module")
-def cube() -> Trial:
+def cube() -> MarkerLoadCase:
     return trial("ct_cube_plate", "height_45")
 
 
-def test_the_rigid_baseline_is_the_best_rigid_motion(cube: Trial) -> None:
+def test_the_rigid_baseline_is_the_best_rigid_motion(cube: MarkerLoadCase) -> None:
     points, measured = cube.specimen.marker_points, cube.measured
 
     def residual(p: np.ndarray) -> np.ndarray:
@@ -74,7 +74,7 @@ def test_the_report_s_parameters_are_those_of_its_tables() -> None:
     assert values["hardness 0: poisson_ratio"] == 0.44
 
 
-def test_other_materials_have_their_identified_or_stated_parameters(cube: Trial) -> None:
+def test_other_materials_have_their_identified_or_stated_parameters(cube: MarkerLoadCase) -> None:
     (material,) = cube.specimen.experiment.materials
     found = values_of(cube, 46.0, nu=0.41)
     assert linear_parameters(cube.specimen.experiment, found) == {young_modulus(material): 200.0, poisson_ratio(material): 0.41}
@@ -87,26 +87,26 @@ def test_the_linear_baseline_explains_a_linear_foam_of_low_poisson_ratio() -> No
     truth = {young_modulus("foam"): 40.0, poisson_ratio("foam"): 0.1}
     exact = Scanner(placing_mm=0.0, xy_step_mm=0.0, z_step_mm=0.0, shift_mm=0.0, turn_deg=0.0, tilt_deg=0.0)
     seen = phantom(template, truth, seed=0, scanner=exact, settings=law)
-    pressed = Trial.of(specimen(seen.experiment, COARSE), "pressed", NoiseModel())
+    pressed = MarkerLoadCase.of(specimen(seen.experiment, COARSE), "pressed", NoiseModel())
     position = {platen_position(seen.experiment, "pressed"): 55.0}
     assert baselines(pressed, truth | position)["linear"] < 0.03
     assert baselines(pressed, truth | position | {poisson_ratio("foam"): 0.38})["linear"] > 0.1
 
 
-def test_what_has_no_baseline_is_said(cube: Trial) -> None:
+def test_what_has_no_baseline_is_said(cube: MarkerLoadCase) -> None:
     with pytest.raises(InputError, match="platen position of 5 mm"):
         baselines(cube, values_of(cube, 5.0))
 
 
-def test_force_balance_stands_between_no_model_and_the_match() -> None:
+def test_the_equilibrium_gap_stands_between_no_model_and_the_match() -> None:
     coarse = ModelSettings(element_size_mm=15.0)
     found = calibrate([datasets.load("ct_two_material_2")], known_materials=KnownMaterials({"hardness 5": 222.0}), settings=coarse)
-    (distance,) = balanced(found).values()
-    rigid = baselines(found.trials[0], values_of(found.trials[0], 43.5))["rigid"]
+    (distance,) = equilibrium_gap_baseline(found).values()
+    rigid = baselines(found.load_cases[0], values_of(found.load_cases[0], 43.5))["rigid"]
     assert rms(found.match.fits[0].residual) < distance < 0.6 * rigid
 
 
-def test_one_material_has_no_balance(cube: Trial) -> None:
+def test_one_material_has_no_balance(cube: MarkerLoadCase) -> None:
     e = cube.specimen.experiment
     found = calibrate([e], states={e.name: ["height_45"]}, settings=ModelSettings(element_size_mm=20.0))
-    assert balanced(found) == {}
+    assert equilibrium_gap_baseline(found) == {}

@@ -91,23 +91,23 @@ def test_one_experiment_has_nothing_to_be_predicted_from(gels: list[Experiment])
         leave_one_out(gels[:1])
 
 
-def test_calibration_starts_from_a_force_balance_that_can_be_believed(gels: list[Experiment], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_calibration_starts_from_an_equilibrium_gap_that_can_be_believed(gels: list[Experiment], monkeypatch: pytest.MonkeyPatch) -> None:
     states = {"first": ["pressed"]}
-    found = calibration._start_from_force_balance(gels[:1], KNOWN, states)
+    found = calibration._start_from_equilibrium_gap(gels[:1], KNOWN, states)
     assert 50.0 < found[young_modulus("soft")] < 220.0  # the interface between marker layers pulls it towards 200
-    monkeypatch.setattr(calibration, "force_balance", lambda *_: {"soft": (2.0, 0.4)})
-    assert calibration._start_from_force_balance(gels[:1], KNOWN, states) == {}
-    assert calibration._start_from_force_balance([datasets.load("ct_half_ellipsoid")], KNOWN, {}) == {}
+    monkeypatch.setattr(calibration, "equilibrium_gap", lambda *_: {"soft": (2.0, 0.4)})
+    assert calibration._start_from_equilibrium_gap(gels[:1], KNOWN, states) == {}
+    assert calibration._start_from_equilibrium_gap([datasets.load("ct_half_ellipsoid")], KNOWN, {}) == {}
 
 
 def test_the_users_own_start_comes_first(gels: list[Experiment], monkeypatch: pytest.MonkeyPatch) -> None:
     begun: dict[str, float] = {}
 
-    def run(self: object, callback: object = None, *, start: dict[str, float], nearby: object) -> None:
+    def run(self: object, callback: object = None, *, start: dict[str, float], warm_starts: object) -> None:
         begun.update(start)
 
     monkeypatch.setattr(calibration.Matcher, "run", run)
-    monkeypatch.setattr(calibration, "force_balance", lambda *_: {"soft": (90.0, 0.4)})
+    monkeypatch.setattr(calibration, "equilibrium_gap", lambda *_: {"soft": (90.0, 0.4)})
     calibrate(gels[:1], known_materials=KNOWN, settings=COARSE)
     assert begun[young_modulus("soft")] == 90.0
     calibrate(gels[:1], known_materials=KNOWN, settings=COARSE, start={young_modulus("soft"): 70.0})

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure as Canvas
 
 from naibu import datasets
 from naibu.core.errors import InputError
-from naibu.identification.force_balance.batch import field_balance
+from naibu.identification.equilibrium_gap.batch import batch_equilibrium_gap
 from naibu.identification.from_fields.load_cases import Zones
 from naibu.mechanics.finite_elements.linear_simplices import simplices
 from naibu.reproduction.chapter3.bodies import LAYERS, UNIFORM, PushedBody, Split, cube, shape_error_percent, split_hexahedra, square
@@ -222,4 +222,6 @@ def test_the_experiment_converges_at_inner_nodes_with_its_report_beside() -> Non
     assert len(weighted) == 2
     assert all(float(r[7]) < 1.5 for r in weighted)  # type: ignore[arg-type]
     body = lattice(EXPERIMENT)
-    assert not field_balance(body.mesh, [body.trial("inner")], Zones.of(body.mesh, known={"hardness 5": (222.0, 0.33)})).admissible.all()
+    assert not batch_equilibrium_gap(
+        body.mesh, [body.trial("inner")], Zones.of(body.mesh, known={"hardness 5": (222.0, 0.33)})
+    ).admissible.all()

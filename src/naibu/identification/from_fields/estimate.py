@@ -30,7 +30,7 @@ from naibu.identification.from_fields.gauss_newton import (
     first_point,
     search,
 )
-from naibu.identification.from_fields.load_cases import KNOWN, FieldTrial, Zones
+from naibu.identification.from_fields.load_cases import KNOWN, FieldLoadCase, Zones
 from naibu.identification.from_fields.regularization import Regularization, RegularizationName, ZoneGraph, regularization
 from naibu.identification.from_fields.regularization_weight import WeightChoice, WeightRule, WeightTrial, choose_weight
 from naibu.identification.from_fields.segmentation import EXPLICIT, Segmentation, segment
@@ -58,7 +58,7 @@ class FieldEstimate:
     theta : ndarray, shape (2 count,)
         ln mu, then ln(kappa / mu) of the zones; kPa.
     states : tuple of ndarray, shape (n, d)
-        Displacement of every trial under the result, mm.
+        Displacement of every load case under the result, mm.
     chi_squared, degrees_of_freedom : float
         Misfit in units of the stated noise, and what noise alone would leave on average.
     uncertainty : Uncertainty or None
@@ -116,7 +116,7 @@ class FieldEstimate:
 
 def identify_field(
     mesh: Mesh,
-    trials: Sequence[FieldTrial],
+    load_cases: Sequence[FieldLoadCase],
     zones: Zones,
     *,
     law: LawName = "linear",
@@ -127,13 +127,13 @@ def identify_field(
     start: tuple[FloatArray, FloatArray] | None = None,
     progress: Progress | None = None,
 ) -> FieldEstimate:
-    """Find the moduli of zones from displacement fields measured in one or more trials, no force being known.
+    """Find the moduli of zones from displacement fields measured in one or more load cases, no force being known.
 
     Parameters
     ----------
     mesh : Mesh
         Simplices; independent of the points of measurement.
-    trials : sequence of FieldTrial
+    load_cases : sequence of FieldLoadCase
         Pushes of the body, the loaded components of its nodes, and what was measured.
     zones : Zones
         Known cells, and which cells share a pair of unknown moduli; `Zones.of(..., each_cell=True)` where nothing is known of regions.
@@ -156,15 +156,15 @@ def identify_field(
     Raises
     ------
     InputError
-        No trial, zones of another mesh, or options that are not known.
+        No load case, zones of another mesh, or options that are not known.
     ConvergenceError
         No equilibrium at the start, or a measured field that does not fix how the loaded nodes move.
     """
-    if not trials:
-        raise InputError("give at least one trial")
+    if not load_cases:
+        raise InputError("give at least one load case")
     if len(zones.of_cell) != mesh.n_cells:
         raise InputError(f"the zones are of a mesh of {len(zones.of_cell)} cells, this mesh has {mesh.n_cells}")
-    recipe = _Recipe(FieldModel(mesh, trials, zones, law), bounds or Bounds(), [], progress)
+    recipe = _Recipe(FieldModel(mesh, load_cases, zones, law), bounds or Bounds(), [], progress)
     automatic: RegularizationName | None = "total_variation" if zones.count > FEW else None
     name = automatic if regularization == "automatic" else regularization
     point = recipe.start(start)

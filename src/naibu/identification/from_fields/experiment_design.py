@@ -13,7 +13,7 @@ from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.forward_model import LawName
 from naibu.identification.from_fields.gauss_newton import Objective, SearchSettings, first_point, search
-from naibu.identification.from_fields.load_cases import FieldTrial, Zones
+from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.sensitivities import FieldModel, logarithms, young_and_poisson
 from naibu.identification.from_fields.uncertainty import Uncertainty, information_at
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
@@ -56,7 +56,7 @@ class Accuracy:
 
 def expected_accuracy(
     mesh: Mesh,
-    trials: Sequence[FieldTrial],
+    load_cases: Sequence[FieldLoadCase],
     zones: Zones,
     *,
     young_modulus: ArrayLike,
@@ -66,14 +66,14 @@ def expected_accuracy(
     """Return how accurately displacement matching will find the moduli of the zones.
 
     The covariance is the inverse of the Fisher information (the Cramer-Rao bound) at the true moduli, the unknown displacement of the
-    loaded nodes estimated along with them. The systematic error is what matching finds in the trials' fields as they are, which should
+    loaded nodes estimated along with them. The systematic error is what matching finds in the load cases' fields as they are, which should
     be simulated without noise, best on a finer mesh than `mesh`; fields simulated on `mesh` itself have none.
 
     Parameters
     ----------
     mesh : Mesh
         On which the moduli will be sought.
-    trials : sequence of FieldTrial
+    load_cases : sequence of FieldLoadCase
         Planned pushes with simulated fields without noise, whose covariance is that of the measurement to come.
     zones : Zones
         What is known and what is sought.
@@ -90,12 +90,12 @@ def expected_accuracy(
     young, poisson = np.asarray(young_modulus, dtype=float), np.asarray(poisson_ratio, dtype=float)
     if young.shape != (zones.count,) or poisson.shape != (zones.count,):
         raise InputError(f"give Young's modulus and Poisson's ratio of the {zones.count} zones, not {young.shape} and {poisson.shape}")
-    for trial in trials:
-        sd = trial.field.standard_deviation
-        if sd is None or not (sd[trial.field.valid] > 0.0).all():
-            raise InputError(f"trial {trial.name!r}: a planned measurement needs the standard deviation it will have, sd_mm > 0")
+    for load_case in load_cases:
+        sd = load_case.field.standard_deviation
+        if sd is None or not (sd[load_case.field.valid] > 0.0).all():
+            raise InputError(f"load case {load_case.name!r}: a planned measurement needs the standard deviation it will have, sd_mm > 0")
     lame, shear = np.array([lame_parameters(e, nu) for e, nu in zip(young, poisson, strict=True)]).T
-    model = FieldModel(mesh, trials, zones, law)
+    model = FieldModel(mesh, load_cases, zones, law)
     truth = logarithms(lame, shear)
     start = first_point(model, truth)
     found = Uncertainty.of(information_at(model, start))

@@ -1,8 +1,8 @@
-"""One trial of a measured field: its law, its equilibrium for any motion of the loaded nodes, and how far it lies from what was measured.
+"""Forward model of a load case with a measured displacement field: material law, equilibrium and the weighted residual.
 
-Nobody measured the forces on the loaded components of the nodes, so their displacement b is unknown; that of all others follows from
-equilibrium. The state of a trial is thus a function of the moduli and of b, an ordinary simulation under prescribed displacement, and the
-measured field, which lies near b as well as inside, informs both (spec I6).
+The forces on the loaded components of the nodes are not measured, so their displacement b is unknown; that of all other components follows
+from equilibrium. The state of a load case is thus a function of the moduli and of b, an ordinary simulation under prescribed displacement,
+and the measured field constrains both.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.load_cases import FieldTrial
+from naibu.identification.from_fields.load_cases import FieldLoadCase
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements
@@ -137,12 +137,12 @@ def field_law(mesh: Mesh, name: LawName) -> FieldLaw:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """What was measured in a trial, whitened, and which components of the model's nodes follow from equilibrium.
+    """What was measured in a load case, whitened, and which components of the model's nodes follow from equilibrium.
 
     Attributes
     ----------
-    trial : FieldTrial
-        The trial.
+    load_case : FieldLoadCase
+        The load case.
     operator : csr_matrix, shape (q, n d)
         From nodal displacements to whitened data, 1/mm.
     data : ndarray, shape (q,)
@@ -157,7 +157,7 @@ class Observed:
         Whether the data were called exact, so that `noise_mm` is nominal.
     """
 
-    trial: FieldTrial
+    load_case: FieldLoadCase
     operator: sp.csr_matrix
     data: FloatArray
     loaded: IntArray
@@ -166,22 +166,22 @@ class Observed:
     exact: bool
 
     @classmethod
-    def of(cls, mesh: Mesh, trial: FieldTrial) -> Observed:
-        """Whiten the valid measurements of a trial.
+    def of(cls, mesh: Mesh, load_case: FieldLoadCase) -> Observed:
+        """Whiten the valid measurements of a load case.
 
         Raises
         ------
         InputError
             Some data have a standard deviation and others none, a field that does not move, or points outside the mesh.
         """
-        field, d = trial.field, mesh.dimension
+        field, d = load_case.field, mesh.dimension
         valid = field.valid
-        whiten, noise, exact = _whitening(field, trial.name)
-        where = interpolation_operator(mesh, field.points[valid]) if d == 3 else _at_nodes(mesh, field.points[valid], trial.name)
+        whiten, noise, exact = _whitening(field, load_case.name)
+        where = interpolation_operator(mesh, field.points[valid]) if d == 3 else _at_nodes(mesh, field.points[valid], load_case.name)
         operator = (sp.block_diag(list(whiten), format="csr") @ sp.kron(where, sp.identity(d), format="csr")).tocsr()
         data = np.einsum("nij,nj->ni", whiten, field.vectors[valid]).ravel()
-        loaded = np.flatnonzero(trial.loaded.ravel()).astype(np.int64)
-        return cls(trial, operator, data, loaded, _surface_prior(mesh, loaded), noise, exact)
+        loaded = np.flatnonzero(load_case.loaded.ravel()).astype(np.int64)
+        return cls(load_case, operator, data, loaded, _surface_prior(mesh, loaded), noise, exact)
 
     def residual(self, u: FloatArray) -> FloatArray:
         """Return the whitened difference (q,) of a displacement (n, d), mm, from the measurements."""
@@ -194,13 +194,13 @@ def _whitening(field: DisplacementField, name: str) -> tuple[FloatArray, float, 
     covariance = np.zeros((k, d, d)) if field.covariance is None else field.covariance[field.valid]
     largest = float(np.abs(field.vectors[field.valid]).max())
     if not largest > 0.0:
-        raise InputError(f"trial {name!r}: nothing moves; a field without displacement tells nothing of moduli")
+        raise InputError(f"load case {name!r}: nothing moves; a field without displacement tells nothing of moduli")
     values, vectors = np.linalg.eigh(covariance)
     exact = bool((values <= 0.0).all())
     if exact:
         values = np.full_like(values, (EXACT * largest) ** 2)
     if not (values > 0.0).all():
-        raise InputError(f"trial {name!r}: some vectors have a standard deviation and others none; give one to all, or to none")
+        raise InputError(f"load case {name!r}: some vectors have a standard deviation and others none; give one to all, or to none")
     whiten = np.einsum("nik,nk,njk->nij", vectors, 1.0 / np.sqrt(values), vectors)
     return whiten, float(np.sqrt(values.mean())), exact
 
@@ -210,7 +210,7 @@ def _at_nodes(mesh: Mesh, points: FloatArray, name: str) -> sp.csr_matrix:
     distance = np.linalg.norm(points[:, None] - mesh.points[None], axis=2)
     node = distance.argmin(axis=1)
     if distance.min(axis=1).max() > 1e-9 * float(np.ptp(mesh.points)):
-        raise InputError(f"trial {name!r}: in {mesh.dimension} dimensions fields are measured at nodes of the mesh")
+        raise InputError(f"load case {name!r}: in {mesh.dimension} dimensions fields are measured at nodes of the mesh")
     return sp.csr_matrix((np.ones(len(points)), (np.arange(len(points)), node)), shape=(len(points), mesh.n_points))
 
 
@@ -256,7 +256,7 @@ class Solvers:
 
 
 def equilibrium(
-    law: FieldLaw, solvers: Solvers, lame: FloatArray, shear: FloatArray, trial: FieldTrial, guess: FloatArray, owner: bytes
+    law: FieldLaw, solvers: Solvers, lame: FloatArray, shear: FloatArray, load_case: FieldLoadCase, guess: FloatArray, owner: bytes
 ) -> tuple[FloatArray, Factorization]:
     """Return the displacement (n, d), mm, in balance, with the loaded components as in `guess`, and the factorized tangent there.
 
@@ -265,13 +265,13 @@ def equilibrium(
     ConvergenceError
         Newton's method fails from this guess, or a cell inverts.
     """
-    u, constrained = guess, trial.loaded
+    u, constrained = guess, load_case.loaded
     factor, before = solvers.factorized(lame, shear, u, constrained, owner), np.inf
     for _ in range(NEWTON_ITERATIONS):
-        residual = law.forces(lame, shear, u) - trial.external_force
-        scale = float(np.abs(residual[constrained]).sum() + np.abs(trial.external_force).sum())
+        residual = law.forces(lame, shear, u) - load_case.external_force
+        scale = float(np.abs(residual[constrained]).sum() + np.abs(load_case.external_force).sum())
         if not np.isfinite(scale):
-            raise ConvergenceError(f"trial {trial.name!r}: a cell is inverted")
+            raise ConvergenceError(f"load case {load_case.name!r}: a cell is inverted")
         residual[constrained] = 0.0
         norm = float(np.abs(residual).sum()) / max(scale, 1e-300)
         if norm <= NEWTON_TOLERANCE and not law.linear:
@@ -282,11 +282,11 @@ def equilibrium(
         u = u - np.where(constrained, 0.0, factor.solve(residual.ravel()).reshape(u.shape))
         if law.linear:
             return u, factor
-    raise ConvergenceError(f"trial {trial.name!r}: Newton's method did not find the balance within {NEWTON_ITERATIONS} iterations")
+    raise ConvergenceError(f"load case {load_case.name!r}: Newton's method did not find the balance within {NEWTON_ITERATIONS} iterations")
 
 
 def loaded_from_rest(
-    law: FieldLaw, points: FloatArray, lame: FloatArray, shear: FloatArray, trial: FieldTrial, moved: FloatArray
+    law: FieldLaw, points: FloatArray, lame: FloatArray, shear: FloatArray, load_case: FieldLoadCase, moved: FloatArray
 ) -> FloatArray:
     """Return the displacement (n, d), mm, in balance under a law of finite strain, the loaded components moved in steps to `moved` (n, d).
 
@@ -297,6 +297,6 @@ def loaded_from_rest(
     """
     if not isinstance(law, NeoHookean):
         return moved
-    values = np.where(trial.loaded, moved, 0.0)
-    problem = Problem(points, law.assembler(lame, shear), (), PrescribedDisplacement(trial.loaded, values), trial.external_force)
+    values = np.where(load_case.loaded, moved, 0.0)
+    problem = Problem(points, law.assembler(lame, shear), (), PrescribedDisplacement(load_case.loaded, values), load_case.external_force)
     return solve(problem, settings=SolverSettings(first_step=0.2, largest_step=0.5, tolerance=1e-8)).displacement

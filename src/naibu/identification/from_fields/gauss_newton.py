@@ -166,7 +166,7 @@ def search(
     Parameters
     ----------
     model : FieldModel
-        Trials and zones.
+        Load cases and zones.
     start : Point
         Where to begin; it must be the model's last evaluation.
     objective : Objective

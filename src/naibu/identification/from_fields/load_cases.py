@@ -18,7 +18,7 @@ KNOWN = -1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FieldTrial:
+class FieldLoadCase:
     """One push.
 
     Attributes
@@ -41,8 +41,8 @@ class FieldTrial:
     @classmethod
     def of(
         cls, name: str, field: DisplacementField, mesh: Mesh, *, loaded: ArrayLike, external_force: ArrayLike | None = None
-    ) -> FieldTrial:
-        """Check and make a trial; `loaded` is a mask (n, d) of components or (n,) of nodes.
+    ) -> FieldLoadCase:
+        """Check and make a load case; `loaded` is a mask (n, d) of components or (n,) of nodes.
 
         Raises
         ------
@@ -54,13 +54,15 @@ class FieldTrial:
         mask = np.repeat(mask[:, None], shape[1], axis=1) if mask.ndim == 1 else mask.copy()
         force = np.zeros(shape) if external_force is None else np.array(external_force, dtype=float)
         if mask.shape != shape or force.shape != shape:
-            raise InputError(f"trial {name!r}: loaded and external_force must be for {shape[0]} nodes, not {mask.shape} and {force.shape}")
+            raise InputError(
+                f"load case {name!r}: loaded and external_force must be for {shape[0]} nodes, not {mask.shape} and {force.shape}"
+            )
         if not np.isfinite(force).all():
-            raise InputError(f"trial {name!r}: external_force must be finite, mN")
+            raise InputError(f"load case {name!r}: external_force must be finite, mN")
         if field.points.shape[1] != shape[1]:
-            raise InputError(f"trial {name!r}: the field has {field.points.shape[1]} coordinates, the mesh {shape[1]}")
+            raise InputError(f"load case {name!r}: the field has {field.points.shape[1]} coordinates, the mesh {shape[1]}")
         if not field.valid.any():
-            raise InputError(f"trial {name!r}: the field has no valid point")
+            raise InputError(f"load case {name!r}: the field has no valid point")
         return cls(name, field, mask, force)
 
 

@@ -254,7 +254,7 @@ def segment(
     Parameters
     ----------
     model : FieldModel
-        Trials, and the zones whose moduli vary freely.
+        Load cases, and the zones whose moduli vary freely.
     graph : ZoneGraph
         Of these zones.
     start : Point

@@ -1,7 +1,7 @@
-"""Derivatives of the states of all trials, forwards and adjoint, and the information about moduli once the loaded nodes are estimated too.
+"""Sensitivities of the states of all load cases, tangent linear and adjoint, and the Fisher information of the moduli.
 
 The unknowns of the search are theta = (ln mu of all zones, ln(kappa / mu) of all zones) and the displacement b_t of the loaded components
-of every trial. Every real theta is admissible. With the factorized tangent of a trial,
+of every load case. Every real theta is admissible. With the factorized tangent of a load case,
 
     du_F = -K_FF^-1 (C dtheta + K_FB db),    du_B = db,
 
@@ -22,7 +22,7 @@ from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.forward_model import FieldLaw, LawName, Observed, Solvers, equilibrium, field_law, loaded_from_rest
-from naibu.identification.from_fields.load_cases import KNOWN, FieldTrial, Zones
+from naibu.identification.from_fields.load_cases import KNOWN, FieldLoadCase, Zones
 from naibu.mechanics.linear_algebra.protocols import Factorization
 
 BLOCK = 256  # right-hand sides solved together
@@ -57,9 +57,9 @@ class Point:
     theta : ndarray, shape (2 count,)
         ln mu, then ln(kappa / mu), of all zones; moduli in kPa.
     states : tuple of ndarray, shape (n, d)
-        Displacement of every trial in equilibrium, mm; those of the loaded components are unknowns of the search.
+        Displacement of every load case in equilibrium, mm; those of the loaded components are unknowns of the search.
     factors : tuple of Factorization
-        Factorized tangent of every trial; valid until the next evaluation.
+        Factorized tangent of every load case; valid until the next evaluation.
     misfit : float
         Sum of squares of the whitened differences from the measurements.
     prior : float
@@ -74,12 +74,12 @@ class Point:
 
 
 class FieldModel:
-    """All trials of a body, evaluated and linearised at points of the search."""
+    """All load cases of a body, evaluated and linearised at points of the search."""
 
-    def __init__(self, mesh: Mesh, trials: Sequence[FieldTrial], zones: Zones, law: LawName = "linear") -> None:
+    def __init__(self, mesh: Mesh, load_cases: Sequence[FieldLoadCase], zones: Zones, law: LawName = "linear") -> None:
         self.mesh, self.zones = mesh, zones
         self.law: FieldLaw = field_law(mesh, law)
-        self.observed = tuple(Observed.of(mesh, trial) for trial in trials)
+        self.observed = tuple(Observed.of(mesh, load_case) for load_case in load_cases)
         self.solvers = Solvers(self.law, mesh.points)
         self.boundary: list[BoundaryPreconditioner | None] = [None] * len(self.observed)
         self.informed: list[float | None] = [None] * len(self.observed)
@@ -90,14 +90,14 @@ class FieldModel:
         return sum(len(o.data) for o in self.observed)
 
     def with_zones(self, zones: Zones) -> FieldModel:
-        """Return the model of the same trials with other zones; solvers and preconditioners are shared."""
+        """Return the model of the same load cases with other zones; solvers and preconditioners are shared."""
         out = object.__new__(FieldModel)
         out.__dict__.update(self.__dict__)
         out.zones = zones
         return out
 
     def with_law(self, law: LawName) -> FieldModel:
-        """Return the model of the same trials under another law."""
+        """Return the model of the same load cases under another law."""
         out = object.__new__(FieldModel)
         out.__dict__.update(self.__dict__)
         out.law = field_law(self.mesh, law)
@@ -114,12 +114,12 @@ class FieldModel:
         return self.n_data - sum(len(o.loaded) if i is None else i for o, i in zip(self.observed, self.informed, strict=True))
 
     def evaluate(self, theta: FloatArray, guesses: Sequence[FloatArray]) -> Point:
-        """Find the equilibrium of all trials; `guesses` (n, d), mm, hold the displacement of the loaded components, and help elsewhere.
+        """Find the equilibrium of all load cases; `guesses` (n, d), mm, hold the displacement of the loaded components, and help elsewhere.
 
         Raises
         ------
         ConvergenceError
-            A trial finds no equilibrium.
+            A load case finds no equilibrium.
         """
         lame, shear = moduli_of(self.zones, theta)
         if not (np.isfinite(lame).all() and np.isfinite(shear).all()):
@@ -137,13 +137,13 @@ class FieldModel:
         states, factors = [], []
         shared: dict[bytes, Factorization] = {}
         for t, (o, guess) in enumerate(zip(self.observed, guesses, strict=True)):
-            key = np.packbits(o.trial.loaded).tobytes()
-            if self.law.linear and key in shared:  # one matrix for all trials that are loaded at the same places
-                residual = self.law.forces(lame, shear, guess) - o.trial.external_force
-                residual[o.trial.loaded] = 0.0
+            key = np.packbits(o.load_case.loaded).tobytes()
+            if self.law.linear and key in shared:  # one matrix for all load cases that are loaded at the same places
+                residual = self.law.forces(lame, shear, guess) - o.load_case.external_force
+                residual[o.load_case.loaded] = 0.0
                 u, factor = guess - shared[key].solve(residual.ravel()).reshape(guess.shape), shared[key]
             else:
-                u, factor = equilibrium(self.law, self.solvers, lame, shear, o.trial, guess, b"" if self.law.linear else b"%d" % t)
+                u, factor = equilibrium(self.law, self.solvers, lame, shear, o.load_case, guess, b"" if self.law.linear else b"%d" % t)
                 shared[key] = factor
             states.append(u)
             factors.append(factor)
@@ -153,10 +153,10 @@ class FieldModel:
         """Return states (n, d), mm, reached in load steps, for displacements of the loaded components (n, d)."""
         lame, shear = moduli_of(self.zones, theta)
         pairs = zip(self.observed, moved, strict=True)
-        return [loaded_from_rest(self.law, self.mesh.points, lame, shear, o.trial, u) for o, u in pairs]
+        return [loaded_from_rest(self.law, self.mesh.points, lame, shear, o.load_case, u) for o, u in pairs]
 
     def linearised(self, point: Point) -> Linearised:
-        """Linearise all trials at a point."""
+        """Linearise all load cases at a point."""
         lame, shear = moduli_of(self.zones, point.theta)
         for t, o in enumerate(self.observed):
             if len(o.loaded) <= REFRESHED:
@@ -184,7 +184,7 @@ def modulus_columns(law: FieldLaw, zones: Zones, lame: FloatArray, shear: FloatA
 
 @dataclass(slots=True, eq=False)
 class Linearised:
-    """The trials' displacement as a linear function of changes of the unknowns, at one point of the search."""
+    """The load cases' displacement as a linear function of changes of the unknowns, at one point of the search."""
 
     model: FieldModel
     point: Point
@@ -204,11 +204,11 @@ class Linearised:
             self._border.append(rows[key])
 
     def border(self, t: int) -> sp.csr_matrix:
-        """Return the rows (n_b, n d) of the stiffness of trial `t`, mN/mm, that belong to its loaded components; also its columns."""
+        """Return the rows (n_b, n d) of the stiffness of load case `t`, mN/mm, that belong to its loaded components; also its columns."""
         return self._border[t]
 
     def solved(self, right: list[FloatArray]) -> list[FloatArray]:
-        """Solve with the tangents of all trials, right-hand sides (n d, r) of trials that share a factor together."""
+        """Solve with the tangents of all load cases, right-hand sides (n d, r) of load cases that share a factor together."""
         groups: dict[int, list[int]] = {}
         for t, factor in enumerate(self.point.factors):
             groups.setdefault(id(factor), []).append(t)
@@ -222,7 +222,7 @@ class Linearised:
         return out
 
     def forward(self, theta: FloatArray | None, loaded: Sequence[FloatArray] | None) -> list[FloatArray]:
-        """Return the change of every trial's displacement (n d, r), mm, for changes of theta (2 count, r) and of b_t (n_b, r)."""
+        """Return the change of every load case's displacement (n d, r), mm, for changes of theta (2 count, r) and of b_t (n_b, r)."""
         right = []
         for t, o in enumerate(self.model.observed):
             b = None if loaded is None else loaded[t]
@@ -238,7 +238,7 @@ class Linearised:
         return moved
 
     def adjoint(self, gradients: list[FloatArray]) -> tuple[FloatArray, list[FloatArray]]:
-        """Return what `forward` transposed makes of (n d, r) of every trial: (2 count, r) and a list of (n_b, r)."""
+        """Return what `forward` transposed makes of (n d, r) of every load case: (2 count, r) and a list of (n_b, r)."""
         right = [g.copy() for g in gradients]
         for o, g in zip(self.model.observed, right, strict=True):
             g[o.loaded] = 0.0
@@ -267,7 +267,7 @@ class Linearised:
         return out, [a + o.prior @ b for a, o, b in zip(at_loaded, self.model.observed, loaded, strict=True)]
 
     def preconditioned(self, loaded: Sequence[FloatArray]) -> list[FloatArray]:
-        """Return about what the inverse of the Hessian of the loaded components makes of (n_b, r) of every trial."""
+        """Return about what the inverse of the Hessian of the loaded components makes of (n_b, r) of every load case."""
         made = [self.boundary(t) for t in range(len(loaded))]
         groups: dict[int, list[int]] = {}
         for t, one in enumerate(made):
@@ -280,7 +280,7 @@ class Linearised:
         return out
 
     def boundary(self, t: int) -> BoundaryPreconditioner:
-        """Return the preconditioner of the loaded components of trial `t`, made on first use and kept."""
+        """Return the preconditioner of the loaded components of load case `t`, made on first use and kept."""
         made = self.model.boundary
         found = made[t]
         if found is None:
@@ -291,7 +291,7 @@ class Linearised:
         return found
 
     def loaded_solved(self, right: Sequence[FloatArray]) -> list[FloatArray]:
-        """Solve with the Hessian of the loaded components: (n_b, r) of every trial, by preconditioned conjugate gradients."""
+        """Solve with the Hessian of the loaded components: (n_b, r) of every load case, by preconditioned conjugate gradients."""
 
         def product(loaded: list[FloatArray]) -> list[FloatArray]:
             moved = self.forward(None, loaded)
@@ -335,13 +335,13 @@ class Concentrated:
     offset: list[FloatArray]
 
     def loaded(self, step: FloatArray) -> list[FloatArray]:
-        """Return the change of the loaded components (n_b,) of every trial, mm, that goes with a step (k,)."""
+        """Return the change of the loaded components (n_b,) of every load case, mm, that goes with a step (k,)."""
         return [-(x @ step) - r for x, r in zip(self.response, self.offset, strict=True)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoundaryPreconditioner:
-    """The Hessian of the loaded components of one trial at one point of the search, factorized; it changes little with the moduli.
+    """The Hessian of the loaded components of one load case at one point of the search, factorized; it changes little with the moduli.
 
     Attributes
     ----------
@@ -381,13 +381,13 @@ class BoundaryPreconditioner:
             cholesky = sl.cho_factor(full, overwrite_a=False)
         except np.linalg.LinAlgError as error:
             raise ConvergenceError(
-                f"trial {o.trial.name!r}: the measured field does not fix how the loaded nodes move as a whole"
+                f"load case {o.load_case.name!r}: the measured field does not fix how the loaded nodes move as a whole"
             ) from error
         informed = n_b - float(np.sum(o.prior.multiply(sl.cho_solve(cholesky, np.eye(n_b)))))
         return cls(cholesky, informed)
 
     def scaled(self, observed: Sequence[Observed], source: int, target: int) -> BoundaryPreconditioner:
-        """Return the preconditioner of a trial `target` whose measurements differ from those of `source` in accuracy alone."""
+        """Return the preconditioner of a load case `target` whose measurements differ from those of `source` in accuracy alone."""
         ratio = (observed[source].noise_mm / observed[target].noise_mm) ** 2
         return BoundaryPreconditioner(self.factor, self.informed, self.scale * ratio)
 
@@ -397,7 +397,7 @@ class BoundaryPreconditioner:
 
 
 def _alike(one: Observed, other: Observed) -> bool:
-    """Whether two trials are measured at the same points and loaded at the same places, and differ in accuracy alone."""
+    """Whether two load cases are measured at the same points and loaded at the same places, and differ in accuracy alone."""
     same = one.operator.shape == other.operator.shape and np.array_equal(one.loaded, other.loaded)
     if not same or not np.array_equal(one.operator.indices, other.operator.indices):
         return False
@@ -415,7 +415,7 @@ def _conjugate_gradients(
     precondition: Callable[[list[FloatArray]], list[FloatArray]],
     right: list[FloatArray],
 ) -> list[FloatArray]:
-    """Solve independent systems of several trials, every column by its own iteration, all advanced together."""
+    """Solve independent systems of several load cases, every column by its own iteration, all advanced together."""
 
     def dot(a: list[FloatArray], b: list[FloatArray]) -> list[FloatArray]:
         return [np.einsum("ij,ij->j", p, q) for p, q in zip(a, b, strict=True)]

@@ -1,6 +1,6 @@
 """Gauss-Newton steps where zones are many: conjugate gradients with adjoints, no Jacobian is formed (spec I6).
 
-A product with the Hessian takes one forward and one adjoint solve a trial with factors that exist anyway. The preconditioner is the
+A product with the Hessian takes one forward and one adjoint solve a load case with factors that exist anyway. The preconditioner is the
 penalty's Hessian with a share of the data's mean diagonal for the moduli, and the Hessian of the loaded components for these.
 """
 

@@ -12,7 +12,7 @@ from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.forward_model import LawName
 from naibu.identification.from_fields.gauss_newton import Objective
-from naibu.identification.from_fields.load_cases import FieldTrial, Zones
+from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.sensitivities import FieldModel, Linearised, Point, logarithms, young_and_poisson
 from naibu.identification.from_fields.truncated_newton import RegularizedSystem, conjugate_gradients
 
@@ -75,7 +75,7 @@ def young_and_poisson_slopes(theta: FloatArray) -> tuple[FloatArray, FloatArray]
 
 def cramer_rao_bound(
     mesh: Mesh,
-    trials: Sequence[FieldTrial],
+    load_cases: Sequence[FieldLoadCase],
     zones: Zones,
     lame_lambda: FloatArray,
     shear_modulus: FloatArray,
@@ -87,14 +87,14 @@ def cramer_rao_bound(
 
     Parameters
     ----------
-    mesh, trials, zones, law
-        As for `identify_field`; of the trials the points, covariances and loaded components count, not the measurements.
+    mesh, load_cases, zones, law
+        As for `identify_field`; of the load cases the points, covariances and loaded components count, not the measurements.
     lame_lambda, shear_modulus : ndarray, shape (count,)
         True moduli of the zones, kPa.
     states : sequence of ndarray, shape (n, d)
-        True displacement of every trial, mm.
+        True displacement of every load case, mm.
     """
-    model = FieldModel(mesh, trials, zones, law)
+    model = FieldModel(mesh, load_cases, zones, law)
     point = model.evaluate(logarithms(lame_lambda, shear_modulus), states)
     return Uncertainty.of(information_at(model, point))
 

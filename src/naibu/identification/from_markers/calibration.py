@@ -11,9 +11,9 @@ from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, Layer, State
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.identification.from_markers.gauss_newton import Match, Matcher, MatchingSettings
-from naibu.identification.from_markers.initial_guess import force_balance
+from naibu.identification.from_markers.initial_guess import equilibrium_gap
 from naibu.identification.from_markers.known_materials import KnownMaterials
-from naibu.identification.from_markers.observations import Nearby, NoiseModel, Trial
+from naibu.identification.from_markers.observations import MarkerLoadCase, NoiseModel, SolvedLoadCase
 from naibu.identification.from_markers.parameter_names import (
     SHAPE_NAMES,
     base_offset,
@@ -40,18 +40,19 @@ TRUSTED_RATIO = (0.05, 20.0)  # of an unknown modulus to the known ones; force b
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """The trials of a calibration and the match found for them."""
+    """The load cases of a calibration and the match found for them."""
 
-    trials: tuple[Trial, ...]
+    load_cases: tuple[MarkerLoadCase, ...]
     match: Match
     settings: ModelSettings
     noise: NoiseModel
     known_materials: KnownMaterials
 
     @property
-    def nearby(self) -> dict[str, Nearby]:
-        """The solved trials by label, for other searches to start from."""
-        return {trial.label: Nearby(fit, self.match.parameters) for trial, fit in zip(self.trials, self.match.fits, strict=True)}
+    def warm_starts(self) -> dict[str, SolvedLoadCase]:
+        """The solved load cases by label, for other searches to start from."""
+        pairs = zip(self.load_cases, self.match.fits, strict=True)
+        return {load_case.label: SolvedLoadCase(fit, self.match.parameters) for load_case, fit in pairs}
 
 
 def calibrate(
@@ -63,7 +64,7 @@ def calibrate(
     noise: NoiseModel | None = None,
     search: MatchingSettings | None = None,
     start: Mapping[str, float] | None = None,
-    nearby: Mapping[str, Nearby] | None = None,
+    warm_starts: Mapping[str, SolvedLoadCase] | None = None,
     callback: Callable[[int, float, Mapping[str, float]], None] | None = None,
 ) -> Calibration:
     """Identify materials, friction and boundary conditions from all loaded states of some experiments jointly.
@@ -84,8 +85,8 @@ def calibrate(
         Iterations and tolerance.
     start : mapping, optional
         Physical values to start from, by name; priors keep their centres.
-    nearby : mapping, optional
-        Solutions near the start, by the labels of their trials (`Calibration.nearby`); they save time.
+    warm_starts : mapping, optional
+        Solutions near the start, by the labels of their load cases (`Calibration.warm_starts`); they save time.
     callback : callable, optional
         ``callback(iteration, objective, values)`` after every step.
 
@@ -94,33 +95,33 @@ def calibrate(
     InputError
         No experiment, no measured loaded state, a known material that no experiment contains, or data that cannot be used.
     ConvergenceError
-        A trial cannot be solved at the starting values.
+        A load case cannot be solved at the starting values.
     """
     if not experiments:
         raise InputError("no experiments are given; name at least one folder or bundled dataset")
     chosen, measured = settings or ModelSettings(), noise or NoiseModel()
     specimens = [specimen(e, chosen) for e in experiments]
     used = {e.name: tuple((states or {}).get(e.name, [s.name for s in e.loaded_states])) for e in experiments}
-    trials = tuple(Trial.of(s, name, measured) for s in specimens for name in used[s.experiment.name])
-    if not trials:
+    load_cases = tuple(MarkerLoadCase.of(s, name, measured) for s in specimens for name in used[s.experiment.name])
+    if not load_cases:
         raise InputError(f"no loaded state with measured positions in {', '.join(e.name for e in experiments)}")
     known = known_materials or _first_material(experiments)
     parameters = initial_parameters(specimens, used, known)
-    begin = dict(start or {}) or _start_from_force_balance(experiments, known, used)
-    match = Matcher(trials, parameters, search or MatchingSettings()).run(callback, start=begin, nearby=nearby)
-    return Calibration(trials, match, chosen, measured, known)
+    begin = dict(start or {}) or _start_from_equilibrium_gap(experiments, known, used)
+    match = Matcher(load_cases, parameters, search or MatchingSettings()).run(callback, start=begin, warm_starts=warm_starts)
+    return Calibration(load_cases, match, chosen, measured, known)
 
 
 def _first_material(experiments: Sequence[Experiment]) -> KnownMaterials:
     return KnownMaterials({experiments[0].materials[0]: REFERENCE_MODULUS_KPA}, scale_is_absolute=False)
 
 
-def _start_from_force_balance(
+def _start_from_equilibrium_gap(
     experiments: Sequence[Experiment], known_materials: KnownMaterials, states: Mapping[str, Sequence[str]]
 ) -> dict[str, float]:
     """Young's moduli, by parameter, from the force balance between markers, where it gives sensible ones; a start needs no more."""
     try:
-        found = force_balance(experiments, known_materials, states)
+        found = equilibrium_gap(experiments, known_materials, states)
     except (InputError, np.linalg.LinAlgError):
         return {}
     reference = float(np.mean(list(known_materials.young_moduli.values())))
@@ -129,7 +130,7 @@ def _start_from_force_balance(
 
 
 def initial_parameters(specimens: Sequence[Specimen], states: Mapping[str, Sequence[str]], known_materials: KnownMaterials) -> ParameterSet:
-    """Return all parameters of the trials with their starting values and priors.
+    """Return all parameters of the load cases with their starting values and priors.
 
     Raises
     ------

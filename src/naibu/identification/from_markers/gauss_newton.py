@@ -19,7 +19,7 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.core.rigid_transform import RigidTransform, registration
 from naibu.core.status import Status
-from naibu.identification.from_markers.observations import Nearby, Trial, TrialFit
+from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase, SolvedLoadCase
 from naibu.identification.from_markers.parameter_names import pixel_scale
 from naibu.identification.from_markers.specimen_model import Specimen
 from naibu.mechanics.finite_strain.newton import Newton
@@ -64,8 +64,8 @@ class Match:
         With the estimated values.
     covariance : ndarray, shape (p, p)
         Of the free parameters on the optimiser's scale, poses marginalised, scaled by the misfit where it exceeds the noise.
-    fits : tuple of TrialFit
-        One for each trial.
+    fits : tuple of LoadCaseFit
+        One for each load case.
     chi_squared, degrees_of_freedom : float
         Noise-normalised sum of squares of the data, and number of data minus effective number of parameters.
     information : ndarray, shape (p, p)
@@ -77,7 +77,7 @@ class Match:
 
     parameters: ParameterSet
     covariance: FloatArray
-    fits: tuple[TrialFit, ...]
+    fits: tuple[LoadCaseFit, ...]
     chi_squared: float
     degrees_of_freedom: float
     information: FloatArray
@@ -118,51 +118,55 @@ class NormalEquations:
 
 @dataclass(slots=True, eq=False)
 class Matcher:
-    """Trials and parameters, evaluated with warm starts along the search."""
+    """Load cases and parameters, evaluated with warm starts along the search."""
 
-    trials: Sequence[Trial]
+    load_cases: Sequence[MarkerLoadCase]
     parameters: ParameterSet
     settings: MatchingSettings = field(default_factory=MatchingSettings)
     _solvers: dict[int, LinearSolver | None] = field(default_factory=dict)
 
     def evaluate(
-        self, values: Mapping[str, float], nearby: Sequence[Nearby | None] = (), poses: Sequence[RigidTransform | None] = ()
-    ) -> list[TrialFit]:
-        """Solve all trials at `values`; solutions `nearby` help, and `poses` stand in for those that register the markers best.
+        self, values: Mapping[str, float], warm_starts: Sequence[SolvedLoadCase | None] = (), poses: Sequence[RigidTransform | None] = ()
+    ) -> list[LoadCaseFit]:
+        """Solve all load cases at `values`; solutions `warm_starts` help, and `poses` stand in for those that register the markers best.
 
         Raises
         ------
         ConvergenceError
-            A trial cannot be solved at these values.
+            A load case cannot be solved at these values.
         """
 
-        def one(i: int) -> TrialFit:
-            near = nearby[i] if nearby else None
-            return self._evaluate_one(i, values, near.hints(values) if near is not None else [], poses[i] if poses else None)
+        def one(i: int) -> LoadCaseFit:
+            near = warm_starts[i] if warm_starts else None
+            return self._evaluate_one(i, values, near.warm_start(values) if near is not None else [], poses[i] if poses else None)
 
-        if len(self.trials) == 1:
+        if len(self.load_cases) == 1:
             return [one(0)]
-        with ThreadPoolExecutor(min(len(self.trials), os.cpu_count() or 1), initializer=use_one_thread) as pool:
-            return list(pool.map(one, range(len(self.trials))))
+        with ThreadPoolExecutor(min(len(self.load_cases), os.cpu_count() or 1), initializer=use_one_thread) as pool:
+            return list(pool.map(one, range(len(self.load_cases))))
 
-    def _evaluate_one(self, index: int, values: Mapping[str, float], hints: Sequence[WarmStart], pose: RigidTransform | None) -> TrialFit:
-        trial = self.trials[index]
-        problem = trial.specimen.problem(values, trial.state)
+    def _evaluate_one(
+        self, index: int, values: Mapping[str, float], warm_start: Sequence[WarmStart], pose: RigidTransform | None
+    ) -> LoadCaseFit:
+        load_case = self.load_cases[index]
+        problem = load_case.specimen.problem(values, load_case.state)
         try:
-            solution = solve(problem, settings=_PATH, solver=self._solvers.get(index), warm_start=hints)
+            solution = solve(problem, settings=_PATH, solver=self._solvers.get(index), warm_start=warm_start)
         except ConvergenceError as error:
-            raise ConvergenceError(f"{trial.label}: {error}") from error
+            raise ConvergenceError(f"{load_case.label}: {error}") from error
         newton = Newton(problem, _PATH, self._solvers.get(index))
-        path = self._path_derivatives(trial, values, solution, newton)
+        path = self._path_derivatives(load_case, values, solution, newton)
         self._solvers[index] = newton.solver
-        return self._observed(trial, values, solution, path, pose)
+        return self._observed(load_case, values, solution, path, pose)
 
-    def _path_derivatives(self, trial: Trial, values: Mapping[str, float], solution: Solution, newton: Newton) -> tuple[FloatArray, ...]:
+    def _path_derivatives(
+        self, load_case: MarkerLoadCase, values: Mapping[str, float], solution: Solution, newton: Newton
+    ) -> tuple[FloatArray, ...]:
         """Derivatives (n, 3, p) of every state on the path with respect to the physical values of the free parameters."""
         free = self.parameters.free
         directions, owner = [], []
         for k, parameter in enumerate(free):
-            found = trial.specimen.direction(parameter.name, values, trial.state)
+            found = load_case.specimen.direction(parameter.name, values, load_case.state)
             directions += found
             owner += [k] * len(found)
         gather = np.zeros((len(directions), len(free)))
@@ -171,28 +175,33 @@ class Matcher:
         return tuple(d @ gather for d in raw)
 
     def _observed(
-        self, trial: Trial, values: Mapping[str, float], solution: Solution, path: tuple[FloatArray, ...], pose: RigidTransform | None
-    ) -> TrialFit:
-        specimen = trial.specimen.reshaped(values)
+        self,
+        load_case: MarkerLoadCase,
+        values: Mapping[str, float],
+        solution: Solution,
+        path: tuple[FloatArray, ...],
+        pose: RigidTransform | None,
+    ) -> LoadCaseFit:
+        specimen = load_case.specimen.reshaped(values)
         u = specimen.observation @ solution.displacement
         gradient = specimen.deformation_gradient(solution.displacement)
         moved = specimen.marker_points + u
         enlargement = specimen.enlargement(values)
         if pose is None:
-            pose = _first_pose(specimen, moved, trial.measured * enlargement)
+            pose = _first_pose(specimen, moved, load_case.measured * enlargement)
         placed = pose.applied(moved)
         predicted = placed / enlargement  # residuals stay in the file's millimetres: a smaller scale must not make them smaller
         turned = np.einsum("ij,kjl->kil", pose.rotation, gradient)
         rotated = specimen.placement.pose.rotation.T  # noise of the free scan, turned into the object's frame
         both = np.einsum("kij,jl->kil", turned, rotated)
-        sd = np.sqrt(trial.sd**2 + np.einsum("kil,kl->ki", both**2, trial.free_sd**2))
+        sd = np.sqrt(load_case.sd**2 + np.einsum("kil,kl->ki", both**2, load_case.free_sd**2))
         du = path[-1]
         n_free = du.shape[2]
         at_markers = np.stack([specimen.observation @ du[:, i, :] for i in range(3)], axis=1) if n_free else np.zeros((len(u), 3, 0))
         for k, parameter in enumerate(self.parameters.free):
-            if (motion := trial.specimen.marker_motion(parameter.name, values)) is not None:
+            if (motion := load_case.specimen.marker_motion(parameter.name, values)) is not None:
                 at_markers[:, :, k] += np.einsum("kij,kj->ki", gradient, motion)
-            if (shift := trial.specimen.shift(parameter.name, values)) is not None:  # the nodes move past the markers, which stay
+            if (shift := load_case.specimen.shift(parameter.name, values)) is not None:  # the nodes move past the markers, which stay
                 at_markers[:, :, k] -= np.einsum("kij,kj->ki", gradient - np.eye(3), specimen.observation @ shift)
         jacobian = np.einsum("ij,kjp->kip", pose.rotation, at_markers)
         for k, parameter in enumerate(self.parameters.free):
@@ -205,10 +214,10 @@ class Matcher:
         for axis in range(3):
             pose_jacobian[:, :, 3 + axis] = np.cross(np.eye(3)[axis], arm)
         pose_jacobian /= enlargement[:, None]
-        return TrialFit(solution, pose, predicted, trial.measured - predicted, sd, jacobian, pose_jacobian, path)
+        return LoadCaseFit(solution, pose, predicted, load_case.measured - predicted, sd, jacobian, pose_jacobian, path)
 
-    def normal_equations(self, fits: Sequence[TrialFit], inner: FloatArray) -> NormalEquations:
-        """Linearise the objective at some fits of the trials and the free parameters that gave them, on the optimiser's scale."""
+    def normal_equations(self, fits: Sequence[LoadCaseFit], inner: FloatArray) -> NormalEquations:
+        """Linearise the objective at some fits of the load cases and the free parameters that gave them, on the optimiser's scale."""
         free = self.parameters.free
         p, size = len(free), len(free) + 6 * len(fits)
         slope = np.array([q.slope(q.physical(x)) for q, x in zip(free, inner, strict=True)])
@@ -240,20 +249,21 @@ class Matcher:
         callback: Callable[[int, float, Mapping[str, float]], None] | None = None,
         *,
         start: Mapping[str, float] | None = None,
-        nearby: Mapping[str, Nearby] | None = None,
+        warm_starts: Mapping[str, SolvedLoadCase] | None = None,
     ) -> Match:
         """Search for the parameters; `callback(iteration, objective, values)` is called after every accepted step.
 
-        The search starts from the parameters' own values, or from those in `start`; solutions `nearby`, by the trials' labels, help.
+        The search starts from the parameters' own values, or from those in `start`; `warm_starts` are solutions near the start, by the
+        labels of their load cases.
 
         Raises
         ------
         ConvergenceError
-            A trial cannot be solved at the starting values.
+            A load case cannot be solved at the starting values.
         """
         free = self.parameters.free
         inner = np.array([p.inner((start or {}).get(p.name, p.value)) for p in free])
-        fits = self.evaluate(self.parameters.values(inner), [(nearby or {}).get(t.label) for t in self.trials])
+        fits = self.evaluate(self.parameters.values(inner), [(warm_starts or {}).get(t.label) for t in self.load_cases])
         now = self.normal_equations(fits, inner)
         history, damping, rough, status = [now.objective], 1e-3, True, Status.ITERATION_LIMIT
         try:
@@ -290,22 +300,22 @@ class Matcher:
         return self._match(inner, fits, status, history)
 
     def _try(
-        self, inner: FloatArray, step: FloatArray, fits: list[TrialFit], objective: float
-    ) -> tuple[FloatArray, list[TrialFit], NormalEquations] | None:
-        """Evaluate a step; None where it does not lower the objective or a trial cannot be solved."""
+        self, inner: FloatArray, step: FloatArray, fits: list[LoadCaseFit], objective: float
+    ) -> tuple[FloatArray, list[LoadCaseFit], NormalEquations] | None:
+        """Evaluate a step; None where it does not lower the objective or a load case cannot be solved."""
         free = self.parameters.free
         moved = inner + step[: len(free)]
         old, new = self.parameters.values(inner), self.parameters.values(moved)
         here = self.parameters.with_values({q.name: old[q.name] for q in free})
         poses = [f.pose.moved(step[len(free) + 6 * t : len(free) + 6 * t + 6]) for t, f in enumerate(fits)]
         try:
-            found = self.evaluate(new, [Nearby(f, here) for f in fits], poses)
+            found = self.evaluate(new, [SolvedLoadCase(f, here) for f in fits], poses)
         except (ConvergenceError, InputError):  # InputError: a step that moves markers out of the object
             return None
         equations = self.normal_equations(found, moved)
         return (moved, found, equations) if equations.objective < objective else None
 
-    def _match(self, inner: FloatArray, fits: list[TrialFit], status: Status, history: list[float]) -> Match:
+    def _match(self, inner: FloatArray, fits: list[LoadCaseFit], status: Status, history: list[float]) -> Match:
         free = self.parameters.free
         p = len(free)
         equations = self.normal_equations(fits, inner)

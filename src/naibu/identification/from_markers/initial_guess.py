@@ -1,6 +1,6 @@
 """Identification by force balance: at an unloaded marker the forces of the cells around it sum to zero, linearly in the parameters.
 
-The report's principle (report ch. 3) with a finite-strain law: one linear least-squares problem for all trials, no initial guess, no
+The report's principle (report ch. 3) with a finite-strain law: one linear least-squares problem for all load cases, no initial guess, no
 boundary conditions. What it bears badly is noise in the displacement, which enters the matrix too and pulls Poisson's ratio down to
 nothing. Further sweeps therefore weigh the equations with the covariance that noise gives them, and move the displacement by the least
 that balances the forces: the Gauss-Helmert model of least squares with conditions (Mikhail & Ackermann 1976). Nodes interpolated on an
@@ -49,7 +49,7 @@ class _System:
 
 
 @dataclass(slots=True, eq=False)
-class _Trial:
+class _MeshEquations:
     """A marker mesh ready to be balanced; `displacement` moves with the sweeps."""
 
     source: MarkerMesh
@@ -58,7 +58,7 @@ class _Trial:
     displacement: FloatArray
 
     @classmethod
-    def of(cls, source: MarkerMesh, sd: FloatArray) -> _Trial:
+    def of(cls, source: MarkerMesh, sd: FloatArray) -> _MeshEquations:
         placeholder = [from_moduli(LAW, 1.0, 10.0)] * len(source.mesh.region_names)
         assembler = Assembler.from_materials(elements(source.mesh), source.mesh.regions, placeholder)
         if assembler.forces(source.displacement)[2] <= 0.0:
@@ -87,7 +87,7 @@ class _Trial:
     def system(
         self, sought: Sequence[tuple[str, int]], fixed: Mapping[tuple[str, int], float], moduli: Mapping[str, tuple[float, float]] | None
     ) -> _System:
-        """Return the balances of this trial, linearised about `displacement`; without `moduli` all have unit weight."""
+        """Return the balances of this load case, linearised about `displacement`; without `moduli` all have unit weight."""
         matrix = np.column_stack([self.column(*key) for key in sought])
         right = -np.sum([value * self.column(*key) for key, value in fixed.items()], axis=0)
         if moduli is None:
@@ -98,7 +98,7 @@ class _Trial:
         return _System(matrix, right - tangent @ (self.source.displacement - self.displacement).ravel(), factor, scaled)
 
 
-def force_balance(
+def equilibrium_gap(
     experiments: Sequence[Experiment],
     known_materials: KnownMaterials,
     states: Mapping[str, Sequence[str]] | None = None,
@@ -107,7 +107,7 @@ def force_balance(
     noise: NoiseModel | None = None,
     sweeps: int = SWEEPS,
 ) -> dict[str, tuple[float, float]]:
-    """Estimate the materials with unknown modulus from the balance of forces between markers, over all trials jointly.
+    """Estimate the materials with unknown modulus from the balance of forces between markers, over all load cases jointly.
 
     Blocks that merely lie on each other are taken to be tied.
 
@@ -143,10 +143,10 @@ def force_balance(
             spreads.append(np.sqrt(2.0) * measured.standard_deviation(e.xy_step_mm, e.z_step_mm))
     if not meshes:
         raise InputError(f"no loaded state with measured positions in {', '.join(e.name for e in experiments) or 'no experiment'}")
-    return balanced(meshes, spreads, known_materials.young_moduli, poisson_ratios=poisson_ratios, sweeps=sweeps)
+    return equilibrium_gap_of_meshes(meshes, spreads, known_materials.young_moduli, poisson_ratios=poisson_ratios, sweeps=sweeps)
 
 
-def balanced(
+def equilibrium_gap_of_meshes(
     meshes: Sequence[MarkerMesh],
     spreads: Sequence[FloatArray],
     young_moduli: Mapping[str, float],
@@ -154,14 +154,14 @@ def balanced(
     poisson_ratios: Mapping[str, float] | None = None,
     sweeps: int = SWEEPS,
 ) -> dict[str, tuple[float, float]]:
-    """Estimate unknown materials from displaced meshes; see `force_balance`.
+    """Estimate unknown materials from displaced meshes; see `equilibrium_gap`.
 
     Parameters
     ----------
     meshes : sequence of MarkerMesh
-        One for each trial.
+        One for each load case.
     spreads : sequence of ndarray, shape (3,)
-        Standard deviation of a displacement along x, y, z in every trial, mm.
+        Standard deviation of a displacement along x, y, z in every load case, mm.
     young_moduli, poisson_ratios : mapping of str to float
         Known ones, kPa.
     sweeps : int
@@ -170,7 +170,7 @@ def balanced(
     Raises
     ------
     InputError
-        See `force_balance`.
+        See `equilibrium_gap`.
     """
     names = list(dict.fromkeys(name for m in meshes for name in m.mesh.region_names))
     known = {name: e for name, e in young_moduli.items() if name in names}
@@ -178,13 +178,13 @@ def balanced(
     _require_solvable(meshes, known, unknown)
     given = {name: nu for name, nu in (poisson_ratios or {}).items() if name in known}
     sought = [(name, which) for name in unknown for which in (0, 1)] + [(name, 1) for name in known if name not in given]
-    trials = [_Trial.of(mesh, sd) for mesh, sd in zip(meshes, spreads, strict=True)]
+    load_cases = [_MeshEquations.of(mesh, sd) for mesh, sd in zip(meshes, spreads, strict=True)]
     ratios = {name: given.get(name, POISSON_RATIO) for name in known}
     moduli: dict[str, tuple[float, float]] = {}
     for sweep in range(sweeps + 1):
         fixed = {(name, 0): e / (2.0 * (1.0 + ratios[name])) for name, e in known.items()}
         fixed |= {(name, 1): 2.0 * fixed[name, 0] * nu / (1.0 - 2.0 * nu) for name, nu in given.items()}
-        found = _sweep(trials, sought, fixed, moduli if sweep else None)
+        found = _sweep(load_cases, sought, fixed, moduli if sweep else None)
         if found is None:
             break
         old, moduli = moduli, found
@@ -195,18 +195,18 @@ def balanced(
 
 
 def _sweep(
-    trials: Sequence[_Trial],
+    load_cases: Sequence[_MeshEquations],
     sought: Sequence[tuple[str, int]],
     fixed: Mapping[tuple[str, int], float],
     moduli: Mapping[str, tuple[float, float]] | None,
 ) -> dict[str, tuple[float, float]] | None:
     """Solve for the moduli sought; with `moduli` to weigh by, also move the displacements to balance. None where a cell turned over."""
-    systems = [t.system(sought, fixed, moduli) for t in trials]
+    systems = [t.system(sought, fixed, moduli) for t in load_cases]
     reference = float(np.mean([v for (_, which), v in fixed.items() if which == 0]))
     whitened = [tuple(solve_triangular(s.factor, a, lower=True) for a in (s.matrix, s.right)) for s in systems]
     values = _bounded(np.vstack([w[0] for w in whitened]), np.concatenate([w[1] for w in whitened]), reference)
     if moduli is not None:
-        for t, s in zip(trials, systems, strict=True):
+        for t, s in zip(load_cases, systems, strict=True):
             error = t.sd.ravel() * (s.scaled.T @ cho_solve((s.factor, True), s.matrix @ values - s.right))
             t.displacement = t.source.displacement - error.reshape(-1, 3)
             if t.assembler.forces(t.displacement)[2] <= 0.0:

@@ -15,7 +15,7 @@ from naibu.identification.from_markers.marker_grid import FILLED_SD_MM
 from naibu.identification.from_markers.specimen_model import Specimen
 from naibu.mechanics.finite_strain.statics import Solution, WarmStart
 
-HINT_SPACING = 0.05  # of the load, between states that the next evaluation starts from
+WARM_START_SPACING = 0.05  # of the load, between states that the next evaluation starts from
 FAR_MM = 1.0
 
 
@@ -32,7 +32,7 @@ class NoiseModel:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Trial:
+class MarkerLoadCase:
     """One measured state of a specimen.
 
     Attributes
@@ -61,7 +61,7 @@ class Trial:
         return f"{self.specimen.experiment.name}/{self.state}"
 
     @classmethod
-    def of(cls, specimen: Specimen, state: str, noise: NoiseModel) -> Trial:
+    def of(cls, specimen: Specimen, state: str, noise: NoiseModel) -> MarkerLoadCase:
         """Gather the measured positions (true mm in the scan's frame) of a state, in the order of the specimen's markers.
 
         Raises
@@ -81,8 +81,8 @@ class Trial:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TrialFit:
-    """A trial at one set of parameters.
+class LoadCaseFit:
+    """A load case at one set of parameters.
 
     Attributes
     ----------
@@ -109,19 +109,19 @@ class TrialFit:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Nearby:
-    """A solved trial, to start from: its fit, and the parameters with the values that gave it."""
+class SolvedLoadCase:
+    """A solved load case, to start from: its fit, and the parameters with the values that gave it."""
 
-    fit: TrialFit
+    fit: LoadCaseFit
     parameters: ParameterSet
 
-    def hints(self, values: Mapping[str, float]) -> list[WarmStart]:
+    def warm_start(self, values: Mapping[str, float]) -> list[WarmStart]:
         """Where the states of its path lie at other `values`."""
         change = np.array([values.get(q.name, q.value) - q.value for q in self.parameters.free])
-        return _hints(self.fit, change)
+        return _warm_start(self.fit, change)
 
 
-def _hints(previous: TrialFit, change: FloatArray) -> list[WarmStart]:
+def _warm_start(previous: LoadCaseFit, change: FloatArray) -> list[WarmStart]:
     """Where the states of a path lie after a small `change` of the parameters; of states close together one is enough.
 
     After a large change the path is better followed anew: a poor guess costs more iterations than none.
@@ -131,6 +131,6 @@ def _hints(previous: TrialFit, change: FloatArray) -> list[WarmStart]:
         return out
     states = previous.solution.states
     for state, derivative in zip(states[1:], previous.path[1:], strict=True):
-        if state.load == 1.0 or state.load - (out[-1][0] if out else 0.0) > HINT_SPACING:
+        if state.load == 1.0 or state.load - (out[-1][0] if out else 0.0) > WARM_START_SPACING:
             out.append((state.load, state.displacement + derivative @ change))
     return out

@@ -34,7 +34,7 @@ TOLD = 0.5  # a direction is told by the data where they narrow its prior to les
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MotionTrial:
+class MotionLoadCase:
     """One measured motion.
 
     Attributes
@@ -98,8 +98,8 @@ class MotionTrial:
         force: Mapping[str, ArrayLike] | None = None,
         force_sd_mn: float = np.nan,
         step_s: float | None = None,
-    ) -> MotionTrial:
-        """Check and make a trial; `thickness_mm` is that of a body of triangles.
+    ) -> MotionLoadCase:
+        """Check and make a load case; `thickness_mm` is that of a body of triangles.
 
         Raises
         ------
@@ -109,20 +109,22 @@ class MotionTrial:
         times, points, u = (np.array(a, dtype=float) for a in (times_s, points_mm, displacement))
         if points.ndim != 2 or u.shape != (len(times), *points.shape):
             raise InputError(
-                f"trial {name!r}: displacement must have shape {(len(times), *points.shape)} (times, points, axes), not {u.shape}"
+                f"load case {name!r}: displacement must have shape {(len(times), *points.shape)} (times, points, axes), not {u.shape}"
             )
         if not np.isfinite(u[1:]).any():
-            raise InputError(f"trial {name!r}: no displacement is measured after the first time")
+            raise InputError(f"load case {name!r}: no displacement is measured after the first time")
         if not sd_mm > 0.0:
-            raise InputError(f"trial {name!r}: sd_mm must be positive, not {sd_mm:g}")
+            raise InputError(f"load case {name!r}: sd_mm must be positive, not {sd_mm:g}")
         forces = {key: np.array(value, dtype=float) for key, value in (force or {}).items()}
         for key, value in forces.items():
             if key not in {s.name for s in supports}:
-                raise InputError(f"trial {name!r}: force of {key!r}, but the supports are {', '.join(s.name for s in supports) or 'none'}")
+                raise InputError(
+                    f"load case {name!r}: force of {key!r}, but the supports are {', '.join(s.name for s in supports) or 'none'}"
+                )
             if value.shape != (len(times), points.shape[1]):
-                raise InputError(f"trial {name!r}: force of {key!r} must have shape {(len(times), points.shape[1])}, not {value.shape}")
+                raise InputError(f"load case {name!r}: force of {key!r} must have shape {(len(times), points.shape[1])}, not {value.shape}")
         if forces and not force_sd_mn > 0.0:
-            raise InputError(f"trial {name!r}: give force_sd_mn, the standard deviation of the measured force, mN")
+            raise InputError(f"load case {name!r}: give force_sd_mn, the standard deviation of the measured force, mN")
         given = load if load is None or callable(load) else np.array(load, dtype=float)
         body = LinearBody.of(mesh, thickness_mm=thickness_mm)
         return cls(name, mesh, body, tuple(supports), times, points, u, sd_mm, density, given, forces, force_sd_mn, step_s)
@@ -158,7 +160,7 @@ class MotionEstimate:
     noise_factor : float
         Root mean square residual in units of the stated noise.
     residual : tuple of ndarray, shape (k, q, d)
-        Measured minus modelled displacement of every trial, mm.
+        Measured minus modelled displacement of every load case, mm.
     series : tuple of Series
         The modelled motions.
     undetermined : tuple of str
@@ -221,13 +223,13 @@ def rheology_parameters(
 
 
 def identify_motion(
-    trials: Sequence[MotionTrial], parameters: ParameterSet, *, progress: Callable[[int, float], None] | None = None
+    load_cases: Sequence[MotionLoadCase], parameters: ParameterSet, *, progress: Callable[[int, float], None] | None = None
 ) -> MotionEstimate:
     """Fit the parameters of all regions to the measured motions.
 
     Parameters
     ----------
-    trials : sequence of MotionTrial
+    load_cases : sequence of MotionLoadCase
         Of bodies made of the same regions.
     parameters : ParameterSet
         From `rheology_parameters`.
@@ -237,15 +239,15 @@ def identify_motion(
     Raises
     ------
     InputError
-        No trial, nothing to find, or a region without parameters.
+        No load case, nothing to find, or a region without parameters.
     ConvergenceError
         A motion cannot be computed.
     """
-    if not trials:
-        raise InputError("no trial is given")
+    if not load_cases:
+        raise InputError("no load case is given")
     if not parameters.free:
         raise InputError("all parameters are known: free at least one")
-    problem = _Problem(tuple(trials), parameters, progress)
+    problem = _Problem(tuple(load_cases), parameters, progress)
     found = least_squares(
         problem.residuals,
         parameters.start(),
@@ -261,32 +263,34 @@ def identify_motion(
 
 
 class _Problem:
-    """Whitened residuals of all trials and priors as a function of the free parameters."""
+    """Whitened residuals of all load cases and priors as a function of the free parameters."""
 
-    def __init__(self, trials: tuple[MotionTrial, ...], parameters: ParameterSet, progress: Callable[[int, float], None] | None) -> None:
-        self.trials, self.parameters, self.progress = trials, parameters, progress
-        self.operators: list[sp.csr_array] = [interpolation_operator(t.mesh, t.points_mm) for t in trials]
+    def __init__(
+        self, load_cases: tuple[MotionLoadCase, ...], parameters: ParameterSet, progress: Callable[[int, float], None] | None
+    ) -> None:
+        self.load_cases, self.parameters, self.progress = load_cases, parameters, progress
+        self.operators: list[sp.csr_array] = [interpolation_operator(t.mesh, t.points_mm) for t in load_cases]
         self.centre = np.array([p.inner(p.value) for p in parameters.free])
         self.prior_sd = np.array([p.prior_sd for p in parameters.free])
         self.evaluations = 0
-        for trial in trials:
-            for region in trial.mesh.region_names:
+        for load_case in load_cases:
+            for region in load_case.mesh.region_names:
                 if f"{region}: young_modulus" not in parameters.values():
-                    raise InputError(f"trial {trial.name!r}: region {region!r} has no parameters; give a starting value for it")
+                    raise InputError(f"load case {load_case.name!r}: region {region!r} has no parameters; give a starting value for it")
 
-    def materials(self, trial: MotionTrial, inner: FloatArray) -> CellRheology:
+    def materials(self, load_case: MotionLoadCase, inner: FloatArray) -> CellRheology:
         values = self.parameters.values(inner)
-        return per_region(trial.mesh, {region: _rheology(region, values) for region in trial.mesh.region_names})
+        return per_region(load_case.mesh, {region: _rheology(region, values) for region in load_case.mesh.region_names})
 
     def simulated(self, inner: FloatArray) -> list[Series]:
-        return [trial.simulated(self.materials(trial, inner)) for trial in self.trials]
+        return [load_case.simulated(self.materials(load_case, inner)) for load_case in self.load_cases]
 
     def data_residuals(self, series: Sequence[Series]) -> FloatArray:
         parts = []
-        for trial, operator, motion in zip(self.trials, self.operators, series, strict=True):
+        for load_case, operator, motion in zip(self.load_cases, self.operators, series, strict=True):
             modelled = np.stack([operator @ u for u in motion.displacement])
-            forces = {name: motion.force(name) - force for name, force in trial.force.items()}
-            parts.append(trial.compared(modelled - trial.displacement, forces))
+            forces = {name: motion.force(name) - force for name, force in load_case.force.items()}
+            parts.append(load_case.compared(modelled - load_case.displacement, forces))
         return np.concatenate(parts)
 
     def residuals(self, inner: FloatArray) -> FloatArray:
@@ -297,23 +301,25 @@ class _Problem:
         return np.concatenate([data, (inner - self.centre) / self.prior_sd])
 
     def jacobian(self, inner: FloatArray) -> FloatArray:
-        data = np.vstack([self._data_jacobian(trial, operator, inner) for trial, operator in zip(self.trials, self.operators, strict=True)])
+        data = np.vstack(
+            [self._data_jacobian(load_case, operator, inner) for load_case, operator in zip(self.load_cases, self.operators, strict=True)]
+        )
         return np.vstack([data, np.diag(1.0 / self.prior_sd)])
 
-    def _data_jacobian(self, trial: MotionTrial, operator: sp.csr_array, inner: FloatArray) -> FloatArray:
+    def _data_jacobian(self, load_case: MotionLoadCase, operator: sp.csr_array, inner: FloatArray) -> FloatArray:
         """Exact derivatives of the computed motion; only the tables of materials are differenced."""
         directions = []
         for step in DIFFERENCE * np.eye(len(inner)):
-            ends = self.materials(trial, inner - step), self.materials(trial, inner + step)
+            ends = self.materials(load_case, inner - step), self.materials(load_case, inner + step)
             directions.append(MaterialChange.between(*ends, 2.0 * DIFFERENCE))
-        found = trial.differentiated(self.materials(trial, inner), directions)
+        found = load_case.differentiated(self.materials(load_case, inner), directions)
         columns = []
         for k, moved in enumerate(found.displacement):
             forces = {}
-            for support in trial.supports:
-                acts = (trial.times_s > support.start_s) & (trial.times_s <= support.end_s)
+            for support in load_case.supports:
+                acts = (load_case.times_s > support.start_s) & (load_case.times_s <= support.end_s)
                 forces[support.name] = found.force(support)[k] * acts[:, None]
-            columns.append(trial.compared(np.stack([operator @ u for u in moved]), forces))
+            columns.append(load_case.compared(np.stack([operator @ u for u in moved]), forces))
         return np.column_stack(columns)
 
     def estimate(self, inner: FloatArray) -> MotionEstimate:
@@ -325,8 +331,8 @@ class _Problem:
         covariance: FloatArray = np.asarray(np.linalg.inv(information + np.diag(1.0 / self.prior_sd**2)), dtype=float)
         values = self.parameters.values(inner)
         residual = tuple(
-            trial.displacement - np.stack([operator @ u for u in motion.displacement])
-            for trial, operator, motion in zip(self.trials, self.operators, series, strict=True)
+            load_case.displacement - np.stack([operator @ u for u in motion.displacement])
+            for load_case, operator, motion in zip(self.load_cases, self.operators, series, strict=True)
         )
         told = self.parameters.with_values({p.name: values[p.name] for p in self.parameters.free})
         return MotionEstimate(told, covariance, information, factor, residual, tuple(series), self._undetermined(information))

@@ -61,11 +61,11 @@ def cost_of(problem: CalibrationProblem, theta: FloatArray, *, measure: Measure 
     if measure == "chi-squared":
         return float(sum((r**2).sum() for r in evaluated(problem, theta, derivatives=False, threads=1).residual))
     parameters, total = problem.unknowns.parameters(np.exp(theta)), 0.0
-    for trial in problem.trials:
-        capture, found = trial.capture, trial.coarse.run(parameters)
+    for load_case in problem.load_cases:
+        capture, found = load_case.capture, load_case.coarse.run(parameters)
         if problem.index != "force":
             for points, x in zip(capture.points, found.positions, strict=True):
-                distance = np.abs(closest_points(points, trial.coarse.hull, x).signed)
+                distance = np.abs(closest_points(points, load_case.coarse.hull, x).signed)
                 total += float(distance[distance >= capture.point_sd_mm].sum()) / capture.point_sd_mm
         if problem.index != "shape":
             since = round(capture.pushing.push_s / SAMPLE_S) if problem.window == "keep" else 0

@@ -36,7 +36,7 @@ SETTLED = 0.05  # decrease of chi-squared that is not worth another iteration
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Trial:
+class LatticeLoadCase:
     """A capture and the lattice that is to reproduce it, with coarse and with fine steps."""
 
     capture: Capture
@@ -52,7 +52,7 @@ class CalibrationProblem:
     ----------
     unknowns : LatticeUnknowns
         Parameters.
-    trials : tuple of Trial
+    load_cases : tuple of LatticeLoadCase
         Captured pushings.
     index : str
         ``"shape"``, ``"force"`` or ``"joint"``: what counts.
@@ -65,7 +65,7 @@ class CalibrationProblem:
     """
 
     unknowns: LatticeUnknowns
-    trials: tuple[Trial, ...]
+    load_cases: tuple[LatticeLoadCase, ...]
     index: Index
     window: Window
     window_s: float
@@ -113,20 +113,22 @@ class CalibrationProblem:
             coarse, fine = (
                 PushedLattice.of(lattice, capture.pushing, mode, step=step, long_step=s, force=capture.force) for s in (window_s, step)
             )
-            made.append(Trial(capture, coarse, fine))
+            made.append(LatticeLoadCase(capture, coarse, fine))
         return cls(unknowns or LatticeUnknowns.of(lattice), tuple(made), index, window, float(window_s))
 
-    def weighed(self, trial: Trial, found: Reproduced, step: float) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
+    def weighed(
+        self, load_case: LatticeLoadCase, found: Reproduced, step: float
+    ) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
         """Return residuals and derivatives (count,), (count, p) of points and of forces in units of their noise, none that do not count."""
-        return self._shape_rows(trial, found), self._force_rows(trial, found, step)
+        return self._shape_rows(load_case, found), self._force_rows(load_case, found, step)
 
-    def _shape_rows(self, trial: Trial, found: Reproduced) -> tuple[FloatArray, FloatArray]:
+    def _shape_rows(self, load_case: LatticeLoadCase, found: Reproduced) -> tuple[FloatArray, FloatArray]:
         p = len(found.positions_change)
         if self.index == "force":
             return np.zeros(0), np.zeros((0, p))
-        sd, hull = trial.capture.point_sd_mm * self.excess[0], trial.coarse.hull
+        sd, hull = load_case.capture.point_sd_mm * self.excess[0], load_case.coarse.hull
         rows, slopes = [], []
-        for k, points in enumerate(trial.capture.points):
+        for k, points in enumerate(load_case.capture.points):
             near = closest_points(points, hull, found.positions[k])
             rows.append(near.signed / sd)
             corners = hull.triangles[near.triangle]
@@ -134,14 +136,14 @@ class CalibrationProblem:
             slopes.append(-(moved * near.direction).sum(axis=2).T / sd)
         return np.concatenate(rows), np.concatenate(slopes)
 
-    def _force_rows(self, trial: Trial, found: Reproduced, step: float) -> tuple[FloatArray, FloatArray]:
+    def _force_rows(self, load_case: LatticeLoadCase, found: Reproduced, step: float) -> tuple[FloatArray, FloatArray]:
         p = len(found.force_change)
         if self.index == "shape":
             return np.zeros(0), np.zeros((0, p))
         count, each = round(self.window_s / SAMPLE_S), round(self.window_s / step)
-        sd = trial.capture.force_sd_mn * self.excess[1] / np.sqrt(count)
-        since = round(trial.capture.pushing.push_s / self.window_s) if self.window == "keep" else 0
-        lack = averaged(found.force, each) - averaged(trial.capture.force, count)
+        sd = load_case.capture.force_sd_mn * self.excess[1] / np.sqrt(count)
+        since = round(load_case.capture.pushing.push_s / self.window_s) if self.window == "keep" else 0
+        lack = averaged(found.force, each) - averaged(load_case.capture.force, count)
         slopes = np.stack([averaged(f, each) for f in found.force_change]) if p else np.zeros((0, *lack.shape))
         return lack[since:].ravel() / sd, slopes[:, since:].reshape(p, lack[since:].size).T / sd
 
@@ -228,10 +230,10 @@ def evaluated(
     order = np.concatenate([np.arange(len(changes))[k::threads] for k in range(len(parts))]).astype(np.int64)
     rows: list[tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]] = []
     with ThreadPoolExecutor(threads) if executor is None else nullcontext(executor) as pool:
-        runs = [[pool.submit((t.fine if fine else t.coarse).run, parameters, part) for part in parts] for t in problem.trials]
-        for trial, jobs in zip(problem.trials, runs, strict=True):
+        runs = [[pool.submit((t.fine if fine else t.coarse).run, parameters, part) for part in parts] for t in problem.load_cases]
+        for load_case, jobs in zip(problem.load_cases, runs, strict=True):
             found = _joined([job.result() for job in jobs], order)
-            rows.append(problem.weighed(trial, found, (trial.fine if fine else trial.coarse).long_step))
+            rows.append(problem.weighed(load_case, found, (load_case.fine if fine else load_case.coarse).long_step))
     residual = [np.concatenate([row[k][0] for row in rows]) for k in range(2)]
     slopes = [np.concatenate([row[k][1] for row in rows]) for k in range(2)]
     return _Point(theta, (residual[0], residual[1]), (slopes[0], slopes[1]))
@@ -307,7 +309,7 @@ def calibrate_lattice(
     factors = _noise_factors(here, point)
     shown = tuple(f if len(r) else np.nan for f, r in zip(factors, point.residual, strict=True))
     return LatticeEstimate(
-        problem.unknowns, np.exp(point.theta), covariance, information, (shown[0], shown[1]), count, runs * len(problem.trials),
+        problem.unknowns, np.exp(point.theta), covariance, information, (shown[0], shown[1]), count, runs * len(problem.load_cases),
         identifiability(problem.unknowns.names, information),
     )  # fmt: skip
 
@@ -350,11 +352,11 @@ def _descend(
         if -slope @ step < SETTLED:
             return point, used
         step *= min(1.0, LONGEST / np.abs(step).max())
-        trial = at(problem, point.theta + step, fine=fine)
+        load_case = at(problem, point.theta + step, fine=fine)
         used += 1
-        if (new := _cost(trial, centre, prior_sd)) < cost:
+        if (new := _cost(load_case, centre, prior_sd)) < cost:
             settled = cost - new < SETTLED + (1e-6 if fine else 1e-5) * cost
-            point, cost, damping = trial, new, 0.3 * damping if damping > 1e-4 else 0.0
+            point, cost, damping = load_case, new, 0.3 * damping if damping > 1e-4 else 0.0
             if settled:
                 return point, used
         else:
@@ -385,9 +387,9 @@ def _polished(problem: CalibrationProblem, point: _Point, centre: FloatArray, pr
         step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), slope)
         if -slope @ step < SETTLED:
             return best, count, True
-        trial = fine(best.theta + step * min(1.0, LONGEST / np.abs(step).max()))
-        if (new := _cost(trial, centre, prior_sd)) < cost:
-            best, cost, damping = trial, new, 0.3 * damping
+        load_case = fine(best.theta + step * min(1.0, LONGEST / np.abs(step).max()))
+        if (new := _cost(load_case, centre, prior_sd)) < cost:
+            best, cost, damping = load_case, new, 0.3 * damping
         else:
             damping = max(10.0 * damping, 1e-3)
     return best, POLISHING, False

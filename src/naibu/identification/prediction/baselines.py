@@ -12,8 +12,8 @@ from naibu.core.experiment import Experiment
 from naibu.core.parameters import MAX_POISSON_RATIO
 from naibu.core.rigid_transform import registration
 from naibu.identification.from_markers.calibration import Calibration
-from naibu.identification.from_markers.initial_guess import force_balance
-from naibu.identification.from_markers.observations import Trial
+from naibu.identification.from_markers.initial_guess import equilibrium_gap
+from naibu.identification.from_markers.observations import MarkerLoadCase
 from naibu.identification.from_markers.parameter_names import platen_position, poisson_ratio, young_modulus
 from naibu.identification.from_markers.specimen_model import ModelSettings, specimen
 from naibu.identification.prediction.prediction import rms
@@ -23,14 +23,14 @@ from naibu.mechanics.finite_strain.statics import solve
 REPORT = {"hardness 5": (222.0, 0.33), "hardness 0": (125.0, 0.44)}
 
 
-def baselines(trial: Trial, values: Mapping[str, float]) -> dict[str, float]:
+def baselines(load_case: MarkerLoadCase, values: Mapping[str, float]) -> dict[str, float]:
     """Return the root mean square distance (mm) between measured markers and three simple descriptions of the state.
 
     Only markers with three trusted coordinates in the loaded state count; all of each description's freedoms are fitted to the data.
 
     Parameters
     ----------
-    trial : Trial
+    load_case : Load case
         A measured state.
     values : mapping of str to float
         Identified or stated parameters; the linear model takes the platen position and the moduli from them.
@@ -47,24 +47,24 @@ def baselines(trial: Trial, values: Mapping[str, float]) -> dict[str, float]:
     InputError
         A platen position out of reach.
     """
-    free, measured = trial.specimen.marker_points, trial.measured
+    free, measured = load_case.specimen.marker_points, load_case.measured
     return {
         "rigid": rms(measured - registration(free, measured).applied(free)),
         "affine": rms(measured - affine(free, measured)),
-        "linear": rms(residual) if np.isfinite(residual := measured - _linear(trial, values)).any() else np.nan,
+        "linear": rms(residual) if np.isfinite(residual := measured - _linear(load_case, values)).any() else np.nan,
     }
 
 
-def balanced(calibration: Calibration) -> dict[str, float]:
-    """Return the root mean square distance (mm) of every trial with the moduli that force balance between the markers gives (spec I2, I3).
+def equilibrium_gap_baseline(calibration: Calibration) -> dict[str, float]:
+    """Return the root mean square distance, mm, of every load case with the moduli of the equilibrium gap between the markers.
 
-    The boundary conditions, friction and the materials known beforehand are those of the calibration. Empty where force balance has no
-    answer (no lattice, one material); without the trials that cannot be solved with its moduli.
+    The boundary conditions, friction and known materials are those of the calibration. Empty where the equilibrium gap has no solution
+    (no lattice, one material); without the load cases that cannot be solved with its moduli.
     """
-    experiments = {t.specimen.experiment.name: t.specimen.experiment for t in calibration.trials}
-    states = {name: [t.state for t in calibration.trials if t.specimen.experiment.name == name] for name in experiments}
+    experiments = {t.specimen.experiment.name: t.specimen.experiment for t in calibration.load_cases}
+    states = {name: [t.state for t in calibration.load_cases if t.specimen.experiment.name == name] for name in experiments}
     try:
-        found = force_balance(list(experiments.values()), calibration.known_materials, states)
+        found = equilibrium_gap(list(experiments.values()), calibration.known_materials, states)
     except (InputError, np.linalg.LinAlgError):
         return {}
     values = calibration.match.parameters.values()
@@ -72,14 +72,14 @@ def balanced(calibration: Calibration) -> dict[str, float]:
         values[young_modulus(name)] = modulus
         values[poisson_ratio(name)] = min(ratio, MAX_POISSON_RATIO - 1e-4)
     out = {}
-    for trial in calibration.trials:
+    for load_case in calibration.load_cases:
         try:
-            displacement = solve(trial.specimen.problem(values, trial.state)).displacement
+            displacement = solve(load_case.specimen.problem(values, load_case.state)).displacement
         except ConvergenceError:
             continue
-        body = trial.specimen.reshaped(values)
+        body = load_case.specimen.reshaped(values)
         moved = body.marker_points + body.observation @ displacement
-        out[trial.label] = rms(trial.measured - registration(moved, trial.measured).applied(moved))
+        out[load_case.label] = rms(load_case.measured - registration(moved, load_case.measured).applied(moved))
     return out
 
 
@@ -113,20 +113,20 @@ def linear_parameters(experiment: Experiment, values: Mapping[str, float]) -> di
     return {name(m): v for m, pair in found.items() for name, v in zip((young_modulus, poisson_ratio), pair, strict=True)}
 
 
-def _linear(trial: Trial, values: Mapping[str, float]) -> FloatArray:
+def _linear(load_case: MarkerLoadCase, values: Mapping[str, float]) -> FloatArray:
     """Positions (k, 3), mm, of linear elasticity with the parameters of `linear_parameters`, registered to the measured ones."""
-    experiment = trial.specimen.experiment
-    position = platen_position(experiment, trial.state)
+    experiment = load_case.specimen.experiment
+    position = platen_position(experiment, load_case.state)
     platen_position_mm = values[position]
     full = experiment.shape.size_mm[1 if experiment.loading.kind == "side_plates" else 2]
     if not 0.3 * full < platen_position_mm <= full:
         raise InputError(f"a platen position of {platen_position_mm:g} mm is not between 30 % and 100 % of the object's {full:g} mm")
-    size = trial.specimen.settings.element_size_mm
+    size = load_case.specimen.settings.element_size_mm
     body = specimen(experiment, ModelSettings(law="linear_elastic", contact="stick", element_size_mm=size))
     chosen = linear_parameters(experiment, values) | {position: platen_position_mm}
     try:
-        solution = solve(body.problem(chosen, trial.state))
+        solution = solve(body.problem(chosen, load_case.state))
     except ConvergenceError:
-        return np.full_like(trial.measured, np.nan)
+        return np.full_like(load_case.measured, np.nan)
     moved = body.marker_points + body.observation @ solution.displacement
-    return registration(moved, trial.measured).applied(moved)
+    return registration(moved, load_case.measured).applied(moved)

@@ -28,7 +28,7 @@ class CalibratedModel:
     settings : ModelSettings
         Law, contact, mesh size.
     parameters : ParameterSet
-        Estimated and given values, boundary conditions of the trials included.
+        Estimated and given values, boundary conditions of the load cases included.
     covariance : ndarray, shape (p, p)
         Of the free parameters on the optimiser's scale.
     noise : NoiseModel
@@ -37,7 +37,7 @@ class CalibratedModel:
         Root mean square residual in units of the noise.
     known_materials : KnownMaterials
         What set the scale.
-    trials : tuple of str
+    load_cases : tuple of str
         ``experiment/state`` of the data used.
     provenance : mapping
         Version, settings, input hashes.
@@ -49,14 +49,14 @@ class CalibratedModel:
     noise: NoiseModel
     noise_factor: float
     known_materials: KnownMaterials
-    trials: tuple[str, ...]
+    load_cases: tuple[str, ...]
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def of(cls, calibration: Calibration, provenance: Mapping[str, Any] | None = None) -> CalibratedModel:
         """Take the model from a calibration."""
         c = calibration
-        labels = tuple(t.label for t in c.trials)
+        labels = tuple(t.label for t in c.load_cases)
         return cls(
             c.settings, c.match.parameters, c.match.covariance, c.noise, c.match.noise_factor, c.known_materials, labels, provenance or {}
         )
@@ -101,7 +101,7 @@ class CalibratedModel:
             "noise": asdict(self.noise),
             "noise_factor": self.noise_factor,
             "known": {"young_moduli": dict(self.known_materials.young_moduli), "scale_is_absolute": self.known_materials.scale_is_absolute},
-            "trials": list(self.trials),
+            "load_cases": list(self.load_cases),
             "parameters": rows,
             "covariance": self.covariance.tolist(),
             "provenance": dict(self.provenance),
@@ -124,7 +124,7 @@ class CalibratedModel:
             known = data["known"]
             return cls(
                 ModelSettings(**data["settings"]), parameters, covariance, NoiseModel(**data["noise"]), float(data["noise_factor"]),
-                KnownMaterials(known["young_moduli"], known["scale_is_absolute"]), tuple(data["trials"]), data.get("provenance", {}),
+                KnownMaterials(known["young_moduli"], known["scale_is_absolute"]), tuple(data["load_cases"]), data.get("provenance", {}),
             )  # fmt: skip
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"the model file is damaged or was written by another version ({error}); identify the model again") from error

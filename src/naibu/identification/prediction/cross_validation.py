@@ -110,14 +110,14 @@ def leave_one_out(
     InputError
         Fewer than two experiments, or others that do not contain a material which the one left out needs.
     ConvergenceError
-        A trial cannot be solved.
+        A load case cannot be solved.
     KeyboardInterrupt
         The user stopped one of the calibrations.
     """
     if len(experiments) < 2:
         raise InputError(f"leaving one out needs at least 2 experiments, not {len(experiments)}")
     start = None if reference is None else reference.match.parameters.values()
-    nearby = {} if reference is None else reference.nearby
+    warm_starts = {} if reference is None else reference.warm_starts
     stop = threading.Event()
 
     def without(left: Experiment) -> list[LeftOut]:
@@ -129,14 +129,16 @@ def leave_one_out(
             noise=noise,
             search=search,
             start=start,
-            nearby=nearby,
+            warm_starts=warm_starts,
             callback=_reporting(callback, left.name, stop),
         )
         if found.match.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         model = CalibratedModel.of(found)
         return [
-            _left_out(predict_state(model, left, state.name, heights_from_markers=True, nearby=nearby.get(f"{left.name}/{state.name}")))
+            _left_out(
+                predict_state(model, left, state.name, heights_from_markers=True, warm_starts=warm_starts.get(f"{left.name}/{state.name}"))
+            )
             for state in left.loaded_states
         ]
 

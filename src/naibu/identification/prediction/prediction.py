@@ -15,7 +15,7 @@ from naibu.core.rigid_transform import registration
 from naibu.identification.from_markers.calibration import REFERENCE_MODULUS_KPA, START_FRICTION, START_SPRING, initial_parameters
 from naibu.identification.from_markers.gauss_newton import Matcher
 from naibu.identification.from_markers.known_materials import KnownMaterials
-from naibu.identification.from_markers.observations import Nearby, Trial, TrialFit
+from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase, SolvedLoadCase
 from naibu.identification.from_markers.parameter_names import platen_position
 from naibu.identification.from_markers.specimen_model import Specimen, specimen
 from naibu.identification.prediction.calibrated_model import CalibratedModel
@@ -50,7 +50,7 @@ class Prediction:
         Physical values of all parameters that were used.
     measured_in_object : ndarray, shape (k, 3)
         Measured markers brought into the object's frame, mm; NaN where not measured.
-    fit : TrialFit
+    fit : LoadCaseFit
         The solution behind it.
     notes : tuple of str
         Every assumption that was made, in words.
@@ -65,7 +65,7 @@ class Prediction:
     platen_position_mm: float
     values: Mapping[str, float]
     measured_in_object: FloatArray
-    fit: TrialFit
+    fit: LoadCaseFit
     notes: tuple[str, ...]
 
 
@@ -76,7 +76,7 @@ def predict_state(
     *,
     platen_position_mm: float | None = None,
     heights_from_markers: bool = False,
-    nearby: Nearby | None = None,
+    warm_starts: SolvedLoadCase | None = None,
 ) -> Prediction:
     """Predict one state of an experiment with a calibrated model.
 
@@ -93,7 +93,7 @@ def predict_state(
         other states of the same experiment showed.
     heights_from_markers : bool
         Take the height from the mean z of the lowest and the highest marker layer of the measured state, and from nothing else of it.
-    nearby : Nearby, optional
+    warm_starts : SolvedLoadCase, optional
         The state as solved before with similar parameters; it saves time and has no influence on the result.
 
     Raises
@@ -113,9 +113,9 @@ def predict_state(
         notes.append("heights of marker layers do not give the distance of side plates; the stated distance is used")
     start, sd = _platen_position(model, experiment, target, platen_position_mm, notes)
     parameters = parameters.changed({name: Parameter(name, start, "mm", prior_sd=PLATEN_POSITION_SD_MM["markers"] if use_layers else sd)})
-    trial = _unmeasured(body, state, model)
-    matcher = Matcher([trial], parameters)
-    fit = matcher.evaluate(parameters.values(), [nearby])[0]
+    load_case = _unmeasured(body, state, model)
+    matcher = Matcher([load_case], parameters)
+    fit = matcher.evaluate(parameters.values(), [warm_starts])[0]
     if use_layers:
         parameters, fit = _fit_height(matcher, fit, name, target, notes)
     return _finished(model, body, target, parameters, fit, name, notes)
@@ -222,10 +222,10 @@ def _platen_position(
     raise InputError(f"{experiment.name}/{state.name} states no height and has no markers; give one with --height-mm")
 
 
-def _unmeasured(body: Specimen, state: str, model: CalibratedModel) -> Trial:
-    """A trial without data: its pose is that of the free scan."""
+def _unmeasured(body: Specimen, state: str, model: CalibratedModel) -> MarkerLoadCase:
+    """A load case without data: its pose is that of the free scan."""
     sd = model.noise.standard_deviation(body.experiment.xy_step_mm, body.experiment.z_step_mm)
-    return Trial(body, state, np.full(body.marker_points.shape, np.nan), sd, np.broadcast_to(sd, body.marker_points.shape))
+    return MarkerLoadCase(body, state, np.full(body.marker_points.shape, np.nan), sd, np.broadcast_to(sd, body.marker_points.shape))
 
 
 def marker_layers(heights: FloatArray, spacing: float | None) -> IntArray:
@@ -237,7 +237,7 @@ def marker_layers(heights: FloatArray, spacing: float | None) -> IntArray:
     return index
 
 
-def _fit_height(matcher: Matcher, fit: TrialFit, name: str, state: State, notes: list[str]) -> tuple[ParameterSet, TrialFit]:
+def _fit_height(matcher: Matcher, fit: LoadCaseFit, name: str, state: State, notes: list[str]) -> tuple[ParameterSet, LoadCaseFit]:
     """Choose the height so that the distance between the lowest and the highest marker layer is the measured one.
 
     Raises
@@ -245,7 +245,7 @@ def _fit_height(matcher: Matcher, fit: TrialFit, name: str, state: State, notes:
     InputError
         The state has no markers in one of the two layers.
     """
-    body = matcher.trials[0].specimen
+    body = matcher.load_cases[0].specimen
     if state.markers is None:
         raise InputError(f"{body.experiment.name}/{state.name} has no measured markers to take heights from; give --height-mm")
     z = state.markers.aligned(body.marker_ids)[:, 2]
@@ -266,13 +266,13 @@ def _fit_height(matcher: Matcher, fit: TrialFit, name: str, state: State, notes:
         if abs(change) < 1e-3:
             break
         before, parameters = parameters, parameters.with_values({name: parameters.values()[name] + change})
-        fit = matcher.evaluate(parameters.values(), [Nearby(fit, before)], [fit.pose])[0]
+        fit = matcher.evaluate(parameters.values(), [SolvedLoadCase(fit, before)], [fit.pose])[0]
     notes.append(f"the height of {parameters.values()[name]:.2f} mm follows from the mean z of the lowest and the highest marker layer")
     return parameters, fit
 
 
 def _finished(
-    model: CalibratedModel, body: Specimen, state: State, parameters: ParameterSet, fit: TrialFit, name: str, notes: list[str]
+    model: CalibratedModel, body: Specimen, state: State, parameters: ParameterSet, fit: LoadCaseFit, name: str, notes: list[str]
 ) -> Prediction:
     scale = body.placement.scale
     measured = state.markers.aligned(body.marker_ids) * scale if state.markers is not None else np.full(fit.predicted.shape, np.nan)
@@ -286,7 +286,7 @@ def _finished(
     )  # fmt: skip
 
 
-def _standard_deviation(model: CalibratedModel, parameters: ParameterSet, fit: TrialFit) -> FloatArray:
+def _standard_deviation(model: CalibratedModel, parameters: ParameterSet, fit: LoadCaseFit) -> FloatArray:
     """Standard deviation (k,) of a predicted coordinate, mm: the model's covariance, the priors of the rest, the model's misfit."""
     free = parameters.free
     covariance = np.diag([p.prior_sd**2 if np.isfinite(p.prior_sd) else 0.0 for p in free])

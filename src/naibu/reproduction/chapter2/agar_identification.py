@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 
 from naibu.core.arrays import FloatArray
 from naibu.core.parameters import MAX_POISSON_RATIO
-from naibu.identification.from_motion.rheology import MotionTrial, identify_motion, rheology_parameters
+from naibu.identification.from_motion.rheology import MotionLoadCase, identify_motion, rheology_parameters
 from naibu.mechanics.prescribed_motion import PrescribedMotion
 from naibu.mechanics.small_strain.rheology import elastic
 from naibu.mechanics.small_strain.supports import Support
@@ -96,7 +96,7 @@ def told_by_histories(readings: tuple[FloatArray, FloatArray], fit: AgarFit, cel
     force = np.full((2, 3), np.nan)
     force[1, 2] = -1e3 * WEIGHT_N
     points = _in_block(start, float(shift))
-    trial = MotionTrial.of(
+    trial = MotionLoadCase.of(
         "agar", study.mesh, supports, [0.0, WATCHED_S], points, u, sd_mm=SD_MM, force={"weight": force}, force_sd_mn=50.0, step_s=1.0
     )
     return identify_motion([trial], rheology_parameters({"body": AGAR})).undetermined

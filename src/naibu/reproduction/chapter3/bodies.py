@@ -19,7 +19,7 @@ from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.load_cases import FieldTrial, Zones
+from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements
@@ -106,14 +106,14 @@ class PushedBody:
         problem = Problem(self.mesh.points, assembler.with_parameters(parameters), (), prescribed, np.zeros_like(self.mesh.points))
         return solve(problem, settings=SolverSettings(tolerance=1e-11)).displacement
 
-    def trials(self, *, sd_mm: float = 0.0, seed: int = 0) -> tuple[FieldTrial, ...]:
+    def load_cases(self, *, sd_mm: float = 0.0, seed: int = 0) -> tuple[FieldLoadCase, ...]:
         """Return the trials as measured at the nodes of the same mesh, with normal noise of `sd_mm`, mm, at every node."""
         rng = np.random.default_rng(seed)
         out = []
         for k, push in enumerate(self.pushes):
             u = self.displacement(push)
             field = DisplacementField.from_arrays(self.mesh.points, u + sd_mm * rng.standard_normal(u.shape), sd_mm=sd_mm)
-            out.append(FieldTrial.of(f"push {k + 1}", field, self.mesh, loaded=self.constrained))
+            out.append(FieldLoadCase.of(f"push {k + 1}", field, self.mesh, loaded=self.constrained))
         return tuple(out)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from naibu.core.arrays import BoolArray, FloatArray
-from naibu.identification.force_balance.batch import BalanceEstimate, field_balance
+from naibu.identification.equilibrium_gap.batch import EquilibriumGapEstimate, batch_equilibrium_gap
 from naibu.identification.from_fields.load_cases import Zones
 from naibu.reproduction.chapter3 import figures as drawn
 from naibu.reproduction.chapter3.bodies import LAYERS, PushedBody, Split, cube, shape_error_percent
@@ -43,7 +43,7 @@ class CellResult:
         The case.
     zones : Zones
         One a tetrahedron.
-    estimate : BalanceEstimate
+    estimate : EquilibriumGapEstimate
         Of minimum norm.
     displacement, again : ndarray, shape (n, 3)
         Of the push with the true and with the identified moduli, mm.
@@ -53,7 +53,7 @@ class CellResult:
 
     body: PushedBody
     zones: Zones
-    estimate: BalanceEstimate
+    estimate: EquilibriumGapEstimate
     displacement: FloatArray
     again: FloatArray
     error: float
@@ -67,7 +67,7 @@ class CellResult:
 def every_cell(body: PushedBody) -> CellResult:
     """Identify every tetrahedron by minimum norm from the exact displacement, as the report does, and simulate again."""
     zones = body.zones(each_cell=True)
-    estimate = field_balance(body.mesh, body.trials(), zones, method="minimum_norm")
+    estimate = batch_equilibrium_gap(body.mesh, body.load_cases(), zones, method="minimum_norm")
     moduli = zones.per_cell(estimate.lame_lambda, estimate.shear_modulus)
 
     def simulated(push: ArrayLike) -> tuple[FloatArray, FloatArray, float]:
@@ -213,7 +213,7 @@ def reach_section() -> Section:
         for name, pushes in cases.items():
             body = cube(LAYERS, split=split, pushes=pushes)
             zones = body.zones(each_cell=True)
-            found = field_balance(body.mesh, body.trials(), zones, method="minimum_norm")
+            found = batch_equilibrium_gap(body.mesh, body.load_cases(), zones, method="minimum_norm")
             fixed = found.determined.all(axis=1)
             truth = np.array([LAYERS[zone.split(":")[0]][0] for zone in zones.names])
             error = float(np.abs(found.young_modulus / truth - 1.0)[fixed].max()) if fixed.any() else None

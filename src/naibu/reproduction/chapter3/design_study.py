@@ -11,7 +11,7 @@ from naibu.core.arrays import FloatArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.identification.from_fields.experiment_design import Accuracy, expected_accuracy
 from naibu.identification.from_fields.gauss_newton import Objective, first_point, search
-from naibu.identification.from_fields.load_cases import FieldTrial
+from naibu.identification.from_fields.load_cases import FieldLoadCase
 from naibu.identification.from_fields.sensitivities import FieldModel, logarithms, young_and_poisson
 from naibu.meshing.point_location import interpolation_operator
 from naibu.reproduction.chapter3.bodies import PushedBody, cube
@@ -43,10 +43,10 @@ def cube_with_known(ratio: float, divisions: int = 4) -> PushedBody:
     return cube(LAYERS, known=(ratio * mean, 0.43), divisions=divisions)
 
 
-def planned(body: PushedBody, points: FloatArray, vectors: FloatArray) -> list[FieldTrial]:
+def planned(body: PushedBody, points: FloatArray, vectors: FloatArray) -> list[FieldLoadCase]:
     """Return the push as it will be measured at some points, without noise yet."""
     field = DisplacementField.from_arrays(points, vectors, sd_mm=NOISE_MM)
-    return [FieldTrial.of("push", field, body.mesh, loaded=body.constrained)]
+    return [FieldLoadCase.of("push", field, body.mesh, loaded=body.constrained)]
 
 
 def known_stiffness(ratio: float) -> Accuracy:

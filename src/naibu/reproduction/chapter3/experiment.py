@@ -11,9 +11,9 @@ from naibu import datasets
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
-from naibu.identification.force_balance.batch import BalanceEstimate, field_balance
-from naibu.identification.force_balance.weighted import whitened_balance
-from naibu.identification.from_fields.load_cases import FieldTrial, Zones
+from naibu.identification.equilibrium_gap.batch import EquilibriumGapEstimate, batch_equilibrium_gap
+from naibu.identification.equilibrium_gap.weighted import weighted_equilibrium_gap
+from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_markers.marker_mesh import MarkerMesh, marker_mesh
 from naibu.mechanics.finite_elements.modulus_derivatives import SimplexLaw
 from naibu.reproduction.chapter3 import figures as drawn
@@ -58,7 +58,7 @@ class Lattice:
     mesh: Mesh
     shape: tuple[int, int, int]
 
-    def trial(self, balanced: Balanced) -> FieldTrial:
+    def trial(self, balanced: Balanced) -> FieldLoadCase:
         """Return the measured state, with forces in balance at all nodes but those of top and bottom, or at the inner ones only."""
         loaded = np.ones(self.shape, dtype=bool)
         if balanced == "inner":
@@ -67,7 +67,7 @@ class Lattice:
             loaded[1:-1] = False
         sd = np.where(self.source.measured, MARKER_SD_MM, COMPLETED_SD_MM)
         field = DisplacementField.from_arrays(self.mesh.points, self.source.displacement, sd_mm=sd)
-        return FieldTrial.of(self.name, field, self.mesh, loaded=loaded.ravel())
+        return FieldLoadCase.of(self.name, field, self.mesh, loaded=loaded.ravel())
 
 
 def lattice(name: str, split: Split = "symmetric") -> Lattice:
@@ -149,7 +149,7 @@ def table_3_7(body: Lattice) -> Table:
 def _single_cells(body: Lattice, nu: float, balanced: Balanced) -> tuple[Cell, ...]:
     """The report's way: a pair of moduli a tetrahedron, of minimum norm, averaged."""
     zones = Zones.of(body.mesh, known={KNOWN: (222.0, nu)}, each_cell=True)
-    found = field_balance(body.mesh, [body.trial(balanced)], zones, method="minimum_norm")
+    found = batch_equilibrium_gap(body.mesh, [body.trial(balanced)], zones, method="minimum_norm")
     e, poisson = float(found.young_modulus.mean()), float(found.poisson_ratio.mean())
     return ("every tetrahedron, minimum norm, mean (the report's)", balanced, nu, e, poisson, None, None, None, 100.0 * found.residual)
 
@@ -171,10 +171,10 @@ def _one_pair(body: Lattice, nu: float, balanced: Balanced, law: SimplexLaw, met
     return (name, balanced, nu, e, poisson, *(spread if weighted else (None, None)), chi, 100.0 * found.residual)
 
 
-def _estimate(mesh: Mesh, trial: FieldTrial, zones: Zones, law: SimplexLaw, method: Method) -> BalanceEstimate:
+def _estimate(mesh: Mesh, trial: FieldLoadCase, zones: Zones, law: SimplexLaw, method: Method) -> EquilibriumGapEstimate:
     if method == "least_squares":
-        return field_balance(mesh, [trial], zones, law=law)
-    return whitened_balance(mesh, [trial], zones, law=law, max_sweeps=60)
+        return batch_equilibrium_gap(mesh, [trial], zones, law=law)
+    return weighted_equilibrium_gap(mesh, [trial], zones, law=law, max_sweeps=60)
 
 
 def printed_errors(body: Lattice) -> Table:

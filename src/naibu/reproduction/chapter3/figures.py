@@ -9,7 +9,7 @@ import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.mesh import Mesh
-from naibu.identification.force_balance.batch import BalanceEstimate
+from naibu.identification.equilibrium_gap.batch import EquilibriumGapEstimate
 from naibu.reproduction.chapter3.bodies import PushedBody
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ class Result(Protocol):
         ...
 
     @property
-    def estimate(self) -> BalanceEstimate:
+    def estimate(self) -> EquilibriumGapEstimate:
         """Of single tetrahedra."""
         ...
 

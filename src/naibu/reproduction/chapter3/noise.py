@@ -9,8 +9,8 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.core.displacement_field import DisplacementField
-from naibu.identification.force_balance.batch import BalanceEstimate, field_balance
-from naibu.identification.force_balance.weighted import whitened_balance
+from naibu.identification.equilibrium_gap.batch import EquilibriumGapEstimate, batch_equilibrium_gap
+from naibu.identification.equilibrium_gap.weighted import weighted_equilibrium_gap
 from naibu.reproduction.chapter3 import figures as drawn
 from naibu.reproduction.chapter3.bodies import LAYERS, PushedBody, cube
 from naibu.viewer.chapter import Figure, Section
@@ -51,18 +51,18 @@ def noise_scatter(body: PushedBody, sd_mm: float, seed: int, draws: int) -> Scat
     top among the unknowns.
     """
     zones = body.zones()
-    exact = [replace(t, field=DisplacementField.from_arrays(t.field.points, t.field.vectors, sd_mm=sd_mm)) for t in body.trials()]
-    best = whitened_balance(body.mesh, exact, zones)
+    exact = [replace(t, field=DisplacementField.from_arrays(t.field.points, t.field.vectors, sd_mm=sd_mm)) for t in body.load_cases()]
+    best = weighted_equilibrium_gap(body.mesh, exact, zones)
     plain, weighted = [], []
     for k in range(draws):
-        trials = body.trials(sd_mm=sd_mm, seed=seed + k)
-        plain.append(_moduli(field_balance(body.mesh, trials, zones)))
-        weighted.append(_moduli(whitened_balance(body.mesh, trials, zones)))
+        trials = body.load_cases(sd_mm=sd_mm, seed=seed + k)
+        plain.append(_moduli(batch_equilibrium_gap(body.mesh, trials, zones)))
+        weighted.append(_moduli(weighted_equilibrium_gap(body.mesh, trials, zones)))
     truth = np.array([body.truth[name] for name in zones.names])
     return Scatter(zones.names, truth, best.engineering_deviation, np.array(plain), np.array(weighted))
 
 
-def _moduli(estimate: BalanceEstimate) -> FloatArray:
+def _moduli(estimate: EquilibriumGapEstimate) -> FloatArray:
     return np.column_stack([estimate.young_modulus, estimate.poisson_ratio])
 
 

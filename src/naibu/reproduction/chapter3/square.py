@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from naibu.core.arrays import FloatArray
-from naibu.identification.force_balance.batch import field_balance
-from naibu.identification.force_balance.incremental import IncrementalStep, incremental_balance
+from naibu.identification.equilibrium_gap.batch import batch_equilibrium_gap
+from naibu.identification.equilibrium_gap.incremental import IncrementalStep, incremental_equilibrium_gap
 from naibu.identification.from_fields.load_cases import KNOWN, Zones
 from naibu.reproduction.chapter3.bodies import SQUARE, PushedBody, square
 from naibu.reproduction.chapter3.material_tests import printed_table
@@ -75,8 +75,8 @@ def counts() -> Table:
     """Return Table 3.1: numbers of unknowns and equations."""
     _, ((unknowns, equations),) = printed_table("3.1")
     body = square()
-    zones, trials = body.zones(each_cell=True), body.trials()
-    one, two = (field_balance(body.mesh, trials[:k], zones, method="minimum_norm") for k in (1, 2))
+    zones, trials = body.zones(each_cell=True), body.load_cases()
+    one, two = (batch_equilibrium_gap(body.mesh, trials[:k], zones, method="minimum_norm") for k in (1, 2))
     rows: tuple[tuple[Cell, ...], ...] = (
         ("unknown moduli", unknowns, one.unknowns),
         ("equations, one trial", equations, one.equations),
@@ -117,7 +117,7 @@ def _of_two(body: PushedBody, sd_mm: float, seed: int) -> FloatArray:
     of_cell = np.full(body.mesh.n_cells, KNOWN)
     of_cell[[13, 14]] = 0, 1
     zones = Zones(of_cell, ("triangle 13", "triangle 14"), lame, shear)
-    found = incremental_balance(body.mesh, body.trials(sd_mm=sd_mm, seed=seed), zones, order=(13,)).estimate
+    found = incremental_equilibrium_gap(body.mesh, body.load_cases(sd_mm=sd_mm, seed=seed), zones, order=(13,)).estimate
     return np.stack([found.lame_lambda, found.shear_modulus], axis=1).ravel()
 
 
@@ -127,10 +127,10 @@ def accumulation(seed: int, draws: int) -> Accumulation:
     zones = body.zones(each_cell=True)
     errors, batch = [], []
     for k in range(draws):
-        trials = body.trials(sd_mm=STEP_NOISE_MM, seed=seed + k)
-        result = incremental_balance(body.mesh, trials, zones, order=REPORT_ORDER)
+        trials = body.load_cases(sd_mm=STEP_NOISE_MM, seed=seed + k)
+        result = incremental_equilibrium_gap(body.mesh, trials, zones, order=REPORT_ORDER)
         errors.append(np.abs(result.estimate.young_modulus / SQUARE[0] - 1.0))
-        batch.append(np.abs(field_balance(body.mesh, trials, zones).young_modulus / SQUARE[0] - 1.0))
+        batch.append(np.abs(batch_equilibrium_gap(body.mesh, trials, zones).young_modulus / SQUARE[0] - 1.0))
     return Accumulation(result.steps, np.median(errors, axis=0), np.median(batch, axis=0))
 
 

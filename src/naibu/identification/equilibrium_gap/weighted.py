@@ -1,6 +1,6 @@
 """Force balance weighted by what noise in the displacement does to it: maximum likelihood, without the bias of least squares (spec I6).
 
-The true displacement x of a trial obeys ``c(x, p) = A(x) p - b(x) = 0`` at the nodes in balance, and the measured one scatters about it
+The true displacement x of a load case obeys ``c(x, p) = A(x) p - b(x) = 0`` at the nodes in balance, and the measured one scatters about it
 with covariance Sigma. Linearised about a state (x, p) of the search, with the tangent T of c,
 
     r + A dp,   r = c(x, p) + T (measured - x),   S = T Sigma T^T,
@@ -25,9 +25,9 @@ from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
 from naibu.core.status import Status
-from naibu.identification.force_balance.batch import BalanceEstimate, field_balance
-from naibu.identification.force_balance.equations import TrialBalance, trial_balances
-from naibu.identification.from_fields.load_cases import FieldTrial, Zones
+from naibu.identification.equilibrium_gap.batch import EquilibriumGapEstimate, batch_equilibrium_gap
+from naibu.identification.equilibrium_gap.equations import LoadCaseEquations, load_case_equations
+from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
 from naibu.mechanics.finite_elements.modulus_derivatives import SimplexLaw
 from naibu.mechanics.linear_algebra.direct import direct_solver
 
@@ -49,7 +49,7 @@ class _Sweep:
     information, gradient : ndarray, shape (u, u) and (u,)
         ``A^T S^-1 A``, 1/kPa^2, and ``A^T S^-1 r``, 1/kPa.
     pulls : tuple of (ndarray, ndarray), shapes (n, d) and (n, d, u)
-        ``Sigma T^T S^-1 r``, mm, and ``Sigma T^T S^-1 A``, mm/kPa, of every trial.
+        ``Sigma T^T S^-1 r``, mm, and ``Sigma T^T S^-1 A``, mm/kPa, of every load case.
     """
 
     objective: float
@@ -57,31 +57,31 @@ class _Sweep:
     gradient: FloatArray
     pulls: tuple[tuple[FloatArray, FloatArray], ...]
 
-    def displacements(self, balances: Sequence[TrialBalance], step: FloatArray) -> tuple[FloatArray, ...]:
-        """Return the balanced displacement (n, d), mm, of every trial after a step (u,), kPa, of the moduli."""
-        return tuple(b.field.displacement - residual - moduli @ step for b, (residual, moduli) in zip(balances, self.pulls, strict=True))
+    def displacements(self, systems: Sequence[LoadCaseEquations], step: FloatArray) -> tuple[FloatArray, ...]:
+        """Return the balanced displacement (n, d), mm, of every load case after a step (u,), kPa, of the moduli."""
+        return tuple(b.field.displacement - residual - moduli @ step for b, (residual, moduli) in zip(systems, self.pulls, strict=True))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Search:
     """What all sweeps share: equations, covariance (n d, n d) of the nodes' displacement, mm^2, and bounds (u,) of the moduli, kPa."""
 
-    balances: tuple[TrialBalance, ...]
+    systems: tuple[LoadCaseEquations, ...]
     covariances: tuple[sp.csr_matrix, ...]
     lower: FloatArray
     upper: FloatArray
 
     def swept(self, moduli: FloatArray, displacements: Sequence[FloatArray]) -> _Sweep:
-        """Linearise all trials, with one factorization each."""
+        """Linearise all load cases, with one factorization each."""
         u = len(moduli)
         objective, information, gradient, pulls = 0.0, np.zeros((u, u)), np.zeros(u), []
-        for balance, covariance, x in zip(self.balances, self.covariances, displacements, strict=True):
-            matrix, right = balance.columns(x)
-            tangent = balance.tangent(x, moduli)
-            residual = matrix @ moduli - right + tangent @ (balance.field.displacement - x).ravel()
+        for system, covariance, x in zip(self.systems, self.covariances, displacements, strict=True):
+            matrix, right = system.columns(x)
+            tangent = system.tangent(x, moduli)
+            residual = matrix @ moduli - right + tangent @ (system.field.displacement - x).ravel()
             spread = covariance @ tangent.T
             sides = np.column_stack([residual, matrix.toarray()])
-            weighted = _solved(balance.name, sp.csr_matrix(tangent @ spread), sides)
+            weighted = _solved(system.name, sp.csr_matrix(tangent @ spread), sides)
             products = sides.T @ weighted
             objective += float(products[0, 0])
             gradient += products[1:, 0]
@@ -93,7 +93,7 @@ class _Search:
     def tried(self, sweep: _Sweep, moduli: FloatArray, step: FloatArray) -> _Sweep | None:
         """Return the sweep after a step, or None where the objective rises or a cell turns inside out."""
         try:
-            new = self.swept(moduli + step, sweep.displacements(self.balances, step))
+            new = self.swept(moduli + step, sweep.displacements(self.systems, step))
         except InputError:
             return None
         return new if new.objective <= sweep.objective * (1.0 + LEVEL) + 1e-20 else None
@@ -103,11 +103,11 @@ class _Search:
         scale = 1.0 / np.sqrt(np.diag(sweep.information))
         values, vectors = np.linalg.eigh(sweep.information * np.outer(scale, scale))
         if not values[0] > OPEN:
-            zones = self.balances[0].zones
+            zones = self.systems[0].zones
             worst = int(np.argmax(np.abs(vectors[:, 0]))) % zones.count
             raise InputError(
-                f"{sum(len(b.rows) for b in self.balances)} equations leave a combination of the {len(moduli)} moduli open, which holds "
-                f"zone {zones.names[worst]!r}; add trials that push differently, or join cells to zones"
+                f"{sum(len(b.rows) for b in self.systems)} equations leave a combination of the {len(moduli)} moduli open, which holds "
+                f"zone {zones.names[worst]!r}; add load cases that push differently, or join cells to zones"
             )
         root = np.sqrt(values)[:, None] * vectors.T
         target = -(vectors.T @ (scale * sweep.gradient)) / np.sqrt(values)
@@ -118,9 +118,9 @@ class _Search:
         return np.asarray(scale * lsq_linear(root, target, bounds=bounds, method="bvls", tol=1e-12).x)
 
 
-def whitened_balance(
+def weighted_equilibrium_gap(
     mesh: Mesh,
-    trials: Sequence[FieldTrial],
+    load_cases: Sequence[FieldLoadCase],
     zones: Zones,
     *,
     law: SimplexLaw = "linear",
@@ -129,62 +129,62 @@ def whitened_balance(
     start: tuple[FloatArray, FloatArray] | None = None,
     max_sweeps: int = 50,
     tolerance: float = 1e-6,
-) -> BalanceEstimate:
+) -> EquilibriumGapEstimate:
     """Identify the moduli of all zones from balance weighted by the noise of the displacement.
 
     Parameters
     ----------
-    mesh, trials, zones, law, thickness_mm
-        As for `naibu.identification.force_balance.batch.field_balance`. If the covariance of all fields is zero, all nodes are given one
-        and the same unknown variance.
+    mesh, load_cases, zones, law, thickness_mm
+        As for `naibu.identification.equilibrium_gap.batch.batch_equilibrium_gap`. If the covariance of all fields is zero, all nodes
+        have the same unknown variance.
     interpolation_sd_mm : float
         Standard deviation, mm, of what linear interpolation adds at nodes between the points of a field.
     start : tuple of ndarray, shape (count,)
         First lambda and mu of the zones, kPa; by default from non-negative least squares.
     max_sweeps : int
-        Linearisations; each factorizes one matrix a trial.
+        Linearisations; each factorizes one matrix a load case.
     tolerance : float
         The search ends when a step would change no modulus by more than this share of the largest of its zone.
 
     Returns
     -------
-    BalanceEstimate
+    EquilibriumGapEstimate
         With the covariance, kPa^2: the inverse information, which is the Cramer-Rao bound at the estimate; scaled by the misfit where the
         variance of the data was not given. `equations` counts those without an unknown too: they smooth the displacement.
 
     Raises
     ------
     InputError
-        Moduli that the data leave open, nodes that share their data (see `interpolation_sd_mm`), or as for `field_balance`.
+        Moduli that the data leave open, nodes that share their data (see `interpolation_sd_mm`), or as for `batch_equilibrium_gap`.
     """
-    balances = trial_balances(mesh, trials, zones, law=law, thickness_mm=thickness_mm)
-    covariances, known_noise = _covariances(balances, interpolation_sd_mm)
-    least = field_balance(mesh, trials, zones, method="bounded", law=law, thickness_mm=thickness_mm)
+    systems = load_case_equations(mesh, load_cases, zones, law=law, thickness_mm=thickness_mm)
+    covariances, known_noise = _covariances(systems, interpolation_sd_mm)
+    least = batch_equilibrium_gap(mesh, load_cases, zones, method="bounded", law=law, thickness_mm=thickness_mm)
     size = _unit(zones, least)
     lower = np.repeat([0.0, FLOOR * size], zones.count)
-    search = _Search(balances, covariances, lower, np.full(len(lower), CEILING * size))
+    search = _Search(systems, covariances, lower, np.full(len(lower), CEILING * size))
     moduli = _start(least, size) if start is None else np.concatenate([np.asarray(part, dtype=float) for part in start])
     if moduli.shape != lower.shape or not ((moduli >= lower) & (moduli <= search.upper)).all():
         raise InputError(f"the start must be {zones.count} positive lambda and as many mu, kPa, not {start}")
-    return _estimate(balances, *_descended(search, moduli, max_sweeps, tolerance), known_noise)
+    return _estimate(systems, *_descended(search, moduli, max_sweeps, tolerance), known_noise)
 
 
-def _unit(zones: Zones, least: BalanceEstimate) -> float:
+def _unit(zones: Zones, least: EquilibriumGapEstimate) -> float:
     """Mean known shear modulus, kPa, or that of the first guess where nothing is known."""
     known = zones.known_mu[np.isfinite(zones.known_mu)]
     return float(known.mean()) if len(known) else max(float(least.shear_modulus.mean()), 1e-12)
 
 
-def _start(least: BalanceEstimate, size: float) -> FloatArray:
+def _start(least: EquilibriumGapEstimate, size: float) -> FloatArray:
     mu = np.maximum(least.shear_modulus, SOFTEST_START * size)
     return np.asarray(np.minimum(np.concatenate([np.maximum(least.lame_lambda, mu), mu]), 0.1 * CEILING * size))
 
 
 def _descended(search: _Search, moduli: FloatArray, max_sweeps: int, tolerance: float) -> tuple[_Sweep, FloatArray, int, Status]:
     """Gauss-Newton with step halving; returns the last sweep, its moduli, the number of sweeps and how it ended."""
-    sweep = search.swept(moduli, [balance.field.displacement for balance in search.balances])
+    sweep = search.swept(moduli, [system.field.displacement for system in search.systems])
     # gradient and objective hold at displacements that balance, to which the measured ones are brought first
-    sweep, count, fresh = search.swept(moduli, sweep.displacements(search.balances, np.zeros_like(moduli))), 2, True
+    sweep, count, fresh = search.swept(moduli, sweep.displacements(search.systems, np.zeros_like(moduli))), 2, True
     while True:
         step, length = search.step(sweep, moduli), 1.0
         largest = np.tile(np.abs(moduli.reshape(2, -1)).max(axis=0), 2)
@@ -198,69 +198,69 @@ def _descended(search: _Search, moduli: FloatArray, max_sweeps: int, tolerance: 
         if new is not None:
             sweep, moduli, fresh = new, moduli + length * step, False
         elif not fresh and count < max_sweeps:
-            sweep, count, fresh = search.swept(moduli, sweep.displacements(search.balances, np.zeros_like(moduli))), count + 1, True
+            sweep, count, fresh = search.swept(moduli, sweep.displacements(search.systems, np.zeros_like(moduli))), count + 1, True
         else:
             return sweep, moduli, count, Status.ITERATION_LIMIT
 
 
-def _covariances(balances: Sequence[TrialBalance], interpolation_sd_mm: float) -> tuple[tuple[sp.csr_matrix, ...], bool]:
-    """Covariance of the nodes of every trial, and whether the data came with one."""
+def _covariances(systems: Sequence[LoadCaseEquations], interpolation_sd_mm: float) -> tuple[tuple[sp.csr_matrix, ...], bool]:
+    """Covariance of the nodes of every load case, and whether the data came with one."""
     if not (np.isfinite(interpolation_sd_mm) and interpolation_sd_mm >= 0.0):
         raise InputError(f"interpolation_sd_mm must be a number >= 0, not {interpolation_sd_mm:g}")
-    given = [balance.field.covariance.nnz > 0 and bool(balance.field.covariance.diagonal().any()) for balance in balances]
+    given = [system.field.covariance.nnz > 0 and bool(system.field.covariance.diagonal().any()) for system in systems]
     if any(given) and not all(given):
-        without = ", ".join(repr(b.name) for b, has in zip(balances, given, strict=True) if not has)
+        without = ", ".join(repr(b.name) for b, has in zip(systems, given, strict=True) if not has)
         raise InputError(f"the fields of {without} come without standard deviations, the others with; give sd_mm to all fields or to none")
     out = []
-    for balance, has in zip(balances, given, strict=True):
-        d = balance.body.dimension
-        spread = sp.kron(balance.field.weights, sp.identity(d), format="csr")
-        covariance = balance.field.covariance if has else spread @ spread.T
-        extra = np.repeat(np.where(balance.field.interpolated, interpolation_sd_mm**2, 0.0), d)
-        if interpolation_sd_mm == 0.0 and len(balance.rows) > d * (np.diff(balance.field.weights.tocsc().indptr) > 0).sum():
-            raise _shared(balance.name)
+    for system, has in zip(systems, given, strict=True):
+        d = system.body.dimension
+        spread = sp.kron(system.field.weights, sp.identity(d), format="csr")
+        covariance = system.field.covariance if has else spread @ spread.T
+        extra = np.repeat(np.where(system.field.interpolated, interpolation_sd_mm**2, 0.0), d)
+        if interpolation_sd_mm == 0.0 and len(system.rows) > d * (np.diff(system.field.weights.tocsc().indptr) > 0).sum():
+            raise _shared(system.name)
         out.append(sp.csr_matrix(covariance + sp.diags(extra)))
     return tuple(out), all(given)
 
 
-def _solved(trial: str, matrix: sp.csr_matrix, sides: FloatArray) -> FloatArray:
+def _solved(load_case: str, matrix: sp.csr_matrix, sides: FloatArray) -> FloatArray:
     """Solve with the covariance of the residual, scaled to a unit diagonal."""
     diagonal = matrix.diagonal()
     if not (diagonal > 0.0).all():
-        raise _shared(trial)
+        raise _shared(load_case)
     scale = 1.0 / np.sqrt(diagonal)
     scaled = sp.bsr_matrix(sp.diags(scale) @ matrix @ sp.diags(scale), blocksize=(1, 1))
     scaled.sort_indices()
     try:
         return np.asarray(scale[:, None] * direct_solver(scaled, symmetric=True).factorize(scaled).solve(scale[:, None] * sides))
     except ConvergenceError as error:
-        raise _shared(trial) from error
+        raise _shared(load_case) from error
 
 
-def _shared(trial: str) -> InputError:
+def _shared(load_case: str) -> InputError:
     return InputError(
-        f"trial {trial!r}: the noise of the balances is singular, for nodes share the data of the same points, or have no noise of their "
-        "own; make the points the nodes of the mesh, or give interpolation_sd_mm, or standard deviations > 0"
+        f"load case {load_case!r}: the noise of the balances is singular, for nodes share the data of the same points, or have no noise "
+        "of their own; make the points the nodes of the mesh, or give interpolation_sd_mm, or standard deviations > 0"
     )
 
 
 def _estimate(
-    balances: Sequence[TrialBalance], sweep: _Sweep, moduli: FloatArray, count: int, status: Status, known_noise: bool
-) -> BalanceEstimate:
-    zones = balances[0].zones
-    equations = sum(len(balance.rows) for balance in balances)
+    systems: Sequence[LoadCaseEquations], sweep: _Sweep, moduli: FloatArray, count: int, status: Status, known_noise: bool
+) -> EquilibriumGapEstimate:
+    zones = systems[0].zones
+    equations = sum(len(system.rows) for system in systems)
     freedom = equations - len(moduli)
     covariance: FloatArray = np.asarray(np.linalg.inv(sweep.information), dtype=np.float64)
     if not known_noise:
         covariance = covariance * (sweep.objective / freedom if freedom > 0 else np.nan)
     squares = np.zeros(2)
-    for balance in balances:
-        matrix, right = balance.columns()
-        tells = balance.tells
-        squares += [float(np.sum((matrix @ moduli - right)[tells] ** 2)), float(np.sum(right[tells] ** 2))]
+    for system in systems:
+        matrix, right = system.columns()
+        informative = system.informative
+        squares += [float(np.sum((matrix @ moduli - right)[informative] ** 2)), float(np.sum(right[informative] ** 2))]
     singular = np.asarray(np.sqrt(np.linalg.eigvalsh(sweep.information)[::-1].clip(0.0)), dtype=np.float64)
     lame, mu = moduli.reshape(2, -1)
-    return BalanceEstimate(
+    return EquilibriumGapEstimate(
         zones.names, lame, mu, covariance, np.ones((zones.count, 2), dtype=bool), equations, len(moduli), len(moduli), singular,
         float(np.sqrt(squares[0] / squares[1])), count, status, sweep.objective, freedom,
     )  # fmt: skip

@@ -1,7 +1,7 @@
 """Incremental identification: node after node from the known region into the unknown one (spec I2; report 3.3.2).
 
-At a node that touches known cells the balances of all trials give the moduli of its unknown cells; these count as known from then on. A
-node with k unknown cells needs 2 k equations, so at least two trials in the plane. Every step inherits the errors of those before it:
+At a node that touches known cells the balances of all load cases give the moduli of its unknown cells; these count as known from then on. A
+node with k unknown cells needs 2 k equations, so at least two load cases in the plane. Every step inherits the errors of those before it:
 `IncrementalStep.depth` counts them.
 """
 
@@ -16,9 +16,9 @@ import scipy.sparse as sp
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
-from naibu.identification.force_balance.batch import RANK_TOLERANCE, BalanceEstimate
-from naibu.identification.force_balance.equations import TrialBalance, require_scale, trial_balances
-from naibu.identification.from_fields.load_cases import KNOWN, FieldTrial, Zones
+from naibu.identification.equilibrium_gap.batch import RANK_TOLERANCE, EquilibriumGapEstimate
+from naibu.identification.equilibrium_gap.equations import LoadCaseEquations, load_case_equations, require_scale
+from naibu.identification.from_fields.load_cases import KNOWN, FieldLoadCase, Zones
 from naibu.mechanics.finite_elements.modulus_derivatives import SimplexLaw
 
 
@@ -33,7 +33,7 @@ class IncrementalStep:
     zones : tuple of int
         Zones whose moduli it gave.
     equations : int
-        Of all trials at the node.
+        Of all load cases at the node.
     condition : float
         Condition number of its equations, columns scaled to one length: how much errors may grow here.
     depth : int
@@ -53,13 +53,13 @@ class IncrementalEstimate:
 
     Attributes
     ----------
-    estimate : BalanceEstimate
+    estimate : EquilibriumGapEstimate
         Moduli; NaN of zones that were not reached.
     steps : tuple of IncrementalStep
         In the order in which they were taken.
     """
 
-    estimate: BalanceEstimate
+    estimate: EquilibriumGapEstimate
     steps: tuple[IncrementalStep, ...]
 
     @property
@@ -71,9 +71,9 @@ class IncrementalEstimate:
         return out
 
 
-def incremental_balance(
+def incremental_equilibrium_gap(
     mesh: Mesh,
-    trials: Sequence[FieldTrial],
+    load_cases: Sequence[FieldLoadCase],
     zones: Zones,
     *,
     law: SimplexLaw = "linear",
@@ -86,8 +86,8 @@ def incremental_balance(
 
     Parameters
     ----------
-    mesh, trials, zones, law, thickness_mm
-        As for `naibu.identification.force_balance.batch.field_balance`; zones are usually single cells.
+    mesh, load_cases, zones, law, thickness_mm
+        As for `naibu.identification.equilibrium_gap.batch.batch_equilibrium_gap`; zones are usually single cells.
     order : sequence of int, optional
         Nodes to balance, one after the other. By default every step takes the node whose equations are conditioned best.
     partial : bool
@@ -98,10 +98,10 @@ def incremental_balance(
     Raises
     ------
     InputError
-        Steps that end early (unless `partial`), a node of `order` that gives no result, or as for `trial_balances`.
+        Steps that end early (unless `partial`), a node of `order` that gives no result, or as for `load_case_equations`.
     """
-    balances = trial_balances(mesh, trials, zones, law=law, thickness_mm=thickness_mm)
-    walk = _Walk.of(balances, zones, mesh, rank_tolerance)
+    systems = load_case_equations(mesh, load_cases, zones, law=law, thickness_mm=thickness_mm)
+    walk = _Walk.of(systems, zones, mesh, rank_tolerance)
     if order is None:
         while (node := walk.best()) is not None:
             walk.take(node)
@@ -110,13 +110,13 @@ def incremental_balance(
             walk.require(int(node))
             walk.take(int(node))
     if not partial and np.isnan(walk.moduli).any():
-        raise InputError(walk.shortage(len(trials), mesh.dimension))
+        raise InputError(walk.shortage(len(load_cases), mesh.dimension))
     return IncrementalEstimate(walk.estimate(), tuple(walk.steps))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Node:
-    """Equations of all trials at a node: ``matrix`` (e, 2, k) times the moduli (2, k) of its zones is ``right`` (e,)."""
+    """Equations of all load cases at a node: ``matrix`` (e, 2, k) times the moduli (2, k) of its zones is ``right`` (e,)."""
 
     zones: IntArray
     matrix: FloatArray
@@ -137,10 +137,10 @@ class _Walk:
     steps: list[IncrementalStep]
 
     @classmethod
-    def of(cls, balances: Sequence[TrialBalance], zones: Zones, mesh: Mesh, tolerance: float) -> _Walk:
+    def of(cls, systems: Sequence[LoadCaseEquations], zones: Zones, mesh: Mesh, tolerance: float) -> _Walk:
         count = zones.count
         empty, none = np.full((2, count), np.nan), np.zeros(count, dtype=np.int64)
-        return cls(_nodes(balances, zones, mesh), zones.names, tolerance, empty, none, {}, [])
+        return cls(_nodes(systems, zones, mesh), zones.names, tolerance, empty, none, {}, [])
 
     def best(self) -> int | None:
         """Return the node with open zones whose equations are conditioned best, or None."""
@@ -165,31 +165,33 @@ class _Walk:
     def require(self, node: int) -> None:
         """Refuse a node of a given order that gives no result."""
         if node not in self.nodes:
-            raise InputError(f"node {node} is not in balance in any trial, or meets no unknown cell; leave it out of the order")
+            raise InputError(f"node {node} is not in balance in any load case, or meets no unknown cell; leave it out of the order")
         if not np.isfinite(self._condition(node)):
             _, right, found = self._local(node)
             raise InputError(
                 f"node {node} cannot be taken now: {len(right)} equations for the {2 * len(found)} moduli of {len(found)} open zones, "
-                "or they depend on each other; change the order, or add trials"
+                "or they depend on each other; change the order, or add load cases"
             )
 
-    def shortage(self, n_trials: int, dimension: int) -> str:
+    def shortage(self, n_load_cases: int, dimension: int) -> str:
         """Say why the steps ended."""
         left = int(np.isnan(self.moduli[0]).sum())
         needs = [-(-2 * k // dimension) for node in self.nodes if (k := len(self._local(node)[2]))]
-        more = f"at least {min(needs)} independent trials" if needs and min(needs) > n_trials else "trials that push differently"
+        more = (
+            f"at least {min(needs)} independent load cases" if needs and min(needs) > n_load_cases else "load cases that push differently"
+        )
         return (
-            f"the steps ended after {len(self.names) - left} of {len(self.names)} zones: with {n_trials} trials no node fixes all its "
-            f"remaining zones; give {more}, join cells to zones, or use field_balance, which takes all nodes together"
+            f"the steps ended after {len(self.names) - left} of {len(self.names)} zones: with {n_load_cases} load cases no node fixes "
+            f"all its remaining zones; give {more}, join cells to zones, or use batch_equilibrium_gap, which takes all nodes together"
         )
 
-    def estimate(self) -> BalanceEstimate:
+    def estimate(self) -> EquilibriumGapEstimate:
         """Return the moduli, and how well they balance the nodes whose zones are all known."""
         reached = ~np.isnan(self.moduli[0])
         whole = [node for node in self.nodes.values() if reached[node.zones].all()]
         misfit = sum(float(((np.einsum("epk,pk->e", n.matrix, self.moduli[:, n.zones]) - n.right) ** 2).sum()) for n in whole)
         force = sum(float((n.right**2).sum()) for n in whole)
-        return BalanceEstimate(
+        return EquilibriumGapEstimate(
             self.names, self.moduli[0], self.moduli[1], None, np.column_stack([reached, reached]),
             sum(len(node.right) for node in self.nodes.values()), self.moduli.size, 2 * int(reached.sum()), np.zeros(0),
             float(np.sqrt(misfit / force)) if force else np.nan, len(self.steps),
@@ -217,17 +219,17 @@ class _Walk:
         return float(singular[0] / singular[-1]) if singular[-1] > self.tolerance * singular[0] else np.inf
 
 
-def _nodes(balances: Sequence[TrialBalance], zones: Zones, mesh: Mesh) -> dict[int, _Node]:
+def _nodes(systems: Sequence[LoadCaseEquations], zones: Zones, mesh: Mesh) -> dict[int, _Node]:
     """Gather the equations that hold an unknown by node."""
-    parts, keep = [balance.columns() for balance in balances], np.concatenate([balance.tells for balance in balances])
+    parts, keep = [system.columns() for system in systems], np.concatenate([system.informative for system in systems])
     matrix = sp.csr_matrix(sp.vstack([part[0] for part in parts]))[keep]
     right = np.concatenate([part[1] for part in parts])[keep]
-    require_scale(balances, right)
-    node_of_row = np.concatenate([balance.rows // mesh.dimension for balance in balances])[keep]
+    require_scale(systems, right)
+    node_of_row = np.concatenate([system.rows // mesh.dimension for system in systems])[keep]
     order = np.argsort(node_of_row, kind="stable")
     nodes, first = np.unique(node_of_row[order], return_index=True)
     pairs = np.unique(np.column_stack([mesh.cells.ravel(), np.repeat(zones.of_cell, mesh.cells.shape[1])]), axis=0)
-    pushed = np.any([balance.external_force.any(axis=1) for balance in balances], axis=0)
+    pushed = np.any([system.external_force.any(axis=1) for system in systems], axis=0)
     out = {}
     for node, rows in zip(nodes.tolist(), np.split(order, first[1:]), strict=True):
         near = pairs[slice(*np.searchsorted(pairs[:, 0], (node, node + 1))), 1]

@@ -1,6 +1,6 @@
 """Equations of balance: at a node that no unknown force reaches, the forces of the cells around it add up to the known external one.
 
-Equation (3.20) of the report, at all nodes of all trials: ``A x = b`` with the moduli x of the zones - lambda of every zone, then mu of
+Equation (3.20) of the report, at all nodes of all load cases: ``A x = b`` with the moduli x of the zones - lambda of every zone, then mu of
 every zone - and in b the external forces less those of the known cells (spec I1). A displacement is needed at every node of every cell
 around a node, else the node gives no equation.
 """
@@ -19,7 +19,7 @@ from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.load_cases import KNOWN, FieldTrial, Zones
+from naibu.identification.from_fields.load_cases import KNOWN, FieldLoadCase, Zones
 from naibu.mechanics.finite_elements.linear_simplices import Simplices, simplices
 from naibu.mechanics.finite_elements.modulus_derivatives import SimplexLaw, cell_tangents, unit_forces
 
@@ -122,13 +122,13 @@ def _interpolation_weights(field: DisplacementField, nodes: FloatArray) -> sp.cs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TrialBalance:
-    """The equations of one trial.
+class LoadCaseEquations:
+    """The equations of one load case.
 
     Attributes
     ----------
     name : str
-        Of the trial.
+        Of the load case.
     field : NodalField
         Measured displacement of the nodes.
     body : Simplices
@@ -155,7 +155,7 @@ class TrialBalance:
     zones: Zones
 
     @property
-    def tells(self) -> BoolArray:
+    def informative(self) -> BoolArray:
         """Equations that hold an unknown modulus (e,); the others only tell how well the displacement obeys the known ones."""
         touched = np.zeros(self.body.n_points, dtype=bool)
         touched[self.body.cells[self.zones.of_cell[self.cells] != KNOWN].ravel()] = True
@@ -200,24 +200,24 @@ class TrialBalance:
 
 
 @contextmanager
-def _named(trial: str) -> Iterator[None]:
-    """Tell in which trial an error arose."""
+def _named(load_case: str) -> Iterator[None]:
+    """Tell in which load case an error arose."""
     try:
         yield
     except InputError as error:
-        raise InputError(f"trial {trial!r}: {error}") from error
+        raise InputError(f"load case {load_case!r}: {error}") from error
 
 
-def trial_balances(
-    mesh: Mesh, trials: Sequence[FieldTrial], zones: Zones, *, law: SimplexLaw = "linear", thickness_mm: float = 1.0
-) -> tuple[TrialBalance, ...]:
-    """Return the equations of all trials.
+def load_case_equations(
+    mesh: Mesh, load_cases: Sequence[FieldLoadCase], zones: Zones, *, law: SimplexLaw = "linear", thickness_mm: float = 1.0
+) -> tuple[LoadCaseEquations, ...]:
+    """Return the equations of all load cases.
 
     Parameters
     ----------
     mesh : Mesh
         Lines, triangles (plane strain) or linear tetrahedra.
-    trials : sequence of FieldTrial
+    load_cases : sequence of FieldLoadCase
         At least one.
     zones : Zones
         Of the cells of `mesh`.
@@ -229,13 +229,13 @@ def trial_balances(
     Raises
     ------
     InputError
-        No trial, shapes that do not fit the mesh, known cells without moduli, or a trial in which no node is in balance.
+        No load case, shapes that do not fit the mesh, known cells without moduli, or a load case in which no node is in balance.
     """
     body = simplices(mesh, thickness_mm=thickness_mm)
-    if not trials:
-        raise InputError("no trial is given: force balance needs the measured field of at least one push")
+    if not load_cases:
+        raise InputError("no load case is given: force balance needs the measured field of at least one push")
     _check_zones(zones, mesh)
-    return tuple(_trial_balance(mesh, body, trial, zones, law) for trial in trials)
+    return tuple(_equations_of(mesh, body, load_case, zones, law) for load_case in load_cases)
 
 
 def _check_zones(zones: Zones, mesh: Mesh) -> None:
@@ -247,28 +247,28 @@ def _check_zones(zones: Zones, mesh: Mesh) -> None:
         raise InputError(f"cell {int(np.flatnonzero(known & ~finite)[0])} is called known, but its moduli are not finite numbers")
 
 
-def _trial_balance(mesh: Mesh, body: Simplices, trial: FieldTrial, zones: Zones, law: SimplexLaw) -> TrialBalance:
-    if trial.loaded.shape != mesh.points.shape:
-        raise InputError(f"trial {trial.name!r} was made for {len(trial.loaded)} nodes, the mesh has {mesh.n_points}")
-    with _named(trial.name):
-        field = nodal_field(trial.field, mesh)
+def _equations_of(mesh: Mesh, body: Simplices, load_case: FieldLoadCase, zones: Zones, law: SimplexLaw) -> LoadCaseEquations:
+    if load_case.loaded.shape != mesh.points.shape:
+        raise InputError(f"load case {load_case.name!r} was made for {len(load_case.loaded)} nodes, the mesh has {mesh.n_points}")
+    with _named(load_case.name):
+        field = nodal_field(load_case.field, mesh)
     has = field.has_data
     whole = has[mesh.cells].all(axis=1)
     used = np.zeros(mesh.n_points, dtype=bool)
     used[mesh.cells.ravel()] = True
     used[mesh.cells[~whole].ravel()] = False
-    balanced = used[:, None] & ~trial.loaded
+    balanced = used[:, None] & ~load_case.loaded
     cells = np.flatnonzero(whole)
     if not balanced.any():
         raise InputError(
-            f"trial {trial.name!r} gives no equation: {int(has.sum())} of {mesh.n_points} nodes have data, and all nodes whose cells have "
-            "data are loaded; measure more densely, or use larger cells"
+            f"load case {load_case.name!r} gives no equation: {int(has.sum())} of {mesh.n_points} nodes have data, and all nodes whose "
+            "cells have data are loaded; measure more densely, or use larger cells"
         )
     part = Simplices(body.cells[cells], body.gradients[cells], body.measures[cells], body.n_points)
-    return TrialBalance(trial.name, field, part, cells, np.flatnonzero(balanced.ravel()), trial.external_force, law, zones)
+    return LoadCaseEquations(load_case.name, field, part, cells, np.flatnonzero(balanced.ravel()), load_case.external_force, law, zones)
 
 
-def require_scale(balances: Sequence[TrialBalance], right: FloatArray) -> None:
+def require_scale(systems: Sequence[LoadCaseEquations], right: FloatArray) -> None:
     """Refuse systems from which only ratios of moduli follow.
 
     Raises
@@ -278,10 +278,10 @@ def require_scale(balances: Sequence[TrialBalance], right: FloatArray) -> None:
     """
     if np.abs(right).max(initial=0.0) > 0.0:
         return
-    zones = balances[0].zones
+    zones = systems[0].zones
     if not (zones.of_cell == KNOWN).any():
         raise InputError(
-            "no region is known and no force: balance then gives only ratios of moduli; name a region in `known`, or give a trial's "
+            "no region is known and no force: balance then gives only ratios of moduli; name a region in `known`, or give a load case's "
             "external_force (a measured push, or the weight)"
         )
     raise InputError(

@@ -13,11 +13,11 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.status import Status
-from naibu.identification.force_balance.batch import BalanceEstimate, field_balance
-from naibu.identification.force_balance.equations import nodal_field, trial_balances
-from naibu.identification.force_balance.incremental import incremental_balance
-from naibu.identification.force_balance.weighted import whitened_balance
-from naibu.identification.from_fields.load_cases import FieldTrial, Zones
+from naibu.identification.equilibrium_gap.batch import EquilibriumGapEstimate, batch_equilibrium_gap
+from naibu.identification.equilibrium_gap.equations import load_case_equations, nodal_field
+from naibu.identification.equilibrium_gap.incremental import incremental_equilibrium_gap
+from naibu.identification.equilibrium_gap.weighted import weighted_equilibrium_gap
+from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.mechanics.finite_elements.linear_simplices import connection_matrices, lumped_mass, simplices
@@ -28,7 +28,7 @@ REPORT_ORDER = (14, 13, 12, 11, 10, 9, 8, 7, 6, 5)
 SHEARED = ((0.0, 0.0, -10.0), (10.0, 0.0, 0.0))
 
 
-def found(estimate: BalanceEstimate) -> np.ndarray:
+def found(estimate: EquilibriumGapEstimate) -> np.ndarray:
     return np.concatenate([estimate.lame_lambda, estimate.shear_modulus])
 
 
@@ -39,7 +39,7 @@ def true(body: PushedBody, zones: Zones) -> np.ndarray:
 
 
 def stacked(body: PushedBody, zones: Zones) -> tuple[np.ndarray, np.ndarray]:
-    parts = [(b.columns(), b.tells) for b in trial_balances(body.mesh, body.trials(), zones, law=body.law)]
+    parts = [(b.columns(), b.informative) for b in load_case_equations(body.mesh, body.load_cases(), zones, law=body.law)]
     return np.vstack([a[keep].toarray() for (a, _), keep in parts]), np.concatenate([b[keep] for (_, b), keep in parts])
 
 
@@ -58,7 +58,7 @@ def stacked(body: PushedBody, zones: Zones) -> tuple[np.ndarray, np.ndarray]:
 def test_exact_displacements_give_what_the_balances_determine(body: PushedBody) -> None:
     """The solution of minimum norm is the truth less its part in the null space; where that is empty, it is the truth."""
     zones = body.zones(each_cell=True)
-    estimate = field_balance(body.mesh, body.trials(), zones, method="minimum_norm")
+    estimate = batch_equilibrium_gap(body.mesh, body.load_cases(), zones, method="minimum_norm")
     truth, (matrix, right) = true(body, zones), stacked(body, zones)
     _, singular, basis = np.linalg.svd(matrix)
     rank = int((singular > 1e-9 * singular[0]).sum())
@@ -73,20 +73,20 @@ def test_exact_displacements_give_what_the_balances_determine(body: PushedBody) 
 
 def test_numbers_of_equations_are_those_of_table_3_1() -> None:
     body = square()
-    one, two = body.trials()[:1], body.trials()
+    one, two = body.load_cases()[:1], body.load_cases()
     zones = body.zones(each_cell=True)
-    assert (zones.count, field_balance(body.mesh, one, zones, method="minimum_norm").equations) == (16, 20)
-    estimate = field_balance(body.mesh, two, zones)
+    assert (zones.count, batch_equilibrium_gap(body.mesh, one, zones, method="minimum_norm").equations) == (16, 20)
+    estimate = batch_equilibrium_gap(body.mesh, two, zones)
     assert (estimate.equations, estimate.rank, estimate.determined.all()) == (40, 32, True)
     assert estimate.young_modulus == pytest.approx(np.full(16, SQUARE[0]), rel=1e-6)
     assert estimate.poisson_ratio == pytest.approx(np.full(16, SQUARE[1]), rel=1e-6)
-    with pytest.raises(InputError, match=r"1 trial gives 20 equations for 32 unknown moduli; add trials .*'minimum_norm'"):
-        field_balance(body.mesh, one, zones)
+    with pytest.raises(InputError, match=r"1 load case gives 20 equations for 32 unknown moduli; add load cases .*'minimum_norm'"):
+        batch_equilibrium_gap(body.mesh, one, zones)
 
 
 def test_a_minimum_norm_about_the_truth_is_the_truth() -> None:
     body = cube()
-    estimate = field_balance(body.mesh, body.trials(), body.zones(each_cell=True), method="minimum_norm", about=UNIFORM)
+    estimate = batch_equilibrium_gap(body.mesh, body.load_cases(), body.zones(each_cell=True), method="minimum_norm", about=UNIFORM)
     assert estimate.young_modulus == pytest.approx(np.full(192, UNIFORM[0]), rel=1e-6)
     assert not estimate.determined.any()
 
@@ -98,16 +98,16 @@ def test_in_three_dimensions_single_cells_stay_open_however_many_trials_there_ar
     for count in (3, 5):
         body = cube(LAYERS, split=split, pushes=[rng.normal((0, 0, -5), 3.0, (25, 3)) for _ in range(count)])  # type: ignore[arg-type]
         zones = body.zones(each_cell=True)
-        ranks.append(field_balance(body.mesh, body.trials(), zones, method="minimum_norm").rank)
+        ranks.append(batch_equilibrium_gap(body.mesh, body.load_cases(), zones, method="minimum_norm").rank)
     assert ranks[0] == ranks[1] < 2 * zones.count
     with pytest.raises(InputError, match="equations fix only"):
-        field_balance(body.mesh, body.trials(), zones)
+        batch_equilibrium_gap(body.mesh, body.load_cases(), zones)
 
 
 @pytest.mark.parametrize("order", [None, REPORT_ORDER])
 def test_the_incremental_method_finds_every_triangle_of_the_square(order: Sequence[int] | None) -> None:
     body = square()
-    result = incremental_balance(body.mesh, body.trials(), body.zones(each_cell=True), order=order)
+    result = incremental_equilibrium_gap(body.mesh, body.load_cases(), body.zones(each_cell=True), order=order)
     assert result.estimate.young_modulus == pytest.approx(np.full(16, SQUARE[0]), rel=1e-6)
     assert sorted(z for step in result.steps for z in step.zones) == list(range(16))
     if order is not None:  # equations (3.23), (3.28), and figure 3.8 (c), (d)
@@ -120,13 +120,13 @@ def test_the_incremental_method_goes_as_far_as_it_can_in_three_dimensions() -> N
     rng = np.random.default_rng(1)
     body = cube(LAYERS, split="asymmetric", pushes=[rng.normal((0, 0, -5), 3.0, (25, 3)) for _ in range(4)])
     zones = body.zones(each_cell=True)
-    result = incremental_balance(body.mesh, body.trials(), zones, partial=True)
+    result = incremental_equilibrium_gap(body.mesh, body.load_cases(), zones, partial=True)
     reached = ~np.isnan(result.estimate.lame_lambda)
     assert 100 < reached.sum() < zones.count
     assert found(result.estimate)[np.tile(reached, 2)] == pytest.approx(true(body, zones)[np.tile(reached, 2)], rel=1e-6)
     assert ((result.depth > 0) == reached).all()
     with pytest.raises(InputError, match=rf"after {reached.sum()} of 192 zones"):
-        incremental_balance(body.mesh, body.trials(), zones)
+        incremental_equilibrium_gap(body.mesh, body.load_cases(), zones)
 
 
 def test_a_step_inherits_the_errors_of_those_before_it_and_the_batch_does_not() -> None:
@@ -137,34 +137,34 @@ def test_a_step_inherits_the_errors_of_those_before_it_and_the_batch_does_not() 
     last = zones.of_cell == 0
     told = replace(zones, of_cell=np.where(last, 0, -1), names=zones.names[:1], known_lambda=body.moduli[0], known_mu=body.moduli[1])
     for seed in range(60):
-        trials = body.trials(sd_mm=1e-4, seed=seed)
-        result = incremental_balance(body.mesh, trials, zones, order=REPORT_ORDER)
+        trials = body.load_cases(sd_mm=1e-4, seed=seed)
+        result = incremental_equilibrium_gap(body.mesh, trials, zones, order=REPORT_ORDER)
         inherited.append(np.abs(found(result.estimate) / truth - 1.0))
-        alone.append(np.abs(found(incremental_balance(body.mesh, trials, told, order=(5,)).estimate) / truth[[0, 16]] - 1.0))
-        batch.append(np.abs(found(field_balance(body.mesh, trials, zones)) / truth - 1.0))
+        alone.append(np.abs(found(incremental_equilibrium_gap(body.mesh, trials, told, order=(5,)).estimate) / truth[[0, 16]] - 1.0))
+        batch.append(np.abs(found(batch_equilibrium_gap(body.mesh, trials, zones)) / truth - 1.0))
     assert result.depth[0] == 7
     assert (np.median(inherited, axis=0)[[0, 16]] > 2.0 * np.median(alone, axis=0)).all()
     assert np.median(batch) < 0.7 * np.median(inherited)
 
 
-def weighed(divisions: int = 4) -> tuple[Mesh, FieldTrial]:
+def weighed(divisions: int = 4) -> tuple[Mesh, FieldLoadCase]:
     """A cube that stands on its floor under its own weight, uniform."""
     body = cube(divisions=divisions)
     weight = lumped_mass(simplices(body.mesh), 1e-6)[:, None] * np.array([0.0, 0.0, -9810.0])
     floor = np.flatnonzero(body.mesh.points[:, 2] < 1e-9)
     u = LinearBody.of(body.mesh).solve(*body.moduli, PrescribedDisplacement.none(body.mesh.n_points).and_also(floor, np.zeros(3)), weight)
     field = DisplacementField.from_arrays(body.mesh.points, u)
-    return body.mesh, FieldTrial.of("standing", field, body.mesh, loaded=body.mesh.points[:, 2] < 1e-9, external_force=weight)
+    return body.mesh, FieldLoadCase.of("standing", field, body.mesh, loaded=body.mesh.points[:, 2] < 1e-9, external_force=weight)
 
 
 def test_a_density_gives_the_scale_where_nothing_is_known() -> None:
     mesh, trial = weighed()
     zones = Zones.of(mesh, known={})
-    for estimate in (field_balance(mesh, [trial], zones), whitened_balance(mesh, [trial], zones)):
+    for estimate in (batch_equilibrium_gap(mesh, [trial], zones), weighted_equilibrium_gap(mesh, [trial], zones)):
         assert estimate.young_modulus == pytest.approx(np.full(2, UNIFORM[0]), rel=1e-6)
         assert estimate.poisson_ratio == pytest.approx(np.full(2, UNIFORM[1]), rel=1e-6)
     without = replace(trial, external_force=np.zeros_like(trial.external_force))
-    for method in (field_balance, whitened_balance, incremental_balance):
+    for method in (batch_equilibrium_gap, weighted_equilibrium_gap, incremental_equilibrium_gap):
         with pytest.raises(InputError, match="only ratios of moduli"):
             method(mesh, [without], zones)
 
@@ -174,9 +174,9 @@ def test_trials_that_contradict_each_other_are_named() -> None:
     mesh, trial = weighed()
     heavy = replace(trial, name="in lead", external_force=4.0 * trial.external_force)
     zones = Zones.of(mesh, known={})
-    assert field_balance(mesh, [heavy], zones).young_modulus == pytest.approx(np.full(2, 4.0 * UNIFORM[0]), rel=1e-6)
+    assert batch_equilibrium_gap(mesh, [heavy], zones).young_modulus == pytest.approx(np.full(2, 4.0 * UNIFORM[0]), rel=1e-6)
     with pytest.raises(InputError, match=r"'standing', 'in lead' contradict each other: alone they leave .* together 1.. % .* 'standing'"):
-        field_balance(mesh, [trial, heavy], zones)
+        batch_equilibrium_gap(mesh, [trial, heavy], zones)
 
 
 def test_a_known_force_on_the_top_gives_the_scale_and_thickness_counts() -> None:
@@ -185,23 +185,26 @@ def test_a_known_force_on_the_top_gives_the_scale_and_thickness_counts() -> None
     reaction = LinearBody.of(body.mesh, thickness_mm=3.0).forces(lame, shear, u)
     floor = body.mesh.points[:, 1] < 1e-9
     force = np.where(floor[:, None], 0.0, reaction)
-    trial = FieldTrial.of("push", DisplacementField.from_arrays(body.mesh.points, u), body.mesh, loaded=floor, external_force=force)
-    estimate = field_balance(body.mesh, [trial], Zones.of(body.mesh, known={}), thickness_mm=3.0)
+    trial = FieldLoadCase.of("push", DisplacementField.from_arrays(body.mesh.points, u), body.mesh, loaded=floor, external_force=force)
+    estimate = batch_equilibrium_gap(body.mesh, [trial], Zones.of(body.mesh, known={}), thickness_mm=3.0)
     assert estimate.young_modulus == pytest.approx(np.full(2, SQUARE[0]), rel=1e-6)
-    thin = field_balance(body.mesh, [trial], Zones.of(body.mesh, known={}))
+    thin = batch_equilibrium_gap(body.mesh, [trial], Zones.of(body.mesh, known={}))
     assert thin.young_modulus == pytest.approx(np.full(2, 3.0 * SQUARE[0]), rel=1e-6)
 
 
 @pytest.mark.parametrize("law", ["neo_hookean", "saint_venant_kirchhoff"])
 def test_balance_at_finite_strain_is_exact_with_the_right_law_and_absurd_with_the_linear_one(law: str) -> None:
     body = cube(LAYERS, pushes=((0.0, 0.0, -6.0), (6.0, 0.0, -3.0)), law=law)  # type: ignore[arg-type]
-    trials, zones = body.trials(), body.zones()
-    for estimate in (field_balance(body.mesh, trials, zones, law=body.law), whitened_balance(body.mesh, trials, zones, law=body.law)):
+    trials, zones = body.load_cases(), body.zones()
+    for estimate in (
+        batch_equilibrium_gap(body.mesh, trials, zones, law=body.law),
+        weighted_equilibrium_gap(body.mesh, trials, zones, law=body.law),
+    ):
         assert found(estimate) == pytest.approx(true(body, zones), rel=2e-6)
-    linear = field_balance(body.mesh, trials, zones)
+    linear = batch_equilibrium_gap(body.mesh, trials, zones)
     assert np.abs(linear.young_modulus / [0.25, 0.5] - 1.0).max() > 0.1
     cells = body.zones(each_cell=True)
-    single = field_balance(body.mesh, trials, cells, law=body.law, method="minimum_norm")
+    single = batch_equilibrium_gap(body.mesh, trials, cells, law=body.law, method="minimum_norm")
     fixed = single.determined.T.ravel()
     assert fixed.any()
     assert found(single)[fixed] == pytest.approx(true(body, cells)[fixed], rel=1e-4)
@@ -259,11 +262,11 @@ def test_nodes_without_data_take_their_neighbours_out_and_nothing_else() -> None
     zones = body.zones()
     u = body.displacement((0.0, -25.0))
     u[6] = np.nan
-    trial = FieldTrial.of("hole", DisplacementField.from_arrays(body.mesh.points, u), body.mesh, loaded=body.constrained)
-    balance = trial_balances(body.mesh, [trial], zones)[0]
+    trial = FieldLoadCase.of("hole", DisplacementField.from_arrays(body.mesh.points, u), body.mesh, loaded=body.constrained)
+    balance = load_case_equations(body.mesh, [trial], zones)[0]
     around = set(body.mesh.cells[(body.mesh.cells == 6).any(axis=1)].ravel().tolist())
     assert set((balance.rows // 2).tolist()) == set(range(5, 20)) - around
-    estimate = field_balance(body.mesh, [trial], zones)
+    estimate = batch_equilibrium_gap(body.mesh, [trial], zones)
     assert estimate.young_modulus == pytest.approx([SQUARE[0]], rel=1e-6)
 
 
@@ -274,8 +277,8 @@ def test_a_mesh_coarser_than_the_truth_errs_less_as_it_is_refined() -> None:
     errors = []
     for divisions in (4, 8, 16):
         body = square(SQUARE_PUSHES[0][:1], divisions=divisions)
-        trial = FieldTrial.of("fine", DisplacementField.from_arrays(fine.mesh.points, u), body.mesh, loaded=body.constrained)
-        estimate = whitened_balance(body.mesh, [trial], body.zones())
+        trial = FieldLoadCase.of("fine", DisplacementField.from_arrays(fine.mesh.points, u), body.mesh, loaded=body.constrained)
+        estimate = weighted_equilibrium_gap(body.mesh, [trial], body.zones())
         errors.append(abs(estimate.young_modulus[0] / SQUARE[0] - 1.0))
     assert errors[2] < errors[1] < errors[0]
     assert errors[2] < 0.05
@@ -284,7 +287,7 @@ def test_a_mesh_coarser_than_the_truth_errs_less_as_it_is_refined() -> None:
 def cramer_rao(body: PushedBody, zones: Zones, sd_mm: float) -> np.ndarray:
     """Bound of the moduli's covariance if every node is measured: the displacement depends on them and on that of the held nodes.
 
-    Dense and by differentiating the solution, which `whitened_balance` never does.
+    Dense and by differentiating the solution, which `weighted_equilibrium_gap` never does.
     """
     lame, shear = body.moduli
     linear, constrained = LinearBody.of(body.mesh), np.repeat(body.constrained, body.mesh.dimension)
@@ -318,8 +321,8 @@ CASES = {
 def test_the_covariance_of_the_whitened_balance_is_the_cramer_rao_bound(name: str) -> None:
     body, sd = CASES[name]
     zones = body.zones()
-    exact = [replace(t, field=DisplacementField.from_arrays(t.field.points, t.field.vectors, sd_mm=sd)) for t in body.trials()]
-    estimate = whitened_balance(body.mesh, exact, zones)
+    exact = [replace(t, field=DisplacementField.from_arrays(t.field.points, t.field.vectors, sd_mm=sd)) for t in body.load_cases()]
+    estimate = weighted_equilibrium_gap(body.mesh, exact, zones)
     assert found(estimate) == pytest.approx(true(body, zones), rel=1e-6)
     bound = cramer_rao(body, zones, sd)
     assert estimate.covariance == pytest.approx(bound, rel=1e-5, abs=1e-9 * np.abs(bound).max())
@@ -331,12 +334,12 @@ def scatter(body: PushedBody, sd: float, draws: int) -> tuple[np.ndarray, np.nda
     truth = true(body, zones)
     white, plain, chi = [], [], []
     for seed in range(draws):
-        trials = body.trials(sd_mm=sd, seed=1000 + seed)
-        estimate = whitened_balance(body.mesh, trials, zones)
+        trials = body.load_cases(sd_mm=sd, seed=1000 + seed)
+        estimate = weighted_equilibrium_gap(body.mesh, trials, zones)
         assert estimate.status is Status.CONVERGED
         white.append(found(estimate) - truth)
         chi.append(estimate.chi_squared / estimate.degrees_of_freedom)
-        plain.append(found(field_balance(body.mesh, trials, zones)) - truth)
+        plain.append(found(batch_equilibrium_gap(body.mesh, trials, zones)) - truth)
     return np.array(white), np.array(plain), np.array(chi), cramer_rao(body, zones, sd)
 
 
@@ -351,7 +354,7 @@ def test_twenty_draws_scatter_by_no_more_than_the_bound_allows(name: str) -> Non
     white, plain, chi, bound = scatter(body, sd, 20)
     assert over_bound(white, bound) < 1.2
     assert over_bound(plain, bound) > 1.5 * over_bound(white, bound)
-    equations = sum(len(b.rows) for b in trial_balances(body.mesh, body.trials(), body.zones()))
+    equations = sum(len(b.rows) for b in load_case_equations(body.mesh, body.load_cases(), body.zones()))
     freedom = equations - len(bound)
     assert chi.mean() == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / freedom / 20))
 
@@ -370,7 +373,7 @@ def test_a_hundred_draws_have_no_bias_and_the_spread_of_the_bound_in_every_modul
 
 def test_the_whitened_estimate_is_a_stationary_point_of_the_likelihood_written_out_densely() -> None:
     body, sd = square(SQUARE_PUSHES[0]), 0.2
-    zones, trials = body.zones(), body.trials(sd_mm=0.2, seed=3)
+    zones, trials = body.zones(), body.load_cases(sd_mm=0.2, seed=3)
     lame, shear = connection_matrices(simplices(body.mesh))
     index = (body.mesh.cells[:, :, None] * 2 + np.arange(2)).reshape(body.mesh.n_cells, 6)
     rows = ~np.repeat(body.constrained, 2)
@@ -384,7 +387,7 @@ def test_the_whitened_estimate_is_a_stationary_point_of_the_likelihood_written_o
         residuals = [k @ t.field.vectors.ravel() for t in trials]
         return sum(float(r @ np.linalg.solve(sd**2 * k @ k.T, r)) for r in residuals)
 
-    estimate = whitened_balance(body.mesh, trials, zones, tolerance=1e-10)
+    estimate = weighted_equilibrium_gap(body.mesh, trials, zones, tolerance=1e-10)
     at = np.log(found(estimate))
     assert estimate.chi_squared == pytest.approx(deviance(at), rel=1e-8)
     slope = (np.array([deviance(at + h) - deviance(at - h) for h in 1e-4 * np.eye(2)])) / 2e-4
@@ -396,9 +399,9 @@ def test_the_whitened_estimate_is_a_stationary_point_of_the_likelihood_written_o
 
 def test_a_variance_that_is_not_given_is_estimated() -> None:
     body = cube(LAYERS, pushes=SHEARED)
-    given = body.trials(sd_mm=0.05, seed=5)
+    given = body.load_cases(sd_mm=0.05, seed=5)
     plain = [replace(t, field=DisplacementField.from_arrays(t.field.points, t.field.vectors)) for t in given]
-    first, second = (whitened_balance(body.mesh, trials, body.zones()) for trials in (given, plain))
+    first, second = (weighted_equilibrium_gap(body.mesh, trials, body.zones()) for trials in (given, plain))
     assert found(second) == pytest.approx(found(first), rel=1e-6)
     factor = second.standard_deviation / first.standard_deviation
     assert factor == pytest.approx(np.full((2, 2), np.sqrt(first.chi_squared / first.degrees_of_freedom)), rel=1e-4)
@@ -410,7 +413,7 @@ def test_whitening_holds_at_finite_strain() -> None:
     zones, errors = body.zones(), []
     truth = true(body, zones)
     for seed in range(5):
-        estimate = whitened_balance(body.mesh, body.trials(sd_mm=0.03, seed=seed), zones, law="neo_hookean")
+        estimate = weighted_equilibrium_gap(body.mesh, body.load_cases(sd_mm=0.03, seed=seed), zones, law="neo_hookean")
         assert estimate.status is Status.CONVERGED
         errors.append((found(estimate) - truth) / estimate.standard_deviation.T.ravel())
     assert np.sqrt(np.mean(np.square(errors))) < 1.6
@@ -418,11 +421,11 @@ def test_whitening_holds_at_finite_strain() -> None:
 
 def test_bounds_keep_moduli_positive_where_least_squares_does_not() -> None:
     body = cube(LAYERS, split="asymmetric")
-    trials = body.trials(sd_mm=0.1, seed=1)
-    assert not field_balance(body.mesh, trials, body.zones()).admissible.all()
-    bounded = field_balance(body.mesh, trials, body.zones(), method="bounded")
+    trials = body.load_cases(sd_mm=0.1, seed=1)
+    assert not batch_equilibrium_gap(body.mesh, trials, body.zones()).admissible.all()
+    bounded = batch_equilibrium_gap(body.mesh, trials, body.zones(), method="bounded")
     assert (found(bounded) >= 0.0).all()
-    whitened = whitened_balance(body.mesh, trials, body.zones())
+    whitened = weighted_equilibrium_gap(body.mesh, trials, body.zones())
     assert whitened.admissible.all()
     assert whitened.young_modulus == pytest.approx([0.25, 0.5], rel=0.15)
 
@@ -431,18 +434,18 @@ def test_data_on_points_of_their_own_need_the_noise_of_interpolation() -> None:
     body = cube()
     u = body.displacement((0.0, 0.0, -10.0))
     coarse = (np.rint(body.mesh.points / 10.0) % 2 == 0).all(axis=1)
-    trial = FieldTrial.of(
+    trial = FieldLoadCase.of(
         "coarse", DisplacementField.from_arrays(body.mesh.points[coarse], u[coarse], sd_mm=0.05), body.mesh, loaded=body.constrained
     )
     with pytest.raises(InputError, match=r"share the data of the same points.*interpolation_sd_mm"):
-        whitened_balance(body.mesh, [trial], body.zones())
-    estimate = whitened_balance(body.mesh, [trial], body.zones(), interpolation_sd_mm=0.5)
+        weighted_equilibrium_gap(body.mesh, [trial], body.zones())
+    estimate = weighted_equilibrium_gap(body.mesh, [trial], body.zones(), interpolation_sd_mm=0.5)
     assert estimate.young_modulus == pytest.approx([UNIFORM[0]], rel=0.5)
 
 
-def broken() -> dict[str, tuple[str, str, list[FieldTrial], Zones, dict[str, object]]]:
+def broken() -> dict[str, tuple[str, str, list[FieldLoadCase], Zones, dict[str, object]]]:
     body = square()
-    mesh, zones, (one, two) = body.mesh, body.zones(), body.trials()
+    mesh, zones, (one, two) = body.mesh, body.zones(), body.load_cases()
     cells = body.zones(each_cell=True)
     u = two.field.vectors
     inverted = u.copy()
@@ -450,15 +453,15 @@ def broken() -> dict[str, tuple[str, str, list[FieldTrial], Zones, dict[str, obj
     field = DisplacementField.from_arrays(mesh.points, inverted)
     line = DisplacementField.from_arrays(mesh.points[:5], u[:5])
     mixed = replace(one, field=DisplacementField.from_arrays(mesh.points, one.field.vectors, sd_mm=0.1))
-    nowhere = FieldTrial.of("held", one.field, mesh, loaded=np.ones(mesh.n_points, dtype=bool))
+    nowhere = FieldLoadCase.of("held", one.field, mesh, loaded=np.ones(mesh.n_points, dtype=bool))
     unfit = replace(zones, known_lambda=np.full_like(zones.known_lambda, np.nan))
     far = np.where(mesh.points[:, 1:] == 100.0, True, body.constrained[:, None])
     return {
-        "no trial": ("field", "no trial is given", [], zones, {}),
+        "no load case": ("field", "no load case is given", [], zones, {}),
         "method": ("field", "method 'svd' is not known", [one], zones, {"method": "svd"}),
         "law": ("field", "law 'rubber' is not known", [one], zones, {"law": "rubber"}),
         "about": ("field", "has no use for it", [one], zones, {"about": (1.0, 0.3)}),
-        "inverted": ("field", r"trial 'push 2': the displacement inverts the cell of nodes", [replace(two, field=field)], zones,
+        "inverted": ("field", r"load case 'push 2': the displacement inverts the cell of nodes", [replace(two, field=field)], zones,
                      {"law": "neo_hookean"}),
         "points on a line": ("field", "lie on one plane or line", [replace(one, field=line)], zones, {}),
         "all loaded": ("field", "'held' gives no equation: 25 of 25 nodes have data", [nowhere], zones, {}),
@@ -469,7 +472,7 @@ def broken() -> dict[str, tuple[str, str, list[FieldTrial], Zones, dict[str, obj
         "open": ("white", "leave a combination of the 32 moduli open", [mixed], cells, {}),
         "start": ("white", "start must be 1 positive lambda", [one], zones, {"start": (np.ones(2), np.ones(2))}),
         "interpolation": ("white", "interpolation_sd_mm must be", [one], zones, {"interpolation_sd_mm": -1.0}),
-        "too few trials": ("step", "after 1 of 16 zones: with 1 trials .* at least 2 independent trials", [one], cells, {}),
+        "too few load cases": ("step", "after 1 of 16 zones: with 1 load cases .* at least 2 independent load cases", [one], cells, {}),
         "wrong order": ("step", "node 13 cannot be taken now: 4 equations for the 6 moduli of 3 open zones", [one, two], cells,
                         {"order": [13]}),
         "order outside": ("step", "node 2 is not in balance", [one, two], cells, {"order": [2]}),
@@ -479,7 +482,7 @@ def broken() -> dict[str, tuple[str, str, list[FieldTrial], Zones, dict[str, obj
 @pytest.mark.parametrize("case", broken())
 def test_what_cannot_be_balanced_is_said(case: str) -> None:
     method, words, trials, zones, options = broken()[case]
-    call = {"field": field_balance, "white": whitened_balance, "step": incremental_balance}[method]
+    call = {"field": batch_equilibrium_gap, "white": weighted_equilibrium_gap, "step": incremental_equilibrium_gap}[method]
     with pytest.raises(InputError, match=words):
         call(square().mesh, trials, zones, **options)  # type: ignore[operator]
 
@@ -489,9 +492,9 @@ def test_zones_that_no_balance_reaches_are_named() -> None:
     zones = body.zones(each_cell=True)
     u = body.displacement((0.0, -25.0))
     u[5] = np.nan
-    trial = FieldTrial.of("hole", DisplacementField.from_arrays(body.mesh.points, u), body.mesh, loaded=body.constrained)
+    trial = FieldLoadCase.of("hole", DisplacementField.from_arrays(body.mesh.points, u), body.mesh, loaded=body.constrained)
     with pytest.raises(InputError, match=r"'lower half: cell 0', .* and 1 more zones appear in no balance"):
-        field_balance(body.mesh, [trial], zones, method="minimum_norm")
+        batch_equilibrium_gap(body.mesh, [trial], zones, method="minimum_norm")
 
 
 def test_moduli_of_the_square_are_those_of_equation_3_1() -> None:

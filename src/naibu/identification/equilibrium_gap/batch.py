@@ -1,8 +1,9 @@
-"""Batch identification from measured fields: the balance of all nodes of all trials at once (spec I3; report 3.3.3, equation 3.34).
+"""Equilibrium gap method in batch form: equilibrium of all nodes in all load cases as one linear system in the moduli.
 
-One linear system for lambda and mu of every zone. With fewer equations than unknowns - the report's one push - the solution of minimum norm
-fulfils every balance and need not be near the truth: `BalanceEstimate.determined` tells which moduli the equations fix. Noise enters the
-matrix too, which least squares does not know: moduli come out too low (errors in variables). `whitened_balance` mends that.
+The method is that of :cite:t:`claire2004`, and equation (3.34) of :cite:t:`hirai2008`; the unknowns are lambda and mu of every zone. With
+fewer equations than unknowns the minimum-norm solution satisfies every equation and need not be close to the truth:
+`EquilibriumGapEstimate.determined` states which moduli the equations determine. Noise in the displacement enters the matrix, which makes
+least squares underestimate the moduli (errors in variables); `naibu.identification.equilibrium_gap.weighted` removes that bias.
 """
 
 from __future__ import annotations
@@ -18,22 +19,22 @@ from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.status import Status
-from naibu.identification.force_balance.equations import TrialBalance, require_scale, trial_balances
-from naibu.identification.from_fields.load_cases import FieldTrial, Zones
+from naibu.identification.equilibrium_gap.equations import LoadCaseEquations, load_case_equations, require_scale
+from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.mechanics.finite_elements.modulus_derivatives import SimplexLaw
 
-BalanceMethod = Literal["least_squares", "minimum_norm", "bounded"]
+EquilibriumGapMethod = Literal["least_squares", "minimum_norm", "bounded"]
 MOST_UNKNOWNS = 4000  # a dense decomposition of more would take minutes and gigabytes
 MOST_ACTIVE = 100  # unknowns up to which the exact method of active bounds is used, which takes a step for each
 RANK_TOLERANCE = 1e-9  # of the largest singular value; displacements of a direct solver are good to about 1e-12
 LOOSE = 1e-5  # part of a determined unknown that may lie in the null space
-CONTRADICTION = 3.0  # a trial fits alone this many times better than with the others ...
+CONTRADICTION = 3.0  # a load case fits alone this many times better than with the others ...
 UNEXPLAINED = 0.2  # ... which leave this share of its known forces unbalanced
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BalanceEstimate:
+class EquilibriumGapEstimate:
     """Moduli of the zones from force balance.
 
     Attributes
@@ -117,24 +118,24 @@ class BalanceEstimate:
         return np.asarray(np.sqrt(np.stack(variances, axis=1)), dtype=np.float64)
 
 
-def field_balance(
+def batch_equilibrium_gap(
     mesh: Mesh,
-    trials: Sequence[FieldTrial],
+    load_cases: Sequence[FieldLoadCase],
     zones: Zones,
     *,
-    method: BalanceMethod = "least_squares",
+    method: EquilibriumGapMethod = "least_squares",
     law: SimplexLaw = "linear",
     thickness_mm: float = 1.0,
     about: tuple[float, float] | None = None,
     rank_tolerance: float = RANK_TOLERANCE,
-) -> BalanceEstimate:
+) -> EquilibriumGapEstimate:
     """Identify the moduli of all zones from the balance of all nodes (spec I3).
 
     Parameters
     ----------
     mesh : Mesh
         Lines, triangles (plane strain) or linear tetrahedra.
-    trials : sequence of FieldTrial
+    load_cases : sequence of FieldLoadCase
         One push or several.
     zones : Zones
         What is known and what is sought.
@@ -153,50 +154,50 @@ def field_balance(
     Raises
     ------
     InputError
-        Nothing known to compare with, too few or dependent equations for ``"least_squares"``, trials that contradict each other, or data
-        that do not fit (see `trial_balances`).
+        No known modulus or force, too few or dependent equations for ``"least_squares"``, load cases that contradict each other, or
+        data that do not fit (see `load_case_equations`).
 
     Notes
     -----
-    Every trial counts with the size of its forces: a push twice as deep has four times the weight in the sum of squares.
+    Every load case counts with the size of its forces: a push twice as deep has four times the weight in the sum of squares.
     """
-    if method not in get_args(BalanceMethod):
-        raise InputError(f"method {method!r} is not known; use one of {', '.join(get_args(BalanceMethod))}")
+    if method not in get_args(EquilibriumGapMethod):
+        raise InputError(f"method {method!r} is not known; use one of {', '.join(get_args(EquilibriumGapMethod))}")
     if about is not None and method != "minimum_norm":
         raise InputError(f"`about` chooses among solutions of minimum norm; method {method!r} has no use for it")
-    balances = trial_balances(mesh, trials, zones, law=law, thickness_mm=thickness_mm)
-    parts = [_informative(balance) for balance in balances]
+    systems = load_case_equations(mesh, load_cases, zones, law=law, thickness_mm=thickness_mm)
+    parts = [_informative(system) for system in systems]
     matrix, right = _stacked(parts)
-    require_scale(balances, right)
+    require_scale(systems, right)
     _require_columns(matrix, zones)
     left, singular, rows = np.linalg.svd(matrix, full_matrices=False)
     rank = int((singular > rank_tolerance * singular[0]).sum())
     determined = _determined(rows[:rank])
     if method == "least_squares":
-        _require_rank(rank, matrix.shape, determined, zones, len(trials))
+        _require_rank(rank, matrix.shape, determined, zones, len(load_cases))
     if method == "bounded":
         solution = _bounded(matrix, right)
     else:
         start = np.repeat(lame_parameters(*about), zones.count) if about is not None else np.zeros(matrix.shape[1])
         solution = start + rows[:rank].T @ ((left[:, :rank].T @ (right - matrix @ start)) / singular[:rank])
     misfit = matrix @ solution - right
-    _require_agreement([balance.name for balance in balances], parts, misfit)
+    _require_agreement([system.name for system in systems], parts, misfit)
     lame, mu = solution.reshape(2, -1)
     residual = float(np.linalg.norm(misfit) / np.linalg.norm(right))
     flags = determined.reshape(2, -1).T
-    return BalanceEstimate(zones.names, lame, mu, None, flags, len(right), matrix.shape[1], rank, singular, residual)
+    return EquilibriumGapEstimate(zones.names, lame, mu, None, flags, len(right), matrix.shape[1], rank, singular, residual)
 
 
-def _informative(balance: TrialBalance) -> tuple[FloatArray, FloatArray]:
-    """Dense equations of a trial that hold an unknown."""
-    if 2 * balance.zones.count > MOST_UNKNOWNS:
+def _informative(system: LoadCaseEquations) -> tuple[FloatArray, FloatArray]:
+    """Dense equations of a load case that hold an unknown."""
+    if 2 * system.zones.count > MOST_UNKNOWNS:
         raise InputError(
-            f"{2 * balance.zones.count} unknown moduli are too many for force balance (at most {MOST_UNKNOWNS}): join cells to zones, or "
+            f"{2 * system.zones.count} unknown moduli are too many for force balance (at most {MOST_UNKNOWNS}): join cells to zones, or "
             "match displacements with regularization"
         )
-    matrix, right = balance.columns()
-    tells = balance.tells
-    return matrix[tells].toarray(), right[tells]
+    matrix, right = system.columns()
+    informative = system.informative
+    return matrix[informative].toarray(), right[informative]
 
 
 def _stacked(parts: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
@@ -225,15 +226,15 @@ def _require_columns(matrix: FloatArray, zones: Zones) -> None:
         )
 
 
-def _require_rank(rank: int, shape: tuple[int, ...], determined: BoolArray, zones: Zones, n_trials: int) -> None:
+def _require_rank(rank: int, shape: tuple[int, ...], determined: BoolArray, zones: Zones, n_load_cases: int) -> None:
     """Refuse systems that leave a modulus open."""
     equations, unknowns = shape
     if rank == unknowns:
         return
-    remedy = "add trials that push differently, join cells to zones, or take method='minimum_norm'"
+    remedy = "add load cases that push differently, join cells to zones, or take method='minimum_norm'"
     if equations < unknowns:
-        trials = "1 trial gives" if n_trials == 1 else f"{n_trials} trials give"
-        raise InputError(f"{trials} {equations} equations for {unknowns} unknown moduli; {remedy}")
+        load_cases = "1 load case gives" if n_load_cases == 1 else f"{n_load_cases} load cases give"
+        raise InputError(f"{load_cases} {equations} equations for {unknowns} unknown moduli; {remedy}")
     open_zones = np.asarray(~determined.reshape(2, -1).all(axis=0), dtype=bool)
     raise InputError(
         f"{equations} equations fix only {rank} of {unknowns} combinations of the moduli; open are those of "
@@ -247,7 +248,7 @@ def _listed(names: Sequence[str], chosen: BoolArray) -> str:
 
 
 def _require_agreement(names: Sequence[str], parts: Sequence[tuple[FloatArray, FloatArray]], misfit: FloatArray) -> None:
-    """Refuse trials each of which makes sense alone, but not together."""
+    """Refuse load cases each of which makes sense alone, but not together."""
     start, together, alone = 0, [], []
     for _, right in parts:
         scale = max(float(np.linalg.norm(right)), 1e-300)
@@ -261,12 +262,12 @@ def _require_agreement(names: Sequence[str], parts: Sequence[tuple[FloatArray, F
             continue
         found = np.linalg.lstsq(matrix, right, rcond=RANK_TOLERANCE)[0]
         alone.append(float(np.linalg.norm(matrix @ found - right) / np.linalg.norm(right)))
-    # a trial with more unknowns than equations fits alone whatever it is: then only complete failure counts
+    # a load case with more unknowns than equations fits alone whatever it is: then only complete failure counts
     spare = all(len(right) > matrix.shape[1] for matrix, right in parts)
     worst = int(np.argmax(together))
     if (spare and together[worst] > CONTRADICTION * max(alone)) or (together[worst] > 0.98 and max(alone) < 0.1):
         raise InputError(
-            f"the trials {', '.join(map(repr, names))} contradict each other: alone they leave {100.0 * max(alone):.2g} % of the known "
+            f"the load cases {', '.join(map(repr, names))} contradict each other: alone they leave {100.0 * max(alone):.2g} % of the known "
             f"forces unbalanced, together {100.0 * together[worst]:.0f} % of those of {names[worst]!r}; check the order of the fields, "
             "their frames and units, which nodes are loaded, and the forces"
         )
