@@ -1,4 +1,4 @@
-"""The cube that ``fe_compression.py`` and ``fe_linear.py`` press together, and what their programs share (mm, kPa, mN)."""
+"""The cube compressed by ``fe_compression.py`` and ``fe_linear.py``, and what their programs have in common (mm, kPa, mN)."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class Cholesky:
 
 
 def newton(case: Case, forces: Callable[[Array], Array], tangent: Callable[[Array], sp.bsr_matrix], solver: str) -> Result:
-    """Full Newton's method for a peer that assembles but does not iterate, with naibu's criterion; held nodes move by the first tangent."""
+    """Full Newton's method for a peer that assembles but does not iterate, with naibu's criterion and predictor."""
     support, u, count = prescribed(case), np.zeros_like(case.mesh.points), 0
     linear = SuperLUSolver() if solver == "superlu" else Cholesky()
     for step in range(1, STEPS + 1):

@@ -1,6 +1,6 @@
 """The linear-elastic problem of a soft cube with a stiff ball, from the arrays of the mesh to the displacement: naibu beside others.
 
-``python benchmarks/fe_linear.py [--cells 20] [--repeats 3] [--peers naibu,scikit-fem,...]`` (mm, kPa, mN). The base is held and the top
+``python benchmarks/fe_linear.py [--cells 20] [--repeats 3] [--peers naibu,scikit-fem,...]`` (mm, kPa, mN). The base is fixed and the top
 lowered by 3 mm; the stiffness is assembled and solved once. Every peer runs in a process of its own, without its start (see
 ``fe_driver.py`` and ``benchmarks/README.md``).
 """

@@ -27,7 +27,7 @@ def cholesky(matrix: Any, b: Any) -> Array:
 
 
 def run_scikit_fem(case: Case, solver: str) -> Result:
-    """scikit-fem: its model of linear elasticity, held unknowns condensed."""
+    """scikit-fem: its model of linear elasticity, constrained unknowns condensed."""
     import skfem
     from skfem.models.elasticity import linear_elasticity
 

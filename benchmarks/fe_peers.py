@@ -111,7 +111,7 @@ def ngsolve_mesh(case: Case) -> tuple[Any, Any, Any]:
 
 
 def ngsolve_free(constrained: Any) -> Any:
-    """Return the unknowns that are not held, for NGSolve."""
+    """Return the unconstrained unknowns, for NGSolve."""
     import ngsolve as ng
 
     free = ng.BitArray(constrained.size)
@@ -159,7 +159,7 @@ def run_ngsolve(case: Case) -> Result:
 
 
 def jax_fem_ends(depth: float) -> list[Any]:
-    """Return JAX-FEM's conditions: the base held, the top lowered by `depth`, mm."""
+    """Return JAX-FEM's conditions: the base fixed, the top lowered by `depth`, mm."""
     import jax.numpy as jnp
 
     def below(point: Any) -> Any:
@@ -172,7 +172,7 @@ def jax_fem_ends(depth: float) -> list[Any]:
 
 
 def jax_fem_linear(case: Case) -> Callable[..., Array]:
-    """Return naibu's direct solver for JAX-FEM; the rows of held nodes, which it replaces, are made symmetric again."""
+    """Return naibu's direct solver for JAX-FEM; the rows of constrained nodes, which it replaces, are made symmetric again."""
     constrained, cholesky = prescribed(case).constrained, Cholesky()
 
     def linear(matrix: Any, b: Any, start: Any, _: Any) -> Array:
@@ -275,7 +275,7 @@ def run_tatva(case: Case) -> Result:
 def run_torch_fem(case: Case, method: str) -> Result:
     """torch-fem with its own Newton method and load increments, and one of the linear solvers that it ships.
 
-    It begins a step with the increment of the last one, but with held nodes in their new places. The first of 5 steps would flatten the
+    It begins a step with the increment of the last one, but with constrained nodes displaced. The first of 5 steps would flatten the
     uppermost of 20 layers of cells to nothing, from where it does not converge; that step is therefore taken in two, of 1 and 2 mm.
     """
     import torch
@@ -387,7 +387,7 @@ def sfepy_linear() -> Any:
 def run_sfepy(case: Case) -> Result:
     """SfePy with its Newton method and time stepping; only the linear solver is given to it.
 
-    It begins a step with held nodes in their new places, which flattens the uppermost cells; a step is therefore begun with all nodes moved
+    It begins a step with constrained nodes displaced, which flattens the uppermost cells; a step is therefore begun with all nodes moved
     in proportion to their height.
     """
     from sfepy.base.base import output

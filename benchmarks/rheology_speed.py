@@ -1,11 +1,11 @@
-"""How fast a three-element block of 6 000 tetrahedra moves: the default method beside explicit Runge-Kutta of fourth order.
+"""Speed of time integration of a three-element block of 6 000 tetrahedra: the default method against the classical Runge-Kutta method.
 
 A cube of 50 mm, E = 10 kPa, C2 = 300 kPa s, nu = 0.4, is pressed and sheared by its top for 0.5 s, one full swing, with C1 = 0.1, 1 and
-100 kPa s, which is the report's agar. Errors are differences of displacement at five times from a reference, over its largest displacement;
-the reference is Richardson's extrapolation of the default method at 4 000 and 8 000 steps. Runge-Kutta takes the longest steps at which it
-is stable, found by trial: longer ones, which would make its error as large as that of the implicit method, blow up. Where that takes more
-than 20 000 steps, 2 000 are timed and scaled, and their error is not known. Times are those of the processor (one thread), as the machine
-may have other work.
+100 kPa s, which is the agar of the 2008 report. Errors are differences of displacement at five times from a reference, relative to its
+largest displacement; the reference is Richardson's extrapolation of the default method at 4 000 and 8 000 steps. Runge-Kutta takes the
+longest steps at which it is stable, found by trial: longer ones, which would make its error as large as that of the implicit method, are
+unstable. Where that takes more than 20 000 steps, 2 000 are timed and scaled, and their error is not known. Times are processor times of
+one thread, as the machine may have other work.
 
 Run: ``MKL_NUM_THREADS=1 OMP_NUM_THREADS=1 python benchmarks/rheology_speed.py``.
 """
@@ -70,8 +70,8 @@ def compare(body: LinearBody, viscosity: float) -> None:
     seconds = {}
     for method, steps in (("sdirk2", COARSE), ("sdirk2", STEPS), ("generalized_alpha", STEPS), ("backward_euler", STEPS)):
         series, seconds[method, steps] = press(body, gel, method, SPAN_S, SPAN_S / steps)
-        told = f"{series.factorizations} factorization"
-        row(method, series.steps, seconds[method, steps], f"{error(series, reference):.1e}", told)
+        note = f"{series.factorizations} factorization"
+        row(method, series.steps, seconds[method, steps], f"{error(series, reference):.1e}", note)
     step = largest_stable_step(body, gel)
     while True:
         count = int(np.ceil(SPAN_S / step))
@@ -87,8 +87,8 @@ def compare(body: LinearBody, viscosity: float) -> None:
     print(f"  rk4 over sdirk2: {', '.join(ratios)}", flush=True)
 
 
-def row(method: str, steps: int, seconds: float, wrong: str, told: str) -> None:
-    print(f"  {method:18s} {steps:9d} steps {seconds:11.2f} s {1e3 * seconds / steps:7.2f} ms a step   error {wrong:8s} {told}", flush=True)
+def row(method: str, steps: int, seconds: float, wrong: str, note: str) -> None:
+    print(f"  {method:18s} {steps:9d} steps {seconds:11.2f} s {1e3 * seconds / steps:7.2f} ms a step   error {wrong:8s} {note}", flush=True)
 
 
 def main() -> None:

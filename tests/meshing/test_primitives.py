@@ -167,7 +167,7 @@ def test_quadratic_cells_share_their_edge_nodes():
 
 
 @pytest.mark.parametrize(
-    ("call", "told"),
+    ("call", "message"),
     [
         (lambda: box_from_coordinates([0, 1, 1], [0, 1], [0, 1]), "x coordinates"),
         (lambda: box_from_coordinates([0, 1], [0], [0, 1]), "y coordinates"),
@@ -183,8 +183,8 @@ def test_quadratic_cells_share_their_edge_nodes():
         (lambda: to_quadratic(box((1, 1, 1), (1, 1, 1))), "to_tetra"),
     ],
 )
-def test_bad_measures_are_named(call, told):
-    with pytest.raises(InputError, match=told):
+def test_bad_measures_are_named(call, message):
+    with pytest.raises(InputError, match=message):
         call()
 
 

@@ -91,7 +91,7 @@ def test_forces_balance_and_turn_with_the_body(kind, formulation, seed, law):
     size = np.abs(force).sum()
     np.testing.assert_allclose(force.sum(axis=0), 0, atol=1e-12 * size)
     if law == "linear_elastic":
-        return  # not objective: moments balance about the free state only
+        return  # not objective: moments balance about the reference configuration only
     np.testing.assert_allclose(np.cross(mesh.points + u, force).sum(axis=0), 0, atol=1e-11 * size)
     turn = Rotation.random(random_state=np.random.default_rng(seed)).as_matrix()
     turned_energy, turned, _ = body.forces((mesh.points + u) @ turn.T - mesh.points)

@@ -127,7 +127,7 @@ def test_parameter_vector_is_linear_in_the_moduli(law):
 
 def test_lame_parameters_by_hand():
     assert lame_parameters(2.5, 0.25) == pytest.approx((1.0, 1.0))
-    assert lame_parameters(5.0e3, 0.43) == pytest.approx((1.07e4, 1.75e3), rel=5e-3)  # the report's 2-D example (spec I4)
+    assert lame_parameters(5.0e3, 0.43) == pytest.approx((1.07e4, 1.75e3), rel=5e-3)  # Hirai et al. (2008), chapter 3
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The kernel of linear tetrahedra agrees with the general one, however many threads share the mesh."""
+"""The kernel of linear tetrahedra agrees with the general one, whatever the number of threads."""
 
 from dataclasses import replace
 

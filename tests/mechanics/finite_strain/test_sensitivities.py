@@ -1,4 +1,4 @@
-"""Sensitivities of whole load paths, Coulomb slip and its memory included, against central differences of solves."""
+"""Sensitivities of whole load paths, including Coulomb slip and its history, against central differences of solves."""
 
 from dataclasses import replace
 
@@ -108,7 +108,7 @@ def directions(body: Problem) -> dict[str, tuple[Direction, float]]:
 
 
 def slipping(solution: Solution, body: Problem) -> np.ndarray:
-    """Share of the touching points of each contact that slip in the last step."""
+    """Fraction of the touching points of each contact that slip in the last step."""
     out = []
     for c, a in zip(body.contacts, solution.states[-2].anchors, strict=True):
         response = c.evaluate(solution.displacement, a, 1.0)

@@ -164,12 +164,12 @@ def test_manufactured_finite_deformation_converges_with_order_two(law):
     assert rates[-1] > 1.8, errors
 
 
-def crushed(share: float) -> tuple:
+def crushed(fraction: float) -> tuple:
     mesh = box((10, 10, 10), (3, 3, 3))
     support = (
         PrescribedDisplacement.none(mesh.n_points)
         .and_also(side_nodes(mesh, "z-"), ZERO)
-        .and_also(side_nodes(mesh, "z+"), (0, 0, -10 * share))
+        .and_also(side_nodes(mesh, "z+"), (0, 0, -10 * fraction))
     )
     return mesh, problem(mesh, prescribed=support)
 
@@ -273,8 +273,8 @@ def test_states_follow_the_load_and_are_reported():
 def test_reaction_is_the_derivative_of_the_energy():
     """Castigliano: force on the plate = d(energy)/d(height)."""
     energies, heights = [], np.array([0.199, 0.2, 0.201])
-    for share in heights:
-        _, body = crushed(share)
+    for fraction in heights:
+        _, body = crushed(fraction)
         solution = solve(body, settings=SolverSettings(tolerance=1e-10))
         energies.append(body.assembler.forces(solution.displacement)[0])
     mesh, body = crushed(0.2)

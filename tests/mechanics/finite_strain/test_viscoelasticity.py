@@ -182,7 +182,7 @@ def ramped(t, weights_times=SERIES) -> np.ndarray:
 
 
 def bar(m: Material, value=None, force: float = 0.0, divisions=(1, 1, 2)):
-    """A cube on a frictionless floor, its free sides held from turning; the top is moved by `value`, or pulled by `force` mN."""
+    """A cube on a frictionless floor, its free sides constrained against rotation; the top is moved by `value`, or pulled by `force` mN."""
     mesh = box((SIDE,) * 3, divisions, centred=False)
     x = mesh.points
     constrained = PrescribedDisplacement.none(len(x))
@@ -192,9 +192,9 @@ def bar(m: Material, value=None, force: float = 0.0, divisions=(1, 1, 2)):
     top = np.flatnonzero(x[:, 2] > SIDE - 1e-9)
     if value is not None:
         constrained = constrained.and_also(top, (0, 0, value), (False, False, True))
-    share = np.zeros_like(x)
-    share[top, 2] = force / len(top)
-    return problem(mesh, m, prescribed=constrained, force=share), top
+    nodal = np.zeros_like(x)
+    nodal[top, 2] = force / len(top)
+    return problem(mesh, m, prescribed=constrained, force=nodal), top
 
 
 def test_slow_and_fast_ramps_are_the_maxwell_solids_of_small_strain():
@@ -320,11 +320,11 @@ def test_each_region_relaxes_by_its_own_series():
     found = simulate_viscoelastic(p, [SERIES, ELASTIC], times=times, loads=[1, 1, 1], regions=mesh.regions, relaxing="all")
     middle = np.abs(mesh.points[:, 2] - 5.0) < 1e-9
     at_once, at_last = (found.displacement[k, middle, 2].mean() for k in (0, -1))
-    share = SERIES.long_term
+    fraction = SERIES.long_term
     assert at_once == pytest.approx(-0.5e-4, rel=1e-4)
-    assert at_last == pytest.approx(-1e-4 / (1.0 + share), rel=1e-4)
+    assert at_last == pytest.approx(-1e-4 / (1.0 + fraction), rel=1e-4)
     force = [s.internal_force[top, 2].sum() for s in found.steps]
-    assert force[-1] / force[0] == pytest.approx(2.0 * share / (1.0 + share), rel=1e-4)
+    assert force[-1] / force[0] == pytest.approx(2.0 * fraction / (1.0 + fraction), rel=1e-4)
 
 
 def test_a_plate_feels_the_body_relax():

@@ -1,4 +1,4 @@
-"""Linear solvers: they agree with each other and with dense algebra, refuse singular systems, and may be reused."""
+"""Linear solvers: they agree with each other and with dense algebra, refuse singular systems, and can be reused."""
 
 import subprocess
 import sys
@@ -23,7 +23,7 @@ needs_pardiso = pytest.mark.skipif(pardiso_library() is None, reason="oneMKL is 
 
 
 def body(divisions: int):
-    """A block, and which of its degrees of freedom are held."""
+    """A block, and which of its degrees of freedom are constrained."""
     mesh = distorted("hexahedron", divisions=divisions, amount=0.1)
     constrained = np.zeros((mesh.n_points, 3), dtype=bool)
     constrained[side_nodes(distorted("hexahedron", divisions=divisions, amount=0.0), "z-")] = True
@@ -34,7 +34,7 @@ MESH, CONSTRAINED = body(5)
 
 
 def stiffness(young=20.0, nu=0.45, squeeze=0.05, constrained=CONSTRAINED, mesh=MESH) -> sp.bsr_matrix:
-    """Tangent of a block that is compressed by `squeeze` at constant volume: positive definite where it is held."""
+    """Tangent of a block that is compressed by `squeeze` at constant volume: positive definite where it is constrained."""
     made = assembler(mesh, of("neo_hookean", nu, young))
     widening = (1 - squeeze) ** -0.5 - 1
     return with_dirichlet_rows(made.pattern.matrix(made.evaluate(mesh.points * [widening, widening, -squeeze])[2]), constrained)

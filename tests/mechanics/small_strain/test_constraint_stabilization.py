@@ -1,4 +1,4 @@
-"""Constraint stabilisation: the report's system (9), how gaps close, and contact forces against those of exact supports."""
+"""Constraint stabilisation: system (9) of Hirai et al. (2008), how gaps close, and contact forces against those of exact supports."""
 
 from __future__ import annotations
 

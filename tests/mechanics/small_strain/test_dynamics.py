@@ -43,7 +43,7 @@ def flung(body: LinearBody, free: np.ndarray, seed: int = 1) -> MotionState:
 
 
 def exact_motion(body: LinearBody, free: np.ndarray, start: MotionState, kind: str, time: float) -> tuple[np.ndarray, np.ndarray]:
-    """Free nodes' displacement and velocity from the report's nodal equations by a matrix exponential."""
+    """Free nodes' displacement and velocity from the nodal equations of motion by a matrix exponential."""
     unknown = (2 * free[:, None] + np.arange(2)).ravel()
     parts = []
     for part, matrices in enumerate(connection_matrices(body.simplices)):
@@ -196,7 +196,7 @@ def test_generalized_alpha_keeps_or_damps_as_asked() -> None:
 
 
 def test_bar_vibrates_at_its_frequency() -> None:
-    """A rod held at one end, released from a stretch: quarter waves of speed sqrt(E / rho)."""
+    """A rod fixed at one end, released from a stretch: quarter waves of speed sqrt(E / rho)."""
     length, divisions = 10.0, 40
     body = LinearBody.of(interval(length, divisions))
     speed = np.sqrt(9.0 / 1e-3)
@@ -211,7 +211,7 @@ def test_bar_vibrates_at_its_frequency() -> None:
 
 
 def test_energy_balance_of_a_push() -> None:
-    """Work is kinetic plus spring energy plus what dampers took, and these never give back."""
+    """Work is kinetic plus spring energy plus what dashpots dissipate, and they never return any."""
     body, free, floor = small_block()
     plate = Support("plate", free[:1], motion=BROKEN, end_s=0.7)
     motion = simulate_motion(body, GEL, 0.1, [floor, plate], np.linspace(0.0, 3.0, 301), step=0.002)

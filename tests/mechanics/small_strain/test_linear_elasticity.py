@@ -63,8 +63,8 @@ def test_connection_matrices_equal_textbook_stiffness(dimension: int, seed: int)
     assert 3.0 * lame[0] + 2.0 * shear[0] == pytest.approx(expected, rel=1e-12, abs=1e-13 * np.abs(expected).max())
 
 
-def test_triangle_matches_the_reports_block_form() -> None:
-    """Equation 3.3: J_lambda = h / 4S [A], with A of edge vectors in x and y."""
+def test_triangle_matches_the_block_form() -> None:
+    """Equation (3.3) of Hirai et al. (2008): J_lambda = h / 4S [A], with A of edge vectors in x and y."""
     mesh = random_simplex(2, 1)
     (xi, yi), (xj, yj), (xk, yk) = mesh.points
     area = 0.5 * ((xj - xi) * (yk - yi) - (xk - xi) * (yj - yi))

@@ -27,7 +27,8 @@ from naibu.validation.analytic.viscoelastic import complex_modulus, creep_strain
 Elements = tuple[float, float, float]
 THREE = (10.0, 4.0, 30.0)
 CASES: dict[str, Elements] = {
-    "elastic": (10.0, 0.0, np.inf), "voigt": (10.0, 4.0, np.inf), "maxwell": (10.0, 0.0, 30.0), "three": THREE, "dampers": (0.0, 4.0, 30.0),
+    "elastic": (10.0, 0.0, np.inf), "voigt": (10.0, 4.0, np.inf), "maxwell": (10.0, 0.0, 30.0), "three": THREE,
+    "dashpots": (0.0, 4.0, 30.0),
 }  # fmt: skip
 moduli = st.floats(0.01, 1e4)
 ratios = st.floats(0.001, 0.499)
@@ -38,7 +39,7 @@ def rod(length: float = 5.0, divisions: int = 4) -> LinearBody:
 
 
 def material(elements: Elements) -> Rheology:
-    return three_element(*elements, 0.0)  # in one dimension the report's J is that of lambda = 0, 2 mu = E
+    return three_element(*elements, 0.0)  # in one dimension J is that of lambda = 0, 2 mu = E
 
 
 def pulled(elements: Elements, path: PrescribedMotion, times: np.ndarray, **options: object) -> Series:
@@ -73,7 +74,7 @@ def test_creep_and_recovery(name: str) -> None:
 
 @pytest.mark.parametrize("name", CASES)
 def test_stress_of_a_ramp_is_exact_at_any_step(name: str) -> None:
-    """A strain that grows evenly and is held: the exponential update leaves no error, whatever the step."""
+    """A strain that grows evenly and then stays constant: the exponential update leaves no error, whatever the step."""
     elements, strain = CASES[name], 0.02
     times = np.array([0.0, 0.7, 1.5, 4.0, 40.0, 4000.0])
     motion = pulled(elements, PrescribedMotion.through([0.0, 1.5], [[0.0], [5.0 * strain]]), times, step=1e6)
@@ -85,7 +86,7 @@ def test_stress_of_a_ramp_is_exact_at_any_step(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["elastic", "voigt", "maxwell", "three"])
 def test_displacement_that_stays(name: str) -> None:
-    """Pulled in 1.5 s, held for 3 s, released: the residual is the series damper's share."""
+    """Pulled in 1.5 s, kept for 3 s, released: the residual is the strain of the series dashpot."""
     elements = CASES[name]
     times = np.array([0.0, 4.5, 5.0, 6.0, 60.0])
     path = PrescribedMotion.through([0.0, 1.5], [[0.0], [0.1]])
@@ -112,11 +113,11 @@ def test_steady_vibration(name: str) -> None:
 
 @pytest.mark.parametrize("name", CASES)
 def test_references_solve_the_chain(name: str) -> None:
-    """The closed solutions against a numerical solution of spring and dampers, each with its own strain."""
+    """The closed solutions against a numerical solution of spring and dashpots, each with its own strain."""
     modulus, first, second = CASES[name]
     soft = max(first, 1e-6), min(second, 1e9)  # the chain below divides by C1 and C2
 
-    def flow(t: float, y: np.ndarray) -> list[float]:  # strain of the Voigt part and of the series damper under a given stress
+    def flow(t: float, y: np.ndarray) -> list[float]:  # strain of the Voigt part and of the series dashpot under a given stress
         stress = 3.0 if t <= 2.0 else 0.0
         return [(stress - modulus * y[0]) / soft[0], stress / soft[1]]
 
@@ -138,7 +139,7 @@ def test_references_solve_the_chain(name: str) -> None:
 @given(moduli, moduli, moduli, ratios)
 @settings(max_examples=40, deadline=None)
 def test_limits_of_the_coefficients(young: float, first: float, second: float, nu: float) -> None:
-    """C2 -> inf is Voigt, C1 -> 0 Maxwell, both elastic, E -> 0 dampers in series - also of what a step does."""
+    """C2 -> inf is Voigt, C1 -> 0 Maxwell, both elastic, E -> 0 dashpots in series - also of what a step does."""
 
     def same(a: Rheology, b: Rheology, tolerance: float) -> None:
         x, y = (CellRheology.of(1, m).over(0.3) for m in (a, b))
@@ -160,13 +161,13 @@ def test_limits_of_the_coefficients(young: float, first: float, second: float, n
 @given(moduli, st.floats(0.0, 1e4), moduli, ratios, st.floats(1e-8, 1e8))
 @settings(max_examples=60, deadline=None)
 def test_a_step_is_the_solution_of_the_internal_equation(young: float, first: float, second: float, nu: float, step: float) -> None:
-    """Two half steps are one step, and the stress never exceeds that of the springs and dampers alone."""
+    """Two half steps are one step, and the stress never exceeds that of the springs and dashpots alone."""
     law = CellRheology.of(1, three_element(young, first, second, nu))
     whole, half = law.over(step), law.over(0.5 * step)
     assert half.decay**2 == pytest.approx(whole.decay, rel=1e-9, abs=1e-300)
     assert half.decay * half.gain + half.gain == pytest.approx(whole.gain, rel=1e-9)
     assert (whole.effective <= law.dashpot + law.spring * law.viscosity_ratio * step + 1e-9).all()
-    assert (whole.effective <= law.series * (1.0 + 1e-9)).all()  # no faster than the series damper lets it
+    assert (whole.effective <= law.series * (1.0 + 1e-9)).all()  # no faster than the series dashpot lets it
 
 
 @pytest.mark.parametrize("dimension", [1, 2, 3])
@@ -177,7 +178,7 @@ def test_kernel_equals_connection_matrices(dimension: int) -> None:
     body, d = simplices(mesh), dimension
     m, shape = mesh.n_cells, mesh.points.shape
     table = CellRheology.from_arrays(m, rng.uniform(1, 9, m), rng.uniform(0, 3, m), rng.uniform(1, 9, m), 0.3, 0.2, 0.4)
-    history = rng.standard_normal(shape)  # of which the internal strain is that of the nodes, as in the report
+    history = rng.standard_normal(shape)  # of which the internal strain is that of the nodes
     gradient = body.displacement_gradients(history)
     trace, strain = np.einsum("maa->m", gradient), 0.5 * (gradient + np.swapaxes(gradient, 1, 2))
     velocity, step = rng.standard_normal(shape), table.over(0.4)
@@ -226,7 +227,7 @@ def test_regions_have_their_own_materials() -> None:
 
 
 def test_a_damper_without_lambda_part_carries_no_pressure() -> None:
-    """Series damper of Poisson ratio 0: its lambda part is nothing, so nothing holds the lambda strain of the spring."""
+    """Series dashpot of Poisson ratio 0: its lambda part is nothing, so nothing resists the lambda strain of the spring."""
     law = CellRheology.of(1, maxwell(10.0, 3.0, 0.4, series_poisson_ratio=0.0))
     step = law.over(0.1)
     assert step.effective[0, 0] == 0.0 and step.effective[0, 1] > 0.0

@@ -40,7 +40,7 @@ def changed(law: CellRheology, change: MaterialChange, amount: float) -> CellRhe
 @pytest.mark.parametrize("inertia", ["lumped", "consistent", "none"])
 @pytest.mark.parametrize("name", MATERIALS)
 def test_derivatives_are_those_of_finite_differences(name: str, inertia: str) -> None:
-    """Of displacement and reaction, while pushed, held and released, of E, C1 and C2 in the upper half."""
+    """Of displacement and reaction, while pushed, at rest and released, of E, C1 and C2 in the upper half."""
     body, supports, upper = set_up()
     law = CellRheology.of(body.simplices.n_cells, MATERIALS[name])
     load = np.zeros(body.points.shape)
