@@ -9,23 +9,26 @@ the sides bulge, and what force the plate needs, depends on the friction between
 # %%
 # A block and its materials
 # -------------------------
-# `naibu.meshing.primitives.box` puts element faces on the boundary between the layers. Moduli are in kPa. Both gels are nearly
+# `naibu.meshing.box` puts element faces on the boundary between the layers. Moduli are in kPa. Both gels are nearly
 # incompressible, as real gels are.
 import matplotlib.pyplot as plt
 import numpy as np
 
-from naibu.mechanics.contact.contact_surfaces import Friction, rigid_contact
-from naibu.mechanics.contact.indenter_geometry import plane_geometry
-from naibu.mechanics.contact.penalty_contact import Contact
-from naibu.mechanics.finite_elements.assembly import Assembler
-from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
-from naibu.mechanics.finite_elements.elements import elements
-from naibu.mechanics.finite_elements.hyperelasticity import material
-from naibu.mechanics.finite_strain.problem import Problem
-from naibu.mechanics.finite_strain.statics import Solution, solve
-from naibu.mechanics.linear_algebra.block_matrix import block_pattern
-from naibu.meshing.primitives import box
-from naibu.meshing.surface import boundary_faces
+from naibu.mechanics import (
+    Assembler,
+    Contact,
+    Friction,
+    PrescribedDisplacement,
+    Problem,
+    Solution,
+    block_pattern,
+    elements,
+    material,
+    plane_geometry,
+    rigid_contact,
+    solve,
+)
+from naibu.meshing import boundary_faces, box
 
 SIDE_MM, PRESSED_MM = 60.0, 45.0
 mesh = box((SIDE_MM, SIDE_MM, SIDE_MM), (8, 8, 8), layers=[("soft", 30.0), ("firm", 30.0)])

@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import naibu
-from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification import ModelSettings
 
 found = naibu.identify("ct_cube_plate", states={"ct_cube_plate": ["height_45"]}, settings=ModelSettings(element_size_mm=12.0))
 unseen = naibu.predict(found.model, "ct_cube_plate", state="height_35", heights_from_markers=True)

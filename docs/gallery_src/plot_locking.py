@@ -1,30 +1,27 @@
 """
-Your own material, and why elements must not lock
-=================================================
+A material of your own, and volumetric locking
+==============================================
 
-Gels and tissues hardly change their volume: Poisson's ratio is close to 0.5. Plain elements then become far too stiff. Elements that
-average the change of volume (the default, ``"mean_dilatation"``) do not, and this script shows the difference.
+Gels and tissues are nearly incompressible: Poisson's ratio is close to 0.5. Standard elements then become far too stiff (volumetric
+locking). Elements that average the dilatation (the default, ``"mean_dilatation"``) do not; this script shows the difference.
 """
 
 # %%
 # A material of your own
 # ----------------------
-# Give Young's modulus (kPa) and Poisson's ratio at small strain. `naibu.mechanics.finite_elements.hyperelasticity.LAWS` lists the laws;
-# for laws with more parameters, ``shape`` sets what the two moduli leave open.
+# Give Young's modulus (kPa) and Poisson's ratio at small strain. :doc:`/concepts` lists the laws; for laws with more parameters,
+# ``shape`` sets those that the two moduli leave open.
+from typing import Literal
+
 import matplotlib.pyplot as plt
 import numpy as np
 
-from naibu.mechanics.finite_elements.assembly import Assembler
-from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
-from naibu.mechanics.finite_elements.elements import Formulation, elements
-from naibu.mechanics.finite_elements.hyperelasticity import LAWS, material
-from naibu.mechanics.finite_strain.problem import Problem
-from naibu.mechanics.finite_strain.statics import solve
-from naibu.mechanics.linear_algebra.block_matrix import block_pattern
-from naibu.meshing.primitives import box
-from naibu.meshing.surface import side_nodes
+from naibu.mechanics import Assembler, PrescribedDisplacement, Problem, block_pattern, elements, law_named, material, solve
+from naibu.meshing import box, side_nodes
 
-for law in LAWS.values():
+Formulation = Literal["mean_dilatation", "standard"]
+for name in ("neo_hookean", "mooney_rivlin", "yeoh"):
+    law = law_named(name)
     print(f"{law.name}: {', '.join(law.parameter_names)} (kPa)")
 print(material("yeoh", young_modulus=60.0, poisson_ratio=0.49, shape=(0.1, 0.0)))
 

@@ -3,7 +3,7 @@ Look at measured markers
 ========================
 
 naibu comes with measurements: positions of markers cast into gels, before and after pressing, found by computed tomography. Your own
-measurements are read in the same way from a folder, by `naibu.io.experiment_folder.reader.read_experiment`.
+measurements are read in the same way from a folder, by `naibu.io.read_experiment`.
 """
 
 # %%

@@ -16,12 +16,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 import naibu
-from naibu.core.experiment import Loading
-from naibu.identification.from_markers.specimen_model import ModelSettings
-from naibu.imaging.markers.tracking import track_markers
-from naibu.io.marker_tables import write_experiment_folder
-from naibu.validation.scanners.experiments import scanned_states
-from naibu.validation.specimens.marker_phantoms import box_experiment, virtual_specimen
+from naibu.core import Loading
+from naibu.identification import ModelSettings
+from naibu.imaging import track_markers
+from naibu.io import write_experiment_folder
+from naibu.validation import box_experiment, scanned_states, virtual_specimen
 
 HEIGHTS = {"pressed": 35.0, "pressed_more": 32.0}
 TRUTH = {
