@@ -74,3 +74,17 @@ def test_each_public_name_stands_once_in_the_page_of_its_package(package: str) -
     assert sorted(listed_in(page)) == sorted(names_of(package))
     if package != "naibu":
         assert f"   api/{page.stem}\n" in (DOCS / "api.rst").read_text(encoding="utf-8")
+
+
+def test_pages_and_examples_import_public_names_only() -> None:
+    pages = [ROOT / "README.md", *DOCS.glob("*.rst"), *(DOCS / "api").glob("*.rst"), *(DOCS / "gallery_src").glob("*.py")]
+    statement = re.compile(r"^\s*from (naibu[\w.]*) import (\([^)]*\)|[^\n]+)", re.MULTILINE)
+    private = []
+    for page in pages:
+        for package, names in statement.findall(page.read_text(encoding="utf-8")):
+            if package.startswith("naibu.reproduction."):  # the report's specimens, of which a page makes use
+                continue
+            wanted = set(re.findall(r"\w+", re.sub(r" as \w+", "", names)))
+            public = set(dir(importlib.import_module(package))) if package in ("naibu", *(f"naibu.{p}" for p in PACKAGES)) else set()
+            private += [f"{page.name}: {package}.{name}" for name in sorted(wanted - public)]
+    assert not private, "\n".join(private)
