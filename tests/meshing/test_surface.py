@@ -71,7 +71,7 @@ def test_selection_by_plane():
     assert len(nodes_on_plane(mesh, (1, 0, 0), (1, 0, 0))) == 9
     assert len(nodes_on_plane(mesh, (0.5, 0, 0), (1, 0, 0))) == 0
     assert len(boundary_nodes(mesh)) == mesh.n_points - 2
-    with pytest.raises(InputError, match="direction"):
+    with pytest.raises(InputError, match="normal is"):
         nodes_on_plane(mesh, (0, 0, 0), (0, 0, 0))
     with pytest.raises(InputError, match="'up'"):
         side_nodes(mesh, "up")

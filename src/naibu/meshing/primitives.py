@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.arrays import FloatArray, IntArray, require_positive
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.meshing._o_grid import round_positions, smoothed, wrapped
@@ -131,7 +131,7 @@ def half_ellipsoid(size_mm: Sequence[float], element_size_mm: float, *, cell_typ
         Sizes that are not positive, or an unknown cell type.
     """
     radii = _three("size_mm", size_mm) / [2, 2, 1]
-    n = [max(1, round(r)) for r in _CORE_CELLS * radii / _positive("element_size_mm", element_size_mm)]
+    n = [max(1, round(r)) for r in _CORE_CELLS * radii / require_positive("element_size_mm", element_size_mm)]
     shells = max(1, round((1 - _CORE) * float(np.cbrt(radii.prod())) / element_size_mm))
     cube = _grid(np.arange(-n[0], n[0] + 1) / n[0], np.arange(-n[1], n[1] + 1) / n[1], np.arange(n[2] + 1) / n[2])
     grid = wrapped(grid_cells(2 * n[0] + 1, 2 * n[1] + 1, n[2] + 1), (cube[:, 2] == 0)[None], shells)
@@ -150,7 +150,7 @@ def hemisphere(diameter_mm: float, element_size_mm: float, *, cell_type: str = "
     InputError
         Sizes that are not positive, or an unknown cell type.
     """
-    diameter = _positive("diameter_mm", diameter_mm)
+    diameter = require_positive("diameter_mm", diameter_mm)
     return half_ellipsoid((diameter, diameter, diameter / 2), element_size_mm, cell_type=cell_type)
 
 
@@ -188,11 +188,11 @@ def cylinder(
     InputError
         Sizes that are not positive, layers that do not fill the height, or an unknown cell type.
     """
-    radius, height = _positive("diameter_mm", diameter_mm) / 2, _positive("height_mm", height_mm)
-    size = _positive("element_size_mm", element_size_mm)
+    radius, height = require_positive("diameter_mm", diameter_mm) / 2, require_positive("height_mm", height_mm)
+    size = require_positive("element_size_mm", element_size_mm)
     named = _named_layers(layers, height)
     tops = _layer_tops(named, height)
-    z = _graded("z", 0.0, height, height / size, _positive("grading", grading), tops[:-1].tolist(), height)
+    z = _graded("z", 0.0, height, height / size, require_positive("grading", grading), tops[:-1].tolist(), height)
     n, shells = max(1, round(_CORE_CELLS * radius / size)), max(1, round((1 - _CORE) * radius / size))
     square = np.arange(-n, n + 1) / n
     cube = _grid(square, square, z)
@@ -248,14 +248,6 @@ def _three(name: str, values: Sequence[float]) -> FloatArray:
     if name == "divisions" and (array != np.round(array)).any():
         raise InputError(f"divisions are {values!r}; give three whole numbers")
     return array
-
-
-def _positive(name: str, value: float) -> float:
-    """Return one positive number as a float."""
-    number = float(value)
-    if not (np.isfinite(number) and number > 0):
-        raise InputError(f"{name} is {value!r}; give a positive number")
-    return number
 
 
 def _grid(x: FloatArray, y: FloatArray, z: FloatArray) -> FloatArray:

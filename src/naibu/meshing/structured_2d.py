@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from naibu.core.arrays import require_positive
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 
@@ -20,8 +21,9 @@ def interval(length_mm: float, divisions: int) -> Mesh:
     InputError
         A length that is not positive, or no division.
     """
-    if not (np.isfinite(length_mm) and length_mm > 0.0) or divisions < 1:
-        raise InputError(f"an interval needs a positive length and at least one division, not {length_mm:g} mm and {divisions}")
+    require_positive("length_mm", length_mm)
+    if divisions < 1:
+        raise InputError(f"divisions must be at least 1, not {divisions}")
     nodes = np.arange(divisions + 1)
     return Mesh.from_arrays(np.linspace(0.0, length_mm, divisions + 1)[:, None], np.stack([nodes[:-1], nodes[1:]], axis=1), "line")
 
@@ -47,7 +49,7 @@ def rectangle(size_mm: Sequence[float], divisions: Sequence[int], *, diagonals: 
     """
     (width, height), (nx, ny) = size_mm, divisions
     if not (np.isfinite([width, height]).all() and min(width, height) > 0.0) or min(nx, ny) < 1:
-        raise InputError(f"a rectangle needs positive sizes and divisions, not {list(size_mm)} mm in {list(divisions)}")
+        raise InputError(f"size_mm and divisions must be positive, not {list(size_mm)} and {list(divisions)}")
     if diagonals not in DIAGONALS:
         raise InputError(f"diagonals must be {' or '.join(map(repr, DIAGONALS))}, not {diagonals!r}")
     x = np.linspace(0.0, width, nx + 1) - (0.5 * width if centred else 0.0)

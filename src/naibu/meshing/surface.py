@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from naibu.core.arrays import BoolArray, FloatArray, IntArray
+from naibu.core.arrays import BoolArray, FloatArray, IntArray, as_vector
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 
@@ -143,7 +143,7 @@ def nodes_on_plane(mesh: Mesh, point_mm: ArrayLike, normal: ArrayLike, *, tolera
     InputError
         The normal is zero.
     """
-    distance = (mesh.points - np.asarray(point_mm, dtype=np.float64)) @ _unit(normal)
+    distance = (mesh.points - np.asarray(point_mm, dtype=np.float64)) @ _unit("normal", normal)
     limit = 1e-6 * float(np.linalg.norm(np.ptp(mesh.points, axis=0))) if tolerance_mm is None else tolerance_mm
     return np.flatnonzero(np.abs(distance) <= limit).astype(np.int64)
 
@@ -182,7 +182,7 @@ def faces_towards(mesh: Mesh, direction: ArrayLike, *, max_angle_deg: float = 45
     """
     faces = boundary_faces(mesh).faces
     normals = face_normals(mesh.points, faces)
-    cosine = (normals @ _unit(direction)) / np.linalg.norm(normals, axis=1)
+    cosine = (normals @ _unit("direction", direction)) / np.linalg.norm(normals, axis=1)
     towards: BoolArray = cosine >= np.cos(np.radians(max_angle_deg)) - 1e-12
     return faces[towards]
 
@@ -195,12 +195,12 @@ def faces_among(mesh: Mesh, nodes: ArrayLike) -> IntArray:
     return faces[chosen[faces].all(axis=1)]
 
 
-def _unit(vector: ArrayLike) -> FloatArray:
+def _unit(name: str, vector: ArrayLike) -> FloatArray:
     """Return a direction of length one."""
-    array = np.asarray(vector, dtype=np.float64)
+    array = as_vector(name, vector)
     length = float(np.linalg.norm(array))
-    if array.shape != (3,) or not length > 0:
-        raise InputError(f"the direction is {array.tolist()}; give three numbers that are not all zero")
+    if not length > 0:
+        raise InputError(f"{name} is {array.tolist()}; give three numbers that are not all zero")
     return array / length
 
 

@@ -78,15 +78,15 @@ def touching(seed: int, surface, *, ramp=False) -> np.ndarray:
     return np.where((np.arange(8) < 4)[:, None], np.column_stack([x, y, depth]), edge)
 
 
-@pytest.mark.parametrize("regime", ["stick", "slip", "ramp", "bonded", "frictionless"])
+@pytest.mark.parametrize("regime", ["stick", "slip", "ramp", "tied", "frictionless"])
 @pytest.mark.parametrize("surface", [FLAT, BAR], ids=["plane", "bar"])
 @given(seed=SEED)
 @settings(max_examples=15, deadline=None)
 def test_derivatives_of_tractions(surface, regime, seed):
     rng = np.random.default_rng(seed)
     y = touching(seed, surface, ramp=regime == "ramp")
-    mu = {"stick": 1e3, "slip": 0.01, "ramp": 0.3, "bonded": 0.1, "frictionless": 0.0}[regime]
-    c = points(y, surface=surface, mu=mu, tied=regime == "bonded")
+    mu = {"stick": 1e3, "slip": 0.01, "ramp": 0.3, "tied": 0.1, "frictionless": 0.0}[regime]
+    c = points(y, surface=surface, mu=mu, tied=regime == "tied")
     anchors = y + rng.normal(scale=3.0 if regime == "slip" else 0.05, size=y.shape)
     zero = np.zeros_like(y)
     response = c.evaluate(zero, anchors, 0.0)
@@ -103,7 +103,7 @@ def test_derivatives_of_tractions(surface, regime, seed):
     np.testing.assert_allclose(response.tangential_stiffness, by_place, atol=1e-6 * size)
     by_anchor = differences(lambda a: c.evaluate(zero, a, 0.0).force, anchors)
     np.testing.assert_allclose(response.anchor_stiffness, by_anchor, atol=1e-6 * size)
-    more, less = (points(y, surface=surface, mu=mu + s * 1e-6, tied=regime == "bonded").evaluate(zero, anchors, 0.0).force for s in (1, -1))
+    more, less = (points(y, surface=surface, mu=mu + s * 1e-6, tied=regime == "tied").evaluate(zero, anchors, 0.0).force for s in (1, -1))
     if mu > 0:
         np.testing.assert_allclose(response.slip_direction, (more - less) / 2e-6, atol=1e-6 * np.abs(response.force).max())
 
@@ -126,7 +126,7 @@ def test_coulombs_limit_holds_and_friction_opposes_slip(seed):
     np.testing.assert_allclose(again.tangential, response.tangential, atol=1e-9 * np.abs(response.tangential).max() + 1e-12)
 
 
-def test_points_apart_from_the_body_feel_nothing_unless_bonded():
+def test_points_apart_from_the_body_feel_nothing_unless_tied():
     away, zero = np.array([[0.0, 0.0, -0.5]]), np.zeros((1, 3))
     response = points(away).evaluate(zero, zero, 0.0)
     assert response.gap[0] == pytest.approx(0.5)
@@ -187,9 +187,9 @@ def test_bad_contacts_are_refused():
         plane_geometry((0, 0, 0))
     with pytest.raises(InputError, match="corner radius"):
         bar_geometry("x", 10.0, corner_radius_mm=6.0)
-    with pytest.raises(InputError, match="lid: no faces"):
+    with pytest.raises(InputError, match="lid: faces is empty"):
         rigid_contact("lid", mesh.points, top[:0], FLAT, normal_stiffness=1.0, **common)
-    with pytest.raises(InputError, match="lid: the normal stiffness"):
+    with pytest.raises(InputError, match="lid: normal_stiffness must be positive, kPa/mm"):
         rigid_contact("lid", mesh.points, top, FLAT, normal_stiffness=0.0, **common)
     with pytest.raises(InputError, match="coefficient >= 0"):
         Friction(-0.1)

@@ -1,5 +1,7 @@
 """Quasi-static solves: patch tests, closed forms, manufactured solutions with their rates, and what failure says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from builders import GEL, KINDS, distorted, of, problem, relative
@@ -289,3 +291,11 @@ def test_stiffer_gel_moves_alike_and_pushes_in_proportion():
         solve(problem(mesh, m, prescribed=body.prescribed)) for m in (GEL, of("neo_hookean", 0.45, 60.0)) for mesh, body in [crushed(0.3)]
     )
     assert relative(hard.displacement, soft.displacement) < 1e-8
+
+
+def test_forces_and_conditions_for_another_mesh_are_refused():
+    mesh, body = pressed()
+    with pytest.raises(InputError, match="external_force must have shape"):
+        replace(body, external_force=np.zeros((1, 3)))
+    with pytest.raises(InputError, match=r"prescribed\.constrained must have shape"):
+        replace(body, prescribed=PrescribedDisplacement.none(mesh.n_points + 1))

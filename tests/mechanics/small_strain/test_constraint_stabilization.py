@@ -122,7 +122,7 @@ def test_stable_with_stiff_stabilisation_and_huge_steps() -> None:
 
 
 def test_bad_input_is_named() -> None:
-    with pytest.raises(InputError, match="must be positive, not 0 1/s"):
+    with pytest.raises(InputError, match="must be positive, 1/s, not 0"):
         Stabilization(0.0)
     with pytest.raises(InputError, match="must be positive"):
         Stabilization(float("nan"))
@@ -130,5 +130,5 @@ def test_bad_input_is_named() -> None:
     twice = sp.csc_matrix(np.eye(4)[:, [0, 0]])
     with pytest.raises(ConvergenceError, match="linearly dependent"):
         stabilized_accelerations(identity, twice, zero, (zero, zero), 1.0)
-    with pytest.raises(InputError, match="for the 4 components"):
+    with pytest.raises(InputError, match="force must have shape"):
         stabilized_accelerations(identity, twice, np.zeros(3), (zero, zero), 1.0)

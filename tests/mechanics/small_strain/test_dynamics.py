@@ -317,7 +317,7 @@ def push(**changes: object) -> Series:
         ({"density": None, "method": "rk4"}, "density=None needs method"),
         ({"density": None, "stabilization": 10.0}, "density=None needs method"),
         ({"density": None, "supports": []}, "3 of 3 rigid-body motions"),
-        ({"stabilization": -1.0}, "stabilisation must be positive"),
+        ({"stabilization": -1.0}, "stabilization must be positive"),
         ({"method": "generalized_alpha", "spectral_radius": 1.5}, r"in \[0, 1\]"),
         ({"method": "rkf45", "tolerance": 0.0}, "tolerance"),
         ({"load": np.zeros(3)}, "finite forces of shape"),
@@ -350,7 +350,7 @@ def test_bad_supports_are_named() -> None:
     with pytest.raises(InputError, match="node 3 belongs to no cell"):
         simulate_motion(LinearBody.of(lonely), GEL, 1.0, [], [0.0, 1.0])
     body, free, floor = small_block()
-    with pytest.raises(InputError, match="the times start at 1 s"):
+    with pytest.raises(InputError, match="times start at 1 s"):
         simulate_motion(body, GEL, 1.0, [floor], [1.0, 2.0], initial=flung(body, free))
-    with pytest.raises(InputError, match="of another body"):
+    with pytest.raises(InputError, match="initial is the state of another body"):
         simulate_motion(body, GEL, 1.0, [floor], [0.0, 2.0], initial=MotionState.at_rest(LinearBody.of(lonely).simplices))

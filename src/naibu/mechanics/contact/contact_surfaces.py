@@ -1,4 +1,4 @@
-"""What holds and presses a body: prescribed nodes, rigid bodies in contact, interfaces between blocks, weight."""
+"""Contact surfaces: boundary faces against rigid indenters, and interfaces between blocks."""
 
 from __future__ import annotations
 
@@ -7,24 +7,29 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.arrays import FloatArray, IntArray, require_positive
 from naibu.core.errors import InputError
 from naibu.mechanics.contact.indenter_geometry import IndenterGeometry, plane_geometry
 from naibu.mechanics.contact.penalty_contact import STICK, Contact
 
-QUADRATURE_ORDER = 3  # Gauss points a side of a quadrilateral face: contact edges cross faces, so more than elasticity needs
+QUADRATURE_ORDER = 3  # Gauss points per side of a quadrilateral face; more than for elasticity, as the edge of contact crosses faces
 
 
 @dataclass(frozen=True, slots=True)
 class Friction:
-    """How a surface rubs on another.
+    """Coulomb friction between two surfaces, with an elastic stiffness before slip.
 
     Attributes
     ----------
     coefficient : float
-        Coulomb's coefficient; `STICK` or more never slips, 0 slips freely.
+        Friction coefficient; `STICK` or more never slips, 0 is frictionless.
     stiffness : float
-        Tangential stiffness before slip, kPa/mm; a soft one makes tangential springs.
+        Tangential stiffness before slip, kPa/mm; a low one makes tangential springs.
+
+    Raises
+    ------
+    InputError
+        A negative coefficient, or a stiffness that is not positive.
     """
 
     coefficient: float = STICK
@@ -41,26 +46,26 @@ def rigid_contact(
     name: str, points: FloatArray, faces: IntArray, surface: IndenterGeometry, *, start: ArrayLike, stop: ArrayLike,
     friction: Friction | list[Friction], normal_stiffness: float, tied: bool = False, rotation: FloatArray | None = None,
 ) -> Contact:  # fmt: skip
-    """Let boundary faces touch a rigid body.
+    """Return the contact of boundary faces with a rigid body.
 
     Parameters
     ----------
     name : str
         Name of the body, under which its reaction is returned.
     points : ndarray, shape (n, 3)
-        Nodes of the mesh in the free state, mm.
+        Nodes of the mesh in the reference configuration, mm.
     faces : ndarray, shape (f, 3) or (f, 4), int64
-        Boundary faces that may touch.
+        Boundary faces that may come into contact.
     surface : IndenterGeometry
         Shape of the body.
     start, stop : array_like, shape (3,)
-        Path of the body's reference point, mm.
+        Position of the body's reference point at the beginning and at the end of loading, mm; it moves in a straight line.
     friction : Friction or list of Friction
         One for all faces or one for each face.
     normal_stiffness : float
         Penalty, kPa/mm: a pressure p lets the surface penetrate by p / normal_stiffness.
     tied : bool
-        Whether the body sticks to the faces for good (tie): no lift-off, no slip.
+        Whether the body is tied to the faces: neither separation nor slip.
     rotation : ndarray, shape (3, 3), optional
         Constant orientation of the body.
 
@@ -70,9 +75,8 @@ def rigid_contact(
         No faces, or a penalty that is not positive.
     """
     if len(faces) == 0:
-        raise InputError(f"{name}: no faces to touch; check the selection of the surface")
-    if not normal_stiffness > 0.0:
-        raise InputError(f"{name}: the normal stiffness must be positive, not {normal_stiffness:g} kPa/mm")
+        raise InputError(f"{name}: faces is empty; check the selection of the surface")
+    require_positive(f"{name}: normal_stiffness", normal_stiffness, "kPa/mm")
     shape, area = face_quadrature(points, faces)
     n_q = shape.shape[0]
     nodes = np.repeat(faces, n_q, axis=0)
@@ -88,10 +92,26 @@ def rigid_contact(
 def interface(
     name: str, points: FloatArray, pairs: IntArray, area: FloatArray, *, friction: Friction, normal_stiffness: float, tied: bool = False
 ) -> Contact:
-    """Lay one block on another: pairs (k, 2) of a lower and an upper node at the same place, each standing for `area` (k,) mm2.
+    """Return the contact between two stacked blocks at pairs of coinciding nodes.
 
-    The blocks may separate and slide (``bonded=False``); the normal is vertical in the free state and kept, which suits interfaces that
-    stay near horizontal.
+    The normal is vertical and constant, which suits interfaces that remain nearly horizontal.
+
+    Parameters
+    ----------
+    name : str
+        Name of the interface, under which its force is returned.
+    points : ndarray, shape (n, 3)
+        Nodes of the mesh in the reference configuration, mm.
+    pairs : ndarray, shape (k, 2), int64
+        Lower and upper node of every pair; see `naibu.meshing.split_at_plane`.
+    area : ndarray, shape (k,)
+        Tributary area of every pair, mm2.
+    friction : Friction
+        Friction of the interface.
+    normal_stiffness : float
+        Penalty, kPa/mm.
+    tied : bool
+        Whether the blocks are tied; otherwise they may separate and slide.
 
     Raises
     ------
@@ -109,7 +129,7 @@ def interface(
 
 
 def face_quadrature(points: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return shape values (q, k) of the quadrature points of faces, and the areas (f, q), mm2, that they stand for."""
+    """Return shape functions (q, k) at the quadrature points of faces, and their weights (f, q), mm2."""
     corners = points[faces]
     if faces.shape[1] == 3:
         shape = np.full((3, 3), 1.0 / 6.0) + 0.5 * np.eye(3)

@@ -1,10 +1,9 @@
-"""Contact of a surface with rigid bodies, and of two blocks that lie on each other: unilateral or bonded, with friction.
+"""Penalty contact with rigid bodies and between stacked blocks, unilateral or tied, with Coulomb friction :cite:p:`wriggers2006`.
 
 Contact is evaluated at points, each a fixed combination of nodes: quadrature points of boundary faces against a rigid body, or pairs
-of nodes on an interface between blocks. Per unit of area of the free state the body presses with
-``p = k_n <-g>`` (a C1 ramp; or ``-k_n g`` where bonded) and rubs with ``t``, the elastic slip law with Coulomb's limit:
-``t = k_t P (y - a)``, scaled back to ``|t| = mu p`` where it exceeds that; `a` is the anchor of the point, carried from one load step to
-the next. Large k_t and mu stick; finite k_t with mu = inf are tangential springs; mu = 0 slips freely.
+of nodes on an interface between blocks. Per unit of reference area the pressure is ``p = k_n <-g>`` (a C1 ramp; or ``-k_n g`` where tied),
+and the tangential traction t follows by a return mapping of the elastic predictor ``t = k_t P (y - a)`` to ``|t| <= mu p``; `a` is the
+anchor of the point, a history variable. Large k_t and mu stick; finite k_t with mu = inf are tangential springs; mu = 0 is frictionless.
 """
 
 from __future__ import annotations
@@ -20,13 +19,13 @@ from naibu.mechanics.contact._geometry_kernels import distance_with_derivatives
 from naibu.mechanics.contact.indenter_geometry import IndenterGeometry, packed_geometries
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 
-RAMP_MM = 0.01  # width of the rounded start of the contact pressure
+RAMP_MM = 0.01  # penetration over which the contact pressure rises smoothly
 STICK = 1e3  # a friction coefficient that never slips in practice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contact:
-    """Contact points against one body that moves on a straight path.
+    """Contact points against one rigid body that moves on a straight path.
 
     Attributes
     ----------
@@ -35,26 +34,26 @@ class Contact:
     nodes : ndarray, shape (p, k), int64
         Nodes of every contact point.
     shape : ndarray, shape (p, k)
-        Their coefficients: the point lies at ``sum_a shape[a] x[nodes[a]]``.
+        Coefficients of the nodes: the point is at ``sum_a shape[a] x[nodes[a]]``.
     rest : ndarray, shape (p, 3)
-        Position of the point in the free state, mm (for a pair of nodes: their difference).
+        Position of the point in the reference configuration, mm (for a pair of nodes: their difference).
     area : ndarray, shape (p,)
-        Area of the free state that a point stands for, mm2.
+        Reference area of every point, mm2.
     surface : IndenterGeometry
         The body's surface.
     start, stop : ndarray, shape (3,)
-        Where the body's reference point is at the beginning and at the end of loading, mm.
+        Position of the body's reference point at the beginning and at the end of loading, mm.
     rotation : ndarray, shape (3, 3)
         Orientation of the body at the beginning.
     normal_stiffness : float
-        kPa/mm.
+        Penalty, kPa/mm.
     tangential_stiffness, friction_coefficient : ndarray, shape (p,)
-        kPa/mm, and Coulomb's coefficient.
+        Stiffness before slip, kPa/mm, and Coulomb's coefficient.
     tied : bool
-        Whether the body also holds the point back.
+        Whether points can neither separate nor slip.
     tilt : ndarray, shape (3,), optional
-        Rotation vector, rad, by which the body turns about its reference point, in proportion to the load. A plate that tilts as it
-        presses touches flat at first, where one tilted from the beginning would let the body rock on an edge.
+        Rotation vector, rad, of the body about its reference point at full load; it grows in proportion to the load. A plate that tilts
+        during loading touches flat at first; one that is tilted from the beginning would touch at an edge.
     """
 
     name: str
@@ -92,8 +91,8 @@ class Contact:
     def evaluate(self, displacement: FloatArray, anchors: FloatArray, load: float, *, curvature: bool = True) -> ContactResponse:
         """Evaluate tractions and their derivatives at every point.
 
-        Without the `curvature` of the body the stiffness lacks what lets a pressed point slip off an edge by itself: it is not the
-        derivative of the force then, but keeps equilibrium iterations from circling there.
+        Without the `curvature` of the body the stiffness lacks the geometric term by which a point slips off an edge: it is not the
+        derivative of the force then, but prevents equilibrium iterations from cycling there.
         """
         y = self.local(displacement, load)
         n = len(y)
@@ -128,20 +127,20 @@ class Contact:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContactResponse:
-    """What a body does at every contact point, in the body's frame.
+    """Gaps, tractions and their derivatives at all contact points, in the body's frame.
 
     Attributes
     ----------
     orientation : ndarray, shape (3, 3)
-        Of the body.
+        Orientation of the body.
     local : ndarray, shape (p, 3)
         Positions, mm.
     gap : ndarray, shape (p,)
         Distance to the body, mm; negative where the penalty lets the point penetrate.
     force : ndarray, shape (p, 3)
-        Force on the soft object, mN.
+        Force on the deformable body, mN.
     tangential : ndarray, shape (p, 3)
-        Friction traction t, kPa (the force holds ``-t`` times the area).
+        Friction traction t, kPa (the force has the part ``-t`` times the area).
     slip_direction : ndarray, shape (p, 3)
         Derivative of the force with respect to the friction coefficient, mN; zero where the point sticks.
     stiffness : ndarray, shape (p, 3, 3)

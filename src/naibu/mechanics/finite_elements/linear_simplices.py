@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from naibu._numba.compilation import njit
-from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.arrays import FloatArray, IntArray, require_positive
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 
@@ -78,8 +78,8 @@ def simplices(mesh: Mesh, *, thickness_mm: float = 1.0, cross_section_mm2: float
     """
     if mesh.cell_type not in ("line", "triangle", "tetra"):
         raise InputError(f"linear simplices are lines, triangles or tetrahedra, not {mesh.cell_type!r} cells")
-    if not (thickness_mm > 0.0 and cross_section_mm2 > 0.0):
-        raise InputError(f"thickness and cross-section must be positive, not {thickness_mm:g} mm and {cross_section_mm2:g} mm^2")
+    require_positive("thickness_mm", thickness_mm)
+    require_positive("cross_section_mm2", cross_section_mm2)
     d = mesh.dimension
     measures, gradients = (_tetrahedra if d == 3 else _lines_or_triangles)(mesh.points, mesh.cells)
     if not (measures > 0.0).all():
@@ -185,12 +185,12 @@ def lumped_mass(body: Simplices, density: ArrayLike) -> FloatArray:
 
     Equation (3.12) of :cite:t:`hirai2008`, which prints the area S for the volume V.
     """
-    nodal = per_cell(density, body.n_cells, "the density") * body.measures / (body.dimension + 1)
+    nodal = per_cell(density, body.n_cells, "density") * body.measures / (body.dimension + 1)
     return np.bincount(body.cells.ravel(), np.repeat(nodal, body.dimension + 1), minlength=body.n_points).astype(float)
 
 
 def consistent_mass_matrices(body: Simplices, density: ArrayLike) -> FloatArray:
     """Return the consistent mass matrix of every cell (m, d + 1, d + 1), kg: ``rho V (1 + delta_ij) / ((d + 1)(d + 2))``."""
     d = body.dimension
-    mass = per_cell(density, body.n_cells, "the density") * body.measures
+    mass = per_cell(density, body.n_cells, "density") * body.measures
     return np.asarray(mass[:, None, None] * (1.0 + np.eye(d + 1)) / ((d + 1) * (d + 2)))

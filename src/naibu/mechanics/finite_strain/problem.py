@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from naibu.core.arrays import FloatArray, Int32Array
+from naibu.core.arrays import FloatArray, Int32Array, require_shape
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
@@ -55,6 +55,11 @@ class Problem:
         Dirichlet boundary conditions.
     external_force : ndarray, shape (n, 3)
         Dead load, mN, applied in full from the beginning (weight).
+
+    Raises
+    ------
+    InputError
+        Forces or boundary conditions for another number of nodes.
     """
 
     points: FloatArray
@@ -65,6 +70,8 @@ class Problem:
     _positions: tuple[Int32Array, ...] = field(default=())
 
     def __post_init__(self) -> None:
+        require_shape("external_force", self.external_force, self.points.shape)
+        require_shape("prescribed.constrained", self.prescribed.constrained, self.points.shape)
         if not self._positions and self.contacts:
             object.__setattr__(self, "_positions", tuple(self.assembler.pattern.positions(c.nodes) for c in self.contacts))
 

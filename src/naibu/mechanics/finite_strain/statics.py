@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray
-from naibu.core.errors import ConvergenceError, InputError
+from naibu.core.arrays import FloatArray, require_finite
+from naibu.core.errors import ConvergenceError
 from naibu.core.status import Status
 from naibu.mechanics.finite_strain.newton import Newton
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
@@ -109,8 +109,7 @@ def solve(
         External forces that are not finite.
     """
     chosen = settings or SolverSettings()
-    if not np.isfinite(problem.external_force).all():
-        raise InputError("problem.external_force must hold finite numbers, mN")
+    require_finite("problem.external_force", problem.external_force)
     newton = Newton(problem, chosen, solver)
     first = LoadState(0.0, np.zeros_like(problem.points), tuple(c.anchors_at_rest() for c in problem.contacts))
     states, residual = [first], 0.0

@@ -18,7 +18,7 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import FloatArray, require_positive, require_shape
 from naibu.core.errors import ConvergenceError, InputError
 
 
@@ -35,8 +35,7 @@ class Stabilization:
     frequency: float
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.frequency) and self.frequency > 0.0):
-            raise InputError(f"the frequency of constraint stabilisation must be positive, not {self.frequency:g} 1/s")
+        require_positive("stabilization", self.frequency, "1/s")
 
     def acceleration(self, gap: FloatArray, gap_rate: FloatArray, path_acceleration: FloatArray) -> FloatArray:
         """Return u'' of constrained components for a gap ``u - g``, mm, its rate ``u' - g'``, mm/s, and g'', mm/s^2."""
@@ -91,8 +90,10 @@ def stabilized_accelerations(
     """
     a = sp.csc_matrix(constraint)
     n, c = a.shape
-    if mass.shape != (n, n) or force.shape != (n,) or any(x.shape != (n,) for x in state):
-        raise InputError(f"mass, force and state must be for the {n} components of the constraint")
+    if mass.shape != (n, n):
+        raise InputError(f"mass must have shape {(n, n)} for a constraint of {n} components, not {mass.shape}")
+    for name, array in (("force", force), ("state[0]", state[0]), ("state[1]", state[1])):
+        require_shape(name, array, (n,))
     g, speed, second = path if path is not None else (np.zeros(c),) * 3
     rule = Stabilization(frequency).acceleration(a.T @ state[0] - g, a.T @ state[1] - speed, second)
     try:

@@ -205,7 +205,7 @@ def explicit_step_limit(body: LinearBody, materials: Rheology | CellRheology, de
     cells = body.simplices
     law = CellRheology.of(cells.n_cells, materials)
     lame, shear = connection_matrices(cells)
-    mass = per_cell(density, cells.n_cells, "the density") * cells.measures / (cells.dimension + 1)
+    mass = per_cell(density, cells.n_cells, "density") * cells.measures / (cells.dimension + 1)
     stiff = law.spring * law.viscosity_ratio
     fastest = [np.linalg.eigvalsh(m[:, 0, None, None] * lame + m[:, 1, None, None] * shear)[:, -1] / mass for m in (stiff, law.dashpot)]
     rate, damping = np.maximum(fastest[0], 0.0), 0.5 * np.maximum(fastest[1], 0.0)
@@ -299,7 +299,7 @@ def _checked_times(times: ArrayLike, step: float | None) -> FloatArray:
     if output.ndim != 1 or len(output) < 2 or not np.isfinite(output).all() or not (np.diff(output) > 0.0).all():
         raise InputError("times must be two or more finite numbers, s, that increase")
     if step is not None and not step > 0.0:
-        raise InputError(f"the step must be positive, not {step:g} s")
+        raise InputError(f"step must be positive, not {step:g} s")
     return output
 
 
@@ -320,9 +320,9 @@ def _start(body: LinearBody, initial: MotionState | None, time: float) -> Motion
     d = cells.dimension
     shapes = [initial.displacement.shape, initial.velocity.shape, initial.trace.shape, initial.strain.shape]
     if shapes != [body.points.shape, body.points.shape, (cells.n_cells,), (cells.n_cells, d, d)]:
-        raise InputError("the initial state is that of another body")
+        raise InputError("initial is the state of another body")
     if abs(initial.time - time) > 1e-9 * max(1.0, abs(time)):
-        raise InputError(f"the initial state is at {initial.time:g} s, but the times start at {time:g} s")
+        raise InputError(f"initial is the state at {initial.time:g} s, but times start at {time:g} s")
     return initial
 
 
@@ -333,11 +333,11 @@ def _as_function(load: ArrayLike | Load | None, shape: tuple[int, ...]) -> Load:
         def checked(time: float) -> FloatArray:
             value = np.asarray(given(time), dtype=float)
             if value.shape != shape or not np.isfinite(value).all():
-                raise InputError(f"the load at {time:g} s must be finite forces of shape {shape}, mN")
+                raise InputError(f"load at {time:g} s must be finite forces of shape {shape}, mN")
             return value
 
         return checked
     constant = np.zeros(shape) if load is None else np.asarray(load, dtype=float)
     if constant.shape != shape or not np.isfinite(constant).all():
-        raise InputError(f"the load must be finite forces of shape {shape}, mN, not an array of shape {constant.shape}")
+        raise InputError(f"load must be finite forces of shape {shape}, mN, not an array of shape {constant.shape}")
     return lambda _: constant

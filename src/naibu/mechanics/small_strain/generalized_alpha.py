@@ -32,7 +32,7 @@ class GeneralizedAlpha(Integrator):
     def __init__(self, spectral_radius: float = 0.8) -> None:
         super().__init__()
         if not 0.0 <= spectral_radius <= 1.0:
-            raise InputError(f"the spectral radius of generalized-alpha must lie in [0, 1], not {spectral_radius:g}")
+            raise InputError(f"spectral_radius must lie in [0, 1], not {spectral_radius:g}")
         r = spectral_radius
         self.alpha_m, self.alpha_f = (2.0 * r - 1.0) / (r + 1.0), r / (r + 1.0)
         self.gamma = 0.5 - self.alpha_m + self.alpha_f

@@ -87,18 +87,18 @@ class ConsistentMass:
 
 
 def mass_of(body: LinearBody, density: ArrayLike, kind: str) -> Mass:
-    """Return the ``"lumped"`` or ``"consistent"`` mass of a density in kg/mm^3 (water: 1e-6), one number or one a cell.
+    """Return the ``"lumped"`` or ``"consistent"`` mass matrix of a density in kg/mm^3 (water: 1e-6), one number or one a cell.
 
     Raises
     ------
     InputError
         A density that is not positive, an unknown kind, or a node that belongs to no cell.
     """
-    given = per_cell(density, body.simplices.n_cells, "the density")
+    given = per_cell(density, body.simplices.n_cells, "density")
     if not (given > 0.0).all():
-        raise InputError(f"the density must be positive, not {given.min():g} kg/mm^3; give None to leave inertia out")
+        raise InputError(f"density must be positive, not {given.min():g} kg/mm^3; give None to neglect inertia")
     if kind not in ("lumped", "consistent"):
-        raise InputError(f"the mass is 'lumped' or 'consistent', not {kind!r}")
+        raise InputError(f"mass must be 'lumped' or 'consistent', not {kind!r}")
     lonely = np.setdiff1d(np.arange(body.simplices.n_points), body.simplices.cells)
     if len(lonely):
         raise InputError(f"node {lonely[0]} belongs to no cell, so it has no mass: remove it from the mesh")

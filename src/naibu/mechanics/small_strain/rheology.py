@@ -136,7 +136,7 @@ class CellRheology:
         """
         if isinstance(materials, CellRheology):
             if len(materials.elastic) != n_cells:
-                raise InputError(f"the materials are for {len(materials.elastic)} cells, the body has {n_cells}")
+                raise InputError(f"materials are for {len(materials.elastic)} cells, the body has {n_cells}")
             return materials
         m = materials
         return cls.from_arrays(

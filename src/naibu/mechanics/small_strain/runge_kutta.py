@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import FloatArray, require_positive
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.mechanics.small_strain._rheology_kernels import rates
 from naibu.mechanics.small_strain.implicit_integrators import Integrator, MotionState, Phase
@@ -105,9 +105,7 @@ class RungeKuttaFehlberg(Explicit):
 
     def __init__(self, tolerance: float = 1e-6) -> None:
         super().__init__()
-        if not tolerance > 0.0:
-            raise InputError(f"the tolerance of Runge-Kutta-Fehlberg must be positive, not {tolerance:g}")
-        self.tolerance = tolerance
+        self.tolerance = require_positive("tolerance", tolerance)
         self.rejected = 0
         self._length = np.inf
         self._largest = np.zeros(0)
