@@ -1,1 +1,1 @@
-"""The report's tables and figures, one module a chapter, each beside ours."""
+"""Reproduction of the tables and figures of the 2008 report :cite:p:`hirai2008`, one package per chapter."""

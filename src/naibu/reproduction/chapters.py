@@ -1,4 +1,4 @@
-"""The chapters that can be reproduced, by name."""
+"""Registry of the chapters of the report that can be reproduced."""
 
 from __future__ import annotations
 

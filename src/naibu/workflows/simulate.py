@@ -81,6 +81,6 @@ def simulate(
         return simulate_lattice(study, out, resume=resume, tell=tell)
     if resume:
         raise InputError(f"{name} takes seconds and keeps nothing to resume from; run it without `resume`")
-    files = simulate_study(name, out, tell=tell)
+    files = simulate_study(name, out, progress=progress)
     count = sum(path.suffix == ".vtkhdf" for path in files)
     return SimulationRun(tuple(files), count, count)

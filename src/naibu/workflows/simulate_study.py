@@ -1,10 +1,9 @@
-"""Run the report's simulations and keep them: a series for ParaView, an animated page, and the numbers."""
+"""Simulations of the 2008 report :cite:p:`hirai2008` (chapter 2), written as a series for ParaView, an animated page and JSON."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import numpy as np
 
 from naibu._version import __version__
 from naibu.core.errors import InputError
+from naibu.core.progress import Progress, report_progress
 from naibu.io.files.atomic import write_atomically
 from naibu.io.vtk_files import write_vtkhdf_series
 from naibu.reproduction.chapter2.simulations import NAMES, SQUARES, Study, run
@@ -21,17 +21,17 @@ SLUGS = {name.replace(",", "").replace(" ", "-").lower(): name for name in NAMES
 SQUARES_TOGETHER = "squares"
 
 
-def simulate_study(name: str, out: str | os.PathLike[str], *, tell: Callable[[int, int], None] | None = None) -> list[Path]:
-    """Run a named study and write ``STUDY.vtkhdf``, ``STUDY.json`` and, for plane ones, the animation ``STUDY.html``.
+def simulate_study(name: str, out: str | os.PathLike[str], *, progress: Progress | None = None) -> list[Path]:
+    """Run a named study; write ``STUDY.vtkhdf``, ``STUDY.json`` and, for plane studies, the animation ``STUDY.html``.
 
     Parameters
     ----------
     name : str
         ``"elastic-square"``, ``"agar-block"``, ...; ``"squares"`` runs the three squares and animates them side by side.
     out : path-like
-        Folder for the files.
-    tell : callable
-        Told how many studies are done, and how many there are.
+        Folder of the files.
+    progress : callable, optional
+        Called with a `ProgressReport` before every study.
 
     Returns
     -------
@@ -41,7 +41,7 @@ def simulate_study(name: str, out: str | os.PathLike[str], *, tell: Callable[[in
     Raises
     ------
     InputError
-        There is no such study, or the folder cannot be written.
+        There is no study of this name, or the folder cannot be written.
     """
     if name != SQUARES_TOGETHER and name not in SLUGS:
         raise InputError(f"there is no study {name!r}; choose one of {', '.join([SQUARES_TOGETHER, *SLUGS])}")
@@ -50,8 +50,7 @@ def simulate_study(name: str, out: str | os.PathLike[str], *, tell: Callable[[in
     studies: list[Study] = []
     files: list[Path] = []
     for each in names:
-        if tell is not None:
-            tell(len(studies), len(names))
+        report_progress(progress, f"simulate {name}", done=len(studies), total=len(names))
         studies.append(run(each))
         files += _written(studies[-1], folder)
     if all(study.mesh.dimension == 2 for study in studies):

@@ -17,7 +17,7 @@ from naibu.reproduction.chapter2.tables import (
     REPORTED_ERROR_MM,
     chapter2,
     fitted_push,
-    magnetic_resonance_readings,
+    magnetic_resonance_measurement,
     marker_errors,
     ultrasound_trial,
 )
@@ -114,14 +114,14 @@ def test_readings_are_those_of_the_table() -> None:
     first, second = ultrasound_trial("trial1"), ultrasound_trial("trial2")
     assert first.displacement == pytest.approx(np.array([[-3.0, -4.0], [-1.5, -5.0], [2.0, -5.0], [3.5, -5.0], [2.0, -2.5]]))
     assert second.start[2] == pytest.approx([0.0, 17.0]) and second.displacement[4] == pytest.approx([3.5, -2.0])
-    seen, trusted = magnetic_resonance_readings()
+    seen, trusted = magnetic_resonance_measurement()
     assert seen.ids[~trusted].tolist() == [2, 3]
     assert seen.displacement[4] == pytest.approx([0.0, -2.0])
 
 
 def test_fitted_push_finds_the_push() -> None:
     """Displacements made with a push of 2.3 mm are recognised as such; doubtful markers have no say."""
-    seen, trusted = magnetic_resonance_readings()
+    seen, trusted = magnetic_resonance_measurement()
     made = agar_under_bar(push_mm=2.3).displacement_at(seen.start, 1.0)
     made[~trusted] += 100.0
     push, simulated = fitted_push(agar_under_bar(), type(seen)(seen.ids, seen.start, made), trusted)
@@ -129,7 +129,7 @@ def test_fitted_push_finds_the_push() -> None:
 
 
 def test_tables_show_what_they_say(chapter: Chapter) -> None:
-    titles = ["Three squares", "Agar under a weight", "What the ultrasound markers tell about the agar", "Agar under a bar"]
+    titles = ["Three squares", "Agar under a weight", "What the ultrasound markers determine of the agar", "Agar under a bar"]
     assert [s.title.split(",")[0] for s in chapter.sections] == titles
     for section in chapter.sections:
         for t in section.tables:

@@ -17,7 +17,7 @@ from naibu.reproduction.chapter3.material_tests import (
     table_3_4,
     table_3_5,
 )
-from naibu.reproduction.chapter3.poisson_readings import GELS, constrained_block, marker_ratios, pairs_that_fit, readings
+from naibu.reproduction.chapter3.poisson_readings import GELS, constrained_block, marker_ratios, matching_pairs, readings
 from naibu.viewer.chapter import Section
 
 PAPER = {t["id"]: t["rows"] for t in datasets.paper_tables()["tables"]}
@@ -97,13 +97,13 @@ def test_no_strain_measure_and_no_reading_explains_both_rows(ratio_section):
     _, measures, candidates, _ = ratio_section.tables
     assert not any(all(abs(j - 1.0) <= 0.03 for j in row[1:]) for row in measures.rows)
     assert not any(max(row[-2:]) <= 2.0 for row in candidates.rows)
-    assert pairs_that_fit([(-a, t, nu) for _, a, t, nu in PAPER["3.5"]]).fitting[1] == 0
+    assert matching_pairs([(-a, t, nu) for _, a, t, nu in PAPER["3.5"]]).fitting[1] == 0
 
 
 def test_pairs_that_fit_finds_a_pair_that_is_there():
     seen = readings("ct_cube_plate", "height_45")
     pair = seen.longitudinal["all layers"], seen.transversal["one gel, hardness not stated, layer 3"], 0.5
-    found = pairs_that_fit([pair, (-0.9, 2.0, 0.0)])
+    found = matching_pairs([pair, (-0.9, 2.0, 0.0)])
     assert found.fitting[0] >= 1
     assert found.fitting[1] == 0
     assert found.tried > 50

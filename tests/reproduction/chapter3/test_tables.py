@@ -14,10 +14,17 @@ from naibu.identification.equilibrium_gap.batch import batch_equilibrium_gap
 from naibu.identification.from_fields.load_cases import Zones
 from naibu.mechanics.finite_elements.linear_simplices import simplices
 from naibu.reproduction.chapter3.bodies import LAYERS, UNIFORM, PushedBody, Split, cube, shape_error_percent, split_hexahedra, square
-from naibu.reproduction.chapter3.cubes import every_cell, layer_section, mean_error_percent, most_frequent, reach_section, uniform_section
-from naibu.reproduction.chapter3.experiment import EXPERIMENT, experiment_section, lattice, printed_errors
-from naibu.reproduction.chapter3.noise import noise_scatter, noise_section
-from naibu.reproduction.chapter3.square import accumulation, square_section
+from naibu.reproduction.chapter3.cubes import (
+    identifiability_section,
+    identify_cells,
+    layer_section,
+    mean_error_percent,
+    most_frequent,
+    uniform_section,
+)
+from naibu.reproduction.chapter3.experiment import EXPERIMENT, experiment_section, marker_lattice, printed_errors
+from naibu.reproduction.chapter3.noise import noise_section, noise_study
+from naibu.reproduction.chapter3.square import error_accumulation, square_section
 from naibu.reproduction.chapter3.tables import chapter3
 from naibu.viewer.chapter import Section
 from naibu.viewer.chapter_page import write_chapter
@@ -103,7 +110,7 @@ def test_the_two_triangles_of_2007_come_back_exactly(square_part: Section) -> No
 
 
 def test_the_batch_method_errs_less_than_the_incremental_one() -> None:
-    growth = accumulation(3, 12)
+    growth = error_accumulation(3, 12)
     assert [step.node for step in growth.steps] == list(range(14, 4, -1))
     assert growth.batch.mean() < growth.incremental.mean()
 
@@ -136,7 +143,7 @@ def test_table_3_3_is_nearly_the_printed_one() -> None:
 
 
 def test_an_identified_body_deforms_as_the_true_one_though_no_modulus_is_right() -> None:
-    result = every_cell(cube())
+    result = identify_cells(cube())
     moduli = result.zones.per_cell(result.estimate.lame_lambda, result.estimate.shear_modulus)
     assert result.again == pytest.approx(result.displacement, abs=1e-10)
     assert result.body.displacement((0.0, 0.0, -20.0), moduli) == pytest.approx(2.0 * result.displacement, abs=1e-9)
@@ -151,7 +158,7 @@ def test_most_frequent_values_are_the_fullest_bins() -> None:
 
 
 def test_the_printed_moduli_of_table_3_7_make_a_hundred_times_the_printed_error() -> None:
-    table = printed_errors(lattice(EXPERIMENT))
+    table = printed_errors(marker_lattice(EXPERIMENT))
     gel = row(table, "Table 3.7, hardness 0")
     assert gel["printed error, %"] == PAPER["3.7"][1][6]
     assert float(gel["ours, %"]) / float(gel["printed error, %"]) == pytest.approx(100.0, rel=0.05)  # type: ignore[arg-type]
@@ -159,7 +166,7 @@ def test_the_printed_moduli_of_table_3_7_make_a_hundred_times_the_printed_error(
 
 
 def test_markers_are_nodes_and_the_interface_lies_half_way() -> None:
-    body = lattice(EXPERIMENT)
+    body = marker_lattice(EXPERIMENT)
     assert body.shape == (5, 5, 5)
     planes = body.mesh.points.reshape(5, 5, 5, 3)
     moved = body.source.displacement.reshape(5, 5, 5, 3)
@@ -174,10 +181,10 @@ def test_markers_are_nodes_and_the_interface_lies_half_way() -> None:
 
 
 def test_noise_biases_least_squares_and_not_the_weighted_balance() -> None:
-    scatter = noise_scatter(cube(LAYERS), 0.05, 7, 6)
+    scatter = noise_study(cube(LAYERS), 0.05, 7, 6)
     assert scatter.over_bound(scatter.weighted) < 1.5
     assert scatter.over_bound(scatter.plain) > 2.0 * scatter.over_bound(scatter.weighted)
-    assert noise_scatter(cube(LAYERS), 0.1, 7, 2).bound == pytest.approx(2.0 * scatter.bound, rel=1e-6)
+    assert noise_study(cube(LAYERS), 0.1, 7, 2).bound == pytest.approx(2.0 * scatter.bound, rel=1e-6)
     assert drawn(noise_section(0, 2)) == 1
 
 
@@ -185,7 +192,7 @@ def test_the_square_has_no_law_for_finite_strain_and_layers_need_fitting_cells()
     body = square()
     with pytest.raises(InputError, match="solved on tetrahedra only"):
         PushedBody(body.name, body.mesh, body.truth, body.known, body.pushes, "neo_hookean").displacement((0.0, -1.0))
-    with pytest.raises(InputError, match="6 divisions do not fit 2 layers"):
+    with pytest.raises(InputError, match="divisions = 6 does not fit 2 layers"):
         cube(LAYERS, divisions=6)
     with pytest.raises(InputError, match="split 'kuhn' is not known"):
         split_hexahedra(np.arange(8)[None], np.zeros((1, 3), dtype=np.int64), "kuhn")  # type: ignore[arg-type]
@@ -195,7 +202,7 @@ def test_the_square_has_no_law_for_finite_strain_and_layers_need_fitting_cells()
 
 @pytest.mark.slow
 def test_more_trials_do_not_determine_single_tetrahedra() -> None:
-    rows = reach_section().tables[0].rows
+    rows = identifiability_section().tables[0].rows
     for split in ("symmetric", "asymmetric"):
         ranks = [r[4] for r in rows if r[0] == split]
         assert ranks[0] == 150
@@ -221,7 +228,7 @@ def test_the_experiment_converges_at_inner_nodes_with_its_report_beside() -> Non
     weighted = [r for r in table.rows if r[0] == "one pair, neo-hookean, weighted" and r[1] == "inner"]
     assert len(weighted) == 2
     assert all(float(r[7]) < 1.5 for r in weighted)  # type: ignore[arg-type]
-    body = lattice(EXPERIMENT)
+    body = marker_lattice(EXPERIMENT)
     assert not batch_equilibrium_gap(
         body.mesh, [body.trial("inner")], Zones.of(body.mesh, known={"hardness 5": (222.0, 0.33)})
     ).admissible.all()

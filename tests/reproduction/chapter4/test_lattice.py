@@ -10,7 +10,7 @@ from naibu.identification.lattice_calibration.gauss_newton import ReportIndices
 from naibu.reproduction.chapter4.cube import TABLES, cube_section
 from naibu.reproduction.chapter4.lattice import _one_set, _pattern_table, exact_section
 from naibu.reproduction.chapter4.octree import chapter4_octree, cost_section
-from naibu.reproduction.chapter4.patterns import JOINT, PATTERNS, RIVALS, PatternStudy, pattern_study
+from naibu.reproduction.chapter4.patterns import JOINT, PATTERNS, SEPARATE, PatternStudy, pattern_study
 from naibu.validation.specimens.lattice_twin import dough_lattice
 from naibu.viewer.tables import Table
 
@@ -25,7 +25,7 @@ def made_up(seed: int) -> ReportIndices:
 
 @pytest.fixture(scope="module")
 def made_up_study() -> PatternStudy:
-    found = {p.letter: made_up(k) for k, p in enumerate((*PATTERNS, *JOINT, *RIVALS))}
+    found = {p.letter: made_up(k) for k, p in enumerate((*PATTERNS, *JOINT, *SEPARATE))}
     return PatternStudy(dough_lattice(25.0, size_cm=(5, 5, 5)), (), {}, found)
 
 

@@ -27,7 +27,7 @@ from naibu.reproduction.chapter1.matching import (
     picked_registration,
     under_noise,
 )
-from naibu.reproduction.chapter3.material_tests import printed_table
+from naibu.reproduction.printed_tables import printed_table
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.tables import Cell, Table
 

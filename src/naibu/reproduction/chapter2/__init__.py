@@ -1,1 +1,1 @@
-"""Chapter 2: simulating rheological deformation."""
+"""Chapter 2 of the report: simulation and measurement of viscoelastic deformation."""

@@ -1,13 +1,14 @@
-"""The figures of chapter 2, each a function that paints on a canvas."""
+"""Figures of chapter 2."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
+from naibu.reproduction.chapter2.marker_measurements import MarkerMeasurement
 from naibu.reproduction.chapter2.simulations import PHASES_S, Study
 
 if TYPE_CHECKING:
@@ -17,27 +18,8 @@ Draw = Callable[["Canvas"], None]
 SHOWN_S = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0)
 
 
-class Seen(Protocol):
-    """Markers of a trial."""
-
-    @property
-    def ids(self) -> IntArray:
-        """Numbers (k,)."""
-        ...
-
-    @property
-    def start(self) -> FloatArray:
-        """First positions (k, 2), mm."""
-        ...
-
-    @property
-    def displacement(self) -> FloatArray:
-        """Displacements (k, 2), mm."""
-        ...
-
-
 def snapshots(study: Study) -> Draw:
-    """Draw the deformed mesh at seven times, cells coloured by the change of their area."""
+    """Draw the deformed mesh at seven times, coloured by the area ratio of the cells."""
 
     def draw(canvas: Canvas) -> None:
         points, cells = study.mesh.points, study.mesh.cells
@@ -57,13 +39,13 @@ def snapshots(study: Study) -> Draw:
                 ylim=(-0.03 * side, side + 0.5 * pushed),
             )
         axes[0].set_ylabel("y, mm")
-        canvas.colorbar(shading, ax=list(axes), label="area over free area", shrink=0.8)
+        canvas.colorbar(shading, ax=list(axes), label="area ratio", shrink=0.8)
 
     return draw
 
 
 def curves(studies: Sequence[Study]) -> Draw:
-    """Draw displacement of the pushed point and force of the indenter against time."""
+    """Draw displacement of the loaded point and force of the indenter against time."""
 
     def draw(canvas: Canvas) -> None:
         left, right = canvas.subplots(1, 2)
@@ -82,8 +64,8 @@ def curves(studies: Sequence[Study]) -> Draw:
     return draw
 
 
-def measured_markers(trials: Mapping[str, Seen]) -> Draw:
-    """Draw where the markers of every trial were and where they went."""
+def measured_markers(trials: Mapping[str, MarkerMeasurement]) -> Draw:
+    """Draw the marker positions of every trial before and after loading."""
 
     def draw(canvas: Canvas) -> None:
         for axis, (name, seen) in zip(np.atleast_1d(canvas.subplots(1, len(trials), sharey=True)), trials.items(), strict=True):
@@ -100,7 +82,7 @@ def measured_markers(trials: Mapping[str, Seen]) -> Draw:
 
 
 def deformed_block(study: Study, time_s: float) -> Draw:
-    """Draw the free outline and the deformed mesh."""
+    """Draw the undeformed outline and the deformed mesh."""
 
     def draw(canvas: Canvas) -> None:
         axis, points = canvas.subplots(), study.mesh.points
@@ -108,13 +90,13 @@ def deformed_block(study: Study, time_s: float) -> Draw:
         (x0, y0), (x1, y1) = points.min(axis=0), points.max(axis=0)
         axis.plot([x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0], "--", color="0.6", lw=1.0)
         axis.triplot(*moved.T, study.mesh.cells, lw=0.5, color="C0")
-        axis.set(aspect="equal", xlabel="x, mm", ylabel="y, mm", title=f"{time_s:g} s after the weight was laid on")
+        axis.set(aspect="equal", xlabel="x, mm", ylabel="y, mm", title=f"{time_s:g} s after the start of loading")
 
     return draw
 
 
-def marker_paths(middle: Study, left: Study, trials: Mapping[str, Seen], markers: Sequence[int]) -> Draw:
-    """Draw the simulated paths of markers, and the displacements measured."""
+def marker_paths(middle: Study, left: Study, trials: Mapping[str, MarkerMeasurement], markers: Sequence[int]) -> Draw:
+    """Draw the simulated paths of markers, and their measured displacements."""
 
     def draw(canvas: Canvas) -> None:
         for axis, marker in zip(canvas.subplots(1, len(markers), sharey=True), markers, strict=True):
@@ -133,7 +115,7 @@ def marker_paths(middle: Study, left: Study, trials: Mapping[str, Seen], markers
 
 
 def cross_section(study: Study, start: FloatArray, measured: FloatArray, simulated: FloatArray, trusted: BoolArray) -> Draw:
-    """Draw measured and simulated displacements of markers in the cross-section, threefold."""
+    """Draw measured and simulated displacements of markers in the cross-section, magnified threefold."""
 
     def draw(canvas: Canvas) -> None:
         axis = canvas.subplots()
@@ -142,7 +124,7 @@ def cross_section(study: Study, start: FloatArray, measured: FloatArray, simulat
         axis.quiver(*start[trusted].T, *measured[trusted].T, color="C0", label="measured", **arrow)
         axis.quiver(*start.T, *simulated.T, color="C1", label="simulated", **arrow)
         axis.plot(*start[trusted].T, "o", ms=3, color="0.3")
-        axis.plot(*start[~trusted].T, "o", ms=3, mfc="none", color="0.3", label="doubtful")
+        axis.plot(*start[~trusted].T, "o", ms=3, mfc="none", color="0.3", label="suspect")
         axis.set(aspect="equal", xlabel="x from the middle, mm", ylabel="height, mm")
         axis.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 

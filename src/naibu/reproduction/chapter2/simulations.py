@@ -1,8 +1,8 @@
-"""The simulations of the report's chapter 2, each by its name: three squares pushed and released, and the blocks of agar (spec M5).
+"""Simulations of the 2008 report :cite:p:`hirai2008` (chapter 2): three squares loaded and released, and the blocks of agar.
 
-What the report prints is the default of a parameter; what it leaves open - the size of the squares, how deep and how wide they are pushed,
-how fast the agar is - is a parameter too, and `ASSUMED` says what was taken for it. The squares' numbers are printed without units: they
-are taken as mm, kPa, kPa s and kg/mm^3, and any other consistent system gives the same motion.
+Values printed in the report are the defaults of the parameters. What it does not state - the size of the squares, depth and width of the
+indentation, the loading time of the agar - is a parameter too; `ASSUMED` lists the values chosen. The numbers of the squares are printed
+without units: they are taken as mm, kPa, kPa s and kg/mm^3, and any other consistent system gives the same motion.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SQUARES: Mapping[str, Rheology] = MappingProxyType(
         "rheological square": three_element(30.0, 200.0, 500.0, 0.35),
     }
 )
-PHASES_S = (10.0, 20.0, 30.0)  # pushed until, held until, watched until
+PHASES_S = (10.0, 20.0, 30.0)  # end of loading, of holding, of recovery
 AGAR = three_element(10.0, 100.0, 300.0, 0.35)  # 0.01e6 N/m^2, 0.1e6 and 0.3e6 N s/m^2
 AGAR_SIZE_MM = (75.0, 75.0, 30.0)  # x, z, height
 AGAR_MASS_KG = 0.2
@@ -42,10 +42,10 @@ MR_SIZE_MM = (55.0, 25.0)  # x, height
 NAMES = (*SQUARES, "agar block", "agar block, 3-D", "agar under a bar")
 ASSUMED = MappingProxyType(
     {
-        "side of the squares": "1, and 10 x 10 cells with diagonals in turn: no size is printed",
-        "push of the squares": "0.2 of the side, on the middle fifth of the top, which sticks: neither is printed",
-        "agar, push": "1 s, then held; no effect on the shape at rest",
-        "agar, weight and floor": "stick, as for the squares ('fixed on the floor'); variants are shown",
+        "side of the squares": "1, with 10 x 10 cells and alternating diagonals: no size is printed",
+        "indentation of the squares": "0.2 of the side, on the middle fifth of the top, without slip: neither is printed",
+        "agar, loading": "1 s, then constant; no effect on the shape in equilibrium",
+        "agar, weight and floor": "no slip, as for the squares ('fixed on the floor'); variants are shown",
         "agar under a bar": "plane strain; strip of 15 mm; base at y = 4 mm, middle at x = 25 mm of the table's axes",
     }
 )
@@ -53,20 +53,20 @@ ASSUMED = MappingProxyType(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Study:
-    """A simulation that was run.
+    """The result of a simulation.
 
     Attributes
     ----------
     name : str
         One of `NAMES`.
     mesh : Mesh
-        The body, mm.
+        Mesh of the body, mm.
     material : Rheology
-        kPa and kPa s.
+        Viscoelastic material, kPa and kPa s.
     series : Series
-        Its motion.
+        Displacements, reactions and energies over time.
     middle_top : int
-        The node in the middle of the pushed face.
+        Node in the middle of the loaded face.
     """
 
     name: str
@@ -76,12 +76,12 @@ class Study:
     middle_top: int
 
     def displacement_at(self, points: ArrayLike, time_s: float) -> FloatArray:
-        """Return the displacement (k, d), mm, at points (k, d), mm, of the free body, at the stored time nearest to `time_s`.
+        """Return the displacement (k, d), mm, at points (k, d) of the reference configuration, mm, at the stored time nearest to `time_s`.
 
         Raises
         ------
         InputError
-            A point outside the body.
+            A point lies outside the body.
         """
         wanted, mesh = np.asarray(points, dtype=float), self.mesh
         corners = mesh.points[mesh.cells]
@@ -104,38 +104,38 @@ def pushed_square(
     side_mm: float = 1.0,
     divisions: int = 10,
     push_mm: float = 0.2,
-    pushed_share: float = 0.2,
+    pushed_fraction: float = 0.2,
     density: float | None = 6.4,
     step_s: float = 0.05,
     method: str = "sdirk2",
 ) -> Study:
-    """Push the middle of a square's top down for 10 s, hold it for 10 s, and watch it for 10 s more (figures 1 to 3 of the paper).
+    """Indent the middle of a square's top for 10 s, keep it for 10 s, and release it for 10 s (figures 1 to 3 of the paper).
 
     Parameters
     ----------
     name : str
         ``"elastic square"``, ``"viscoplastic square"`` or ``"rheological square"``.
     side_mm, divisions : float and int
-        Size, and cells along a side.
-    push_mm, pushed_share : float
-        How deep, and on which share of the top.
+        Edge length, and cells per edge.
+    push_mm, pushed_fraction : float
+        Indentation depth, and loaded fraction of the top.
     density : float or None
-        As printed; None leaves inertia out.
+        Density, kg/mm^3; None neglects inertia.
     step_s : float
-        Step, and time between stored states.
+        Time step, and time between stored states, s.
     method : str
-        Of `simulate_motion`.
+        Time integration, see `simulate_motion`.
 
     Raises
     ------
     InputError
-        Another name.
+        There is no square of this name.
     """
     if name not in SQUARES:
-        raise InputError(f"there is no square called {name!r}; there are {', '.join(SQUARES)}")
+        raise InputError(f"there is no square called {name!r}; available are {', '.join(SQUARES)}")
     mesh = rectangle((side_mm, side_mm), (divisions, divisions))
     x, y = mesh.points.T
-    top = np.flatnonzero((y > side_mm * (1.0 - 1e-9)) & (np.abs(x) <= side_mm * (0.5 * pushed_share + 1e-9)))
+    top = np.flatnonzero((y > side_mm * (1.0 - 1e-9)) & (np.abs(x) <= side_mm * (0.5 * pushed_fraction + 1e-9)))
     path = PrescribedMotion.through([0.0, PHASES_S[0]], [(0.0, 0.0), (0.0, -push_mm)])
     supports = [Support("floor", np.flatnonzero(y == 0.0)), Support("indenter", top, motion=path, end_s=PHASES_S[1])]
     times = np.linspace(0.0, PHASES_S[2], round(PHASES_S[2] / step_s) + 1)
@@ -150,21 +150,21 @@ def agar_block(
     weight_sticks: bool = True,
     floor_sticks: bool = True,
     push_s: float = 1.0,
-    watched_s: float = 6.0,
+    duration_s: float = 6.0,
     step_s: float = 0.1,
 ) -> Study:
-    """Push the agar block down by 7.5 mm under the weight of 40 mm, in plane strain on the report's mesh of 30 x 12 cells of 2.5 mm.
+    """Indent the agar block by 7.5 mm under the weight of 40 mm width, in plane strain, on the report's mesh of 30 x 12 cells of 2.5 mm.
 
     Parameters
     ----------
     shifted_cells : float
-        How many cells the weight lies left of the middle.
+        Shift of the weight to the left, in cells.
     material : Rheology
-        As printed by default.
+        Material; as printed by default.
     weight_sticks, floor_sticks : bool
-        Whether the weight, and the floor, hold the block sideways too.
-    push_s, watched_s, step_s : float
-        Duration of the push, of the whole, and of a step.
+        Whether there is no slip under the weight, and on the floor; otherwise they are frictionless.
+    push_s, duration_s, step_s : float
+        Duration of the loading, of the whole simulation, and of a time step, s.
     """
     width, depth, height = AGAR_SIZE_MM
     mesh = rectangle((width, height), (30, 12))
@@ -180,25 +180,25 @@ def agar_block(
         supports.append(Support("middle", np.array([_nearest(mesh, (0.0, 0.0))]), axes=(0,)))
     density = AGAR_MASS_KG / (width * depth * height)
     body = LinearBody.of(mesh, thickness_mm=depth)
-    times = np.linspace(0.0, watched_s, round(watched_s / step_s) + 1)
+    times = np.linspace(0.0, duration_s, round(duration_s / step_s) + 1)
     series = simulate_motion(body, material, density, supports, times)
     return Study("agar block", mesh, material, series, _nearest(mesh, (middle, height)))
 
 
 def agar_block_3d(
-    *, shift_mm: float = 0.0, material: Rheology = AGAR, cell_mm: float = 3.75, push_s: float = 1.0, watched_s: float = 6.0
+    *, shift_mm: float = 0.0, material: Rheology = AGAR, cell_mm: float = 3.75, push_s: float = 1.0, duration_s: float = 6.0
 ) -> Study:
-    """Push the whole block, 75 x 75 x 30 mm, under the round weight that it was: beyond the report, which computed a plane.
+    """Indent the three-dimensional block, 75 x 75 x 30 mm, under a round weight; the report computed plane strain.
 
     Parameters
     ----------
     shift_mm : float
         How far the weight lies left of the middle.
     material : Rheology
-        As printed by default.
+        Material; as printed by default.
     cell_mm : float
         Size of the cells that are cut into six tetrahedra each.
-    push_s, watched_s : float
+    push_s, duration_s : float
         Duration of the push and of the whole. Inertia is left out.
     """
     width, depth, height = AGAR_SIZE_MM
@@ -207,23 +207,23 @@ def agar_block_3d(
     top = np.flatnonzero((z > height - 1e-9) & (np.hypot(x + shift_mm, y) <= 0.5 * WEIGHT_MM + 1e-9))
     path = PrescribedMotion.through([0.0, push_s], [(0.0, 0.0, 0.0), (0.0, 0.0, -AGAR_PUSH_MM)])
     supports = [Support("floor", np.flatnonzero(z < 1e-9)), Support("weight", top, motion=path)]
-    series = simulate_motion(LinearBody.of(mesh), material, None, supports, [0.0, push_s, watched_s], step=0.5)
+    series = simulate_motion(LinearBody.of(mesh), material, None, supports, [0.0, push_s, duration_s], step=0.5)
     return Study("agar block, 3-D", mesh, material, series, _nearest(mesh, (-shift_mm, 0.0, height)))
 
 
 def agar_under_bar(*, push_mm: float = 1.0, strip_mm: float = 15.0, material: Rheology = AGAR, cell_mm: float = 2.5) -> Study:
-    """Push the cross-section of the MR block under the bar, in plane strain; displacements are in proportion to `push_mm`.
+    """Indent the cross-section of the MR block under the bar, in plane strain; displacements are proportional to `push_mm`.
 
     Parameters
     ----------
     push_mm : float
-        How deep; the report does not state it.
+        Indentation depth; the report does not state it.
     strip_mm : float
-        Width on which the round bar touches.
+        Width of the contact with the round bar, mm.
     material : Rheology
-        As printed for the block of section 2.4, the same agar.
+        Material; as printed for the block of section 2.4, which is the same agar.
     cell_mm : float
-        Size of the cells.
+        Edge length of the cells, mm.
     """
     width, height = MR_SIZE_MM
     mesh = rectangle((width, height), (round(width / cell_mm), round(height / cell_mm)))
@@ -236,7 +236,7 @@ def agar_under_bar(*, push_mm: float = 1.0, strip_mm: float = 15.0, material: Rh
 
 
 def run(name: str) -> Study:
-    """Run a study with its defaults.
+    """Run a study with its default parameters.
 
     Raises
     ------
@@ -251,7 +251,7 @@ def run(name: str) -> Study:
         "agar under a bar": agar_under_bar,
     }
     if name not in others:
-        raise InputError(f"there is no study called {name!r}; there are {', '.join(NAMES)}")
+        raise InputError(f"there is no study called {name!r}; available are {', '.join(NAMES)}")
     return others[name]()
 
 

@@ -1,1 +1,1 @@
-"""Chapter 3: identifying non-uniform elasticity."""
+"""Chapter 3 of the report: identification of non-uniform elasticity."""

@@ -1,8 +1,8 @@
-"""The virtual bodies of the report's chapter 3: a square of triangles, and a cube of tetrahedra, each pushed from the top (spec I4).
+"""Virtual bodies of the 2008 report :cite:p:`hirai2008` (chapter 3.4): a square of triangles and a cube of tetrahedra, loaded on top.
 
-The report shows its meshes only in a figure (3.9), and does not print the moduli of the known half. The symmetric cube is taken to be
-cells of six tetrahedra, each cell the mirror image of its neighbours, which scatters the moduli nearly as printed; in the asymmetric one
-all cells are alike. The known half is given the moduli of the uniform case (500 Pa, 0.43).
+The report shows its meshes only in a figure (3.9), and does not print the moduli of the known half. The symmetric cube is assumed to
+consist of cells of six tetrahedra, each cell the mirror image of its neighbours, which spreads the moduli nearly as printed; in the
+asymmetric one all cells are equal. The known half has the moduli of the uniform case (500 Pa, 0.43).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Split = Literal["symmetric", "asymmetric"]
 UNIFORM = (0.5, 0.43)  # Young's modulus, kPa, and Poisson's ratio
 LAYERS = {"layer 1": (0.25, 0.43), "layer 2": (0.5, 0.38)}
 SQUARE = (5.0, 0.43)
-# pushes of the top of the square (2007 paper, Table 2), mm; x to the left and y downwards are positive there
+# displacements of the top of the square (2007 paper, Table 2), mm; x to the left and y downwards are positive there
 SQUARE_PUSHES = (((0.0, 25.0), (25.0, 25.0)), ((0.0, 30.0), (30.0, 30.0)), ((0.0, 50.0), (50.0, 50.0)), ((0.0, 50.0), (100.0, 100.0)))
 # hexahedra in VTK order: coordinates of the corners
 _CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
@@ -41,22 +41,22 @@ _CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PushedBody:
-    """A body on a fixed floor whose top is moved, with its true moduli.
+    """A virtual body on a fixed floor whose top face is displaced, with its true moduli.
 
     Attributes
     ----------
     name : str
-        For tables.
+        Name in tables.
     mesh : Mesh
-        The last coordinate points up; the floor is at zero.
+        Mesh, mm; the last axis is vertical, the floor is at zero.
     truth : mapping of str to (float, float)
         Young's modulus, kPa, and Poisson's ratio of every region.
     known : tuple of str
-        Regions whose moduli are known beforehand.
+        Regions whose moduli are known.
     pushes : tuple of ndarray, shape (d,) or (top nodes, d)
-        Displacement of the top in every trial, mm.
+        Displacement of the top face in every load case, mm.
     law : str
-        See `naibu.mechanics.finite_elements.modulus_derivatives`.
+        Constitutive law, see `naibu.mechanics.finite_elements.modulus_derivatives`.
     """
 
     name: str
@@ -68,13 +68,13 @@ class PushedBody:
 
     @property
     def moduli(self) -> tuple[FloatArray, FloatArray]:
-        """True lambda and mu of every cell (m,), kPa."""
+        """True Lamé parameters lambda and mu of every cell, (m,) each, kPa."""
         table = np.array([lame_parameters(*self.truth[name]) for name in self.mesh.region_names])[self.mesh.regions]
         return table[:, 0], table[:, 1]
 
     @property
     def constrained(self) -> BoolArray:
-        """Nodes of floor and top (n,), on which unknown forces act."""
+        """Constrained nodes of floor and top, boolean (n,), on which unknown forces act."""
         height = self.mesh.points[:, -1]
         return np.asarray((height < 1e-9) | (height > height.max() - 1e-9))
 
@@ -83,12 +83,12 @@ class PushedBody:
         return Zones.of(self.mesh, known={name: self.truth[name] for name in self.known}, each_cell=each_cell)
 
     def displacement(self, push: ArrayLike, moduli: tuple[FloatArray, FloatArray] | None = None) -> FloatArray:
-        """Return the displacement (n, d), mm, in equilibrium, of the true moduli or of others (m,), kPa.
+        """Return the equilibrium displacement (n, d), mm, with the true moduli or with others, (m,) each, kPa.
 
         Raises
         ------
         InputError
-            A law for finite strain in two dimensions.
+            A finite-strain law in two dimensions.
         """
         lame, shear = self.moduli if moduli is None else moduli
         height = self.mesh.points[:, -1]
@@ -107,7 +107,7 @@ class PushedBody:
         return solve(problem, settings=SolverSettings(tolerance=1e-11)).displacement
 
     def load_cases(self, *, sd_mm: float = 0.0, seed: int = 0) -> tuple[FieldLoadCase, ...]:
-        """Return the trials as measured at the nodes of the same mesh, with normal noise of `sd_mm`, mm, at every node."""
+        """Return the load cases as measured at the nodes of the same mesh, with normal noise of SD `sd_mm`, mm, at every node."""
         rng = np.random.default_rng(seed)
         out = []
         for k, push in enumerate(self.pushes):
@@ -118,10 +118,10 @@ class PushedBody:
 
 
 def square(pushes: Sequence[ArrayLike] = SQUARE_PUSHES[0], *, divisions: int = 4) -> PushedBody:
-    """Return the square of 200 x 200 mm of Figs. 3.6 and 8 (2007), uniform, its upper half known.
+    """Return the uniform square of 200 x 200 mm of Figs. 3.6 and 8 (2007), its upper half known.
 
     The diagonal of every cell falls to the right. Cell 2 (i + 4 j) + k is the triangle of that number in the figure, with k = 0 below the
-    diagonal and 1 above; node i + 5 j likewise. Pushes are given as in the 2007 paper, x to the left and y downwards.
+    diagonal and 1 above; node i + 5 j likewise. `pushes` are given as in the 2007 paper, x to the left and y downwards.
     """
     n = divisions
     points = _grid(np.linspace(0.0, 200.0, n + 1), np.linspace(0.0, 200.0, n + 1))
@@ -152,22 +152,22 @@ def cube(
     split : {"symmetric", "asymmetric"}
         Figure 3.9 (a) or (b); see `split_hexahedra`.
     divisions : int
-        Cells an edge; even, and for two layers a multiple of four.
+        Cells per edge; even, and for two layers a multiple of four.
     pushes : sequence of array_like, shape (3,) or (top nodes, 3)
-        Displacement of the top, mm; ten millimetres down by default.
+        Displacement of the top face, mm; ten millimetres down by default.
     known : (float, float)
         Young's modulus, kPa, and Poisson's ratio of the upper half.
     law : str
-        See `naibu.mechanics.finite_elements.modulus_derivatives`.
+        Constitutive law, see `naibu.mechanics.finite_elements.modulus_derivatives`.
 
     Raises
     ------
     InputError
-        Divisions that do not fall on the borders of the layers.
+        `divisions` does not fit the boundaries of the layers.
     """
     unknown = dict(layers) if layers is not None else {"lower half": UNIFORM}
     if divisions % (2 * len(unknown)):
-        raise InputError(f"{divisions} divisions do not fit {len(unknown)} layers in the lower half; take a multiple of {2 * len(unknown)}")
+        raise InputError(f"divisions = {divisions} does not fit {len(unknown)} layers; use a multiple of {2 * len(unknown)}")
     axis = np.linspace(0.0, 40.0, divisions + 1)
     index = np.array(list(np.ndindex(divisions, divisions, divisions)))[:, ::-1]
     numbers = index[:, None, :] + _CORNERS
@@ -188,10 +188,10 @@ def split_hexahedra(hexahedra: IntArray, index: IntArray, split: Split = "symmet
     hexahedra : ndarray, shape (m, 8), int64
         Nodes in VTK order.
     index : ndarray, shape (m, 3), int64
-        Place of every cell in the grid along its three edges.
+        Grid indices of every cell.
     split : {"symmetric", "asymmetric"}
-        ``"asymmetric"`` is Kuhn's split, all cells alike; in ``"symmetric"`` cells are mirror images of their neighbours, so that the whole
-        is symmetric to the middle planes of a grid with an even number of cells.
+        ``"asymmetric"`` is Kuhn's subdivision, equal in all cells; in ``"symmetric"`` cells are mirror images of their neighbours, so that
+        the mesh is symmetric about the middle planes of a grid with an even number of cells.
 
     Returns
     -------
@@ -210,9 +210,9 @@ def split_hexahedra(hexahedra: IntArray, index: IntArray, split: Split = "symmet
     )
     mirrored = (index % 2 == 1) & (split == "symmetric")
     corners = np.where(mirrored[:, None, None, :], 1 - paths, paths)
-    place = np.zeros((2, 2, 2), dtype=int)
-    place[tuple(_CORNERS.T)] = np.arange(8)
-    local = place[tuple(np.moveaxis(corners, -1, 0))]
+    corner_number = np.zeros((2, 2, 2), dtype=int)
+    corner_number[tuple(_CORNERS.T)] = np.arange(8)
+    local = corner_number[tuple(np.moveaxis(corners, -1, 0))]
     cells = np.take_along_axis(hexahedra[:, None, :], local, axis=2)
     edges = np.diff(corners, axis=2)
     wrong = np.linalg.det(edges) < 0.0
@@ -221,11 +221,11 @@ def split_hexahedra(hexahedra: IntArray, index: IntArray, split: Split = "symmet
 
 
 def shape_error_percent(first: FloatArray, second: FloatArray, width_mm: float, height_mm: float) -> float:
-    """Return the report's error (3.35), per cent: squared distances of the nodes (n, d), mm, added up, over width times height."""
+    """Return the report's error (3.35), per cent: sum of squared distances of the nodes (n, d), mm, over width times height."""
     return 100.0 * float(((first - second) ** 2).sum()) / (width_mm * height_mm)
 
 
 def _grid(*axes: ArrayLike) -> FloatArray:
-    """Points of a tensor grid (n, d), the first coordinate fastest."""
+    """Return the points (n, d) of a tensor grid, the first coordinate fastest."""
     parts = np.meshgrid(*[np.asarray(a, dtype=float) for a in reversed(axes)], indexing="ij")
     return np.stack([part.ravel() for part in reversed(parts)], axis=1)

@@ -1,26 +1,23 @@
-"""Chapter 3 in space: the cube pushed from the top, every tetrahedron unknown (Tables 3.2, 3.3, Figs. 3.9 to 3.19; spec I3, I4)."""
+"""Identification of every tetrahedron of a cube: Tables 3.2, 3.3 and Figs. 3.9 to 3.19 of the 2008 report :cite:p:`hirai2008`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from naibu.core.arrays import BoolArray, FloatArray
-from naibu.identification.equilibrium_gap.batch import EquilibriumGapEstimate, batch_equilibrium_gap
-from naibu.identification.from_fields.load_cases import Zones
+from naibu.core.arrays import FloatArray
+from naibu.identification.equilibrium_gap.batch import batch_equilibrium_gap
 from naibu.reproduction.chapter3 import figures as drawn
 from naibu.reproduction.chapter3.bodies import LAYERS, PushedBody, Split, cube, shape_error_percent
-from naibu.reproduction.chapter3.material_tests import printed_table
+from naibu.reproduction.chapter3.cell_identification import SIDE_MM, SIDEWAYS, CellResult, identify_cells
+from naibu.reproduction.printed_tables import printed_table
 from naibu.viewer.chapter import Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 SPLITS: tuple[Split, ...] = get_args(Split)
-SIDE_MM = 40.0
-SIDEWAYS = (10.0, 0.0, 0.0)  # a push that was not used, mm
 # ranges of single elements in the text of 3.4.1 and 3.4.2: Young's modulus, Pa, and Poisson's ratio. The text gives those of layer 1 with
 # the true Poisson ratio of layer 2, see the notes of the paper's table.
 PRINTED_RANGES = {
@@ -33,66 +30,22 @@ PRINTED_MODES = {"lower half": ("430-440, 450-460", "0.41-0.42"), "layer 1": ("4
 E_BIN_PA, NU_BIN, FREQUENT = 10.0, 0.01, 3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CellResult:
-    """What the batch method finds for every tetrahedron of the unknown half from one push.
-
-    Attributes
-    ----------
-    body : PushedBody
-        The case.
-    zones : Zones
-        One a tetrahedron.
-    estimate : EquilibriumGapEstimate
-        Of minimum norm.
-    displacement, again : ndarray, shape (n, 3)
-        Of the push with the true and with the identified moduli, mm.
-    error, sideways : float
-        The report's error (3.35), per cent, for the push that was used and for `SIDEWAYS`.
-    """
-
-    body: PushedBody
-    zones: Zones
-    estimate: EquilibriumGapEstimate
-    displacement: FloatArray
-    again: FloatArray
-    error: float
-    sideways: float
-
-    def layer(self, name: str) -> BoolArray:
-        """Zones (count,) that lie in a layer."""
-        return np.array([zone.startswith(f"{name}: ") for zone in self.zones.names])
-
-
-def every_cell(body: PushedBody) -> CellResult:
-    """Identify every tetrahedron by minimum norm from the exact displacement, as the report does, and simulate again."""
-    zones = body.zones(each_cell=True)
-    estimate = batch_equilibrium_gap(body.mesh, body.load_cases(), zones, method="minimum_norm")
-    moduli = zones.per_cell(estimate.lame_lambda, estimate.shear_modulus)
-
-    def simulated(push: ArrayLike) -> tuple[FloatArray, FloatArray, float]:
-        first, second = body.displacement(push), body.displacement(push, moduli)
-        return first, second, shape_error_percent(first, second, SIDE_MM, SIDE_MM)
-
-    return CellResult(body, zones, estimate, *simulated(body.pushes[0]), simulated(SIDEWAYS)[2])
-
-
 def uniform_section() -> Section:
     """Return Table 3.2 and Figs. 3.9, 3.11 to 3.13."""
-    results: dict[str, CellResult] = {split: every_cell(cube(split=split)) for split in SPLITS}
+    results: dict[str, CellResult] = {split: identify_cells(cube(split=split)) for split in SPLITS}
     _, ((e, nu, e_found, nu_found, error),) = printed_table("3.2")
     text = (
-        "A cube of 40 mm, 4 x 4 x 4 cells of six tetrahedra, is held at the floor; its top is moved 10 mm down. The upper half is known, "
-        f"all moduli of the lower half are sought: {results['symmetric'].estimate.equations} equations for "
-        f"{results['symmetric'].estimate.unknowns} unknowns, none of which they determine by itself, so the solution of minimum norm is "
-        "taken.",
-        "The report shows its meshes in a figure only. A mesh whose cells are mirror images of their neighbours scatters the moduli nearly "
-        "as printed, one of cells that are all alike far more; so the former is taken to be Fig. 3.9 (a), the latter (b): even the most "
-        "frequent values of the report are among ours. The moduli of the known half are not printed; 500 Pa and 0.43 are assumed. The data "
-        "are exact: all the scatter is the method's own choice among solutions.",
-        "The error (3.35) of a solution of minimum norm is rounding, whatever the moduli are, for it balances every node. That the report "
-        "prints more says that its displacements were not quite in equilibrium. Under a push from the side, which was not used, "
-        "the error is no longer rounding.",
+        "A cube of 40 mm, 4 x 4 x 4 cells of six tetrahedra, is fixed to the floor; its top is moved 10 mm down. The upper half is known, "
+        f"all moduli of the lower half are unknown: {results['symmetric'].estimate.equations} equations for "
+        f"{results['symmetric'].estimate.unknowns} unknowns, none of which they determine individually, so the solution of minimum norm is "
+        "used.",
+        "The report shows its meshes in a figure only. A mesh whose cells are mirror images of their neighbours spreads the moduli nearly "
+        "as printed, one of equal cells far more; so the former is assumed to be Fig. 3.9 (a), the latter (b): even the most frequent "
+        "values of the report are among ours. The moduli of the known half are not printed; 500 Pa and 0.43 are assumed. The data are "
+        "exact: the whole spread is the choice of the method among solutions.",
+        "The error (3.35) of a solution of minimum norm is rounding error, whatever the moduli are, because it is in equilibrium at every "
+        "node. That the report prints more shows that its displacements were not quite in equilibrium. Under a sideways displacement of "
+        "the top, which was not used for identification, the error is larger than rounding.",
     )
     rows: list[tuple[Cell, ...]] = [("true", e, nu, *(None,) * 8)]
     rows.append(
@@ -114,7 +67,7 @@ def uniform_section() -> Section:
         Figure("Figure 3.9", "The two meshes: faces of the cube.", lambda c: drawn.meshes(c, shown)),
         Figure("Figure 3.11", "Moduli of every unknown tetrahedron (symmetric mesh).", lambda c: drawn.by_cell(c, found, "lower half")),
         Figure("Figure 3.12", "Distribution of the moduli.", lambda c: drawn.histograms(c, found, "lower half", PRINTED_RANGES)),
-        Figure("Figure 3.13", "Front of the pushed cube with true and with identified moduli.", lambda c: drawn.deformed(c, found)),
+        Figure("Figure 3.13", "Front of the deformed cube with true and with identified moduli.", lambda c: drawn.deformed(c, found)),
     )
     return Section("Uniform parameters (3.4.1)", text, (table,), figures)
 
@@ -142,7 +95,7 @@ def _columns() -> tuple[str, ...]:
 
 
 def _moments(result: CellResult, layer: str) -> tuple[Cell, ...]:
-    """Mean E and nu, the ranges of E, Pa, and nu, and their most frequent values."""
+    """Return the means of E and nu, the ranges of E, Pa, and nu, and their most frequent values."""
     at = result.layer(layer)
     e, nu = 1e3 * result.estimate.young_modulus[at], result.estimate.poisson_ratio[at]
     numbers = (e.mean(), nu.mean(), e.min(), e.max(), nu.min(), nu.max())
@@ -150,15 +103,15 @@ def _moments(result: CellResult, layer: str) -> tuple[Cell, ...]:
 
 
 def most_frequent(values: FloatArray, width: float) -> str:
-    """Return the fullest bins of a width, the fullest first, as ``"430-440, 450-460"``."""
-    place, count = np.unique(np.floor(values / width), return_counts=True)
-    fullest = place[np.argsort(-count, kind="stable")][:FREQUENT]
+    """Return the fullest bins of a histogram of given bin width, the fullest first, as ``"430-440, 450-460"``."""
+    bins, count = np.unique(np.floor(values / width), return_counts=True)
+    fullest = bins[np.argsort(-count, kind="stable")][:FREQUENT]
     return ", ".join(f"{k * width:.{0 if width >= 1.0 else 2}f}-{(k + 1.0) * width:.{0 if width >= 1.0 else 2}f}" for k in fullest)
 
 
 def layer_section() -> Section:
     """Return Table 3.3 and Figs. 3.15 to 3.19."""
-    results: dict[str, CellResult] = {split: every_cell(cube(LAYERS, split=split)) for split in SPLITS}
+    results: dict[str, CellResult] = {split: identify_cells(cube(LAYERS, split=split)) for split in SPLITS}
     _, printed = printed_table("3.3")
     rows: list[tuple[Cell, ...]] = []
     for layer, (_, e, nu, e_found, nu_found, error) in zip(LAYERS, printed, strict=True):
@@ -189,24 +142,24 @@ def layer_section() -> Section:
             ),
         ]
     figures.append(
-        Figure("Figure 3.19", "Front of the pushed cube with true and with identified moduli.", lambda c: drawn.deformed(c, found))
+        Figure("Figure 3.19", "Front of the deformed cube with true and with identified moduli.", lambda c: drawn.deformed(c, found))
     )
     text = (
-        "The unknown half has two layers, 250 Pa with 0.43 next to the floor and 500 Pa with 0.38 above. Means over a layer come near the "
-        "truth, as the report says, and even the mean 0.32 for a true 0.38 comes back; single tetrahedra do not.",
+        "The unknown half has two layers, 250 Pa with 0.43 next to the floor and 500 Pa with 0.38 above. Means over a layer are close to "
+        "the truth, as the report states, and even its mean of 0.32 for a true 0.38 is reproduced; single tetrahedra are not identified.",
     )
     return Section("Two layers (3.4.2)", text, (table,), tuple(figures))
 
 
-def reach_section() -> Section:
-    """Return what can be determined at all, by mesh and by pushes."""
+def identifiability_section() -> Section:
+    """Return what meshes and load cases can determine at all."""
     down, aside, across = (0.0, 0.0, -10.0), SIDEWAYS, (0.0, 10.0, 0.0)
     bent = np.random.default_rng(0).normal((0.0, 0.0, -5.0), 3.0, (6, 25, 3))
     cases: dict[str, Sequence[ArrayLike]] = {
         "1: down": (down,),
         "2: down, sideways": (down, aside),
         "3: down, and both ways sideways": (down, aside, across),
-        "6: every node of the top moved on its own": tuple(bent),
+        "6: every node of the top displaced independently": tuple(bent),
     }
     rows: list[tuple[Cell, ...]] = []
     for split in SPLITS:
@@ -218,18 +171,18 @@ def reach_section() -> Section:
             truth = np.array([LAYERS[zone.split(":")[0]][0] for zone in zones.names])
             error = float(np.abs(found.young_modulus / truth - 1.0)[fixed].max()) if fixed.any() else None
             rows.append((split, name, found.equations, found.unknowns, found.rank, int(fixed.sum()), zones.count, error))
-    columns = ("mesh", "pushes", "equations", "unknowns", "rank", "tetrahedra determined", "of", "their largest relative error of E")
-    table = Table("Meshes and pushes", columns, tuple(rows), caption="What exact displacements determine.")
+    columns = ("mesh", "load cases", "equations", "unknowns", "rank", "tetrahedra determined", "of", "their largest relative error of E")
+    table = Table("Meshes and load cases", columns, tuple(rows), caption="Moduli determined by exact displacements.")
     text = (
-        "Rigid motions of the top give at most three independent trials, as the body is linear. Even with the top moved in any way the "
-        "rank ends short of the number of unknowns: two moduli of every tetrahedron are more than balances at nodes can hold, on either "
-        "mesh. What is determined comes back exactly. More trials are no remedy; fewer unknowns are.",
+        "Rigid motions of the top give at most three independent load cases, as the body is linear. Even if the nodes of the top move "
+        "independently the rank stays below the number of unknowns: two moduli per tetrahedron are more than nodal equilibrium can "
+        "determine, on either mesh. What is determined is recovered exactly. More load cases do not help; fewer unknowns do.",
     )
-    return Section("What meshes and trials can determine", text, (table,))
+    return Section("Identifiability by mesh and load cases", text, (table,))
 
 
 def mean_error_percent(body: PushedBody, found: Mapping[str, tuple[float, float]]) -> float:
-    """Return the error (3.35), per cent, if whole regions have other Young's moduli, kPa, and Poisson's ratios."""
+    """Return the error (3.35), per cent, for other Young's moduli, kPa, and Poisson's ratios of whole regions."""
     other = PushedBody(body.name, body.mesh, {**body.truth, **found}, body.known, body.pushes, body.law)
     first, second = body.displacement(body.pushes[0]), other.displacement(body.pushes[0])
     return shape_error_percent(first, second, SIDE_MM, SIDE_MM)

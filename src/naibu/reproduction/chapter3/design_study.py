@@ -1,4 +1,4 @@
-"""The report's two open questions: how stiff should the known object be, and how dense mesh and markers (spec I6)."""
+"""Two open questions of the 2008 report :cite:p:`hirai2008` (chapter 3.7): stiffness of the known object, density of mesh and markers."""
 
 from __future__ import annotations
 
@@ -30,45 +30,45 @@ MARKERS_A_SIDE, CELLS_A_SIDE, TRUTH_CELLS = (5, 6, 8, 10), (4, 8, 12), 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Repeated:
-    """Root mean square errors of repeated identifications with noise: of ln E, and of Poisson's ratio, (2,) each."""
+class MonteCarloErrors:
+    """Root mean square errors of identifications with noise (Monte Carlo): of ln E and of Poisson's ratio, (2,) each."""
 
     young_modulus: FloatArray
     poisson_ratio: FloatArray
 
 
 def cube_with_known(ratio: float, divisions: int = 4) -> PushedBody:
-    """Return the cube of two unknown layers under a known half that is `ratio` times as stiff as their mean."""
+    """Return the cube of two unknown layers below a known half that is `ratio` times as stiff as their mean."""
     mean = float(np.mean([young for young, _ in LAYERS.values()]))
     return cube(LAYERS, known=(ratio * mean, 0.43), divisions=divisions)
 
 
-def planned(body: PushedBody, points: FloatArray, vectors: FloatArray) -> list[FieldLoadCase]:
-    """Return the push as it will be measured at some points, without noise yet."""
+def planned_trials(body: PushedBody, points: FloatArray, vectors: FloatArray) -> list[FieldLoadCase]:
+    """Return the load case as it is measured at given points, without noise."""
     field = DisplacementField.from_arrays(points, vectors, sd_mm=NOISE_MM)
-    return [FieldLoadCase.of("push", field, body.mesh, loaded=body.constrained)]
+    return [FieldLoadCase.of("indentation", field, body.mesh, loaded=body.constrained)]
 
 
 def known_stiffness(ratio: float) -> Accuracy:
-    """Return the accuracy to expect where all nodes of the report's mesh are measured, for one stiffness of the known half."""
+    """Return the expected accuracy if all nodes of the report's mesh are measured, for a stiffness ratio of the known half."""
     body = cube_with_known(ratio)
     young, poisson = np.array(list(LAYERS.values())).T
-    trials = planned(body, body.mesh.points, body.displacement(PUSH))
+    trials = planned_trials(body, body.mesh.points, body.displacement(PUSH))
     return expected_accuracy(body.mesh, trials, body.zones(), young_modulus=young, poisson_ratio=poisson)
 
 
 def density(cells: int, markers: int, truth: PushedBody, displacement: FloatArray) -> Accuracy:
-    """Return the accuracy to expect on a model of `cells` a side with a lattice of `markers` a side, of a body solved on a finer mesh."""
+    """Return the expected accuracy on a model of `cells` per edge with `markers` per edge, for a body solved on a finer mesh."""
     at = (np.arange(markers) + 0.5) / markers * SIDE_MM
     points = np.array(np.meshgrid(at, at, at, indexing="ij")).reshape(3, -1).T
     body = cube_with_known(1.0, cells)
     young, poisson = np.array(list(LAYERS.values())).T
-    trials = planned(body, points, interpolation_operator(truth.mesh, points) @ displacement)
+    trials = planned_trials(body, points, interpolation_operator(truth.mesh, points) @ displacement)
     return expected_accuracy(body.mesh, trials, body.zones(), young_modulus=young, poisson_ratio=poisson)
 
 
-def repeated(ratio: float, draws: int, seed: int) -> Repeated:
-    """Identify the two layers from noisy data again and again, and return the errors: the check of the expected ones."""
+def monte_carlo_errors(ratio: float, draws: int, seed: int) -> MonteCarloErrors:
+    """Return the errors of repeated identifications of the two layers from noisy data, to verify the expected accuracy."""
     body = cube_with_known(ratio)
     lame, shear = (values[[np.flatnonzero(body.mesh.regions == k)[0] for k in range(2)]] for values in body.moduli)
     young, poisson = np.array(list(LAYERS.values())).T
@@ -76,41 +76,41 @@ def repeated(ratio: float, draws: int, seed: int) -> Repeated:
     exact, rng = body.displacement(PUSH), np.random.default_rng(seed)
     errors = []
     for _ in range(draws):
-        noisy = planned(body, body.mesh.points, exact + NOISE_MM * rng.standard_normal(exact.shape))
+        noisy = planned_trials(body, body.mesh.points, exact + NOISE_MM * rng.standard_normal(exact.shape))
         model = FieldModel(body.mesh, noisy, body.zones())
         e, nu = young_and_poisson(search(model, first_point(model, truth), Objective()).point.theta)
         errors.append([np.log(e / young), nu - poisson])
     rms = np.sqrt(np.mean(np.square(errors), axis=0))
-    return Repeated(rms[0], rms[1])
+    return MonteCarloErrors(rms[0], rms[1])
 
 
 def design_section(*, draws: int = 40, seed: int = 0) -> Section:
-    """Return both answers as tables and figures.
+    """Return both studies as tables and figures.
 
     Parameters
     ----------
     draws : int
-        Noisy identifications for each check by Monte Carlo.
+        Noisy identifications for each Monte Carlo verification.
     seed : int
-        Of the noise.
+        Seed of the noise.
     """
     expected = [known_stiffness(ratio) for ratio in RATIOS]
-    checked = {ratio: repeated(ratio, draws, seed) for ratio in CHECKED}
+    checked = {ratio: monte_carlo_errors(ratio, draws, seed) for ratio in CHECKED}
     truth = cube_with_known(1.0, TRUTH_CELLS)
     displacement = truth.displacement(PUSH)
     lattices = {(n, k): density(n, k, truth, displacement) for n in CELLS_A_SIDE for k in MARKERS_A_SIDE}
     worse = np.array([a.young_modulus_sd.max() for a in expected])
     good = [ratio for ratio, sd in zip(RATIOS, worse, strict=True) if sd < 1.5 * worse.min()]
     text = (
-        "The report asks how stiff the known object should be, and how the mesh changes the accuracy. Both are answered before anything is "
-        "identified, by the covariance that displacement matching will have: the Cramer-Rao bound, with the unknown displacement of the "
-        f"floor and the top estimated along. Cube of {SIDE_MM:g} mm, two unknown layers under a known half, one push of 10 mm, noise "
+        "The report asks how stiff the known object should be, and how the mesh affects the accuracy. Both are answered before any "
+        "identification, by the covariance of displacement matching: the Cramer-Rao bound, with the unknown displacement of the floor and "
+        f"the top estimated as well. Cube of {SIDE_MM:g} mm, two unknown layers below a known half, one indentation of 10 mm, noise SD "
         f"{NOISE_MM:g} mm.",
-        f"Among the ratios tried, the worse of the two moduli is found best with a known half {RATIOS[int(worse.argmin())]:g} times as "
-        f"stiff as the unknown layers; from {good[0]:g} to {good[-1]:g} its error stays below 1.5 times the smallest. A soft known "
-        "body takes all the deformation and leaves the unknown one unmoved; a stiff one hardly deforms, and its forces are lost in noise.",
-        "The noise of the result falls with the number of markers, the error of the mesh with its cells: on a mesh as coarse as that of "
-        "the report the latter decides, however many markers there are.",
+        f"Among the ratios tried, the less accurate of the two moduli is best with a known half {RATIOS[int(worse.argmin())]:g} times as "
+        f"stiff as the unknown layers; from {good[0]:g} to {good[-1]:g} its error is below 1.5 times the smallest. A soft known "
+        "object takes all the deformation; a stiff one hardly deforms, and its forces are lost in the noise.",
+        "The error due to noise decreases with the number of markers, the discretisation error with the number of cells: on a mesh as "
+        "coarse as that of the report the latter dominates, however many markers there are.",
     )
     tables = (_stiffness_table(expected, checked, draws), _density_table(lattices))
     figures = (
@@ -122,20 +122,20 @@ def design_section(*, draws: int = 40, seed: int = 0) -> Section:
         ),
         Figure(
             "Mesh and marker density",
-            "Expected root mean square relative error of Young's modulus, both layers together: noise (dashed), and noise with the error "
-            f"of the mesh (solid). The truth is a mesh of {TRUTH_CELLS} cells a side.",
+            "Expected root mean square relative error of Young's modulus, both layers together: noise (dashed), noise and discretisation "
+            f"(solid). The truth is computed on a mesh of {TRUTH_CELLS} cells per edge.",
             lambda canvas: _draw_density(canvas, lattices),
             (6.0, 3.6),
         ),
     )
-    return Section("How stiff a known object, how dense a mesh", text, tables, figures)
+    return Section("Stiffness of the known object, density of mesh and markers", text, tables, figures)
 
 
-def _stiffness_table(expected: list[Accuracy], checked: dict[float, Repeated], draws: int) -> Table:
+def _stiffness_table(expected: list[Accuracy], checked: dict[float, MonteCarloErrors], draws: int) -> Table:
     names = tuple(LAYERS)
     columns: tuple[str, ...] = ("known / unknown stiffness",)
-    columns += tuple(f"E of {name}: expected sd, %" for name in names) + tuple(f"E of {name}: {draws} draws, %" for name in names)
-    columns += tuple(f"nu of {name}: expected sd" for name in names) + tuple(f"nu of {name}: {draws} draws" for name in names)
+    columns += tuple(f"E of {name}: expected SD, %" for name in names) + tuple(f"E of {name}: {draws} draws, %" for name in names)
+    columns += tuple(f"nu of {name}: expected SD" for name in names) + tuple(f"nu of {name}: {draws} draws" for name in names)
     rows = []
     for ratio, a in zip(RATIOS, expected, strict=True):
         found = checked.get(ratio)
@@ -146,7 +146,7 @@ def _stiffness_table(expected: list[Accuracy], checked: dict[float, Repeated], d
 
 
 def _density_table(lattices: dict[tuple[int, int], Accuracy]) -> Table:
-    columns = ("cells a side", "markers a side", "E: sd by noise, %", "E: error of the mesh, %", "nu: sd by noise", "nu: error of the mesh")
+    columns = ("cells per edge", "markers per edge", "E: SD by noise, %", "E: mesh error, %", "nu: SD by noise", "nu: mesh error")
     rows = tuple(
         (n, k, 100.0 * _rms(a.young_modulus_sd), 100.0 * _rms(a.young_modulus_bias), _rms(a.poisson_ratio_sd), _rms(a.poisson_ratio_bias))
         for (n, k), a in lattices.items()
@@ -158,7 +158,7 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _draw_stiffness(canvas: Canvas, expected: list[Accuracy], checked: dict[float, Repeated]) -> None:
+def _draw_stiffness(canvas: Canvas, expected: list[Accuracy], checked: dict[float, MonteCarloErrors]) -> None:
     left, right = canvas.subplots(1, 2)
     for k, (name, colour) in enumerate(zip(LAYERS, ("#414487", "#22a884"), strict=True)):
         left.loglog(RATIOS, [100.0 * a.young_modulus_sd[k] for a in expected], color=colour, label=name)
@@ -176,9 +176,9 @@ def _draw_density(canvas: Canvas, lattices: dict[tuple[int, int], Accuracy]) -> 
     axes = canvas.subplots()
     for n, colour in zip(CELLS_A_SIDE, ("#440154", "#21918c", "#b5b81c"), strict=True):
         own = [lattices[n, k] for k in MARKERS_A_SIDE]
-        axes.semilogy(MARKERS_A_SIDE, [100.0 * _rms(a.young_modulus_error) for a in own], "o-", color=colour, label=f"{n} cells a side")
+        axes.semilogy(MARKERS_A_SIDE, [100.0 * _rms(a.young_modulus_error) for a in own], "o-", color=colour, label=f"{n} cells per edge")
         axes.semilogy(MARKERS_A_SIDE, [100.0 * _rms(a.young_modulus_sd) for a in own], "--", color=colour)
-    axes.set_xlabel("markers a side")
+    axes.set_xlabel("markers per edge")
     axes.set_ylabel("error of Young's modulus, %")
     axes.grid(alpha=0.3, which="both")
     axes.legend(frameon=False)

@@ -1,50 +1,21 @@
-"""Figures of chapter 3: meshes, moduli of single tetrahedra and their distribution, pushed cubes, and the mesh of the markers."""
+"""Figures of chapter 3: meshes, moduli of single tetrahedra and their distribution, deformed cubes, and the marker mesh."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.mesh import Mesh
-from naibu.identification.equilibrium_gap.batch import EquilibriumGapEstimate
-from naibu.reproduction.chapter3.bodies import PushedBody
+from naibu.reproduction.chapter3.cell_identification import CellResult
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
 Ranges = Mapping[str, tuple[tuple[float, float], tuple[float, float]]]
-
-
-class Result(Protocol):
-    """Moduli of single tetrahedra and the displacement that follows from them; see `naibu.reproduction.chapter3.cubes.CellResult`."""
-
-    @property
-    def body(self) -> PushedBody:
-        """The case."""
-        ...
-
-    @property
-    def estimate(self) -> EquilibriumGapEstimate:
-        """Of single tetrahedra."""
-        ...
-
-    @property
-    def displacement(self) -> FloatArray:
-        """With the true moduli (n, 3), mm."""
-        ...
-
-    @property
-    def again(self) -> FloatArray:
-        """With the identified moduli (n, 3), mm."""
-        ...
-
-    def layer(self, name: str) -> BoolArray:
-        """Return the zones (count,) that lie in a layer."""
-        ...
 
 
 def meshes(canvas: Canvas, shown: Mapping[str, Mesh]) -> None:
@@ -58,7 +29,7 @@ def meshes(canvas: Canvas, shown: Mapping[str, Mesh]) -> None:
 
 
 def face_triangles(mesh: Mesh, axis: int, coordinate: float) -> IntArray:
-    """Return the triangles (k, 3) of tetrahedra that lie on the plane where a coordinate has a value, mm."""
+    """Return the faces (k, 3) of tetrahedra in the plane where coordinate `axis` has a value, mm."""
     faces = mesh.cells[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3)
     return np.asarray(faces[(np.abs(mesh.points[faces, axis] - coordinate) < 1e-9).all(axis=1)])
 
@@ -67,7 +38,7 @@ def _oblique(points: FloatArray) -> FloatArray:
     return np.column_stack([points[:, 0] + 0.4 * points[:, 1], points[:, 2] + 0.4 * points[:, 1]])
 
 
-def by_cell(canvas: Canvas, result: Result, layer: str) -> None:
+def by_cell(canvas: Canvas, result: CellResult, layer: str) -> None:
     """Draw the moduli of the tetrahedra of a layer, and the true ones."""
     panels = canvas.subplots(2, 1, sharex=True)
     at, (e, nu) = result.layer(layer), result.body.truth[layer]
@@ -80,7 +51,7 @@ def by_cell(canvas: Canvas, result: Result, layer: str) -> None:
     panels[1].set_xlabel("tetrahedron")
 
 
-def histograms(canvas: Canvas, result: Result, layer: str, printed: Ranges) -> None:
+def histograms(canvas: Canvas, result: CellResult, layer: str, printed: Ranges) -> None:
     """Draw the distribution of the moduli of a layer, the true values and the printed ranges."""
     panels = canvas.subplots(1, 2, sharey=True)
     at, (e, nu) = result.layer(layer), result.body.truth[layer]
@@ -96,8 +67,8 @@ def histograms(canvas: Canvas, result: Result, layer: str, printed: Ranges) -> N
     panels[0].legend()
 
 
-def deformed(canvas: Canvas, result: Result) -> None:
-    """Draw the front of the pushed cube with the true moduli and, over it, with the identified ones."""
+def deformed(canvas: Canvas, result: CellResult) -> None:
+    """Draw the front of the deformed cube with the true and with the identified moduli."""
     axes = canvas.add_subplot()
     mesh = result.body.mesh
     triangles = face_triangles(mesh, 1, 0.0)
@@ -108,7 +79,7 @@ def deformed(canvas: Canvas, result: Result) -> None:
 
 
 def _outline(axes: Axes, points: FloatArray, triangles: IntArray, style: str, label: str) -> None:
-    """Draw edges of triangles once."""
+    """Draw the edges of triangles, each once."""
     edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
     lines = np.full((3 * len(edges), 2), np.nan)
     lines[0::3], lines[1::3] = points[edges[:, 0]], points[edges[:, 1]]
@@ -116,10 +87,10 @@ def _outline(axes: Axes, points: FloatArray, triangles: IntArray, style: str, la
 
 
 def marker_mesh_views(canvas: Canvas, points: FloatArray, moved: FloatArray, interpolated: BoolArray) -> None:
-    """Draw the markers of a lattice (planes, rows, columns, 3) from above and from the side, before and after, with interface nodes."""
+    """Draw a marker grid (planes, rows, columns, 3), mm, from above and from the side, before and after loading, with interface nodes."""
     panels = canvas.subplots(1, 2)
     middle = points.shape[1] // 2
-    for position, style, label in ((points, "0.6", "free"), (moved, "C0", "pushed")):
+    for position, style, label in ((points, "0.6", "unloaded"), (moved, "C0", "loaded")):
         panels[0].plot(*_mesh_lines(position[0][..., :2]).T, color=style, linewidth=0.9, label=label)
         panels[1].plot(*_mesh_lines(position[:, middle][..., [0, 2]]).T, color=style, linewidth=0.9, label=label)
         on = position[interpolated][:, middle]
@@ -130,7 +101,7 @@ def marker_mesh_views(canvas: Canvas, points: FloatArray, moved: FloatArray, int
 
 
 def _mesh_lines(grid: FloatArray) -> FloatArray:
-    """Lines (k, 2) along rows and columns of a grid (rows, columns, 2), with breaks."""
+    """Return lines (k, 2) along rows and columns of a grid (rows, columns, 2), separated by NaN."""
     parts = []
     for lines in (grid, np.swapaxes(grid, 0, 1)):
         broken = np.full((lines.shape[0], lines.shape[1] + 1, 2), np.nan)
@@ -140,12 +111,12 @@ def _mesh_lines(grid: FloatArray) -> FloatArray:
 
 
 def efficiencies(canvas: Canvas, cases: Mapping[str, tuple[float, float]]) -> None:
-    """Draw root mean square errors over the bound: of least squares, and of the weighted balance."""
+    """Draw root mean square errors over the Cramér-Rao bound, of least squares and of the weighted equilibrium gap."""
     axes = canvas.add_subplot()
-    place = np.arange(len(cases))
+    position = np.arange(len(cases))
     for shift, name, index in ((-0.2, "least squares (report)", 0), (0.2, "weighted by the noise", 1)):
-        axes.bar(place + shift, [values[index] for values in cases.values()], width=0.38, label=name)
+        axes.bar(position + shift, [values[index] for values in cases.values()], width=0.38, label=name)
     axes.axhline(1.0, color="k", linewidth=0.8, label="Cramer-Rao bound")
-    axes.set_xticks(place, list(cases))
+    axes.set_xticks(position, list(cases))
     axes.set(ylabel="root mean square error / bound", yscale="log")
     axes.legend()

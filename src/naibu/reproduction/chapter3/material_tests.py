@@ -1,7 +1,7 @@
-"""Tables 3.4 and 3.5 of the report: the gels' moduli from compression tests and from strains in CT images (spec S9).
+"""Material tests, Tables 3.4 and 3.5 of the 2008 report :cite:p:`hirai2008`: moduli of the gels from compression and from CT images.
 
-The report prints no readings of its tests, only their results. What can be reproduced is what follows from those: the means and how sure
-they are, the effect that could make the specimens of one gel differ, and, for Poisson's ratio, what the markers inside the same gels say.
+The report prints no readings of its tests, only their results. Reproduced is what follows from these: the means and their uncertainty, the
+effects that could make the specimens of one gel differ :cite:p:`gent1959`, and, for Poisson's ratio, the markers inside the same gels.
 """
 
 from __future__ import annotations
@@ -24,23 +24,24 @@ from naibu.reproduction.chapter3.poisson_readings import (
     SIDE_MM,
     constrained_block,
     marker_ratios,
-    pairs_that_fit,
+    matching_pairs,
     readings,
 )
+from naibu.reproduction.printed_tables import printed_table
 from naibu.viewer.chapter import Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
-VOLUME_SPREAD = 0.03  # of the markers' volume ratios about 1
+VOLUME_SPREAD = 0.03  # range of the markers' volume ratios about 1
 Spread = Callable[[FloatArray, "Specimens", float], FloatArray]  # moduli of the specimens' gels, specimens, parameter -> apparent moduli
-USUAL_STRAIN = 0.1  # at which a compression test of a gel reads its modulus; the report does not state its own
+USUAL_STRAIN = 0.1  # at which compression tests of gels are evaluated; the report does not state it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Specimens:
-    """The cylinders of Table 3.4: gel (number), shape factor, area over height (mm), height (mm), printed modulus (kPa); (6,) each."""
+    """Cylinders of Table 3.4: gel (number), shape factor, area over height (mm), height (mm), printed modulus (kPa); (6,) each."""
 
     gel: IntArray
     shape_factor: FloatArray
@@ -50,8 +51,8 @@ class Specimens:
 
 
 CHANCE, CONSTRAINED, COMPLIANCE, SLACK = (
-    "nothing but chance",
-    "faces held by the plates, 1 + 2 S^2 (Gent and Lindley 1959)",
+    "chance alone",
+    "faces bonded to the plates, 1 + 2 S^2 (Gent and Lindley 1959)",
     "compliance of the machine, mm/mN",
     "slack counted as strain, mm at a strain of 10 %",
 )
@@ -63,14 +64,8 @@ _SPREAD: dict[str, tuple[Spread, bool]] = {
 }
 
 
-def printed_table(number: str) -> tuple[tuple[str, ...], list[list[Any]]]:
-    """Return columns and rows of one of the report's tables (`naibu.datasets.paper_tables`), as printed."""
-    table = next(t for t in datasets.paper_tables()["tables"] if t["id"] == number)
-    return tuple(table["columns"]), table["rows"]
-
-
 def table_3_4() -> Section:
-    """Return Table 3.4: Young's moduli of the gels from compression tests, printed and ours, and what could make the specimens differ."""
+    """Return Table 3.4: Young's moduli of the gels from compression tests, printed and ours, and effects that could spread them."""
     _, rows = printed_table("3.4")
     cells: list[tuple[Cell, ...]] = []
     for gel in dict.fromkeys(r[0] for r in rows):
@@ -87,12 +82,12 @@ def table_3_4() -> Section:
              f"{low:.0f} to {high:.0f}")
         )  # fmt: skip
     columns = (
-        "gel", "diameter (mm)", "height (mm)", "E, paper (kPa)", "shape factor S", "E if the faces were held, ours (kPa)",
+        "gel", "diameter (mm)", "height (mm)", "E, paper (kPa)", "shape factor S", "E for bonded faces, ours (kPa)",
         "mean, paper (kPa)", "mean, ours (kPa)", "standard error (kPa)", "95 % interval (kPa)",
     )  # fmt: skip
     note = (
         "Means are those of the three specimens. Interval: Student's t with 2 degrees of freedom. The corrected column divides by "
-        "1 + 2 S^2, as if the plates had held the faces."
+        "1 + 2 S^2, as if the faces had been bonded to the plates."
     )
     tables = (
         Table(
@@ -117,9 +112,16 @@ def _specimens(rows: list[list[Any]]) -> Specimens:
 
 
 def explained_spread(specimens: Specimens, effect: str) -> tuple[tuple[float, float], float | None, float]:
-    """Fit two moduli, kPa, and the effect's parameter, if it has one, to the printed moduli: returns both and the scatter left (relative).
+    """Fit two moduli and the parameter of an effect, if it has one, to the printed moduli, by least squares of the logarithms.
 
-    Least squares of the logarithms, per degree of freedom.
+    Returns
+    -------
+    moduli : (float, float)
+        Young's moduli of both gels, kPa.
+    parameter : float or None
+        Parameter of the effect.
+    residual_sd : float
+        Relative standard deviation of the residuals, per degree of freedom.
     """
     model, has_parameter = _SPREAD[effect]
 
@@ -130,25 +132,25 @@ def explained_spread(specimens: Specimens, effect: str) -> tuple[tuple[float, fl
     starts = [-12.0, -8.0, -4.0, 0.0] if has_parameter else [0.0]
     fits = [least_squares(residual, np.r_[np.log([200.0, 100.0]), start][: 2 + has_parameter]) for start in starts]
     best = min(fits, key=lambda fit: float(fit.cost))
-    scatter = float(np.sqrt(2.0 * best.cost / (len(specimens.gel) - 2 - has_parameter)))
+    residual_sd = float(np.sqrt(2.0 * best.cost / (len(specimens.gel) - 2 - has_parameter)))
     moduli = float(np.exp(best.x[0])), float(np.exp(best.x[1]))
-    return moduli, float(np.exp(best.x[2])) if has_parameter else None, scatter
+    return moduli, float(np.exp(best.x[2])) if has_parameter else None, residual_sd
 
 
 def _spread_table(rows: list[list[Any]]) -> Table:
-    """How well one shared effect explains the six moduli: two moduli, and at most one more number, for six values."""
+    """Return how well one common effect explains the six moduli: two moduli, and at most one more parameter, for six values."""
     cells: list[tuple[Cell, ...]] = []
     for effect in _SPREAD:
-        moduli, parameter, scatter = explained_spread(_specimens(rows), effect)
+        moduli, parameter, residual_sd = explained_spread(_specimens(rows), effect)
         shown = None if parameter is None else float(f"{parameter:.2g}")
-        cells.append((effect, *(round(e, 0) for e in moduli), shown, round(100.0 * scatter, 1)))
+        cells.append((effect, *(round(e, 0) for e in moduli), shown, round(100.0 * residual_sd, 1)))
     columns = (
-        "what would make them differ",
+        "effect",
         *(f"E of {g} (kPa)" for g in dict.fromkeys(r[0] for r in rows)),
-        "size of it",
-        "scatter left (%)",
+        "its size",
+        "residual SD (%)",
     )
-    note = "Least squares of ln E, scatter per degree of freedom. Six values bear no finer judgement than which effect goes the right way."
+    note = "Least squares of ln E, residual SD per degree of freedom. Six values only show which effects have the right sign."
     return Table("Spread of Table 3.4", columns, tuple(cells), caption="Effects that could make specimens of one gel differ.", note=note)
 
 
@@ -158,28 +160,28 @@ def _spread_text(table: Table) -> tuple[str, ...]:
     slack, compliance = by_name[SLACK][-2], float(str(by_name[COMPLIANCE][-2]))
     return (
         "The report gives neither the readings nor the range of strain nor the friction at the plates. Within each gel the lowest "
-        "specimen has the lowest modulus. Plates that hold the faces would do the opposite - they make low specimens look stiffer - and "
-        f"the correction for it takes the scatter from {left[CHANCE]:.0f} to {left[CONSTRAINED]:.0f} %. Slack or a machine's compliance "
-        f"counted as strain goes the right way and leaves {left[SLACK]:.0f} and {left[COMPLIANCE]:.0f} %, but it would take {slack} mm of "
+        "specimen has the lowest modulus. Bonded faces would have the opposite effect - they make low specimens appear stiffer - and the "
+        f"correction for them changes the residual SD from {left[CHANCE]:.0f} to {left[CONSTRAINED]:.0f} %. Slack or machine compliance "
+        f"counted as strain has the right sign and leaves {left[SLACK]:.0f} and {left[COMPLIANCE]:.0f} %, but it would take {slack} mm of "
         f"slack or {1e3 * compliance:.2g} mm/N of compliance, and moduli far above the printed ones. Specimens cast at different times may "
-        "as well differ. The readings would tell: naibu.identification.material_testing.uniaxial.compression_test "
-        "estimates the slack from them.",
+        "also differ. The readings would decide: naibu.identification.material_testing.uniaxial.compression_test estimates the slack "
+        "from them.",
     )
 
 
 def table_3_5(*, divisions: int = 6) -> Section:
-    """Return Table 3.5: Poisson's ratios, printed and ours, and every explanation of their difference that can be put to numbers.
+    """Return Table 3.5: Poisson's ratios, printed and ours, and quantified explanations of their difference.
 
     Parameters
     ----------
     divisions : int
-        Cells along the side of the computed block whose faces are held.
+        Cells per edge of the simulated block with constrained faces.
     """
     _, rows = printed_table("3.5")
     printed = {row[0]: (-float(row[1]), float(row[2]), float(row[3])) for row in rows}
     tables = (_ratio_table(printed), _definition_table(printed), _candidate_table(printed, divisions), _volume_table(printed, divisions))
-    caption = "Transversal strain of every layer of markers under a plate, and what the report prints for the gels."
-    figures = (Figure("Widening of the marker layers", caption, _draw_widening),)
+    caption = "Lateral strain of every marker layer under a plate, and the values printed in the report."
+    figures = (Figure("Lateral strain of the marker layers", caption, _draw_lateral_strain),)
     return Section("Table 3.5: Poisson's ratio from CT images", _ratio_text(printed, tables), tables, figures)
 
 
@@ -199,12 +201,12 @@ def _ratio_table(printed: dict[str, tuple[float, float, float]]) -> Table:
              round(r.standard_error, 3), round(r.volume_ratio, 3), round(r.volume_ratio_standard_error, 3))
         )  # fmt: skip
     columns = (
-        "gel", "source", "longitudinal strain", "transversal strain", "nu, paper", "nu, ratio of strains", "nu, Hencky", "standard error",
+        "gel", "source", "axial strain", "lateral strain", "nu, paper", "nu, ratio of strains", "nu, Hencky", "standard error",
         "volume ratio J", "standard error of J",
     )  # fmt: skip
     note = (
-        "Shortening is positive, as the report prints it. 0.10 / 0.32 is 0.31; 0.33 is printed. Markers: local affine maps, 0.15 mm for "
-        "each coordinate. nu (Hencky) = (1 - ln J / ln l) / 2; the gel of the plate cube is not stated."
+        "Compression is positive, as in the report. 0.10 / 0.32 is 0.31; 0.33 is printed. Markers: local affine maps, SD of a coordinate "
+        "0.15 mm. nu (Hencky) = (1 - ln J / ln l) / 2; the gel of the plate cube is not stated."
     )
     return Table("Table 3.5", columns, tuple(cells), caption="Poisson's ratio of the gels.", note=note)
 
@@ -223,7 +225,7 @@ def _definition_table(printed: dict[str, tuple[float, float, float]]) -> Table:
     for name, stretch in _STRETCH.items():
         volumes = [stretch(along) * stretch(across) ** 2 for along, across, _ in printed.values()]
         cells.append((name, *(round(v, 3) for v in volumes)))
-    columns = ("strain, if it was read as", *(f"J of {gel}" for gel in printed))
+    columns = ("strain, if it was defined as", *(f"J of {gel}" for gel in printed))
     note = f"A definition would explain the table if both volume ratios were those of the markers, 1.00 within {VOLUME_SPREAD:g}."
     return Table("Strain measures", columns, tuple(cells), caption="Volume ratios that the printed strains imply.", note=note)
 
@@ -239,21 +241,21 @@ def _candidate_table(printed: dict[str, tuple[float, float, float]], divisions: 
             row += [round(-along, 3), round(across, 3), round(-across / along, 2)]
         cells.append((*row, *(round(d, 1) for d in distances)))
     columns = (
-        "reading", *(f"{what}, {gel}" for gel in GELS for what in ("longitudinal", "transversal", "nu")),
-        *(f"distance from printed, {gel} (sd)" for gel in GELS),
+        "reading", *(f"{what}, {gel}" for gel in GELS for what in ("axial", "lateral", "nu")),
+        *(f"distance from printed, {gel} (SD)" for gel in GELS),
     )  # fmt: skip
     note = f"Markers of ct_two_material_2, the experiment of chapter 3.6. One standard deviation of a reading is taken as {READING_SD:g}."
     return Table(
         "Candidate readings",
         columns,
         tuple(cells),
-        caption="Strains that a reader of the images could have taken, beside the printed ones.",
+        caption="Strains that could have been read from the images, and the printed ones.",
         note=note,
     )
 
 
 def _candidates(printed: dict[str, tuple[float, float, float]], divisions: int) -> dict[str, dict[str, tuple[float, float]]]:
-    """For every candidate, longitudinal and transversal strain of both gels."""
+    """Return axial and lateral strain of both gels for every candidate reading."""
     seen = readings("ct_two_material_2", "deformed")
     lateral = {gel: {k: v for k, v in seen.transversal.items() if gel in k} for gel in GELS}
     own = {gel: float(np.mean(list(lateral[gel].values()))) for gel in GELS}
@@ -264,14 +266,14 @@ def _candidates(printed: dict[str, tuple[float, float, float]], divisions: int) 
     free = {gel: float((1.0 + printed[gel][0]) ** -0.5) - 1.0 for gel in GELS}
     out = {
         "the gel's own layers": {g: (along[g], own[g]) for g in GELS},
-        "shortening of the whole stack, the gel's widening": {g: (stack, own[g]) for g in GELS},
-        "shortening of the whole stack, widening of the gel's layer nearest to plate or table": {g: (stack, least[g]) for g in GELS},
-        "shortening from the stated height, the gel's widening": {g: (stated, own[g]) for g in GELS},
-        "volume kept, sides free": {g: (printed[g][0], free[g]) for g in GELS},
-        "volume kept, one side of two read": {g: (printed[g][0], 0.5 * free[g]) for g in GELS},
+        "axial strain of the whole stack, lateral strain of the gel": {g: (stack, own[g]) for g in GELS},
+        "axial strain of the whole stack, lateral strain of the gel's outermost layer": {g: (stack, least[g]) for g in GELS},
+        "axial strain from the stated height, lateral strain of the gel": {g: (stated, own[g]) for g in GELS},
+        "incompressible, free sides": {g: (printed[g][0], free[g]) for g in GELS},
+        "incompressible, one side of two read": {g: (printed[g][0], 0.5 * free[g]) for g in GELS},
     }
     for name, height in (("middle", 0.5), ("one sixth of the height above a face", 1 / 6), ("one twelfth above a face", 1 / 12)):
-        key = f"computed block, nu 0.49, faces held, read in the {name}" if height == 0.5 else f"computed block, faces held, read {name}"
+        key = f"simulated block, nu 0.49, constrained faces, {name}"
         out[key] = {g: (printed[g][0], constrained[g].transversal_at(height)) for g in GELS}
     return out
 
@@ -282,10 +284,10 @@ def _volume_table(printed: dict[str, tuple[float, float, float]], divisions: int
         for nu, whose in ((value, "printed"), (0.49, "0.49")):
             block = constrained_block(-along, nu, divisions)
             cells.append((gel, whose, nu, -along, round(block.volume_ratio, 3), round(block.transversal_at(0.5), 3)))
-    columns = ("gel", "which nu", "nu", "longitudinal strain", "volume ratio of the block", "transversal strain in the middle")
-    note = "Cube with held faces, law neo_hookean, hexahedra with shared dilatation."
+    columns = ("gel", "source of nu", "nu", "axial strain", "volume ratio of the block", "lateral strain in the middle")
+    note = "Cube with constrained faces, neo-Hookean, hexahedra with mean dilatation."
     return Table(
-        "Volume under the printed ratio", columns, tuple(cells), caption="What markers would show if the printed ratio held.", note=note
+        "Volume under the printed ratio", columns, tuple(cells), caption="Marker strains for the printed Poisson ratio.", note=note
     )
 
 
@@ -293,32 +295,30 @@ def _ratio_text(printed: dict[str, tuple[float, float, float]], tables: Sequence
     volumes = [source.ratio.volume_ratio for source in marker_ratios()]
     lost = [1.0 - (1.0 + a) * (1.0 + t) ** 2 for a, t, _ in printed.values()]
     pixels = [((1.0 + a) ** -0.5 - 1.0 - t) * SIDE_MM / PIXEL_MM for a, t, _ in printed.values()]
-    counts = pairs_that_fit(list(printed.values()))
+    counts = matching_pairs(list(printed.values()))
     distances = {str(row[0]): tuple(float(str(d)) for d in row[-len(GELS) :]) for row in tables[2].rows}
     nearest = min(distances, key=lambda name: max(distances[name]))
     kept = [str(row[0]) for row in tables[1].rows if all(abs(float(str(v)) - 1.0) <= VOLUME_SPREAD for v in row[1:])]
     constrained = [float(str(row[4])) for row in tables[3].rows if row[1] != "printed"]
-    measure = (
-        f"read as {' or '.join(kept)}, both printed pairs keep the volume" if kept else "under none do both printed pairs keep the volume"
-    )
+    measure = f"read as {' or '.join(kept)}, both printed pairs are isochoric" if kept else "under none are both printed pairs isochoric"
     return (
-        f"The printed strains mean that the gels lost {100 * lost[0]:.0f} and {100 * lost[1]:.0f} % of their volume. The markers inside "
-        f"the same gels, in the same kind of images, say {min(volumes):.2f} to {max(volumes):.2f} times the free volume.",
-        f"Resolution: were the volume kept, the width of the {SIDE_MM:.0f} mm cube would have been misread by {pixels[0]:.0f} and "
-        f"{pixels[1]:.0f} pixels. Strain measure: {measure}. Held faces: they hold the widening back near plate and table only, and at "
-        f"nu = 0.49 leave {min(constrained):.2f} to {max(constrained):.2f} of the volume (last table).",
-        f"Other readings: of all {counts.tried} pairs of a longitudinal and a transversal strain between marker layers of the bundled "
+        f"The printed strains imply that the gels lost {100 * lost[0]:.0f} and {100 * lost[1]:.0f} % of their volume. The markers inside "
+        f"the same gels, in the same kind of images, give {min(volumes):.2f} to {max(volumes):.2f} times the undeformed volume.",
+        f"Resolution: for an incompressible gel, the width of the {SIDE_MM:.0f} mm cube would have been misread by {pixels[0]:.0f} and "
+        f"{pixels[1]:.0f} pixels. Strain measure: {measure}. Constrained faces: they reduce the lateral strain near plate and table only, "
+        f"and at nu = 0.49 leave {min(constrained):.2f} to {max(constrained):.2f} of the volume (last table).",
+        f"Other readings: of all {counts.tried} pairs of an axial and a lateral strain between marker layers of the bundled "
         f"plate experiments, {counts.fitting[0]} lie within two standard deviations of the printed pair of {GELS[0]} and "
         f"{counts.fitting[1]} of that of {GELS[1]}. Of the candidates in the third table the one nearest to both is '{nearest}': "
         f"{distances[nearest][0]:g} and {distances[nearest][1]:g} standard deviations away.",
-        "So the printed ratios are no property of the gels. How the strains were read is not recorded, and none of these candidates is "
-        "proven by its closeness; a ratio of two strains is Poisson's ratio only at small strain and where the sides are free, and the "
-        "change of volume between markers needs neither.",
+        "The printed ratios are therefore not a property of the gels. How the strains were read is not recorded, and closeness does not "
+        "prove any of these candidates; a ratio of two strains is Poisson's ratio only at small strain and with free sides, whereas the "
+        "volume change between markers needs neither.",
     )
 
 
-def _draw_widening(canvas: Canvas) -> None:
-    """Transversal strain of the marker layers over their height, beside the printed values."""
+def _draw_lateral_strain(canvas: Canvas) -> None:
+    """Draw the lateral strain of the marker layers over their height, and the printed values."""
     axes = canvas.add_subplot()
     _, rows = printed_table("3.5")
     for (name, state), marker in zip(PLATE_STATES, "os^v", strict=True):
@@ -326,5 +326,5 @@ def _draw_widening(canvas: Canvas) -> None:
         axes.plot(list(seen.transversal.values()), datasets.load(name).nominal_heights_mm, marker + "-", label=f"{name}, {state}")
     for row, style in zip(rows, (":", "--"), strict=True):
         axes.axvline(row[2], color="0.3", linestyle=style, label=f"Table 3.5, {row[0]}")
-    axes.set(xlabel="transversal strain", ylabel="height of the marker layer above the base (mm)", xlim=(0.0, None))
+    axes.set(xlabel="lateral strain", ylabel="height of the marker layer above the base (mm)", xlim=(0.0, None))
     axes.legend(fontsize=8)

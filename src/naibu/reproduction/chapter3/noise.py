@@ -1,4 +1,4 @@
-"""Chapter 3 with noise: what the report's least squares and the weighted balance make of the same measurements, and the bound (spec I6)."""
+"""Least squares and weighted equilibrium gap on noisy measurements, compared with the Cramér-Rao bound :cite:p:`hirai2008` (chapter 3)."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from naibu.reproduction.chapter3.bodies import LAYERS, PushedBody, cube
 from naibu.viewer.chapter import Figure, Section
 from naibu.viewer.tables import Cell, Table
 
-NOISE_MM = 0.1  # a hundredth of the push, as the best measurements of the report's chapter 3.6 allow
+NOISE_MM = 0.1  # a hundredth of the indentation, as in the best measurements of chapter 3.6 of the report
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scatter:
-    """Young's moduli, kPa, and Poisson's ratios of the zones over draws of noise.
+class NoiseStudy:
+    """Estimates of Young's moduli, kPa, and Poisson's ratios of the zones over draws of noise.
 
     Attributes
     ----------
     names : tuple of str
-        The zones.
+        Names of the zones.
     truth, bound : ndarray, shape (count, 2)
-        True values, and the standard deviations of the Cramer-Rao bound.
+        True values, and standard deviations of the Cramér-Rao bound.
     plain, weighted : ndarray, shape (draws, count, 2)
-        Of least squares and of the weighted balance.
+        Estimates of least squares and of the weighted equilibrium gap.
     """
 
     names: tuple[str, ...]
@@ -40,15 +40,15 @@ class Scatter:
     weighted: FloatArray
 
     def over_bound(self, values: FloatArray) -> float:
-        """Root mean square error over the bound, over all moduli."""
+        """Return the root mean square over all moduli of the error relative to the bound."""
         return float(np.sqrt((((values - self.truth) / self.bound) ** 2).mean()))
 
 
-def noise_scatter(body: PushedBody, sd_mm: float, seed: int, draws: int) -> Scatter:
-    """Identify a body from noisy displacements of all its nodes, over and over.
+def noise_study(body: PushedBody, sd_mm: float, seed: int, draws: int) -> NoiseStudy:
+    """Return identifications of a body from repeated noisy displacements of all its nodes (Monte Carlo).
 
-    The bound is the covariance of the weighted balance without noise: the inverse information of all nodes, with the motion of floor and
-    top among the unknowns.
+    The bound is the covariance of the weighted equilibrium gap without noise: the inverse Fisher information of all nodes, with the
+    displacement of floor and top among the unknowns.
     """
     zones = body.zones()
     exact = [replace(t, field=DisplacementField.from_arrays(t.field.points, t.field.vectors, sd_mm=sd_mm)) for t in body.load_cases()]
@@ -59,7 +59,7 @@ def noise_scatter(body: PushedBody, sd_mm: float, seed: int, draws: int) -> Scat
         plain.append(_moduli(batch_equilibrium_gap(body.mesh, trials, zones)))
         weighted.append(_moduli(weighted_equilibrium_gap(body.mesh, trials, zones)))
     truth = np.array([body.truth[name] for name in zones.names])
-    return Scatter(zones.names, truth, best.engineering_deviation, np.array(plain), np.array(weighted))
+    return NoiseStudy(zones.names, truth, best.engineering_deviation, np.array(plain), np.array(weighted))
 
 
 def _moduli(estimate: EquilibriumGapEstimate) -> FloatArray:
@@ -67,23 +67,23 @@ def _moduli(estimate: EquilibriumGapEstimate) -> FloatArray:
 
 
 def noise_section(seed: int, draws: int) -> Section:
-    """Return bias and scatter of both methods, over draws of noise of `NOISE_MM`."""
+    """Return bias and standard deviation of both methods, over draws of noise of SD `NOISE_MM`."""
     aside = ((0.0, 0.0, -10.0), (10.0, 0.0, 0.0))
-    bodies = {"uniform": cube(), "two layers": cube(LAYERS), "two layers, two pushes": cube(LAYERS, pushes=aside)}
-    cases = {name: noise_scatter(body, NOISE_MM, seed, draws) for name, body in bodies.items()}
+    bodies = {"uniform": cube(), "two layers": cube(LAYERS), "two layers, two load cases": cube(LAYERS, pushes=aside)}
+    cases = {name: noise_study(body, NOISE_MM, seed, draws) for name, body in bodies.items()}
     efficiencies = {name: (s.over_bound(s.plain), s.over_bound(s.weighted)) for name, s in cases.items()}
     text = (
-        f"The report adds no noise to its simulations. Here every node's displacement has normal noise of {NOISE_MM:g} mm, one per cent of "
-        "the push, and one pair of moduli is sought for every layer: the report's least squares, which weighs the forces of all nodes "
-        "alike, and the balance weighted by the covariance that the noise gives those forces, at the displacement that balances.",
-        "Least squares is biased, as the noise is in its matrix too; weighting reaches the Cramer-Rao bound, the least scatter that any "
-        "unbiased method can have.",
+        f"The report adds no noise to its simulations. Here the displacement of every node has normal noise of {NOISE_MM:g} mm, one per "
+        "cent of the indentation, and one pair of moduli is identified for every layer: by the report's least squares, which weights the "
+        "forces of all nodes equally, and by the equilibrium gap weighted with the covariance of the forces due to the noise.",
+        "Least squares is biased, because the noise is in its matrix too (errors in variables); weighting reaches the Cramer-Rao bound, "
+        "the smallest standard deviation of any unbiased method.",
     )
     figure = Figure("Noise", "Root mean square errors over the bound.", lambda canvas: drawn.efficiencies(canvas, efficiencies), (6.0, 3.2))
     return Section("With noise", text, (_table(cases),), (figure,))
 
 
-def _table(cases: Mapping[str, Scatter]) -> Table:
+def _table(cases: Mapping[str, NoiseStudy]) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for case, s in cases.items():
         for z, name in enumerate(s.names):
@@ -92,5 +92,5 @@ def _table(cases: Mapping[str, Scatter]) -> Table:
                 for values in (s.plain, s.weighted):
                     numbers += [np.mean(values[:, z, at]), np.std(values[:, z, at])]
                 rows.append((case, name, quantity, *(scale * float(number) for number in numbers)))
-    columns = ("case", "zone", "quantity", "true", "bound", "least squares, mean", "scatter", "weighted, mean", "scatter ")
+    columns = ("case", "zone", "quantity", "true", "bound", "least squares, mean", "SD", "weighted, mean", "SD ")
     return Table("Noise", columns, tuple(rows), caption=f"Means and standard deviations with noise of {NOISE_MM:g} mm.")

@@ -1,4 +1,4 @@
-"""What a reader of the CT images could have measured: strains between layers of markers, and in a computed block with held faces."""
+"""Candidate strain readings from CT images: between marker layers, and in a simulated block with constrained faces."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class MarkerRatio:
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """Strains of one state that could be read between marker layers, by what was read; shortening is negative."""
+    """Axial and lateral strains of one state between marker layers, by what was read; compression is negative."""
 
     longitudinal: dict[str, float]
     transversal: dict[str, float]
@@ -57,20 +57,20 @@ class Readings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConstrainedBlock:
-    """A compressed cube with held faces: heights over the height (k,), transversal strain there (k,), volume ratio of the whole."""
+    """Compressed cube with constrained faces: relative heights (k,), lateral strain there (k,), volume ratio of the cube."""
 
     height: FloatArray
     transversal: FloatArray
     volume_ratio: float
 
     def transversal_at(self, height: float) -> float:
-        """Return the transversal strain at a fraction of the height."""
+        """Return the lateral strain at a relative height."""
         return float(np.interp(height, self.height, self.transversal))
 
 
 @dataclass(frozen=True, slots=True)
-class FittingPairs:
-    """How many pairs of readings were tried, and how many lie within two standard deviations of each printed pair."""
+class MatchingPairs:
+    """Number of pairs of readings tried, and numbers within two standard deviations of each printed pair."""
 
     tried: int
     fitting: tuple[int, ...]
@@ -78,7 +78,7 @@ class FittingPairs:
 
 @cache
 def marker_ratios() -> tuple[MarkerRatio, ...]:
-    """Return Poisson's ratios from the markers of every gel that a plate pressed as a block of its own."""
+    """Return Poisson's ratios from the markers of every gel compressed by a plate as a separate block."""
     parts = [
         ("hardness 5", "ct_two_material_2", "deformed", (51, 100)),
         ("hardness 5", "ct_two_material_3", "deformed", (51, 100)),
@@ -101,8 +101,8 @@ def marker_ratios() -> tuple[MarkerRatio, ...]:
 def readings(name: str, state: str) -> Readings:
     """Return the strains between marker layers of a bundled plate experiment.
 
-    Longitudinal: between the outermost layers, between the layers of each gel, and from the stated and estimated heights of the plate.
-    Transversal: of every layer, from the affine fit of its complete markers (square root of the ratio of areas).
+    Axial: between the outermost layers, between the layers of each gel, and from the stated and estimated heights of the plate.
+    Lateral: of every layer, from the affine fit of its complete markers (square root of the area ratio).
     """
     experiment = datasets.load(name)
     free, loaded = experiment.initial.points * _scale(experiment), experiment.state(state).markers
@@ -121,12 +121,12 @@ def readings(name: str, state: str) -> Readings:
     for what, height in (("stated height", record.stated_mm), ("estimated height", record.estimated_mm)):
         if height is not None:
             along[what] = height / experiment.height_mm - 1.0
-    across = {f"{names[k]}, layer {k + 1}": _widening(free[layer == k], pressed[layer == k]) for k in range(count)}
+    across = {f"{names[k]}, layer {k + 1}": _transversal_strain(free[layer == k], pressed[layer == k]) for k in range(count)}
     return Readings(along, across)
 
 
-def pairs_that_fit(printed: Sequence[tuple[float, float, float]]) -> FittingPairs:
-    """Try every longitudinal reading with every transversal one of the same state against printed (longitudinal, transversal, nu)."""
+def matching_pairs(printed: Sequence[tuple[float, float, float]]) -> MatchingPairs:
+    """Compare every pair of an axial and a lateral reading of one state with the printed values (axial, lateral, nu)."""
     tried, fitting = 0, [0] * len(printed)
     for name, state in PLATE_STATES:
         seen = readings(name, state)
@@ -134,12 +134,12 @@ def pairs_that_fit(printed: Sequence[tuple[float, float, float]]) -> FittingPair
             tried += 1
             for k, pair in enumerate(printed):
                 fitting[k] += bool(np.hypot(along - pair[0], across - pair[1]) <= 2.0 * READING_SD)
-    return FittingPairs(tried, tuple(fitting))
+    return MatchingPairs(tried, tuple(fitting))
 
 
 @cache
 def constrained_block(shortening: float, poisson_ratio: float, divisions: int) -> ConstrainedBlock:
-    """Compress a cube whose loaded faces are held, by a fraction `shortening` of its height; its Young's modulus does not matter."""
+    """Compress a cube with constrained loaded faces by a fraction `shortening` of its height, for any Young's modulus."""
     mesh = box((SIDE_MM,) * 3, (divisions, divisions, 2 * divisions))
     z = mesh.points[:, 2]
     bottom, top = np.flatnonzero(z < 1e-9), np.flatnonzero(z > SIDE_MM - 1e-9)
@@ -148,13 +148,13 @@ def constrained_block(shortening: float, poisson_ratio: float, divisions: int) -
     u = solve(Problem(mesh.points, body, (), supports, np.zeros_like(mesh.points))).displacement
     heights = np.unique(z.round(6))
     at = [np.abs(z - h) < 1e-3 for h in heights]
-    across = np.array([_widening(mesh.points[k], mesh.points[k] + u[k]) for k in at])
+    across = np.array([_transversal_strain(mesh.points[k], mesh.points[k] + u[k]) for k in at])
     volume = elements(mesh.moved(u)).volume / elements(mesh).volume
     return ConstrainedBlock(heights / SIDE_MM, across, volume)
 
 
-def _widening(free: FloatArray, pressed: FloatArray) -> float:
-    """Transversal strain of points (k, 3) of one layer: of the side of a square of the area to which the affine fit maps a unit square."""
+def _transversal_strain(free: FloatArray, pressed: FloatArray) -> float:
+    """Return the lateral strain of points (k, 3) of one layer: square root of the area ratio of their affine fit, less one."""
     ok = np.isfinite(free).all(axis=1) & np.isfinite(pressed).all(axis=1)
     design = np.column_stack([np.ones(ok.sum()), free[ok, :2]])
     slope = np.linalg.lstsq(design, pressed[ok, :2], rcond=None)[0][1:]
@@ -166,7 +166,7 @@ def _scale(experiment: Experiment) -> FloatArray:
 
 
 def _gel_of_layers(experiment: Experiment, count: int) -> list[str]:
-    """Material of every layer of markers, by its nominal height."""
+    """Return the material of every marker layer, from its nominal height."""
     tops = np.array([layer.to_base_mm for layer in experiment.layers[:-1]])
     return [experiment.layers[int(np.searchsorted(tops, h))].material for h in experiment.nominal_heights_mm[:count]]
 

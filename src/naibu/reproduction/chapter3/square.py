@@ -1,4 +1,4 @@
-"""Chapter 3 in the plane: counts of equations, the identification of two triangles, and how errors grow from step to step (spec I2, I3)."""
+"""The square of the 2008 report :cite:p:`hirai2008` (chapter 3.3): equation counts, two triangles, and accumulation of errors."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from naibu.identification.equilibrium_gap.batch import batch_equilibrium_gap
 from naibu.identification.equilibrium_gap.incremental import IncrementalStep, incremental_equilibrium_gap
 from naibu.identification.from_fields.load_cases import KNOWN, Zones
 from naibu.reproduction.chapter3.bodies import SQUARE, PushedBody, square
-from naibu.reproduction.chapter3.material_tests import printed_table
+from naibu.reproduction.printed_tables import printed_table
 from naibu.viewer.chapter import Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
-REPORT_ORDER = (14, 13, 12, 11, 10, 9, 8, 7, 6, 5)  # nodes of Fig. 3.8
+REPORT_ORDER = (14, 13, 12, 11, 10, 9, 8, 7, 6, 5)  # node numbers of Fig. 3.8
 SMALL_MM = 1e-4  # noise to which errors are proportional
 STEP_NOISE_MM = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Accumulation:
-    """Errors of the two methods with the same noise.
+class ErrorAccumulation:
+    """Errors of the incremental and the batch method with the same noise.
 
     Attributes
     ----------
     steps : tuple of IncrementalStep
-        In the report's order.
+        Steps in the order of the report.
     incremental, batch : ndarray, shape (16,)
         Median over draws of the relative error of Young's modulus of every unknown triangle.
     """
@@ -42,37 +42,37 @@ class Accumulation:
 
 
 def square_section(seed: int, draws: int) -> Section:
-    """Return what the report and the 2007 paper do in two dimensions, beside ours.
+    """Return the two-dimensional results of the report and the 2007 paper, and ours.
 
     Parameters
     ----------
     seed : int
-        Of the noise.
+        Seed of the noise.
     draws : int
-        Of the noise, for medians and standard deviations.
+        Draws of noise, for medians and standard deviations.
     """
-    growth, table = accumulation(seed, draws), two_triangles(seed, draws)
+    growth, table = error_accumulation(seed, draws), two_triangles(seed, draws)
     needed = [float(row[-1]) for row in table.rows if row[-1] is not None]
     worst = float(growth.incremental.max() / growth.batch.max())
     text = (
-        "A square of 200 x 200 mm, 4 x 4 cells of two triangles, E 5 kPa, nu 0.43, stands on a fixed floor; its top is moved, and the "
-        "upper half is known. All data are displacements computed on the same mesh, as in the report, so that an error of the method alone "
-        "would show.",
-        "Without noise the incremental and the batch method return the true moduli of all 16 triangles from two pushes, whatever their "
-        "size, for small strain is linear. The errors printed in 2007 are therefore not the method's, nor the mesh's, as that paper "
-        f"believes: displacements that are off by {min(needed):.1g} to {max(needed):.1g} % of the push suffice for them, so that a damped "
-        "motion which has not quite come to rest, or numbers written with few digits, would do.",
-        f"With noise every step inherits the errors of the steps before it: the worst median error is {worst:.1f} times that of the batch "
-        "method, which uses the same equations together.",
+        "A square of 200 x 200 mm, 4 x 4 cells of two triangles, E 5 kPa, nu 0.43, stands on a fixed floor; its top is displaced, and the "
+        "upper half is known. All data are displacements computed on the same mesh, as in the report, so that only errors of the method "
+        "appear.",
+        "Without noise the incremental and the batch method return the true moduli of all 16 triangles from two load cases, whatever "
+        "their size, because small strain is linear. The errors printed in 2007 are therefore neither of the method nor of the mesh, as "
+        f"that paper assumes: errors of the displacements of {min(needed):.1g} to {max(needed):.1g} % of the push suffice to explain them, "
+        "such as a damped motion that has not quite reached equilibrium, or numbers written with few digits.",
+        f"With noise the errors accumulate from step to step: the largest median error is {worst:.1f} times that of the batch method, "
+        "which uses the same equations simultaneously.",
     )
     caption = "Order of the incremental method, and the error of every triangle with noise."
     figure = Figure("Figure 3.8", caption, lambda canvas: _draw(canvas, growth))
-    tables = (counts(), table, _growth_table(growth))
+    tables = (equation_counts(), table, _growth_table(growth))
     return Section("The square (3.3; Robomec paper of 2007)", text, tables, (figure,))
 
 
-def counts() -> Table:
-    """Return Table 3.1: numbers of unknowns and equations."""
+def equation_counts() -> Table:
+    """Return Table 3.1: numbers of unknown moduli and of equations."""
     _, ((unknowns, equations),) = printed_table("3.1")
     body = square()
     zones, trials = body.zones(each_cell=True), body.load_cases()
@@ -88,7 +88,7 @@ def counts() -> Table:
 
 
 def two_triangles(seed: int, draws: int) -> Table:
-    """Return Table 2 of the 2007 paper: triangles 13 and 14 from the balance of node 13, all others known."""
+    """Return Table 2 of the 2007 paper: triangles 13 and 14 from the equilibrium of node 13, all others known."""
     _, printed = printed_table("3-2d")
     rows: list[tuple[Cell, ...]] = []
     for values in printed:
@@ -112,7 +112,7 @@ def two_triangles(seed: int, draws: int) -> Table:
 
 
 def _of_two(body: PushedBody, sd_mm: float, seed: int) -> FloatArray:
-    """Lambda and mu of triangle 13, then of 14, kPa."""
+    """Return lambda and mu of triangle 13, then of 14, kPa."""
     lame, shear = body.moduli
     of_cell = np.full(body.mesh.n_cells, KNOWN)
     of_cell[[13, 14]] = 0, 1
@@ -121,8 +121,8 @@ def _of_two(body: PushedBody, sd_mm: float, seed: int) -> FloatArray:
     return np.stack([found.lame_lambda, found.shear_modulus], axis=1).ravel()
 
 
-def accumulation(seed: int, draws: int) -> Accumulation:
-    """Return the errors of both methods over draws of noise of `STEP_NOISE_MM`."""
+def error_accumulation(seed: int, draws: int) -> ErrorAccumulation:
+    """Return the errors of both methods over draws of noise of SD `STEP_NOISE_MM`."""
     body = square()
     zones = body.zones(each_cell=True)
     errors, batch = [], []
@@ -131,10 +131,10 @@ def accumulation(seed: int, draws: int) -> Accumulation:
         result = incremental_equilibrium_gap(body.mesh, trials, zones, order=REPORT_ORDER)
         errors.append(np.abs(result.estimate.young_modulus / SQUARE[0] - 1.0))
         batch.append(np.abs(batch_equilibrium_gap(body.mesh, trials, zones).young_modulus / SQUARE[0] - 1.0))
-    return Accumulation(result.steps, np.median(errors, axis=0), np.median(batch, axis=0))
+    return ErrorAccumulation(result.steps, np.median(errors, axis=0), np.median(batch, axis=0))
 
 
-def _growth_table(growth: Accumulation) -> Table:
+def _growth_table(growth: ErrorAccumulation) -> Table:
     rows = tuple(
         (
             step.node,
@@ -148,14 +148,14 @@ def _growth_table(growth: Accumulation) -> Table:
     )
     return Table(
         "Incremental and batch",
-        ("node", "triangles found", "steps it rests on", "condition number", "error, incremental, %", "error, batch, %"),
+        ("node", "triangles identified", "preceding steps", "condition number", "error, incremental, %", "error, batch, %"),
         rows,
         caption=f"Errors of Young's modulus in the report's order, with noise of {STEP_NOISE_MM:g} mm (medians).",
     )
 
 
-def _draw(canvas: Canvas, growth: Accumulation) -> None:
-    """The square's triangles, coloured by the error of each method, with the order of the nodes."""
+def _draw(canvas: Canvas, growth: ErrorAccumulation) -> None:
+    """Draw the triangles of the square, coloured by the error of each method, with the order of the nodes."""
     mesh = square().mesh
     panels = canvas.subplots(1, 2, sharey=True)
     top = 100.0 * float(growth.incremental.max())

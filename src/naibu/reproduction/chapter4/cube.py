@@ -7,8 +7,8 @@ from naibu.identification.lattice_calibration.gauss_newton import CalibrationPro
 from naibu.identification.lattice_calibration.unknowns import LatticeUnknowns
 from naibu.mechanics.lattices.model.lattice import Lattice, box_mask, classic_lattice
 from naibu.mechanics.lattices.model.octree import octree_lattice
-from naibu.reproduction.chapter3.material_tests import printed_table
-from naibu.reproduction.chapter4.patterns import START, with_spread
+from naibu.reproduction.chapter4.patterns import START, with_interval_factor
+from naibu.reproduction.printed_tables import printed_table
 from naibu.validation.specimens.lattice_twin import (
     CUBE_CM,
     CUBE_G,
@@ -79,7 +79,7 @@ def _parameters(n: int, fits: list[LatticeEstimate]) -> Table:
         found: list[Cell] = []
         for fit in fits:
             own = f"{kind} level {ORDERS.index(order)}"
-            found.append(with_spread(fit, fit.unknowns.names.index(own)) if own in fit.unknowns.names else None)
+            found.append(with_interval_factor(fit, fit.unknowns.names.index(own)) if own in fit.unknowns.names else None)
         rows.append((name, *cells, *found))
     columns = ("parameter", *(f"paper, {m}" for m in MODELS), *(f"ours, {m}, mN/mm or mN s/mm" for m in MODELS))
     note = (

@@ -6,8 +6,8 @@ import numpy as np
 
 from naibu.identification.lattice_calibration.gauss_newton import CalibrationProblem, ReportIndices, calibrate_lattice
 from naibu.identification.lattice_calibration.unknowns import UNITS
-from naibu.reproduction.chapter3.material_tests import printed_table
-from naibu.reproduction.chapter4.patterns import START, PatternStudy, pattern_study, with_spread
+from naibu.reproduction.chapter4.patterns import START, PatternStudy, pattern_study, with_interval_factor
+from naibu.reproduction.printed_tables import printed_table
 from naibu.validation.specimens.lattice_twin import FORCE_SD_MN, POINT_SD_MM, POINTS, TRUTH, dough_lattice, dough_twin
 from naibu.viewer.chapter import Chapter, Section
 from naibu.viewer.tables import Cell, Table
@@ -140,7 +140,7 @@ def _parameter_table(study: PatternStudy) -> Table:
     names = next(iter(study.estimates.values())).unknowns.names
     rows: list[tuple[Cell, ...]] = []
     for k, name in enumerate(names):
-        rows.append((f"{name}, {UNITS[name.split()[0]]}", *(with_spread(e, k) for e in study.estimates.values())))
+        rows.append((f"{name}, {UNITS[name.split()[0]]}", *(with_interval_factor(e, k) for e in study.estimates.values())))
     where = ("first", "second")
     columns = ("parameter", *(f"{where[number]}, by {mode}, {index}" for number, mode, index in study.estimates))
     note = "Found, and the factor by which the 95 % interval reaches up and down. What the data leave open stays near the start."

@@ -10,7 +10,7 @@ import numpy as np
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import Lattice, box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.octree import octree_lattice
-from naibu.reproduction.chapter3.material_tests import printed_table
+from naibu.reproduction.printed_tables import printed_table
 from naibu.viewer.chapter import Chapter, Section
 from naibu.viewer.tables import Cell, Table
 
@@ -22,7 +22,7 @@ NOTES = {
     "4-VIII": "The printed 1056 must be about 105, and 12.0 about 13.0: the savings printed beside them say so.",
     "4-IX": "The printed 9980 must be 9880: the saving printed beside it says so.",
 }
-GENTLE = (0.03, 0.002, 0.003)  # K, C1, C2 for which explicit steps of 2 ms are stable
+STABLE_PARAMETERS = (0.03, 0.002, 0.003)  # K, C1, C2 for which explicit steps of 2 ms are stable
 STEPS, REPEATS = 200, 7
 
 
@@ -105,7 +105,7 @@ def _saving_rows(number: str, ours: Mapping[Cell, Sequence[float]]) -> tuple[tup
 
 
 def _engine(lattice: Lattice) -> LatticeEngine:
-    parameters = lattice_parameters(lattice, *GENTLE)
+    parameters = lattice_parameters(lattice, *STABLE_PARAMETERS)
     return LatticeEngine.of(lattice, parameters, method="euler", threads=1)
 
 

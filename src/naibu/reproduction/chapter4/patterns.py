@@ -48,7 +48,7 @@ JOINT = (
     Pattern("joint 2", 1, "displacement", (1, "displacement", "joint")),
     Pattern("joint 1 on 2", 1, "displacement", (0, "displacement", "joint")),
 )
-RIVALS = (  # the report's two sets by displacement, on either pushing
+SEPARATE = (  # the report's two sets by displacement, on either pushing
     Pattern("force 1", 0, "displacement", (0, "displacement", "force")),
     Pattern("force 2", 1, "displacement", (1, "displacement", "force")),
     Pattern("force 1 on 2", 1, "displacement", (0, "displacement", "force")),
@@ -95,7 +95,7 @@ def pattern_study(seed: int = 0, *, law: Law = "finer", spacing_mm: float = 10.0
     lattice = dough_lattice(spacing_mm)
     estimates: dict[Key, LatticeEstimate] = {}
     found = {}
-    for pattern in (*PATTERNS, *JOINT, *RIVALS):
+    for pattern in (*PATTERNS, *JOINT, *SEPARATE):
         if pattern.calibration not in estimates:
             estimates[pattern.calibration] = calibrated(lattice, twin.captures, pattern.calibration)
         capture = twin.captures[pattern.pushing]
@@ -112,6 +112,6 @@ def calibrated(lattice: Lattice, captures: tuple[Capture, ...], key: Key) -> Lat
     return calibrate_lattice(problem, {name: value * scale for name, value in START.items()}, max_iterations=80)
 
 
-def with_spread(estimate: LatticeEstimate, k: int) -> str:
+def with_interval_factor(estimate: LatticeEstimate, k: int) -> str:
     """Return a parameter's value, and the factor by which its 95 % interval reaches up and down."""
     return f"{estimate.values[k]:.3g} (x/÷ {np.exp(1.96 * np.sqrt(estimate.covariance[k, k])):.2g})"
