@@ -1,21 +1,33 @@
 from __future__ import annotations
 
+import pickle
 import shutil
 from pathlib import Path
 
 import pytest
 from virtual_press import COARSE, KNOWN, Press, virtual_press, write_press
 
+from naibu._numba.process_lock import ProcessLock
 from naibu.workflows import identify
+
+LONGEST_WAIT_S = 900.0
 
 
 @pytest.fixture(scope="session")
-def press(tmp_path_factory: pytest.TempPathFactory) -> Press:
-    root = tmp_path_factory.mktemp("press")
-    folder = write_press(root / "press", virtual_press(), ("pressed", "pressed_more"))
-    results = root / "results"
-    found = identify.identify(folder, known=KNOWN, settings=COARSE, states={"press": ["pressed"]}, out=results)
-    return Press(folder, results, found)
+def press(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Press:
+    """The same for all workers: the first one that needs it makes it, in a folder of the whole run."""
+    shared = tmp_path_factory.getbasetemp()
+    if hasattr(request.config, "workerinput"):
+        shared = shared.parent
+    root, kept = shared / "press", shared / "press.pickle"
+    with ProcessLock(shared / "press.lock", LONGEST_WAIT_S):
+        if not kept.exists():
+            folder = write_press(root / "press", virtual_press(), ("pressed", "pressed_more"))
+            results = root / "results"
+            found = identify.identify(folder, known=KNOWN, settings=COARSE, states={"press": ["pressed"]}, out=results)
+            kept.write_bytes(pickle.dumps(Press(folder, results, found)))
+    made: Press = pickle.loads(kept.read_bytes())
+    return made
 
 
 @pytest.fixture

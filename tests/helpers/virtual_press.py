@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copyreg
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import pytest
 
@@ -29,6 +31,14 @@ class Press:
     folder: Path
     results: Path
     identification: Identification
+
+
+def read_only(values: dict[object, object]) -> MappingProxyType[object, object]:
+    return MappingProxyType(values)
+
+
+# so that one process of a run can make the press for the others
+copyreg.pickle(MappingProxyType, lambda view: (read_only, (dict(view),)))
 
 
 def virtual_press(seed: int = 1) -> Phantom:
