@@ -260,9 +260,9 @@ def test_more_bad_input() -> None:
         CellRheology.of(4, CellRheology.of(3, elastic(1.0, 0.3)))
     with pytest.raises(InputError, match="one for each of the 4 cells"):
         CellRheology.from_arrays(4, np.ones(3), 0.0, np.inf, 0.3)
-    with pytest.raises(InputError, match="positive length"):
+    with pytest.raises(InputError, match="length_mm must be positive"):
         interval(0.0, 3)
-    with pytest.raises(InputError, match="positive sizes"):
+    with pytest.raises(InputError, match="size_mm and divisions must be positive"):
         rectangle((1.0, np.nan), (2, 2))
     with pytest.raises(InputError, match="other way round"):
         LinearBody.of(Mesh.from_arrays([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], [[0, 2, 1]], "triangle"))
