@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.mesh import Mesh
+from naibu.core.progress import ProgressReport
 from naibu.identification.from_fields.estimate import FieldEstimate, identify_field
 from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.regularization import cell_volumes
@@ -199,10 +200,10 @@ def timed_ball(cells: int, fine: int, goal_s: float, **options: float) -> None:
     )
     start, busy = time.perf_counter(), time.process_time()
 
-    def tell(text: str) -> None:
-        print(f"    {time.perf_counter() - start:7.1f} s  {text}", flush=True)
+    def shown(report: ProgressReport) -> None:
+        print(f"    {time.perf_counter() - start:7.1f} s  {report.stage}", flush=True)
 
-    found = identify_field(mesh, trials, zones, progress=tell)
+    found = identify_field(mesh, trials, zones, progress=shown)
     seconds, of_processors = time.perf_counter() - start, time.process_time() - busy
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform != "darwin" else 2**30)
     dice, modulus, outside = found_ball(mesh, zones, found, truth)

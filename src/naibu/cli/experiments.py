@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from naibu.cli.console import INTERRUPTED, app, print_table, progress_lines, say
+from naibu.cli.console import INTERRUPTED, app, print_table, progress_display, say
 from naibu.cli.described import ObjectOptions
 from naibu.core.errors import InputError
 
@@ -116,7 +116,7 @@ def _identify(
     from naibu.workflows import identify
 
     began = time.perf_counter()
-    with progress_lines() as progress:
+    with progress_display() as progress:
         result = identify.identify(
             list(experiments), known=known, states=states, settings=settings, out=out, cross_validate=cross_validate, resume=resume,
             progress=progress,
@@ -230,7 +230,7 @@ def compare(
         ModelSettings(law=one, contact=two, joined=three, element_size_mm=element_size_mm)
         for one, two, three in product(laws, contacts, joints)
     ]
-    with progress_lines() as progress:
+    with progress_display() as progress:
         rows = compare_workflow.compare(experiments, candidates=candidates, known=known or (), out=out, progress=progress)
     table = comparison_table(rows)
     print_table(table.title, table.columns, table.rows)

@@ -1,4 +1,4 @@
-"""One measured experiment: an object with markers inside, seen in a free state and in one or more loaded states."""
+"""Experiment: an object with markers inside, measured in its reference configuration and in one or more loaded states."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ShapeKind = Literal["box", "half_ellipsoid", "cylinder", "hemisphere"]
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """Outer shape of the object in its free state; `size_mm` is its extent along x, y, z."""
+    """Outer shape of the object in its reference configuration; `size_mm` is its extent along x, y, z."""
 
     kind: ShapeKind
     size_mm: tuple[float, float, float]
@@ -55,7 +55,7 @@ class Loading:
     bar_axis : str
         Direction along which the bar lies, or along which side plates press: ``"x"``, ``"y"`` or, where z is not up, ``"z"``.
     assumed : tuple of str
-        What was read between the lines of the file, in words for the user; empty when the file says it all.
+        Assumptions about what the file does not state, in words for the user; empty when there are none.
     """
 
     kind: LoadingKind
@@ -75,15 +75,16 @@ class State:
     name : str
         Name of the state, also of its file.
     markers : Markers or None
-        None when the state is announced but its positions are held back.
+        None where the positions are withheld.
     stated_mm : float or None
-        Nominal height of the plate or bar above the base, or distance of the side plates; None in the free state or when not stated.
+        Nominal height of the plate or bar above the base, or distance of the side plates; None in the reference configuration or when not
+        stated.
     estimated_mm : float or None
         The same, as estimated beforehand from the data by whoever wrote the file.
     what : str
         What the state shows, in words.
     loaded : bool
-        False for a state without load: the free one, and any measured before a second loading or after unloading.
+        False for a state without load: the reference configuration, and any measured before a second loading or after unloading.
     """
 
     name: str
@@ -96,7 +97,7 @@ class State:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Experiment:
-    """An object, its loading, and its measured states; the first state is the free one.
+    """An object, its loading, and its measured states; the first state is the reference configuration.
 
     Attributes
     ----------
@@ -113,7 +114,7 @@ class Experiment:
     nominal_heights_mm : tuple of float
         Heights of the marker layers above the base; empty when unknown.
     base_z_mm : float or None
-        Estimated z of the base plane in the free scan.
+        Estimated z of the base plane in the scan of the reference configuration.
     xy_scale : float
         Factor by which printed x, y must be multiplied according to the file (1 when nothing is known).
     xy_step_mm, z_step_mm : float
@@ -149,20 +150,20 @@ class Experiment:
 
     @property
     def initial(self) -> Markers:
-        """Markers of the free state."""
+        """Markers of the reference configuration."""
         markers = self.states[0].markers
         if markers is None:
-            raise InputError(f"experiment {self.name!r} has no positions for its free state {self.states[0].name!r}")
+            raise InputError(f"experiment {self.name!r} has no positions for its reference configuration {self.states[0].name!r}")
         return markers
 
     @property
     def height_mm(self) -> float:
-        """Height of the object above its base in the free state, mm."""
+        """Height of the object above its base in the reference configuration, mm."""
         return self.shape.size_mm["xyz".index(self.up_axis)]
 
     @property
     def full_platen_position_mm(self) -> float:
-        """Height of the plate or bar, or distance of the side plates, at which they touch the free object, mm."""
+        """Height of the plate or bar, or distance of the side plates, at which they touch the undeformed object, mm."""
         size = self.shape.size_mm
         return size["xyz".index(self.loading.bar_axis)] if self.loading.kind == "side_plates" else size[2]
 

@@ -1,4 +1,4 @@
-"""Named parameters: physical values outside, unconstrained ones for the optimiser, with a Gaussian prior in the latter."""
+"""Named parameters with physical values, unconstrained scales for the optimiser, and Gaussian priors on these scales."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 
-MAX_POISSON_RATIO = 0.4995  # beyond it a solid is incompressible for all that displacements can tell
+MAX_POISSON_RATIO = 0.4995  # beyond it displacements do not distinguish a solid from an incompressible one
 
 Scale = Literal["linear", "log", "incompressibility"]
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One number that a model depends on.
+    """One parameter of a model.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What a solver hands back: a value, and a status whose text tells the user what happened."""
+"""Solver status: how a solve ended, in a sentence for the user."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import Enum
 
 
 class Status(Enum):
-    """How a solve ended; the value is the sentence for the user."""
+    """Status of a solve; the value is the sentence for the user."""
 
     CONVERGED = "Converged."
     STEP_TOO_SMALL = (
@@ -14,7 +14,7 @@ class Status(Enum):
         "load is more than the mesh can follow. Refine the mesh near the indenter, lower the load or the Poisson ratio, or ask for "
         "more steps."
     )
-    SINGULAR = "The linear system is singular: the body can move freely. Hold it by a fixed support, a bonded contact, or friction."
+    SINGULAR = "The linear system is singular: the body can move freely. Constrain it by a fixed support, a tied contact, or friction."
     INTERRUPTED = "Interrupted by the user; what is returned is the best so far."
     ITERATION_LIMIT = (
         "The iteration limit was reached before the tolerance; the result may be used with care, or continued with more iterations."

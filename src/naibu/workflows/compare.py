@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 
 from naibu.core.errors import InputError
+from naibu.core.progress import Progress, ProgressReport
 from naibu.identification.from_markers.specimen_model import ModelSettings
 from naibu.identification.prediction.cross_validation import ModelRow, compare_models
 from naibu.workflows.experiments import Source, load_experiments, parse_known, provenance_of
 from naibu.workflows.result_folder import read_comparison, result_folder, write_comparison
-
-Progress = Callable[[str, int, float], None]
 
 
 def compare(
@@ -36,7 +36,7 @@ def compare(
         Folder for ``comparison.json``, written anew after every candidate; candidates that it holds already, of the same inputs, are not
         repeated.
     progress : callable, optional
-        ``progress(stage, iteration, objective)``.
+        Gets reports whose stages name the candidate, and the experiment left out (`naibu.core.progress`).
 
     Returns
     -------
@@ -49,7 +49,7 @@ def compare(
         Unusable input, or no candidate.
     """
     if not candidates:
-        raise InputError("no model is given to compare; name at least one law or contact")
+        raise InputError("candidates is empty; give at least one model to compare")
     loaded = load_experiments(experiments)
     known_materials = parse_known(known)
     folder = None if out is None else result_folder(out)
@@ -58,20 +58,21 @@ def compare(
         provenance = provenance_of(loaded, known, {}, settings)
         row = read_comparison(folder, provenance) if folder is not None else None
         if row is None:
-            told = _stage(progress, settings)
-            row = compare_models(loaded, [settings], known_materials=known_materials, callback=told)[0]
+            row = compare_models(loaded, [settings], known_materials=known_materials, progress=_of_candidate(progress, settings))[0]
             if folder is not None:
                 write_comparison(folder, provenance, row)
         rows.append(row)
     return rows
 
 
-def _stage(progress: Progress | None, settings: ModelSettings) -> Callable[[str, int, float], None]:
+def _of_candidate(progress: Progress | None, settings: ModelSettings) -> Progress | None:
     """Report the steps of one candidate under its name."""
+    if progress is None:
+        return None
+    name = f"{settings.law}, {settings.contact}, {settings.joined}"
 
-    def tell(left: str, iteration: int, objective: float) -> None:
-        if progress is not None:
-            without = "" if left == "none" else f" without {left}"
-            progress(f"{settings.law}, {settings.contact}, {settings.joined}{without}", iteration, objective)
+    def passed_on(report: ProgressReport) -> None:
+        stage = name if report.stage == "calibration" else f"{name} {report.stage}"
+        progress(replace(report, stage=stage))
 
-    return tell
+    return passed_on

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from naibu.core.errors import ConvergenceError, InputError, NaibuError
 from naibu.core.experiment import Experiment
+from naibu.core.progress import Progress
 from naibu.core.rigid_transform import registration
 from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration, calibrate
@@ -21,7 +22,6 @@ from naibu.identification.prediction.prediction import rms
 from naibu.workflows.experiments import Source, load_experiments, parse_known, provenance_of, require_loaded
 from naibu.workflows.result_folder import CHECKPOINT_FILE, read_checkpoint, result_folder, write_checkpoint, write_identification
 
-Progress = Callable[[str, int, float], None]
 MOST_ELEMENTS = 100_000
 
 
@@ -83,7 +83,7 @@ def identify(
     resume : bool
         Continue from the checkpoint of an interrupted search with the same inputs and settings in `out`.
     progress : callable, optional
-        ``progress(stage, iteration, objective)``.
+        Gets reports of the stages "calibration" and, with `cross_validate`, "without EXPERIMENT" (`naibu.core.progress`).
 
     Returns
     -------
@@ -105,15 +105,15 @@ def identify(
     folder = None if out is None else result_folder(out)
     provenance = provenance_of(loaded, known, states or {}, chosen)
 
-    def each(iteration: int, objective: float, values: Mapping[str, float]) -> None:
+    def checkpoint(values: Mapping[str, float]) -> None:
         if folder is not None:
             write_checkpoint(folder, provenance, values)
-        if progress is not None:
-            progress("identify", iteration, objective)
 
     start = read_checkpoint(folder, provenance) if folder is not None and resume else None
     try:
-        calibration = calibrate(loaded, known_materials=known_materials, states=states, settings=chosen, start=start, callback=each)
+        calibration = calibrate(
+            loaded, known_materials=known_materials, states=states, settings=chosen, start=start, progress=progress, checkpoint=checkpoint
+        )
     except ConvergenceError as error:
         labels = [f"{e.name}/{s.name}" for e in loaded for s in _with_states(e, states or {}).loaded_states]
         one_of = "one of " * (len(labels) > 1) + ", ".join(labels)
@@ -135,12 +135,12 @@ def identify(
 def _check_size(loaded: Sequence[Experiment], edge_mm: float) -> None:
     """Refuse elements of no size, and so many that no memory holds them."""
     if not (math.isfinite(edge_mm) and edge_mm >= 0.0):
-        raise InputError(f"an element size of {edge_mm:g} mm cannot be; give a positive length, or 0 for an eighth of the object's height")
+        raise InputError(f"element_size_mm is {edge_mm:g}; give a positive length, mm, or 0 for an eighth of the object's height")
     for e in loaded:
         count = math.prod(e.shape.size_mm) / edge_mm**3 if edge_mm > 0.0 else 0.0
         if count > MOST_ELEMENTS:
             raise InputError(
-                f"an element size of {edge_mm:g} mm makes {count:.3g} elements of {e.name}, at most {MOST_ELEMENTS} are solved"
+                f"element_size_mm of {edge_mm:g} mm makes {count:.3g} elements of {e.name}; at most {MOST_ELEMENTS} are solved"
             )
 
 
@@ -149,7 +149,7 @@ def _check_states(loaded: Sequence[Experiment], states: Mapping[str, Sequence[st
     by_name = {e.name: e for e in loaded}
     for name, chosen in states.items():
         if name not in by_name:
-            raise InputError(f"states of {name!r} are chosen, but the experiments are {', '.join(by_name)}")
+            raise InputError(f"states names {name!r}, but the experiments are {', '.join(by_name)}")
         for state in chosen:
             require_loaded(by_name[name], state)
 
@@ -171,10 +171,6 @@ def _compared(
     interrupted, trouble = calibration.match.status is Status.INTERRUPTED, None
     values = model.parameters.values()
 
-    def each(left: str, iteration: int, objective: float) -> None:
-        if progress is not None:
-            progress(f"without {left}", iteration, objective)
-
     try:
         if not interrupted:
             compared = {t.label: _baselines(t, values) for t in calibration.load_cases}
@@ -186,7 +182,7 @@ def _compared(
                 known_materials=calibration.known_materials,
                 settings=calibration.settings,
                 reference=calibration,
-                callback=each,
+                progress=progress,
             )
             left_out = tuple(found)
     except KeyboardInterrupt:

@@ -1,4 +1,4 @@
-"""Turn calibrations and predictions into the records that a report shows. Here residuals are predicted minus measured."""
+"""Content of reports: calibrations and predictions as the records that a page shows. Here residuals are predicted minus measured."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _ACCURACY_COLUMNS = ("experiment/state", "markers", "x mm", "y mm", "z mm", "3-D
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    """How far predicted markers lie from measured ones.
+    """Accuracy of predicted markers.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ def accuracy_table(calibration: Calibration, baselines: Mapping[str, Mapping[str
     if unseen:
         note += " Left out: the other experiments identified the parameters."
     if names:
-        note += " What comes last are distances in 3-D that simple descriptions leave."
+        note += " The last columns are 3-D distances of simple models."
     return Table("Measured against predicted markers", columns, tuple(rows), note=note)
 
 
@@ -185,7 +185,7 @@ def parameter_rows(model: CalibratedModel, names: Sequence[str]) -> tuple[Parame
 
 
 def undetermined(model: CalibratedModel, names: Sequence[str]) -> tuple[str, ...]:
-    """Say in words what the data cannot tell about the parameters `names`."""
+    """Return, in words, what the data do not determine about the parameters `names`."""
     out = []
     if not model.known_materials.scale_is_absolute:
         out.append("Displacements alone do not give the absolute stiffness: the moduli are ratios to the material that sets the scale.")
@@ -194,9 +194,9 @@ def undetermined(model: CalibratedModel, names: Sequence[str]) -> tuple[str, ...
         p, sd = by_name[name], model.standard_deviation(name)
         low, high = model.interval(name)
         if name.endswith("poisson_ratio") and high > 0.499:
-            out.append(f"{name}: at least {low:.3f}; the data cannot tell it from incompressible.")
+            out.append(f"{name}: at least {low:.3f}; the data do not distinguish it from incompressible.")
         elif np.isfinite(p.prior_sd) and sd > 0.6 * p.prior_sd:
-            out.append(f"{name}: the data hardly narrow it down; {p.value:.3g} {p.unit}".rstrip() + " is close to what was assumed before.")
+            out.append(f"{name}: the data hardly determine it; {p.value:.3g} {p.unit}".rstrip() + " is close to the prior.")
         elif name.endswith("friction") and high > 4.0 * p.value:
             out.append(f"{name}: anything above {low:.2g} looks the same, because the surfaces do not slip.")
     if len(names) > 1:
@@ -256,7 +256,7 @@ def _boundary_table(model: CalibratedModel, names: Sequence[str]) -> Table:
 
 def _assumptions(sentences: Sequence[str]) -> tuple[Table, ...]:
     """A table of what was assumed; none where nothing was."""
-    return (Table("Assumptions", ("what was not told, and what was taken instead",), tuple((s,) for s in sentences)),) if sentences else ()
+    return (Table("Assumptions", ("what is not stated, and what is assumed",), tuple((s,) for s in sentences)),) if sentences else ()
 
 
 def _short(value: float) -> float:

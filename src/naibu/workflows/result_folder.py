@@ -1,4 +1,4 @@
-"""The files of a result folder: written whole, in an order that loses nothing, and read back with clear words where they are damaged."""
+"""Result folders: files are written whole, in an order that loses nothing, and read back with clear errors where they are damaged."""
 
 from __future__ import annotations
 

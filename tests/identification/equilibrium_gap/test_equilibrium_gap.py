@@ -475,7 +475,7 @@ def broken() -> dict[str, tuple[str, str, list[FieldLoadCase], Zones, dict[str, 
         "too few load cases": ("step", "after 1 of 16 zones: with 1 load cases .* at least 2 independent load cases", [one], cells, {}),
         "wrong order": ("step", "node 13 cannot be taken now: 4 equations for the 6 moduli of 3 open zones", [one, two], cells,
                         {"order": [13]}),
-        "order outside": ("step", "node 2 is not in balance", [one, two], cells, {"order": [2]}),
+        "order outside": ("step", "node 2 is not in equilibrium", [one, two], cells, {"order": [2]}),
     }  # fmt: skip
 
 
@@ -493,7 +493,7 @@ def test_zones_that_no_balance_reaches_are_named() -> None:
     u = body.displacement((0.0, -25.0))
     u[5] = np.nan
     trial = FieldLoadCase.of("hole", DisplacementField.from_arrays(body.mesh.points, u), body.mesh, loaded=body.constrained)
-    with pytest.raises(InputError, match=r"'lower half: cell 0', .* and 1 more zones appear in no balance"):
+    with pytest.raises(InputError, match=r"'lower half: cell 0', .* and 1 more zones appear in no equation"):
         batch_equilibrium_gap(body.mesh, [trial], zones, method="minimum_norm")
 
 

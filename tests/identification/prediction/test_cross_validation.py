@@ -37,10 +37,10 @@ def gels() -> list[Experiment]:
 def test_each_gel_is_predicted_from_the_other(gels: list[Experiment]) -> None:
     steps: list[str] = []
     rows = leave_one_out(
-        gels, known_materials=KNOWN, settings=COARSE, noise=NoiseModel(0.05), search=QUICK, callback=lambda name, *_: steps.append(name)
+        gels, known_materials=KNOWN, settings=COARSE, noise=NoiseModel(0.05), search=QUICK, progress=lambda r: steps.append(r.stage)
     )
     assert [(r.experiment, r.state, r.marker_count) for r in rows] == [("first", "pressed", 64), ("second", "pressed", 64)]
-    assert set(steps) == {"first", "second"}
+    assert set(steps) == {"without first", "without second"}
     for row in rows:
         assert row.rms_mm == pytest.approx(np.linalg.norm(row.rms_xyz))
         assert row.rms_mm < 0.4  # noise of two scans in three coordinates is 0.12 mm; the coarse mesh adds its own
@@ -63,7 +63,7 @@ def test_an_interrupted_candidate_is_no_row(gels: list[Experiment]) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        compare_models(gels[:1], [COARSE], known_materials=KNOWN, noise=NoiseModel(0.05), search=QUICK, callback=stopped)
+        compare_models(gels[:1], [COARSE], known_materials=KNOWN, noise=NoiseModel(0.05), search=QUICK, progress=stopped)
 
 
 def test_a_failure_with_an_experiment_left_out_keeps_the_rest_of_the_row(gels: list[Experiment], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -103,7 +103,7 @@ def test_calibration_starts_from_an_equilibrium_gap_that_can_be_believed(gels: l
 def test_the_users_own_start_comes_first(gels: list[Experiment], monkeypatch: pytest.MonkeyPatch) -> None:
     begun: dict[str, float] = {}
 
-    def run(self: object, callback: object = None, *, start: dict[str, float], warm_starts: object) -> None:
+    def run(self: object, *, start: dict[str, float], **_: object) -> None:
         begun.update(start)
 
     monkeypatch.setattr(calibration.Matcher, "run", run)

@@ -30,12 +30,12 @@ MOST_ACTIVE = 100  # unknowns up to which the exact method of active bounds is u
 RANK_TOLERANCE = 1e-9  # of the largest singular value; displacements of a direct solver are good to about 1e-12
 LOOSE = 1e-5  # part of a determined unknown that may lie in the null space
 CONTRADICTION = 3.0  # a load case fits alone this many times better than with the others ...
-UNEXPLAINED = 0.2  # ... which leave this share of its known forces unbalanced
+UNEXPLAINED = 0.2  # ... which leave this fraction of its known forces unbalanced
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EquilibriumGapEstimate:
-    """Moduli of the zones from force balance.
+    """Moduli of the zones from the equilibrium gap.
 
     Attributes
     ----------
@@ -46,19 +46,19 @@ class EquilibriumGapEstimate:
     covariance : ndarray, shape (2 count, 2 count), or None
         Of all lambda, then all mu, kPa^2; only weighted methods know it.
     determined : ndarray, shape (count, 2), bool
-        Whether the equations fix lambda and mu of a zone, or leave them to the choice of a solution.
+        Whether the equations determine lambda and mu of a zone, or the choice among their solutions does.
     equations, unknowns, rank : int
-        Balances that hold an unknown modulus, moduli sought, and how many combinations of them the balances fix.
+        Equations with an unknown modulus, unknown moduli, and the number of their combinations that the equations determine.
     singular_values : ndarray
-        Of the system, mm^2, the largest first; of the whitened system, 1/kPa.
+        Of the system, mm^2, the largest first; of the weighted system, 1/kPa.
     residual : float
-        Norm of the unbalanced force over that of the known forces.
+        Norm of the equilibrium gap over that of the known forces.
     sweeps : int
         Linear systems solved.
     status : Status
         How the search ended.
     chi_squared : float
-        Of the displacements that would balance, in units of the noise; NaN where a method does not weigh by it.
+        Of the displacement corrections that restore equilibrium; NaN for methods that do not use the covariance of the noise.
     degrees_of_freedom : int
         Equations less unknowns.
     """
@@ -129,7 +129,7 @@ def batch_equilibrium_gap(
     about: tuple[float, float] | None = None,
     rank_tolerance: float = RANK_TOLERANCE,
 ) -> EquilibriumGapEstimate:
-    """Identify the moduli of all zones from the balance of all nodes (spec I3).
+    """Identify the moduli of all zones from the equilibrium gap at all nodes (:cite:p:`claire2004`).
 
     Parameters
     ----------
@@ -143,13 +143,13 @@ def batch_equilibrium_gap(
         ``"least_squares"`` asks that the equations fix every modulus; ``"minimum_norm"`` takes, of all solutions of least squares, the
         smallest; ``"bounded"`` keeps lambda and mu from being negative.
     law : {"linear", "neo_hookean", "saint_venant_kirchhoff"}
-        The balance is linear in the moduli for all of them.
+        Equilibrium is linear in the moduli for all of them.
     thickness_mm : float
         Of triangles; matters where forces are known.
     about : (float, float), optional
         Young's modulus, kPa, and Poisson's ratio: ``"minimum_norm"`` then finds the solution nearest to them. Zero moduli by default.
     rank_tolerance : float
-        Singular values below this share of the largest count as zero.
+        Singular values below this fraction of the largest count as zero.
 
     Raises
     ------
@@ -192,8 +192,8 @@ def _informative(system: LoadCaseEquations) -> tuple[FloatArray, FloatArray]:
     """Dense equations of a load case that hold an unknown."""
     if 2 * system.zones.count > MOST_UNKNOWNS:
         raise InputError(
-            f"{2 * system.zones.count} unknown moduli are too many for force balance (at most {MOST_UNKNOWNS}): join cells to zones, or "
-            "match displacements with regularization"
+            f"{2 * system.zones.count} unknown moduli are too many for the equilibrium gap method (at most {MOST_UNKNOWNS}): join cells "
+            "to zones, or match displacements with regularization"
         )
     matrix, right = system.columns()
     informative = system.informative
@@ -221,7 +221,7 @@ def _require_columns(matrix: FloatArray, zones: Zones) -> None:
     empty = np.asarray(np.abs(matrix).sum(axis=0).reshape(2, -1).sum(axis=0) == 0.0)
     if empty.any():
         raise InputError(
-            f"{_listed(zones.names, empty)} appear in no balance: no node there has data around it and is free of unknown forces; give "
+            f"{_listed(zones.names, empty)} appear in no equation: no node there has data around it and is free of unknown forces; give "
             "data there, or count these cells to a neighbouring zone"
         )
 

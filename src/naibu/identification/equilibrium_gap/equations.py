@@ -1,8 +1,8 @@
-"""Equations of balance: at a node that no unknown force reaches, the forces of the cells around it add up to the known external one.
+"""Equations of the equilibrium gap: at a node without unknown external force, internal forces equal the known external one.
 
-Equation (3.20) of the report, at all nodes of all load cases: ``A x = b`` with the moduli x of the zones - lambda of every zone, then mu of
-every zone - and in b the external forces less those of the known cells (spec I1). A displacement is needed at every node of every cell
-around a node, else the node gives no equation.
+This is equation (3.20) of :cite:t:`hirai2008` at all nodes of all load cases: ``A x = b`` with the moduli x of the zones (lambda of every
+zone, then mu of every zone) and b, the external forces less those of the known cells. A node gives equations only if a displacement is
+known at every node of every cell around it.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class NodalField:
 
 
 def nodal_field(field: DisplacementField, mesh: Mesh) -> NodalField:
-    """Bring a measured field to the nodes of a mesh.
+    """Interpolate a measured field to the nodes of a mesh.
 
     Where every node is a point of the field, nodes take its vectors, and nodes at points that are not valid have none. Any other field is
     interpolated linearly in the Delaunay simplices of its valid points; nodes outside of them have no data.
@@ -136,7 +136,7 @@ class LoadCaseEquations:
     cells : ndarray, shape (c,), int64
         Their numbers in the mesh.
     rows : ndarray, shape (e,), int64
-        Components (node times d plus axis) that are in balance.
+        Components (node times d plus axis) in equilibrium.
     external_force : ndarray, shape (n, d)
         Known forces on the nodes, mN.
     law : str
@@ -156,7 +156,7 @@ class LoadCaseEquations:
 
     @property
     def informative(self) -> BoolArray:
-        """Equations that hold an unknown modulus (e,); the others only tell how well the displacement obeys the known ones."""
+        """Equations with an unknown modulus (e,); the others only constrain the displacement."""
         touched = np.zeros(self.body.n_points, dtype=bool)
         touched[self.body.cells[self.zones.of_cell[self.cells] != KNOWN].ravel()] = True
         return np.asarray(touched[self.rows // self.body.dimension])
@@ -201,7 +201,7 @@ class LoadCaseEquations:
 
 @contextmanager
 def _named(load_case: str) -> Iterator[None]:
-    """Tell in which load case an error arose."""
+    """Add the name of the load case to errors."""
     try:
         yield
     except InputError as error:
@@ -229,11 +229,11 @@ def load_case_equations(
     Raises
     ------
     InputError
-        No load case, shapes that do not fit the mesh, known cells without moduli, or a load case in which no node is in balance.
+        No load case, shapes that do not fit the mesh, known cells without moduli, or a load case in which no node gives an equation.
     """
     body = simplices(mesh, thickness_mm=thickness_mm)
     if not load_cases:
-        raise InputError("no load case is given: force balance needs the measured field of at least one push")
+        raise InputError("no load case is given: the equilibrium gap needs the measured field of at least one")
     _check_zones(zones, mesh)
     return tuple(_equations_of(mesh, body, load_case, zones, law) for load_case in load_cases)
 
@@ -281,8 +281,8 @@ def require_scale(systems: Sequence[LoadCaseEquations], right: FloatArray) -> No
     zones = systems[0].zones
     if not (zones.of_cell == KNOWN).any():
         raise InputError(
-            "no region is known and no force: balance then gives only ratios of moduli; name a region in `known`, or give a load case's "
-            "external_force (a measured push, or the weight)"
+            "neither a region nor a force is known: equilibrium then gives only ratios of moduli; name a region in `known`, or give a "
+            "load case's external_force (a measured push, or the weight)"
         )
     raise InputError(
         "no known cell meets an unknown one at a node with data that is not loaded, and no force is known: the moduli have no scale; "

@@ -1,8 +1,8 @@
-"""Incremental identification: node after node from the known region into the unknown one (spec I2; report 3.3.2).
+"""Incremental equilibrium gap method: node by node from the known region into the unknown one (:cite:p:`hirai2008`, section 3.3.2).
 
-At a node that touches known cells the balances of all load cases give the moduli of its unknown cells; these count as known from then on. A
-node with k unknown cells needs 2 k equations, so at least two load cases in the plane. Every step inherits the errors of those before it:
-`IncrementalStep.depth` counts them.
+At a node that touches known cells the equilibrium of all load cases gives the moduli of its unknown cells; these count as known from then
+on. A node with k unknown cells needs 2 k equations, hence at least two load cases in the plane. Errors accumulate from step to step:
+`IncrementalStep.depth` counts the steps that a result depends on.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from naibu.mechanics.finite_elements.modulus_derivatives import SimplexLaw
 
 @dataclass(frozen=True, slots=True)
 class IncrementalStep:
-    """One node and what its balance gave.
+    """One node and the moduli that its equilibrium gave.
 
     Attributes
     ----------
     node : int
-        Whose forces were balanced.
+        Number of the node.
     zones : tuple of int
         Zones whose moduli it gave.
     equations : int
         Of all load cases at the node.
     condition : float
-        Condition number of its equations, columns scaled to one length: how much errors may grow here.
+        Condition number of its equations, columns scaled to one length: the largest amplification of errors at this step.
     depth : int
-        Steps one upon the other that the result rests on, this one included.
+        Number of consecutive steps that the result depends on, this one included.
     """
 
     node: int
@@ -82,18 +82,18 @@ def incremental_equilibrium_gap(
     partial: bool = False,
     rank_tolerance: float = RANK_TOLERANCE,
 ) -> IncrementalEstimate:
-    """Identify the moduli of all zones step by step (spec I2).
+    """Identify the moduli of all zones step by step (:cite:p:`hirai2008`, section 3.3.2).
 
     Parameters
     ----------
     mesh, load_cases, zones, law, thickness_mm
         As for `naibu.identification.equilibrium_gap.batch.batch_equilibrium_gap`; zones are usually single cells.
     order : sequence of int, optional
-        Nodes to balance, one after the other. By default every step takes the node whose equations are conditioned best.
+        Nodes to use, one after the other. By default every step takes the node whose equations are conditioned best.
     partial : bool
         Whether to return what was reached where the steps end before the last zone, or to raise.
     rank_tolerance : float
-        Singular values of a step below this share of its largest count as zero.
+        Singular values of a step below this fraction of its largest count as zero.
 
     Raises
     ------
@@ -165,7 +165,7 @@ class _Walk:
     def require(self, node: int) -> None:
         """Refuse a node of a given order that gives no result."""
         if node not in self.nodes:
-            raise InputError(f"node {node} is not in balance in any load case, or meets no unknown cell; leave it out of the order")
+            raise InputError(f"node {node} is not in equilibrium in any load case, or meets no unknown cell; leave it out of the order")
         if not np.isfinite(self._condition(node)):
             _, right, found = self._local(node)
             raise InputError(
@@ -182,7 +182,7 @@ class _Walk:
         )
         return (
             f"the steps ended after {len(self.names) - left} of {len(self.names)} zones: with {n_load_cases} load cases no node fixes "
-            f"all its remaining zones; give {more}, join cells to zones, or use batch_equilibrium_gap, which takes all nodes together"
+            f"all its remaining zones; give {more}, join cells to zones, or use batch_equilibrium_gap, which solves for all nodes at once"
         )
 
     def estimate(self) -> EquilibriumGapEstimate:

@@ -1,15 +1,15 @@
-"""Force balance weighted by what noise in the displacement does to it: maximum likelihood, without the bias of least squares (spec I6).
+"""Weighted equilibrium gap: maximum likelihood with errors in variables, without the bias of least squares (:cite:p:`mikhail1976`).
 
-The true displacement x of a load case obeys ``c(x, p) = A(x) p - b(x) = 0`` at the nodes in balance, and the measured one scatters about it
-with covariance Sigma. Linearised about a state (x, p) of the search, with the tangent T of c,
+The true displacement x of a load case satisfies ``c(x, p) = A(x) p - b(x) = 0`` at the nodes in equilibrium; the measured one differs from
+it by noise of covariance Sigma. Linearised about a state (x, p) of the search, with the tangent T of c,
 
     r + A dp,   r = c(x, p) + T (measured - x),   S = T Sigma T^T,
 
-is what dp has to make small in the norm of S^-1; the displacement then moves to ``measured - Sigma T^T S^-1 (r + A dp)``, where the forces
-balance. This is the Gauss-Helmert model of least squares with conditions (Mikhail & Ackermann 1976). Because A is taken at the balanced
-displacement and not at the measured one, noise does not pull the moduli down; because all forces of a residual are brought back to the
-displacements that made them, stiff and soft cells count alike. Displacements of loaded nodes enter Sigma as all others do: an unknown
-motion of the boundary is estimated along with the moduli. A sweep factorizes S once.
+dp minimises the norm of S^-1, and the displacement is updated to ``measured - Sigma T^T S^-1 (r + A dp)``, where the forces are in
+equilibrium. This is the Gauss-Helmert model of least squares with conditions. Since A is evaluated at the equilibrated displacement and not
+at the measured one, noise does not bias the moduli; since all residual forces are mapped back to displacements, stiff and compliant cells
+have equal weight. Displacements of loaded nodes enter Sigma like all others: an unknown motion of the boundary is estimated along with the
+moduli. Each sweep factorizes S once.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class _Sweep:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Search:
-    """What all sweeps share: equations, covariance (n d, n d) of the nodes' displacement, mm^2, and bounds (u,) of the moduli, kPa."""
+    """Data common to all sweeps: equations, covariance (n d, n d) of the nodes' displacement, mm^2, and bounds (u,) of the moduli, kPa."""
 
     systems: tuple[LoadCaseEquations, ...]
     covariances: tuple[sp.csr_matrix, ...]
@@ -130,7 +130,7 @@ def weighted_equilibrium_gap(
     max_sweeps: int = 50,
     tolerance: float = 1e-6,
 ) -> EquilibriumGapEstimate:
-    """Identify the moduli of all zones from balance weighted by the noise of the displacement.
+    """Identify the moduli of all zones by the weighted equilibrium gap, the noise of the displacement taken into account.
 
     Parameters
     ----------

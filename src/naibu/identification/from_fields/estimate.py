@@ -1,15 +1,16 @@
-"""Moduli from measured displacement fields: the whole recipe, from a homogeneous start to regions with standard errors (spec I6).
+"""Identification of moduli from measured displacement fields by FEMU: homogeneous start, penalised fit, regions with standard errors.
 
-The estimate is that of maximum likelihood: moduli p and the displacement of the loaded nodes, where forces are unknown, minimise::
+The estimate is that of maximum likelihood (:cite:p:`kavanagh1971,avril2008`): moduli p and the displacement of the loaded nodes, where
+forces are unknown, minimise::
 
     sum_t |S_t^-1/2 (H_t u_t - d_t)|^2 / 2 + w R(p),    with u_t in equilibrium at all other nodes,
 
-by Gauss-Newton with exact derivatives: explicit where zones are few, by adjoints and conjugate gradients where they are many.
+by Gauss-Newton with exact derivatives: explicit for few zones, by adjoints and conjugate gradients for many.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -18,6 +19,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
+from naibu.core.progress import Progress, report_progress
 from naibu.core.status import Status
 from naibu.identification.from_fields.forward_model import LawName
 from naibu.identification.from_fields.gauss_newton import (
@@ -42,7 +44,6 @@ FEW = 12  # zones up to which no penalty is needed by default
 START_POISSON_RATIO = 0.4
 SEARCH_AT_WEIGHT = SearchSettings(max_iterations=15, tolerance=1e-3)
 UNEXPLAINED = 3.0  # standard deviations of chi squared by which regions may fit worse than the regularised field
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,7 +152,7 @@ def identify_field(
     start : tuple of ndarray, shape (count,), optional
         lambda and mu of the zones, kPa, to start from; by default those of a homogeneous body that fits best.
     progress : callable, optional
-        ``progress(text)`` is told every step.
+        Gets a report after every step, its stage in words (`naibu.core.progress`); the same words are in `FieldEstimate.steps`.
 
     Raises
     ------
@@ -180,11 +181,10 @@ class _Recipe:
     steps: list[str]
     progress: Progress | None
 
-    def tell(self, text: str) -> None:
-        """Keep a step, and pass it on."""
+    def record(self, text: str, objective: float | None = None) -> None:
+        """Keep a step in words, and report it."""
         self.steps.append(text)
-        if self.progress is not None:
-            self.progress(text)
+        report_progress(self.progress, text, objective=objective)
 
     def start(self, given: tuple[FloatArray, FloatArray] | None) -> Point:
         """Return where to begin: the given moduli, or those of the homogeneous body that fits best."""
@@ -200,7 +200,7 @@ class _Recipe:
         first = first_point(homogeneous, objective.clipped(np.log([shear, ratio])))
         found = search(homogeneous, first, objective, SearchSettings(tolerance=1e-3))
         young, poisson = young_and_poisson(found.point.theta)
-        self.tell(
+        self.record(
             f"homogeneous start: Young's modulus {young[0]:.4g} kPa, Poisson's ratio {poisson[0]:.3f}, "
             f"misfit {found.point.misfit:.4g} (noise alone: {self.model.n_free:.4g})"
         )
@@ -209,7 +209,7 @@ class _Recipe:
     def free(self, point: Point) -> FieldEstimate:
         """Fit the zones without a penalty."""
         found = search(self.model, point, Objective(bounds=self.bounds))
-        self.tell(
+        self.record(
             f"fit of {self.model.zones.count} zones without penalty: misfit {found.point.misfit:.4g} after {found.iterations} iterations"
         )
         return self._estimate(self.model, found.point, found.status)
@@ -240,7 +240,7 @@ class _Recipe:
             first = self.model.evaluate(at.theta, at.states)
             found = search(self.model, first, Objective(penalty, weight, self.bounds), SEARCH_AT_WEIGHT, rule=step)
             done = WeightTrial(weight, found, found.point.misfit, penalty.value(found.point.theta))
-            self.tell(
+            self.record(
                 f"{penalty.name} of weight {weight:.3g}: misfit {done.misfit:.4g} (noise alone: {self.model.n_free:.4g}), "
                 f"penalty {done.penalty:.4g}, {found.iterations} iterations"
             )
@@ -249,7 +249,7 @@ class _Recipe:
         # a jump of 1 across the body would cost as much as a sixth of what the homogeneous body leaves unexplained
         first = 0.5 * point.misfit / (6.0 * float(graph.volume.sum()) ** ((self.model.mesh.dimension - 1) / self.model.mesh.dimension))
         choice = choose_weight(solve, first, self.model.n_free, rule)
-        self.tell(choice.reason)
+        self.record(choice.reason)
         return choice
 
     def _under_penalty(self, found: Found, choice: WeightChoice, resolved: FloatArray) -> FieldEstimate:
@@ -271,11 +271,11 @@ class _Recipe:
         target = self.model.n_free
         limit = max(field.chi_squared, target) + UNEXPLAINED * float(np.sqrt(2.0 * target))
         misfit, count = regions.point.misfit, regions.zones.count
-        self.tell(
+        self.record(
             f"{regions.clusters} clusters made {count} regions ({regions.moved} zones changed sides): misfit {misfit:.4g} without penalty"
         )
         if misfit > limit:
-            self.tell(f"the regions leave more unexplained than noise would ({limit:.4g}): the regularised field is the result")
+            self.record(f"the regions leave more unexplained than noise would ({limit:.4g}): the regularised field is the result")
             return replace(field, segmentation=regions, steps=tuple(self.steps))
         model = self.model.with_zones(regions.zones)
         sharp = self._estimate(model, model.evaluate(regions.point.theta, regions.point.states), Status.CONVERGED)

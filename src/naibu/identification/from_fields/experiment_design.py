@@ -1,4 +1,4 @@
-"""How accurate moduli will be before anything is measured: expected covariance and systematic error of a planned experiment (spec I6)."""
+"""Optimal experiment design: expected covariance (Cramer-Rao bound) and systematic error of a planned experiment (:cite:p:`kay1993`)."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ _TO_THE_END = SearchSettings(max_iterations=40, tolerance=1e-10)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Accuracy:
-    """What an experiment will tell about the moduli of its zones.
+    """Expected accuracy of the moduli of all zones in a planned experiment.
 
     Attributes
     ----------
     names : tuple of str
         The zones.
     young_modulus_sd : ndarray, shape (k,)
-        Standard deviation of Young's modulus as a share of it.
+        Relative standard deviation of Young's modulus.
     poisson_ratio_sd : ndarray, shape (k,)
         Standard deviation of Poisson's ratio.
     young_modulus_bias, poisson_ratio_bias : ndarray, shape (k,)
-        What would be wrong without any noise: relative error of Young's modulus, and error of Poisson's ratio.
+        Systematic error without noise: relative error of Young's modulus, and error of Poisson's ratio.
     """
 
     names: tuple[str, ...]
@@ -63,7 +63,7 @@ def expected_accuracy(
     poisson_ratio: ArrayLike,
     law: LawName = "linear",
 ) -> Accuracy:
-    """Return how accurately displacement matching will find the moduli of the zones.
+    """Return the accuracy with which FEMU will identify the moduli of the zones.
 
     The covariance is the inverse of the Fisher information (the Cramer-Rao bound) at the true moduli, the unknown displacement of the
     loaded nodes estimated along with them. The systematic error is what matching finds in the load cases' fields as they are, which should

@@ -34,7 +34,7 @@ from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.meshing.point_location import interpolation_operator
 
 LawName = Literal["linear", "neo_hookean"]
-EXACT = 1e-3  # standard deviation ascribed to data that are called exact, as a share of the largest displacement: models are not exact
+EXACT = 1e-3  # standard deviation ascribed to data that are called exact, as a fraction of the largest displacement: models are not exact
 SURFACE_STRAIN = 1.0  # standard deviation of the strain along loaded nodes: holds those near which nothing was measured
 NEWTON_TOLERANCE = 1e-9  # residual force over the force on the loaded nodes
 NEWTON_ITERATIONS = 12
@@ -137,7 +137,7 @@ def field_law(mesh: Mesh, name: LawName) -> FieldLaw:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """What was measured in a load case, whitened, and which components of the model's nodes follow from equilibrium.
+    """Measurements of a load case, whitened, and the components of the model's nodes that follow from equilibrium.
 
     Attributes
     ----------
@@ -194,7 +194,7 @@ def _whitening(field: DisplacementField, name: str) -> tuple[FloatArray, float, 
     covariance = np.zeros((k, d, d)) if field.covariance is None else field.covariance[field.valid]
     largest = float(np.abs(field.vectors[field.valid]).max())
     if not largest > 0.0:
-        raise InputError(f"load case {name!r}: nothing moves; a field without displacement tells nothing of moduli")
+        raise InputError(f"load case {name!r}: all displacements are zero; such a field does not determine moduli")
     values, vectors = np.linalg.eigh(covariance)
     exact = bool((values <= 0.0).all())
     if exact:
@@ -282,7 +282,7 @@ def equilibrium(
         u = u - np.where(constrained, 0.0, factor.solve(residual.ravel()).reshape(u.shape))
         if law.linear:
             return u, factor
-    raise ConvergenceError(f"load case {load_case.name!r}: Newton's method did not find the balance within {NEWTON_ITERATIONS} iterations")
+    raise ConvergenceError(f"load case {load_case.name!r}: Newton's method did not reach equilibrium within {NEWTON_ITERATIONS} iterations")
 
 
 def loaded_from_rest(

@@ -1,4 +1,8 @@
-"""Gauss-Newton over moduli and the displacement of loaded nodes together, within bounds, with or without a penalty (spec I6)."""
+"""Gauss-Newton search over moduli and displacements of loaded nodes, within bounds, with or without a penalty.
+
+This is finite element model updating (FEMU, :cite:p:`kavanagh1971,avril2008`): the misfit between computed and measured displacement is
+minimised, weighted by the covariance of the measurement.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +21,14 @@ from naibu.identification.from_fields.regularization import Regularization
 from naibu.identification.from_fields.sensitivities import FieldModel, Linearised, Point
 
 LONGEST_STEP = 1.0  # of a logarithm of a modulus in one iteration
-SHORTEST_SHARE = 1e-3  # of a step, below which the search ends
+SHORTEST_FRACTION = 1e-3  # of a step, below which the search ends
 NEGLIGIBLE = 1e-9  # by how much a step must promise to lower half of chi squared to be worth taking
 ANCHOR = 1e-9  # of the Hessian's largest diagonal entry, on every modulus: what neither data nor penalty determine stays where it is
 
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """Between which the moduli of all zones are sought.
+    """Bounds of the moduli of all zones.
 
     Attributes
     ----------
@@ -87,14 +91,14 @@ class Objective:
 
 @dataclass(frozen=True, slots=True)
 class SearchSettings:
-    """When a search ends.
+    """Stopping criteria of a search.
 
     Attributes
     ----------
     max_iterations : int
         Gauss-Newton iterations.
     tolerance : float
-        The search ends when a step promises to lower the objective by less than this share of it.
+        The search ends when a step promises to lower the objective by less than this fraction of it.
     """
 
     max_iterations: int = 30
@@ -151,7 +155,7 @@ def exact_step(at: Linearised, objective: Objective) -> Step:
     try:
         step[free] = -sl.cho_solve(sl.cho_factor(hessian[np.ix_(free, free)]), gradient[free])
     except np.linalg.LinAlgError as error:
-        raise ConvergenceError("the measured fields tell nothing of some moduli; measure more points, or join zones") from error
+        raise ConvergenceError("the measured fields do not determine some moduli; measure more points, or join zones") from error
     step *= min(1.0, LONGEST_STEP / max(float(np.abs(step).max()), 1e-300))
     promise = -float(gradient @ step + 0.5 * step @ hessian @ step)
     loaded = 0.5 * sum(float(r @ p) for r, p in zip(data.offset, at.gradient()[1], strict=True))
@@ -174,7 +178,7 @@ def search(
     settings : SearchSettings, optional
         When to end.
     rule : callable
-        Finds a step at a linearisation: `exact_step`, or `truncated_step` of `field_matching_many` where zones are many.
+        Finds a step at a linearisation: `exact_step`, or `naibu.identification.from_fields.truncated_newton.truncated_step` for many zones.
     """
     chosen = settings or SearchSettings()
     point, value = start, objective.value(start)
@@ -195,7 +199,7 @@ def _line_search(at: Linearised, step: Step, objective: Objective, value: float)
     point = at.point
     moved = at.forward(step.theta[:, None], [b[:, None] for b in step.loaded])
     share = 1.0
-    while share >= SHORTEST_SHARE:
+    while share >= SHORTEST_FRACTION:
         guesses = [u + share * du.reshape(u.shape) for u, du in zip(point.states, moved, strict=True)]
         try:
             found = at.model.evaluate(objective.clipped(point.theta + share * step.theta), guesses)

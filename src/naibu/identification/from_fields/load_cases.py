@@ -1,4 +1,4 @@
-"""Pushes of one body whose inner displacement was measured as a field, and the zones of cells whose moduli are sought (spec I1)."""
+"""Load cases with a measured displacement field, and the zones of cells whose moduli are sought."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ KNOWN = -1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldLoadCase:
-    """One push.
+    """One load case of a body whose inner displacement was measured as a field.
 
     Attributes
     ----------
@@ -28,7 +28,7 @@ class FieldLoadCase:
     field : DisplacementField
         Measured displacement, at any points inside the body; the voxels of a grid become a list of points.
     loaded : ndarray, shape (n, d), bool
-        Components of the model's nodes at which forces act that nobody measured - floor, plates, clamps: balance says nothing there.
+        Components of the model's nodes with unmeasured forces (floor, plates, clamps): no equilibrium equation holds there.
     external_force : ndarray, shape (n, d)
         Known forces on the nodes (weight, a measured push), mN.
     """

@@ -1,7 +1,7 @@
-"""What is asked of neighbouring zones where measurements do not tell: that moduli jump rarely (total variation) or vary slowly (Laplacian).
+"""Regularization of zone moduli: total variation (:cite:p:`rudin1992`), for few jumps, or Laplacian, for slow variation.
 
-Both act on theta = (ln mu, ln(kappa / mu)) of all zones, coupled, so that both jump at one place: a border of materials.
-Faces between cells weigh by their area, so that the penalty does not depend on the mesh.
+Both act on theta = (ln mu, ln(kappa / mu)) of all zones, coupled, so that both jump at the same interface. Faces between cells have the
+weight of their area, so that the penalty does not depend on the mesh.
 """
 
 from __future__ import annotations
@@ -138,7 +138,8 @@ class _OnJumps:
 class TotalVariation(_OnJumps):
     """Sum over faces of area times ``sqrt(jump^2 + rounding^2) - rounding``, jumps of both logarithms under one root.
 
-    Its Hessian is that of lagged diffusivity, which majorises: steps that lower the quadratic lower the penalty itself.
+    Its Hessian is that of lagged diffusivity (:cite:p:`vogel1996`), which majorises: steps that lower the quadratic lower the penalty
+    itself.
     """
 
     name = "total_variation"

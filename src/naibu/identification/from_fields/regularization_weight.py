@@ -1,4 +1,4 @@
-"""How much a penalty is to weigh: by the discrepancy principle, at the corner of the L-curve, or as given (spec I6)."""
+"""Regularization weight: discrepancy principle (:cite:p:`morozov1966`), corner of the L-curve (:cite:p:`hansen1993`), or a given value."""
 
 from __future__ import annotations
 

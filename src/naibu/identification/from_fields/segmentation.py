@@ -1,22 +1,17 @@
-"""From a field of moduli found under total variation to regions of one material each, refitted without the penalty (spec I6).
+"""Segmentation of a field of moduli into regions of one material each, refitted without the penalty.
 
-Total variation finds where materials meet but shrinks their contrast. So zones of like moduli are gathered into clusters; clusters are
-merged for as long as a criterion of Bayes' kind says that the measurements do not tell them apart; cells at borders change sides where
-that lowers the objective; and the moduli of what remains are fitted to the measurements alone.
+Total variation locates interfaces but reduces their contrast. Zones with similar moduli are therefore gathered into clusters
+(:cite:p:`ward1963`); clusters are merged as long as a Bayesian information criterion favours it; cells at interfaces change sides where
+that lowers the objective; and the moduli of the remaining regions are fitted to the measurements alone.
 
-The objective of a partition is half of chi squared, plus the weight of total variation times that of the partition (of no more than a
-clear jump), plus for each region the logarithms of the number of measurements (its two moduli) and of cells (where it is): BIC extended
-to sets of candidates [1]_.
-
-References
-----------
-.. [1] J. Chen and Z. Chen, Extended Bayesian information criteria for model selection with large model spaces, Biometrika 95:759, 2008.
+The objective of a partition is half of chi squared, plus the weighted total variation of the partition (each jump counted up to a maximum),
+plus, for each region, the logarithms of the number of measurements (its two moduli) and of cells (its location): BIC extended to sets of
+candidates (:cite:p:`schwarz1978,chen2008`).
 """
 
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,6 +19,7 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.progress import Progress, report_progress
 from naibu.identification.from_fields.gauss_newton import Bounds, Objective, SearchSettings, search
 from naibu.identification.from_fields.load_cases import KNOWN, Zones
 from naibu.identification.from_fields.regularization import BULK_SHARE, ZoneGraph
@@ -247,7 +243,7 @@ def border_moves(graph: ZoneGraph, labels: IntArray, theta: FloatArray, quadrati
 
 
 def segment(
-    model: FieldModel, graph: ZoneGraph, start: Point, weight: float, bounds: Bounds, progress: Callable[[str], None] | None = None
+    model: FieldModel, graph: ZoneGraph, start: Point, weight: float, bounds: Bounds, progress: Progress | None = None
 ) -> Segmentation:
     """Find regions in a field of moduli that was found under total variation of some weight, and fit them without it.
 
@@ -264,15 +260,15 @@ def segment(
     bounds : Bounds
         Of the moduli.
     progress : callable, optional
-        Told what is being done.
+        Gets a report after every number of clusters.
     """
     criterion = Criterion.of(model, graph, start, weight)
     found: list[tuple[float, IntArray, Point, int]] = []
     for most in CLUSTERS:
         labels, point, moved = _from_clusters(model, criterion, start, bounds, most)
         found.append((criterion.value(labels, point), labels, point, moved))
-        if progress is not None:
-            progress(f"{most} clusters made {int(labels.max()) + 1} regions, misfit {point.misfit:.4g}")
+        text = f"{most} clusters made {int(labels.max()) + 1} regions, misfit {point.misfit:.4g}"
+        report_progress(progress, text, done=len(found), total=len(CLUSTERS), objective=point.misfit)
     _, labels, point, moved = min(found, key=lambda f: f[0])
     order = np.argsort(-np.bincount(labels, graph.volume), kind="stable")
     labels = np.argsort(order)[labels]

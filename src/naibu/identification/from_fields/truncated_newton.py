@@ -1,7 +1,7 @@
-"""Gauss-Newton steps where zones are many: conjugate gradients with adjoints, no Jacobian is formed (spec I6).
+"""Inexact Gauss-Newton steps for many zones: conjugate gradients with adjoints, no Jacobian is formed (:cite:p:`dembo1982`).
 
-A product with the Hessian takes one forward and one adjoint solve a load case with factors that exist anyway. The preconditioner is the
-penalty's Hessian with a share of the data's mean diagonal for the moduli, and the Hessian of the loaded components for these.
+A product with the Hessian takes one forward and one adjoint solve for each load case, with existing factors. The preconditioner is the
+penalty's Hessian plus a fraction of the data's mean diagonal for the moduli, and the Hessian of the loaded components for these.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from naibu.identification.from_fields.sensitivities import Linearised
 from naibu.mechanics.linear_algebra.direct import direct_solver
 
 Parts = list[FloatArray]
-FORCING = 0.1  # conjugate gradients end when the residual of a step has fallen to this share
+FORCING = 0.1  # conjugate gradients end when the residual of a step has fallen to this fraction
 MAX_ITERATIONS = 150
-DATA_SHARE = 0.1  # of the mean diagonal of the data's Hessian in the preconditioner: most of its eigenvalues are far below
+DATA_FRACTION = 0.1  # of the mean diagonal of the data's Hessian in the preconditioner: most of its eigenvalues are far below
 
 
 def truncated_step(at: Linearised, objective: Objective, *, forcing: float = FORCING, max_iterations: int = MAX_ITERATIONS) -> Step:
@@ -55,7 +55,7 @@ class RegularizedSystem:
     def __init__(self, at: Linearised, curvature: sp.csr_matrix, free: BoolArray | None = None) -> None:
         self.at, self.curvature = at, curvature
         self.free = np.ones(curvature.shape[0], dtype=bool) if free is None else free
-        matrix = sp.bsr_matrix(curvature + sp.diags(DATA_SHARE * self._data_diagonal()), blocksize=(1, 1))
+        matrix = sp.bsr_matrix(curvature + sp.diags(DATA_FRACTION * self._data_diagonal()), blocksize=(1, 1))
         matrix.sort_indices()
         self._factor = direct_solver(matrix, symmetric=True).factorize(matrix)
 
@@ -95,7 +95,7 @@ def _as_columns(v: Parts) -> tuple[FloatArray, Parts]:
 def conjugate_gradients(
     product: Callable[[Parts], Parts], precondition: Callable[[Parts], Parts], right: Parts, forcing: float, max_iterations: int
 ) -> tuple[Parts, Parts]:
-    """Return solution and residual once the residual, in the preconditioner's norm, has fallen to the share `forcing`.
+    """Return solution and residual once the residual, in the preconditioner's norm, has fallen to the fraction `forcing`.
 
     Every part of `right` may have columns: these have their own iterations, which are advanced together.
     """

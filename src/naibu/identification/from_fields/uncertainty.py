@@ -1,4 +1,4 @@
-"""How well moduli are determined: covariance, Cramer-Rao bound, resolution, and what of it to tell a reader (spec I6)."""
+"""Uncertainty of identified moduli: Fisher information, Cramer-Rao bound (:cite:p:`kay1993`), resolution, and a summary in words."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.sensitivities import FieldModel, Linearised, Point, logarithms, young_and_poisson
 from naibu.identification.from_fields.truncated_newton import RegularizedSystem, conjugate_gradients
 
-UNKNOWN_BELOW = 1e-12  # share of the largest eigenvalue of the information below which a combination is not determined at all
+UNKNOWN_BELOW = 1e-12  # fraction of the largest eigenvalue of the information below which a combination is not determined at all
 PROBES = 24
 WELL, POORLY = 0.1, 0.5  # standard deviations of a logarithm of a modulus that are called well and poorly determined
 POISSON_POORLY = 0.1
@@ -25,7 +25,7 @@ RESOLVED = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
-    """What the measurements say about the moduli of k zones.
+    """Fisher information and covariance of the moduli of k zones.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ def cramer_rao_bound(
     *,
     law: LawName = "linear",
 ) -> Uncertainty:
-    """Return what no unbiased estimate can beat at true moduli and displacements, the motion of loaded nodes being unknown.
+    """Return the Cramer-Rao bound at true moduli and displacements, the motion of loaded nodes being unknown.
 
     Parameters
     ----------
@@ -108,11 +108,7 @@ def resolution(at: Linearised, objective: Objective, *, explicit: bool, probes: 
     """Return by how much an estimate under a penalty follows the truth, for every logarithm (2 count,): 1 is all, 0 not at all.
 
     It is the diagonal of ``(A + P)^-1 A`` with the information A and the penalty's Hessian P: exact from explicit matrices, else its
-    estimate from products with random signs [1]_, which scatters about the truth (and beyond 0 and 1), less so its sum.
-
-    References
-    ----------
-    .. [1] C. Bekas, E. Kokiopoulou, Y. Saad, An estimator for the diagonal of a matrix, Applied Numerical Mathematics 57:1214, 2007.
+    estimate from products with random signs (:cite:p:`bekas2007`), which has random errors (single values may leave the range from 0 to 1).
     """
     curvature = objective.curvature(at.point.theta)
     size = curvature.shape[0]
@@ -157,7 +153,7 @@ def _worst(zones: Zones, found: Uncertainty) -> str:
     sd = 1.0 / np.sqrt(max(float(values[0]), 1e-300)) * float(np.abs(vectors[:, 0]).max())
     several = "together " if len(parts) > 1 else ""
     much = f"by {100 * sd:.2g} %" if sd < 1.0 else f"{np.exp(min(sd, 300.0)):.2g} times"
-    return f"Least determined among {2 * k} numbers: {towards}; {several}{much} before the measurements object."
+    return f"Least determined among {2 * k} numbers: {towards}; {several}{much} before the fit exceeds the noise."
 
 
 def resolution_report(zones: Zones, centres: FloatArray, resolved: FloatArray) -> tuple[str, ...]:

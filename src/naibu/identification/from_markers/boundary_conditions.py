@@ -1,4 +1,4 @@
-"""What touches a measured object: the table, plates and bars, and the joints between its blocks."""
+"""Contacts of a measured object: table, plates and bars, and the joints between its blocks."""
 
 from __future__ import annotations
 

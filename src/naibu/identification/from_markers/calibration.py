@@ -1,8 +1,8 @@
-"""From experiments to a calibrated model: which parameters there are, what is known of them beforehand, and what the data say."""
+"""Calibration: parameters with priors, and their joint identification from markers in all loaded states by FEMU."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +10,8 @@ import numpy as np
 from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, Layer, State
 from naibu.core.parameters import Parameter, ParameterSet
-from naibu.identification.from_markers.gauss_newton import Match, Matcher, MatchingSettings
+from naibu.core.progress import Progress
+from naibu.identification.from_markers.gauss_newton import Checkpoint, Match, Matcher, MatchingSettings
 from naibu.identification.from_markers.initial_guess import equilibrium_gap
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import MarkerLoadCase, NoiseModel, SolvedLoadCase
@@ -34,13 +35,13 @@ START_POISSON_RATIO = 0.49
 START_FRICTION = 0.2
 START_SPRING = 30.0  # kPa/mm
 PIXEL_SCALE_SD = 0.005  # a size printed with two digits, 0.29 mm for 0.293
-BATCH_SD = 0.3  # of ln(stiffness) between batches: the report's samples of one gel scatter by 0.2 (Table 3.4)
-TRUSTED_RATIO = (0.05, 20.0)  # of an unknown modulus to the known ones; force balance is not believed beyond
+BATCH_SD = 0.3  # of ln(stiffness) between batches: the samples of one gel in Hirai et al. (2008), Table 3.4, have an SD of 0.2
+TRUSTED_RATIO = (0.05, 20.0)  # of an unknown modulus to the known ones; the equilibrium gap is not used beyond
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """The load cases of a calibration and the match found for them."""
+    """Load cases of a calibration and their fit."""
 
     load_cases: tuple[MarkerLoadCase, ...]
     match: Match
@@ -65,7 +66,8 @@ def calibrate(
     search: MatchingSettings | None = None,
     start: Mapping[str, float] | None = None,
     warm_starts: Mapping[str, SolvedLoadCase] | None = None,
-    callback: Callable[[int, float, Mapping[str, float]], None] | None = None,
+    progress: Progress | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> Calibration:
     """Identify materials, friction and boundary conditions from all loaded states of some experiments jointly.
 
@@ -87,8 +89,10 @@ def calibrate(
         Physical values to start from, by name; priors keep their centres.
     warm_starts : mapping, optional
         Solutions near the start, by the labels of their load cases (`Calibration.warm_starts`); they save time.
-    callback : callable, optional
-        ``callback(iteration, objective, values)`` after every step.
+    progress : callable, optional
+        Gets a report after every step (`naibu.core.progress`).
+    checkpoint : callable, optional
+        Gets the values of all parameters after every step.
 
     Raises
     ------
@@ -108,7 +112,9 @@ def calibrate(
     known = known_materials or _first_material(experiments)
     parameters = initial_parameters(specimens, used, known)
     begin = dict(start or {}) or _start_from_equilibrium_gap(experiments, known, used)
-    match = Matcher(load_cases, parameters, search or MatchingSettings()).run(callback, start=begin, warm_starts=warm_starts)
+    match = Matcher(load_cases, parameters, search or MatchingSettings()).run(
+        progress=progress, checkpoint=checkpoint, start=begin, warm_starts=warm_starts
+    )
     return Calibration(load_cases, match, chosen, measured, known)
 
 
@@ -119,7 +125,7 @@ def _first_material(experiments: Sequence[Experiment]) -> KnownMaterials:
 def _start_from_equilibrium_gap(
     experiments: Sequence[Experiment], known_materials: KnownMaterials, states: Mapping[str, Sequence[str]]
 ) -> dict[str, float]:
-    """Young's moduli, by parameter, from the force balance between markers, where it gives sensible ones; a start needs no more."""
+    """Young's moduli, by parameter, from the equilibrium gap between markers, where they are plausible."""
     try:
         found = equilibrium_gap(experiments, known_materials, states)
     except (InputError, np.linalg.LinAlgError):
@@ -205,7 +211,7 @@ def _friction_parameters(s: Specimen) -> list[Parameter]:
 
 
 def state_parameters(experiment: Experiment, state: State) -> list[Parameter]:
-    """Parameters of the boundary conditions of one state, with their priors: opening, tilt of a plate, offset of a bar."""
+    """Parameters of the boundary conditions of one state, with their priors: platen position, tilt of a plate, offset of a bar."""
     prefix = f"{experiment.name}/{state.name}"
     full = experiment.full_platen_position_mm
     start = state.estimated_mm or state.stated_mm or 0.7 * full

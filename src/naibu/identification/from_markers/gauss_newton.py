@@ -1,8 +1,9 @@
-"""Identification by matching measured marker positions: Gauss-Newton on whitened residuals with exact sensitivities.
+"""Finite element model updating (FEMU) with markers: Gauss-Newton on whitened residuals with exact sensitivities.
 
-Unknowns are the parameters of the materials and of friction, shared by all experiments; the boundary conditions of every state; where the
-base lies below the markers; and the rigid pose of the object in every loaded scan. All are estimated together, so that the covariance
-of the materials' parameters includes what the nuisances cost.
+Computed positions are fitted to measured ones (:cite:p:`kavanagh1971,avril2008`) by damped Gauss-Newton steps (:cite:p:`marquardt1963`)
+with robust weights (:cite:p:`huber1964`). Unknowns are the parameters of the materials and of friction, common to all experiments; the
+boundary conditions of every state; the position of the base below the markers; and the rigid pose of the object in every loaded scan. All
+are estimated together, so that the covariance of the material parameters includes the uncertainty of the others.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.parameters import Parameter, ParameterSet
+from naibu.core.progress import Progress, report_progress
 from naibu.core.rigid_transform import RigidTransform, registration
 from naibu.core.status import Status
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase, SolvedLoadCase
@@ -29,15 +31,16 @@ from naibu.mechanics.finite_strain.statics import Solution, WarmStart, solve
 from naibu.mechanics.linear_algebra.direct import use_one_thread
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
 
+Checkpoint = Callable[[Mapping[str, float]], None]
 WIDEST_STEP = 3.0  # of an unknown on a linear scale: mm for positions
 UNEVEN = 0.01  # points that slip over an edge make the objective uneven; a step that promises less than this and fails ends the search
-ROUGH = 0.1  # a search is rough while a step may lower the objective by more than this share
+ROUGH = 0.1  # a search is rough while a step may lower the objective by more than this fraction
 _PATH = SolverSettings(first_step=0.02, largest_step=0.15, tolerance=1e-6)
 
 
 @dataclass(frozen=True, slots=True)
 class MatchingSettings:
-    """How to search.
+    """Settings of the Gauss-Newton search.
 
     Attributes
     ----------
@@ -56,7 +59,7 @@ class MatchingSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Match:
-    """Result of a search.
+    """Result of a Gauss-Newton search.
 
     Attributes
     ----------
@@ -69,7 +72,7 @@ class Match:
     chi_squared, degrees_of_freedom : float
         Noise-normalised sum of squares of the data, and number of data minus effective number of parameters.
     information : ndarray, shape (p, p)
-        What the data alone (without priors) say about the free parameters.
+        Fisher information of the data alone (without priors) about the free parameters.
     status : Status
     history : tuple of float
         Objective after every iteration.
@@ -105,8 +108,8 @@ class NormalEquations:
     data : ndarray, shape (s, s)
         The data's part of `hessian`.
     bend : ndarray, shape (s,)
-        What the curvature of the optimiser's scales adds to the diagonal of the Hessian where it stabilises: without it a modulus or a
-        Poisson's ratio that the data push to the end of its scale swings to and fro.
+        Contribution of the curvature of the optimiser's scales to the diagonal of the Hessian where it stabilises: without it a modulus
+        or a Poisson's ratio close to the end of its scale oscillates.
     """
 
     hessian: FloatArray
@@ -128,7 +131,7 @@ class Matcher:
     def evaluate(
         self, values: Mapping[str, float], warm_starts: Sequence[SolvedLoadCase | None] = (), poses: Sequence[RigidTransform | None] = ()
     ) -> list[LoadCaseFit]:
-        """Solve all load cases at `values`; solutions `warm_starts` help, and `poses` stand in for those that register the markers best.
+        """Solve all load cases at `values`, from `warm_starts` where given; `poses` replace those that register the markers best.
 
         Raises
         ------
@@ -246,12 +249,13 @@ class Matcher:
 
     def run(
         self,
-        callback: Callable[[int, float, Mapping[str, float]], None] | None = None,
         *,
+        progress: Progress | None = None,
+        checkpoint: Checkpoint | None = None,
         start: Mapping[str, float] | None = None,
         warm_starts: Mapping[str, SolvedLoadCase] | None = None,
     ) -> Match:
-        """Search for the parameters; `callback(iteration, objective, values)` is called after every accepted step.
+        """Search for the parameters; after every accepted step `checkpoint` gets the values found so far and `progress` a report.
 
         The search starts from the parameters' own values, or from those in `start`; `warm_starts` are solutions near the start, by the
         labels of their load cases.
@@ -290,8 +294,9 @@ class Matcher:
                 inner, fits, now = found
                 damping = max(damping / 10.0, 1e-8)
                 history.append(now.objective)
-                if callback is not None:
-                    callback(iteration, now.objective, self.parameters.values(inner))
+                if checkpoint is not None:
+                    checkpoint(self.parameters.values(inner))
+                report_progress(progress, "calibration", done=iteration + 1, objective=now.objective)
                 if gained < 2.0 * self.settings.tolerance * max(1.0, 0.01 * now.objective):
                     status = Status.CONVERGED
                     break
@@ -341,9 +346,9 @@ class Matcher:
 
 
 def _limits(free: Sequence[Parameter], rough: bool) -> FloatArray:
-    """Largest change of each free parameter in one step, on the optimiser's scale: what would be a surprise is approached slowly.
+    """Largest change of each free parameter in one step, on the optimiser's scale: values far from the prior are approached slowly.
 
-    While the search is `rough`, whatever is nearly known beforehand (tilts, offsets) rests, lest it makes up for a wrong height.
+    While the search is `rough`, parameters with narrow priors (tilts, offsets) are fixed, lest they compensate a wrong height.
     """
     limits = np.array([{"log": 1.0, "incompressibility": 1.5}.get(q.scale, min(q.prior_sd, WIDEST_STEP)) for q in free])
     nearly_known = np.array([q.scale == "linear" and q.prior_sd < WIDEST_STEP for q in free])

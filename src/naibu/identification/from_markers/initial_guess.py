@@ -1,11 +1,12 @@
-"""Identification by force balance: at an unloaded marker the forces of the cells around it sum to zero, linearly in the parameters.
+"""Equilibrium gap between markers, as initial guess: at an unloaded marker the forces of the cells around it sum to zero.
 
-The report's principle (report ch. 3) with a finite-strain law: one linear least-squares problem for all load cases, no initial guess, no
-boundary conditions. What it bears badly is noise in the displacement, which enters the matrix too and pulls Poisson's ratio down to
-nothing. Further sweeps therefore weigh the equations with the covariance that noise gives them, and move the displacement by the least
-that balances the forces: the Gauss-Helmert model of least squares with conditions (Mikhail & Ackermann 1976). Nodes interpolated on an
-interface have one strain on both sides, where nature has one stress: they pull unknown moduli towards the known ones. An estimate is good
-for a start: within a factor of two under plates, and worse under a bar.
+The principle is that of :cite:t:`claire2004` and of chapter 3 of :cite:t:`hirai2008` with a finite-strain law: one linear least-squares
+problem in the moduli for all load cases, without initial guess or boundary conditions. It is sensitive to noise in the displacement, which
+enters the matrix as well and biases Poisson's ratio towards its lower bound. Further sweeps therefore weight the equations with the
+covariance that the noise gives them, and correct the displacement by the least amount that restores equilibrium: the Gauss-Helmert model of
+least squares with conditions (:cite:p:`mikhail1976`). Nodes interpolated on an interface have equal strain on both sides, where in reality
+the traction is equal: they bias unknown moduli towards the known ones. The estimate is good enough for a start: within a factor of two
+under plates, and worse under a bar.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from naibu.identification.from_markers.known_materials import KnownMaterials
 
 LAW = law_named("neo_hookean")
-SWEEPS = 2  # with noise the estimate has not settled then, nor after 20: beyond about 4 it scatters from one noise draw to the next
+SWEEPS = 2  # with noise the estimate has not settled then, nor after 20: beyond about 4 it varies from one noise draw to the next
 UNMEASURED_SD_MM = 0.5  # of a node that was completed or interpolated
 POISSON_RATIO = 0.45  # of a known material, until a sweep has found its own
 SMALLEST, LARGEST = 1e-3, 1e3  # bounds of the moduli, in units of the known ones
@@ -50,7 +51,7 @@ class _System:
 
 @dataclass(slots=True, eq=False)
 class _MeshEquations:
-    """A marker mesh ready to be balanced; `displacement` moves with the sweeps."""
+    """A marker mesh with its assembler; `displacement` is corrected by the sweeps."""
 
     source: MarkerMesh
     sd: FloatArray
@@ -62,7 +63,7 @@ class _MeshEquations:
         placeholder = [from_moduli(LAW, 1.0, 10.0)] * len(source.mesh.region_names)
         assembler = Assembler.from_materials(elements(source.mesh), source.mesh.regions, placeholder)
         if assembler.forces(source.displacement)[2] <= 0.0:
-            raise InputError(f"{source.label}: a cell between markers is turned inside out; check the markers' numbers and positions")
+            raise InputError(f"{source.label}: a cell between markers is inverted; check the markers' numbers and positions")
         spread = np.where(source.measured, sd, UNMEASURED_SD_MM)
         return cls(source, spread, assembler, source.displacement)
 
@@ -87,7 +88,7 @@ class _MeshEquations:
     def system(
         self, sought: Sequence[tuple[str, int]], fixed: Mapping[tuple[str, int], float], moduli: Mapping[str, tuple[float, float]] | None
     ) -> _System:
-        """Return the balances of this load case, linearised about `displacement`; without `moduli` all have unit weight."""
+        """Return the equilibrium equations of this load case, linearised about `displacement`; without `moduli` all have unit weight."""
         matrix = np.column_stack([self.column(*key) for key in sought])
         right = -np.sum([value * self.column(*key) for key, value in fixed.items()], axis=0)
         if moduli is None:
@@ -107,7 +108,7 @@ def equilibrium_gap(
     noise: NoiseModel | None = None,
     sweeps: int = SWEEPS,
 ) -> dict[str, tuple[float, float]]:
-    """Estimate the materials with unknown modulus from the balance of forces between markers, over all load cases jointly.
+    """Estimate the materials with unknown modulus by the equilibrium gap between markers, over all load cases jointly.
 
     Blocks that merely lie on each other are taken to be tied.
 
@@ -124,7 +125,7 @@ def equilibrium_gap(
     noise : NoiseModel, optional
         Of the measurement.
     sweeps : int
-        Sweeps after the first, plain one; 0 gives the report's batch method.
+        Weighted sweeps after the first, unweighted one; 0 gives the batch method of :cite:t:`hirai2008`.
 
     Returns
     -------
@@ -200,7 +201,7 @@ def _sweep(
     fixed: Mapping[tuple[str, int], float],
     moduli: Mapping[str, tuple[float, float]] | None,
 ) -> dict[str, tuple[float, float]] | None:
-    """Solve for the moduli sought; with `moduli` to weigh by, also move the displacements to balance. None where a cell turned over."""
+    """Solve for the moduli sought; with `moduli` to weigh by, also correct the displacements. None where a cell is inverted."""
     systems = [t.system(sought, fixed, moduli) for t in load_cases]
     reference = float(np.mean([v for (_, which), v in fixed.items() if which == 0]))
     whitened = [tuple(solve_triangular(s.factor, a, lower=True) for a in (s.matrix, s.right)) for s in systems]
@@ -233,12 +234,14 @@ def _young(mu: float, lame_lambda: float) -> tuple[float, float]:
 def _require_solvable(meshes: Sequence[MarkerMesh], known: Mapping[str, float], unknown: Sequence[str]) -> None:
     """Refuse systems without a scale, with too few equations, or with an unknown material that nothing ties to a known one."""
     if not known:
-        raise InputError("force balance finds moduli by comparison: name a material of the experiments whose Young's modulus is known")
+        raise InputError("the equilibrium gap gives ratios of moduli: name a material of the experiments whose Young's modulus is known")
     if not unknown:
         raise InputError(f"no material is unknown: {', '.join(known)} are all given")
     equations = 3 * sum(len(m.interior) for m in meshes)
     if equations < 2 * len(unknown) + len(known):
-        raise InputError(f"{equations} force balances are too few for {len(unknown)} unknown materials; use 3 x 3 x 3 markers or more")
+        raise InputError(
+            f"{equations} equilibrium equations are too few for {len(unknown)} unknown materials; use 3 x 3 x 3 markers or more"
+        )
     reached = set(known)
     groups = [{m.mesh.region_names[r] for r in np.unique(regions)} for m in meshes for regions in _regions_at(m)]
     for _ in unknown:

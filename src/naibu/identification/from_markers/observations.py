@@ -1,4 +1,4 @@
-"""Measured states as the matching sees them, and as a set of parameters explains them."""
+"""Load cases with measured markers: data, noise, and their fit at a set of parameters."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FAR_MM = 1.0
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """Standard deviation of a measured coordinate, mm: placing of the marker's centre, and quantisation to pixels and slices."""
+    """Standard deviation of a measured coordinate, mm: localisation of the marker's centre, and quantisation to pixels and slices."""
 
     placing_mm: float = 0.1
 
@@ -33,7 +33,7 @@ class NoiseModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkerLoadCase:
-    """One measured state of a specimen.
+    """One load case with measured markers: a loaded state of a specimen.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class MarkerLoadCase:
     sd : ndarray, shape (3,)
         Standard deviation of a measured coordinate of the loaded state, mm.
     free_sd : ndarray, shape (k, 3)
-        That of the free state; larger where a coordinate was completed from the lattice.
+        That of the reference configuration; larger where a coordinate was completed from the lattice.
     """
 
     specimen: Specimen
@@ -82,7 +82,7 @@ class MarkerLoadCase:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadCaseFit:
-    """A load case at one set of parameters.
+    """Computed and measured markers of a load case at one set of parameters.
 
     Attributes
     ----------
@@ -110,21 +110,21 @@ class LoadCaseFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolvedLoadCase:
-    """A solved load case, to start from: its fit, and the parameters with the values that gave it."""
+    """A solved load case to start other searches from: its fit and the parameters that gave it."""
 
     fit: LoadCaseFit
     parameters: ParameterSet
 
     def warm_start(self, values: Mapping[str, float]) -> list[WarmStart]:
-        """Where the states of its path lie at other `values`."""
+        """Return estimates of the states on its path at other `values`, to first order."""
         change = np.array([values.get(q.name, q.value) - q.value for q in self.parameters.free])
         return _warm_start(self.fit, change)
 
 
 def _warm_start(previous: LoadCaseFit, change: FloatArray) -> list[WarmStart]:
-    """Where the states of a path lie after a small `change` of the parameters; of states close together one is enough.
+    """Return estimates of the states of a path after a small `change` of the parameters, one for states close together.
 
-    After a large change the path is better followed anew: a poor guess costs more iterations than none.
+    There is none after a large change: a poor estimate costs more iterations than none.
     """
     out: list[WarmStart] = []
     if np.abs(previous.path[-1] @ change).max() > FAR_MM:

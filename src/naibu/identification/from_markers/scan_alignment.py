@@ -1,4 +1,4 @@
-"""Where the object lies in the scan of its free state: the frame of the model from the markers and what is known of their lattice."""
+"""Scan alignment: pose of the object in the scan of its reference configuration, from the markers and the design of their lattice."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Placement:
 
 
 def placement(experiment: Experiment) -> Placement:
-    """Find the object in its free scan.
+    """Find the pose of the object in the scan of its reference configuration.
 
     The turn about the vertical is that of the marker lattice where it has a nominal spacing; x and y are centred on the markers (the
     lattice is taken to be centred in the object); the base is the one stated in the file, else the lattice's nominal heights, else the

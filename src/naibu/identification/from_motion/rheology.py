@@ -1,13 +1,13 @@
-"""Elastic and viscous parameters from displacement histories of points inside, with and without a measured force (spec I6).
+"""Identification of the three-element (Jeffreys) model from displacement histories of points, with or without measured forces.
 
-The three-element model of every region is fitted to the measured motion by Gauss and Newton on the logarithms of E, C1 and C2 and on the
-Poisson ratios. Without a force sensor displacements alone tell ratios of moduli and viscosities, unless weight or inertia, a known region
-or a force gives the scale.
+The model of every region is fitted to the measured motion by Gauss-Newton on the logarithms of E, C1 and C2 and on the Poisson's ratios
+(FEMU in time, :cite:p:`avril2008`). Without a force sensor displacements determine only ratios of moduli and viscosities, unless weight,
+inertia, a known region or a force sets the scale.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,6 +19,7 @@ from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.parameters import Parameter, ParameterSet, Scale
+from naibu.core.progress import Progress, report_progress
 from naibu.mechanics.small_strain.dynamics import Load, Series, simulate_motion
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.mechanics.small_strain.rheology import CellRheology, Rheology, per_region, three_element
@@ -30,12 +31,12 @@ KINDS = ("young_modulus", "voigt_viscosity", "series_viscosity", "poisson_ratio"
 UNITS = {"young_modulus": "kPa", "voigt_viscosity": "kPa s", "series_viscosity": "kPa s", "poisson_ratio": ""}
 PRIOR_SD = {"young_modulus": 3.0, "voigt_viscosity": 3.0, "series_viscosity": 3.0, "poisson_ratio": 1.5}
 DIFFERENCE = 1e-4  # on the optimiser's scale, between the tables of materials that give the direction of a parameter
-TOLD = 0.5  # a direction is told by the data where they narrow its prior to less than this share
+DETERMINED = 0.5  # a direction is determined where the data narrow its prior to less than this fraction
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionLoadCase:
-    """One measured motion.
+    """One load case with a measured motion.
 
     Attributes
     ----------
@@ -46,11 +47,11 @@ class MotionLoadCase:
     body : LinearBody
         The same, prepared.
     supports : tuple of Support
-        What holds and moves the body.
+        Constraints and prescribed motions of the body.
     times_s : ndarray, shape (k,)
-        Times of the measurements; the body is at rest in its free shape at the first.
+        Times of the measurements; the body is at rest in its reference configuration at the first.
     points_mm : ndarray, shape (q, d)
-        Measured points of the free body.
+        Measured points in the reference configuration.
     displacement : ndarray, shape (k, q, d)
         mm; NaN where not measured.
     sd_mm : float
@@ -147,7 +148,7 @@ class MotionLoadCase:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionEstimate:
-    """What the motions tell.
+    """Parameters identified from motions.
 
     Attributes
     ----------
@@ -156,7 +157,7 @@ class MotionEstimate:
     covariance : ndarray, shape (p, p)
         Of the free parameters on the optimiser's scale, priors included, enlarged where the misfit exceeds the noise.
     information : ndarray, shape (p, p)
-        What the data alone tell.
+        Fisher information of the data alone.
     noise_factor : float
         Root mean square residual in units of the stated noise.
     residual : tuple of ndarray, shape (k, q, d)
@@ -164,7 +165,7 @@ class MotionEstimate:
     series : tuple of Series
         The modelled motions.
     undetermined : tuple of str
-        In words, the combinations that the data do not tell.
+        Combinations of parameters that the data do not determine, in words.
     """
 
     parameters: ParameterSet
@@ -222,9 +223,7 @@ def rheology_parameters(
     return ParameterSet.of(out)
 
 
-def identify_motion(
-    load_cases: Sequence[MotionLoadCase], parameters: ParameterSet, *, progress: Callable[[int, float], None] | None = None
-) -> MotionEstimate:
+def identify_motion(load_cases: Sequence[MotionLoadCase], parameters: ParameterSet, *, progress: Progress | None = None) -> MotionEstimate:
     """Fit the parameters of all regions to the measured motions.
 
     Parameters
@@ -234,7 +233,7 @@ def identify_motion(
     parameters : ParameterSet
         From `rheology_parameters`.
     progress : callable, optional
-        ``progress(evaluation, chi_squared)``.
+        Gets a report after every evaluation (`naibu.core.progress`).
 
     Raises
     ------
@@ -265,9 +264,7 @@ def identify_motion(
 class _Problem:
     """Whitened residuals of all load cases and priors as a function of the free parameters."""
 
-    def __init__(
-        self, load_cases: tuple[MotionLoadCase, ...], parameters: ParameterSet, progress: Callable[[int, float], None] | None
-    ) -> None:
+    def __init__(self, load_cases: tuple[MotionLoadCase, ...], parameters: ParameterSet, progress: Progress | None) -> None:
         self.load_cases, self.parameters, self.progress = load_cases, parameters, progress
         self.operators: list[sp.csr_array] = [interpolation_operator(t.mesh, t.points_mm) for t in load_cases]
         self.centre = np.array([p.inner(p.value) for p in parameters.free])
@@ -296,8 +293,7 @@ class _Problem:
     def residuals(self, inner: FloatArray) -> FloatArray:
         data = self.data_residuals(self.simulated(inner))
         self.evaluations += 1
-        if self.progress is not None:
-            self.progress(self.evaluations, float(data @ data))
+        report_progress(self.progress, "fitting measured motions", done=self.evaluations, objective=float(data @ data))
         return np.concatenate([data, (inner - self.centre) / self.prior_sd])
 
     def jacobian(self, inner: FloatArray) -> FloatArray:
@@ -344,16 +340,16 @@ class _Problem:
         names = [p.name for p in free]
         out = []
         for value, direction in zip(sharpness, directions.T, strict=True):
-            if 1.0 / np.sqrt(1.0 + max(value, 0.0)) < TOLD:
+            if 1.0 / np.sqrt(1.0 + max(value, 0.0)) < DETERMINED:
                 continue
             parts = [i for i in np.argsort(-np.abs(direction)) if abs(direction[i]) > 0.3]
             listed = ", ".join(names[i] for i in sorted(parts))
             if len(parts) == 1:
-                out.append(f"The data hardly tell {listed}.")
+                out.append(f"The data hardly determine {listed}.")
             elif len({np.sign(direction[i]) for i in parts}) == 1 and all(free[i].scale == "log" for i in parts):
-                out.append(f"The data do not tell a common factor of {listed}; they tell the ratios.")
+                out.append(f"The data do not determine a common factor of {listed}; they determine the ratios.")
             else:
-                out.append(f"The data do not tell {listed} one by one: changes of some make up for changes of others.")
+                out.append(f"The data do not determine {listed} separately: changes of some compensate changes of others.")
         return tuple(out)
 
 

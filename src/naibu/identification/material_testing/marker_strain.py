@@ -1,8 +1,8 @@
-"""Strain, change of volume and Poisson's ratio inside a body, from the positions of markers in two states (spec S9).
+"""Strain, volume ratio and Poisson's ratio inside a body from local affine fits to markers in two states.
 
-Around every marker an affine map is fitted to its neighbours. It needs neither a lattice nor a model, and the uncertainty of a position
-goes through it in closed form. Change of volume is what tells Poisson's ratios near 0.5 apart, and it can be measured wherever the
-markers are, however the ends are held: the ratio of two strains needs a bar that is free to widen.
+Around every marker an affine map is fitted to its neighbours. This needs neither a lattice nor a model, and the uncertainty of the
+positions propagates in closed form. The volume ratio distinguishes Poisson's ratios close to 0.5, and it can be measured wherever there are
+markers, whatever the end conditions: a ratio of two strains requires a bar that is free to expand laterally.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def poisson_ratio_from_markers(
     scale_sd: float = 0.0,
     confidence: float = 0.95,
 ) -> PoissonRatio:
-    """Compute Poisson's ratio from the change of volume inside a compressed body, averaged over all neighbourhoods (spec S9).
+    """Compute Poisson's ratio from the change of volume inside a compressed body, averaged over all neighbourhoods.
 
     With J = det F and l the stretch of the material along `axis`, ``nu = (1 - mean ln J / mean ln l) / 2`` (Hencky strains). Where
     friction holds the sides back, the pressure is higher than in a free bar and the volume shrinks more at the same l: the true ratio

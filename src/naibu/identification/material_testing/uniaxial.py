@@ -1,15 +1,9 @@
-"""Moduli from simple tests: Young's modulus from a compression test, Poisson's ratio from strains or from markers inside (spec S9).
+"""Uniaxial material tests: Young's modulus from compression tests, Poisson's ratio from strains or from markers inside.
 
-Both need care that their formulas do not show. A compression test begins with slack (plates that do not touch yet, faces that are not
-flat), its curve bends because the strain is finite [2]_, and plates that hold the faces make the specimen look stiffer than it is [1]_.
-A ratio of strains is Poisson's ratio only at small strain: a body that keeps its volume shows 0.62 when it is pressed by 25 %. Hencky's
-logarithmic strains [3]_ give 0.5.
-
-References
-----------
-.. [1] A. N. Gent and P. B. Lindley, "The compression of bonded rubber blocks", Proc. Inst. Mech. Eng. 173 (1959) 111-122.
-.. [2] L. R. G. Treloar, "The Physics of Rubber Elasticity", 3rd edition, Oxford, 1975, chapter 5.
-.. [3] H. Hencky, "Ueber die Form des Elastizitaetsgesetzes bei ideal elastischen Stoffen", Z. techn. Phys. 9 (1928) 215-220.
+A compression test begins with slack (plates not yet in contact, faces that are not flat), its curve is nonlinear because the strain is
+finite (:cite:p:`treloar1975`, chapter 5), and plates that constrain the faces make the specimen appear stiffer (:cite:p:`gent1959`). A
+ratio of strains is Poisson's ratio at small strain only: an incompressible body shows 0.62 at 25 % compression, while logarithmic strains
+(:cite:p:`hencky1928`) give 0.5.
 """
 
 from __future__ import annotations
@@ -128,11 +122,11 @@ def compression_test(
     relative_height_sd: float = 0.0,
     confidence: float = 0.95,
 ) -> CompressionTest:
-    """Estimate Young's modulus from the readings of a compression test (spec S9, report Table 3.4).
+    """Estimate Young's modulus from the readings of a compression test (:cite:p:`hirai2008`, Table 3.4).
 
-    Fitted is ``F = A E g((d - d0) / H)``: with ``curve="linear"`` g(e) = e, with ``"neo_hookean"`` the nominal stress of an
-    incompressible solid, g(e) = ((1 - e)^-2 - (1 - e)) / 3 (Treloar 1975). The slack d0 takes up plates that do not touch yet and the
-    toe of faces that are not flat: readings outside `strain_range`, counted from d0, are left out, and the curve is extended to zero force.
+    Fitted is ``F = A E g((d - d0) / H)``: with ``curve="linear"`` g(e) = e, with ``"neo_hookean"`` the nominal stress of an incompressible
+    solid, g(e) = ((1 - e)^-2 - (1 - e)) / 3 (:cite:p:`treloar1975`). The slack d0 takes up plates that do not touch yet and the toe of
+    faces that are not flat: readings outside `strain_range`, counted from d0, are left out, and the curve is extended to zero force.
 
     Parameters
     ----------
@@ -214,7 +208,7 @@ class SpecimenMean:
 
 
 def specimen_mean(moduli: ArrayLike, *, confidence: float = 0.95) -> SpecimenMean:
-    """Average the moduli (k,) of several specimens, as the report does for Table 3.4, with the uncertainty that their scatter implies.
+    """Average the moduli (k,) of several specimens as in Table 3.4 of :cite:t:`hirai2008`, with the uncertainty from their SD.
 
     Raises
     ------
@@ -265,12 +259,12 @@ def poisson_ratio(
     definition: PoissonDefinition = "hencky",
     confidence: float = 0.95,
 ) -> PoissonRatio:
-    """Compute Poisson's ratio from the strains of a bar that is free to widen (spec S9, report Table 3.5).
+    """Compute Poisson's ratio from the strains of a bar that is free to widen (:cite:p:`hirai2008`, Table 3.5).
 
     With the stretches l = 1 + longitudinal and t = 1 + transversal strain and the volume ratio J = l t^2, the definitions are
 
-    * ``"engineering"``: -(t - 1) / (l - 1), the report's; only for small strain,
-    * ``"hencky"``: -ln t / ln l = (1 - ln J / ln l) / 2, 0.5 where the volume is kept, at any strain (Hencky 1928),
+    * ``"engineering"``: -(t - 1) / (l - 1), only for small strain,
+    * ``"hencky"``: -ln t / ln l = (1 - ln J / ln l) / 2, 0.5 where the volume is kept, at any strain (:cite:p:`hencky1928`),
     * ``"volume_ratio"``: (1 - (J - 1) / (l - 1)) / 2, the small-strain relation between dilatation and strain,
     * ``"neo_hookean"``: lambda / (2 lambda + 2 mu) of the law ``neo_hookean``, whose free sides demand mu (t^2 - 1) + lambda ln J = 0.
 

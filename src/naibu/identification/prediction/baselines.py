@@ -1,4 +1,4 @@
-"""What simple models make of a measured state: the yardsticks that an identified model has to beat."""
+"""Baselines for predictions: rigid transform, affine map, linear elasticity, and moduli from the equilibrium gap."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ REPORT = {"hardness 5": (222.0, 0.33), "hardness 0": (125.0, 0.44)}
 
 
 def baselines(load_case: MarkerLoadCase, values: Mapping[str, float]) -> dict[str, float]:
-    """Return the root mean square distance (mm) between measured markers and three simple descriptions of the state.
+    """Return the root mean square distance, mm, of measured markers from three simple models of the state.
 
-    Only markers with three trusted coordinates in the loaded state count; all of each description's freedoms are fitted to the data.
+    Only markers with three trusted coordinates in the loaded state count; all parameters of the maps are fitted to the data.
 
     Parameters
     ----------

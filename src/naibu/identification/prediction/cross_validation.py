@@ -1,17 +1,18 @@
-"""Which model to believe: prediction of experiments that were left out, and laws and contacts side by side."""
+"""Model selection: leave-one-out cross-validation (:cite:p:`stone1974`) and comparison of models by BIC (:cite:p:`schwarz1978`)."""
 
 from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.experiment import Experiment
+from naibu.core.progress import Progress, ProgressReport
 from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration, calibrate
 from naibu.identification.from_markers.gauss_newton import MatchingSettings
@@ -21,8 +22,6 @@ from naibu.identification.from_markers.specimen_model import ModelSettings
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.prediction import Prediction, predict_state, rms
 from naibu.mechanics.linear_algebra.direct import use_one_thread
-
-Callback = Callable[[str, int, float], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,7 +63,8 @@ class ModelRow:
     parameter_count : int
         Free parameters, poses included.
     bic : float
-        Bayesian information criterion ``n ln(chi_squared / n) + k ln n`` (Schwarz 1978), the level of noise estimated; less is better.
+        Bayesian information criterion ``n ln(chi_squared / n) + k ln n`` (:cite:p:`schwarz1978`), the noise level estimated; less is
+        better.
     left_out_mm : float
         Root mean square distance over all markers of the experiments left out one by one, mm; NaN where there is but one experiment.
     problem : str
@@ -88,7 +88,7 @@ def leave_one_out(
     noise: NoiseModel | None = None,
     search: MatchingSettings | None = None,
     reference: Calibration | None = None,
-    callback: Callback | None = None,
+    progress: Progress | None = None,
 ) -> list[LeftOut]:
     """Predict all loaded states of every experiment with a model calibrated on the others.
 
@@ -102,8 +102,8 @@ def leave_one_out(
         As for `calibrate`.
     reference : Calibration, optional
         The calibration on all experiments: the others start from its solutions, which saves time.
-    callback : callable, optional
-        ``callback(left_out, iteration, objective)`` after every step of a calibration; calls come from several threads.
+    progress : callable, optional
+        Gets a report after every step of a calibration, its stage "without EXPERIMENT"; it is called from several threads.
 
     Raises
     ------
@@ -130,14 +130,14 @@ def leave_one_out(
             search=search,
             start=start,
             warm_starts=warm_starts,
-            callback=_reporting(callback, left.name, stop),
+            progress=_under_stage(progress, f"without {left.name}", stop),
         )
         if found.match.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         model = CalibratedModel.of(found)
         return [
             _left_out(
-                predict_state(model, left, state.name, heights_from_markers=True, warm_starts=warm_starts.get(f"{left.name}/{state.name}"))
+                predict_state(model, left, state.name, heights_from_markers=True, warm_start=warm_starts.get(f"{left.name}/{state.name}"))
             )
             for state in left.loaded_states
         ]
@@ -161,18 +161,16 @@ def _applicable(known_materials: KnownMaterials | None, experiments: Sequence[Ex
     return KnownMaterials(known, known_materials.scale_is_absolute) if known else None
 
 
-def _reporting(
-    callback: Callback | None, name: str, stop: threading.Event | None = None
-) -> Callable[[int, float, Mapping[str, float]], None]:
-    """Report a calibration's steps under a name, and end it where it was stopped from another thread."""
+def _under_stage(progress: Progress | None, stage: str, stop: threading.Event) -> Progress:
+    """Report the steps of a calibration as a stage of another name, and end it where it was stopped from another thread."""
 
-    def report(iteration: int, objective: float, values: Mapping[str, float]) -> None:
-        if stop is not None and stop.is_set():
+    def passed_on(report: ProgressReport) -> None:
+        if stop.is_set():
             raise KeyboardInterrupt
-        if callback is not None:
-            callback(name, iteration, objective)
+        if progress is not None:
+            progress(replace(report, stage=stage))
 
-    return report
+    return passed_on
 
 
 def _left_out(p: Prediction) -> LeftOut:
@@ -194,7 +192,7 @@ def compare_models(
     known_materials: KnownMaterials | None = None,
     noise: NoiseModel | None = None,
     search: MatchingSettings | None = None,
-    callback: Callback | None = None,
+    progress: Progress | None = None,
 ) -> list[ModelRow]:
     """Calibrate every candidate on all experiments, and predict each experiment from the others; one row a candidate, in their order.
 
@@ -212,7 +210,7 @@ def compare_models(
         try:
             found = calibrate(
                 experiments, known_materials=known_materials, settings=settings, noise=noise, search=search,
-                callback=_reporting(callback, "none"),
+                progress=progress,
             )  # fmt: skip
         except ConvergenceError as error:
             rows.append(ModelRow(settings, np.nan, np.nan, 0, np.nan, np.nan, str(error)))
@@ -230,7 +228,7 @@ def compare_models(
                         noise=noise,
                         search=search,
                         reference=found,
-                        callback=callback,
+                        progress=progress,
                     )
                 )
             except ConvergenceError as error:

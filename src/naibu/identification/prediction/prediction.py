@@ -76,7 +76,7 @@ def predict_state(
     *,
     platen_position_mm: float | None = None,
     heights_from_markers: bool = False,
-    warm_starts: SolvedLoadCase | None = None,
+    warm_start: SolvedLoadCase | None = None,
 ) -> Prediction:
     """Predict one state of an experiment with a calibrated model.
 
@@ -93,8 +93,8 @@ def predict_state(
         other states of the same experiment showed.
     heights_from_markers : bool
         Take the height from the mean z of the lowest and the highest marker layer of the measured state, and from nothing else of it.
-    warm_starts : SolvedLoadCase, optional
-        The state as solved before with similar parameters; it saves time and has no influence on the result.
+    warm_start : SolvedLoadCase, optional
+        Solution of the state with similar parameters; it saves time and does not change the result.
 
     Raises
     ------
@@ -115,7 +115,7 @@ def predict_state(
     parameters = parameters.changed({name: Parameter(name, start, "mm", prior_sd=PLATEN_POSITION_SD_MM["markers"] if use_layers else sd)})
     load_case = _unmeasured(body, state, model)
     matcher = Matcher([load_case], parameters)
-    fit = matcher.evaluate(parameters.values(), [warm_starts])[0]
+    fit = matcher.evaluate(parameters.values(), [warm_start])[0]
     if use_layers:
         parameters, fit = _fit_height(matcher, fit, name, target, notes)
     return _finished(model, body, target, parameters, fit, name, notes)
@@ -193,7 +193,7 @@ def _platen_position(
     if given is not None:
         full = experiment.full_platen_position_mm
         if not 0.3 * full < given <= full:
-            raise InputError(f"a height or width of {given:g} mm is not between 30 % and 100 % of the object's {full:g} mm")
+            raise InputError(f"platen_position_mm is {given:g} mm, which is not between 30 % and 100 % of the object's {full:g} mm")
         return given, PLATEN_POSITION_SD_MM["given"]
     values = model.parameters.values()
     name = platen_position(experiment, state.name)
@@ -219,7 +219,7 @@ def _platen_position(
     if state.markers is not None:
         notes.append("the file states no height; the search for it starts at 70 % of the object's")
         return 0.7 * experiment.height_mm, 5.0
-    raise InputError(f"{experiment.name}/{state.name} states no height and has no markers; give one with --height-mm")
+    raise InputError(f"{experiment.name}/{state.name} states no height and has no markers; give platen_position_mm")
 
 
 def _unmeasured(body: Specimen, state: str, model: CalibratedModel) -> MarkerLoadCase:
@@ -247,13 +247,13 @@ def _fit_height(matcher: Matcher, fit: LoadCaseFit, name: str, state: State, not
     """
     body = matcher.load_cases[0].specimen
     if state.markers is None:
-        raise InputError(f"{body.experiment.name}/{state.name} has no measured markers to take heights from; give --height-mm")
+        raise InputError(f"{body.experiment.name}/{state.name} has no measured markers to take heights from; give platen_position_mm")
     z = state.markers.aligned(body.marker_ids)[:, 2]
     layer = marker_layers(body.marker_points[:, 2], body.experiment.nominal_spacing_mm)
     low, high = (layer == 0) & np.isfinite(z), (layer == layer.max()) & np.isfinite(z)
     if not low.any() or not high.any():
         raise InputError(
-            f"{body.experiment.name}/{state.name}: no height is known in the lowest or the highest marker layer; give --height-mm"
+            f"{body.experiment.name}/{state.name}: no height is known in the lowest or the highest marker layer; give platen_position_mm"
         )
     wanted = float(z[high].mean() - z[low].mean())
     free = [p.name for p in matcher.parameters.free]

@@ -1,12 +1,8 @@
-"""Closed forms with which computed results are compared, in tests and in the manual.
+"""Closed-form solutions at finite strain, and of thick shells and columns at small strain.
 
-Nothing here uses the kernels of `naibu.mechanics`: stresses are written out in principal stretches, as textbooks do [1]_, [2]_, and only
-the names and the order of a law's parameters are taken from `naibu.mechanics.finite_elements.hyperelasticity`.
-
-References
-----------
-.. [1] G. A. Holzapfel, "Nonlinear Solid Mechanics", Wiley, 2000, chapter 6.
-.. [2] S. P. Timoshenko and J. N. Goodier, "Theory of Elasticity", 3rd edition, McGraw-Hill, 1970, sections 28 and 136.
+They are independent of the kernels of `naibu.mechanics`: stresses are written in principal stretches as in :cite:t:`holzapfel2000`
+(chapter 6), shells as in :cite:t:`timoshenko1970` (sections 28 and 136); only the names and the order of a law's parameters are taken from
+`naibu.mechanics.finite_elements.hyperelasticity`.
 """
 
 from __future__ import annotations
@@ -47,7 +43,7 @@ class HomogeneousState:
 
     @property
     def volume_ratio(self) -> float:
-        """Volume over that of the free state."""
+        """Volume over that of the reference configuration."""
         return float(np.prod(self.stretches))
 
     @property

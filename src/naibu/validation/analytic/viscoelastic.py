@@ -1,4 +1,4 @@
-"""Closed solutions of the three-element solid in one dimension, and its motion by matrix exponentials (spec M2, M4).
+"""Closed solutions of the three-element solid in one dimension, and its motion by matrix exponentials.
 
 With a spring E, a damper C1 beside it and a damper C2 in series: ``r = C2 / (C1 + C2)``, ``tau = (C1 + C2) / E`` and
 ``Cbar = C1 C2 / (C1 + C2)``. Any E >= 0, C1 >= 0 and C2 in (0, inf] may be given, so these hold for elastic, Voigt and Maxwell solids too.
@@ -101,7 +101,7 @@ def free_motion(
 ) -> tuple[FloatArray, FloatArray]:
     """Return displacement and velocity (k, N) of ``M u'' + sum_p J_p s_p = 0`` by the exponential of the whole system.
 
-    Each part's nodal strain history obeys the report's equations (13) to (15) in their corrected form: ``s = Cbar u' + w``,
+    Each part's nodal strain history obeys equations (13) to (15) of :cite:t:`hirai2008` in their corrected form: ``s = Cbar u' + w``,
     ``w' = -w / tau + r^2 E u'``.
 
     Parameters

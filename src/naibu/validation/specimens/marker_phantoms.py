@@ -1,8 +1,8 @@
 """Virtual specimens: experiments with known parameters, solved on a mesh of their own and seen by a scanner with noise.
 
-A phantom looks like a measured `Experiment`: markers in a free and in loaded states, each scan in a pose of its own, positions placed with
-an error and rounded to pixels and slices. What is not known of a real gel is known here, so that an identification can be judged by the
-parameters it returns. The mesh is finer than, and not a refinement of, the one on which parameters are sought.
+A phantom looks like a measured `Experiment`: markers in the reference configuration and in loaded states, each scan in a
+pose of its own, positions with random errors and rounded to pixels and slices. All parameters are known, so that an identification can be
+judged by the parameters that it returns. The mesh is finer than, and not a refinement of, the one on which parameters are sought.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ ELEMENTS_OVER_HEIGHT = 14  # identification takes 10: no face between elements i
 
 @dataclass(frozen=True, slots=True)
 class Scanner:
-    """How markers are seen.
+    """Measurement of marker positions by a virtual scanner.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class Scanner:
     tilt_deg : float
         Standard deviation of its tilt about the two horizontal axes in loaded scans; in the free one it stands upright.
     missing : float
-        Share of the coordinates that are lost (NaN).
+        Fraction of the coordinates that are lost (NaN).
     """
 
     placing_mm: float = 0.1
@@ -61,7 +61,7 @@ class Scanner:
     def __post_init__(self) -> None:
         values = (self.placing_mm, self.xy_step_mm, self.z_step_mm, self.shift_mm, self.turn_deg, self.tilt_deg, self.missing)
         if not all(np.isfinite(v) and v >= 0.0 for v in values) or self.missing >= 1.0:
-            raise InputError(f"a scanner needs numbers that are not negative and a share missing below 1, not {self}")
+            raise InputError(f"a scanner needs numbers that are not negative and a missing fraction below 1, not {self}")
 
     @property
     def standard_deviation(self) -> FloatArray:
@@ -86,19 +86,19 @@ class Scanner:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VirtualSpecimen:
-    """A deformed gel whose every marker is known.
+    """A deformed gel with known parameters and exact marker positions.
 
     Attributes
     ----------
     experiment : Experiment
-        Description, with the markers of the free state in the object's frame (base at z = 0, centre at x = y = 0) and without those of
-        the loaded states.
+        Description, with the markers of the reference configuration in the object's frame (base at z = 0, centre at x = y = 0) and without
+        those of the loaded states.
     truth : mapping
         Physical value of every parameter, under the names that identification uses.
     model : Specimen
         The finite element model that was solved.
     free : ndarray, shape (k, 3)
-        Positions of the markers in the free state, mm, in the object's frame, in the order of ``experiment.initial.ids``.
+        Positions of the markers in the reference configuration, mm, in the object's frame, in the order of ``experiment.initial.ids``.
     loaded : mapping of str to ndarray, shape (k, 3)
         The same in every loaded state.
     solutions : mapping of str to Solution
@@ -205,9 +205,9 @@ def box_experiment(
 
 
 def marker_lattice(experiment: Experiment) -> FloatArray:
-    """Return the places (k, 3), mm, of the markers in the object's frame: row by row along x, then y, then z.
+    """Return the positions (k, 3), mm, of the markers in the object's frame: row by row along x, then y, then z.
 
-    They are the nominal ones of a lattice in a box, else those of the markers of the free state.
+    They are the nominal ones of a lattice in a box, else those of the markers in the reference configuration.
 
     Raises
     ------
@@ -221,13 +221,13 @@ def marker_lattice(experiment: Experiment) -> FloatArray:
         grid = np.meshgrid(z, _centred(size[1], spacing, margin), _centred(size[0], spacing, margin), indexing="ij")
         return np.stack([g.ravel() for g in grid[::-1]], axis=1)
     if experiment.states[0].markers is None:
-        raise InputError(f"experiment {experiment.name!r} has neither a nominal lattice nor markers; give their places")
+        raise InputError(f"experiment {experiment.name!r} has neither a nominal lattice nor markers; give their positions")
     complete = experiment.initial.trusted & np.isfinite(experiment.initial.points).all(axis=1)
     return placement(experiment).to_object(experiment.initial.points[complete])
 
 
 def _centred(extent: float, spacing: float, margin: float) -> FloatArray:
-    """Return the places of a row of markers about the middle of an edge."""
+    """Return the positions of a row of markers about the middle of an edge."""
     count = int(np.floor((extent - 2.0 * margin) / spacing + 1e-9)) + 1
     if count < 2:
         raise InputError(f"an edge of {extent:g} mm has no room for two markers {spacing:g} mm apart and {margin:g} mm from the faces")
@@ -249,17 +249,17 @@ def virtual_specimen(
     Parameters
     ----------
     template : Experiment
-        Object, loading and states: a measured one to make its virtual twin, or one from `box_experiment`. Its measured positions are not
-        used but for the places of the markers where there is no nominal lattice.
+        Object, loading and states: a measured one to make its virtual twin, or one from `box_experiment`. Its measured positions are
+        used only for the positions of the markers where there is no nominal lattice.
     truth : mapping of str to float
         Physical values: `young_modulus` and `poisson_ratio` of every material, `friction` (sticking where left out), and what departs
         from the nominal boundary conditions: `platen_position`, tilts, offset of a bar.
     settings : ModelSettings, optional
         Law, contact, mesh; by default those of identification with `ELEMENTS_OVER_HEIGHT` elements over the height.
     markers : array_like, shape (k, 3), optional
-        Places of the markers in the object's frame, mm; default: `marker_lattice`.
+        Positions of the markers in the object's frame, mm; default: `marker_lattice`.
     jitter_mm, seed : float, int
-        Standard deviation by which markers miss their places, and the seed of that draw.
+        Standard deviation of the markers about their positions, and the seed of that draw.
     solver : SolverSettings, optional
         Load steps and tolerance.
 

@@ -1,4 +1,4 @@
-"""Whether two scans show the same block: markers are never placed twice with the same errors."""
+"""Comparison of marker lattices: whether two scans show the same specimen, since markers are never placed twice with the same errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two scans of a textured ball that was turned, shifted and pushed, with its displacement at every voxel; nothing is interpolated."""
+"""Virtual scans of a textured sphere, rotated, translated and compressed, with the exact displacement at every voxel."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def _out(p: FloatArray) -> FloatArray:
 
 
 def _waves(rng: np.random.Generator) -> Callable[[FloatArray], FloatArray]:
-    """Grey values of waves of random directions and lengths, with standard deviation `TEXTURE`."""
+    """Intensities of waves of random directions and lengths, with standard deviation `TEXTURE`."""
     direction = rng.standard_normal((WAVES, 3))
     direction /= np.linalg.norm(direction, axis=1)[:, None]
     k, phase = direction * (2.0 * np.pi / rng.uniform(*WAVE_MM, WAVES))[:, None], rng.uniform(0.0, 2.0 * np.pi, WAVES)
