@@ -72,3 +72,27 @@ def test_the_example_of_a_page_runs(page: str, capsys: pytest.CaptureFixture[str
         found = [code for code in found if "lattice_gpu" not in code]
     exec("\n".join(re.sub("^   ", "", code, flags=re.MULTILINE) for code in found), {})
     assert capsys.readouterr().out
+
+
+CONTRIBUTING = (DOCS.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
+
+
+def test_contributing_names_files_that_exist() -> None:
+    named = set(re.findall(r"`([\w./-]+(?:\.(?:py|pyi|rst|md|toml|bib)|/))`", CONTRIBUTING))
+    roots = (DOCS.parent, DOCS.parent / "src" / "naibu", DOCS.parent / "src" / "naibu" / "io", DOCS.parent / "src/naibu/mechanics/contact")
+    examples = {"src/naibu/io/image_formats/FORMAT.py", "src/naibu/io/mesh_formats/FORMAT.py", "workflows/VERB.py"}
+    lost = sorted(name for name in named - examples if not any((root / name).exists() for root in roots))
+    assert len(named) > 30 and not lost, lost
+
+
+def test_contributing_shows_every_folder() -> None:
+    (tree,) = re.findall(r"^src/naibu/\n((?:  .*\n)+)", CONTRIBUTING, re.MULTILINE)
+    shown: set[str] = set()
+    parent = ""
+    for indent, name in re.findall(r"^( +)(\w+)/(?:\s|$)", tree, re.MULTILINE):
+        parent = name if len(indent) == 2 else parent
+        shown.add(name if len(indent) == 2 else f"{parent}/{name}")
+    package = DOCS.parent / "src" / "naibu"
+    folders = {path.parent.relative_to(package).as_posix() for path in package.rglob("__init__.py")} - {"."}
+    told_within = ("mechanics/lattices/", "validation/", "viewer/", "reproduction/")  # their folders stand in the line of the parent
+    assert {f for f in folders if f.count("/") < 2 and not f.startswith(told_within)} <= shown <= folders
