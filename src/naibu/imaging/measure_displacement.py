@@ -142,10 +142,10 @@ def _shared_motion(found: PotentialMatches) -> RigidTransform:
         if kept.sum() < FEWEST_MATCHES:
             return RigidTransform.identity()
         try:
-            motion = rigid_from_points(found.initial_mm[kept], found.deformed_mm[kept]).transform
+            motion = rigid_from_points(found.reference_mm[kept], found.deformed_mm[kept]).transform
         except InputError:  # on one line
             return RigidTransform.identity()
-        off = np.linalg.norm(motion.applied(found.initial_mm) - found.deformed_mm, axis=1)
+        off = np.linalg.norm(motion.applied(found.reference_mm) - found.deformed_mm, axis=1)
         good = off <= 3.0 * np.median(off[kept])
         if (good == kept).all():
             break

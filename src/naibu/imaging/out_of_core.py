@@ -24,9 +24,9 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError, MissingDependencyError
 from naibu.core.optional_packages import optional_package
 from naibu.core.volume import Volume
-from naibu.imaging.dense_matching.block_matching import Measure, Search, grey_range, matched
+from naibu.imaging.dense_matching.block_matching import Measure, Search, intensity_range, matched
 from naibu.imaging.dense_matching.optical_flow import horn_schunck
-from naibu.imaging.feature_matching.harris import Response, default_sigmas, known_grey, response_of
+from naibu.imaging.feature_matching.harris import Response, default_sigmas, known_intensities, response_of
 from naibu.imaging.preprocessing.filters import REACH
 from naibu.imaging.preprocessing.volume_pair import shifted_grey, to_millimetres
 
@@ -383,12 +383,12 @@ def _every(n: int, step: int) -> Iterator[int]:
 
 
 def _harris(values: AnyArray, *, shift: float, spacing_mm: AnyArray, sigmas: tuple[float, float], k: float | None) -> AnyArray:
-    return response_of(known_grey(values, shift), spacing_mm, sigmas[0], sigmas[1], k)
+    return response_of(known_intensities(values, shift), spacing_mm, sigmas[0], sigmas[1], k)
 
 
 def _matched(a: AnyArray, b: AnyArray, *, search: Search, shift: float, least_range: float, sign: float, direction: AnyArray) -> AnyArray:
     frame = Volume(a, search.spacing_mm, np.zeros(3), direction)
-    wanted = np.asarray(grey_range(frame, 2 * search.half + 1) > least_range)
+    wanted = np.asarray(intensity_range(frame, 2 * search.half + 1) > least_range)
     move, cost = matched(shifted_grey(a, shift, "reference"), shifted_grey(b, shift, "deformed"), wanted, search)
     return _packed(to_millimetres(move, frame), np.isfinite(move[0]), sign * cost)
 

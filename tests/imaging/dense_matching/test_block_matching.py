@@ -9,7 +9,7 @@ from scenes import grid, inner, pair, texture
 from naibu.core.errors import InputError
 from naibu.core.rigid_transform import rotation_matrix
 from naibu.core.volume import Volume
-from naibu.imaging.dense_matching.block_matching import block_matching, grey_range
+from naibu.imaging.dense_matching.block_matching import block_matching, intensity_range
 from naibu.imaging.preprocessing.resampling import positions
 
 RNG = np.random.default_rng(4)
@@ -104,7 +104,7 @@ def test_blocks_without_contrast_are_not_measured() -> None:
     zero = block_matching(volume, volume, search=(2, 2, 1), least_range=1.0, unmeasured="zero")
     assert (zero.vectors[:, :, :11] == 0.0).all() and not zero.valid[:, :, :11].any()
     block = grey[1:4, 4:7, 13:16]
-    assert grey_range(volume, (3, 3, 3))[2, 5, 14] == pytest.approx(np.ptp(block))
+    assert intensity_range(volume, (3, 3, 3))[2, 5, 14] == pytest.approx(np.ptp(block))
     with pytest.raises(InputError, match="lower least_range"):
         block_matching(volume, volume, least_range=1e6)
 
@@ -146,10 +146,10 @@ def test_bad_pairs_and_sizes_are_refused() -> None:
         with pytest.raises(InputError, match=told):
             block_matching(volume, other)
     for options, told in (
-        ({"block": (4, 3, 3)}, "must be odd"),
+        ({"block": (4, 3, 3)}, "block must be odd"),
         ({"block": (3, 3)}, "three whole numbers"),
         ({"search": (-1, 0, 0)}, "at least 0"),
-        ({"block": (3, 3, 9)}, "does not fit"),
+        ({"block": (3, 3, 9)}, "must fit into the volume"),
         ({"measure": "best"}, "measure must be"),
         ({"mask": np.zeros(frame.shape)}, "empty"),
     ):

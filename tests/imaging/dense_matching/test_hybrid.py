@@ -8,7 +8,7 @@ from scenes import grid, inner, pair, texture
 
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
-from naibu.imaging.dense_matching.block_matching import block_matching, grey_range
+from naibu.imaging.dense_matching.block_matching import block_matching, intensity_range
 from naibu.imaging.dense_matching.hybrid import hybrid_flow
 from naibu.imaging.dense_matching.optical_flow import AS_REPORTED, horn_schunck
 from naibu.imaging.preprocessing.resampling import positions
@@ -53,7 +53,7 @@ def test_the_hybrid_of_the_report_has_one_grid_and_one_warp() -> None:
     reported = {k: AS_REPORTED[k] for k in ("data_weight", "iterations", "warps", "levels")}
     found = hybrid_flow(before, after, least_range=60.0, search=(3, 3, 1), **reported)
     flow = horn_schunck(before, after, **reported)
-    low = grey_range(before, (3, 3, 3)) <= 60.0
+    low = intensity_range(before, (3, 3, 3)) <= 60.0
     assert 0.02 < low.mean() < 0.98
     np.testing.assert_array_equal(found.vectors[low], flow.vectors[low])
 

@@ -80,12 +80,16 @@ def test_the_search_box_grows_away_from_the_middle() -> None:
 def test_bad_input_to_the_matching_is_refused() -> None:
     before, after = noisy()
     x = inside_points(before, 5)
-    with pytest.raises(InputError, match="no two points look alike"):
+    with pytest.raises(InputError, match="no pair of points scores"):
         candidate_matches(before, after, x, x + 500.0)
     with pytest.raises(InputError, match="three whole numbers"):
         candidate_matches(before, after, x, x, match=(1.5, 1, 1))
-    with pytest.raises(InputError, match="shape"):
+    with pytest.raises(InputError, match="reference_mm must have shape"):
         candidate_matches(before, after, x[:, :2], x)
     other = Volume.from_array(after.values, spacing_mm=(1.0, 1.0, 1.0))
-    with pytest.raises(InputError, match="voxels differ"):
+    with pytest.raises(InputError, match="voxels of reference and deformed differ"):
         candidate_matches(before, other, x, x)
+    with pytest.raises(InputError, match="search_growth must be 0 or more"):
+        candidate_matches(before, after, x, x, search_growth=-0.5)
+    with pytest.raises(InputError, match=r"deformed_mm\[1, 2\] is nan"):
+        candidate_matches(before, after, x, np.where(np.arange(15).reshape(5, 3) == 5, np.nan, x))

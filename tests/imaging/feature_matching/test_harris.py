@@ -103,8 +103,16 @@ def test_what_has_no_points_is_refused() -> None:
     textured = frame.with_values(texture()(positions(frame)))
     with pytest.raises(InputError, match="lower the threshold"):
         interest_points(textured, threshold=1e12)
-    with pytest.raises(InputError, match="one or more"):
+    with pytest.raises(InputError, match="count must be one or more"):
         interest_points(textured, count=0)
+    for arguments, words in (
+        ({"min_distance_mm": -1.0}, "min_distance_mm must be 0 or more"),
+        ({"border": (1, -1, 0)}, "border must be 0 or more"),
+        ({"gradient_sigma_mm": -0.1}, "gradient_sigma_mm must be"),
+        ({"window_sigma_mm": np.inf}, "window_sigma_mm must be"),
+    ):
+        with pytest.raises(InputError, match=words):
+            interest_points(textured, **arguments)
     with pytest.raises(InputError, match="response must be"):
         harris_response(textured, response="fast")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="unknown voxels"):

@@ -156,7 +156,7 @@ def test_false_matches_are_removed_while_the_energy_grows(kind: str, dimension: 
     assert wrong_before > 0.3 * len(by_score)
     # grey residuals tell what the correlation has told already: the report finds this strength the weakest
     assert wrong < (0.4 if kind == "residual" else 0.2) * wrong_before
-    assert len(found) == len(c.initial_mm)
+    assert len(found) == len(c.reference_mm)
     assert len(found.energies) > 2 and (np.diff(found.energies) >= 0.0).all()
     assert found.energies[-1] > found.energies[0]
     # the energy is the mean strength of what is returned
@@ -179,7 +179,7 @@ def test_a_smooth_motion_is_found_in_volumes_and_images(kind: str, shape: tuple[
     c = candidate_matches(before, after, x1, x2, search=(7, 7, 5), match=(2, 2, 2), least_score=0.3)
     found = relaxed(c, strength=kind)  # type: ignore[arg-type]
     # points are voxels in both volumes: two of them are right when they differ by rounding
-    error = np.linalg.norm(found.deformed_mm - found.initial_mm - motion(found.initial_mm), axis=1)
+    error = np.linalg.norm(found.deformed_mm - found.reference_mm - motion(found.reference_mm), axis=1)
     all_errors = np.linalg.norm(x2[c.pairs[:, 1]] - x1[c.pairs[:, 0]] - motion(x1[c.pairs[:, 0]]), axis=1)
     assert (all_errors < 2.0).mean() < 0.8
     assert len(found) > 60 and (error < 2.0).mean() > 0.9
@@ -191,5 +191,13 @@ def test_relaxation_refuses_what_it_does_not_know() -> None:
         relaxed(made_up(0, 3), strength="best")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="radius"):
         relaxed(made_up(0, 3), radius_mm=0.0)
+    for arguments, words in (
+        ({"neighbours": 0}, "neighbours must be 1 or more"),
+        ({"alpha_step": -0.1}, "alpha_step must be 0 or more"),
+        ({"alpha_max": -1.0}, "alpha_max must be 0 or more"),
+        ({"distance_tolerance": 0.0}, "distance_tolerance must be positive"),
+    ):
+        with pytest.raises(InputError, match=words):
+            relaxed(made_up(0, 3), **arguments)
     with pytest.raises(InputError, match="max_iterations"):
         relaxed(made_up(0, 3), max_iterations=0)

@@ -71,7 +71,7 @@ def test_the_displacement_is_told_in_the_registered_frame_or_as_a_whole() -> Non
     matches, rigid, local = matched()
     registered = sparse_displacement(matches, rigid)
     np.testing.assert_allclose(registered.vectors, local, atol=1e-12)
-    np.testing.assert_allclose(registered.points, rigid.applied(matches.initial_mm))
+    np.testing.assert_allclose(registered.points, rigid.applied(matches.reference_mm))
     turned = sparse_displacement(matches, rigid, rotation_only=True)
     np.testing.assert_allclose(turned.vectors, local + rigid.translation, atol=1e-12)
     whole = sparse_displacement(matches)

@@ -1,1 +1,1 @@
-"""Displacement voxel by voxel: block matching, optical flow, and both combined."""
+"""Dense matching: block matching, optical flow (Horn-Schunck, Lucas-Kanade), and a hybrid of both."""

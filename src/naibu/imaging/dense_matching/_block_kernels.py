@@ -1,9 +1,8 @@
 # mypy: disallow-untyped-decorators=False
-"""Numba kernels behind `naibu.imaging.dense_matching.block_matching`.
+"""Numba kernels for `naibu.imaging.dense_matching.block_matching` :cite:p:`hirai2008` (chapter 3.5): full search, sub-voxel fit.
 
-The best of all displacements for every voxel, and a fit between voxels.
-
-Costs are least where the match is best: mean absolute difference, mean squared difference, or minus the normalised correlation.
+Costs are least where the match is best: mean absolute difference (SAD), mean squared difference (SSD), or minus the normalised
+cross-correlation (NCC).
 """
 
 from __future__ import annotations
@@ -15,12 +14,12 @@ from naibu._numba.compilation import njit
 from naibu.core.arrays import AnyArray, BoolArray, Int32Array, IntArray
 
 SAD, SSD, NCC = range(3)
-# NaN marks what lies outside, so it must not be assumed away
+# reassociation lets loops be vectorised; "nnan" is left out, as NaN marks what lies outside
 FAST = {"reassoc", "contract", "arcp", "nsz"}
 
 
-# All loops run from 0 over slices of long rows, which lets the compiler take several voxels at once, and take three or two rows together,
-# because reading and writing costs more than what is done in between.
+# All loops run from 0 over slices of long rows, so that they are vectorised, and take three or two rows together, because they are limited
+# by memory bandwidth.
 @njit(cache=True, fastmath=FAST)
 def _differ(measure: int, a: AnyArray, b: AnyArray, at_a: int, at_b: int, step: int, depth: int, out: AnyArray) -> None:
     """Fill out (n,) with the sum of differences over an odd number of slices, `step` apart in a and b."""
@@ -77,8 +76,8 @@ def _take_better(cost: AnyArray, number: np.int32, best: AnyArray, which: Int32A
 
 
 @njit(cache=True, fastmath=FAST)
-def _correlate(cost: AnyArray, share: float, mean_a: AnyArray, scale_a: AnyArray, mean_b: AnyArray, scale_b: AnyArray) -> None:
-    one = np.float32(share)
+def _correlate(cost: AnyArray, fraction: float, mean_a: AnyArray, scale_a: AnyArray, mean_b: AnyArray, scale_b: AnyArray) -> None:
+    one = np.float32(fraction)
     for x in range(len(cost)):
         cost[x] = (mean_a[x] * mean_b[x] - cost[x] * one) * scale_a[x] * scale_b[x]
 
@@ -97,18 +96,18 @@ def full_search(
     best: AnyArray,
     which: Int32Array,
 ) -> None:
-    """Fill best and which with the least cost of every voxel and the number of its offset (m, 3), given along x, y, z.
+    """Fill best and which with the least cost of every voxel and the index of its offset (m, 3), given along x, y, z.
 
     All volumes are flat: `layout` is nz, ny, the length of a row, and the number of values before the first one. Rows end with as many NaN
-    as a block or a displacement reaches, and so do the volumes at both ends: what leaves the volume costs NaN, which is never better.
-    `wanted` (nz, chunks) tells where a chunk of rows holds wanted voxels; statistics (2, size) are the means of the blocks and the inverses
-    of their standard deviations, used by the correlation.
+    as a block or a displacement reaches, and so do the volumes at both ends: a block that leaves the volume costs NaN, which is never
+    better. `wanted` (nz, chunks) is true where a chunk of rows holds wanted voxels; statistics (2, size) are the means of the blocks and
+    the inverses of their standard deviations, used by the correlation.
     """
     nz, ny, width, guard = layout[0], layout[1], layout[2], layout[3]
     hx, hy, hz = half[0], half[1], half[2]
     chunks = wanted.shape[1]
     rows = -(-ny // chunks)
-    share = 1.0 / ((2 * hx + 1) * (2 * hy + 1) * (2 * hz + 1))
+    fraction = 1.0 / ((2 * hx + 1) * (2 * hy + 1) * (2 * hz + 1))
     for task in prange(nz * chunks):
         k, y0 = task // chunks, (task % chunks) * rows
         if not wanted[k, task % chunks] or k < hz or k + hz >= nz:
@@ -132,7 +131,7 @@ def full_search(
                 to = at + shift
                 _correlate(
                     cost[:n],
-                    share,
+                    fraction,
                     statistics_a[0, at : at + n],
                     statistics_a[1, at : at + n],
                     statistics_b[0, to : to + n],
@@ -149,7 +148,7 @@ def _block_cost(measure: int, a: AnyArray, b: AnyArray, half: IntArray, k: int, 
     if x < half[0] or y < half[1] or z < half[2] or x + half[0] >= nx or y + half[1] >= ny or z + half[2] >= nz:
         return np.nan
     n, total, sa, sb, saa, sbb, sab = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    # differences from the middle keep the sums of squares exact
+    # differences from the central voxel avoid cancellation in the sums of squares
     ca, cb = np.float64(a[k, j, i]), np.float64(b[z, y, x])
     for p in range(-half[2], half[2] + 1):
         for q in range(-half[1], half[1] + 1):
@@ -175,7 +174,7 @@ def _costs_about(
 ) -> None:
     """Fill out (3, 3, 3), along z, y, x, with the costs about a displacement, but for the corners of the cube.
 
-    Mean absolute differences are squared: they grow with the distance from the best place, their squares with its square.
+    Mean absolute differences are squared: they grow linearly with the distance from the minimum, their squares quadratically.
     """
     nz, ny, nx = a.shape
     for p in range(-1, 2):
@@ -195,12 +194,12 @@ def _along_axis(c: AnyArray, axis: int, sign: int) -> float:
 
 
 @njit(cache=True)
-def _least_of_quadratic(c: AnyArray, active: BoolArray, step: AnyArray) -> None:
-    """Fill step (3,), along x, y, z, with the least of the quadratic function through costs (3, 3, 3).
+def _minimum_of_quadratic(c: AnyArray, active: BoolArray, step: AnyArray) -> None:
+    """Fill step (3,), along x, y, z, with the minimum of the quadratic function through costs (3, 3, 3).
 
-    Where that function has no least within a voxel, every axis is taken by itself; one along which the middle is not the least stays.
+    Where that function has no minimum within a voxel, axes are treated one by one; the step is 0 along one without a minimum.
     """
-    slope, bend, free = np.zeros(3), np.eye(3), np.zeros(3, dtype=np.bool_)
+    gradient, bend, free = np.zeros(3), np.eye(3), np.zeros(3, dtype=np.bool_)
     for u in range(3):
         step[u] = 0.0
         if not active[u]:
@@ -208,8 +207,8 @@ def _least_of_quadratic(c: AnyArray, active: BoolArray, step: AnyArray) -> None:
         before, after = _along_axis(c, u, -1), _along_axis(c, u, 1)
         if not (before >= c[1, 1, 1] and after >= c[1, 1, 1] and before + after > 2.0 * c[1, 1, 1]):
             continue
-        slope[u], bend[u, u] = 0.5 * (after - before), before - 2.0 * c[1, 1, 1] + after
-        step[u], free[u] = -slope[u] / bend[u, u], True
+        gradient[u], bend[u, u] = 0.5 * (after - before), before - 2.0 * c[1, 1, 1] + after
+        step[u], free[u] = -gradient[u] / bend[u, u], True
         for v in range(u):
             if free[v]:
                 mixed = 0.0
@@ -224,7 +223,7 @@ def _least_of_quadratic(c: AnyArray, active: BoolArray, step: AnyArray) -> None:
     det = bend[0, 0] * (bend[1, 1] * bend[2, 2] - f * f) - d * (d * bend[2, 2] - f * e) + e * (d * f - bend[1, 1] * e)
     if not (minor > 0.0 and det > 1e-3 * bend[0, 0] * bend[1, 1] * bend[2, 2]):
         return
-    found = -np.linalg.solve(bend, slope)
+    found = -np.linalg.solve(bend, gradient)
     if np.abs(found).max() <= 1.0:
         for u in range(3):
             step[u] = found[u]
@@ -248,5 +247,5 @@ def between_voxels(
             if fit:
                 about[:] = np.nan
                 _costs_about(measure, a, b, half, k, j, i, dz, dy, dx, about)
-                _least_of_quadratic(about, active, step)
+                _minimum_of_quadratic(about, active, step)
             move[0, k, j, i], move[1, k, j, i], move[2, k, j, i] = dx + step[0], dy + step[1], dz + step[2]

@@ -1,5 +1,8 @@
 # mypy: disallow-untyped-decorators=False
-"""Numba kernels behind `naibu.imaging.dense_matching.optical_flow`; displacements (3, nz, ny, nx) are in mm along the axes of the grid."""
+"""Numba kernels for `naibu.imaging.dense_matching.optical_flow` :cite:p:`horn1981,lucas1981`.
+
+Displacements (3, nz, ny, nx) are in mm along the axes of the grid.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +15,10 @@ from naibu.imaging.preprocessing._interpolation_kernels import interpolate
 
 
 @njit(cache=True, parallel=True)
-def linearize(a: AnyArray, b: AnyArray, per_step: AnyArray, u: AnyArray, wanted: BoolArray, slopes: AnyArray, rest: AnyArray) -> None:
-    """Fill slopes (3, nz, ny, nx), grey per mm, and rest, so that ``slopes . u' + rest`` is the grey difference at displacement u'.
+def linearize(a: AnyArray, b: AnyArray, per_step: AnyArray, u: AnyArray, wanted: BoolArray, gradients: AnyArray, rest: AnyArray) -> None:
+    """Fill gradients (3, nz, ny, nx), intensity/mm, and rest: ``gradients . u' + rest`` is the intensity difference at displacement u'.
 
-    The slopes are the mean of those of the reference a and of b warped by u; both are zero where b is left, and where nothing is wanted.
+    The gradients are the mean of those of the reference a and of b warped by u; both are zero outside b and where `wanted` is false.
     """
     nz, ny, nx = a.shape
     warped = np.empty_like(a)
@@ -40,14 +43,14 @@ def linearize(a: AnyArray, b: AnyArray, per_step: AnyArray, u: AnyArray, wanted:
             else:
                 known = gx * u[0, k, j, i] + gy * u[1, k, j, i] + gz * u[2, k, j, i]
                 rest[k, j, i] = warped[k, j, i] - a[k, j, i] - known
-            slopes[0, k, j, i], slopes[1, k, j, i], slopes[2, k, j, i] = gx, gy, gz
+            gradients[0, k, j, i], gradients[1, k, j, i], gradients[2, k, j, i] = gx, gy, gz
 
 
 @njit(cache=True, fastmath=True)
-def _row_mean(row: AnyArray, up: AnyArray, down: AnyArray, front: AnyArray, back: AnyArray, share: AnyArray, out: AnyArray) -> None:
+def _row_mean(row: AnyArray, up: AnyArray, down: AnyArray, front: AnyArray, back: AnyArray, weights: AnyArray, out: AnyArray) -> None:
     """Fill out (n,) with the weighted mean of the neighbours along x, y, z; at the ends a value is its own neighbour."""
     n = len(out)
-    sx, sy, sz = share[0], share[1], share[2]
+    sx, sy, sz = weights[0], weights[1], weights[2]
     for x in range(n):
         out[x] = sy * (up[x] + down[x]) + sz * (front[x] + back[x])
     if n > 1:
@@ -85,22 +88,24 @@ def _row_update(
 
 
 @njit(cache=True, parallel=True)
-def horn_schunck_step(u: AnyArray, slopes: AnyArray, rest: AnyArray, weight: float, share: AnyArray, stride: float, out: AnyArray) -> None:
-    """Move out by `stride` times the way to one step of (3.56), (3.57) from u: the mean of the neighbours, less what grey asks for."""
+def horn_schunck_step(
+    u: AnyArray, gradients: AnyArray, rest: AnyArray, weight: float, weights: AnyArray, stride: float, out: AnyArray
+) -> None:
+    """Relax out by `stride` towards a Horn-Schunck step, (3.56) and (3.57) of the report, from u."""
     _, nz, ny, nx = u.shape
     for row in prange(nz * ny):
         k, j = row // ny, row % ny
         k0, k1, j0, j1 = max(k - 1, 0), min(k + 1, nz - 1), max(j - 1, 0), min(j + 1, ny - 1)
         mean = np.empty((3, nx), dtype=u.dtype)
         for a in range(3):
-            _row_mean(u[a, k, j], u[a, k, j0], u[a, k, j1], u[a, k0, j], u[a, k1, j], share, mean[a])
+            _row_mean(u[a, k, j], u[a, k, j0], u[a, k, j1], u[a, k0, j], u[a, k1, j], weights, mean[a])
         _row_update(
             mean[0],
             mean[1],
             mean[2],
-            slopes[0, k, j],
-            slopes[1, k, j],
-            slopes[2, k, j],
+            gradients[0, k, j],
+            gradients[1, k, j],
+            gradients[2, k, j],
             rest[k, j],
             weight,
             stride,
@@ -112,7 +117,7 @@ def horn_schunck_step(u: AnyArray, slopes: AnyArray, rest: AnyArray, weight: flo
 
 @njit(cache=True)
 def _least_eigenvalue(a: float, b: float, c: float, d: float, e: float, f: float, plane: bool) -> float:
-    """Return the least eigenvalue of the symmetric matrix ((a, d, e), (d, b, f), (e, f, c)), or of its part in the plane."""
+    """Return the smallest eigenvalue of the symmetric matrix ((a, d, e), (d, b, f), (e, f, c)), or of its part in the plane."""
     if plane:
         return float(0.5 * (a + b) - np.sqrt(0.25 * (a - b) ** 2 + d * d))
     q = (a + b + c) / 3.0
@@ -129,11 +134,11 @@ def _least_eigenvalue(a: float, b: float, c: float, d: float, e: float, f: float
 def lucas_kanade_step(
     tensor: AnyArray, right: AnyArray, least: float, damping: float, plane: bool, longest: float, u: AnyArray, eigenvalue: AnyArray
 ) -> None:
-    """Move u to the solution of (3.60) for every voxel, and fill eigenvalue with the least one of its matrix.
+    """Move u to the Lucas-Kanade solution, (3.60) of the report, of every voxel; fill eigenvalue with the smallest one of its matrix.
 
-    tensor (6, nz, ny, nx) holds the window means xx, yy, zz, xy, xz, yz of the slopes' products, right (3, ...) those of slopes times the
-    grey difference at no displacement. Where the least eigenvalue is below `least` u stays; elsewhere it goes along every eigenvector the
-    further the larger its eigenvalue is against `damping`, and nowhere further than `longest`.
+    tensor (6, nz, ny, nx) holds the window means xx, yy, zz, xy, xz, yz of the products of intensity gradients, right (3, ...) those of
+    gradients times the intensity difference at zero displacement. Where the smallest eigenvalue is below `least`, u is kept; elsewhere the
+    step along an eigenvector is scaled by its eigenvalue over that plus `damping`, and its length is limited to `longest`, mm.
     """
     _, nz, ny, nx = tensor.shape
     for row in prange(nz * ny):

@@ -1,4 +1,4 @@
-"""Block matching: the displacement of every voxel by full search (spec S7, equations 3.38-3.40)."""
+"""Block matching: the displacement of every voxel by full search :cite:p:`hirai2008` (chapter 3.5, equations 3.38 to 3.40)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from naibu.imaging.preprocessing.volume_pair import grey_pair, to_millimetres
 
 Measure = Literal["sad", "ssd", "ncc"]
 MEASURES: dict[Measure, int] = {"sad": SAD, "ssd": SSD, "ncc": NCC}
-# grey values of a task: few enough that they stay in the fastest cache
+# intensities per task of a thread, few enough to stay in the first-level cache: 12 kB of single precision
 VALUES_AT_ONCE = 3000
 
 
@@ -35,38 +35,39 @@ def block_matching(
     unmeasured: Literal["nan", "zero"] = "nan",
     mask: ArrayLike | None = None,
 ) -> DisplacementField:
-    """Return the displacement of every voxel whose surroundings look most like its own (spec S7).
+    """Return the displacement of every voxel by block matching: full search for the most similar block.
 
     Parameters
     ----------
     reference, deformed : Volume
-        Before and after, on one grid; a volume of one slice is an image.
+        The image pair, on one grid; a volume of one slice is an image.
     block : array_like, shape (3,)
         Size of the block along x, y, z, voxels, odd. The report: 3 x 3 x 3, or 5 x 5 in images.
     search : array_like, shape (3,)
-        Largest displacement along x, y, z, voxels. The report: 15, 15, 1, or 30, 35 in images.
+        Largest displacement along x, y, z, voxels, 0 or more. The report: 15, 15, 1, or 30, 35 in images.
     measure : {"sad", "ssd", "ncc"}
-        Sum of absolute (3.38) or squared (3.39) differences, or normalised correlation (3.40), which tells gain and offset apart from
-        motion.
+        Sum of absolute (3.38) or squared (3.39) differences, or normalised cross-correlation (3.40), which is invariant to gain and offset.
     sub_voxel : bool
-        Whether the least of a quadratic function through the costs of neighbouring places is taken; of their squares where they are
-        absolute differences, which grow in proportion with distance.
+        Whether the minimum of a quadratic function through the costs of neighbouring displacements is taken; through their squares for
+        absolute differences, which grow linearly with distance.
     least_range : float
-        A block whose grey values span no more than this has nothing to be known by, and is not measured.
+        Intensity range that a block must exceed to be measured.
     unmeasured : {"nan", "zero"}
-        What stands where nothing was measured; the report puts zero.
+        Displacement of voxels that are not measured; the report takes zero.
     mask : array_like, shape (nz, ny, nx), optional
-        Voxels that are wanted; by default all.
+        Voxels to measure; by default all.
 
     Returns
     -------
     DisplacementField
-        Its quality is the mean absolute or squared difference, or the correlation. Voxels whose block leaves the volume are not measured.
+        Displacement, mm; its quality is the mean absolute or squared intensity difference, or the correlation. Voxels whose block leaves
+        the volume are not measured.
 
     Raises
     ------
     InputError
-        Volumes on different grids or without contrast, sizes that are no sizes, an empty mask, or no block with enough contrast.
+        Volumes on different grids or without contrast, sizes that are not odd whole numbers or too large, an unknown measure, an empty
+        mask, or no block with enough contrast.
     """
     if measure not in MEASURES or unmeasured not in ("nan", "zero"):
         raise InputError(f"measure must be one of {', '.join(MEASURES)} and unmeasured 'nan' or 'zero', not {measure!r} and {unmeasured!r}")
@@ -74,12 +75,12 @@ def block_matching(
     chosen = Search.of(measure, block, search, reference.shape, reference.spacing_mm, sub_voxel)
     half = chosen.half
     # a range with unknown voxels in it is unknown
-    wanted = np.asarray(grey_range(reference, 2 * half + 1) > least_range)
+    wanted = np.asarray(intensity_range(reference, 2 * half + 1) > least_range)
     if mask is not None:
         wanted &= require_mask(mask, reference)
     if not wanted.any():
         raise InputError(
-            f"no block of {(2 * half + 1).tolist()} voxels has a grey range above {least_range:g} in the mask: lower least_range"
+            f"no block of {(2 * half + 1).tolist()} voxels in the mask has an intensity range above {least_range:g}: lower least_range"
         )
     move, cost = matched(a, b, wanted, chosen)
     vectors, valid = to_millimetres(move, reference), np.isfinite(move[0])
@@ -90,7 +91,7 @@ def block_matching(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Search:
-    """How the best displacement is looked for.
+    """Parameters of a full search.
 
     Attributes
     ----------
@@ -101,9 +102,9 @@ class Search:
     spacing_mm : ndarray, shape (3,)
         Of the voxels, mm.
     sub_voxel : bool
-        Whether places between voxels are looked at.
+        Whether the displacement is refined between voxels.
     spread : float, optional
-        Standard deviation of all grey values, against which a block may count as flat; by default that of the voxels given.
+        Standard deviation of all intensities, relative to which a block counts as uniform; by default that of the voxels given.
     """
 
     kind: int
@@ -124,13 +125,13 @@ class Search:
         sub_voxel: bool,
         spread: float | None = None,
     ) -> Search:
-        """Check the sizes for a volume of that shape (nz, ny, nx); see `block_matching`."""
+        """Return the parameters, checked for a volume of shape (nz, ny, nx); see `block_matching`."""
         half, reach = _sizes(block, search, shape)
         return cls(MEASURES[measure], half, reach, spacing_mm, sub_voxel, spread)
 
 
 def matched(a: Float32Array, b: Float32Array, wanted: BoolArray, search: Search) -> tuple[FloatArray, FloatArray]:
-    """Return displacement (3, nz, ny, nx), voxels along x, y, z, and cost (nz, ny, nx) of wanted voxels; NaN where there is none."""
+    """Return displacement (3, nz, ny, nx), voxels along x, y, z, and cost (nz, ny, nx) of wanted voxels; NaN elsewhere."""
     kind, half, reach = search.kind, search.half, search.reach
     move, cost = np.full((3, *a.shape), np.nan), np.full(a.shape, np.nan)
     if not wanted.any():
@@ -144,13 +145,13 @@ def matched(a: Float32Array, b: Float32Array, wanted: BoolArray, search: Search)
     return move, cost
 
 
-def grey_range(volume: Volume, block: ArrayLike) -> FloatArray:
-    """Return the difference (nz, ny, nx) of the largest and the smallest grey value in the block about every voxel.
+def intensity_range(volume: Volume, block: ArrayLike) -> FloatArray:
+    """Return the intensity range (nz, ny, nx) of the block about every voxel.
 
     Parameters
     ----------
     volume : Volume
-        Voxels.
+        Intensities.
     block : array_like, shape (3,)
         Size of the block along x, y, z, voxels.
     """
@@ -165,30 +166,30 @@ def _sizes(block: ArrayLike, search: ArrayLike, shape: tuple[int, int, int]) -> 
         if values.shape != (3,) or values.dtype.kind not in "iu" or (values < least).any():
             raise InputError(f"{name} must be three whole numbers of voxels along x, y, z, at least {least}, not {values.tolist()}")
     if (size % 2 == 0).any():
-        raise InputError(f"a block has a voxel in its middle: its sizes must be odd, not {size.tolist()}")
+        raise InputError(f"block must be odd along every axis, as a voxel is its centre, not {size.tolist()}")
     active = np.array(shape[::-1]) > 1
     size, reach = np.where(active, size, 1), np.where(active, reach, 0)
     if (size > shape[::-1]).any():
-        raise InputError(f"a block of {size.tolist()} voxels does not fit into a volume of {list(shape[::-1])}")
+        raise InputError(f"block is {size.tolist()} voxels; it must fit into the volume of {list(shape[::-1])}")
     return (size // 2).astype(np.int64), reach.astype(np.int64)
 
 
 def _offsets(reach: IntArray, spacing_mm: FloatArray) -> IntArray:
-    """Return all displacements (m, 3), the shortest first: of equal costs the first one wins."""
+    """Return all displacements (m, 3), voxels, the shortest first, so that it wins among equal costs."""
     axes = np.meshgrid(*(np.arange(-r, r + 1) for r in reach), indexing="ij")
     offsets = np.stack(axes, axis=-1).reshape(-1, 3)
     return np.ascontiguousarray(offsets[np.argsort(np.linalg.norm(offsets * spacing_mm, axis=1), kind="stable")])
 
 
 def _reached(wanted: BoolArray, margin: IntArray) -> tuple[slice, slice, slice]:
-    """Return the box that holds all that the wanted voxels are compared with."""
+    """Return the box of all voxels that the wanted ones are compared with."""
     where = [np.flatnonzero(np.any(wanted, axis=tuple(a for a in range(3) if a != axis))) for axis in range(3)]
     first, second, third = (slice(max(int(w[0] - m), 0), int(w[-1] + m + 1)) for w, m in zip(where, margin[::-1], strict=True))
     return first, second, third
 
 
 def _search(search: Search, a: Float32Array, b: Float32Array, offsets: IntArray, wanted: BoolArray) -> Int32Array:
-    """Return the number (nz, ny, nx) of the best offset, -1 where there is none."""
+    """Return the index (nz, ny, nx) of the best offset, -1 where there is none."""
     kind, half, reach = search.kind, search.half, search.reach
     nz, ny, nx = a.shape
     spare = int(reach[0] + half[0])
@@ -210,7 +211,7 @@ def _search(search: Search, a: Float32Array, b: Float32Array, offsets: IntArray,
 
 
 def _flat(values: Float32Array, spare: int, guard: int, fill: float) -> Float32Array:
-    """Return a volume as one long row, with room after every row and at both ends."""
+    """Return a volume as one long row, padded after every row and at both ends."""
     nz, ny, nx = values.shape
     out = np.full(2 * guard + nz * ny * (nx + spare), fill, dtype=np.float32)
     out[guard : len(out) - guard].reshape(nz, ny, nx + spare)[:, :, :nx] = values
@@ -218,7 +219,7 @@ def _flat(values: Float32Array, spare: int, guard: int, fill: float) -> Float32A
 
 
 def _statistics(values: Float32Array, half: IntArray, spread: float | None) -> Float32Array:
-    """Return the mean of every block and the inverse of its standard deviation, zero where it has none (2, nz, ny, nx).
+    """Return the mean of every block and the inverse of its standard deviation, zero for uniform blocks (2, nz, ny, nx).
 
     Both are NaN where a block holds unknown voxels.
     """

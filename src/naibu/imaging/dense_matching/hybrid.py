@@ -1,4 +1,4 @@
-"""The report's hybrid: block matching where blocks have contrast, Horn and Schunck elsewhere (spec S7)."""
+"""Hybrid of block matching, where blocks have contrast, and Horn-Schunck optical flow elsewhere :cite:p:`hirai2008` (chapter 3.5)."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def hybrid_flow(
     levels: int | None = None,
     mask: ArrayLike | None = None,
 ) -> DisplacementField:
-    """Return the displacement by block matching where the grey range of a block exceeds a limit, by Horn and Schunck elsewhere (spec S7).
+    """Return the displacement by block matching where the intensity range of a block exceeds a limit, by Horn-Schunck elsewhere.
 
     Parameters
     ----------
     reference, deformed : Volume
-        Before and after, on one grid; a volume of one slice is an image.
+        The image pair, on one grid; a volume of one slice is an image.
     least_range : float
-        The limit, in grey values of the volume; the report takes 30 of 256 levels.
+        The limit, in intensities of the volume; the report takes 30 of 256 levels.
     block, search, measure, sub_voxel
         As in `naibu.imaging.dense_matching.block_matching.block_matching`.
     data_weight, full_scale, iterations, warps, levels
@@ -46,12 +46,12 @@ def hybrid_flow(
     Returns
     -------
     DisplacementField
-        Its quality is the grey difference that is left.
+        Displacement, mm; its quality is the absolute intensity residual.
 
     Raises
     ------
     InputError
-        As the two methods; also where no block has contrast enough.
+        As the two methods; also where no block has enough contrast.
     """
     blocks = block_matching(
         reference, deformed, block=block, search=search, measure=measure, sub_voxel=sub_voxel, least_range=least_range, mask=mask

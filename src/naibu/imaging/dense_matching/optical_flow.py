@@ -1,4 +1,8 @@
-"""Optical flow: the displacement of every voxel from the gradients of grey values, coarse to fine (spec S7)."""
+"""Optical flow: the displacement of every voxel from image intensity gradients, coarse to fine.
+
+The methods of :cite:t:`horn1981` and :cite:t:`lucas1981` in two and three dimensions, with warping and median filtering
+:cite:p:`sun2010`; chapter 3.5 of :cite:t:`hirai2008` uses them on one grid.
+"""
 
 from __future__ import annotations
 
@@ -22,11 +26,11 @@ from naibu.imaging.preprocessing.pyramid import Level, coarsened, pyramid, refin
 from naibu.imaging.preprocessing.resampling import require_mask
 from naibu.imaging.preprocessing.volume_pair import grey_pair, to_millimetres, to_voxels
 
-REPORT_LEVELS = 256.0
-# Horn and Schunck as in chapter 3 of the report: one grid, 40 plain steps, lambda = 4
+REPORT_LEVELS = 256.0  # intensity levels of the report's images, to which its lambda refers
+# Horn-Schunck as in chapter 3.5 of the report: one grid, 40 plain steps, lambda = 4
 AS_REPORTED: dict[str, Any] = {"data_weight": 4.0, "iterations": 40, "warps": 1, "levels": 1, "median_filter": False, "accelerated": False}
-SLOWEST = 0.99
-# voxels below which sharing a step among threads costs more than it saves; on a busy machine much more
+SLOWEST = 0.99  # spectral radius that the Chebyshev acceleration assumes of the Jacobi iteration; empirical
+# voxels below which starting threads costs more than they save; empirical
 WORTH_SHARING = 200_000
 
 
@@ -44,55 +48,50 @@ def horn_schunck(
     mask: ArrayLike | None = None,
     start: ArrayLike | None = None,
 ) -> DisplacementField:
-    """Return the smooth displacement that explains the change of grey values best (spec S7, equations 3.46-3.57).
+    """Return the displacement by Horn-Schunck optical flow: brightness constancy with a smoothness penalty :cite:p:`horn1981`.
 
     Parameters
     ----------
     reference, deformed : Volume
-        Before and after, on one grid; a volume of one slice is an image.
+        The image pair, on one grid; a volume of one slice is an image.
     data_weight : float
-        lambda, the weight of the grey values against smoothness, for images of 256 grey levels and lengths in voxels. The report's 4 holds
-        for images without noise.
+        lambda, the weight of the intensities against smoothness, for images of 256 intensity levels and lengths in voxels; above 0. The
+        report's 4 suits images without noise.
     full_scale : float, optional
-        Grey range that stands for the 256 levels; by default that of the reference but for its 0.5 % darkest and brightest voxels.
+        Intensity range that stands for the 256 levels; above 0. By default that of the reference without its 0.5 % darkest and brightest
+        voxels.
     iterations : int
-        Steps of (3.56), (3.57) between two warps; the report takes 40 plain ones.
+        Steps of (3.56), (3.57) between two warps, 1 or more; the report takes 40 plain ones.
     warps : int
-        How often, on every grid, the deformed volume is warped by what was found and differentiated anew.
+        How often, on every grid, the deformed volume is warped by the present displacement and differentiated again; 1 or more.
     levels : int, optional
-        Number of grids, each twice as coarse as the next; by default as many as there is room for.
+        Number of grids, each twice as coarse as the next, 1 or more; by default as many as fit.
     median_filter : bool
-        Whether the displacement is replaced by the median over neighbours after every warp, which takes out what noise and wrong gradients
-        have left at single voxels (Sun 2010).
+        Whether the displacement is replaced by the median over neighbours after every warp, which removes outliers :cite:p:`sun2010`.
     accelerated : bool
-        Whether the steps are combined by Chebyshev's sequence, which takes several times fewer of them.
+        Whether the steps are accelerated by the Chebyshev semi-iterative method :cite:p:`golub1961`, which needs several times fewer.
     mask : array_like, shape (nz, ny, nx), optional
-        Voxels of the reference whose grey values count; the field is continued smoothly outside.
+        Voxels of the reference whose intensities count; the field is continued smoothly outside.
     start : array_like, shape (nz, ny, nx, 3), optional
-        First guess of the displacement, mm; zero by default.
+        Initial displacement, mm; zero by default.
 
     Returns
     -------
     DisplacementField
-        Valid where the displaced voxel lies inside the deformed volume, and in the mask. Its quality is the grey difference that is left.
+        Displacement, mm; valid where the displaced voxel lies inside the deformed volume, and in the mask. Its quality is the absolute
+        intensity residual.
 
     Raises
     ------
     InputError
-        Volumes on different grids or without contrast, an empty mask, weights or numbers that are not positive.
+        Volumes on different grids or without contrast, an empty mask, a start that is not finite, weights or numbers that are not positive.
 
     Notes
     -----
-    ``u <- ubar - lambda grad I (grad I . ubar + I_t) / (1 + lambda |grad I|^2)``, ubar the mean of the neighbours. Lengths are counted in
-    the smallest spacing of the grid, and neighbours further away count less, by the square of their distance. The printed (3.52), (3.53)
-    lack the derivative in time on the right, and (3.54)-(3.57) the factor ``lambda I_x``. The method of the report, for motions of less
-    than a voxel or so, is ``horn_schunck(reference, deformed, **AS_REPORTED)``.
-
-    References
-    ----------
-    B. K. P. Horn, B. G. Schunck: Determining optical flow. Artificial Intelligence 17 (1981) 185-203.
-
-    D. Sun, S. Roth, M. J. Black: Secrets of optical flow estimation and their principles. CVPR (2010) 2432-2439.
+    ``u <- ubar - lambda grad I (grad I . ubar + I_t) / (1 + lambda |grad I|^2)``, ubar the weighted mean of the neighbours. Lengths are in
+    units of the smallest spacing of the grid, and weights of neighbours are inverse to the square of their distance. In the report, the
+    printed (3.52), (3.53) lack the derivative in time on the right, and (3.54) to (3.57) the factor ``lambda I_x``. The method of the
+    report, for motions of up to about a voxel, is ``horn_schunck(reference, deformed, **AS_REPORTED)``.
     """
     _require_counts(iterations=iterations, warps=warps, levels=1 if levels is None else levels)
     if not (data_weight > 0.0 and (full_scale is None or full_scale > 0.0)):
@@ -126,52 +125,48 @@ def lucas_kanade(
     mask: ArrayLike | None = None,
     start: ArrayLike | None = None,
 ) -> DisplacementField:
-    """Return the displacement that explains the change of grey values in a window about every voxel best (spec S7, 3.58-3.60).
+    """Return the displacement by Lucas-Kanade optical flow: least squares in a window about every voxel :cite:p:`lucas1981`.
 
     Parameters
     ----------
     reference, deformed : Volume
-        Before and after, on one grid; a volume of one slice is an image.
+        The image pair, on one grid; a volume of one slice is an image.
     window : array_like, shape (3,)
         Size of the window along x, y, z, voxels, odd.
     least_eigenvalue : float
-        Windows whose matrix ``mean(grad I grad I^T)``, (grey/mm)^2, has a smaller eigenvalue than this do not fix a displacement and are
-        not measured; they keep that of the coarser grid.
+        Windows whose structure tensor ``mean(grad I grad I^T)`` has a smaller eigenvalue than this, (intensity/mm)^2, are not measured;
+        they keep the displacement of the coarser grid.
     damping : float
-        Eigenvalue, as a share of the mean one, below which a direction of the displacement stays nearer to its guess than to its solution.
-        The report has none.
+        Levenberg-Marquardt damping, as a fraction of the mean eigenvalue, 0 or more: directions of smaller eigenvalues stay nearer to the
+        initial displacement than to the solution. The report has none.
     warps : int
-        How often, on every grid, the deformed volume is warped by what was found and differentiated anew.
+        How often, on every grid, the deformed volume is warped by the present displacement and differentiated again; 1 or more.
     levels : int, optional
-        Number of grids, each twice as coarse as the next; by default as many as there is room for. With ``levels=1, warps=1, damping=0,
-        median_filter=False`` this is the method of the report.
+        Number of grids, each twice as coarse as the next, 1 or more; by default as many as fit. With ``levels=1, warps=1, damping=0,
+        median_filter=False`` this is the method of the report (3.58 to 3.60).
     median_filter : bool
         As in `horn_schunck`.
     mask : array_like, shape (nz, ny, nx), optional
-        Voxels of the reference whose grey values count.
+        Voxels of the reference whose intensities count.
     start : array_like, shape (nz, ny, nx, 3), optional
-        First guess of the displacement, mm; zero by default.
+        Initial displacement, mm; zero by default.
 
     Returns
     -------
     DisplacementField
-        Its quality is the least eigenvalue, (grey/mm)^2.
+        Displacement, mm; its quality is the smallest eigenvalue, (intensity/mm)^2.
 
     Raises
     ------
     InputError
-        Volumes on different grids or without contrast, an empty mask, or numbers that are not positive.
-
-    References
-    ----------
-    B. D. Lucas, T. Kanade: An iterative image registration technique with an application to stereo vision. IJCAI (1981) 674-679.
+        Volumes on different grids or without contrast, an empty mask, a window that is not odd, or numbers that are not positive.
     """
     _require_counts(warps=warps, levels=1 if levels is None else levels)
     size = np.asarray(window)
     if not damping >= 0.0:
         raise InputError(f"damping must be 0 or more, not {damping}")
     if size.shape != (3,) or size.dtype.kind not in "iu" or (size < 1).any() or (size % 2 == 0).any():
-        raise InputError(f"a window has three odd sizes along x, y, z, voxels, not {size.tolist()}")
+        raise InputError(f"window must be three odd numbers of voxels along x, y, z, not {size.tolist()}")
     a, b = grey_pair(reference, deformed)
     wanted = _wanted(mask, reference)
     grids = pyramid(a, b, wanted, reference.spacing_mm, levels)
@@ -186,14 +181,14 @@ def lucas_kanade(
                 _solve_windows(u, grid, size // 2, least_eigenvalue, damping, eigenvalue)
                 u = _median(u) if median_filter else u
     found = _result(u, reference, a, b, wanted)
-    # a single direction has no eigenvalue but that of rounding
+    # a window with gradients along one direction only has an eigenvalue of rounding error
     fixed = eigenvalue > max(least_eigenvalue, 1e-6 * float(eigenvalue.max()))
     return DisplacementField.on_grid(reference, found.vectors, valid=found.valid & fixed, quality=eigenvalue)
 
 
 @contextmanager
 def _threads_worth(grid: Level) -> Iterator[None]:
-    """Use one thread alone while the grid is small."""
+    """Use a single thread while the grid is small."""
     before = numba.get_num_threads()
     numba.set_num_threads(before if grid.reference.size >= WORTH_SHARING else 1)
     try:
@@ -203,19 +198,19 @@ def _threads_worth(grid: Level) -> Iterator[None]:
 
 
 def _relaxed(u: Float32Array, grid: Level, weight: float, iterations: int, accelerated: bool) -> Float32Array:
-    """Return the displacement after some steps of Horn and Schunck about the present one."""
+    """Return the displacement after some Horn-Schunck steps about the present one."""
     active = np.array(grid.reference.shape[::-1]) > 1
-    slopes, rest = _linearized(u, grid)
+    gradients, rest = _linearized(u, grid)
     inverse = np.where(active, 1.0 / grid.spacing_mm**2, 0.0)
-    share = (0.5 * inverse / inverse.sum()).astype(np.float32)
+    weights = (0.5 * inverse / inverse.sum()).astype(np.float32)
     in_millimetres = weight * float(grid.spacing_mm[active].min()) ** 2
     now, before = u.copy(), u.copy()
     stride = 1.0
     for number in range(iterations):
-        horn_schunck_step(now, slopes, rest, in_millimetres, share, stride, before)
+        horn_schunck_step(now, gradients, rest, in_millimetres, weights, stride, before)
         now, before = before, now
         if accelerated:
-            # Chebyshev's sequence for eigenvalues up to SLOWEST; beyond, steps still shrink the error
+            # Chebyshev sequence for eigenvalues up to SLOWEST; errors of larger ones decrease, too
             stride = 1.0 / (1.0 - SLOWEST**2 * stride / (2.0 if number == 0 else 4.0))
     return now
 
@@ -228,12 +223,12 @@ def _median(u: Float32Array) -> Float32Array:
 
 
 def _solve_windows(u: Float32Array, grid: Level, half: IntArray, least: float, damping: float, eigenvalue: Float32Array) -> None:
-    """Improve the displacement in place by one solve in every window."""
-    slopes, rest = _linearized(u, grid)
+    """Update the displacement in place by one least-squares solve in every window."""
+    gradients, rest = _linearized(u, grid)
     tensor = np.empty((6, *grid.reference.shape), dtype=np.float32)
-    products(slopes, tensor)
-    # the whole displacement is the unknown of a window, though its voxels were linearized each about its own
-    right = np.stack([box_mean(s * rest, half) for s in slopes])
+    products(gradients, tensor)
+    # the whole displacement is the unknown of a window, though each of its voxels was linearised about its own
+    right = np.stack([box_mean(s * rest, half) for s in gradients])
     tensor = np.stack([box_mean(t, half) for t in tensor])
     plane = grid.reference.shape[0] == 1
     active = np.array(grid.reference.shape[::-1]) > 1
@@ -242,19 +237,19 @@ def _solve_windows(u: Float32Array, grid: Level, half: IntArray, least: float, d
 
 
 def _linearized(u: Float32Array, grid: Level) -> tuple[Float32Array, Float32Array]:
-    slopes, rest = np.empty_like(u), np.empty_like(grid.reference)
+    gradients, rest = np.empty_like(u), np.empty_like(grid.reference)
     per_step = (1.0 / grid.spacing_mm).astype(np.float32)
-    linearize(grid.reference, grid.deformed, per_step, u, grid.wanted, slopes, rest)
-    return slopes, rest
+    linearize(grid.reference, grid.deformed, per_step, u, grid.wanted, gradients, rest)
+    return gradients, rest
 
 
 def _start(start: ArrayLike | None, reference: Volume, grids: list[Level]) -> Float32Array:
-    """Return the first guess (3, nz, ny, nx), mm along the axes of the grid, on the coarsest level."""
+    """Return the initial displacement (3, nz, ny, nx), mm along the axes of the grid, on the coarsest level."""
     if start is None:
         return np.zeros((3, *grids[0].reference.shape), dtype=np.float32)
     given = np.asarray(start, dtype=float)
     if given.shape == (*reference.shape, 3) and not np.isfinite(given).all():
-        raise InputError("the start has voxels without displacement; fill them, for example with dense_from_sparse(outside='nearest')")
+        raise InputError("start has voxels without displacement; fill them, for example with dense_from_sparse(outside='nearest')")
     along = to_voxels(given, reference) * reference.spacing_mm[:, None, None, None]
     return coarsened(along.astype(np.float32), grids)
 

@@ -1,1 +1,1 @@
-"""Feature points: detection, matching by correlation and relaxation labelling, interpolation between them."""
+"""Feature matching: Harris points, normalised cross-correlation, relaxation labelling, Delaunay interpolation."""

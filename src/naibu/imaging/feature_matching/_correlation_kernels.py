@@ -1,5 +1,8 @@
 # mypy: disallow-untyped-decorators=False
-"""Numba kernels behind `naibu.imaging.feature_matching.correlation_matching`: correlation and residual of boxes about pairs of points."""
+"""Numba kernels for `naibu.imaging.feature_matching.correlation_matching` :cite:p:`zhang1995`.
+
+Normalised cross-correlation and intensity residual of boxes about pairs of points.
+"""
 
 from __future__ import annotations
 
@@ -13,19 +16,19 @@ from naibu.imaging.preprocessing._interpolation_kernels import interpolate
 
 @njit(cache=True)
 def candidates(
-    places: AnyArray, order: IntArray, sorted_x: AnyArray, others: AnyArray, half: AnyArray, first: IntArray, second: IntArray
+    points: AnyArray, order: IntArray, sorted_x: AnyArray, others: AnyArray, half: AnyArray, first: IntArray, second: IntArray
 ) -> int:
-    """Fill first and second with pairs of places (n, 3) and others (m, 3) no further apart than half (n, 3), in order of first.
+    """Fill first and second with the pairs of points (n, 3) and others (m, 3) no further apart than half (n, 3), in order of first.
 
-    `order` sorts the others by x, whose values are `sorted_x`. Returns the number of pairs, which may exceed what there is room for.
+    `order` sorts the others by x, whose values are `sorted_x`. Returns the number of pairs, which may exceed the room for them.
     """
     n = 0
-    for p in range(len(places)):
-        at = np.searchsorted(sorted_x, places[p, 0] - half[p, 0])
-        while at < len(order) and sorted_x[at] <= places[p, 0] + half[p, 0]:
+    for p in range(len(points)):
+        at = np.searchsorted(sorted_x, points[p, 0] - half[p, 0])
+        while at < len(order) and sorted_x[at] <= points[p, 0] + half[p, 0]:
             q = order[at]
             at += 1
-            if abs(others[q, 1] - places[p, 1]) <= half[p, 1] and abs(others[q, 2] - places[p, 2]) <= half[p, 2]:
+            if abs(others[q, 1] - points[p, 1]) <= half[p, 1] and abs(others[q, 2] - points[p, 2]) <= half[p, 2]:
                 if n < len(first):
                     first[n], second[n] = p, q
                 n += 1
@@ -34,7 +37,7 @@ def candidates(
 
 @njit(cache=True)
 def _box(v: AnyArray, centre: AnyArray, turn: AnyArray, half: IntArray, out: AnyArray) -> bool:
-    """Fill out (m,) with the values about an index, at offsets turned by a matrix; return whether all lie inside."""
+    """Fill out (m,) with the intensities about an index, at offsets rotated by a matrix; return whether all lie inside."""
     nz, ny, nx = v.shape
     straight = True
     for a in range(3):
@@ -70,9 +73,9 @@ def _box(v: AnyArray, centre: AnyArray, turn: AnyArray, half: IntArray, out: Any
 
 @njit(cache=True, parallel=True)
 def compare(
-    initial: AnyArray,
+    reference: AnyArray,
     deformed: AnyArray,
-    at_initial: AnyArray,
+    at_reference: AnyArray,
     at_deformed: AnyArray,
     pairs: IntArray,
     half: IntArray,
@@ -81,9 +84,9 @@ def compare(
     scores: AnyArray,
     residuals: AnyArray,
 ) -> None:
-    """Fill scores (n,) with the normalised correlation of boxes about pairs (n, 2) of points, and residuals with their mean difference.
+    """Fill scores (n,) with the normalised cross-correlation of boxes about pairs (n, 2), and residuals with their mean difference.
 
-    The box in the deformed volume is turned by `turn` for the correlation and by `turn_residual` for the residual; both are NaN where a
+    The box in the deformed volume is rotated by `turn` for the correlation and by `turn_residual` for the residual; both are NaN where a
     box leaves its volume, and the correlation where a box has no contrast.
     """
     m = (2 * half[0] + 1) * (2 * half[1] + 1) * (2 * half[2] + 1)
@@ -95,7 +98,7 @@ def compare(
     for p in prange(len(pairs)):
         a, b = np.empty(m), np.empty(m)
         scores[p], residuals[p] = np.nan, np.nan
-        if not _box(initial, at_initial[pairs[p, 0]], straight, half, a):
+        if not _box(reference, at_reference[pairs[p, 0]], straight, half, a):
             continue
         if _box(deformed, at_deformed[pairs[p, 1]], turn, half, b):
             scores[p] = _correlation(a, b)

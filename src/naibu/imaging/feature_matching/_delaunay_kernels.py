@@ -1,8 +1,5 @@
 # mypy: disallow-untyped-decorators=False
-"""Numba kernel behind `naibu.imaging.feature_matching.scattered_interpolation`.
-
-The voxels inside every simplex, and their shape functions.
-"""
+"""Numba kernel for `naibu.imaging.feature_matching.scattered_interpolation`: linear interpolation in Delaunay simplices."""
 
 from __future__ import annotations
 
@@ -11,15 +8,15 @@ import numpy as np
 from naibu._numba.compilation import njit
 from naibu.core.arrays import AnyArray, BoolArray
 
-# of a shape function: a voxel on a face belongs to one of its simplices
+# tolerance of a shape function, far above rounding: a voxel on a face belongs to one of its simplices
 ON_FACE = 1e-9
 
 
 @njit(cache=True)
 def fill_simplices(corners: AnyArray, inverses: AnyArray, values: AnyArray, out: AnyArray, done: BoolArray) -> None:
-    """Fill out (nz, ny, nx, c) at the voxels inside simplices with linear interpolation of the values of their corners.
+    """Fill out (nz, ny, nx, c) at the voxels inside simplices by linear interpolation of the values at their vertices.
 
-    Corners (m, d + 1, d) are in indices x, y (, z); inverses (m, d, d) of the edges from the first one; values (m, d + 1, c).
+    Vertices `corners` (m, d + 1, d) are in indices x, y (, z); inverses (m, d, d) of the edges from the first one; values (m, d + 1, c).
     """
     m, k, d = corners.shape
     n_components = values.shape[2]

@@ -1,5 +1,5 @@
 # mypy: disallow-untyped-decorators=False
-"""Numba kernels behind `naibu.imaging.feature_matching.harris`: the two responses, and the peaks among them."""
+"""Numba kernels for `naibu.imaging.feature_matching.harris` :cite:p:`harris1988`: the two responses, and their local maxima."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def respond(tensor: AnyArray, plane: bool, k: float, out: AnyArray) -> None:
 
 @njit(cache=True)
 def peaks(response: AnyArray, allowed: BoolArray, least: float, found: IntArray) -> int:
-    """Fill found (m, 3) with indices x, y, z of voxels above their neighbours and above `least`, and return how many there are."""
+    """Fill found (m, 3) with the indices x, y, z of local maxima above `least`, and return their number."""
     nz, ny, nx = response.shape
     n = 0
     for z in range(nz):

@@ -1,5 +1,5 @@
 # mypy: disallow-untyped-decorators=False
-"""Numba kernels behind `naibu.imaging.feature_matching.relaxation_labelling`.
+"""Numba kernels for `naibu.imaging.feature_matching.relaxation_labelling` :cite:p:`zhang1995,hirai2008` (chapter 1).
 
 Strength of match of every candidate pair, and mutual best pairs.
 """
@@ -12,14 +12,12 @@ from naibu._numba.compilation import njit
 from naibu.core.arrays import AnyArray, IntArray
 
 CHEN, RESIDUAL, DIRECTION, DIRECTION26 = range(4)
-# Zhang 1995: pairs of neighbours whose distances differ by more than this share do not support each other
-TOLERANCE = 0.3
-STILL = 1e-9
+STILL = 1e-9  # displacements shorter than this, mm, have no direction
 
 
 @njit(cache=True)
 def mutual_best(pairs: IntArray, values: AnyArray, n_first: int, n_second: int) -> IntArray:
-    """Return which pairs are the best of both their points."""
+    """Return the indices of the pairs that are the best of both their points."""
     best_first, best_second = np.full(n_first, -1), np.full(n_second, -1)
     for p in range(len(pairs)):
         i, j = pairs[p, 0], pairs[p, 1]
@@ -39,7 +37,7 @@ def mutual_best(pairs: IntArray, values: AnyArray, n_first: int, n_second: int) 
 
 @njit(cache=True)
 def _angle_class(a: AnyArray, b: AnyArray) -> int:
-    """Return 0 for one direction, 1, 2, 3 for less than, equal to and more than 90 degrees, of whole vectors."""
+    """Return 0 for equal directions, 1, 2, 3 for angles below, equal to and above 90 degrees, of vectors of whole numbers."""
     dot, same = 0, True
     for c in range(3):
         dot += a[c] * b[c]
@@ -64,10 +62,10 @@ def _cosine(a: AnyArray, b: AnyArray) -> float:
 
 
 @njit(cache=True)
-def _weight(kind: int, difference: float, p: int, q: int, moves: AnyArray, states: IntArray) -> float:
-    """Return what the support of a neighbour pair q for a pair p is multiplied by, but for its correlation."""
+def _weight(kind: int, difference: float, tolerance: float, p: int, q: int, moves: AnyArray, states: IntArray) -> float:
+    """Return the weight, without its correlation, of the support of a neighbour pair q for a pair p."""
     if kind == CHEN:
-        return float(np.exp(-difference / TOLERANCE)) if difference < TOLERANCE else 0.0
+        return float(np.exp(-difference / tolerance)) if difference < tolerance else 0.0
     if kind == DIRECTION:
         cosine = _cosine(moves[p], moves[q])
         return float(np.exp(-(1.0 + 1.0 / (1.0 + cosine)) * (1.0 + difference))) if cosine > -1.0 else 0.0
@@ -81,6 +79,7 @@ def _weight(kind: int, difference: float, p: int, q: int, moves: AnyArray, state
 def strengths(
     kind: int,
     alpha: float,
+    tolerance: float,
     pairs: IntArray,
     scores: AnyArray,
     residuals: AnyArray,
@@ -96,7 +95,8 @@ def strengths(
 ) -> None:
     """Fill out (c,) with the strength of match of every pair.
 
-    `near[start[i]:start[i + 1]]` are the points before about point i; `match_of` tells the potential match of a point before, or -1.
+    `near[start[i]:start[i + 1]]` are the reference points about point i; `match_of` is the potential match of a reference point, or -1.
+    Neighbours whose relative difference of distances exceeds `tolerance` give no support for the kind `CHEN`.
     """
     most = 0
     for i in range(len(start) - 1):
@@ -117,10 +117,10 @@ def strengths(
             if d2 > radius * radius or d1 == 0.0:
                 continue
             d1, d2 = np.sqrt(d1), np.sqrt(d2)
-            who[n], weights[n] = q, _weight(kind, 2.0 * abs(d1 - d2) / (d1 + d2), p, q, moves, states)
+            who[n], weights[n] = q, _weight(kind, 2.0 * abs(d1 - d2) / (d1 + d2), tolerance, p, q, moves, states)
             n += 1
         if kind == RESIDUAL:
-            _share_out(residuals, who, weights, n)
+            _apportion(residuals, who, weights, n)
         support = 0.0
         for s in range(n):
             support += scores[who[s]] * weights[s]
@@ -128,8 +128,8 @@ def strengths(
 
 
 @njit(cache=True)
-def _share_out(residuals: AnyArray, who: IntArray, weights: AnyArray, n: int) -> None:
-    """Multiply weights by the Gibbs distribution of the residuals of the neighbour pairs, whose sum is one."""
+def _apportion(residuals: AnyArray, who: IntArray, weights: AnyArray, n: int) -> None:
+    """Multiply weights by the Gibbs distribution, of sum one, of the residuals of the neighbour pairs."""
     if n == 0:
         return
     mean = 0.0

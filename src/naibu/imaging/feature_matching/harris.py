@@ -1,4 +1,4 @@
-"""Interest points: the Harris operator in two and three dimensions, on voxels of any shape (spec S3)."""
+"""Interest points: the Harris corner detector :cite:p:`harris1988` in two and three dimensions, on voxels of any shape."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Response = Literal["ratio", "harris"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InterestPoints:
-    """Points of a volume about which the grey values change in every direction, strongest first.
+    """Points of a volume about which the intensity changes in every direction, strongest first.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class InterestPoints:
     indices : ndarray, shape (n, 3), int64
         Indices of their voxels along x, y, z.
     responses : ndarray, shape (n,)
-        Response of the operator.
+        Response of the detector: intensity^2/mm^2 for ``"ratio"``; in 3-D intensity^6/mm^6 and intensity^4/mm^4 combined for ``"harris"``.
     """
 
     points_mm: FloatArray
@@ -49,43 +49,48 @@ def harris_response(
     gradient_sigma_mm: float | None = None,
     window_sigma_mm: float | None = None,
 ) -> Float32Array:
-    """Return the response (nz, ny, nx) of the Harris operator (spec S3, equation 1.13).
+    """Return the response (nz, ny, nx) of the Harris corner detector :cite:p:`harris1988`.
 
     Parameters
     ----------
     volume : Volume
-        Voxels; a volume of one slice is an image, whose operator is the one in two dimensions.
+        Intensities; a volume of one slice is an image, with the detector in two dimensions.
     response : {"ratio", "harris"}
         ``det M / tr M``, free of a constant, or ``det M - k tr(M)^2``.
     k : float
-        Constant of the second, 0.04 to 0.06.
+        Constant of ``"harris"``, 0 or more; 0.04 to 0.06 is usual.
     gradient_sigma_mm : float, optional
-        Standard deviation of the Gaussian that smooths before derivatives are taken, mm; by default 0.7 of the smallest spacing.
+        Standard deviation of the Gaussian that smooths before derivatives are taken, mm, 0 or more; by default 0.7 of the smallest
+        spacing.
     window_sigma_mm : float, optional
-        Standard deviation of the Gaussian window of M, mm; by default the smallest spacing.
+        Standard deviation of the Gaussian window of M, mm, 0 or more; by default the smallest spacing.
+
+    Returns
+    -------
+    ndarray, shape (nz, ny, nx), float32
+        Response.
 
     Raises
     ------
     InputError
-        A constant volume, or a constant that is negative.
+        A constant volume, unknown voxels, an unknown response, a negative k, or a negative standard deviation.
 
     Notes
     -----
-    ``M = G * (grad I grad I^T)``, derivatives in grey per mm, so that the response is the same however fine the voxels are. In space
-    ``det M`` and ``tr(M)^2`` do not grow alike with contrast, so that the meaning of k depends on the unit of grey: ``"ratio"`` is free
-    of that.
-
-    References
-    ----------
-    C. Harris, M. Stephens: A combined corner and edge detector. Alvey Vision Conference (1988) 147-151.
+    ``M = G * (grad I grad I^T)``, the structure tensor (1.13), with intensity gradients per mm, so that the response does not depend on
+    the size of the voxels. In three dimensions ``det M`` and ``tr(M)^2`` do not grow alike with contrast, so that the meaning of k depends
+    on the unit of intensity; ``"ratio"`` does not.
     """
     if response not in ("ratio", "harris") or k < 0.0:
         raise InputError(f"response must be 'ratio' or 'harris' with k >= 0, not {response!r} with {k}")
+    for name, sigma in (("gradient_sigma_mm", gradient_sigma_mm), ("window_sigma_mm", window_sigma_mm)):
+        if sigma is not None and not (np.isfinite(sigma) and sigma >= 0.0):
+            raise InputError(f"{name} must be 0 or more, mm, not {sigma}")
     inner, outer = default_sigmas(volume.spacing_mm, volume.shape, gradient_sigma_mm, window_sigma_mm)
-    grey = known_grey(volume.values, float(np.mean(volume.values, dtype=float)))
-    if not float(grey.max()) > float(grey.min()):
+    intensity = known_intensities(volume.values, float(np.mean(volume.values, dtype=float)))
+    if not float(intensity.max()) > float(intensity.min()):
         raise InputError("the volume is constant: it has no interest points")
-    return response_of(grey, volume.spacing_mm, inner, outer, k if response == "harris" else None)
+    return response_of(intensity, volume.spacing_mm, inner, outer, k if response == "harris" else None)
 
 
 def default_sigmas(
@@ -96,31 +101,31 @@ def default_sigmas(
     return 0.7 * finest if gradient_sigma_mm is None else gradient_sigma_mm, finest if window_sigma_mm is None else window_sigma_mm
 
 
-def known_grey(values: AnyArray, shift: float) -> Float32Array:
-    """Return grey values less a shift, in single precision.
+def known_intensities(values: AnyArray, shift: float) -> Float32Array:
+    """Return intensities less a shift, in single precision.
 
     Raises
     ------
     InputError
         Unknown voxels.
     """
-    grey = np.asarray(values - shift, dtype=np.float32)
-    if not np.isfinite(grey).all():
-        raise InputError("the volume has unknown voxels (NaN); look for interest points before it is resampled, or fill them")
-    return grey
+    intensity = np.asarray(values - shift, dtype=np.float32)
+    if not np.isfinite(intensity).all():
+        raise InputError("the volume has unknown voxels (NaN); find interest points before it is resampled, or fill them")
+    return intensity
 
 
 def response_of(
-    grey: Float32Array, spacing_mm: FloatArray, gradient_sigma_mm: float, window_sigma_mm: float, k: float | None
+    intensity: Float32Array, spacing_mm: FloatArray, gradient_sigma_mm: float, window_sigma_mm: float, k: float | None
 ) -> Float32Array:
-    """Return the response (nz, ny, nx) of the Harris operator on grey values; without k the ratio of determinant and trace."""
-    slopes = gradient(smoothed(grey, gradient_sigma_mm / spacing_mm), spacing_mm)
-    tensor = np.empty((6, *grey.shape), dtype=np.float32)
-    products(slopes, tensor)
-    plane = grey.shape[0] == 1
+    """Return the response (nz, ny, nx) of the Harris detector to intensities; without k the ratio of determinant and trace."""
+    gradients = gradient(smoothed(intensity, gradient_sigma_mm / spacing_mm), spacing_mm)
+    tensor = np.empty((6, *intensity.shape), dtype=np.float32)
+    products(gradients, tensor)
+    plane = intensity.shape[0] == 1
     for entry in (0, 1, 3) if plane else range(6):
         tensor[entry] = smoothed(tensor[entry], window_sigma_mm / spacing_mm)
-    out = np.empty(grey.shape, dtype=np.float32)
+    out = np.empty(intensity.shape, dtype=np.float32)
     respond(tensor, plane, -1.0 if k is None else k, out)
     return out
 
@@ -138,22 +143,22 @@ def interest_points(
     gradient_sigma_mm: float | None = None,
     window_sigma_mm: float | None = None,
 ) -> InterestPoints:
-    """Return the strongest interest points of a volume (spec S3).
+    """Return the strongest interest points of a volume by the Harris corner detector :cite:p:`harris1988`.
 
     Parameters
     ----------
     volume : Volume
-        Voxels; a volume of one slice is an image.
+        Intensities; a volume of one slice is an image.
     count : int, optional
-        At most so many, the strongest; the report takes 200 to 5000.
+        Largest number of points, 1 or more; the report takes 200 to 5000.
     threshold : float
-        Least response.
+        Response that points must exceed.
     min_distance_mm : float, optional
-        Of two points nearer than this, mm, the stronger stays; by default twice the smallest spacing.
+        Of two points nearer than this, mm, the stronger is kept; by default twice the smallest spacing, and all are kept at 0.
     mask : array_like, shape (nz, ny, nx), optional
         Where points may lie.
     border : int or array_like, shape (3,)
-        Voxels along x, y, z at every face where no points are wanted, such as half a match box.
+        Voxels along x, y, z at every face where no points are wanted, such as half a match box; 0 or more.
     response, k, gradient_sigma_mm, window_sigma_mm
         As in `harris_response`.
 
@@ -165,13 +170,18 @@ def interest_points(
     Raises
     ------
     InputError
-        No point above the threshold, a constant volume, an empty mask, or a count below one.
+        No point above the threshold, a constant volume, an empty mask, a count below one, a negative distance or border.
     """
     if count is not None and count < 1:
-        raise InputError(f"{count} interest points are none; ask for one or more")
+        raise InputError(f"count must be one or more, not {count}; leave it out to keep all points")
+    if min_distance_mm is not None and not min_distance_mm >= 0.0:
+        raise InputError(f"min_distance_mm must be 0 or more, mm, not {min_distance_mm}")
+    edge = np.broadcast_to(np.asarray(border, dtype=int), 3)
+    if (edge < 0).any():
+        raise InputError(f"border must be 0 or more voxels along every axis, not {edge.tolist()}")
     strength = harris_response(volume, response=response, k=k, gradient_sigma_mm=gradient_sigma_mm, window_sigma_mm=window_sigma_mm)
     allowed = np.ones(volume.shape, dtype=bool) if mask is None else require_mask(mask, volume).copy()
-    for axis, b in zip((2, 1, 0), np.broadcast_to(np.asarray(border, dtype=int), 3), strict=True):
+    for axis, b in zip((2, 1, 0), edge, strict=True):
         if volume.shape[axis] > 1 and b > 0:
             inner = np.moveaxis(allowed, axis, 0)
             inner[:b], inner[-b:] = False, False

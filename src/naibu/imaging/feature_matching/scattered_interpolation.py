@@ -1,4 +1,4 @@
-"""From displacements at points to one at every voxel, by Delaunay simplices (spec S6)."""
+"""Dense displacement from scattered points by linear interpolation in Delaunay simplices :cite:p:`hirai2008` (chapter 1)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
-from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.arrays import FloatArray, IntArray, as_points
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.rigid_transform import RigidTransform
@@ -19,45 +19,45 @@ from naibu.imaging.feature_matching.relaxation_labelling import PotentialMatches
 from naibu.imaging.preprocessing.resampling import positions
 
 Outside = Literal["nan", "nearest", "affine"]
-# of the mean simplex: flatter ones are rounding, and their voxels belong to neighbours
+# measure of a simplex, as a fraction of the mean one, below which it is flat but for rounding; its voxels belong to neighbours
 FLAT = 1e-9
 
 
 def sparse_displacement(
     matches: PotentialMatches, rigid: RigidTransform | None = None, *, rotation_only: bool = False
 ) -> DisplacementField:
-    """Return the displacement of matched points (spec S6).
+    """Return the displacement of matched points.
 
     Parameters
     ----------
     matches : PotentialMatches
         Pairs of points.
     rigid : RigidTransform, optional
-        The points then stand in the registered frame, ``R x1 + tau``, and what the rigid motion does is no displacement. By default
-        they stand where they were before, and the displacement is the whole ``x2 - x1``.
+        The points are then in the registered frame, ``R x1 + tau``, and the rigid motion is not part of the displacement. By default they
+        are at ``x1``, and the displacement is the whole ``x2 - x1``.
     rotation_only : bool
-        Take out the rotation and keep the translation, as (1.25) of the report does: points at ``R x1``.
+        Remove the rotation and keep the translation, as (1.25) of the report does: points at ``R x1``.
 
     Returns
     -------
     DisplacementField
-        ``u = x2 - (R x1 + tau)`` at the points; the report's ``D = R x1 + tau - x2`` points the other way.
+        ``u = x2 - (R x1 + tau)`` at the points; the report's ``D = R x1 + tau - x2`` has the opposite sign.
 
     Raises
     ------
     InputError
-        `rotation_only` without a rigid motion.
+        `rotation_only` without `rigid`.
     """
     if rigid is None:
         if rotation_only:
-            raise InputError("rotation_only takes the rotation out of the displacement: give the rigid motion")
-        return DisplacementField.from_arrays(matches.initial_mm, matches.deformed_mm - matches.initial_mm)
-    start = matches.initial_mm @ rigid.rotation.T if rotation_only else rigid.applied(matches.initial_mm)
+            raise InputError("rotation_only removes the rotation of rigid from the displacement: give the rigid motion")
+        return DisplacementField.from_arrays(matches.reference_mm, matches.deformed_mm - matches.reference_mm)
+    start = matches.reference_mm @ rigid.rotation.T if rotation_only else rigid.applied(matches.reference_mm)
     return DisplacementField.from_arrays(start, matches.deformed_mm - start)
 
 
 def elevation_angle(vectors: ArrayLike) -> FloatArray:
-    """Return the angle (n,), rad, of displacements (n, 3) to the plane of x and z: ``asin(u_y / |u|)``; zero where nothing moves."""
+    """Return the elevation (n,), rad, of displacements (n, 3), mm, from the xz-plane: ``asin(u_y / |u|)``; zero for zero vectors."""
     u = np.asarray(vectors, dtype=float)
     length = np.linalg.norm(u, axis=1)
     return np.asarray(np.arcsin(np.clip(np.divide(u[:, 1], length, out=np.zeros(len(u)), where=length > 0), -1.0, 1.0)))
@@ -80,14 +80,21 @@ class Triangulation:
 
 
 def triangulated(points_mm: ArrayLike, grid: Volume) -> Triangulation:
-    """Return the Delaunay tetrahedra of points (n, 3), mm, or triangles where the grid is one slice.
+    """Return the Delaunay tetrahedra of points, or triangles where the grid is one slice.
+
+    Parameters
+    ----------
+    points_mm : array_like, shape (n, 3)
+        Points, mm.
+    grid : Volume
+        Its axes and its number of slices; values do not matter.
 
     Raises
     ------
     InputError
-        Too few points, or points that span no simplex.
+        Points of another shape or not finite, too few of them, or points that span no simplex.
     """
-    p = np.asarray(points_mm, dtype=float)
+    p = as_points("points_mm", points_mm, 3)
     d = 2 if grid.shape[0] == 1 else 3
     what = "triangle" if d == 2 else "tetrahedron"
     if len(p) < d + 1:
@@ -101,32 +108,32 @@ def triangulated(points_mm: ArrayLike, grid: Volume) -> Triangulation:
 
 
 def dense_from_sparse(field: DisplacementField, grid: Volume, *, outside: Outside = "nan") -> DisplacementField:
-    """Return the displacement at every voxel, linear in the Delaunay simplices of the points of a field (spec S6, 1.11, 1.12, 1.27).
+    """Return the displacement at every voxel by linear interpolation in the Delaunay simplices of points (1.11, 1.12, 1.27).
 
     Parameters
     ----------
     field : DisplacementField
-        Displacement at points, mm; points without data are left out.
+        Displacement at points, mm; invalid points are left out.
     grid : Volume
-        Voxels where it is wanted; a volume of one slice is an image, with triangles.
+        Voxels of the result; a volume of one slice is an image, with triangles.
     outside : {"nan", "nearest", "affine"}
-        At voxels outside the hull of the points: nothing, the displacement of the nearest point, or the affine motion that fits all points
-        best. `valid` is true inside the hull only.
+        At voxels outside the convex hull of the points: NaN, the displacement of the nearest point, or the least-squares affine motion of
+        all points. `valid` is true inside the hull only.
 
     Returns
     -------
     DisplacementField
-        Its quality is 1 inside the hull.
+        Displacement, mm; its quality is 1 inside the hull.
 
     Raises
     ------
     InputError
-        Points that span no simplex, an unknown choice, or a hull without a voxel in it.
+        Points that span no simplex, an unknown `outside`, or a hull without a voxel in it.
     """
     if outside not in ("nan", "nearest", "affine"):
         raise InputError(f"outside must be 'nan', 'nearest' or 'affine', not {outside!r}")
-    # Qhull would leave out all but one point of a place without saying which
-    p, u = _one_a_place(field.points[field.valid], field.vectors[field.valid])
+    # of coincident points Qhull keeps one without saying which
+    p, u = _merged(field.points[field.valid], field.vectors[field.valid])
     net = triangulated(p, grid)
     d = net.simplices.shape[1] - 1
     index = grid.to_index(p)[:, :d]
@@ -139,15 +146,15 @@ def dense_from_sparse(field: DisplacementField, grid: Volume, *, outside: Outsid
     vectors, inside = np.full((*grid.shape, 3), np.nan), np.zeros(grid.shape, dtype=bool)
     fill_simplices(np.ascontiguousarray(corners), np.ascontiguousarray(inverses), u[cells], vectors, inside)
     if not inside.any():
-        raise InputError("no voxel of the grid lies among the points: are points and grid in one frame, in mm?")
+        raise InputError("no voxel of the grid lies among the points of the field: check that both are in one frame, in mm")
     if outside != "nan":
-        places = positions(grid)[~inside]
-        vectors[~inside] = u[cKDTree(p).query(places)[1]] if outside == "nearest" else _affine(p, u, places)
+        beyond = positions(grid)[~inside]
+        vectors[~inside] = u[cKDTree(p).query(beyond)[1]] if outside == "nearest" else _affine(p, u, beyond)
     return DisplacementField.on_grid(grid, vectors, valid=inside, quality=np.where(inside, 1.0, np.nan))
 
 
-def _one_a_place(points: FloatArray, vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return points without duplicates, with the mean of their vectors."""
+def _merged(points: FloatArray, vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return points without duplicates, each with the mean of its vectors."""
     unique, where = np.unique(points, axis=0, return_inverse=True)
     if len(unique) == len(points):
         return points, vectors
@@ -155,9 +162,9 @@ def _one_a_place(points: FloatArray, vectors: FloatArray) -> tuple[FloatArray, F
     return unique, np.stack([np.bincount(where.ravel(), v) / count for v in vectors.T], axis=1)
 
 
-def _affine(points: FloatArray, vectors: FloatArray, places: FloatArray) -> FloatArray:
-    """Return the affine function that fits vectors at points best, at other places."""
+def _affine(points: FloatArray, vectors: FloatArray, at: FloatArray) -> FloatArray:
+    """Return the least-squares affine fit to vectors at points, evaluated at other points (k, d)."""
     middle = points.mean(axis=0)
     columns = np.column_stack([np.ones(len(points)), points - middle])
     found = np.linalg.lstsq(columns, vectors, rcond=None)[0]
-    return np.asarray(np.column_stack([np.ones(len(places)), places - middle]) @ found)
+    return np.asarray(np.column_stack([np.ones(len(at)), at - middle]) @ found)
