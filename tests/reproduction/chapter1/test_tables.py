@@ -53,7 +53,7 @@ def image() -> CalfCase:
 
 @pytest.fixture(scope="module")
 def ways(image: CalfCase) -> dict[str, Matched]:
-    pairs, _, _ = candidates_of(image.initial, image.deformed, (200, 240), picked_registration(image).transform)
+    pairs, _, _ = candidates_of(image.reference, image.deformed, (200, 240), picked_registration(image).transform)
     found = [matched(image, pairs, way) for way in (None, *WAYS)]
     return {each.name: each for each in found}
 
@@ -102,9 +102,9 @@ def test_the_volumes_show_the_motion() -> None:
     """Without noise the second scan carried back by the truth is the first one, but for blur; nothing moved, or half of it, is not."""
     case = calf_case(1, pixels=128, slices=5, noise=0.0)
     inside = case.leg & np.isfinite(case.truth[..., 0])
-    left = [intensity_rms(case.initial, case.deformed, share * case.truth, region=inside, frame="initial") for share in (0.0, 0.5, 1.0)]
+    left = [intensity_rms(case.reference, case.deformed, share * case.truth, region=inside, frame="initial") for share in (0.0, 0.5, 1.0)]
     assert left[2] < 0.25 * left[1] < 0.25 * left[0]
-    back = intensity_rms(case.initial, case.deformed, np.where(case.leg[..., None], case.truth, np.nan), region=case.tissue_after)
+    back = intensity_rms(case.reference, case.deformed, np.where(case.leg[..., None], case.truth, np.nan), region=case.tissue_after)
     assert back < 0.25 * left[0]
 
 
@@ -116,7 +116,7 @@ def test_the_phantom_is_a_calf() -> None:
     around = np.column_stack([*(np.array(TIBIA)[:, None] + 11.0 * np.array([np.cos(t := np.linspace(0, 6, 40)), np.sin(t)])), 0.0 * t])
     assert phantom.grey(around).max() < 60.0 < phantom.grey(np.array([at["bone"]]))[0]  # dark rim, bright marrow
     assert (CalfPhantom(1).grey(around + np.array([40.0, 20.0, 0.0])) != 4.0).any()
-    assert judged_slices(calf_case(0, pixels=16, slices=29).initial) == slice(10, 51)
+    assert judged_slices(calf_case(0, pixels=16, slices=29).reference) == slice(10, 51)
 
 
 def test_most_matches_are_right_and_relaxation_adds_some(ways: dict[str, Matched]) -> None:
@@ -133,17 +133,17 @@ def test_most_matches_are_right_and_relaxation_adds_some(ways: dict[str, Matched
 
 def test_check_points_come_back(image: CalfCase, ways: dict[str, Matched]) -> None:
     points = check_points(image)
-    assert points.initial_mm.shape == (10, 3)
-    assert np.linalg.norm(points.deformed_mm - points.initial_mm, axis=1).mean() > 3.0
+    assert points.reference_mm.shape == (10, 3)
+    assert np.linalg.norm(points.deformed_mm - points.reference_mm, axis=1).mean() > 3.0
     for name in WAYS:
-        assert points.errors_mm(ways[name].moved_back(points.deformed_mm, image.initial)).mean() < 2.0, name
-    truth = continued(np.where(image.leg[..., None], image.truth, np.nan), image.initial)
-    assert points.errors_mm(moved_back(truth, image.initial, points.deformed_mm)).max() < 0.1
+        assert points.errors_mm(ways[name].moved_back(points.deformed_mm, image.reference)).mean() < 2.0, name
+    truth = continued(np.where(image.leg[..., None], image.truth, np.nan), image.reference)
+    assert points.errors_mm(moved_back(truth, image.reference, points.deformed_mm)).max() < 0.1
 
 
 def test_the_bone_is_registered_by_picked_points(image: CalfCase) -> None:
     found = picked_registration(image)
-    axis = np.array([[*TIBIA, image.initial.origin_mm[2]]])
+    axis = np.array([[*TIBIA, image.reference.origin_mm[2]]])
     assert found.transform.applied(axis)[:, :2] == pytest.approx(leg_pose().applied(axis)[:, :2], abs=1.0)
 
 
@@ -202,11 +202,11 @@ def test_flow_of_section_3_5(chapter: Chapter) -> None:
 def test_the_same_seed_gives_the_same_scans_and_matches(image: CalfCase, ways: dict[str, Matched]) -> None:
     again = calf_case(0, pixels=192, slices=3).slices(2)
     assert np.array_equal(again.deformed.values, image.deformed.values)
-    pairs, _, _ = candidates_of(again.initial, again.deformed, (200, 240), picked_registration(again).transform)
+    pairs, _, _ = candidates_of(again.reference, again.deformed, (200, 240), picked_registration(again).transform)
     found = matched(again, pairs, "direction26")
     assert np.array_equal(found.matches.pairs, ways["direction26"].matches.pairs)
     other = calf_case(1, pixels=48, slices=2)
-    assert not np.array_equal(calf_case(2, pixels=48, slices=2).initial.values, other.initial.values)
+    assert not np.array_equal(calf_case(2, pixels=48, slices=2).reference.values, other.reference.values)
 
 
 @pytest.mark.slow

@@ -109,7 +109,7 @@ class CalfCase:
 
     Attributes
     ----------
-    initial, deformed : Volume
+    reference, deformed : Volume
         Before and after the push, 256 grey levels, with slices put between.
     truth : ndarray, shape (nz, ny, nx, 3)
         Displacement of the tissue at the voxels of the initial volume, mm.
@@ -121,7 +121,7 @@ class CalfCase:
         Which made it.
     """
 
-    initial: Volume
+    reference: Volume
     deformed: Volume
     truth: FloatArray
     tissue: Int8Array
@@ -143,8 +143,8 @@ class CalfCase:
         The truth of an image is the motion of its tissue within the slice.
         """
         k = slice(first, (first if last is None else last) + 1)
-        origin = self.initial.to_physical((0.0, 0.0, float(first)))
-        cut = [Volume(v.values[k], v.spacing_mm, origin, v.direction) for v in (self.initial, self.deformed)]
+        origin = self.reference.to_physical((0.0, 0.0, float(first)))
+        cut = [Volume(v.values[k], v.spacing_mm, origin, v.direction) for v in (self.reference, self.deformed)]
         truth = self.truth[k].copy()
         if last is None:
             truth[..., 2] = 0.0

@@ -50,11 +50,11 @@ def the_case(case: CalfCase, at: int) -> Draw:
 
     def draw(canvas: Canvas) -> None:
         axes = canvas.subplots(1, 3, sharey=True)
-        for axis, volume, title in zip(axes, (case.initial, case.deformed), ("before", "after"), strict=False):
+        for axis, volume, title in zip(axes, (case.reference, case.deformed), ("before", "after"), strict=False):
             axis.imshow(volume.values[at], extent=_extent(volume), **GREY)
             axis.set(title=title)
         length = np.where(case.leg, np.linalg.norm(case.truth, axis=-1), np.nan)[at]
-        shown = axes[2].imshow(length, extent=_extent(case.initial), cmap="viridis", vmin=0.0, interpolation="nearest")
+        shown = axes[2].imshow(length, extent=_extent(case.reference), cmap="viridis", vmin=0.0, interpolation="nearest")
         axes[2].set(title="true displacement")
         canvas.colorbar(shown, ax=axes[2], label="mm", shrink=0.8)
         for axis in axes:
@@ -71,7 +71,7 @@ def match_panels(case: CalfCase, chosen: Sequence[Matched]) -> Draw:
             axis.imshow(case.deformed.values[0], extent=_extent(case.deformed), alpha=0.75, **GREY)
             right = way.errors_mm < RIGHT_MM
             for some, colour, label in ((right, "#56b4e9", "right"), (~right, "#e69f00", "wrong")):
-                a, b = way.matches.initial_mm[some], way.matches.deformed_mm[some]
+                a, b = way.matches.reference_mm[some], way.matches.deformed_mm[some]
                 axis.plot(*np.stack([a[:, :2], b[:, :2], np.full((len(a), 2), np.nan)], axis=1).reshape(-1, 2).T, color=colour, lw=1.3)
                 axis.plot(*b[:, :2].T, "o", ms=2.5, color=colour, label=f"{label}: {some.sum()}")
             axis.set(title=way.name)
@@ -105,11 +105,11 @@ def net_panels(case: CalfCase, chosen: Sequence[Matched]) -> Draw:
 
     def draw(canvas: Canvas) -> None:
         axes = canvas.subplots(len(chosen), 3, squeeze=False, sharex=True, sharey=True)
-        extent = _extent(case.initial)
+        extent = _extent(case.reference)
         largest = float(np.linalg.norm(case.truth[case.leg], axis=-1).max())
         for row, way in zip(axes, chosen, strict=True):
             inside = way.dense.valid[0] & case.leg[0]
-            row[0].imshow(case.initial.values[0], extent=extent, alpha=0.7, **GREY)
+            row[0].imshow(case.reference.values[0], extent=extent, alpha=0.7, **GREY)
             row[0].triplot(*way.net.points_mm[:, :2].T, way.net.simplices, lw=0.7, color="#56b4e9")
             row[0].set(title=f"{way.name}: {len(way.net.simplices)} triangles")
             length = np.linalg.norm(way.dense.vectors[0], axis=-1)
@@ -134,10 +134,10 @@ def check_panels(case: CalfCase, points: CheckPoints, back: Mapping[str, FloatAr
 
     def draw(canvas: Canvas) -> None:
         for axis, (name, ends) in zip(np.atleast_1d(canvas.subplots(1, len(back), sharey=True)), back.items(), strict=True):
-            axis.imshow(case.initial.values[0], extent=_extent(case.initial), alpha=0.75, **GREY)
-            axis.plot(*points.initial_mm[:, :2].T, "+", ms=11, mew=1.6, color="#f0e442", label="where it was")
+            axis.imshow(case.reference.values[0], extent=_extent(case.reference), alpha=0.75, **GREY)
+            axis.plot(*points.reference_mm[:, :2].T, "+", ms=11, mew=1.6, color="#f0e442", label="where it was")
             axis.plot(*ends[:, :2].T, "x", ms=8, mew=1.6, color="#009e73", label="moved back")
-            for number, place in enumerate(points.initial_mm):
+            for number, place in enumerate(points.reference_mm):
                 axis.annotate(str(number), place[:2], (6, 5), textcoords="offset points", color="white", fontsize=8)
             axis.set(title=name)
             _about(axis, case, case.leg)
@@ -155,7 +155,7 @@ def node_displacements(chosen: Sequence[Matched]) -> Draw:
         largest = 15.0
         for number, way in enumerate(chosen):
             axis: Any = canvas.add_subplot(1, len(chosen), number + 1, projection="3d")
-            p, u = way.matches.initial_mm, way.matches.deformed_mm - way.matches.initial_mm
+            p, u = way.matches.reference_mm, way.matches.deformed_mm - way.matches.reference_mm
             colours = mpl.colormaps["viridis"](np.clip(np.linalg.norm(u, axis=1) / largest, 0.0, 1.0))
             # every arrow has a shaft and two strokes of its head
             axis.quiver(*p.T, *u.T, colors=np.concatenate([colours, np.repeat(colours, 2, axis=0)]), lw=0.8, arrow_length_ratio=0.25)
@@ -195,7 +195,7 @@ def cuts(case: CalfCase, fields: Mapping[str, tuple[FloatArray, BoolArray]], at:
 
 def _slice_and_cut(axes: AnyArray, case: CalfCase, values: FloatArray, at: int, how: dict[str, Any], title: str) -> AxesImage:
     """Show a slice and, below it, a cut along the leg at x = 0 of values (nz, ny, nx)."""
-    grid, (nz, ny, nx) = case.initial, case.initial.shape
+    grid, (nz, ny, nx) = case.reference, case.reference.shape
     shown: AxesImage = axes[0].imshow(values[at], extent=_extent(grid), interpolation="nearest", **how)
     _about(axes[0], case, case.leg)
     axes[0].set(title=title, xlabel="x, mm", ylabel="y, mm")
@@ -213,13 +213,13 @@ def resampled_slices(case: CalfCase, fields: Mapping[str, FloatArray], which: Se
 
     def draw(canvas: Canvas) -> None:
         axes = canvas.subplots(1 + 2 * len(fields), len(which), squeeze=False, sharex=True, sharey=True)
-        extent = _extent(case.initial)
+        extent = _extent(case.reference)
         shown: Any = None
         for axis, k in zip(axes[0], which, strict=True):
             axis.imshow(case.deformed.values[k], extent=extent, **GREY)
             axis.set(title=f"slice {k}: after the push")
         for number, (name, vectors) in enumerate(fields.items()):
-            computed = warped(case.initial, inverse_displacement(vectors, case.initial), case.initial)
+            computed = warped(case.reference, inverse_displacement(vectors, case.reference), case.reference)
             for column, k in enumerate(which):
                 upper, lower = axes[1 + 2 * number, column], axes[2 + 2 * number, column]
                 upper.imshow(computed[k], extent=extent, **GREY)
@@ -257,7 +257,7 @@ def flow_panels(case: CalfCase, chosen: Sequence[Found], at: int) -> Draw:
 
 
 def _arrows(axis: Axes, case: CalfCase, found: Found, at: int) -> Quiver:
-    grid, u = case.initial, found.vectors[at]
+    grid, u = case.reference, found.vectors[at]
     some = np.zeros(u.shape[:2], dtype=bool)
     every = max(round(ARROWS_APART_MM / grid.spacing_mm[0]), 1)
     some[::every, ::every] = True
@@ -273,7 +273,7 @@ def _arrows(axis: Axes, case: CalfCase, found: Found, at: int) -> Quiver:
 
 
 def _errors(axis: Axes, case: CalfCase, found: Found, at: int) -> AxesImage:
-    extent = _extent(case.initial)
+    extent = _extent(case.reference)
     axis.imshow(np.where(case.leg[at], 0.7, np.nan), extent=extent, cmap="gray", vmin=0.0, vmax=1.0)  # where nothing was measured
     error = np.where(case.leg[at], found.errors_mm[at], np.nan)
     return axis.imshow(error, extent=extent, cmap="magma", vmin=0.0, vmax=WORST_MM, interpolation="nearest")
@@ -289,7 +289,7 @@ def _extent(grid: Volume) -> tuple[float, float, float, float]:
 def _window(case: CalfCase, tissue: BoolArray) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the limits along x and y of tissue (nz, ny, nx) with a margin, mm."""
     where = np.argwhere(tissue.any(axis=0))[:, ::-1]
-    low, high = (case.initial.to_physical([*corner, 0.0])[:2] for corner in (where.min(axis=0), where.max(axis=0)))
+    low, high = (case.reference.to_physical([*corner, 0.0])[:2] for corner in (where.min(axis=0), where.max(axis=0)))
     return (low[0] - MARGIN_MM, high[0] + MARGIN_MM), (low[1] - MARGIN_MM, high[1] + MARGIN_MM)
 
 

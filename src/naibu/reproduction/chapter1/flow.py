@@ -64,7 +64,7 @@ def flow_section(case: CalfCase, image: CalfCase, others: Mapping[str, FloatArra
     plane = _measured(image, 0)
     space = _measured(case, 1) + [_against(name, np.where(case.leg[..., None], u, np.nan), case) for name, u in others.items()]
     region = judged(case)[0]
-    at = case.initial.shape[0] // 2
+    at = case.reference.shape[0] // 2
     lost = 100.0 * float(np.mean(plane[0].errors_mm[np.isfinite(plane[0].errors_mm)] > LOST_MM))
     text = (
         "As in the report the two states are first brought together by points on the tibia (3.36). 'As the report' stands for its "
@@ -103,13 +103,13 @@ def flow_section(case: CalfCase, image: CalfCase, others: Mapping[str, FloatArra
 def _measured(case: CalfCase, kind: int) -> list[Measured]:
     """Run all methods of an image (kind 0) or a volume (kind 1)."""
     rigid = picked_registration(case).transform
-    back = resampled_to_grid(case.deformed, case.initial, through=rigid.applied)
-    return [_one(name, flow(case.initial, back), case, rigid) for name, flow in _flows(case, kind).items()]
+    back = resampled_to_grid(case.deformed, case.reference, through=rigid.applied)
+    return [_one(name, flow(case.reference, back), case, rigid) for name, flow in _flows(case, kind).items()]
 
 
 def _one(name: str, found: DisplacementField, case: CalfCase, rigid: RigidTransform) -> Measured:
     known = np.where(found.valid[..., None] & case.leg[..., None], found.vectors, np.nan)
-    return _against(name, total_displacement(known, rigid, case.initial), case)
+    return _against(name, total_displacement(known, rigid, case.reference), case)
 
 
 def _against(name: str, vectors: FloatArray, case: CalfCase) -> Measured:
@@ -117,7 +117,7 @@ def _against(name: str, vectors: FloatArray, case: CalfCase) -> Measured:
 
 
 def _flows(case: CalfCase, kind: int) -> dict[str, Flow]:
-    finer = REPORT_PIXEL_MM / case.initial.spacing_mm[0]
+    finer = REPORT_PIXEL_MM / case.reference.spacing_mm[0]
     block = BLOCKS[kind]
     search = (*(round(n * finer) for n in SEARCHES[kind][:2]), SEARCHES[kind][2])
 

@@ -65,7 +65,7 @@ class Matched:
 
     def moved_back(self, points_mm: FloatArray, grid: Volume) -> FloatArray:
         """Return where points after (k, 3), mm, came from by the net of the matched points after."""
-        backward = DisplacementField.from_arrays(self.matches.deformed_mm, self.matches.initial_mm - self.matches.deformed_mm)
+        backward = DisplacementField.from_arrays(self.matches.deformed_mm, self.matches.reference_mm - self.matches.deformed_mm)
         vectors = dense_from_sparse(backward, grid, outside="affine").vectors
         at = [sampled(grid.with_values(component), points_mm) for component in np.moveaxis(vectors, -1, 0)]
         return np.asarray(points_mm + np.stack(at, axis=-1))
@@ -76,7 +76,7 @@ def picked_registration(case: CalfCase) -> RigidRegistration:
 
     Points are picked as well as a hand can: at the voxels that hold them in either state.
     """
-    grid = case.initial
+    grid = case.reference
     plane = grid.shape[0] == 1
     angles = np.radians([30.0, 150.0, 270.0] if plane else [30.0, 90.0, 150.0, 210.0, 270.0, 330.0])
     rim = np.array(TIBIA) + _RIM_MM * np.column_stack([np.cos(angles), np.sin(angles)])
@@ -93,13 +93,13 @@ def picked_registration(case: CalfCase) -> RigidRegistration:
 
 
 def candidates_of(
-    initial: Volume, deformed: Volume, counts: tuple[int, int], rigid: RigidTransform | None, *, reach: float = 1.0
+    reference: Volume, deformed: Volume, counts: tuple[int, int], rigid: RigidTransform | None, *, reach: float = 1.0
 ) -> tuple[Candidates, InterestPoints, InterestPoints]:
     """Return pairs that look alike, and the interest points before and after.
 
     Parameters
     ----------
-    initial, deformed : Volume
+    reference, deformed : Volume
         Before and after.
     counts : tuple of int
         Interest points before and after.
@@ -108,14 +108,14 @@ def candidates_of(
     reach : float
         Factor on the search box along x and y.
     """
-    finer = REPORT_PIXEL_MM / initial.spacing_mm[0]
+    finer = REPORT_PIXEL_MM / reference.spacing_mm[0]
     match = (*(max(round(m * finer), 2) for m in MATCH[:2]), MATCH[2])
     search = (*(round(s * finer * reach) for s in SEARCH[:2]), SEARCH[2])
     border = np.array(match)
-    before, after = (interest_points(v, count=n, border=border) for v, n in zip((initial, deformed), counts, strict=True))
+    before, after = (interest_points(v, count=n, border=border) for v, n in zip((reference, deformed), counts, strict=True))
     growth = 0.0 if rigid is None else GROWTH
     pairs = candidate_matches(
-        initial, deformed, before.points_mm, after.points_mm,
+        reference, deformed, before.points_mm, after.points_mm,
         search=search, match=match, rigid=rigid, least_score=LEAST_SCORE, search_growth=growth,
     )  # fmt: skip
     return pairs, before, after
@@ -130,16 +130,16 @@ def potential_matches(pairs: Candidates, strength: Strength | None) -> Potential
 
 def match_errors(case: CalfCase, found: PotentialMatches) -> FloatArray:
     """Return how far matches (n,) lie from where their points truly went, mm; in an image, within the slice."""
-    away = found.deformed_mm - case.motion.to_space(found.initial_mm)
-    return np.asarray(np.linalg.norm(away[:, :2] if case.initial.shape[0] == 1 else away, axis=1))
+    away = found.deformed_mm - case.motion.to_space(found.reference_mm)
+    return np.asarray(np.linalg.norm(away[:, :2] if case.reference.shape[0] == 1 else away, axis=1))
 
 
 def matched(case: CalfCase, pairs: Candidates, strength: Strength | None) -> Matched:
     """Return what the match set of one strength gives."""
     found = potential_matches(pairs, strength)
     field = sparse_displacement(found)
-    net = triangulated(field.points, case.initial)
-    dense = dense_from_sparse(field, case.initial, outside="affine")
+    net = triangulated(field.points, case.reference)
+    dense = dense_from_sparse(field, case.reference, outside="affine")
     return Matched(strength or "correlation alone", found, match_errors(case, found), net, dense)
 
 
@@ -157,18 +157,18 @@ def continued(vectors: FloatArray, grid: Volume) -> FloatArray:
 class CheckPoints:
     """Ten points that strike the eye, in an image before and after (k, 3), mm."""
 
-    initial_mm: FloatArray
+    reference_mm: FloatArray
     deformed_mm: FloatArray
 
     def errors_mm(self, ends_mm: FloatArray) -> FloatArray:
         """Return how far the points after, moved back to these ends (k, 3), are from those before (k,), mm."""
-        return np.asarray(np.linalg.norm(ends_mm - self.initial_mm, axis=1))
+        return np.asarray(np.linalg.norm(ends_mm - self.reference_mm, axis=1))
 
 
 def check_points(case: CalfCase) -> CheckPoints:
     """Return the strongest interest points of an image of the calf, under the skin and apart, and where their tissue truly lies after."""
-    deep = ndimage.distance_transform_edt(case.leg[0], sampling=case.initial.spacing_mm[1::-1]) > CHECK_POINTS_UNDER_MM
-    found = interest_points(case.initial, count=CHECK_POINTS, min_distance_mm=CHECK_POINTS_APART_MM, mask=deep[None])
+    deep = ndimage.distance_transform_edt(case.leg[0], sampling=case.reference.spacing_mm[1::-1]) > CHECK_POINTS_UNDER_MM
+    found = interest_points(case.reference, count=CHECK_POINTS, min_distance_mm=CHECK_POINTS_APART_MM, mask=deep[None])
     after = case.motion.to_space(found.points_mm)
     after[:, 2] = found.points_mm[:, 2]
     return CheckPoints(found.points_mm, after)
@@ -182,8 +182,8 @@ def judged_slices(grid: Volume) -> slice:
 
 def judged(case: CalfCase) -> tuple[BoolArray, BoolArray]:
     """Return the voxels of tissue in the slices that count, before and after."""
-    within = np.zeros(case.initial.shape, dtype=bool)
-    within[judged_slices(case.initial)] = True
+    within = np.zeros(case.reference.shape, dtype=bool)
+    within[judged_slices(case.reference)] = True
     return within & case.leg, within & case.tissue_after
 
 
@@ -210,7 +210,7 @@ def under_noise(case: CalfCase, counts: tuple[int, int], levels: tuple[float, ..
             for draw in range(draws):
                 rng = np.random.default_rng([seed, 11, draw])
                 noisy = [
-                    v.with_values(np.clip(v.values + level * rng.standard_normal(v.shape), 0, 255)) for v in (case.initial, case.deformed)
+                    v.with_values(np.clip(v.values + level * rng.standard_normal(v.shape), 0, 255)) for v in (case.reference, case.deformed)
                 ]
                 pairs = candidates_of(noisy[0], noisy[1], counts, motion, reach=1.0 if motion is not None else 2.75)[0]
                 for way in (None, *WAYS):

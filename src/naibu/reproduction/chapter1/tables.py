@@ -95,7 +95,7 @@ def chapter1(
         _space_section(calf),
         flow_section(calf.case, calf.image, {DEFAULT_NAME: calf.default}),
     )
-    nz, ny, nx = calf.case.initial.shape
+    nz, ny, nx = calf.case.reference.shape
     settings: dict[str, Cell] = {"seed": seed, "voxels": f"{nx} x {ny} x {nz}", "draws": draws}
     return Chapter("ch1", "Chapter 1: inner deformation of a calf from MR images (and section 3.5)", sections, settings)
 
@@ -104,22 +104,22 @@ def examined(case: CalfCase, plane_points: tuple[int, int] = (200, 240), space_p
     """Match points in the middle slice and in the volumes by every strength, and correlate the volumes."""
     from naibu.imaging.volume_correlation.correlate import correlate_volumes
 
-    image = case.slices(case.initial.shape[0] // 2)
+    image = case.slices(case.reference.shape[0] // 2)
     found: list[list[Matched]] = []
     numbers, points = [], []
     rigid = picked_registration(case)
     for each, counts, motion in ((image, plane_points, picked_registration(image)), (case, space_points, rigid)):
-        pairs, before, after = candidates_of(each.initial, each.deformed, counts, motion.transform)
+        pairs, before, after = candidates_of(each.reference, each.deformed, counts, motion.transform)
         found.append([matched(each, pairs, way) for way in (None, *WAYS)])
         numbers.append(len(pairs))
         points.append((len(before), len(after)))
-    default = correlate_volumes(case.initial, case.deformed).displacement.vectors
+    default = correlate_volumes(case.reference, case.deformed).displacement.vectors
     return Calf(case, image, found[0], found[1], (points[0], points[1]), (numbers[0], numbers[1]), rigid, default)
 
 
 def _case_section(calf: Calf) -> Section:
     case = calf.case
-    nz, ny, nx = case.initial.shape
+    nz, ny, nx = case.reference.shape
     length = np.linalg.norm(case.truth[case.leg], axis=-1)
     inner = np.linalg.norm(leg_pose().inverse().applied(_places(case) + case.truth[case.leg]) - _places(case), axis=-1)
     text = (
@@ -129,7 +129,7 @@ def _case_section(calf: Calf) -> Section:
         "pushes from below; tissue keeps its volume, the bones move rigidly, the tibia by "
         f"{leg_pose().angle_deg:.1f} degrees. What matters: the true motion of every point is known, which the report could not know.",
         f"Here {nx} x {ny} x {nz} voxels (the report: 256 x 256 x 57). Tissue moves by {np.median(length):.1f} mm (median) and up to "
-        f"{length.max():.1f} mm, {inner.max() / case.initial.spacing_mm[0]:.0f} pixels after the motion of the bone is taken out. "
+        f"{length.max():.1f} mm, {inner.max() / case.reference.spacing_mm[0]:.0f} pixels after the motion of the bone is taken out. "
         "The report's numbers stand beside ours to show that the same quantities are meant, not that they must agree.",
         "As in the report the bone's motion comes from points picked by hand: here voxels on the rim of the tibia, right to half a voxel.",
     )
@@ -140,15 +140,15 @@ def _case_section(calf: Calf) -> Section:
 
 def _places(case: CalfCase) -> FloatArray:
     where = np.argwhere(case.leg)[:, ::-1]
-    return case.initial.to_physical(where)
+    return case.reference.to_physical(where)
 
 
 def _registration(calf: Calf) -> Table:
     rows: list[tuple[Cell, ...]] = []
-    bone = calf.case.initial.to_physical(np.argwhere(calf.case.of("bone"))[:, ::-1])
+    bone = calf.case.reference.to_physical(np.argwhere(calf.case.of("bone"))[:, ::-1])
     tibia = bone[bone[:, 0] < 5.0]
     plane = picked_registration(calf.image)
-    middle = calf.image.initial.origin_mm[2]
+    middle = calf.image.reference.origin_mm[2]
     slab = tibia[np.abs(tibia[:, 2] - middle) < 1e-6]
     for name, found, places, axes in (
         ("image: three points (3.36)", plane, slab, 2),
@@ -165,7 +165,7 @@ def _registration(calf: Calf) -> Table:
 def _plane_section(calf: Calf, draws: int, seed: int) -> Section:
     points = check_points(calf.image)
     chosen = [next(m for m in calf.plane if m.name == name) for name in ("direction", "chen")]
-    back = {m.name: m.moved_back(points.deformed_mm, calf.image.initial) for m in chosen}
+    back = {m.name: m.moved_back(points.deformed_mm, calf.image.reference) for m in chosen}
     text = (
         "TPA, the report's approach in images, is the strength 'direction' (1.6); RFM is 'chen'. The printed 101 iterations are what "
         "alpha makes when it grows from 0 to 10 by a tenth; (1.6) has no alpha, and nothing changes after a few iterations.",
@@ -227,9 +227,9 @@ def _table_1_2(calf: Calf, points: CheckPoints) -> Table:
     _, printed = printed_table("1.2")
     rows = [(f"paper, {r[0]}", *r[1:11], r[11], *_two_means(np.array(r[1:11]))) for r in printed]
     for way in calf.plane[1:]:
-        cm = np.round(0.1 * points.errors_mm(way.moved_back(points.deformed_mm, calf.image.initial)), 3)
+        cm = np.round(0.1 * points.errors_mm(way.moved_back(points.deformed_mm, calf.image.reference)), 3)
         rows.append((f"ours, {way.name}", *cm.tolist(), None, *_two_means(cm)))
-    ends = moved_back(continued(calf.default, calf.case.initial), calf.case.initial, calf.case.motion.to_space(points.initial_mm))
+    ends = moved_back(continued(calf.default, calf.case.reference), calf.case.reference, calf.case.motion.to_space(points.reference_mm))
     cm = np.round(0.1 * points.errors_mm(ends), 3)
     rows.append((DEFAULT_NAME + ", volumes", *cm.tolist(), None, *_two_means(cm)))
     columns = (
@@ -255,14 +255,14 @@ def _two_means(errors: FloatArray) -> tuple[float, float]:
 
 def _space_section(calf: Calf) -> Section:
     case = calf.case
-    nz = case.initial.shape[0]
+    nz = case.reference.shape[0]
     chosen = [next(m for m in calf.space if m.name == name) for name in ("direction26", "chen")]
     everywhere = np.asarray(np.isfinite(calf.default).all(axis=-1))
     fields = {
         chosen[0].name: (chosen[0].dense.vectors, chosen[0].dense.valid),
         "default": (calf.default, everywhere),
     }
-    whole = {"direction26": chosen[0].dense.vectors, "default": continued(calf.default, case.initial)}
+    whole = {"direction26": chosen[0].dense.vectors, "default": continued(calf.default, case.reference)}
     which = [round(share * (nz - 1)) for share in (15 / 56, 30 / 56, 45 / 56)]
     text = (
         "The report's approach in volumes is the strength 'direction26' (1.23), RPFM is 'chen'. Both the report's and our matches of the "
@@ -289,7 +289,7 @@ def table_1_3(calf: Calf) -> Table:
     still = np.zeros_like(case.truth)
     rows.append(("ours, nothing moved", *(None,) * 4, *_judged(case, still, None), None))
     rows.append(
-        ("ours, bone's motion alone", *(None,) * 4, *_judged(case, rigid_displacement(calf.rigid.transform, case.initial), None), None)
+        ("ours, bone's motion alone", *(None,) * 4, *_judged(case, rigid_displacement(calf.rigid.transform, case.reference), None), None)
     )
     for way in calf.space:
         row = _judged(case, way.dense.vectors, way.dense.valid)
@@ -301,9 +301,9 @@ def table_1_3(calf: Calf) -> Table:
         "way", "points before", "points after", "matches", "tetrahedra", "RMS (1.29), grey levels", "field: mean error, mm",
         "median, mm", "95 %, mm", "measured, %", "right, %",
     )  # fmt: skip
-    first, last = judged_slices(case.initial).start, judged_slices(case.initial).stop - 1
+    first, last = judged_slices(case.reference).start, judged_slices(case.reference).stop - 1
     note = (
-        f"Slices {first} to {last} of {case.initial.shape[0]}, tissue alone. Fields from matches are continued outside their net by the "
+        f"Slices {first} to {last} of {case.reference.shape[0]}, tissue alone. Fields from matches are continued outside their net by the "
         "affine motion that fits all matches, and judged there too; 'measured' is the tissue inside the net. Where a field folds nothing "
         "leads back to the volume before: such voxels do not count in the RMS, and are white in the figure below. Right matches lie within "
         f"{RIGHT_MM:g} mm of the truth."
@@ -315,7 +315,7 @@ def table_1_3(calf: Calf) -> Table:
 
 def _judged(case: CalfCase, vectors: FloatArray, measured: BoolArray | None) -> tuple[float, float, float, float, float]:
     before, after = judged(case)
-    rms = intensity_rms(case.initial, case.deformed, continued(vectors, case.initial), region=after)
+    rms = intensity_rms(case.reference, case.deformed, continued(vectors, case.reference), region=after)
     error = end_point_error(vectors, case.truth, before)
     share = error.coverage if measured is None else float(measured[before].mean())
     return rms, error.mean_mm, error.median_mm, error.p95_mm, 100.0 * share
