@@ -31,7 +31,7 @@ from naibu.imaging.dense_matching.block_matching import block_matching
 from naibu.imaging.dense_matching.hybrid import hybrid_flow
 from naibu.imaging.dense_matching.optical_flow import AS_REPORTED, horn_schunck, lucas_kanade
 from naibu.imaging.displacement.accuracy import end_point_error, intensity_rms
-from naibu.imaging.displacement.strain import folded_share
+from naibu.imaging.displacement.strain import folded_fraction
 from naibu.imaging.feature_matching.correlation_matching import Candidates, candidate_matches
 from naibu.imaging.feature_matching.harris import interest_points
 from naibu.imaging.feature_matching.relaxation_labelling import STRENGTHS, relaxed
@@ -93,9 +93,9 @@ def show(case: Case, name: str, seconds: float, vectors: Array, valid: Array) ->
     error = end_point_error(whole, case.truth, case.mask)
     told = f"{error.mean_mm:5.2f} / {error.median_mm:4.2f} / {error.p95_mm:5.2f}"
     share = (valid & case.mask).sum() / case.mask.sum()
-    rms = intensity_rms(case.reference, case.deformed, whole, region=case.mask, frame="initial")
+    rms = intensity_rms(case.reference, case.deformed, whole, region=case.mask, frame="reference")
     print(
-        f"{name:44s} {told}   {share:5.0%}   {folded_share(whole, case.reference, case.mask):6.1%}   {rms:6.1f}   {seconds:7.2f} s",
+        f"{name:44s} {told}   {share:5.0%}   {folded_fraction(whole, case.reference, case.mask):6.1%}   {rms:6.1f}   {seconds:7.2f} s",
         flush=True,
     )
 
@@ -121,7 +121,7 @@ def features_and_relaxation(case: Case) -> None:
         off = np.linalg.norm(sparse.vectors - [truth[tuple(np.round(x, 6))] for x in sparse.points], axis=1)
         error = end_point_error(dense.vectors, case.truth, case.mask)
         told = f"{error.mean_mm:5.2f} / {error.median_mm:4.2f} / {error.p95_mm:5.2f}"
-        rms = intensity_rms(case.reference, case.deformed, dense.vectors, region=case.mask, frame="initial")
+        rms = intensity_rms(case.reference, case.deformed, dense.vectors, region=case.mask, frame="reference")
         simplices = len(triangulated(sparse.points, case.reference).simplices)
         total = seconds_points + seconds_match + seconds
         print(

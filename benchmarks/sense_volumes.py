@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from naibu.core.volume import Volume
-from naibu.imaging.volume_correlation.correlate import CorrelationSettings, correlate_volumes
+from naibu.imaging.volume_correlation.correlate import correlate_volumes
 from naibu.imaging.volume_correlation.result import CorrelationResult
+from naibu.imaging.volume_correlation.settings import CorrelationSettings
 
 Array = NDArray[Any]
 TISSUES = {
@@ -37,12 +38,12 @@ ABLATION = {
     "default": CorrelationSettings(),
     "no local gain": CorrelationSettings(local_gain=False),
     "not robust": CorrelationSettings(robust=np.inf),
-    "no volume term": CorrelationSettings(volume_term=False),
+    "no volume term": CorrelationSettings(dilatation_penalty=False),
     "one weight": CorrelationSettings(adaptive_weight=False),
-    "no stiff bodies": CorrelationSettings(stiff_bodies=False),
-    "slopes of both": CorrelationSettings(slopes="mean"),
-    "slopes of the deformed": CorrelationSettings(slopes="deformed"),
-    "no scatter of place": CorrelationSettings(place_voxels=0.0),
+    "no stiff bodies": CorrelationSettings(rigid_inclusions=False),
+    "slopes of both": CorrelationSettings(gradients="mean"),
+    "slopes of the deformed": CorrelationSettings(gradients="deformed"),
+    "no scatter of place": CorrelationSettings(jitter_sd_voxels=0.0),
 }
 
 
@@ -56,7 +57,7 @@ def compile_all() -> None:
     grid = Volume.from_array(values.astype(np.float32), spacing_mm=(1.0, 1.0, 1.0))
     inner = np.zeros(values.shape, dtype=bool)
     inner[4:-4, 4:-4, 4:-4] = True
-    correlate_volumes(grid, grid.with_values(np.roll(values, 1, 2).astype(np.float32)), mask=np.ones_like(inner), stiff_mask=inner)
+    correlate_volumes(grid, grid.with_values(np.roll(values, 1, 2).astype(np.float32)), mask=np.ones_like(inner), rigid_mask=inner)
 
 
 def score(case: dict[str, Array], found: CorrelationResult) -> dict[str, Any]:

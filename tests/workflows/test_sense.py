@@ -15,7 +15,7 @@ from naibu.cli import main
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError, NaibuError
 from naibu.core.volume import Volume
-from naibu.imaging.measure_displacement import METHODS, measure_displacement, rigid_start
+from naibu.imaging.measure_displacement import METHODS, matched_rigidly, measure_displacement
 from naibu.io.images import read_displacement, read_volume, write_displacement, write_volume
 from naibu.io.marker_tables import import_markers
 from naibu.io.meshes import read_mesh
@@ -64,9 +64,9 @@ def test_the_default_states_a_covariance_that_holds_the_truth() -> None:
     assert 0.8 < np.mean(squared < 7.81) <= 1.0  # chi-squared of three degrees of freedom, 95 %
 
 
-def test_the_rigid_start_takes_out_turn_and_shift() -> None:
+def test_matched_points_register_rotation_and_shift() -> None:
     before, after, _, mask = squeezed_ball(seed=3)
-    matches, rigid = rigid_start(before, after, mask)
+    matches, rigid = matched_rigidly(before, after, mask)
     assert len(matches) > 30
     assert rigid.angle_deg == pytest.approx(3.0, abs=0.7)
 
@@ -75,19 +75,19 @@ def test_files_are_what_other_programs_read(folder: Path, tmp_path: Path) -> Non
     pair = read_pair(folder / "before.mha", folder / "after.nrrd", mask=folder / "mask.nii.gz", truth=folder / "truth.mha")
     run = sense_pair(pair, out=tmp_path)
     vectors, grid = read_displacement(tmp_path / "displacement.mha")
-    assert grid.same_grid(pair.before)
-    assert np.allclose(vectors, run.sensed.displacement.vectors, atol=1e-5, equal_nan=True)
+    assert grid.same_grid(pair.reference)
+    assert np.allclose(vectors, run.measured.displacement.vectors, atol=1e-5, equal_nan=True)
     assert read_mesh(tmp_path / "displacement.vtu").n_cells > 1000
     stored = np.load(tmp_path / "field.npz")
     field = DisplacementField.from_arrays(stored["points"], stored["vectors"], covariance=stored["covariance"], valid=stored["valid"])
     assert len(field.points) > 1000
     before, after = (import_markers(tmp_path / f"{name}.csv") for name in ("initial", "pressed"))
     assert 100 < len(before) < 400
-    assert np.abs(after.points - before.points - run.sensed.displacement.vectors[at(pair.before, before.points)]).max() < 1e-6
+    assert np.abs(after.points - before.points - run.measured.displacement.vectors[at(pair.reference, before.points)]).max() < 1e-6
     told = json.loads((tmp_path / "sense.json").read_text())
-    assert told["figures"]["error, median, mm"] < 0.15
-    assert set(told["inputs"]) == {"before", "after", "mask", "truth"}
-    assert told["inputs"]["after"] == f"after.nrrd, SHA-256 {hashlib.sha256((folder / 'after.nrrd').read_bytes()).hexdigest()}"
+    assert told["figures"]["median_error_mm"] < 0.15
+    assert set(told["inputs"]) == {"reference", "deformed", "mask", "truth"}
+    assert told["inputs"]["deformed"] == f"after.nrrd, SHA-256 {hashlib.sha256((folder / 'after.nrrd').read_bytes()).hexdigest()}"
     page = (tmp_path / "report.html").read_text()
     assert "standard deviation of the displacement" in page
     assert not re.search(r"(?:src|href)=\"https?:", page)
@@ -106,7 +106,7 @@ def test_scans_of_one_name_in_two_folders_are_both_recorded(folder: Path, tmp_pa
         (tmp_path / part).mkdir()
         write_volume(tmp_path / part / "scan.mha", read_volume(folder / file))
     inputs = read_pair(tmp_path / "a" / "scan.mha", tmp_path / "b" / "scan.mha").inputs
-    assert inputs["before"] != inputs["after"]
+    assert inputs["reference"] != inputs["deformed"]
 
 
 def test_a_single_slice_has_all_files_but_the_mesh(folder: Path, tmp_path: Path) -> None:
@@ -129,9 +129,9 @@ def test_methods_that_all_fail_say_why(folder: Path, tmp_path: Path) -> None:
 def test_scans_on_different_grids_are_refused(folder: Path) -> None:
     before, after, *_ = squeezed_ball(seed=3)
     other = Volume.from_array(after.values, spacing_mm=(1.5, 1.5, 1.9))
-    with pytest.raises(InputError, match=r"different grids: 44x40x24 voxels of 1\.5x1\.5x2 mm before"):
+    with pytest.raises(InputError, match=r"different grids: 44x40x24 voxels of 1\.5x1\.5x2 mm and"):
         measure_displacement(before, other)
-    with pytest.raises(InputError, match="there is no method 'best'"):
+    with pytest.raises(InputError, match="not 'best'"):
         measure_displacement(before, after, method="best")  # type: ignore[arg-type]
 
 

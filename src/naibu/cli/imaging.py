@@ -39,10 +39,10 @@ def sense(
     """
     from naibu.workflows.sense import read_pair, sense_pair
 
-    with stages() as tell:
+    with progress_display() as progress:
         scans = read_pair(reference, deformed, **(pair or PairOptions()).arguments)
-        run = sense_pair(scans, method=method, out=out, progress=tell)
-    print_table(f"{reference.name} -> {deformed.name}, {run.sensed.method}", ("what", "value"), list(run.figures.items()))
+        run = sense_pair(scans, method=method, out=out, progress=progress)
+    print_table(f"{reference.name} -> {deformed.name}, {run.measured.method}", ("quantity", "value"), run.rows())
     say(f"{run.seconds:.1f} s. Page: {run.files[0]}   fields: {', '.join(str(p.name) for p in run.files[1:])}")
 
 
@@ -72,9 +72,9 @@ def compare_methods(
     from naibu.workflows.compare_methods import compare_methods as compared
     from naibu.workflows.sense import read_pair
 
-    with stages() as tell:
+    with progress_display() as progress:
         scans = read_pair(reference, deformed, **(pair or PairOptions()).arguments)
-        result = compared(scans, method or METHODS, out=out, tell=tell)
+        result = compared(scans, method or METHODS, out=out, progress=progress)
     print_table(f"{reference.name} -> {deformed.name}", result.columns, result.rows)
     say(f"Page: {result.page}   numbers: {result.numbers}")
 

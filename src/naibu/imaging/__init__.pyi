@@ -19,14 +19,15 @@ from .markers.point_matching import Links, link_markers
 from .markers.sequence_tracking import TrackedSequence, track_sequence
 from .markers.settings import SequenceSettings
 from .markers.tracking import TrackedMarkers, track_markers
-from .measure_displacement import Sensed, measure_displacement
+from .measure_displacement import MeasuredDisplacement, measure_displacement
 from .out_of_core import ChunkedDisplacement, chunked_block_matching, chunked_harris_response, chunked_horn_schunck
 from .preprocessing.bone_mask import bone_mask
 from .preprocessing.object_mask import object_mask
 from .preprocessing.resampling import cropped_to_mask, masked, resampled_to_grid, resampled_to_spacing, warped, with_slices_between
 from .preprocessing.rigid_registration import RigidRegistration, register_rigid, rigid_from_points
-from .volume_correlation.correlate import CorrelationSettings, correlate_volumes
+from .volume_correlation.correlate import correlate_volumes
 from .volume_correlation.result import CorrelationResult
+from .volume_correlation.settings import CorrelationSettings
 
 __all__ = [
     "Candidates",
@@ -37,9 +38,9 @@ __all__ = [
     "ErrorSummary",
     "InterestPoints",
     "Links",
+    "MeasuredDisplacement",
     "PotentialMatches",
     "RigidRegistration",
-    "Sensed",
     "SequenceSettings",
     "TrackedMarkers",
     "TrackedSequence",

@@ -28,7 +28,7 @@ from naibu.imaging.dense_matching.block_matching import Measure, Search, intensi
 from naibu.imaging.dense_matching.optical_flow import horn_schunck
 from naibu.imaging.feature_matching.harris import Response, default_sigmas, known_intensities, response_of
 from naibu.imaging.preprocessing.filters import REACH
-from naibu.imaging.preprocessing.volume_pair import shifted_grey, to_millimetres
+from naibu.imaging.preprocessing.volume_pair import shifted_intensity, to_millimetres
 
 Box = tuple[slice, slice, slice]
 Function = Callable[..., AnyArray]
@@ -389,7 +389,7 @@ def _harris(values: AnyArray, *, shift: float, spacing_mm: AnyArray, sigmas: tup
 def _matched(a: AnyArray, b: AnyArray, *, search: Search, shift: float, least_range: float, sign: float, direction: AnyArray) -> AnyArray:
     frame = Volume(a, search.spacing_mm, np.zeros(3), direction)
     wanted = np.asarray(intensity_range(frame, 2 * search.half + 1) > least_range)
-    move, cost = matched(shifted_grey(a, shift, "reference"), shifted_grey(b, shift, "deformed"), wanted, search)
+    move, cost = matched(shifted_intensity(a, shift, "reference"), shifted_intensity(b, shift, "deformed"), wanted, search)
     return _packed(to_millimetres(move, frame), np.isfinite(move[0]), sign * cost)
 
 

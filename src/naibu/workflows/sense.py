@@ -1,4 +1,4 @@
-"""Sense the displacement between two scans from files to files: fields for other programs, numbers, and a page of slices."""
+"""Measure the displacement between two scans, from files to files: fields for other programs, numbers, and a page of slices."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import io
 import json
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,12 @@ from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import InputError
 from naibu.core.markers import Markers
 from naibu.core.mesh import Mesh
+from naibu.core.progress import Progress
 from naibu.core.volume import Volume
 from naibu.imaging.displacement.accuracy import check_point_errors, end_point_error, intensity_rms
-from naibu.imaging.displacement.strain import folded_share, green_lagrange_strain_of
-from naibu.imaging.measure_displacement import Method, Sensed, measure_displacement
-from naibu.imaging.preprocessing.resampling import positions, warped
+from naibu.imaging.displacement.strain import folded_fraction, green_lagrange_strain_of
+from naibu.imaging.measure_displacement import FACTS, MeasuredDisplacement, Method, measure_displacement
+from naibu.imaging.preprocessing.resampling import warped
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
 from naibu.io.images import read_displacement, read_volume, write_displacement, write_volume
@@ -33,19 +34,33 @@ from naibu.viewer.slices import Overlay, SliceView, slices_html
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.result_folder import result_folder
 
-Progress = Callable[[str], None]
-MESH_CELLS = 60_000  # of the file for ParaView
-FIELD_POINTS = 40_000  # of the field for the identification
+MESH_CELLS = 60_000  # of the file for ParaView, which shows as many without delay
+FIELD_POINTS = 40_000  # of the field for the identification, far more than it has unknowns
 MARKER_TABLES, MARKERS = ("initial", "pressed"), 250
-LEAST_CERTAIN = 4.0  # times the median standard deviation: places known worse make no markers
+LEAST_CERTAIN = 4.0  # median standard deviations: positions of a larger one make no markers
+# what the figures of a run mean, with their units
+FIGURES = {
+    "measured_fraction": "measured fraction of the object",
+    "median_displacement_mm": "median displacement, mm",
+    "largest_displacement_mm": "largest displacement, mm",
+    "initial_residual_rms": "intensity residual RMS without displacement",
+    "residual_rms": "intensity residual RMS",
+    "folded_fraction": "folded fraction",
+    "median_sd_mm": "stated SD, median, mm",
+    "mean_error_mm": "mean error, mm",
+    "median_error_mm": "median error, mm",
+    "p95_error_mm": "95th percentile of the error, mm",
+    "mean_check_point_error_mm": "mean error of the check points, mm",
+    "p95_check_point_error_mm": "95th percentile of the error of the check points, mm",
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """Two scans on one grid, the mask of the object before, and what is known of the truth."""
+    """Two volumes on one grid, the mask of the object in the reference, and true displacements where they are known."""
 
-    before: Volume
-    after: Volume
+    reference: Volume
+    deformed: Volume
     mask: BoolArray | None
     inputs: dict[str, str]
     names: tuple[str, str]
@@ -55,65 +70,73 @@ class Pair:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SenseRun:
-    """A displacement with its numbers and, where asked for, its files."""
+    """Measured displacement with its figures (see `FIGURES`) and files."""
 
-    sensed: Sensed
+    measured: MeasuredDisplacement
     seconds: float
     figures: dict[str, float | int | str | None]
     files: tuple[Path, ...] = ()
 
+    def rows(self) -> list[tuple[str, Cell]]:
+        """Return figures and diagnostics of the method, each with its meaning and unit."""
+        figures = [(FIGURES[name], value) for name, value in self.figures.items()]
+        return figures + [(FACTS[name], value) for name, value in self.measured.facts.items()]
+
 
 def read_pair(
-    before: str | os.PathLike[str],
-    after: str | os.PathLike[str],
+    reference: str | os.PathLike[str],
+    deformed: str | os.PathLike[str],
     *,
     mask: str | os.PathLike[str] | None = None,
     truth: str | os.PathLike[str] | None = None,
     check_points: tuple[str | os.PathLike[str], str | os.PathLike[str]] | None = None,
     spacing_mm: Sequence[float] | None = None,
 ) -> Pair:
-    """Read two scans and what goes with them.
+    """Read the volumes of a pair, and its mask and true displacements.
 
     Parameters
     ----------
-    before, after : path-like
-        Volumes (see `naibu.io.images.read_volume`).
+    reference, deformed : path-like
+        Volumes before and after the deformation (see `naibu.io.images.read_volume`).
     mask : path-like, optional
-        Volume on the grid of the first, not zero where the object is.
+        Volume on the grid of the reference, not zero in the object.
     truth : path-like, optional
-        Known displacement on that grid, an image of vectors, mm.
+        True displacement on that grid, an image of vectors, mm.
     check_points : two path-like, optional
-        Tables of points before and after (see `naibu.io.marker_tables.import_markers`); the same points bear the same numbers.
+        Tables of points in the reference and in the deformed configuration (see `naibu.io.marker_tables.import_markers`), with one number
+        for each point.
     spacing_mm : sequence of float, optional
-        Distance of voxels along x, y, z, mm, for files that do not say.
+        Voxel spacing along x, y, z, mm, for files without it.
 
     Raises
     ------
     InputError
         A file that cannot be read, or a mask or truth on another grid.
     """
-    a, b = (read_volume(p, spacing_mm=spacing_mm) for p in (before, after))
+    a, b = (read_volume(p, spacing_mm=spacing_mm) for p in (reference, deformed))
     inside = None
     if mask is not None:
         m = read_volume(mask, spacing_mm=spacing_mm)
-        _same(m, a, Path(mask), Path(before))
+        _same(m, a, Path(mask), Path(reference))
         inside = np.asarray(m.values != 0)
     known = None
     if truth is not None:
         known, grid = read_displacement(truth)
-        _same(grid, a, Path(truth), Path(before))
+        _same(grid, a, Path(truth), Path(reference))
     points = None if check_points is None else _common_points(*check_points)
-    files = {"before": before, "after": after, "mask": mask, "truth": truth}
-    tables = dict(zip(("check points before", "check points after"), check_points or (), strict=False))
-    return Pair(a, b, inside, input_record(files | tables), (Path(before).name, Path(after).name), known, points)
+    files = {"reference": reference, "deformed": deformed, "mask": mask, "truth": truth}
+    tables = dict(zip(("reference_check_points", "deformed_check_points"), check_points or (), strict=False))
+    return Pair(a, b, inside, input_record(files | tables), (Path(reference).name, Path(deformed).name), known, points)
 
 
-def _common_points(before: str | os.PathLike[str], after: str | os.PathLike[str]) -> tuple[FloatArray, FloatArray]:
-    a, b = import_markers(before), import_markers(after)
+def _common_points(reference: str | os.PathLike[str], deformed: str | os.PathLike[str]) -> tuple[FloatArray, FloatArray]:
+    a, b = import_markers(reference), import_markers(deformed)
     _, i, j = np.intersect1d(a.ids, b.ids, return_indices=True)
     known = np.isfinite(a.points[i]).all(axis=1) & np.isfinite(b.points[j]).all(axis=1)
     if not known.any():
-        raise InputError(f"{Path(before).name} and {Path(after).name} have no point number in common, of {len(a.ids)} and {len(b.ids)}")
+        raise InputError(
+            f"{Path(reference).name} and {Path(deformed).name} have no point number in common, of {len(a.ids)} and {len(b.ids)}"
+        )
     return a.points[i][known], b.points[j][known]
 
 
@@ -158,7 +181,7 @@ def sense(
 def sense_pair(
     pair: Pair, *, method: Method = "default", out: str | os.PathLike[str] | None = None, progress: Progress | None = None
 ) -> SenseRun:
-    """Sense the displacement of a pair, and write it.
+    """Measure the displacement of a pair, and write it.
 
     Parameters
     ----------
@@ -168,9 +191,9 @@ def sense_pair(
         See `naibu.imaging.measure_displacement.measure_displacement`.
     out : path-like, optional
         Folder for ``displacement.mha``, ``standard_deviation.mha`` (where the method states one), ``displacement.vtu`` (of volumes),
-        ``field.npz``, ``initial.csv`` and ``pressed.csv`` (places in the object as markers), ``sense.json`` and the page ``report.html``.
-    progress : callable, optional
-        Told what begins.
+        ``field.npz``, ``initial.csv`` and ``pressed.csv`` (positions in the object as markers), ``sense.json``, ``report.html``.
+    progress : Progress, optional
+        Called at the beginning of every stage.
 
     Raises
     ------
@@ -179,58 +202,58 @@ def sense_pair(
     """
     folder = None if out is None else result_folder(out)
     began = time.perf_counter()
-    sensed = measure_displacement(pair.before, pair.after, method=method, mask=pair.mask, progress=progress)
-    run = SenseRun(sensed, time.perf_counter() - began, figures(pair, sensed))
-    return run if folder is None else SenseRun(sensed, run.seconds, run.figures, tuple(_written(pair, run, folder)))
+    measured = measure_displacement(pair.reference, pair.deformed, method=method, mask=pair.mask, progress=progress)
+    run = SenseRun(measured, time.perf_counter() - began, figures(pair, measured))
+    return run if folder is None else SenseRun(measured, run.seconds, run.figures, tuple(_written(pair, run, folder)))
 
 
-def figures(pair: Pair, sensed: Sensed) -> dict[str, float | int | str | None]:
-    """Return what can be said of a displacement: size, what it leaves unexplained, folding, and errors where the truth is known."""
-    u, inside = sensed.displacement.vectors, sensed.mask & sensed.displacement.valid
-    size, sd = np.linalg.norm(u[inside], axis=1), sensed.displacement.largest_sd_mm
+def figures(pair: Pair, measured: MeasuredDisplacement) -> dict[str, float | int | str | None]:
+    """Return the figures of a displacement (see `FIGURES`): size, residual, folding, and errors where the truth is known."""
+    u, inside = measured.displacement.vectors, measured.mask & measured.displacement.valid
+    size, sd = np.linalg.norm(u[inside], axis=1), measured.displacement.largest_sd_mm
     out: dict[str, float | int | str | None] = {
-        "measured share": float(inside.sum() / sensed.mask.sum()),
-        "displacement, median, mm": float(np.median(size)),
-        "displacement, largest, mm": float(size.max()),
-        "grey RMS before": intensity_rms(pair.before, pair.after, np.zeros_like(u), region=sensed.mask, frame="initial"),
-        "grey RMS after": intensity_rms(pair.before, pair.after, u, region=sensed.mask, frame="initial"),
-        "folded share": folded_share(u, pair.before, sensed.mask),
-        "stated sd, median, mm": None if sd is None else float(np.nanmedian(sd[inside])),
+        "measured_fraction": float(inside.sum() / measured.mask.sum()),
+        "median_displacement_mm": float(np.median(size)),
+        "largest_displacement_mm": float(size.max()),
+        "initial_residual_rms": intensity_rms(pair.reference, pair.deformed, np.zeros_like(u), region=measured.mask, frame="reference"),
+        "residual_rms": intensity_rms(pair.reference, pair.deformed, u, region=measured.mask, frame="reference"),
+        "folded_fraction": folded_fraction(u, pair.reference, measured.mask),
+        "median_sd_mm": None if sd is None else float(np.nanmedian(sd[inside])),
     }
     if pair.truth is not None:
-        e = end_point_error(u, pair.truth, sensed.mask)
-        out |= {"error, mean, mm": e.mean_mm, "error, median, mm": e.median_mm, "error, 95 %, mm": e.p95_mm}
+        e = end_point_error(u, pair.truth, measured.mask)
+        out |= {"mean_error_mm": e.mean_mm, "median_error_mm": e.median_mm, "p95_error_mm": e.p95_mm}
     if pair.check_points is not None:
-        e = check_point_errors(u, pair.before, *pair.check_points)
-        out |= {"check points, mean, mm": e.mean_mm, "check points, 95 %, mm": e.p95_mm}
+        e = check_point_errors(u, pair.reference, *pair.check_points)
+        out |= {"mean_check_point_error_mm": e.mean_mm, "p95_check_point_error_mm": e.p95_mm}
     return out
 
 
 def _written(pair: Pair, run: SenseRun, folder: Path) -> list[Path]:
-    sensed, grid = run.sensed, pair.before
+    measured, grid = run.measured, pair.reference
     files = [
         write_atomically(folder / "report.html", slices_html(slice_view(pair, run))),
-        write_displacement(folder / "displacement.mha", sensed.displacement.vectors, grid),
+        write_displacement(folder / "displacement.mha", measured.displacement.vectors, grid),
     ]
-    sd = sensed.displacement.largest_sd_mm
+    sd = measured.displacement.largest_sd_mm
     if sd is not None:
         files.append(write_volume(folder / "standard_deviation.mha", grid.with_values(np.nan_to_num(sd).astype(np.float32))))
     if min(grid.shape) > 1:  # between the voxels of a single slice there are no cells
-        files.append(_vtu(folder / "displacement.vtu", grid, sensed))
-    files.append(_npz(folder / "field.npz", sensed))
+        files.append(_vtu(folder / "displacement.vtu", grid, measured))
+    files.append(_npz(folder / "field.npz", measured))
     files += [
-        write_markers(folder / f"{name}.csv", markers) for name, markers in zip(MARKER_TABLES, _as_markers(sensed, grid), strict=True)
+        write_markers(folder / f"{name}.csv", markers) for name, markers in zip(MARKER_TABLES, _as_markers(measured, grid), strict=True)
     ]
     numbers = {
         "naibu": __version__,
-        "method": sensed.method,
+        "method": measured.method,
         "mask": "given" if pair.mask is not None else "found",
         "inputs": pair.inputs,
         "seed": "none: the search is deterministic",
         "seconds": round(run.seconds, 2),
-        "units": "mm; displacement is that of the material before: x is found at x + u(x)",
+        "units": "mm; displacement u of the reference configuration: the material at x is found at x + u(x)",
         "figures": run.figures,
-        "method's own": sensed.facts,
+        "diagnostics": measured.facts,
     }
     text = json.dumps(_plain(numbers), indent=1, ensure_ascii=False) + "\n"
     return [*files, write_atomically(folder / "sense.json", text)]
@@ -244,9 +267,9 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _vtu(path: Path, grid: Volume, sensed: Sensed) -> Path:
-    """The object as hexahedra between voxels, as many as ParaView shows at once."""
-    known = np.isfinite(sensed.displacement.vectors).all(axis=-1) & sensed.mask
+def _vtu(path: Path, grid: Volume, measured: MeasuredDisplacement) -> Path:
+    """Write the object as hexahedra between voxels, subsampled for ParaView."""
+    known = np.isfinite(measured.displacement.vectors).all(axis=-1) & measured.mask
     step = 1
     while known[::step, ::step, ::step].sum() > MESH_CELLS:
         step += 1
@@ -257,24 +280,24 @@ def _vtu(path: Path, grid: Volume, sensed: Sensed) -> Path:
     if not len(cells):
         raise InputError("the displacement is known at too few neighbouring voxels for a mesh; enlarge the mask")
     used, numbers = np.unique(cells, return_inverse=True)
-    mesh = Mesh.from_arrays(positions(grid)[some].reshape(-1, 3)[used], numbers.reshape(cells.shape), "hexahedron")
-    strain = green_lagrange_strain_of(sensed.gradient[some].reshape(-1, 3, 3)[used])
+    mesh = Mesh.from_arrays(grid.positions()[some].reshape(-1, 3)[used], numbers.reshape(cells.shape), "hexahedron")
+    strain = green_lagrange_strain_of(measured.gradient[some].reshape(-1, 3, 3)[used])
     data: dict[str, FloatArray] = {
-        "displacement_mm": sensed.displacement.vectors[some].reshape(-1, 3)[used],
+        "displacement_mm": measured.displacement.vectors[some].reshape(-1, 3)[used],
         "green_lagrange_strain": strain,
     }
-    if (covariance := sensed.displacement.covariance) is not None:
+    if (covariance := measured.displacement.covariance) is not None:
         data["displacement_covariance_mm2"] = covariance[some].reshape(-1, 3, 3)[used]
     write_vtu(path, mesh, data)
     return path
 
 
-def _npz(path: Path, sensed: Sensed) -> Path:
-    """The field as the identification takes it: `naibu.core.displacement_field.DisplacementField.from_arrays` on its arrays."""
+def _npz(path: Path, measured: MeasuredDisplacement) -> Path:
+    """Write the field as the identification takes it: the arguments of `naibu.DisplacementField.from_arrays`."""
     step = 1
-    while (sensed.mask & sensed.displacement.valid)[::step, ::step, ::step].sum() > FIELD_POINTS:
+    while (measured.mask & measured.displacement.valid)[::step, ::step, ::step].sum() > FIELD_POINTS:
         step += 1
-    field = sensed.displacement.at_points(step=step)
+    field = measured.displacement.at_points(step=step)
     stream = io.BytesIO()
     arrays: dict[str, Any] = {"points": field.points, "vectors": field.vectors, "valid": field.valid}
     if field.covariance is not None:
@@ -283,41 +306,41 @@ def _npz(path: Path, sensed: Sensed) -> Path:
     return write_atomically(path, stream.getvalue())
 
 
-def _as_markers(sensed: Sensed, grid: Volume) -> tuple[Markers, Markers]:
-    """Some 250 places on a lattice in the object, before and after, as markers for `naibu import` and `naibu identify`."""
-    good = sensed.mask & sensed.displacement.valid
-    if (sd := sensed.displacement.largest_sd_mm) is not None:
+def _as_markers(measured: MeasuredDisplacement, grid: Volume) -> tuple[Markers, Markers]:
+    """Return some 250 positions on a lattice in the object and their displaced positions, as markers for `naibu import`."""
+    good = measured.mask & measured.displacement.valid
+    if (sd := measured.displacement.largest_sd_mm) is not None:
         good &= np.nan_to_num(sd, nan=np.inf) <= LEAST_CERTAIN * np.nanmedian(sd[good])
     apart = (good.sum() * float(np.prod(grid.spacing_mm)) / MARKERS) ** (1.0 / 3.0)
     every = np.maximum(1, np.round(apart / grid.spacing_mm)).astype(int)[::-1]
     some = np.zeros(grid.shape, dtype=bool)
     some[tuple(slice(k // 2, None, k) for k in every)] = True
     some &= good
-    points, ids = positions(grid)[some], np.arange(1, int(some.sum()) + 1)
-    return Markers.from_arrays(ids, points), Markers.from_arrays(ids, points + sensed.displacement.vectors[some])
+    points, ids = grid.positions()[some], np.arange(1, int(some.sum()) + 1)
+    return Markers.from_arrays(ids, points), Markers.from_arrays(ids, points + measured.displacement.vectors[some])
 
 
 def slice_view(pair: Pair, run: SenseRun) -> SliceView:
-    """Return what the page of a run shows."""
-    sensed, grid = run.sensed, pair.before
-    box = _box(sensed.mask)
-    u = sensed.displacement.vectors
-    back = warped(pair.after, np.nan_to_num(u), grid)
-    strain = green_lagrange_strain_of(sensed.gradient)
-    inside = sensed.mask & np.isfinite(strain).all(axis=(-2, -1))
+    """Return the slices of the page of a run."""
+    measured, grid = run.measured, pair.reference
+    box = _box(measured.mask)
+    u = measured.displacement.vectors
+    back = warped(pair.deformed, np.nan_to_num(u), grid)
+    strain = green_lagrange_strain_of(measured.gradient)
+    inside = measured.mask & np.isfinite(strain).all(axis=(-2, -1))
     principal = np.full((*grid.shape, 3), np.nan)
     principal[inside] = np.linalg.eigvalsh(strain[inside])
     ratio = np.full(grid.shape, np.nan)
-    ratio[inside] = np.linalg.det(np.eye(3) + sensed.gradient[inside])
+    ratio[inside] = np.linalg.det(np.eye(3) + measured.gradient[inside])
     overlays = [
         Overlay("displacement, mm", np.linalg.norm(u, axis=-1)[box]),
         Overlay("largest principal Green-Lagrange strain", principal[..., 2][box]),
         Overlay("smallest principal Green-Lagrange strain", principal[..., 0][box]),
         Overlay("volume ratio J", ratio[box], middle=1.0),
     ]
-    if (sd := sensed.displacement.largest_sd_mm) is not None:
-        overlays.append(Overlay("standard deviation of the displacement, mm", np.where(sensed.mask, sd, np.nan)[box]))
-    images = [("before", pair.before.values), ("after", pair.after.values), ("after, carried back", back)]
+    if (sd := measured.displacement.largest_sd_mm) is not None:
+        overlays.append(Overlay("standard deviation of the displacement, mm", np.where(measured.mask, sd, np.nan)[box]))
+    images = [("reference", pair.reference.values), ("deformed", pair.deformed.values), ("deformed, warped back", back)]
     return SliceView(
         title=f"Displacement from {pair.names[0]} to {pair.names[1]}",
         sentences=_sentences(run),
@@ -326,7 +349,7 @@ def slice_view(pair: Pair, run: SenseRun) -> SliceView:
         displacement=(u @ grid.direction)[box],
         overlays=overlays,
         tables=[_table(run)],
-        difference=(("before minus after", 0, 1), ("before minus after, carried back", 0, 2)),
+        difference=(("reference minus deformed", 0, 1), ("reference minus deformed, warped back", 0, 2)),
     )
 
 
@@ -337,22 +360,21 @@ def _box(mask: BoolArray, margin: int = 4) -> tuple[slice, ...]:
 
 def _sentences(run: SenseRun) -> list[str]:
     f = run.figures
-    told = [
-        f"Method {run.sensed.method}, {run.seconds:.1f} s. The object moved by {f['displacement, median, mm']:.2f} mm (median), at most "
-        f"{f['displacement, largest, mm']:.2f} mm; the difference of grey values inside it fell from {f['grey RMS before']:.4g} to "
-        f"{f['grey RMS after']:.4g} (root mean square)."
+    sentences = [
+        f"Method {run.measured.method}, {run.seconds:.1f} s. The object moved by {f['median_displacement_mm']:.2f} mm (median), at most "
+        f"{f['largest_displacement_mm']:.2f} mm; the intensity residual inside it fell from {f['initial_residual_rms']:.4g} to "
+        f"{f['residual_rms']:.4g} (root mean square)."
     ]
-    if f["stated sd, median, mm"] is not None:
-        told.append(
-            f"The displacement is known to {f['stated sd, median, mm']:.3f} mm (standard deviation along the least certain axis, median)."
+    if f["median_sd_mm"] is not None:
+        sentences.append(
+            f"The standard deviation of the displacement is {f['median_sd_mm']:.3f} mm (along the least certain direction, median)."
         )
     else:
-        told.append("This method states no uncertainty.")
-    if isinstance(f["folded share"], float) and f["folded share"] > 0.0:
-        told.append(f"The field folds at {f['folded share']:.2%} of the voxels: do not trust it there.")
-    return told
+        sentences.append("This method states no uncertainty.")
+    if isinstance(f["folded_fraction"], float) and f["folded_fraction"] > 0.0:
+        sentences.append(f"The field folds at {f['folded share']:.2%} of the voxels: it is wrong there.")
+    return sentences
 
 
 def _table(run: SenseRun) -> Table:
-    rows: list[tuple[Cell, ...]] = [(name, value) for name, value in {**run.figures, **run.sensed.facts}.items()]
-    return Table("Numbers", ("what", "value"), tuple(rows))
+    return Table("Figures", ("quantity", "value"), tuple(run.rows()))

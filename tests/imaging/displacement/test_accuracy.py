@@ -20,7 +20,13 @@ from naibu.imaging.displacement.accuracy import (
     inverse_displacement,
     moved_back,
 )
-from naibu.imaging.displacement.strain import displacement_gradient, folded_share, green_lagrange_strain, jacobian_determinant, small_strain
+from naibu.imaging.displacement.strain import (
+    displacement_gradient,
+    folded_fraction,
+    green_lagrange_strain,
+    jacobian_determinant,
+    small_strain,
+)
 from naibu.imaging.preprocessing.resampling import positions
 
 
@@ -60,8 +66,8 @@ def test_folding_is_seen_where_it_is() -> None:
     # central differences of the sine
     central = 1.0 + 6.0 * np.sin(0.25) * np.cos(x[..., 0] / 4.0)
     np.testing.assert_array_equal(folded[:, :, 1:-1], central[:, :, 1:-1] <= 0.0)
-    assert folded_share(u, frame) == pytest.approx(folded.mean())
-    assert folded_share(0.1 * u, frame) == 0.0
+    assert folded_fraction(u, frame) == pytest.approx(folded.mean())
+    assert folded_fraction(0.1 * u, frame) == 0.0
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -120,11 +126,11 @@ def test_end_point_errors_are_those_of_numpy() -> None:
     assert end_point_error(found, truth, mask).coverage == pytest.approx(mask[2:].sum() / mask.sum())
     with pytest.raises(InputError, match="do not fit"):
         end_point_error(found[:2], truth, mask)
-    with pytest.raises(InputError, match="no answer"):
+    with pytest.raises(InputError, match="unknown everywhere"):
         end_point_error(np.full_like(truth, np.nan), truth, mask)
 
 
-@pytest.mark.parametrize("frame_of", ["deformed", "initial"])
+@pytest.mark.parametrize("frame_of", ["deformed", "reference"])
 def test_the_true_field_leaves_only_interpolation_and_noise(frame_of: str) -> None:
     frame = grid((20, 30, 34))
 
@@ -149,11 +155,11 @@ def test_measures_refuse_what_does_not_fit() -> None:
     other = Volume.from_array(volume.values, spacing_mm=(1, 1, 2))
     with pytest.raises(InputError, match="different grids"):
         intensity_rms(volume, other, np.zeros((*frame.shape, 3)))
-    with pytest.raises(InputError, match="carries no voxel"):
+    with pytest.raises(InputError, match="moves no voxel"):
         intensity_rms(volume, volume, np.full((*frame.shape, 3), 500.0))
     with pytest.raises(InputError, match="frame must be"):
         intensity_rms(volume, volume, np.zeros((*frame.shape, 3)), frame="other")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="must have shape"):
         small_strain(np.zeros((2, 2, 2, 3)), frame)
     with pytest.raises(InputError, match="known at no voxel"):
-        folded_share(np.full((*frame.shape, 3), np.nan), frame)
+        folded_fraction(np.full((*frame.shape, 3), np.nan), frame)

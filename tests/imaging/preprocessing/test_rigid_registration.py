@@ -136,7 +136,7 @@ def test_bone_is_found_by_its_dark_rim_and_by_its_brightness() -> None:
     assert wide[found].all() and wide.sum() > 1.3 * found.sum()
     with pytest.raises(InputError, match="appearance"):
         bone_mask(volume, appearance="grey")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="40 are asked for"):
+    with pytest.raises(InputError, match="count = 40"):
         bone_mask(bright, appearance="bright", count=40)
 
 
@@ -151,7 +151,7 @@ def test_otsu_parts_classes_where_brute_force_does() -> None:
     ]
     a = otsu_thresholds(values, 2)[0]
     assert np.var(values[values < a]) * (values < a).mean() + np.var(values[values >= a]) * (values >= a).mean() <= 1.01 * within[0]
-    with pytest.raises(InputError, match="one grey value"):
+    with pytest.raises(InputError, match="constant"):
         otsu_thresholds(np.ones(5))
 
 

@@ -14,8 +14,9 @@ from naibu.core.rigid_transform import rotation_matrix
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.object_mask import object_mask
 from naibu.imaging.preprocessing.resampling import positions
-from naibu.imaging.volume_correlation.correlate import CorrelationSettings, correlate_volumes
+from naibu.imaging.volume_correlation.correlate import correlate_volumes
 from naibu.imaging.volume_correlation.result import CorrelationResult
+from naibu.imaging.volume_correlation.settings import CorrelationSettings
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid
 
 Array = np.ndarray
@@ -197,7 +198,7 @@ def test_a_field_is_what_identification_takes() -> None:
     assert np.allclose(field.vectors, found.displacement_at(field.points), atol=1e-9)
     assert np.linalg.eigvalsh(field.covariance).min() > 0.0
     assert len(found.at_points(step=1).points) == found.valid.sum()
-    with pytest.raises(InputError, match="1 or more"):
+    with pytest.raises(InputError, match="1 voxel or more"):
         found.at_points(step=0)
 
 
@@ -217,8 +218,8 @@ def test_a_stiff_body_moves_as_one() -> None:
 
     before, after = scans(frame(), back)
     ball = np.linalg.norm(positions(before) - MIDDLE, axis=-1) < 7.0
-    found = correlate_volumes(before, after, stiff_mask=ball)
-    assert np.array_equal(found.bodies > 0, ball)
+    found = correlate_volumes(before, after, rigid_mask=ball)
+    assert np.array_equal(found.inclusions > 0, ball)
     f = np.eye(3) + found.gradient()[ball]
     assert np.allclose(f @ np.swapaxes(f, 1, 2), np.eye(3), atol=1e-9)
     assert np.linalg.norm(found.displacement.vectors[ball] - np.array([0.6, -0.4, 0.3]), axis=1).max() < 0.1
@@ -228,10 +229,10 @@ def test_a_stiff_body_moves_as_one() -> None:
 @pytest.mark.parametrize(
     "settings",
     [
-        CorrelationSettings(local_gain=False, stiff_bodies=False),
+        CorrelationSettings(local_gain=False, rigid_inclusions=False),
         CorrelationSettings(robust=np.inf),
-        CorrelationSettings(volume_term=False, adaptive_weight=False),
-        CorrelationSettings(slopes="mean", node_spacing_mm=5.0),
+        CorrelationSettings(dilatation_penalty=False, adaptive_weight=False),
+        CorrelationSettings(gradients="mean", node_spacing_mm=5.0),
     ],
 )
 def test_every_part_can_be_left_out(settings: CorrelationSettings) -> None:
@@ -259,7 +260,7 @@ def test_splines_keep_their_field_when_cells_are_halved_and_know_their_bending()
     nodes = grid.nodes_mm
     local = (nodes[..., 0] * nodes[..., 1])[:4, :4, :4].ravel()
     assert local @ grid.bending() @ local == pytest.approx(2.0 * np.prod(grid.step_mm))
-    assert np.allclose(grid.gauss_slopes()[:, 2] @ local, 0.0, atol=1e-12)
+    assert np.allclose(grid.gauss_gradients()[:, 2] @ local, 0.0, atol=1e-12)
 
 
 def test_bad_scans_are_refused() -> None:
@@ -280,8 +281,8 @@ def test_bad_scans_are_refused() -> None:
     small[20, 20:30, 20:30] = True
     with pytest.raises(InputError, match=r"\[10, 10, 1\] voxels"):
         correlate_volumes(before, after, mask=small)
-    with pytest.raises(InputError, match="slopes"):
-        correlate_volumes(before, after, settings=CorrelationSettings(slopes="none"))  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="gradients"):
+        correlate_volumes(before, after, settings=CorrelationSettings(gradients="none"))  # type: ignore[arg-type]
 
 
 def test_scans_that_are_known_in_different_places_do_not_overlap() -> None:

@@ -15,7 +15,7 @@ from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.imaging.dense_matching._block_kernels import NCC, SAD, SSD, between_voxels, full_search
 from naibu.imaging.preprocessing.resampling import require_mask
-from naibu.imaging.preprocessing.volume_pair import grey_pair, to_millimetres
+from naibu.imaging.preprocessing.volume_pair import intensity_pair, to_millimetres
 
 Measure = Literal["sad", "ssd", "ncc"]
 MEASURES: dict[Measure, int] = {"sad": SAD, "ssd": SSD, "ncc": NCC}
@@ -71,7 +71,7 @@ def block_matching(
     """
     if measure not in MEASURES or unmeasured not in ("nan", "zero"):
         raise InputError(f"measure must be one of {', '.join(MEASURES)} and unmeasured 'nan' or 'zero', not {measure!r} and {unmeasured!r}")
-    a, b = grey_pair(reference, deformed)
+    a, b = intensity_pair(reference, deformed)
     chosen = Search.of(measure, block, search, reference.shape, reference.spacing_mm, sub_voxel)
     half = chosen.half
     # a range with unknown voxels in it is unknown

@@ -24,7 +24,7 @@ from naibu.imaging.preprocessing._interpolation_kernels import warp
 from naibu.imaging.preprocessing.filters import box_mean
 from naibu.imaging.preprocessing.pyramid import Level, coarsened, pyramid, refined
 from naibu.imaging.preprocessing.resampling import require_mask
-from naibu.imaging.preprocessing.volume_pair import grey_pair, to_millimetres, to_voxels
+from naibu.imaging.preprocessing.volume_pair import intensity_pair, to_millimetres, to_voxels
 
 REPORT_LEVELS = 256.0  # intensity levels of the report's images, to which its lambda refers
 # Horn-Schunck as in chapter 3.5 of the report: one grid, 40 plain steps, lambda = 4
@@ -96,7 +96,7 @@ def horn_schunck(
     _require_counts(iterations=iterations, warps=warps, levels=1 if levels is None else levels)
     if not (data_weight > 0.0 and (full_scale is None or full_scale > 0.0)):
         raise InputError(f"data_weight and full_scale must be positive, not {data_weight} and {full_scale}")
-    a, b = grey_pair(reference, deformed)
+    a, b = intensity_pair(reference, deformed)
     scale = _range(a) if full_scale is None else full_scale
     weight = data_weight * (REPORT_LEVELS / scale) ** 2
     wanted = _wanted(mask, reference)
@@ -167,7 +167,7 @@ def lucas_kanade(
         raise InputError(f"damping must be 0 or more, not {damping}")
     if size.shape != (3,) or size.dtype.kind not in "iu" or (size < 1).any() or (size % 2 == 0).any():
         raise InputError(f"window must be three odd numbers of voxels along x, y, z, not {size.tolist()}")
-    a, b = grey_pair(reference, deformed)
+    a, b = intensity_pair(reference, deformed)
     wanted = _wanted(mask, reference)
     grids = pyramid(a, b, wanted, reference.spacing_mm, levels)
     u = _start(start, reference, grids)

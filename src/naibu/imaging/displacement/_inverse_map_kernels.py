@@ -1,5 +1,5 @@
 # mypy: disallow-untyped-decorators=False
-"""Numba kernels behind `naibu.imaging.displacement.accuracy`: where a displaced point came from."""
+"""Numba kernel of the inverse of a displacement field by fixed-point iteration :cite:p:`chen2008b`."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from naibu._numba.compilation import njit
 from naibu.core.arrays import AnyArray
 from naibu.imaging.preprocessing._interpolation_kernels import interpolate
 
-# share of the remaining distance that one step takes: converges for stretches below 2.5
+# fraction of the remaining distance in one step: converges for stretches below 2.5
 DAMPING = 0.8
 
 
 @njit(cache=True, parallel=True)
-def come_from(move: AnyArray, ends: AnyArray, tolerance: float, iterations: int, starts: AnyArray) -> None:
-    """Fill starts (n, 3) with the indices x, y, z that the displacement move (3, nz, ny, nx), voxels, carries to ends (n, 3).
+def invert(move: AnyArray, ends: AnyArray, tolerance: float, iterations: int, starts: AnyArray) -> None:
+    """Fill starts (n, 3) with the indices x, y, z that the displacement move (3, nz, ny, nx), voxels, maps to ends (n, 3).
 
     NaN where there is none within the field.
     """
@@ -28,7 +28,7 @@ def come_from(move: AnyArray, ends: AnyArray, tolerance: float, iterations: int,
             v = interpolate(move[1], x, y, z)
             w = interpolate(move[2], x, y, z)
             if np.isnan(u + v + w):
-                # look again a little further in: the way may lead along the edge of the field
+                # try again at the edge: the iterates may leave the field
                 nz, ny, nx = move.shape[1:]
                 inner_x, inner_y, inner_z = min(max(x, 0.0), nx - 1.0), min(max(y, 0.0), ny - 1.0), min(max(z, 0.0), nz - 1.0)
                 if inner_x == x and inner_y == y and inner_z == z:

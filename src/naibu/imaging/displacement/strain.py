@@ -19,7 +19,7 @@ def displacement_gradient(displacement: ArrayLike, grid: Volume) -> FloatArray:
     displacement : array_like, shape (nz, ny, nx, 3)
         Displacement along x, y, z, mm.
     grid : Volume
-        Where it stands; its axes may be turned.
+        Grid of the displacement; its axes may be rotated.
     """
     u = np.asarray(displacement, dtype=float)
     if u.shape != (*grid.shape, 3):
@@ -32,25 +32,25 @@ def displacement_gradient(displacement: ArrayLike, grid: Volume) -> FloatArray:
 
 
 def jacobian_determinant(displacement: ArrayLike, grid: Volume) -> FloatArray:
-    """Return the volume ratio ``det(I + du/dx)`` (nz, ny, nx); the field folds where it is not positive (spec S8)."""
+    """Return the volume ratio ``det(I + du/dx)`` (nz, ny, nx); the field folds where it is not positive."""
     gradient = displacement_gradient(displacement, grid)
     with np.errstate(invalid="ignore"):  # the field may be unknown at some voxels
         return np.asarray(np.linalg.det(np.eye(3) + gradient))
 
 
-def folded_share(displacement: ArrayLike, grid: Volume, mask: ArrayLike | None = None) -> float:
-    """Return the share of the voxels with a known Jacobian, of a mask (nz, ny, nx) where given, at which the field folds."""
+def folded_fraction(displacement: ArrayLike, grid: Volume, mask: ArrayLike | None = None) -> float:
+    """Return the fraction of the voxels with a known Jacobian, in a mask (nz, ny, nx) where given, at which the field folds."""
     determinant = jacobian_determinant(displacement, grid)
     inside = np.isfinite(determinant)
     if mask is not None:
         inside &= require_mask(mask, grid)
     if not inside.any():
-        raise InputError("the displacement is known at no voxel with known neighbours")
+        raise InputError("displacement is known at no voxel with known neighbours")
     return float(np.mean(determinant[inside] <= 0.0))
 
 
 def small_strain(displacement: ArrayLike, grid: Volume) -> FloatArray:
-    """Return the strain ``(G + G^T) / 2`` (nz, ny, nx, 3, 3) of small displacement gradients G; turns wrongly count as strain."""
+    """Return the strain ``(G + G^T) / 2`` (nz, ny, nx, 3, 3) of small displacement gradients G; rotations count as strain."""
     g = displacement_gradient(displacement, grid)
     return np.asarray(0.5 * (g + np.swapaxes(g, -1, -2)))
 

@@ -1,5 +1,5 @@
 # mypy: disallow-untyped-decorators=False
-"""Numba kernels behind `naibu.imaging.preprocessing.filters`: convolution along one axis, and differences."""
+"""Numba kernels of image filters: convolution along an axis, central differences, structure tensor products, median."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from naibu.core.arrays import AnyArray
 
 @njit(cache=True, parallel=True, fastmath=True)
 def convolve_middle(v: AnyArray, weights: AnyArray, out: AnyArray) -> None:
-    """Convolve v (a, n, b) along its middle axis; beyond the ends the last value goes on."""
+    """Convolve v (a, n, b) along its middle axis; beyond the ends the last value is repeated."""
     a, n, b = v.shape
     r = len(weights) // 2
     for row in prange(a * n):
@@ -28,7 +28,7 @@ def convolve_middle(v: AnyArray, weights: AnyArray, out: AnyArray) -> None:
 
 @njit(cache=True, parallel=True, fastmath=True)
 def convolve_last(v: AnyArray, weights: AnyArray, out: AnyArray) -> None:
-    """Convolve v (m, n) along its last axis; beyond the ends the last value goes on."""
+    """Convolve v (m, n) along its last axis; beyond the ends the last value is repeated."""
     m, n = v.shape
     r = len(weights) // 2
     for row in prange(m):

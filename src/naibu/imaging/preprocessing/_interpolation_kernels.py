@@ -1,5 +1,5 @@
 # mypy: disallow-untyped-decorators=False
-"""Numba kernels behind `naibu.imaging.preprocessing.resampling` and the warps of optical flow: trilinear interpolation."""
+"""Numba kernels of trilinear interpolation, for resampling and for the warps of optical flow."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numba import prange
 from naibu._numba.compilation import njit
 from naibu.core.arrays import AnyArray, FloatArray, IntArray
 
-# of a voxel: positions that rounding put just outside still count as inside
+# voxels: positions outside by no more than rounding count as inside
 EDGE = 1e-6
 
 

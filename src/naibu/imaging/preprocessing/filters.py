@@ -1,4 +1,4 @@
-"""Smoothing and differences of grey values, compiled, in single precision; volumes of one slice are treated as images."""
+"""Gaussian smoothing, box means and image intensity gradients in single precision; volumes of one slice are treated as images."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import Float32Array, FloatArray
 from naibu.imaging.preprocessing._filter_kernels import convolve_last, convolve_middle, differences
 
-# beyond this many standard deviations a Gaussian is cut off
+# standard deviations at which a Gaussian is truncated: 0.3 % of it lie beyond
 REACH = 3.0
 
 
@@ -18,7 +18,7 @@ def smoothed(values: Float32Array, sigma: ArrayLike) -> Float32Array:
     Parameters
     ----------
     values : ndarray, shape (nz, ny, nx), float32
-        Grey values; beyond the edges the last one goes on.
+        Intensities; beyond the edges the last one is repeated.
     sigma : array_like, shape (3,)
         Standard deviation along x, y, z, voxels; 0 leaves an axis alone.
     """
@@ -59,14 +59,14 @@ def gaussian_weights(sigma: float) -> FloatArray:
 
 
 def gradient(values: Float32Array, step: ArrayLike) -> Float32Array:
-    """Return central differences (3, nz, ny, nx) along x, y, z, grey per unit of `step`.
+    """Return the intensity gradient (3, nz, ny, nx) along x, y, z by central differences, per unit of `step`.
 
     Parameters
     ----------
     values : ndarray, shape (nz, ny, nx), float32
-        Grey values.
+        Intensities.
     step : array_like, shape (3,)
-        Distance of voxels along x, y, z.
+        Voxel spacing along x, y, z.
     """
     v = np.ascontiguousarray(values, dtype=np.float32)
     out = np.empty((3, *v.shape), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Where the object is in a scan: what is brighter than the air about it."""
+"""Mask of the object: the largest connected region brighter than the air about it, by the threshold of :cite:t:`otsu1979`."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from naibu.core.arrays import BoolArray
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.bone_mask import otsu_thresholds
 
-# of the way from the air to the object, where the threshold lies at most: skin and cartilage are darker than the mean of the object
+# upper bound of the threshold, in fractions from the mean of the air to that of the object: skin and cartilage are darker than the mean
 DIMMEST = 0.3
-CLOSING = 2
+CLOSING = 2  # voxels: radius of the morphological closing that bridges noise at the surface
 
 
 def object_mask(volume: Volume, *, margin: int = 0) -> BoolArray:
-    """Return the largest body of a scan, holes in its slices filled.
+    """Return the mask of the largest bright region of a volume, with the holes in its slices filled.
 
     Parameters
     ----------
     volume : Volume
-        A scan of one object in air, or of the inside of an object.
+        Volume of one object in air, or of the inside of an object.
     margin : int
-        By how many voxels the mask reaches over the object, so that its surface is seen.
+        Dilation, voxels, by which the mask includes the contrast of the surface.
 
     Returns
     -------
@@ -32,7 +32,7 @@ def object_mask(volume: Volume, *, margin: int = 0) -> BoolArray:
     Raises
     ------
     InputError
-        A scan without contrast.
+        Volume without contrast.
     """
     values = np.asarray(volume.values, dtype=np.float32)
     reach = tuple(1.0 if n > 1 else 0.0 for n in volume.shape)

@@ -1,4 +1,4 @@
-"""Coarse copies of a pair of volumes, and displacements carried from one grid to the next finer one."""
+"""Gaussian image pyramids :cite:p:`burt1983` of a pair of volumes, and interpolation of displacements between their levels."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from naibu.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from naibu.imaging.preprocessing._interpolation_kernels import refine
 from naibu.imaging.preprocessing.filters import smoothed
 
-# voxels along an axis below which it is not halved again
+# voxels along an axis below which it is not halved again: fewer show too little of the object
 SMALLEST = 12
-# the Gaussian that takes out what every second voxel cannot hold
+# SD, voxels, of the Gaussian against aliasing before every second voxel is dropped
 BLUR = 0.8
 
 
@@ -24,13 +24,13 @@ class Level:
     Attributes
     ----------
     reference, deformed : ndarray, shape (nz, ny, nx), float32
-        Grey values.
+        Intensities.
     wanted : ndarray, shape (nz, ny, nx), bool
         Voxels that count.
     spacing_mm : ndarray, shape (3,)
-        Distance of voxels along x, y, z, mm.
+        Voxel spacing along x, y, z, mm.
     factor : ndarray, shape (3,), int64
-        How much finer the level below is, 1 or 2 along x, y, z; 1 at the finest.
+        Ratio of the spacing to that of the next finer level, 1 or 2 along x, y, z; 1 at the finest.
     """
 
     reference: Float32Array
@@ -43,19 +43,19 @@ class Level:
 def pyramid(reference: Float32Array, deformed: Float32Array, wanted: BoolArray, spacing_mm: FloatArray, levels: int | None) -> list[Level]:
     """Return levels from coarse to fine.
 
-    Every level halves the axes whose voxels are not much longer than the shortest, so that thick slices are left alone until the pixels
-    in them have caught up. Voxel 0 stays in its place.
+    Each level halves the resolution of the axes whose voxels are not much longer than the shortest, so that thick slices are kept until
+    the pixels in them are as large. Voxel 0 keeps its position.
 
     Parameters
     ----------
     reference, deformed : ndarray, shape (nz, ny, nx), float32
-        Grey values.
+        Intensities.
     wanted : ndarray, shape (nz, ny, nx), bool
         Voxels that count.
     spacing_mm : ndarray, shape (3,)
-        Distance of voxels along x, y, z, mm.
+        Voxel spacing along x, y, z, mm.
     levels : int, optional
-        How many; by default until an axis would have less than 12 voxels.
+        Number of levels; by default until an axis would have fewer than 12 voxels.
     """
     found = [Level(reference, deformed, wanted, np.asarray(spacing_mm, dtype=float), np.ones(3, dtype=np.int64))]
     while levels is None or len(found) < levels:
@@ -68,12 +68,12 @@ def pyramid(reference: Float32Array, deformed: Float32Array, wanted: BoolArray, 
             break
         pick = tuple(slice(None, None, int(f)) for f in factor[::-1])
         blur = np.where(factor == 2, BLUR, 0.0)
-        share = ndimage.maximum_filter(fine.wanted, tuple(int(2 * f - 1) for f in factor[::-1]))
+        counted = ndimage.maximum_filter(fine.wanted, tuple(int(2 * f - 1) for f in factor[::-1]))
         found.append(
             Level(
                 np.ascontiguousarray(smoothed_known(fine.reference, blur)[pick]),
                 np.ascontiguousarray(smoothed_known(fine.deformed, blur)[pick]),
-                np.ascontiguousarray(share[pick]),
+                np.ascontiguousarray(counted[pick]),
                 fine.spacing_mm * factor,
                 factor,
             )
@@ -82,13 +82,13 @@ def pyramid(reference: Float32Array, deformed: Float32Array, wanted: BoolArray, 
 
 
 def smoothed_known(values: Float32Array, sigma: FloatArray) -> Float32Array:
-    """Return smoothed values where most of the Gaussian falls on known ones; NaN elsewhere."""
+    """Return smoothed values where most of the Gaussian covers known ones; NaN elsewhere (normalised convolution)."""
     known = np.isfinite(values)
     if known.all():
         return smoothed(values, sigma)
-    share = smoothed(known.astype(np.float32), sigma)
+    fraction = smoothed(known.astype(np.float32), sigma)
     total = smoothed(np.where(known, values, np.float32(0.0)), sigma)
-    return np.where(share > 0.5, total / np.maximum(share, 0.5), np.float32(np.nan))
+    return np.where(fraction > 0.5, total / np.maximum(fraction, 0.5), np.float32(np.nan))
 
 
 def refined(displacement: Float32Array, coarse: Level, fine: Level) -> Float32Array:

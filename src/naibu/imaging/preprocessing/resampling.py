@@ -1,4 +1,7 @@
-"""Volumes on other grids: slices put between, other spacings, warped by a displacement, cropped and masked (spec S1)."""
+"""Resampling of volumes: interpolated slices, other spacings and grids, warping by a displacement, cropping and masking.
+
+Slices are interpolated as in :cite:t:`hirai2008` (chapter 3.6); cubic interpolation is by B-splines :cite:p:`unser1999`.
+"""
 
 from __future__ import annotations
 
@@ -20,14 +23,14 @@ Interpolation = Literal["linear", "cubic"]
 
 
 def with_slices_between(volume: Volume, count: int = 1) -> Volume:
-    """Return a volume with slices interpolated linearly into every gap between slices (spec S1, equation 3.37).
+    """Return a volume with slices interpolated linearly into every gap between slices (:cite:t:`hirai2008`, equation 3.37).
 
     Parameters
     ----------
     volume : Volume
         At least two slices.
     count : int
-        Slices in every gap: 1 halves their distance, as the report does with its slices 2 mm apart.
+        Slices in every gap: 1 halves their distance, as the report does with slices 2 mm apart.
 
     Returns
     -------
@@ -44,12 +47,12 @@ def with_slices_between(volume: Volume, count: int = 1) -> Volume:
     ``I_a = (1 - a) I_k + a I_{k+1}`` with ``a = d_k / (d_k + d_{k+1})``, the distances to the slices before and after.
     """
     if count < 1:
-        raise InputError(f"{count} slices cannot be put between two; give 1 or more")
+        raise InputError(f"count must be 1 slice or more, not {count}")
     return with_slices(volume, (volume.shape[0] - 1) * (count + 1) + 1)
 
 
 def with_slices(volume: Volume, n: int) -> Volume:
-    """Return a volume with `n` evenly spaced slices from the first to the last, interpolated linearly (spec S1, equation 3.37).
+    """Return a volume with `n` evenly spaced slices from the first to the last, interpolated linearly (:cite:t:`hirai2008`, equation 3.37).
 
     Raises
     ------
@@ -58,7 +61,7 @@ def with_slices(volume: Volume, n: int) -> Volume:
     """
     nz = volume.shape[0]
     if nz < 2 or n < 2:
-        raise InputError(f"slices are interpolated between two or more, and {n} from {nz} are asked for")
+        raise InputError(f"n must be 2 slices or more, interpolated between 2 or more; it is {n}, from {nz}")
     at = np.arange(n) * ((nz - 1) / (n - 1))
     below = np.minimum(at.astype(int), nz - 2)
     kind = _real(volume.values)
@@ -71,7 +74,7 @@ def with_slices(volume: Volume, n: int) -> Volume:
 def resampled_to_spacing(
     volume: Volume, spacing_mm: ArrayLike, *, interpolation: Interpolation = "linear", averaged: bool = True
 ) -> Volume:
-    """Return a volume with another distance of voxels; the first voxel keeps its place.
+    """Return a volume with another voxel spacing; the first voxel keeps its position.
 
     Parameters
     ----------
@@ -80,9 +83,9 @@ def resampled_to_spacing(
     spacing_mm : float or array_like, shape (3,)
         Distance of voxels along x, y, z, mm.
     interpolation : {"linear", "cubic"}
-        Between voxels: straight, or by cubic B-splines.
+        Linear, or by cubic B-splines.
     averaged : bool
-        Whether a Gaussian takes out first what a coarser grid cannot hold.
+        Whether a Gaussian removes first what would alias on a coarser grid.
 
     Raises
     ------
@@ -116,22 +119,22 @@ def resampled_to_grid(
     Parameters
     ----------
     volume : Volume
-        Where values come from.
+        Intensities.
     grid : Volume
-        Where values are wanted.
+        Voxels of the result; its values do not matter.
     through : callable, optional
         Affine map of positions (n, 3) of the grid, mm, to positions in the volume: the `moved` of a rigid motion brings a deformed
         volume back to the frame of the reference.
     interpolation : {"linear", "cubic"}
-        Between voxels: straight, or by cubic B-splines.
+        Linear, or by cubic B-splines.
     outside : float
-        Value of voxels that lie outside the volume. NaN, which files of whole numbers cannot hold, stands for unknown and is understood
-        by block matching and optical flow: a zero would be an edge to them.
+        Value of voxels that lie outside the volume. NaN stands for unknown in block matching and optical flow, to which a zero would be an
+        edge; files of integers cannot hold it.
 
     Returns
     -------
     Volume
-        Real numbers.
+        Floating-point values.
 
     Raises
     ------
@@ -157,13 +160,13 @@ def resampled_to_grid(
         )
         inside = covered(volume, grid, through=through)
     if not inside.any():
-        raise InputError("the volumes do not overlap: no voxel of the grid lies inside the other volume; check their origins and units")
+        raise InputError("volume and grid do not overlap: no voxel of the grid lies inside the volume; check their origins and units")
     out[~inside] = outside
     return replace(grid, values=out)
 
 
 def covered(volume: Volume, grid: Volume, *, through: Callable[[FloatArray], FloatArray] | None = None) -> BoolArray:
-    """Return which voxels (nz, ny, nx) of a grid lie inside a volume, where `through` has carried them (see `resampled_to_grid`)."""
+    """Return which voxels (nz, ny, nx) of a grid lie inside a volume after the map `through` (see `resampled_to_grid`)."""
     matrix, shift = _index_map(volume, grid, through)
     axes = np.meshgrid(*(np.arange(n, dtype=float) for n in grid.shape), indexing="ij", sparse=True)
     inside = np.ones(grid.shape, dtype=bool)
@@ -192,21 +195,21 @@ def warped(
 ) -> AnyArray:
     """Return the values (nz, ny, nx) of a volume at ``x + u(x)``, x the voxels of a grid.
 
-    With the deformed volume and the displacement of the reference this is the deformed volume carried back, which looks like the
-    reference where the displacement is right.
+    With the deformed volume and the displacement of the reference this is the deformed volume warped back, which equals the reference
+    where the displacement is right.
 
     Parameters
     ----------
     volume : Volume
-        Where values come from.
+        Intensities.
     displacement : array_like, shape (nz, ny, nx, 3)
         Displacement u along x, y, z at the voxels of the grid, mm; NaN where there is none.
     grid : Volume
-        Where the displacement stands.
+        Grid of the displacement.
     interpolation : {"linear", "cubic"}
-        Between voxels: straight, or by cubic B-splines.
+        Linear, or by cubic B-splines.
     outside : float
-        Value of voxels whose place lies outside the volume, or that have no displacement.
+        Value of voxels whose displaced position lies outside the volume, or that have no displacement.
 
     Raises
     ------
@@ -216,9 +219,9 @@ def warped(
     u = np.asarray(displacement, dtype=float)
     if u.shape != (*grid.shape, 3):
         raise InputError(f"displacement must have shape {(*grid.shape, 3)} (z, y, x, component), mm, not {u.shape}")
-    places = positions(grid)
-    places += u
-    return sampled(volume, places, interpolation=interpolation, outside=outside)
+    ends = positions(grid)
+    ends += u
+    return sampled(volume, ends, interpolation=interpolation, outside=outside)
 
 
 def positions(grid: Volume) -> FloatArray:
@@ -232,7 +235,7 @@ def masked(volume: Volume, mask: ArrayLike, fill: float = 0.0) -> Volume:
     Raises
     ------
     InputError
-        A mask of another shape, or an empty one.
+        Mask of another shape, or empty.
     """
     inside = require_mask(mask, volume)
     return volume.with_values(np.where(inside, volume.values, np.asarray(fill, dtype=volume.values.dtype)))
@@ -244,7 +247,7 @@ def cropped_to_mask(volume: Volume, mask: ArrayLike, margin_mm: float = 0.0) -> 
     Raises
     ------
     InputError
-        A mask of another shape, or an empty one.
+        Mask of another shape, or empty.
     """
     inside = np.argwhere(require_mask(mask, volume))[:, ::-1]
     margin = np.ceil(margin_mm / volume.spacing_mm - 1e-9).astype(int)
@@ -252,19 +255,19 @@ def cropped_to_mask(volume: Volume, mask: ArrayLike, margin_mm: float = 0.0) -> 
     return volume.cropped(np.maximum(low, 0), np.minimum(high, volume.shape[::-1]))
 
 
-def require_mask(mask: ArrayLike, volume: Volume) -> BoolArray:
-    """Return a mask (nz, ny, nx) of a volume.
+def require_mask(mask: ArrayLike, volume: Volume, name: str = "mask") -> BoolArray:
+    """Return a mask (nz, ny, nx) of a volume; `name` is the argument that messages name.
 
     Raises
     ------
     InputError
-        A mask of another shape, or an empty one.
+        Mask of another shape, or empty.
     """
     inside = np.asarray(mask, dtype=bool)
     if inside.shape != volume.shape:
-        raise InputError(f"the mask must have shape {volume.shape} (z, y, x), not {inside.shape}")
+        raise InputError(f"{name} must have shape {volume.shape} (z, y, x), not {inside.shape}")
     if not inside.any():
-        raise InputError("the mask is empty: no voxel is to be looked at; check its threshold or its file")
+        raise InputError(f"{name} is empty: no voxel is set; check its threshold or its file")
     return inside
 
 
@@ -276,6 +279,6 @@ def _index_map(volume: Volume, grid: Volume, through: Callable[[FloatArray], Flo
 
 
 def _real(values: AnyArray) -> type[np.floating]:
-    """Return the type of real numbers that holds grey values exactly."""
+    """Return the floating-point type that holds intensities exactly."""
     single = values.dtype in (np.float32, np.float16) or (values.dtype.kind in "biu" and values.dtype.itemsize <= 2)
     return np.float32 if single else np.float64

@@ -1,4 +1,4 @@
-"""What two volumes must have in common before they are compared, and their grey values in single precision."""
+"""Checks of a pair of volumes before they are compared, and their intensities in single precision."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 
 
-def grey_pair(reference: Volume, deformed: Volume) -> tuple[Float32Array, Float32Array]:
-    """Return the grey values of two volumes on one grid.
+def intensity_pair(reference: Volume, deformed: Volume) -> tuple[Float32Array, Float32Array]:
+    """Return the intensities of two volumes on one grid.
 
     Parameters
     ----------
     reference, deformed : Volume
-        Before and after; NaN stands for unknown.
+        Volumes before and after the deformation; NaN stands for unknown.
 
     Returns
     -------
     tuple of ndarray, shape (nz, ny, nx), float32
-        Grey values, less the mean of the reference, which keeps differences exact in single precision; NaN where unknown.
+        Intensities less the mean of the reference, which keeps differences exact in single precision; NaN where unknown.
 
     Raises
     ------
@@ -31,14 +31,14 @@ def grey_pair(reference: Volume, deformed: Volume) -> tuple[Float32Array, Float3
         ratio = deformed.spacing_mm / reference.spacing_mm
         units = " Their spacings differ by a power of ten: was one stored in other units?" if _power_of_ten(ratio) else ""
         raise InputError(
-            f"the volumes lie on different grids ({_told(reference)}; {_told(deformed)}); bring the deformed one to the grid of the "
-            f"reference with naibu.imaging.preprocessing.resampling.resampled_to_grid.{units}"
+            f"reference and deformed lie on different grids ({_described(reference)}; {_described(deformed)}); resample deformed "
+            f"to the grid of the reference with naibu.imaging.resampled_to_grid.{units}"
         )
     known = np.isfinite(reference.values)
     if not (known & np.isfinite(deformed.values)).any():
-        raise InputError("the volumes do not overlap: where one is known the other is not; check the motion that brought them together")
+        raise InputError("reference and deformed do not overlap: no voxel is known in both; check the transform that registered them")
     shift = float(np.mean(reference.values, dtype=np.float64, where=known))
-    a, b = shifted_grey(reference.values, shift, "reference"), shifted_grey(deformed.values, shift, "deformed")
+    a, b = shifted_intensity(reference.values, shift, "reference"), shifted_intensity(deformed.values, shift, "deformed")
     for values, name in ((a, "reference"), (b, "deformed")):
         low, high = float(np.nanmin(values)), float(np.nanmax(values))
         if low == high:
@@ -46,7 +46,7 @@ def grey_pair(reference: Volume, deformed: Volume) -> tuple[Float32Array, Float3
     return a, b
 
 
-def shifted_grey(values: AnyArray, shift: float, name: str) -> Float32Array:
+def shifted_intensity(values: AnyArray, shift: float, name: str) -> Float32Array:
     """Return values less a shift, in single precision; NaN where unknown.
 
     Raises
@@ -54,13 +54,13 @@ def shifted_grey(values: AnyArray, shift: float, name: str) -> Float32Array:
     InputError
         Infinite values.
     """
-    grey = np.asarray(values - shift, dtype=np.float32)
-    if np.isinf(grey).any():
+    shifted = np.asarray(values - shift, dtype=np.float32)
+    if np.isinf(shifted).any():
         raise InputError(f"the {name} volume has infinite values; mask or repair them")
-    return np.ascontiguousarray(grey)
+    return np.ascontiguousarray(shifted)
 
 
-def _told(volume: Volume) -> str:
+def _described(volume: Volume) -> str:
     size = " x ".join(str(n) for n in volume.shape[::-1])
     return f"{size} voxels of {np.round(volume.spacing_mm, 4).tolist()} mm from {np.round(volume.origin_mm, 2).tolist()}"
 

@@ -1,8 +1,8 @@
 # mypy: disallow-untyped-decorators=False
-"""Numba kernels of the normal equations on a grid of cubic B-splines, behind `naibu.imaging.volume_correlation.normal_equations`.
+"""Numba kernels of the normal equations of digital volume correlation on a grid of cubic B-splines :cite:p:`unser1999`.
 
-Cells lie in rows along x. Rows of one colour share no node, so that threads write to no common place and every sum keeps its order.
-The matrix A (n, 3, 1029) has 343 blocks of 3 x 3 a node: those to the nodes at most three apart along every axis.
+Cells lie in rows along x. Rows of one colour share no node, so that threads write to separate memory and every sum keeps its order. The
+matrix A (n, 3, 1029) has 343 blocks of 3 x 3 for each node: those of the nodes at most three apart along every axis.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from naibu._numba.compilation import njit
 from naibu.core.arrays import AnyArray
 
 F = np.float32
-CHUNKS = 64
+CHUNKS = 64  # parts of a matrix product that threads take: many more than threads, so that they end together
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
@@ -101,14 +101,14 @@ def _line(
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _cofactor(local: AnyArray, slopes: AnyArray, q: int, cof: AnyArray) -> Any:
+def _cofactor(local: AnyArray, gradients: AnyArray, q: int, cof: AnyArray) -> Any:
     """Fill cof (3, 3) with the cofactors of I + grad u at a Gauss point, and return its determinant."""
     j = np.empty((3, 3), F)
     for i in range(3):
         for k in range(3):
             s = F(1) if i == k else F(0)
             for a in range(64):
-                s += local[a, i] * slopes[q, k, a]
+                s += local[a, i] * gradients[q, k, a]
             j[i, k] = s
     for i in range(3):
         i1, i2 = (i + 1) % 3, (i + 2) % 3
@@ -119,26 +119,26 @@ def _cofactor(local: AnyArray, slopes: AnyArray, q: int, cof: AnyArray) -> Any:
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _volume_slopes(local: AnyArray, slopes: AnyArray, ratio: Any, weight: Any, load: AnyArray, v: AnyArray, cof: AnyArray) -> Any:
+def _dilatation_gradients(local: AnyArray, gradients: AnyArray, ratio: Any, weight: Any, load: AnyArray, v: AnyArray, cof: AnyArray) -> Any:
     """Fill v (8, 192) with the derivatives of det(I + grad u) at the Gauss points times sqrt(weight), and add to load (64, 3).
 
-    Returns the sum of (J - ratio)^2.
+    Returns the sum of (J - ratio)^2, twice the penalty per unit weight.
     """
     total, root = F(0), F(np.sqrt(weight))
-    for q in range(slopes.shape[0]):
-        e = _cofactor(local, slopes, q, cof) - ratio
+    for q in range(gradients.shape[0]):
+        e = _cofactor(local, gradients, q, cof) - ratio
         total += e * e
         for a in range(64):
             for i in range(3):
-                t = root * (cof[i, 0] * slopes[q, 0, a] + cof[i, 1] * slopes[q, 1, a] + cof[i, 2] * slopes[q, 2, a])
+                t = root * (cof[i, 0] * gradients[q, 0, a] + cof[i, 1] * gradients[q, 1, a] + cof[i, 2] * gradients[q, 2, a])
                 v[q, 3 * a + i] = t
                 load[a, i] -= root * t * e
     return total
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _bent(local: AnyArray, stiffness: AnyArray, weight: AnyArray, load: AnyArray, energy: AnyArray) -> None:
-    """Add the bending forces of a cell to its load, and fill energy (3,) per unit weight."""
+def _add_bending(local: AnyArray, stiffness: AnyArray, weight: AnyArray, load: AnyArray, energy: AnyArray) -> None:
+    """Add the forces of the bending penalty of a cell to its load, and fill energy (3,), twice the penalty per unit weight."""
     energy[:] = F(0)
     for a in range(64):
         s0, s1, s2 = F(0), F(0), F(0)
@@ -157,7 +157,15 @@ def _bent(local: AnyArray, stiffness: AnyArray, weight: AnyArray, load: AnyArray
 
 @njit(cache=True, fastmath=True, error_model="numpy")
 def _row(
-    a: int, stiffness: AnyArray, weight: AnyArray, m3: AnyArray, pairs: AnyArray, with_data: bool, v: AnyArray, swells: bool, row: AnyArray
+    a: int,
+    stiffness: AnyArray,
+    weight: AnyArray,
+    m3: AnyArray,
+    pairs: AnyArray,
+    with_data: bool,
+    v: AnyArray,
+    dilatable: bool,
+    row: AnyArray,
 ) -> None:
     """Fill row (3, 192) with the matrix of a cell for its coefficient a."""
     for b in range(64):
@@ -173,7 +181,7 @@ def _row(
             row[0, 3 * b], row[0, 3 * b + 1], row[0, 3 * b + 2] = k0, F(0), F(0)
             row[1, 3 * b], row[1, 3 * b + 1], row[1, 3 * b + 2] = F(0), k1, F(0)
             row[2, 3 * b], row[2, 3 * b + 1], row[2, 3 * b + 2] = F(0), F(0), k2
-    if swells:
+    if dilatable:
         for i in range(3):
             r = row[i]
             for q in range(0, 8, 4):
@@ -206,14 +214,14 @@ def assemble(
     weights: Any,
     bending: AnyArray,
     stiffness: AnyArray,
-    volume: AnyArray,
-    slopes: AnyArray,
+    dilatation: AnyArray,
+    gradients: AnyArray,
     ratio: float,
     pairs: AnyArray,
-    bent: AnyArray,
-    swollen: AnyArray,
+    bending_energy: AnyArray,
+    dilatation_energy: AnyArray,
 ) -> None:
-    """Add data, bending and change of volume of all cells to big and right; fill bent (m, 3) and swollen (m,) with energies per weight."""
+    """Add intensity data, bending and dilatation of all cells to big and right; fill bending_energy (m, 3) and dilatation_energy (m,)."""
     for colour in range(len(tasks) - 1):
         for task in prange(tasks[colour], tasks[colour + 1]):
             m1, m2, m3 = np.empty((10, 6), F), np.empty((10, 10, 6), F), np.empty((10, 10, 10, 6), F)
@@ -226,11 +234,11 @@ def assemble(
                 _gather(c, cell, local)
                 load[:] = F(0)
                 found = _moments(products, force, which, box, weights[0], weights[1], weights[2], m1, m2, m3, f1, f2, load)
-                _bent(local, stiffness, bending[m], load, bent[m])
-                if volume[m] > 0:
-                    swollen[m] = _volume_slopes(local, slopes, F(ratio), volume[m], load, v, cof)
+                _add_bending(local, stiffness, bending[m], load, bending_energy[m])
+                if dilatation[m] > 0:
+                    dilatation_energy[m] = _dilatation_gradients(local, gradients, F(ratio), dilatation[m], load, v, cof)
                 for a in range(64):
-                    _row(a, stiffness, bending[m], m3, pairs, found, v, volume[m] > 0, row)
+                    _row(a, stiffness, bending[m], m3, pairs, found, v, dilatation[m] > 0, row)
                     az, ay, ax = a >> 4, (a >> 2) & 3, a & 3
                     n = slot[cell[2] + az, cell[3] + ay, cell[4] + ax]
                     for i in range(3):
@@ -243,7 +251,7 @@ def assemble(
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
 def product(big: AnyArray, neighbours: AnyArray, x: AnyArray, y: AnyArray) -> None:
-    """Fill y (n, 3) with A x; x (n + 1, 3) ends in zeros, where neighbours (n, 343) point that there are not."""
+    """Fill y (n, 3) with A x; x (n + 1, 3) ends in zeros, to which neighbours (n, 343) outside the grid point."""
     n = big.shape[0]
     for t in prange(CHUNKS):
         near = np.empty(1029, F)
@@ -321,14 +329,15 @@ def add_noise(
     which: AnyArray,
     starts: Any,
     weights: Any,
-    bends: AnyArray,
-    volume: AnyArray,
-    slopes: AnyArray,
-    swells: AnyArray,
+    bending_draws: AnyArray,
+    dilatation: AnyArray,
+    gradients: AnyArray,
+    dilatation_draws: AnyArray,
 ) -> None:
-    """Add random data and random priors to loads (n, 3, s).
+    """Add the loads of random residuals and of random draws from the penalties to loads (n, 3, s).
 
-    forces (voxels, 3, s): of random residuals; bends (m, 3, 64, s): random loads of bending; swells (m, 8, s): random changes of volume.
+    forces (voxels, 3, s): of random residuals; bending_draws (m, 3, 64, s): random loads of bending; dilatation_draws (m, 8, s): random
+    dilatations.
     """
     samples = loads.shape[2]
     for colour in range(len(tasks) - 1):
@@ -342,18 +351,18 @@ def add_noise(
                 for a in range(64):
                     for i in range(3):
                         for s in range(samples):
-                            load[a, i, s] = bends[m, i, a, s]
+                            load[a, i, s] = bending_draws[m, i, a, s]
                 _add_forces(forces, which, box, weights[0], weights[1], weights[2], f1, f2, load)
-                if volume[m] > 0:
+                if dilatation[m] > 0:
                     _gather(c, cell, local)
-                    for q in range(slopes.shape[0]):
-                        _cofactor(local, slopes, q, cof)
-                        t = F(np.sqrt(volume[m]))
+                    for q in range(gradients.shape[0]):
+                        _cofactor(local, gradients, q, cof)
+                        t = F(np.sqrt(dilatation[m]))
                         for a in range(64):
                             for i in range(3):
-                                w = t * (cof[i, 0] * slopes[q, 0, a] + cof[i, 1] * slopes[q, 1, a] + cof[i, 2] * slopes[q, 2, a])
+                                w = t * (cof[i, 0] * gradients[q, 0, a] + cof[i, 1] * gradients[q, 1, a] + cof[i, 2] * gradients[q, 2, a])
                                 for s in range(samples):
-                                    load[a, i, s] += w * swells[m, q, s]
+                                    load[a, i, s] += w * dilatation_draws[m, q, s]
                 for a in range(64):
                     n = slot[cell[2] + (a >> 4), cell[3] + ((a >> 2) & 3), cell[4] + (a & 3)]
                     for i in range(3):
@@ -363,9 +372,16 @@ def add_noise(
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
 def sample_energies(
-    x: AnyArray, cells: AnyArray, slot: AnyArray, c: AnyArray, stiffness: AnyArray, slopes: AnyArray, bent: AnyArray, swollen: AnyArray
+    x: AnyArray,
+    cells: AnyArray,
+    slot: AnyArray,
+    c: AnyArray,
+    stiffness: AnyArray,
+    gradients: AnyArray,
+    bending_energy: AnyArray,
+    dilatation_energy: AnyArray,
 ) -> None:
-    """Fill the mean over samples x (n + 1, 3, s) of bending per cell (m, 3) and of squared linearised change of volume (m,)."""
+    """Fill the mean over samples x (n + 1, 3, s) of the bending energy of each cell (m, 3) and of the squared linear dilatation (m,)."""
     samples = x.shape[2]
     for m in prange(len(cells)):
         cell = cells[m]
@@ -386,16 +402,16 @@ def sample_energies(
                         d[s] += k * xl[i, b, s]
                 for s in range(samples):
                     e += d[s] * xl[i, a, s]
-            bent[m, i] = e / samples
+            bending_energy[m, i] = e / samples
         e = F(0)
-        for q in range(slopes.shape[0]):
-            _cofactor(local, slopes, q, cof)
+        for q in range(gradients.shape[0]):
+            _cofactor(local, gradients, q, cof)
             d[:] = F(0)
             for i in range(3):
                 for a in range(64):
-                    w = cof[i, 0] * slopes[q, 0, a] + cof[i, 1] * slopes[q, 1, a] + cof[i, 2] * slopes[q, 2, a]
+                    w = cof[i, 0] * gradients[q, 0, a] + cof[i, 1] * gradients[q, 1, a] + cof[i, 2] * gradients[q, 2, a]
                     for s in range(samples):
                         d[s] += w * xl[i, a, s]
             for s in range(samples):
                 e += d[s] * d[s]
-        swollen[m] = e / samples
+        dilatation_energy[m] = e / samples

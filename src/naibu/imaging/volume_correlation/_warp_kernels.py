@@ -1,8 +1,5 @@
 # mypy: disallow-untyped-decorators=False
-"""Numba kernels behind `naibu.imaging.volume_correlation.correlate`.
-
-Grey values at moved voxels, their weights, and the gain between two scans.
-"""
+"""Numba kernels of intensity residuals: cubic B-spline interpolation of images :cite:p:`unser1999`, robust weights, local gain."""
 
 from __future__ import annotations
 
@@ -15,10 +12,10 @@ from naibu._numba.compilation import njit
 from naibu.core.arrays import AnyArray, IntArray
 
 F = np.float32
-# grey value of a voxel that has moved out of the volume; NaN does not survive fastmath
+# intensity of a voxel that has moved out of the volume; NaN does not survive fastmath
 OUTSIDE = -1e30
-FEW = 20000  # points that are not worth waking other threads for
-LEAST_DETERMINANT = 0.2  # below it a gradient is no longer carried along correctly, only limited
+FEW = 20000  # points below which one thread is faster than several
+LEAST_DETERMINANT = 0.2  # bounds the pushed-forward gradient where the field folds during the iterations
 
 
 @njit(cache=True, inline="always")
@@ -34,7 +31,7 @@ def cubic(f: Any) -> Any:
 
 
 @njit(cache=True, inline="always")
-def cubic_slope(f: Any) -> Any:
+def cubic_derivatives(f: Any) -> Any:
     """Return the derivatives of the four weights, per cell."""
     g = F(1) - f
     return -g * g * F(0.5), (F(1.5) * f - F(2)) * f, (F(2) - F(1.5) * g) * g, f * f * F(0.5)
@@ -42,11 +39,11 @@ def cubic_slope(f: Any) -> Any:
 
 @njit(cache=True, fastmath=True, error_model="numpy")
 def spline_value(c: AnyArray, x: Any, y: Any, z: Any) -> Any:
-    """Return value and slope, per voxel, of cubic coefficients that are padded by one before and two after."""
+    """Return value and gradient, per voxel, of cubic coefficients that are padded by one before and two after."""
     i, j, k = int(x), int(y), int(z)
-    ux, vx = cubic(F(x - i)), cubic_slope(F(x - i))
-    uy, vy = cubic(F(y - j)), cubic_slope(F(y - j))
-    uz, vz = cubic(F(z - k)), cubic_slope(F(z - k))
+    ux, vx = cubic(F(x - i)), cubic_derivatives(F(x - i))
+    uy, vy = cubic(F(y - j)), cubic_derivatives(F(y - j))
+    uz, vz = cubic(F(z - k)), cubic_derivatives(F(z - k))
     v, gx, gy, gz = F(0), F(0), F(0), F(0)
     for dk in range(4):
         pv, px, py = F(0), F(0), F(0)
@@ -64,35 +61,35 @@ def spline_value(c: AnyArray, x: Any, y: Any, z: Any) -> Any:
 
 
 @njit(cache=True, inline="always")
-def _sample(c: AnyArray, points: AnyArray, p: int, value: AnyArray, slope: AnyArray) -> None:
+def _sample(c: AnyArray, points: AnyArray, p: int, value: AnyArray, gradient: AnyArray) -> None:
     nz, ny, nx = c.shape[0] - 3, c.shape[1] - 3, c.shape[2] - 3
     x, y, z = points[p, 0], points[p, 1], points[p, 2]
     if x >= 0 and y >= 0 and z >= 0 and x <= nx - 1 and y <= ny - 1 and z <= nz - 1:
-        value[p], slope[p, 0], slope[p, 1], slope[p, 2] = spline_value(c, x, y, z)
+        value[p], gradient[p, 0], gradient[p, 1], gradient[p, 2] = spline_value(c, x, y, z)
     else:
         value[p] = F(OUTSIDE)
-        slope[p] = F(0)
+        gradient[p] = F(0)
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _sample_few(c: AnyArray, points: AnyArray, value: AnyArray, slope: AnyArray) -> None:
+def _sample_few(c: AnyArray, points: AnyArray, value: AnyArray, gradient: AnyArray) -> None:
     for p in range(len(points)):
-        _sample(c, points, p, value, slope)
+        _sample(c, points, p, value, gradient)
 
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
-def _sample_many(c: AnyArray, points: AnyArray, value: AnyArray, slope: AnyArray) -> None:
+def _sample_many(c: AnyArray, points: AnyArray, value: AnyArray, gradient: AnyArray) -> None:
     for p in prange(len(points)):
-        _sample(c, points, p, value, slope)
+        _sample(c, points, p, value, gradient)
 
 
-def sample_spline(c: AnyArray, points: AnyArray, value: AnyArray, slope: AnyArray) -> None:
-    """Fill value (n,) and slope (n, 3), per voxel, at indices (n, 3); OUTSIDE and zero outside."""
-    (_sample_few if len(points) < FEW else _sample_many)(c, points, value, slope)
+def sample_spline(c: AnyArray, points: AnyArray, value: AnyArray, gradient: AnyArray) -> None:
+    """Fill value (n,) and gradient (n, 3), per voxel, at indices (n, 3); OUTSIDE and zero outside."""
+    (_sample_few if len(points) < FEW else _sample_many)(c, points, value, gradient)
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def carried(j: AnyArray, g: AnyArray, out: AnyArray) -> None:
+def pushed_forward(j: AnyArray, g: AnyArray, out: AnyArray) -> None:
     """Fill out with the inverse transpose of a matrix times a vector, its determinant limited from below."""
     c00, c01, c02 = j[1, 1] * j[2, 2] - j[1, 2] * j[2, 1], j[1, 2] * j[2, 0] - j[1, 0] * j[2, 2], j[1, 0] * j[2, 1] - j[1, 1] * j[2, 0]
     c10, c11, c12 = j[2, 1] * j[0, 2] - j[2, 2] * j[0, 1], j[2, 2] * j[0, 0] - j[2, 0] * j[0, 2], j[2, 0] * j[0, 1] - j[2, 1] * j[0, 0]
@@ -105,7 +102,7 @@ def carried(j: AnyArray, g: AnyArray, out: AnyArray) -> None:
 
 @njit(cache=True, fastmath=True, error_model="numpy")
 def collapse(c: AnyArray, row: AnyArray, az: int, ay: int, wz: AnyArray, dz: AnyArray, wy: AnyArray, dy: AnyArray) -> None:
-    """Fill row (3, n, 3) with coefficients along x in a line of voxels, and with their slopes along y and z."""
+    """Fill row (3, n, 3) with coefficients along x in a line of voxels, and with their derivatives along y and z."""
     row[:] = F(0)
     for a in range(4):
         for b in range(4):
@@ -120,20 +117,21 @@ def collapse(c: AnyArray, row: AnyArray, az: int, ay: int, wz: AnyArray, dz: Any
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
 def warp_voxels(
-    c: AnyArray, runs: IntArray, cells: Any, weights: Any, slopes: Any, low: AnyArray, per_mm: AnyArray, image: AnyArray, given: AnyArray,
-    value: AnyArray, reference_slope: AnyArray, slope: AnyArray, move: AnyArray,
+    c: AnyArray, runs: IntArray, cells: Any, weights: Any, derivatives: Any, low: AnyArray, per_mm: AnyArray, image: AnyArray,
+    given: AnyArray,    value: AnyArray, reference_gradient: AnyArray, gradient: AnyArray, displacement: AnyArray,
 ) -> None:  # fmt: skip
-    """Fill what the listed voxels see where they move.
+    """Fill displacement, intensity and intensity gradients of the listed voxels.
 
-    c (NZ, NY, NX, 3) mm; runs (m, 5): z, y, first x, x after the last, place in the list; cells, weights, slopes of the axes x, y, z;
-    low (3,) index of the first voxel; image: coefficients of the deformed volume; given (n, 3): slope of the reference, per mm.
-    value (n,); reference_slope (n, 3): that slope carried along, per mm; slope (n, 3): of the deformed volume, per mm; move (n, 3), mm.
+    c (NZ, NY, NX, 3) mm; runs (m, 5): z, y, first x, x after the last, number in the list; cells, weights, derivatives along x, y, z;
+    low (3,) index of the first voxel; image: coefficients of the deformed volume; given (n, 3): gradient of the reference, per mm.
+    value (n,); reference_gradient (n, 3): that gradient pushed forward, per mm; gradient (n, 3): of the deformed volume, per mm;
+    displacement (n, 3), mm.
     """
     nz, ny, nx = image.shape[0] - 3, image.shape[1] - 3, image.shape[2] - 3
     for r in prange(len(runs)):
         z, y, x0, x1, p0 = runs[r, 0], runs[r, 1], runs[r, 2], runs[r, 3], runs[r, 4]
         row = np.empty((3, c.shape[2], 3), F)
-        collapse(c, row, cells[2][z], cells[1][y], weights[2][z], slopes[2][z], weights[1][y], slopes[1][y])
+        collapse(c, row, cells[2][z], cells[1][y], weights[2][z], derivatives[2][z], weights[1][y], derivatives[1][y])
         u, j = np.empty(3, F), np.empty((3, 3), F)
         for x in range(x0, x1):
             p, t = p0 + x - x0, cells[0][x]
@@ -143,57 +141,58 @@ def warp_voxels(
                 for a in range(4):
                     w = weights[0][x, a]
                     u[k] += w * row[0, t + a, k]
-                    j[k, 0] += slopes[0][x, a] * row[0, t + a, k]
+                    j[k, 0] += derivatives[0][x, a] * row[0, t + a, k]
                     j[k, 1] += w * row[1, t + a, k]
                     j[k, 2] += w * row[2, t + a, k]
                 j[k, k] += F(1)
-                move[p, k] = u[k]
+                displacement[p, k] = u[k]
             px, py, pz = low[0] + x + u[0] * per_mm[0], low[1] + y + u[1] * per_mm[1], low[2] + z + u[2] * per_mm[2]
             if px >= 0 and py >= 0 and pz >= 0 and px <= nx - 1 and py <= ny - 1 and pz <= nz - 1:
                 v, a_, b_, c_ = spline_value(image, px, py, pz)
                 value[p] = v
-                slope[p, 0], slope[p, 1], slope[p, 2] = a_ * per_mm[0], b_ * per_mm[1], c_ * per_mm[2]
-                carried(j, given[p], reference_slope[p])
+                gradient[p, 0], gradient[p, 1], gradient[p, 2] = a_ * per_mm[0], b_ * per_mm[1], c_ * per_mm[2]
+                pushed_forward(j, given[p], reference_gradient[p])
             else:
                 value[p] = F(OUTSIDE)
-                slope[p] = F(0)
-                reference_slope[p] = F(0)
+                gradient[p] = F(0)
+                reference_gradient[p] = F(0)
 
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
-def weigh(
-    grey: AnyArray, value: AnyArray, gain: AnyArray, offset: AnyArray, reference_slope: AnyArray, slope: AnyArray, scalars: AnyArray,
-    products: AnyArray, force: AnyArray, weight: AnyArray, residual: AnyArray, alike: AnyArray,
+def weighted_residuals(
+    intensity: AnyArray, value: AnyArray, gain: AnyArray, offset: AnyArray, reference_gradient: AnyArray, gradient: AnyArray,
+    scalars: AnyArray,    products: AnyArray, force: AnyArray, weight: AnyArray, residual: AnyArray, agreement: AnyArray,
 ) -> None:  # fmt: skip
-    """Fill residual, weight, weighted products of slopes (n, 6: xx xy xz yy yz zz) and force (n, 3) of the listed voxels.
+    """Fill residual, weight, weighted products of gradients (n, 6: xx xy xz yy yz zz) and force (n, 3) of the listed voxels.
 
-    scalars: precision of the residual; variance of the position, mm^2; 1 / (multiple of the scatter where the robust weight is 1/4)^2;
-    share of the slope that is taken from the reference. slope (n, 3) is replaced by the one that was used. alike (n, 2): product of both
-    slopes, in which noise has no part, and mean of their squares, both times the weight.
+    scalars: precision of the residual; variance of the sub-voxel jitter, mm^2; 1 / (residual, in residual SD, where the robust weight is
+    1/4)^2; fraction of the gradient that is taken from the reference. gradient (n, 3) is replaced by the one that was used. agreement
+    (n, 2): product of both gradients, to which noise does not contribute on average, and mean of their squares, both times the weight. The
+    robust weight is that of :cite:t:`geman1987`.
     """
-    precision, place, robust, share = scalars[0], scalars[1], scalars[2], scalars[3]
-    for p in prange(len(grey)):
+    precision, jitter, robust, fraction = scalars[0], scalars[1], scalars[2], scalars[3]
+    for p in prange(len(intensity)):
         if value[p] < F(0.9 * OUTSIDE):
             products[p] = F(0)
             force[p] = F(0)
             weight[p] = F(0)
             residual[p] = F(0)
-            alike[p] = F(0)
+            agreement[p] = F(0)
             continue
-        r = grey[p] - gain[p] * value[p] - offset[p]
+        r = intensity[p] - gain[p] * value[p] - offset[p]
         residual[p] = r
-        rest = (F(1) - share) * gain[p]
-        fx, fy, fz = reference_slope[p, 0], reference_slope[p, 1], reference_slope[p, 2]
-        both = gain[p] * (fx * slope[p, 0] + fy * slope[p, 1] + fz * slope[p, 2])
-        x, y, z = share * fx + rest * slope[p, 0], share * fy + rest * slope[p, 1], share * fz + rest * slope[p, 2]
-        iv = precision / (F(1) + precision * place * max(F(0), both))
+        rest = (F(1) - fraction) * gain[p]
+        fx, fy, fz = reference_gradient[p, 0], reference_gradient[p, 1], reference_gradient[p, 2]
+        both = gain[p] * (fx * gradient[p, 0] + fy * gradient[p, 1] + fz * gradient[p, 2])
+        x, y, z = fraction * fx + rest * gradient[p, 0], fraction * fy + rest * gradient[p, 1], fraction * fz + rest * gradient[p, 2]
+        iv = precision / (F(1) + precision * jitter * max(F(0), both))
         q = F(1) / (F(1) + r * r * iv * robust)
         w = iv * q * q
         weight[p] = w
-        alike[p, 0] = w * both
-        squares = gain[p] * gain[p] * (slope[p, 0] * slope[p, 0] + slope[p, 1] * slope[p, 1] + slope[p, 2] * slope[p, 2])
-        alike[p, 1] = w * F(0.5) * (fx * fx + fy * fy + fz * fz + squares)
-        slope[p, 0], slope[p, 1], slope[p, 2] = x, y, z
+        agreement[p, 0] = w * both
+        squares = gain[p] * gain[p] * (gradient[p, 0] * gradient[p, 0] + gradient[p, 1] * gradient[p, 1] + gradient[p, 2] * gradient[p, 2])
+        agreement[p, 1] = w * F(0.5) * (fx * fx + fy * fy + fz * fz + squares)
+        gradient[p, 0], gradient[p, 1], gradient[p, 2] = x, y, z
         force[p, 0], force[p, 1], force[p, 2] = w * r * x, w * r * y, w * r * z
         products[p, 0], products[p, 1], products[p, 2] = w * x * x, w * x * y, w * x * z
         products[p, 3], products[p, 4], products[p, 5] = w * y * y, w * y * z, w * z * z
@@ -212,7 +211,7 @@ def _corners(x: Any, y: Any, z: Any, low: AnyArray, step: AnyArray, n: IntArray,
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
 def gain_normal_equations(
-    grey: AnyArray,
+    intensity: AnyArray,
     value: AnyArray,
     weight: AnyArray,
     index: AnyArray,
@@ -222,19 +221,19 @@ def gain_normal_equations(
     left: AnyArray,
     right: AnyArray,
 ) -> None:
-    """Add the normal equations of ``grey = gain value + offset``, both trilinear on a lattice, to left and right, one of each a thread."""
+    """Add the normal equations of ``intensity = gain value + offset``, trilinear on a lattice, to left and right, one for each thread."""
     parts = len(left)
     for t in prange(parts):
         ids, w8 = np.empty(8, np.int64), np.empty(8)
-        for p in range(t * len(grey) // parts, (t + 1) * len(grey) // parts):
+        for p in range(t * len(intensity) // parts, (t + 1) * len(intensity) // parts):
             if value[p] < F(0.9 * OUTSIDE) or weight[p] <= 0:
                 continue
             _corners(index[p, 0], index[p, 1], index[p, 2], low, step, n, ids, w8)
             g = float(value[p])
             for q in range(8):
                 a, wq = 2 * ids[q], weight[p] * w8[q]
-                right[t, a] += wq * g * grey[p]
-                right[t, a + 1] += wq * grey[p]
+                right[t, a] += wq * g * intensity[p]
+                right[t, a + 1] += wq * intensity[p]
                 for r in range(8):
                     b, v = 2 * ids[r], wq * w8[r]
                     left[t, a, b] += v * g * g

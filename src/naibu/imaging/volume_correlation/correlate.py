@@ -1,19 +1,20 @@
-"""The displacement between two scans by volume correlation that mechanics hold together: the default way of sensing (spec S7, S8).
+"""Global digital volume correlation (DVC) on cubic B-splines, regularised by mechanics: the default method of measuring displacement.
 
-The displacement is a field of cubic B-splines on a grid about the object. It minimises::
+The displacement is a field of cubic B-splines :cite:p:`unser1999,rueckert1999` on a grid about the object. It minimises::
 
     sum_voxels rho((f - a g(x + u) - b) / s) + sum_cells lambda_c |grad grad u|^2 / 2 + kappa (det(I + grad u) - 1)^2 / 2
 
-where f and g are the scans, a and b a smooth gain and offset, s the scatter of the residual, and rho bounds what a voxel that does not
-belong can do. The weights lambda, one a cell and component, and kappa are the most probable ones given the data. Stiff bodies move
-rigidly. Coarse to fine, Gauss-Newton, from a rigid start.
+where f and g are the intensities of the reference and the deformed volume, a and b a gain and an offset that vary slowly in space, s the
+residual standard deviation, and rho the bounded function of :cite:t:`geman1987`. Global correlation with finite elements is due to
+:cite:t:`besnard2006`, in volumes to :cite:t:`roux2008`; mechanical regularisation makes a resolution of one voxel possible
+:cite:p:`leclerc2011`. The penalty of bending is that of :cite:t:`rueckert1999`; changes of volume are penalised as by
+:cite:t:`rohlfing2003`, but by their square. The weights lambda, one for each cell and component, and kappa are the most probable ones given
+the data :cite:p:`mackay1992`. Rigid inclusions have a rigid motion each. Coarse to fine, Gauss-Newton, from a rigid initialization.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,86 +22,68 @@ from scipy import ndimage
 
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray, Int32Array, IntArray
 from naibu.core.errors import InputError
+from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.object_mask import object_mask
 from naibu.imaging.preprocessing.resampling import require_mask
-from naibu.imaging.preprocessing.volume_pair import grey_pair
-from naibu.imaging.volume_correlation.gauss_newton import Comparison, Correlation, Iterations, chosen_weights
+from naibu.imaging.preprocessing.volume_pair import intensity_pair
+from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit, Iterations, chosen_weights
 from naibu.imaging.volume_correlation.image_level import ImageLevel
+from naibu.imaging.volume_correlation.inclusion_candidates import LEAST_VOLUME, inclusion_candidates
+from naibu.imaging.volume_correlation.intensity_comparison import ComparisonSettings
 from naibu.imaging.volume_correlation.normal_equations import SplineSystem
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise
 from naibu.imaging.volume_correlation.result import CorrelationResult, collected
-from naibu.imaging.volume_correlation.rigid_inclusions import StiffBody, enclosed_bodies, rigid_among
-from naibu.imaging.volume_correlation.rigid_initialization import RigidStart, correlated_shift
+from naibu.imaging.volume_correlation.rigid_inclusions import RigidInclusion, rigid_inclusions_among
+from naibu.imaging.volume_correlation.rigid_initialization import RigidInitialization, correlated_shift
+from naibu.imaging.volume_correlation.settings import REFERENCE_FRACTION, CorrelationSettings
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid
 
-Progress = Callable[[str], None]
-SLOPE_SHARE = {"reference": 1.0, "mean": 0.5, "deformed": 0.0}
-# cells along the cube root of the object's volume, and voxels along a cell at least
-CELLS_ALONG, LEAST_VOXELS = 12.5, 3.5
-LEAST_VOXELS_ALONG = 2.5
-LEAST_SIZE = 4
-LEAST_OVERLAP = 0.05
-# stretch of the outline from which an affine start is tried, and by how much better it must correlate
-LEAST_STRETCH, STRETCHED = 0.15, 0.05
-FIRST = 0.1
-SQUEEZED = 0.02  # such an object also changes its volume: of SWELLING
-LOOSER = (3.0, 2.0, 1.0, 1.0)
-ROUGH = 1  # levels, from the coarsest, where the scatter is that of all residuals
-COARSE_PLACE = 0.15
-COARSE_SHARE = 0.5  # far from register the mean of both scans' slopes reaches furthest
-# weights of bending, mm^-1 per mm of cell, and of change of volume, per cell, before the data have their say
-BENDING, SWELLING = 64.0, 5000.0
-PARTS = (2, 2, 4)
-STIFFER = (20.0, 1.0, 1.0, 1.0)  # bending of coarse grids, in units of BENDING
-STEPS = (8, 8, 3, 4)
-CONSTRAINED = (0.05, 0.01, 0.0, 0.0)
-SMOOTHING = 0.5  # standard deviation, voxels of a level
-BODY_SMOOTHING = 0.8
-WINDOW = 1.9  # cells in which a weight is shared
-AGREE = 0.5  # cells over which the slopes of both scans are compared
-GAIN_CELL = 5.5  # cells of the grid in one of the gain
-ADAPT_SAMPLES, ROUNDS, SEED = 12, 4, 20080301
+LEAST_SIZE = 4  # voxels along an axis: cubic B-splines have four nodes in a cell
+LEAST_OVERLAP = 0.05  # fraction of the object in the deformed volume after its motion, below which the volumes do not overlap
+# No derivation stands behind the numbers below: they are empirical, and benchmarks/sense_volumes.py shows the effect of a change.
+VOXELS_PER_LONG_CELL = 2.5  # least number of voxels along a cell on the axis of the largest spacing
+# an affine motion is tried where the outline is stretched by so much, and taken if its correlation is higher by so much
+LEAST_STRETCH, LEAST_GAIN = 0.15, 0.05
+FIRST_DILATATION = 0.1  # of the dilatation weight, before it is adapted: a field that is penalised too much does not show its dilatation
+AFFINE_DILATATION = 0.02  # of the dilatation weight, for an object that is compressed as a whole: it also changes its volume
+COARSE_JITTER = 0.15  # sub-voxel jitter SD on coarse grids, voxels
+COARSE_FRACTION = 0.5  # of the reference's gradient on coarse grids: far from registered, the mean of both gradients reaches furthest
+INCLUSION_SMOOTHING = 0.8  # of both volumes, for rigid inclusions, voxels
+WEIGHT_WINDOW = 1.9  # cells: standard deviation of the window in which cells share a weight
+AGREEMENT_WINDOW = 0.5  # cells: standard deviation of the window in which the gradients of both volumes are compared
+ADAPTATION_SAMPLES, ADAPTATIONS = 12, 4  # random fields of a round, and rounds, in which the weights are adapted
+INCLUSION_STEPS, ADAPTED_STEPS = 3, 5  # Gauss-Newton steps with rigid inclusions, and after each adaptation
+LEAST_WEIGHT = 1e-3  # of the dilatation weight of the round before
+DEFAULT = CorrelationSettings()
 
 
 @dataclass(frozen=True, slots=True)
-class CorrelationSettings:
-    """What may be chosen; every default suits scans of soft objects, and nothing has to be tuned.
+class _Level:
+    """Resolution level: how far voxels are thinned out, and how its fit differs from that of the finest level.
 
     Attributes
     ----------
-    node_spacing_mm : float, optional
-        Size of the cells of the spline grid, mm; by default about a twelfth of the object, and 3.5 voxels or more.
-    robust : float
-        Multiple of the residual's scatter where a voxel counts a quarter; inf for plain least squares.
-    local_gain : bool
-        Whether gain and offset between the scans vary in space; else there is one of each.
-    volume_term : bool
-        Whether change of volume is held back, as much as the data allow.
-    adaptive_weight : bool
-        Whether bending is weighed by the data, cell by cell; else by one number.
-    slopes : {"reference", "mean", "deformed"}
-        Which scan's slopes of grey values are used.
-    stiff_bodies : bool
-        Whether bodies that move rigidly are looked for and taken as rigid.
-    samples : int
-        Random fields from which the covariance is taken.
-    place_voxels : float
-        Standard deviation of where in its voxel a grey value belongs, voxels.
+    voxels_per_cell : int
+        Voxels along a cell that are taken, at least one of every cell.
+    robust, bending : float
+        Factors on the settings `robust` and `bending_weight`: far from registered residuals are large, and a stiff field takes out most.
+    steps : int
+        Gauss-Newton steps.
+    anchoring : float
+        See `Iterations.anchoring`.
     """
 
-    node_spacing_mm: float | None = None
-    robust: float = 3.0
-    local_gain: bool = True
-    volume_term: bool = True
-    adaptive_weight: bool = True
-    slopes: Literal["reference", "mean", "deformed"] = "reference"
-    stiff_bodies: bool = True
-    samples: int = 32
-    place_voxels: float = 0.15
+    voxels_per_cell: int
+    robust: float
+    bending: float
+    steps: int
+    anchoring: float = 0.0
 
 
-DEFAULT = CorrelationSettings()
+# the cells are halved between the first and the second level, and between the second and the third; the last level has all voxels
+LEVELS = (_Level(2, 3.0, 20.0, 8, 0.05), _Level(2, 2.0, 1.0, 8, 0.01), _Level(4, 1.0, 1.0, 3), _Level(0, 1.0, 1.0, 4))
+HALVINGS = 2
 
 
 def correlate_volumes(
@@ -108,203 +91,184 @@ def correlate_volumes(
     deformed: Volume,
     *,
     mask: ArrayLike | None = None,
-    stiff_mask: ArrayLike | None = None,
+    rigid_mask: ArrayLike | None = None,
     settings: CorrelationSettings = DEFAULT,
     progress: Progress | None = None,
 ) -> CorrelationResult:
-    """Return the displacement of an object between two scans, with its covariance and gradient.
+    """Measure the displacement field of an object by global digital volume correlation (DVC), with covariance and gradient.
 
     Parameters
     ----------
     reference, deformed : Volume
-        Before and after, on one grid, without unknown voxels.
+        Volumes of the object before and after the deformation, on one grid and without NaN.
     mask : array_like, shape (nz, ny, nx), optional
-        The object in the reference; by default the largest body that is brighter than the air about it, and one voxel more.
-    stiff_mask : array_like, shape (nz, ny, nx), bool or int, optional
-        Bodies that are rigid, numbered from 1, or true and told apart by where they touch; by default looked for.
+        Voxels of the object in the reference; by default the largest region brighter than the air about it, dilated by a voxel.
+    rigid_mask : array_like, shape (nz, ny, nx), bool or int, optional
+        Rigid inclusions: labels from 1, or true in each connected inclusion; by default they are found.
     settings : CorrelationSettings
-        Choices.
-    progress : callable, optional
-        ``progress(text)`` is told every step.
+        Grid, penalties, robustness, covariance.
+    progress : Progress, optional
+        Called for every resolution level, inclusion and adaptation of the weights.
 
     Returns
     -------
     CorrelationResult
-        Valid in the mask, where it lies in the deformed scan after its motion.
+        Valid in the mask, where it lies in the deformed volume after its motion.
 
     Raises
     ------
     InputError
-        Scans on different grids, of few slices, constant or with unknown voxels; an empty mask; scans that do not overlap.
+        Volumes on different grids, of few slices, constant or with NaN; an empty mask; volumes that do not overlap.
     """
-    _check(settings)
-    work = _Work(reference, deformed, mask, settings, progress or _silent)
-    work.start()
-    work.refine()
-    work.find_bodies(stiff_mask)
-    work.adapt()
-    return work.result()
+    correlation = _Correlation(reference, deformed, mask, settings, progress)
+    correlation.initialize()
+    correlation.refine()
+    correlation.find_inclusions(rigid_mask)
+    correlation.adapt()
+    return correlation.result()
 
 
-class _Work:
-    """The steps of a correlation and what they pass on."""
+class _Correlation:
+    """State of a correlation that its steps hand on."""
 
-    def __init__(self, reference: Volume, deformed: Volume, mask: ArrayLike | None, settings: CorrelationSettings, say: Progress) -> None:
-        self.volume, self.settings, self.say = reference, settings, say
+    def __init__(
+        self, reference: Volume, deformed: Volume, mask: ArrayLike | None, settings: CorrelationSettings, progress: Progress | None
+    ) -> None:
+        self.volume, self.settings, self.progress = reference, settings, progress
         self.reference, self.deformed = _checked_pair(reference, deformed)
         self.mask = object_mask(reference, margin=1) if mask is None else require_mask(mask, reference)
         self.deformed_volume = deformed
         where = np.argwhere(self.mask)
         if not len(where):
-            raise InputError("the mask is empty: no voxel of the object to follow")
+            raise InputError("mask is empty: it holds no voxel of the object")
         low, high = where.min(axis=0)[::-1], where.max(axis=0)[::-1]
         if ((high - low + 1) < LEAST_SIZE).any():
-            raise InputError(f"the object has {(high - low + 1).tolist()} voxels along x, y, z; {LEAST_SIZE} or more are needed")
+            raise InputError(f"mask spans {(high - low + 1).tolist()} voxels along x, y, z; {LEAST_SIZE} or more are needed")
         self.spacing = reference.spacing_mm
         self.step = _step(settings, self.mask, self.spacing)
         margin = 1.5 * self.spacing
-        self.grid = SplineGrid.around(low * self.spacing - margin, high * self.spacing + margin, self.step, halvings=2)
+        self.grid = SplineGrid.around(low * self.spacing - margin, high * self.spacing + margin, self.step, halvings=HALVINGS)
         self.strides = _strides(self.step, self.spacing)
-        self.levels: dict[tuple[int, ...], ImageLevel] = {}
-        self.bodies: list[StiffBody] = []
-        self.ratio, self.swells = 1.0, 1.0
+        self.inclusions: list[RigidInclusion] = []
+        self.ratio, self.dilatation_factor = 1.0, 1.0
 
-    def level(self, stride: tuple[int, ...], smoothing: float = SMOOTHING) -> ImageLevel:
+    def level(self, stride: tuple[int, ...], smoothing: float) -> ImageLevel:
         return ImageLevel(self.reference, self.deformed, self.mask, self.spacing, stride, smoothing)
 
-    def how(self, level: int) -> Comparison:
-        s = self.settings
+    def comparison(self, level: int) -> ComparisonSettings:
+        s, fine = self.settings, level > 1
         # on the coarsest level a local gain would explain what has moved
-        cell = GAIN_CELL * float(self.step.mean()) if s.local_gain and level else 0.0
-        reliable = AGREE * float(self.step.mean()) if level > 1 else 0.0
-        return Comparison(
-            s.robust * LOOSER[level],
-            s.place_voxels if level > 1 else COARSE_PLACE,
-            SLOPE_SHARE[s.slopes] if level > 1 else COARSE_SHARE,
+        cell = s.gain_cell * float(self.step.mean()) if s.local_gain and level else 0.0
+        return ComparisonSettings(
+            s.robust * LEVELS[level].robust,
+            s.jitter_sd_voxels if fine else COARSE_JITTER,
+            REFERENCE_FRACTION[s.gradients] if fine else COARSE_FRACTION,
             cell,
-            reliable_mm=reliable,
-            rough=level < ROUGH,
+            agreement_window_mm=AGREEMENT_WINDOW * float(self.step.mean()) if fine else 0.0,
+            far=level == 0,
         )
 
-    def weights(self, system: SplineSystem, stiffer: float) -> tuple[FloatArray, float]:
-        # less at first: of a field that is held back too much nobody can tell how much its volume changes
-        first = FIRST if self.settings.adaptive_weight else 1.0
+    def weights(self, system: SplineSystem, factor: float) -> tuple[FloatArray, float]:
+        """Return the weights of bending (m, 3) and dilatation that do not depend on the data."""
+        s = self.settings
+        first = FIRST_DILATATION if s.adaptive_weight else 1.0
         h = system.grid.step_mm
-        bending = np.full((len(system.cells), 3), stiffer * BENDING / float(np.prod(h) ** (1 / 3)))
-        return bending, first * self.swells * SWELLING / float(np.prod(h)) if self.settings.volume_term else 0.0
+        bending = np.full((len(system.cells), 3), factor * s.bending_weight / float(np.prod(h) ** (1 / 3)))
+        return bending, first * self.dilatation_factor * s.dilatation_weight / float(np.prod(h)) if s.dilatation_penalty else 0.0
 
-    def start(self) -> None:
-        """Find the rigid motion and put it on the coarsest grid."""
+    def initialize(self) -> None:
+        """Find the rigid motion, and put it on the coarsest grid."""
+        report_progress(self.progress, "rigid initialization")
         stride = _stride(self.step, self.spacing, 1)
-        level = self.level(stride)
+        level = self.level(stride, self.settings.smoothing_voxels)
         thin = tuple(slice(None, None, s) for s in stride[::-1])
         shifts = [np.zeros(3), correlated_shift(self.reference[thin] * self.mask[thin], self.deformed[thin], level.spacing)]
         after = np.argwhere(object_mask(self.deformed_volume))[:, ::-1] * self.spacing
         before = np.argwhere(self.mask)[:, ::-1] * self.spacing
         shifts.append(after.mean(axis=0) - before.mean(axis=0))
-        start = RigidStart(level)
-        linear, shift, likeness = start.found(shifts)
-        kind = "rigid"
-        # an object that is squeezed as a whole looks like itself only after it is stretched as its outline is
+        start = RigidInitialization(level)
+        linear, shift, correlation = start.found(shifts)
+        # an object that is compressed as a whole correlates only after it is stretched as its outline is
         outline = np.diag(after.std(axis=0) / before.std(axis=0))
         if np.abs(np.diag(outline) - 1).max() > LEAST_STRETCH:
             guesses = (outline @ linear, outline)
             ends = [start.stretched(a, a @ (start.middle - before.mean(axis=0)) + after.mean(axis=0) - start.middle) for a in guesses]
             affine = max(ends, key=lambda end: end[2])
-            if affine[2] > likeness + STRETCHED and np.linalg.det(affine[0]) > 0.1:
-                linear, shift, likeness = affine
-                kind, self.ratio, self.swells = "affine", float(np.linalg.det(linear)), SQUEEZED
+            if affine[2] > correlation + LEAST_GAIN and np.linalg.det(affine[0]) > 0.1:
+                linear, shift, _ = affine
+                self.ratio, self.dilatation_factor = float(np.linalg.det(linear)), AFFINE_DILATATION
         nodes = self.grid.nodes_mm
         self.c = nodes @ linear.T + shift - nodes
-        moved = np.linalg.norm(before @ linear.T + shift - before, axis=1)
-        self.say(f"{kind} start: correlation {likeness:.2f}, displacements of {moved.mean():.2f} mm on average, {moved.max():.2f} at most")
 
     def refine(self) -> None:
         """Fit from coarse to fine with weights that do not depend on the data."""
         for k, stride in enumerate(self.strides):
-            if 0 < k < 3:
+            if 0 < k <= HALVINGS:
                 self.c, self.grid = self.grid.refined(self.c), self.grid.halved()
             if k == 0 or stride != self.strides[k - 1]:
-                level = self.level(stride)
+                level = self.level(stride, self.settings.smoothing_voxels)
             system = SplineSystem(level, self.grid, self.ratio)
-            self.fit = Correlation(level, system, self.how(k))
-            self.bending, self.swelling = self.weights(system, STIFFER[k])
-            self.c = self.fit.iterate(
-                self.c, self.bending, self.swelling * system.watched, Iterations(STEPS[k], constrained=CONSTRAINED[k])
-            )
-            self.say(
-                f"cells of {self.grid.step_mm.mean():.1f} mm, voxels of {level.spacing.mean():.1f} mm: residual {self.fit.scatter:.4g}"
+            self.fit = CorrelationFit(level, system, self.comparison(k))
+            self.bending, self.dilatation = self.weights(system, LEVELS[k].bending)
+            iterations = Iterations(LEVELS[k].steps, anchoring=LEVELS[k].anchoring)
+            self.c = self.fit.iterate(self.c, self.bending, self.dilatation * system.gauss_volume, iterations)
+            report_progress(
+                self.progress, "coarse-to-fine correlation", done=k + 1, total=len(self.strides), objective=self.fit.residual_sd
             )
 
-    def find_bodies(self, stiff_mask: ArrayLike | None) -> None:
-        """Find bodies that are rigid and let them be so."""
-        if not self.settings.stiff_bodies:
+    def find_inclusions(self, rigid_mask: ArrayLike | None) -> None:
+        """Find the inclusions that move rigidly, and give each a rigid motion."""
+        if not self.settings.rigid_inclusions:
             return
         size = float(self.step.mean())
-        found = enclosed_bodies(self.volume, self.mask, size) if stiff_mask is None else _numbered(stiff_mask, self.volume)
+        found = inclusion_candidates(self.volume, self.mask, size) if rigid_mask is None else _labelled(rigid_mask, self.volume)
         labels = np.where(self.mask, found, 0).astype(np.int32)
         if not labels.any():
             return
-        level = self.level((1, 1, 1), BODY_SMOOTHING)
-        self.bodies = rigid_among(self.fit, labels, level, asked=stiff_mask is not None, least_mm3=3.0 * size**3, say=self.say)
-        self.fit.bodies = self.bodies
+        level, given = self.level((1, 1, 1), INCLUSION_SMOOTHING), rigid_mask is not None
+        least = LEAST_VOLUME * size**3
+        self.inclusions = rigid_inclusions_among(self.fit, labels, level, given=given, least_mm3=least, progress=self.progress)
+        self.fit.inclusions = self.inclusions
 
     def adapt(self) -> None:
-        """Choose the weights by the data and fit once more."""
-        fit, system = self.fit, self.fit.system
-        if self.bodies:
-            self.c = fit.iterate(self.c, self.bending, self.swelling * system.watched, Iterations(3))
-        if not self.settings.adaptive_weight:
+        """Choose the weights of the penalties by the data, and fit once more."""
+        fit, system, s = self.fit, self.fit.system, self.settings
+        if self.inclusions:
+            self.c = fit.iterate(self.c, self.bending, self.dilatation * system.gauss_volume, Iterations(INCLUSION_STEPS))
+        if not s.adaptive_weight:
             return
-        kinds, width = _kinds(fit, self.bodies), WINDOW * float(self.step.mean())
-        most = self.swelling / (FIRST * self.swells)
-        for _ in range(ROUNDS):
-            samples = fit.samples(self.c, self.bending, self.swelling * system.watched, ADAPT_SAMPLES, None, SEED)
-            self.bending, swelling = chosen_weights(fit, samples, self.c, self.bending, self.swelling, width, kinds)
-            before = self.swelling
-            if self.settings.volume_term:
+        kinds, width = _kinds(fit, self.inclusions), WEIGHT_WINDOW * float(self.step.mean())
+        most = self.dilatation / (FIRST_DILATATION * self.dilatation_factor)
+        for k in range(ADAPTATIONS):
+            report_progress(self.progress, "weights of the penalties", done=k, total=ADAPTATIONS)
+            samples = fit.samples(self.c, self.bending, self.dilatation * system.gauss_volume, ADAPTATION_SAMPLES, None, s.seed)
+            self.bending, dilatation = chosen_weights(fit, samples, self.c, self.bending, self.dilatation, width, kinds)
+            before = self.dilatation
+            if s.dilatation_penalty:
                 # never more than assumed: what little volume changes may not be noise alone
-                self.swelling = float(np.clip(swelling, 1e-3 * before, most))
-            self.say(f"weights: bending {np.median(self.bending):.3g} (median), volume {self.swelling:.3g}")
-            self.c = fit.iterate(self.c, self.bending, self.swelling * system.watched, Iterations(5))
-            # a field that was held back too much shows only in part how much volume changes
-            if self.swelling > 0.5 * before:
+                self.dilatation = float(np.clip(dilatation, LEAST_WEIGHT * before, most))
+            self.c = fit.iterate(self.c, self.bending, self.dilatation * system.gauss_volume, Iterations(ADAPTED_STEPS))
+            # a field that was penalised too much shows only in part how much volume changes
+            if self.dilatation > 0.5 * before:
                 break
 
     def result(self) -> CorrelationResult:
-        """Draw the covariance and put everything together."""
+        """Draw the covariance, and return the result."""
+        report_progress(self.progress, "covariance")
         fit, system = self.fit, self.fit.system
-        volume = self.swelling * system.watched
+        dilatation = self.dilatation * system.gauss_volume
         fit.compare(self.c)
-        fit.system.assembled(self.c, fit.products, fit.force, self.bending, volume)
+        fit.system.assembled(self.c, fit.products, fit.force, self.bending, dilatation)
         if fit.seen.mean() < LEAST_OVERLAP:
             raise InputError(
-                f"only {fit.seen.mean():.1%} of the object lies in the deformed volume after its motion: the scans do not overlap, or are "
-                "not of one object"
+                f"only {fit.seen.mean():.1%} of the object lies in the deformed volume after its motion: the volumes do not overlap, or do "
+                "not show the same object"
             )
-        for body in self.bodies:
-            body.draws.clear()
+        for inclusion in self.inclusions:
+            inclusion.draws.clear()
         noise = ResidualNoise(fit.level.mask, fit.residual * np.sqrt(fit.weight), _lost_to_robustness(fit))
-        samples = fit.samples(self.c, self.bending, volume, self.settings.samples, noise, SEED + 1)
-        return collected(self.volume, self.mask, fit, self.c, samples, self.bending, self.swelling)
-
-
-def _silent(_: str) -> None:
-    pass
-
-
-def _check(settings: CorrelationSettings) -> None:
-    s = settings
-    if s.slopes not in SLOPE_SHARE:
-        raise InputError(f"slopes must be one of {', '.join(SLOPE_SHARE)}, not {s.slopes!r}")
-    if s.node_spacing_mm is not None and not (np.isfinite(s.node_spacing_mm) and s.node_spacing_mm > 0.0):
-        raise InputError(f"node_spacing_mm must be positive, not {s.node_spacing_mm}")
-    if not s.robust > 0.0:
-        raise InputError(f"robust must be positive, a multiple of the scatter, not {s.robust}")
-    if s.samples < 8:
-        raise InputError(f"a covariance needs 8 samples or more, not {s.samples}")
-    if not s.place_voxels >= 0.0:
-        raise InputError(f"place_voxels must be 0 or more, not {s.place_voxels}")
+        samples = fit.samples(self.c, self.bending, dilatation, self.settings.samples, noise, self.settings.seed + 1)
+        return collected(self.volume, self.mask, fit, self.c, samples, self.bending, self.dilatation)
 
 
 def _checked_pair(reference: Volume, deformed: Volume) -> tuple[Float32Array, Float32Array]:
@@ -312,13 +276,15 @@ def _checked_pair(reference: Volume, deformed: Volume) -> tuple[Float32Array, Fl
         if min(volume.shape) < LEAST_SIZE:
             raise InputError(
                 f"the {name} volume has {' x '.join(map(str, volume.shape[::-1]))} voxels; volume correlation needs {LEAST_SIZE} or more "
-                "along every axis. For an image or a few slices use naibu.imaging.dense_matching.optical_flow.lucas_kanade"
+                "along every axis. For an image or a few slices use naibu.imaging.lucas_kanade"
             )
-    before, after = grey_pair(*(v.with_values(np.asarray(v.values, dtype=np.float32)) for v in (reference, deformed)))
+    before, after = intensity_pair(*(v.with_values(np.asarray(v.values, dtype=np.float32)) for v in (reference, deformed)))
     for name, values in (("reference", before), ("deformed", after)):
         if np.isnan(values).any():
             bad = tuple(int(i) for i in np.argwhere(np.isnan(values))[0])
-            raise InputError(f"voxel {bad} (z, y, x) of the {name} volume is NaN; crop the volumes, or fill what is unknown with air")
+            raise InputError(
+                f"voxel {bad} (z, y, x) of the {name} volume is NaN; crop the volumes, or fill unknown voxels with the intensity of air"
+            )
     return before, after
 
 
@@ -327,52 +293,52 @@ def _step(settings: CorrelationSettings, mask: BoolArray, spacing: FloatArray) -
     if settings.node_spacing_mm is not None:
         return np.full(3, float(settings.node_spacing_mm))
     voxel = float(np.prod(spacing))
-    h = max((float(mask.sum()) * voxel) ** (1 / 3) / CELLS_ALONG, LEAST_VOXELS * voxel ** (1 / 3))
-    return np.asarray(np.maximum(h, LEAST_VOXELS_ALONG * spacing))
+    h = max((float(mask.sum()) * voxel) ** (1 / 3) / settings.cells_along, settings.voxels_per_cell * voxel ** (1 / 3))
+    return np.asarray(np.maximum(h, VOXELS_PER_LONG_CELL * spacing))
 
 
 def _stride(step: FloatArray, spacing: FloatArray, part: int) -> tuple[int, ...]:
-    """Return how many voxels along x, y, z to go so that `part` of those taken lie along a cell."""
+    """Return the stride of voxels along x, y, z with which `part` of them lie along a cell."""
     return tuple(int(n) for n in np.maximum(np.round(step / part / spacing), 1))
 
 
 def _strides(step: FloatArray, spacing: FloatArray) -> list[tuple[int, ...]]:
     """Return the strides of all levels, the last of which takes every voxel."""
-    fine = [_stride(step, spacing, part) for part in PARTS]
+    fine = [_stride(step, spacing, level.voxels_per_cell) for level in LEVELS[:-1]]
     return fine if max(fine[-1]) == 1 else [*fine, (1, 1, 1)]
 
 
-def _numbered(stiff_mask: ArrayLike, volume: Volume) -> Int32Array:
-    given = np.asarray(stiff_mask)
-    require_mask(given, volume)
+def _labelled(rigid_mask: ArrayLike, volume: Volume) -> Int32Array:
+    given = np.asarray(rigid_mask)
+    require_mask(given, volume, name="rigid_mask")
     if given.dtype.kind == "b":
         return np.asarray(ndimage.label(given)[0], dtype=np.int32)
     if given.dtype.kind not in "iu":
-        raise InputError(f"stiff_mask must be boolean or hold numbers of bodies, not {given.dtype}")
+        raise InputError(f"rigid_mask must be boolean or hold labels of inclusions, not {given.dtype}")
     return given.astype(np.int32)
 
 
-def _kinds(fit: Correlation, bodies: list[StiffBody]) -> IntArray:
-    """Return 0 for soft cells, 1 for those next to a body, 2 for those inside one: they differ too much to share a weight."""
+def _kinds(fit: CorrelationFit, inclusions: list[RigidInclusion]) -> IntArray:
+    """Return 0 for soft cells, 1 for those next to an inclusion, 2 for those inside one: they differ too much to share a weight."""
     system, level = fit.system, fit.level
-    if not bodies:
+    if not inclusions:
         return np.zeros(len(system.cells), np.int64)
-    stiff = np.zeros(len(level.grey))
-    for body in bodies:
-        stiff[body.voxels] = 1
+    rigid = np.zeros(len(level.intensity))
+    for inclusion in inclusions:
+        rigid[inclusion.voxels] = 1
     where = (level.index.astype(np.int64) - level.low[::-1]).T
     at = tuple(system.cell_of[a][where[a]] for a in (2, 1, 0))
     shape = tuple(int(n) for n in system.grid.cells[::-1])
     flat = np.ravel_multi_index(at, shape)
     count = np.bincount(flat, minlength=int(np.prod(shape)))
-    share = (np.bincount(flat, stiff, minlength=len(count)) / np.maximum(count, 1)).reshape(shape)
-    near = ndimage.binary_dilation(share > 0, np.ones((3, 3, 3), dtype=bool))
-    return np.asarray(np.where(share > 0.95, 2, np.where(near, 1, 0))[tuple(system.cells[:, 2:].T)], dtype=np.int64)
+    fraction = (np.bincount(flat, rigid, minlength=len(count)) / np.maximum(count, 1)).reshape(shape)
+    near = ndimage.binary_dilation(fraction > 0, np.ones((3, 3, 3), dtype=bool))
+    return np.asarray(np.where(fraction > 0.95, 2, np.where(near, 1, 0))[tuple(system.cells[:, 2:].T)], dtype=np.int64)
 
 
-def _lost_to_robustness(fit: Correlation) -> float:
-    """Return the ratio of the mean weight to the mean derivative of the robust force: by what the normal matrix is too large."""
+def _lost_to_robustness(fit: CorrelationFit) -> float:
+    """Return the mean weight over the mean derivative of the robust force: the factor by which the normal matrix is too large."""
     w = fit.weight.astype(float)
     # with q = sqrt(w / w at r = 0): the derivative of r q^2 is q^2 (4 q - 3)
-    q = 1 / (1 + (fit.residual.astype(float) / (fit.how.robust * fit.scatter)) ** 2)
+    q = 1 / (1 + (fit.residual.astype(float) / (fit.settings.robust * fit.residual_sd)) ** 2)
     return float(w.sum() / max(float((w * (4 * q - 3)).sum()), 0.2 * float(w.sum())))

@@ -1,4 +1,7 @@
-"""Two scans at one resolution, as volume correlation compares them: voxels of the object, their slopes, and the gain between the scans."""
+"""Resolution level of digital volume correlation: voxels of the object, intensity gradients, gain and offset between the volumes.
+
+Cubic B-spline coefficients come from the prefilter of :cite:t:`unser1999`.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +14,15 @@ from scipy import linalg, ndimage
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray
 from naibu.imaging.volume_correlation._warp_kernels import OUTSIDE, gain_normal_equations, gain_values, sample_spline
 
-MARGIN = 12  # voxels about the object that are kept of the reference
+MARGIN = 12  # voxels about the object that are kept of the reference: the prefilter's response at its edge has died out
+# empirical: bounds of the gain, and prior SD of the local gain (of itself) and offset (of the SD of the intensities)
 GAIN_RANGE = (0.2, 5.0)
-# prior scatter of the gain, of itself, and of the offset, of the scatter of the grey values
-GAIN_SCATTER = 0.1
-ENOUGH = 30000  # voxels for one gain
+GAIN_SD = 0.1
+ENOUGH = 30000  # voxels from which one gain is estimated: its error is then far below that of the intensities
 
 
 class ImageLevel:
-    """Both scans smoothed and thinned out, with the voxels of the object in a list.
+    """Both volumes smoothed and subsampled, with the voxels of the object in a list.
 
     Attributes
     ----------
@@ -30,17 +33,17 @@ class ImageLevel:
     mask : ndarray, bool
         The object in its box.
     number : ndarray, int32
-        Place of every voxel of the box in the list, -1 outside the object.
+        Number of every voxel of the box in the list, -1 outside the object.
     index : ndarray, shape (n, 3), float32
         Indices x, y, z of the listed voxels.
-    grey : ndarray, shape (n,), float32
-        Their grey values in the reference.
-    slope : ndarray, shape (n, 3), float32
-        Slopes of the reference, per mm.
+    intensity : ndarray, shape (n,), float32
+        Their intensities in the reference.
+    gradient : ndarray, shape (n, 3), float32
+        Image intensity gradient of the reference, per mm.
     deformed : ndarray, float32
-        Spline coefficients of the deformed scan, padded.
+        Spline coefficients of the deformed volume, padded.
     runs : ndarray, shape (m, 5), int64
-        Lines of voxels: z, y, first x, x after the last, all in the box, and place in the list.
+        Lines of voxels: z, y, first x, x after the last, all in the box, and number in the list.
     """
 
     def __init__(
@@ -65,10 +68,10 @@ class ImageLevel:
         at = np.argwhere(self.mask)
         self.number[self.mask] = np.arange(len(at))
         self.index = np.ascontiguousarray((at + self.low)[:, ::-1]).astype(np.float32)
-        self.grey = np.ascontiguousarray(before[inner][self.mask])
-        value, slope = np.empty(len(at), np.float32), np.empty((len(at), 3), np.float32)
-        sample_spline(before_spline, self.index - shift[::-1].astype(np.float32), value, slope)
-        self.slope = slope / self.spacing.astype(np.float32)
+        self.intensity = np.ascontiguousarray(before[inner][self.mask])
+        value, gradient = np.empty(len(at), np.float32), np.empty((len(at), 3), np.float32)
+        sample_spline(before_spline, self.index - shift[::-1].astype(np.float32), value, gradient)
+        self.gradient = gradient / self.spacing.astype(np.float32)
         edges = np.diff(np.pad(self.mask.astype(np.int8), ((0, 0), (0, 0), (1, 1))), axis=2)
         first, last = np.argwhere(edges == 1), np.argwhere(edges == -1)
         self.runs = np.column_stack([first, last[:, 2], self.number[tuple(first.T)]]).astype(np.int64)
@@ -86,7 +89,7 @@ def _thinned(values: Float32Array, sigma: FloatArray, thin: tuple[slice, ...]) -
 
 
 class GainMap:
-    """Gain and offset that bring the deformed scan to the grey values of the reference, trilinear on a coarse lattice."""
+    """Gain and offset from intensities of the deformed volume to those of the reference, trilinear on a coarse lattice."""
 
     def __init__(self, level: ImageLevel, cell_mm: float) -> None:
         self.level = level
@@ -95,14 +98,14 @@ class GainMap:
         self.low, self.step = level.low[::-1].astype(float), np.maximum(size - 1, 1) / (self.n - 1)
 
     def everywhere(self, value: Float32Array, weight: Float32Array) -> tuple[float, float, float]:
-        """Return one gain and offset for all, and the scatter of the grey values."""
+        """Return one gain and offset for all voxels, and the SD of the intensities."""
         some = slice(None, None, max(1, len(value) // ENOUGH))
         ok = value[some] > 0.9 * OUTSIDE
-        f, g, w = (np.asarray(v[some][ok], dtype=float) for v in (self.level.grey, value, weight))
+        f, g, w = (np.asarray(v[some][ok], dtype=float) for v in (self.level.intensity, value, weight))
         total = max(float(w.sum()), 1e-30)
         mean_f, mean_g = float(w @ f) / total, float(w @ g) / total
         spread, wanted = float(w @ (g - mean_g) ** 2), float(w @ (f - mean_f) ** 2)
-        # the ratio of scatters: what a regression finds is too small while the scans are not yet in register
+        # the ratio of SDs: the gain of a regression is too small before the volumes are registered
         gain = float(np.clip(np.sqrt(wanted / max(spread, 1e-30)), *GAIN_RANGE))
         return gain, mean_f - gain * mean_g, float(np.sqrt(spread / total))
 
@@ -111,10 +114,10 @@ class GainMap:
         gain, offset, spread = self.everywhere(value, weight)
         n = int(np.prod(self.n))
         left, right = np.zeros((2, 2 * n, 2 * n)), np.zeros((2, 2 * n))
-        gain_normal_equations(self.level.grey, value, weight, self.level.index, self.low, self.step, self.n, left, right)
+        gain_normal_equations(self.level.intensity, value, weight, self.level.index, self.low, self.step, self.n, left, right)
         matrix, load = left.sum(axis=0) / variance, right.sum(axis=0) / variance
         first = np.tile([gain, offset], n)
-        prior = np.tile([(GAIN_SCATTER * gain) ** -2, (GAIN_SCATTER * gain * max(spread, 1e-30)) ** -2], n)
+        prior = np.tile([(GAIN_SD * gain) ** -2, (GAIN_SD * gain * max(spread, 1e-30)) ** -2], n)
         solution = first + linalg.solve(matrix + np.diag(prior), load - matrix @ first, assume_a="pos")
         a, b = np.empty(len(value), np.float32), np.empty(len(value), np.float32)
         gain_values(solution, self.level.index, self.low, self.step, self.n, a, b)

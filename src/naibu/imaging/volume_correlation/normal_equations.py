@@ -1,4 +1,7 @@
-"""The normal equations of volume correlation: their assembly, solution, and random samples of what the data leave open."""
+"""Normal equations of global digital volume correlation: assembly, solution by conjugate gradients, random samples of the error.
+
+Samples are drawn by perturbing data and penalties, and solving :cite:p:`papandreou2010`.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +13,15 @@ from naibu.imaging.volume_correlation._warp_kernels import warp_voxels
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable
 
-INSIDE = 0.5  # share of a cell that must lie in the object for its volume to be watched
-REACH = 7
-APART = 3
+INSIDE = 0.5  # fraction of a cell in the object above which its dilatation is penalised
+REACH = 7  # nodes along an axis with which a cubic B-spline overlaps
+APART = 3  # rows of cells that share nodes with one row
 
 
 class SplineSystem:
-    """Equations for the coefficients of a grid of splines, from the voxels of a level.
+    """Normal equations of the coefficients of a spline grid, from the voxels of a level.
 
-    Only cells with voxels of the object count, and only coefficients those see are unknown.
+    Cells without voxels of the object are left out, and only the coefficients of the other cells are unknown.
 
     Attributes
     ----------
@@ -27,13 +30,13 @@ class SplineSystem:
     active : ndarray, shape (NZ, NY, NX), bool
         Which coefficients are unknown; n of them.
     cells : ndarray, shape (m, 5), int64
-        First and last cell of the task of that number, and z, y, x of the cell.
-    share : ndarray, shape (m,)
-        Share of the cell that lies in the object.
-    bent, swollen : ndarray, shape (m, 3) and (m,)
-        Energies of the field per unit weight, after `assembled`.
+        First cell, and the one after the last, of the task of that number; z, y, x of the cell.
+    fraction : ndarray, shape (m,)
+        Fraction of the cell that lies in the object.
+    bending_energy, dilatation_energy : ndarray, shape (m, 3) and (m,)
+        Twice the penalties of the field per unit weight, after `assembled`.
     ratio : float
-        Volume after to volume before, from which changes of volume count.
+        Ratio of the deformed to the reference volume at which the dilatation penalty vanishes.
     """
 
     def __init__(self, level: ImageLevel, grid: SplineGrid, ratio: float = 1.0) -> None:
@@ -42,24 +45,24 @@ class SplineSystem:
         tables = [[grid.table(a, level.axes_mm[a], d) for d in (0, 1)] for a in range(3)]
         self.cell_of = tuple(t[0][0] for t in tables)
         self.weights = tuple(np.ascontiguousarray(t[0][1], dtype=np.float32) for t in tables)
-        self.slopes = tuple(np.ascontiguousarray(t[1][1], dtype=np.float32) for t in tables)
+        self.derivatives = tuple(np.ascontiguousarray(t[1][1], dtype=np.float32) for t in tables)
         self.starts = tuple(np.searchsorted(c, np.arange(n + 1)).astype(np.int64) for c, n in zip(self.cell_of, grid.cells, strict=True))
         self._order_cells()
         self._number_nodes()
         bending = grid.bending()
         values, vectors = np.linalg.eigh(bending)
         self.stiffness, self.root = bending.astype(np.float32), (vectors * np.sqrt(np.maximum(values, 0))).astype(np.float32)
-        self.gauss = grid.gauss_slopes().astype(np.float32)
+        self.gauss = grid.gauss_gradients().astype(np.float32)
         self.pairs = _pair_numbers()
         # weight of the volume of a Gauss point, mm^3, where the cell lies in the object
-        self.watched = np.where(self.share > INSIDE, np.prod(grid.step_mm) / 8, 0.0)
+        self.gauss_volume = np.where(self.fraction > INSIDE, np.prod(grid.step_mm) / 8, 0.0)
         self.matrix = np.empty((self.n, 3, 3 * REACH**3), np.float32)
-        self.bent, self.swollen = np.zeros((len(self.cells), 3), np.float32), np.zeros(len(self.cells), np.float32)
+        self.bending_energy, self.dilatation_energy = np.zeros((len(self.cells), 3), np.float32), np.zeros(len(self.cells), np.float32)
 
     @property
     def inner(self) -> BoolArray:
         """Which cells (m,) lie in the object; all where none does by more than a half."""
-        inside = self.share > INSIDE
+        inside = self.fraction > INSIDE
         return inside if inside.any() else np.ones_like(inside)
 
     @property
@@ -86,7 +89,7 @@ class SplineSystem:
         self.cells = np.zeros((len(z), 5), np.int64)
         self.cells[: len(first), 0], self.cells[: len(first), 1] = first, np.r_[first[1:], len(z)]
         self.cells[:, 2], self.cells[:, 3], self.cells[:, 4] = z, y, x
-        self.share = count[z, y, x] * np.prod(self.level.spacing / self.grid.step_mm)
+        self.fraction = count[z, y, x] * np.prod(self.level.spacing / self.grid.step_mm)
 
     def _number_nodes(self) -> None:
         self.active = np.zeros(self.grid.shape, dtype=bool)
@@ -110,25 +113,27 @@ class SplineSystem:
         full[self.active] = coefficients
         return self.grid.values(full, self.grid.origin_mm + (self.cells[self.inner][:, :1:-1] + 0.5) * self.grid.step_mm)
 
-    def warped(self, c: FloatArray, value: Float32Array, reference_slope: Float32Array, slope: Float32Array, move: Float32Array) -> None:
-        """Fill what the voxels see where coefficients c (NZ, NY, NX, 3), mm, move them: see `warp_voxels`."""
+    def warped(
+        self, c: FloatArray, value: Float32Array, reference_gradient: Float32Array, gradient: Float32Array, displacement: Float32Array
+    ) -> None:
+        """Fill displacement, intensity and gradients of the voxels at coefficients c (NZ, NY, NX, 3), mm: see `warp_voxels`."""
         level = self.level
         warp_voxels(
-            c.astype(np.float32), level.runs, self.cell_of, self.weights, self.slopes, level.low[::-1].astype(np.float32),
-            (1 / level.spacing).astype(np.float32), level.deformed, level.slope, value, reference_slope, slope, move,
+            c.astype(np.float32), level.runs, self.cell_of, self.weights, self.derivatives, level.low[::-1].astype(np.float32),
+            (1 / level.spacing).astype(np.float32), level.deformed, level.gradient, value, reference_gradient, gradient, displacement,
         )  # fmt: skip
 
     def assembled(
-        self, c: FloatArray, products: Float32Array, force: Float32Array, bending: FloatArray, volume: FloatArray
+        self, c: FloatArray, products: Float32Array, force: Float32Array, bending: FloatArray, dilatation: FloatArray
     ) -> Float32Array:
-        """Make the matrix, and return the right side (n, 3), at coefficients c; bending (m, 3) and volume (m,) are weights of the cells."""
+        """Assemble the matrix, and return the right side (n, 3), at coefficients c; bending (m, 3) and dilatation (m,) are weights."""
         self.matrix[:] = 0
         right = np.zeros((self.n, 3), np.float32)
-        self.bent[:], self.swollen[:] = 0, 0
+        self.bending_energy[:], self.dilatation_energy[:] = 0, 0
         assemble(
             self.matrix, right, self.tasks, self.cells, self.slot, c.astype(np.float32), products, force, self.level.number, self.starts,
-            self.weights, bending.astype(np.float32), self.stiffness, volume.astype(np.float32), self.gauss, self.ratio, self.pairs,
-            self.bent, self.swollen,
+            self.weights, bending.astype(np.float32), self.stiffness, dilatation.astype(np.float32), self.gauss, self.ratio, self.pairs,
+            self.bending_energy, self.dilatation_energy,
         )  # fmt: skip
         middle = 3 * (REACH**3 // 2)
         self.inverse = np.linalg.inv(self.matrix[:, :, middle : middle + 3].astype(float)).astype(np.float32)
@@ -167,24 +172,24 @@ class SplineSystem:
         return x, steps
 
     def noise_loads(
-        self, c: FloatArray, forces: Float32Array, bending: FloatArray, volume: FloatArray, rng: np.random.Generator
+        self, c: FloatArray, forces: Float32Array, bending: FloatArray, dilatation: FloatArray, rng: np.random.Generator
     ) -> Float32Array:
-        """Return loads (n, 3, s) of random residuals, given as forces (voxels, 3, s), and of random draws from the priors."""
+        """Return loads (n, 3, s) of random residuals, given as forces (voxels, 3, s), and of random draws from the penalties."""
         count, m = forces.shape[2], len(self.cells)
         loads = np.zeros((self.n, 3, count), np.float32)
         drawn = rng.standard_normal((m, 3, 64, count), dtype=np.float32) * np.sqrt(bending)[:, :, None, None].astype(np.float32)
         add_noise(
             loads, self.tasks, self.cells, self.slot, c.astype(np.float32), forces, self.level.number, self.starts, self.weights,
-            np.matmul(self.root, drawn), volume.astype(np.float32), self.gauss, rng.standard_normal((m, 8, count), dtype=np.float32),
+            np.matmul(self.root, drawn), dilatation.astype(np.float32), self.gauss, rng.standard_normal((m, 8, count), dtype=np.float32),
         )  # fmt: skip
         return loads
 
     def energies(self, samples: Float32Array, c: FloatArray) -> tuple[Float32Array, Float32Array]:
-        """Return the mean energies (m, 3) and (m,), as `bent` and `swollen`, of samples (n, 3, s) about coefficients c."""
-        bent, swollen = np.zeros_like(self.bent), np.zeros_like(self.swollen)
+        """Return the mean energies (m, 3) and (m,) of samples (n, 3, s) about coefficients c: of bending, and of linear dilatation."""
+        bending_energy, dilatation_energy = np.zeros_like(self.bending_energy), np.zeros_like(self.dilatation_energy)
         x = np.concatenate([samples, np.zeros((1, *samples.shape[1:]), np.float32)])
-        sample_energies(x, self.cells, self.slot, c.astype(np.float32), self.stiffness, self.gauss, bent, swollen)
-        return bent, swollen
+        sample_energies(x, self.cells, self.slot, c.astype(np.float32), self.stiffness, self.gauss, bending_energy, dilatation_energy)
+        return bending_energy, dilatation_energy
 
 
 def _dot(a: Float32Array, b: Float32Array) -> FloatArray:

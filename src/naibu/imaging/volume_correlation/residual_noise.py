@@ -1,4 +1,4 @@
-"""Random residuals that are correlated from voxel to voxel as the measured ones are (behind volume correlation)."""
+"""Random residuals with the spatial autocorrelation of the measured ones, for the covariance of digital volume correlation."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from scipy import fft
 
 from naibu.core.arrays import AnyFloatArray, BoolArray, Float32Array
 
-CORRELATED = 4.0  # voxels over which correlation is believed; beyond it is chance
+CORRELATED = 4.0  # empirical: SD, voxels, of the window on the autocorrelation, whose estimate at larger lags is chance
 
 
 class ResidualNoise:
@@ -20,12 +20,12 @@ class ResidualNoise:
     weighted : ndarray, shape (n,)
         Residuals times the square roots of their weights.
     scale : float
-        By what the noise is larger than they are.
+        Factor on the noise.
 
     Notes
     -----
-    The covariance of a fit whose weights take residuals for independent is ``A^-1 B A^-1``, with B from residuals as they are: smoothing,
-    interpolation and what no model explains make neighbours alike, and B larger than A.
+    The covariance of a fit whose weights take residuals for independent is ``A^-1 B A^-1`` :cite:p:`huber1967`, with B from the residuals
+    as they are: smoothing, interpolation and model errors correlate neighbours, and B is larger than A.
     """
 
     def __init__(self, mask: BoolArray, weighted: Float32Array, scale: float = 1.0) -> None:

@@ -1,4 +1,4 @@
-"""What volume correlation returns: a displacement with its gradient, its covariance, and where it holds (spec S7, S8)."""
+"""Result of digital volume correlation: displacement field, gradient, covariance, convergence."""
 
 from __future__ import annotations
 
@@ -14,18 +14,17 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.resampling import positions
-from naibu.imaging.volume_correlation.gauss_newton import Correlation
-from naibu.imaging.volume_correlation.rigid_inclusions import BodyMotion
+from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
+from naibu.imaging.volume_correlation.rigid_inclusions import InclusionMotion
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable
 
-VOXELS_A_CELL = 6
-# cells: few samples of neighbours are worth more samples of one
-SHARED = 0.7
-STILL = 0.1  # voxels
-# displacement that is missed, of the root mean square second derivative times the square of what is resolved
+VOXELS_PER_CELL = 6  # at which the random fields are evaluated: their covariance varies little within a cell
+SHARED = 0.7  # cells: SD of the window in which cells share their samples
+STILL = 0.1  # voxels: step below which a cell has converged
+# empirical: displacement that is not resolved, of the root mean square second derivative times the square of the resolved length
 UNRESOLVED = 0.055
-SQUARE = 151 / 315  # sum of the squares of a spline along an axis
-LEAST_SHARE = 0.003  # the data of so little are not asked: seven cells is as far as a field is believed to be smooth
+SQUARE = 151 / 315  # integral of the square of a cubic B-spline along an axis, in cells
+LEAST_FRACTION = 0.003  # bounds the resolved length to seven cells
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,24 +37,24 @@ class CorrelationResult:
         At the voxels of the reference; valid in the object, where it lies in the deformed volume after its motion, NaN elsewhere. Its
         covariance is not stored for all voxels: see `covariance`, `covariance_at` and `at_points`.
     grid : SplineGrid
-        Where the coefficients stand, along the axes of the volume.
+        Spline grid, along the axes of the volume.
     coefficients : ndarray, shape (NZ, NY, NX, 3)
-        Of the splines, mm along the axes of the volume.
+        Coefficients of the splines, mm along the axes of the volume.
     cell_covariance : ndarray, shape (CZ, CY, CX, 3, 3)
         Covariance of the displacement in every cell of the grid, mm^2 along x, y, z; NaN where there is no object.
-    bending, swelling : ndarray, shape (CZ, CY, CX, 3), and float
-        Weights that were used: of squared second derivatives per component, 1/mm along the axes of the volume, and of squared change of
-        volume, 1/mm^3; NaN where there is no object.
-    noise : float
-        Standard deviation of the residual, grey values of the reference.
+    bending, dilatation : ndarray, shape (CZ, CY, CX, 3), and float
+        Weights of the penalties: of squared second derivatives, for each component along the axes of the volume, 1/mm, and of the squared
+        dilatation, 1/mm^3; NaN where there is no object.
+    residual_sd : float
+        Standard deviation of the intensity residual, in intensities of the reference.
     gain, offset : ndarray, shape (nz, ny, nx)
-        Which bring the deformed scan to the reference; NaN where it is not valid.
+        Which map intensities of the deformed volume to those of the reference; NaN where the field is not valid.
     converged : ndarray, shape (CZ, CY, CX), bool
         Whether the last step moved a cell of the grid by less than a tenth of a voxel; true where there is no object.
-    bodies : ndarray, shape (nz, ny, nx), int32
-        Number of the rigid body of a voxel, 0 in soft matter.
-    motions : tuple of BodyMotion
-        How the bodies move: their voxels have this displacement, its gradient and its covariance, not those of the splines.
+    inclusions : ndarray, shape (nz, ny, nx), int32
+        Label of the rigid inclusion of a voxel, 0 outside of all.
+    motions : tuple of InclusionMotion
+        Motions of the rigid inclusions: their voxels have this displacement, gradient and covariance, not those of the splines.
     status : str
         How the iterations ended, and where they did not.
     """
@@ -65,13 +64,13 @@ class CorrelationResult:
     coefficients: FloatArray
     cell_covariance: FloatArray
     bending: FloatArray
-    swelling: float
-    noise: float
+    dilatation: float
+    residual_sd: float
     gain: FloatArray
     offset: FloatArray
     converged: BoolArray
-    bodies: Int32Array
-    motions: tuple[BodyMotion, ...]
+    inclusions: Int32Array
+    motions: tuple[InclusionMotion, ...]
     status: str
 
     @property
@@ -86,7 +85,7 @@ class CorrelationResult:
 
     @property
     def unconverged_mm(self) -> FloatArray:
-        """Middles (n, 3), mm, of the cells that were still moving."""
+        """Centres (n, 3), mm, of the cells that have not converged."""
         return _middles_mm(self.grid, self.volume, ~self.converged)
 
     def gradient(self) -> FloatArray:
@@ -102,7 +101,7 @@ class CorrelationResult:
         if not np.array_equal(r, np.eye(3)):
             out = r @ out @ r.T
         for motion in self.motions:
-            out[self.bodies == motion.number] = r @ (motion.transform.rotation - np.eye(3)) @ r.T
+            out[self.inclusions == motion.number] = r @ (motion.transform.rotation - np.eye(3)) @ r.T
         out[~self.valid] = np.nan
         return out
 
@@ -129,13 +128,13 @@ class CorrelationResult:
         return out
 
     def at_points(self, *, step: int | tuple[int, int, int] | None = None) -> DisplacementField:
-        """Return points with displacement and covariance, as identification takes them.
+        """Return the displacement field at listed voxels, with covariance, as identification takes it.
 
         Parameters
         ----------
         step : int or tuple of int, optional
-            Every `step`-th voxel along x, y, z; by default one about every cell of the grid, so that errors of neighbours have little in
-            common.
+            Every `step`-th voxel along x, y, z; by default about one in each cell of the grid, so that errors of neighbours are hardly
+            correlated.
 
         Raises
         ------
@@ -147,26 +146,26 @@ class CorrelationResult:
         else:
             every = np.broadcast_to(np.asarray(step, dtype=int), 3)
         if (every < 1).any():
-            raise InputError(f"step must be 1 or more voxels, not {step}")
+            raise InputError(f"step must be 1 voxel or more, not {step}")
         # start in the middle of the first step, so that both ends are treated alike
         some = np.zeros(self.valid.shape, dtype=bool)
         some[tuple(slice(int(e) // 2, None, int(e)) for e in every[::-1])] = True
         some &= self.valid
         if not some.any():
-            raise InputError(f"no voxel of the object is left at every {every.tolist()}-th voxel; give a smaller step")
+            raise InputError(f"step = {every.tolist()} voxels leaves no voxel of the object; give a smaller step")
         points = positions(self.volume)[some]
         return DisplacementField.from_arrays(points, self.displacement.vectors[some], covariance=self.covariance_at(points))
 
     def _local(self, points_mm: ArrayLike) -> FloatArray:
         return self.volume.to_index(points_mm) * self.volume.spacing_mm
 
-    def _in_bodies(self, local_mm: FloatArray) -> Iterator[tuple[BodyMotion, BoolArray]]:
+    def _in_bodies(self, local_mm: FloatArray) -> Iterator[tuple[InclusionMotion, BoolArray]]:
         if not self.motions:
             return
         at = np.rint(local_mm / self.volume.spacing_mm).astype(int)
         size = np.array(self.volume.shape[::-1])
         x, y, z = np.clip(at, 0, size - 1).T
-        number = np.where(((at >= 0) & (at < size)).all(axis=1), self.bodies[z, y, x], 0)
+        number = np.where(((at >= 0) & (at < size)).all(axis=1), self.inclusions[z, y, x], 0)
         for motion in self.motions:
             yield motion, number == motion.number
 
@@ -198,9 +197,9 @@ class CorrelationResult:
 
 
 def collected(
-    volume: Volume, mask: BoolArray, fit: Correlation, c: FloatArray, samples: Float32Array, bending: FloatArray, swelling: float
+    volume: Volume, mask: BoolArray, fit: CorrelationFit, c: FloatArray, samples: Float32Array, bending: FloatArray, dilatation: float
 ) -> CorrelationResult:
-    """Return the result of a fit at full resolution; `samples` (n, 3, s) are random coefficients about c (behind volume correlation)."""
+    """Return the result of a fit at full resolution; `samples` (n, 3, s) are random coefficients about c."""
     system, level = fit.system, fit.level
     box = tuple(slice(int(a), int(b)) for a, b in zip(level.low, level.high, strict=True))
     valid = np.zeros(volume.shape, dtype=bool)
@@ -209,12 +208,12 @@ def collected(
     valid[box] = inside
     axes = [np.arange(n) * s for n, s in zip(volume.shape[::-1], volume.spacing_mm, strict=True)]
     vectors = separable([system.grid.matrix(a, axes[a]) for a in range(3)], c)
-    bodies = np.zeros(volume.shape, np.int32)
-    motions = tuple(body.motion for body in fit.bodies)
-    for body, motion in zip(fit.bodies, motions, strict=True):
-        x, y, z = level.index[body.voxels].astype(int).T
-        bodies[z, y, x] = body.number
-        vectors[z, y, x] = motion.displacement(body.points)
+    inclusions = np.zeros(volume.shape, np.int32)
+    motions = tuple(inclusion.motion for inclusion in fit.inclusions)
+    for inclusion, motion in zip(fit.inclusions, motions, strict=True):
+        x, y, z = level.index[inclusion.voxels].astype(int).T
+        inclusions[z, y, x] = inclusion.number
+        vectors[z, y, x] = motion.displacement(inclusion.points)
     if not np.array_equal(volume.direction, np.eye(3)):
         vectors = vectors @ volume.direction.T
     vectors[~valid] = np.nan
@@ -229,12 +228,12 @@ def collected(
     converged[tuple(system.cells[system.inner, 2:].T)] = still
     return CorrelationResult(
         DisplacementField.on_grid(volume, vectors, valid=valid), system.grid, c, volume.direction @ covariance @ volume.direction.T,
-        _per_cell(system.grid, fit, bending), swelling, fit.scatter, maps[0], maps[1], converged, bodies, motions,
+        _per_cell(system.grid, fit, bending), dilatation, fit.residual_sd, maps[0], maps[1], converged, inclusions, motions,
         _status(system.grid, volume, converged),
     )  # fmt: skip
 
 
-def sampled_covariance(fit: Correlation, samples: Float32Array) -> FloatArray:
+def sampled_covariance(fit: CorrelationFit, samples: Float32Array) -> FloatArray:
     """Return the mean covariance (m, 3, 3), mm^2 along the axes of the volume, of the voxels of every cell.
 
     Parameters
@@ -261,29 +260,29 @@ def sampled_covariance(fit: Correlation, samples: Float32Array) -> FloatArray:
     return np.asarray((wide[:, 1:] / wide[:, :1]).reshape(-1, 3, 3))
 
 
-def _unresolved(fit: Correlation, c: FloatArray, samples: Float32Array, bending: FloatArray) -> FloatArray:
-    """Return the variance (m,), mm^2, of what the field does not follow, being finer than the data resolve.
+def _unresolved(fit: CorrelationFit, c: FloatArray, samples: Float32Array, bending: FloatArray) -> FloatArray:
+    """Return the variance (m,), mm^2, of displacement that is finer than the data resolve.
 
     Notes
     -----
-    Where the data make up a share s of the stiffness of a coefficient, theirs and that of bending, they resolve lengths of about
-    ``h s^(-1/3)``. What is finer is missed: the second derivative of the field, as likely as the samples say, times the square of that
+    Where the data are a fraction s of the stiffness of a coefficient, the rest being the bending penalty, they resolve lengths of about
+    ``h s^(-1/3)``. What is finer is missed: the root mean square second derivative, from field and samples, times the square of that
     length.
     """
     system = fit.system
     h = float(np.prod(system.grid.step_mm) ** (1 / 3))
-    likely = (system.bent + system.energies(samples, c)[0]).astype(float).mean(axis=1) / h**3
+    likely = (system.bending_energy + system.energies(samples, c)[0]).astype(float).mean(axis=1) / h**3
     cell, _ = cells_of_voxels(fit)
     known = np.bincount(cell, fit.products[:, [0, 3, 5]].sum(axis=1) / 3, minlength=len(system.cells))
     dense = np.zeros((*(int(n) for n in system.grid.cells[::-1]), 2))
     at = tuple(system.cells[:, 2:].T)
     dense[at] = np.stack([SQUARE**3 * known, bending.mean(axis=1) * float(np.trace(system.stiffness))], axis=-1)
     wide = ndimage.gaussian_filter(dense, (SHARED, SHARED, SHARED, 0), mode="constant", truncate=3.0)[at]
-    share = np.clip(wide[:, 0] / wide.sum(axis=1), LEAST_SHARE, 1.0)
-    return np.asarray((UNRESOLVED * h**2) ** 2 * share ** (-4 / 3) * likely)
+    fraction = np.clip(wide[:, 0] / wide.sum(axis=1), LEAST_FRACTION, 1.0)
+    return np.asarray((UNRESOLVED * h**2) ** 2 * fraction ** (-4 / 3) * likely)
 
 
-def cells_of_voxels(fit: Correlation) -> tuple[IntArray, IntArray]:
+def cells_of_voxels(fit: CorrelationFit) -> tuple[IntArray, IntArray]:
     """Return the cell of every listed voxel (n,), and the number of voxels of every cell (m,)."""
     system, level = fit.system, fit.level
     where = (level.index.astype(np.int64) - level.low[::-1]).T
@@ -293,20 +292,20 @@ def cells_of_voxels(fit: Correlation) -> tuple[IntArray, IntArray]:
     return of, np.bincount(of, minlength=len(system.cells))
 
 
-def _some_voxels(fit: Correlation) -> tuple[IntArray, IntArray]:
+def _some_voxels(fit: CorrelationFit) -> tuple[IntArray, IntArray]:
     """Return cells and listed voxels, a few of them spread over every cell."""
     of, count = cells_of_voxels(fit)
     order = np.argsort(of, kind="stable")
     first = np.cumsum(count) - count
     rank = np.arange(len(of)) - first[of[order]]
     # voxels in the middles of so many equal stretches of the cell's list
-    n = np.minimum(count, VOXELS_A_CELL)[of[order]]
+    n = np.minimum(count, VOXELS_PER_CELL)[of[order]]
     size = count[of[order]]
     chosen = (rank * n) // size != ((rank - 1) * n) // size
     return of[order][chosen], order[chosen]
 
 
-def _per_cell(grid: SplineGrid, fit: Correlation, values: FloatArray) -> FloatArray:
+def _per_cell(grid: SplineGrid, fit: CorrelationFit, values: FloatArray) -> FloatArray:
     out = np.full((*(int(n) for n in grid.cells[::-1]), *values.shape[1:]), np.nan)
     out[tuple(fit.system.cells[:, 2:].T)] = values
     return out
@@ -323,4 +322,4 @@ def _status(grid: SplineGrid, volume: Volume, converged: BoolArray) -> str:
         return "converged: no cell moved by more than a tenth of a voxel in the last step"
     at = _middles_mm(grid, volume, ~converged)
     low, high = np.round(at.min(axis=0), 1).tolist(), np.round(at.max(axis=0), 1).tolist()
-    return f"{len(at)} cells were still moving in the last step, between {low} and {high} mm: see unconverged_mm"
+    return f"not converged in {len(at)} cells, between {low} and {high} mm: see unconverged_mm"

@@ -1,4 +1,4 @@
-"""A grid of cubic B-splines on which a displacement field stands, and its matrices (behind volume correlation)."""
+"""Tensor-product cubic B-splines on a grid: values, derivatives, refinement, bending energy :cite:p:`unser1999,rueckert1999`."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from numpy.typing import ArrayLike
 
 from naibu.core.arrays import AnyFloatArray, FloatArray, IntArray
 
+# Gauss-Legendre points of two-point quadrature on [0, 1]
 GAUSS = np.array([0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SplineGrid:
-    """Cells of equal size; coefficients (NZ, NY, NX, 3) of cubic B-splines stand at their corners and one row beyond.
+    """Grid of equal cells; coefficients (NZ, NY, NX, 3) of cubic B-splines belong to their corners and one row beyond.
 
     Attributes
     ----------
@@ -48,7 +49,7 @@ class SplineGrid:
 
     @property
     def nodes_mm(self) -> FloatArray:
-        """Where the coefficients stand (NZ, NY, NX, 3), mm, along x, y, z."""
+        """Positions of the coefficients (NZ, NY, NX, 3), mm, along x, y, z."""
         x, y, z = (self.origin_mm[a] + self.step_mm[a] * (np.arange(self.cells[a] + 3) - 1) for a in range(3))
         grid = np.meshgrid(z, y, x, indexing="ij")
         return np.stack(grid[::-1], axis=-1)
@@ -112,8 +113,8 @@ class SplineGrid:
                 total += count * np.einsum("ab,cd,ef->acebdf", parts[2][dz], parts[1][dy], parts[0][dx]).reshape(64, 64)
         return total
 
-    def gauss_slopes(self) -> FloatArray:
-        """Return the slopes (8, 3, 64), 1/mm, of the splines of a cell at its Gauss points."""
+    def gauss_gradients(self) -> FloatArray:
+        """Return the gradients (8, 3, 64), 1/mm, of the splines of a cell at its Gauss points."""
         t = [[self.table(a, self.origin_mm[a] + self.step_mm[a] * GAUSS, d)[1] for d in (0, 1)] for a in range(3)]
         out = np.empty((8, 3, 64))
         for q in range(8):

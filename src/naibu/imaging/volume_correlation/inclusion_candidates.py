@@ -1,0 +1,105 @@
+"""Candidates for rigid inclusions: regions that a dark rim encloses, such as bones in magnetic resonance images.
+
+Morphological opening and closing by thresholds of Euclidean distance transforms :cite:p:`serra1982`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from naibu.core.arrays import BoolArray, FloatArray, Int32Array
+from naibu.core.volume import Volume
+
+# rims are thin and broken: candidates are found at each of these thresholds, between the intensity of air (0) and of the object (1), and
+# closing radii, in units of the size; what enough of the nine find is kept. Empirical, as are all lengths here, in units of the size.
+DARK = (0.5, 0.6, 0.7)
+CLOSING = (0.0, 0.3, 0.5)
+VOTES = 3
+LARGEST_AREA = 25.0  # enclosed in a slice, in squares of the size
+LEAST_VOLUME = 3.0  # in cubes of the size
+DEPTH, OPENING = 0.47, 0.31
+
+
+def inclusion_candidates(volume: Volume, mask: BoolArray, size_mm: float) -> Int32Array:
+    """Return labels of regions that a dark rim encloses: candidates for rigid inclusions.
+
+    Parameters
+    ----------
+    volume : Volume
+        The reference.
+    mask : ndarray, shape (nz, ny, nx), bool
+        The object.
+    size_mm : float
+        Size of the smallest inclusion: it is thicker than about half of it, lies deeper than that in the object, and has the volume of
+        three cubes of it.
+
+    Returns
+    -------
+    ndarray, shape (nz, ny, nx), int32
+        Label of every voxel from 1, 0 outside of all candidates.
+    """
+    spacing = volume.spacing_mm[::-1]
+    smooth = ndimage.gaussian_filter(np.asarray(volume.values, dtype=np.float32), 0.5)
+    out = np.zeros(volume.shape, np.int32)
+    if mask.all():
+        return out
+    air = float(np.median(smooth[~mask]))
+    tissue = float(np.median(smooth[mask]))
+    where = np.argwhere(mask)
+    box = tuple(slice(int(a), int(b)) for a, b in zip(where.min(axis=0), where.max(axis=0) + 1, strict=True))
+    smooth, inside = smooth[box], mask[box]
+    # the object goes on beyond the faces of the volume that it touches
+    rim = [(int(w.start > 0), int(w.stop < n)) for w, n in zip(box, volume.shape, strict=True)]
+    cut = tuple(slice(a, a + n) for (a, _), n in zip(rim, inside.shape, strict=True))
+    depth = ndimage.distance_transform_edt(np.pad(inside, rim), sampling=spacing)[cut]
+    deep = depth > DEPTH * size_mm
+    votes = np.zeros(inside.shape, np.int8)
+    for level in DARK:
+        dark = (smooth < air + level * (tissue - air)) & deep
+        for radius in CLOSING:
+            votes += _filled(_closed(dark, spacing, radius * size_mm) if radius else dark, spacing, LARGEST_AREA * size_mm**2)
+    filled = votes >= VOTES
+    inclusions = _opened(filled, spacing, OPENING * size_mm) & filled
+    labels, n = ndimage.label(inclusions)
+    big = np.bincount(labels.ravel(), minlength=n + 1) * np.prod(spacing) > LEAST_VOLUME * size_mm**3
+    big[0] = False
+    number = np.cumsum(big) * big
+    out[box] = number[labels]
+    return out
+
+
+def _closed(found: BoolArray, spacing: FloatArray, radius: float) -> BoolArray:
+    pad = [int(radius // s) + 1 for s in spacing]
+    wide = np.pad(found, [(p, p) for p in pad], mode="edge")
+    if not wide.any():
+        return found
+    grown = ndimage.distance_transform_edt(~wide, sampling=spacing) <= radius
+    shrunk = ndimage.distance_transform_edt(grown, sampling=spacing) > radius
+    return np.asarray(shrunk[tuple(slice(p, -p) for p in pad)])
+
+
+def _filled(found: BoolArray, spacing: FloatArray, largest: float) -> BoolArray:
+    """Return a region with its holes filled in slices across any axis, if they are no larger than an area, mm^2."""
+    out = found.copy()
+    for axis in range(3):
+        area = float(np.prod(np.delete(spacing, axis)))
+        for page, solid in zip(np.moveaxis(out, axis, 0), np.moveaxis(found, axis, 0), strict=True):
+            if not solid.any():
+                continue
+            holes, n = ndimage.label(ndimage.binary_fill_holes(solid) & ~solid)
+            if n:
+                small = np.bincount(holes.ravel()) * area <= largest
+                small[0] = False
+                page |= small[holes]
+    return out
+
+
+def _opened(found: BoolArray, spacing: FloatArray, radius: float) -> BoolArray:
+    pad = [int(radius // s) + 1 for s in spacing]
+    wide = np.pad(found, [(p, p) for p in pad], mode="edge")
+    core = ndimage.distance_transform_edt(wide, sampling=spacing) > radius
+    if not core.any():
+        return np.zeros_like(found)
+    grown = ndimage.distance_transform_edt(~core, sampling=spacing) <= radius
+    return np.asarray(grown[tuple(slice(p, -p) for p in pad)])

@@ -1,0 +1,126 @@
+"""Intensity residuals of digital volume correlation: warping, gain and offset, robust weights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from naibu.core.arrays import BoolArray, Float32Array
+from naibu.imaging.volume_correlation._warp_kernels import OUTSIDE, weighted_residuals
+from naibu.imaging.volume_correlation.image_level import GainMap, ImageLevel
+
+MAD = 1.4826  # standard deviation of a normal distribution, in median absolute deviations
+LEAST_AGREEMENT = 0.01  # lower bound of a weight, which keeps the normal matrix regular where the gradients do not agree at all
+ROUNDING = 1e-6  # least residual SD, of the intensity range: identical volumes would divide by zero
+
+
+@dataclass(frozen=True, slots=True)
+class ComparisonSettings:
+    """How the intensities of two volumes are compared on one resolution level.
+
+    Attributes
+    ----------
+    robust : float
+        Residual, in residual standard deviations, at which the weight of a voxel has fallen to a quarter; inf for least squares.
+    jitter_sd_voxels : float
+        Standard deviation of the sub-voxel jitter, voxels.
+    reference_fraction : float
+        Fraction of the image intensity gradient that is taken from the reference; the rest from the deformed volume.
+    gain_cell_mm : float
+        Cell size of the lattice of local gain, mm; 0 for one gain.
+    agreement_window_mm : float
+        Standard deviation of the window in which the gradients of both volumes are compared, mm; 0 to weight no voxel by it.
+    far : bool
+        Whether the volumes are far from registered: the residual SD is then that of all residuals, those at edges included.
+    """
+
+    robust: float
+    jitter_sd_voxels: float
+    reference_fraction: float
+    gain_cell_mm: float
+    agreement_window_mm: float = 0.0
+    far: bool = False
+
+
+class IntensityComparison:
+    """Residuals of the listed voxels of a level, and their contributions to the normal equations.
+
+    Attributes
+    ----------
+    value, residual, weight : ndarray, shape (n,), float32
+        Intensity of the deformed volume at the displaced voxels, residual, and its weight (inverse variance times robust weight).
+    reference_gradient, gradient : ndarray, shape (n, 3), float32
+        Image intensity gradient of the reference, pushed forward, and the one that is used, per mm.
+    displacement, force : ndarray, shape (n, 3), float32
+        Displacement, mm, and weight times residual times gradient.
+    products : ndarray, shape (n, 6), float32
+        Weight times products xx, xy, xz, yy, yz, zz of the gradient.
+    gain, offset : ndarray, shape (n,), float32
+        Which map intensities of the deformed volume to those of the reference.
+    residual_sd : float
+        Standard deviation of the residual, robust once the volumes are nearly registered.
+    """
+
+    def __init__(self, level: ImageLevel, settings: ComparisonSettings) -> None:
+        self.level, self.settings = level, settings
+        n = len(level.intensity)
+        self.value, self.residual, self.weight = (np.zeros(n, np.float32) for _ in range(3))
+        self.reference_gradient, self.gradient, self.displacement, self.force = (np.zeros((n, 3), np.float32) for _ in range(4))
+        self.products, self.agreement = np.zeros((n, 6), np.float32), np.zeros((n, 2), np.float32)
+        self.gain, self.offset = np.ones(n, np.float32), np.zeros(n, np.float32)
+        self.robust_weight, self.residual_sd = np.ones(n, np.float32), 0.0
+
+    @property
+    def seen(self) -> BoolArray:
+        """Which displaced voxels lie in the deformed volume (n,)."""
+        return np.asarray(self.value > 0.9 * OUTSIDE)
+
+    def weigh(self) -> None:
+        """Match gain and offset, and weight the residuals at the present displacement."""
+        seen, gain = self.seen, GainMap(self.level, self.settings.gain_cell_mm or 1.0)
+        if self.residual_sd == 0.0:
+            self.gain[:], self.offset[:], _ = gain.everywhere(self.value, self.robust_weight)
+            self._update_residual_sd(seen)
+        if self.settings.gain_cell_mm:
+            self.gain, self.offset = gain.local(self.value, self.robust_weight, self.residual_sd**2)
+        self._update_residual_sd(seen)
+        s = self.settings
+        scalars = np.array(
+            [self.residual_sd**-2, (s.jitter_sd_voxels * self.level.spacing.mean()) ** 2, s.robust**-2, s.reference_fraction]
+        )
+        weighted_residuals(
+            self.level.intensity, self.value, self.gain, self.offset, self.reference_gradient, self.gradient, scalars.astype(np.float32),
+            self.products, self.force, self.weight, self.residual, self.agreement,
+        )  # fmt: skip
+        if s.agreement_window_mm:
+            self._weigh_by_agreement()
+
+    def anchor(self, first: Float32Array, fraction: float) -> None:
+        """Add springs to displacements `first` (n, 3), mm, of a fraction of the mean stiffness that the intensities give."""
+        diagonal = self.products[:, [0, 3, 5]]
+        strength = np.float32(fraction * diagonal[self.seen].sum(axis=1).mean() / 3)
+        for k in (0, 3, 5):
+            self.products[:, k] += strength
+        self.force -= strength * (self.displacement - first)
+
+    def _weigh_by_agreement(self) -> None:
+        """Multiply weights by the local correlation of the gradients of both volumes, which is low where they are mostly noise."""
+        both = []
+        for k in range(2):
+            box = np.zeros(self.level.mask.shape, np.float32)
+            box[self.level.mask] = self.agreement[:, k]
+            wide = ndimage.gaussian_filter(box, self.settings.agreement_window_mm / self.level.spacing[::-1], mode="constant", truncate=2.5)
+            both.append(wide[self.level.mask])
+        agreement = np.clip(both[0] / np.maximum(both[1], 1e-30), LEAST_AGREEMENT, 1.0)
+        for values in (self.products, self.force):
+            values *= agreement[:, None]
+        self.weight *= agreement
+
+    def _update_residual_sd(self, seen: BoolArray) -> None:
+        r = np.where(seen, self.level.intensity - self.gain * self.value - self.offset, 0)
+        rest = r[seen] if seen.any() else self.level.intensity
+        spread = float(np.sqrt(np.mean(rest**2))) if self.settings.far else MAD * float(np.median(np.abs(rest)))
+        self.residual_sd = max(spread, ROUNDING * float(np.ptp(self.level.intensity)))
+        self.robust_weight = np.where(seen, 1 / (1 + (r / (self.settings.robust * self.residual_sd)) ** 2) ** 2, 0).astype(np.float32)
