@@ -1,10 +1,10 @@
 """
-Identify a pressed gel, and predict it pressed further
-======================================================
+Identify a compressed gel, and predict further compression
+==========================================================
 
-A gel cube with 125 markers inside was measured by CT under a plate at two heights. Its friction, its Poisson's ratio and the true height
-and tilt of the plate are identified from the first height alone; the markers at the second are then predicted. Coarse elements keep this
-quick; leave ``settings`` out for the best result.
+A gel cube with 125 markers inside was measured by CT under a plate at two heights. Friction, Poisson's ratio and the true height and tilt
+of the plate are identified from the first height alone; the marker positions at the second are then predicted. Coarse elements keep this
+quick; omit ``settings`` for the best result.
 """
 
 import matplotlib.pyplot as plt
@@ -21,7 +21,7 @@ for parameter in found.model.parameters.free:
     print(f"{parameter.name}: {parameter.value:.4g}, 95 % from {low:.4g} to {high:.4g} {parameter.unit}")
 
 # %%
-# How far the markers moved, and how far the prediction misses them. The wider the marker, the less sure the model says it is.
+# Prediction error against displacement of the markers. The size of a symbol is the predicted standard deviation.
 
 free, measured = unseen.specimen.marker_points, unseen.measured_in_object
 moved = np.linalg.norm(measured - free, axis=1)
@@ -29,9 +29,9 @@ missed = np.linalg.norm(unseen.residual, axis=1)
 
 figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
 drawn = axes.scatter(moved, missed, s=200.0 * unseen.sd_mm, c=free[:, 2], cmap="viridis")
-axes.set_xlabel("distance the marker moved, mm")
-axes.set_ylabel("distance to its prediction, mm")
+axes.set_xlabel("displacement of the marker, mm")
+axes.set_ylabel("prediction error, mm")
 axes.set_ylim(bottom=0.0)
 axes.set_title(f"ct_cube_plate at 35 mm, predicted from 45 mm: {np.sqrt(np.nanmean(missed**2)):.2f} mm RMS")
-figure.colorbar(drawn, label="height in the free cube, mm")
+figure.colorbar(drawn, label="height in the undeformed cube, mm")
 plt.show()

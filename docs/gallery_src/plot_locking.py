@@ -29,11 +29,11 @@ SIDE_MM, COMPRESSION = 40.0, 0.15
 
 
 # %%
-# A block between plates that stick
-# ---------------------------------
-# Bottom and top are held, the top moves down by 15 %. Returned is the force on the top.
+# A block between bonded plates
+# -----------------------------
+# Bottom and top are constrained; the top moves down by 15 %. The function returns the force on the top.
 def force(cells: int, poisson_ratio: float, formulation: Formulation) -> float:
-    """Force (N) that presses a block with `cells` hexahedra an edge."""
+    """Return the force, N, that compresses a block with `cells` hexahedra per edge."""
     mesh = box((SIDE_MM, SIDE_MM, SIDE_MM), (cells, cells, cells))
     body = elements(mesh, formulation)
     gel = material("neo_hookean", young_modulus=60.0, poisson_ratio=poisson_ratio)
@@ -47,9 +47,9 @@ def force(cells: int, poisson_ratio: float, formulation: Formulation) -> float:
 
 
 # %%
-# Towards incompressibility
-# -------------------------
-# Plain elements run away, and refining the mesh helps only slowly. Averaged ones stay where they should be, on a coarse mesh too.
+# The incompressible limit
+# ------------------------
+# Standard elements lock, and refining the mesh helps only slowly. Elements with mean dilatation are accurate even on a coarse mesh.
 ratios = np.array([0.3, 0.4, 0.45, 0.48, 0.49, 0.495, 0.499])
 cells = (4, 8)
 kinds: tuple[Formulation, ...] = ("mean_dilatation", "standard")
@@ -60,7 +60,7 @@ for (n, kind), values in forces.items():
     print(f"{kind:16} {n}^3 elements: " + "  ".join(f"{e:+6.1f} %" for e in excess))
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(9.5, 4), layout="constrained")
-styles = {"mean_dilatation": ("tab:blue", "averaged dilatation"), "standard": ("tab:red", "plain")}
+styles = {"mean_dilatation": ("tab:blue", "mean dilatation"), "standard": ("tab:red", "standard")}
 for (n, kind), values in forces.items():
     colour, label = styles[kind]
     line = "-" if n == max(cells) else "--"
@@ -74,5 +74,5 @@ for axes in (left, right):
     axes.set_xlabel("Poisson's ratio, spaced as log(1 − 2 ν)")
 left.set(ylabel="force for 15 % compression (N)", title="Force", ylim=(0, None))
 left.legend(fontsize=8)
-right.set(ylabel="force / force of the finest averaged mesh", title="Locking")
+right.set(ylabel="force / force of the finest mean-dilatation mesh", title="Locking")
 plt.show()

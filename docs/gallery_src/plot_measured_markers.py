@@ -1,15 +1,15 @@
 """
-Look at measured markers
+Explore measured markers
 ========================
 
-naibu comes with measurements: positions of markers cast into gels, before and after pressing, found by computed tomography. Your own
+naibu includes measurements: positions of markers cast into gels, before and after compression, from computed tomography. Your own
 measurements are read in the same way from a folder, by `naibu.io.read_experiment`.
 """
 
 # %%
 # Read an experiment
 # ------------------
-# An experiment has a shape, layers of materials, a loading and states. The first state is the free one.
+# An experiment has a shape, layers of materials, a loading and states. The first state is the reference configuration (unloaded).
 import matplotlib.pyplot as plt
 import numpy as np
 
@@ -35,25 +35,25 @@ for axis, count in zip("xyz", np.isfinite(moved).sum(axis=0), strict=True):
 # %%
 # Before and after
 # ----------------
-# The frame is that of the scanner. The plate comes from above: the upper layers sink most, and all layers spread sideways.
+# Coordinates are those of the scanner. The plate presses from above: the upper layers move down most, and all layers expand laterally.
 figure, panels = plt.subplots(1, 2, figsize=(10, 4.2), layout="constrained", sharey=True)
 for axes, axis in zip(panels, (0, 1), strict=True):
     seen = np.isfinite(moved[:, axis] + moved[:, 2])
     a, b = before[seen][:, [axis, 2]], after[seen][:, [axis, 2]]
     axes.plot(*np.stack([a, b], axis=1).T, color="0.8", linewidth=0.7, zorder=1)
-    axes.plot(*a.T, "o", color="0.7", markersize=4, label="free")
-    sunk = {"c": -moved[seen, 2], "cmap": "viridis", "vmin": 0, "vmax": -np.nanmin(moved[:, 2])}
-    painted = axes.scatter(*b.T, **sunk, s=18, label="pressed", zorder=3)
+    axes.plot(*a.T, "o", color="0.7", markersize=4, label="unloaded")
+    down = {"c": -moved[seen, 2], "cmap": "viridis", "vmin": 0, "vmax": -np.nanmin(moved[:, 2])}
+    painted = axes.scatter(*b.T, **down, s=18, label="compressed", zorder=3)
     axes.set(xlabel=f"{'xyz'[axis]} in the scanner (mm)", aspect="equal")
 panels[0].set_ylabel("z in the scanner (mm)")
 panels[0].legend(loc="upper right", fontsize=8)
 figure.colorbar(painted, ax=panels, label="downward displacement (mm)")
-figure.suptitle(f"Markers of {experiment.name}, free and pressed")
+figure.suptitle(f"Markers of {experiment.name}, unloaded and compressed")
 
 # %%
-# How much each layer is compressed
-# ---------------------------------
-# The mean height of every layer of markers tells the strain between layers, without any model: the softer gel is compressed more.
+# Strain of each layer
+# --------------------
+# The mean height of every marker layer gives the strain between layers without any model: the softer gel is compressed more.
 # The origin of z may differ between scans, but differences of heights do not depend on it.
 seen = np.isfinite(moved[:, 2])
 above_base = before[seen, 2] - experiment.base_z_mm
@@ -70,5 +70,5 @@ for layer, colour in zip(experiment.layers, ("tab:blue", "tab:orange"), strict=T
     axes.axhspan(layer.from_base_mm, layer.to_base_mm, alpha=0.12, color=colour)
     axes.text(-1, layer.to_base_mm - 1, layer.material, ha="right", va="top", fontsize=8)
 axes.set(xlim=(-50, 0), ylim=(0, 60), title=f"Strain of {experiment.name}")
-axes.set(xlabel="vertical strain between layers of markers (%)", ylabel="height above the base, free (mm)")
+axes.set(xlabel="vertical strain between marker layers (%)", ylabel="height above the base, unloaded (mm)")
 plt.show()

@@ -1,1 +1,1 @@
-"""Chapter 4: lattices in real time."""
+"""Chapter 4 of the report: mass-spring-dashpot lattices."""

@@ -1,4 +1,4 @@
-"""Chapter 4.3 of the report: a cube of dough calibrated as a classic lattice and as octrees, Tables III to VI (spec L3, L6)."""
+"""Calibration of a cube of dough as classic and octree lattices: Tables III to VI of the 2008 report :cite:p:`hirai2008` (chapter 4.3)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from naibu.viewer.chapter import Chapter, Section
 from naibu.viewer.tables import Cell, Table
 
 MODELS = ("classic", "type 0", "type 1", "type 2")
-TABLES = {8: ("4-III", "4-V"), 16: ("4-IV", "4-VI")}  # calibrated parameters and shape differences, by voxels an edge
+TABLES = {8: ("4-III", "4-V"), 16: ("4-IV", "4-VI")}  # calibrated parameters and shape differences, by voxels per edge
 ORDERS = ("1st", "2nd", "3rd")
 EDGE_MM = 10.0 * CUBE_CM[0]
 
@@ -35,11 +35,11 @@ def chapter4_cube(seed: int = 0, *, points: int = POINTS, sizes: tuple[int, ...]
     Parameters
     ----------
     seed : int
-        Of the twin's noise.
+        Seed of the twin's noise.
     points : int
-        Captured points.
+        Number of captured points.
     sizes : tuple of int
-        Voxels along an edge, among 8 and 16.
+        Voxels per edge, among 8 and 16.
     """
     settings: dict[str, Cell] = {"seed": seed, "points": points, "point_sd_mm": POINT_SD_MM, "force_sd_mn": FORCE_SD_MN}
     sections = tuple(cube_section(n, seed, points) for n in sizes)
@@ -47,7 +47,7 @@ def chapter4_cube(seed: int = 0, *, points: int = POINTS, sizes: tuple[int, ...]
 
 
 def cube_section(n: int, seed: int, points: int) -> Section:
-    """Return the tables of the cube of n voxels an edge, calibrated on a twin whose masses stand at half that spacing."""
+    """Return the tables of the cube of n voxels per edge, calibrated on a twin with half the node spacing."""
     spacing = EDGE_MM / n
     truth = dough_lattice(spacing / 2.0, size_cm=CUBE_CM, mass_g=CUBE_G)
     capture = virtual_capture(truth, dough_parameters(truth, zones=True), CUBE_PUSHING, seed=seed, points=points)
@@ -56,11 +56,11 @@ def cube_section(n: int, seed: int, points: int) -> Section:
     lattices += [octree_lattice(mask, spacing, kind, total_mass_kg=mass, scaling="edge") for kind in range(3)]
     fits = [_fitted(lattice, capture) for lattice in lattices]
     text = (
-        "A cube of 8 cm and 630 g, pushed at two facing sides by bodies 2 cm wide. One set of K, C1 and C2 for every level of the octree, "
-        f"as in the report, on shape and force of one twin, whose masses stand at {spacing / 2.0:g} mm and whose surface differs. The "
-        "units printed with the parameters cannot be those of a spring (gf/cm^3): they are shown as printed.",
+        "A cube of 8 cm and 630 g, compressed at two opposite sides by indenters 2 cm wide. One set of K, C1 and C2 for every level of the "
+        f"octree, as in the report, calibrated on shape and force of one twin, with a node spacing of {spacing / 2.0:g} mm and a different "
+        "surface. The units printed with the parameters cannot be those of a spring (gf/cm^3): they are shown as printed.",
     )
-    title = f"{n + 1} x {n + 1} x {n + 1} masses"
+    title = f"{n + 1} x {n + 1} x {n + 1} nodes"
     return Section(title, text, (_parameters(n, fits), _differences(n, fits, lattices, capture)))
 
 
@@ -83,10 +83,10 @@ def _parameters(n: int, fits: list[LatticeEstimate]) -> Table:
         rows.append((name, *cells, *found))
     columns = ("parameter", *(f"paper, {m}" for m in MODELS), *(f"ours, {m}, mN/mm or mN s/mm" for m in MODELS))
     note = (
-        "1st: between the finest masses; 2nd and 3rd: in cubes of two and four voxels an edge, as if they were of one; an element's own "
-        "are greater by the factor that its lattice has for it. a is not determined by any data (it changes nothing) and not sought."
+        "1st: between the finest nodes; 2nd and 3rd: in cubes of two and four voxels per edge, referred to one voxel; the values of an "
+        "element are larger by its scaling factor. a is not determined by any data (it has no effect) and is not calibrated."
     )
-    return Table(f"Table {number[2:]}", columns, tuple(rows), caption=f"Calibrated parameters, {n + 1} masses an edge.", note=note)
+    return Table(f"Table {number[2:]}", columns, tuple(rows), caption=f"Calibrated parameters, {n + 1} nodes per edge.", note=note)
 
 
 def _differences(n: int, fits: list[LatticeEstimate], lattices: list[Lattice], capture: Capture) -> Table:
@@ -101,7 +101,7 @@ def _differences(n: int, fits: list[LatticeEstimate], lattices: list[Lattice], c
             rows.append((time, model, cells[k], distance / 1e3, cells[4 + k], distance / points))
     rows += [("S_force, N", model, None, ours.force_mn / 1e3, None, None) for model, ours in zip(MODELS, found, strict=True)]
     columns = ("time", "lattice", "paper, sum, m", "ours, sum, m", "paper, mean, mm", "ours, mean, mm")
-    note = "The paper's 4 to 5 mm a point hold errors of registration, ours none."
+    note = "The 4 to 5 mm per point of the paper include registration errors, ours none."
     if number == "4-V":
         note = f"The report prints the octrees' means at the second time in cm. {note}"
-    return Table(f"Table {number[2:]}", columns, tuple(rows), caption=f"S_shape at five times, {n + 1} masses an edge.", note=note)
+    return Table(f"Table {number[2:]}", columns, tuple(rows), caption=f"S_shape at five times, {n + 1} nodes per edge.", note=note)

@@ -1,4 +1,4 @@
-"""Chapter 4.3 of the report: a lattice of dough calibrated on shape and force, in eight patterns (spec L6)."""
+"""Calibration of a dough lattice on shape and force, in the eight patterns of the 2008 report :cite:p:`hirai2008` (chapter 4.3)."""
 
 from __future__ import annotations
 
@@ -15,14 +15,11 @@ from naibu.viewer.tables import Cell, Table
 PRINTED_FORCE_N = {"a": 3803.6, "b": 538.7, "c": 7448.3, "d": 979.5}  # captions of Figure 14 of the ICAT paper
 PRINTED_COUNTS = {"first": (2821, 2795, 3075, 2815, 2811), "second": (2255, 2195, 2213, 2201, 2165)}  # the third and the second corrected
 TWIN_TEXT = (
-    "The captures of the report are not available. A virtual twin stands for the dough: a block of 10 x 5 x 7 cm and 510 g on a "
-    "floor to which it "
-    "sticks, pushed by two facing bodies that close at 20 mm/s and cover the middle of their faces, kept, and set free. Two stereo "
-    "cameras see "
-    f"about {POINTS} points at five times, each coordinate with a noise of {POINT_SD_MM:g} mm; a sensor on each body reads its force "
-    "every 2 ms with "
-    f"a noise of {FORCE_SD_MN:g} mN. Which faces the bodies cover, how they share the speed and when the second capture is taken are "
-    "our reading."
+    "The measurements of the report are not available. A virtual twin replaces the dough: a block of 10 x 5 x 7 cm and 510 g fixed to the "
+    "floor, compressed by two opposite indenters that close at 20 mm/s on the middle of its faces, held, released. Two stereo "
+    f"cameras capture about {POINTS} points at five times, with a noise SD of {POINT_SD_MM:g} mm per coordinate; a sensor on each indenter "
+    f"reads its force every 2 ms with a noise SD of {FORCE_SD_MN:g} mN. The loaded faces, the speed of each indenter and the time of the "
+    "second capture are our interpretation."
 )
 
 
@@ -32,9 +29,9 @@ def chapter4_lattice(seed: int = 0, *, points: int = POINTS) -> Chapter:
     Parameters
     ----------
     seed : int
-        Of the twin's noise.
+        Seed of the twin's noise.
     points : int
-        Captured points.
+        Number of captured points.
     """
     study = pattern_study(seed, points=points)
     sections = (exact_section(seed, points), *pattern_sections(study))
@@ -43,7 +40,7 @@ def chapter4_lattice(seed: int = 0, *, points: int = POINTS) -> Chapter:
 
 
 def exact_section(seed: int, points: int) -> Section:
-    """Return the calibration of the nine parameters of a twin that follows the model's law."""
+    """Return the calibration of the nine parameters of a twin that obeys the model."""
     twin = dough_twin(law="same", seed=seed, points=points)
     found = calibrate_lattice(CalibrationProblem.of(dough_lattice(), twin.captures), START)
     rows: list[tuple[Cell, ...]] = []
@@ -52,42 +49,37 @@ def exact_section(seed: int, points: int) -> Section:
         rows.append(
             (f"{name}, {UNITS[name.split()[0]]}", truth, float(value), f"{low:.4g} to {high:.4g}", "yes" if low <= truth <= high else "no")
         )
-    columns = ("parameter", "truth", "found", "95 % interval", "truth inside")
+    columns = ("parameter", "truth", "estimate", "95 % interval", "truth inside")
     note = (
-        f"Both pushings, shape and force, {len(dough_lattice().points)} masses: {found.iterations} iterations, {found.runs} simulated "
-        "pushings (the report's genetic algorithm took about a month). Intervals of 95 % hold for one parameter at a time; those of the "
-        "classes of one kind miss together where they miss, since the data know their sum best. " + found.undetermined[-1]
+        f"Both load cases, shape and force, {len(dough_lattice().points)} nodes: {found.iterations} iterations, {found.runs} simulations "
+        "(the report's genetic algorithm took about a month). The 95 % intervals are for one parameter at a time; those of the classes of "
+        "one kind fail together, because the data determine their sum best. " + found.undetermined[-1]
     )
     return Section(
-        "Nine parameters of a twin that follows the law",
+        "Nine parameters of a twin that obeys the model",
         (TWIN_TEXT,),
-        (Table("Nine parameters", columns, tuple(rows), caption="Truth and found.", note=note),),
+        (Table("Nine parameters", columns, tuple(rows), caption="True and estimated values.", note=note),),
     )
 
 
 def pattern_sections(study: PatternStudy) -> tuple[Section, ...]:
-    """Return the tables of the patterns (a) to (h), printed beside ours, and whether one set can do what the report's two do."""
+    """Return the tables of the patterns (a) to (h), printed and ours, and one joint parameter set compared with the report's two."""
     first = _pattern_table("4-force-1", "first", "abcd", ("joint 1",), study)
     second = _pattern_table("4-force-2", "second", "efgh", ("joint 2", "joint 1 on 2"), study)
     text = (
-        "Here the twin's masses stand at half the spacing of the model's, and its surface is stiffer and less viscous than its "
-        "core: no nine "
-        "parameters fit it exactly. Each pattern pushes the virtual dough by displacement or by the measured force, takes the "
-        "parameters that were "
-        "calibrated on S_shape or S_force of the first or second pushing, and is evaluated by both. In ours, chi-squared of signed "
-        "distances, or of "
-        "forces while the bodies keep still, is made small.",
-        "Pushed by force, the virtual dough answers with the same force whatever its parameters, but for the inertia of the masses "
-        "under the body: "
-        "S_force in (d), (f) and (h) says nothing about the parameters, which stay at their start; the printed ones of (c) and (d), "
-        "some newtons a "
-        "sample, cannot come from the law. In (a) and (e) the shape leaves the common scale of K, C1 and C2 to inertia alone: "
-        "forces are then far off, "
-        "as in the report. Both defects vanish where shape and force count together.",
+        "Here the twin has half the node spacing of the model, and its surface is stiffer and less viscous than its core: no nine "
+        "parameters fit it exactly. Each pattern loads the virtual dough by displacement or by the measured force, uses the parameters "
+        "calibrated on S_shape or S_force of the first or second load case, and is evaluated by both. Ours minimise chi-squared of signed "
+        "distances, or of forces while the indenters are at rest.",
+        "Under force control the virtual dough responds with the same force whatever its parameters, except for the inertia of the nodes "
+        "under the indenter: S_force in (d), (f) and (h) is independent of the parameters, which keep their initial values; the printed "
+        "values of (c) and (d), some newtons per sample, cannot follow from the model. In (a) and (e) shape determines the common scale "
+        "of K, C1 and C2 through inertia alone: forces are then far off, as in the report. Neither occurs if shape and force are fitted "
+        "jointly.",
     )
     return (
-        Section("Eight patterns of pushing and calibrating", text, (first, second)),
-        Section("One set of parameters or two", (), (_one_set(study), _parameter_table(study), _undetermined_table(study))),
+        Section("Eight patterns of loading and calibration", text, (first, second)),
+        Section("One parameter set or two", (), (_one_set(study), _parameter_table(study), _undetermined_table(study))),
     )
 
 
@@ -100,18 +92,17 @@ def _pattern_table(number: str, which: str, letters: str, joint: tuple[str, ...]
     rows.append(("S_force, N", "kept", *(PRINTED_FORCE_N.get(k) for k in letters), *(found.force_mn / 1e3 for found in ours)))
     columns = ("quantity", "time", *(f"paper ({k})" for k in letters), *(f"ours ({k})" for k in letters), *(f"ours {k}" for k in joint))
     note = (
-        "Sums of distances, cm, those below 0.05 cm not counted, and the same for each captured point; points 0.25 cm or more away. "
-        "The twin has no "
-        "error of registration: ours are smaller, and at the first time (before the push) only noise. Paper: points "
-        f"{', '.join(map(str, PRINTED_COUNTS[which]))}. S_force is the sum over 1000 samples and two sensors; its noise alone makes "
+        "Sums of distances, cm, without those below 0.05 cm, and the same per captured point; points 0.25 cm or more away. The twin has no "
+        "registration error: ours are smaller, and at the first time (before loading) only noise. Paper: points "
+        f"{', '.join(map(str, PRINTED_COUNTS[which]))}. S_force is the sum over 1000 samples and two sensors; noise alone gives "
         f"{2 * 1000 * FORCE_SD_MN * np.sqrt(8.0 / np.pi) / 1e3:.0f} N. Joint: by displacement, on shape and force together."
     )
-    caption = f"Patterns ({letters[0]}) to ({letters[-1]}), {which} pushing."
+    caption = f"Patterns ({letters[0]}) to ({letters[-1]}), {which} load case."
     return Table(number, columns, tuple(rows), caption=caption, note=note)
 
 
 def _entry(found: ReportIndices, quantity: str, time: Cell) -> Cell:
-    """Return our value of a row of the printed tables."""
+    """Return our value for a row of the printed tables."""
     chosen = range(len(found.shape_mm)) if time == "total" else [int(time or 0) - 1]
     distance, points = sum(found.shape_mm[k] for k in chosen) / 10.0, sum(found.points[k] for k in chosen)
     large = sum(found.large[k] for k in chosen)
@@ -121,19 +112,19 @@ def _entry(found: ReportIndices, quantity: str, time: Cell) -> Cell:
 def _one_set(study: PatternStudy) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for text, shape, force, joint in (
-        ("first pushing", "a", "force 1", "joint 1"),
-        ("second pushing", "e", "force 2", "joint 2"),
+        ("first load case", "a", "force 1", "joint 1"),
+        ("second load case", "e", "force 2", "joint 2"),
         ("second, calibrated on the first", "g", "force 1 on 2", "joint 1 on 2"),
     ):
         shapes = [sum(study.found[k].shape_mm) / 10.0 for k in (shape, force, joint)]
         forces = [study.found[k].force_mn / 1e3 for k in (shape, force, joint)]
         rows.append((text, shapes[0], shapes[1], shapes[2], shapes[2] / shapes[0], forces[0], forces[1], forces[2], forces[2] / forces[1]))
     columns = (
-        "pushed by displacement", "S_shape, set for shape, cm", "set for force", "one joint set", "joint / set for shape",
+        "displacement control", "S_shape, set for shape, cm", "set for force", "one joint set", "joint / set for shape",
         "S_force, set for shape, N", "set for force", "one joint set", "joint / set for force",
     )  # fmt: skip
-    note = "The report concludes that two sets are needed, one for what is seen and one for what is felt."
-    return Table("One set or two", columns, tuple(rows), caption="The joint set beside the set for shape and the set for force.", note=note)
+    note = "The report concludes that two sets are needed, one for shape and one for force."
+    return Table("One set or two", columns, tuple(rows), caption="The joint set and the sets for shape and for force.", note=note)
 
 
 def _parameter_table(study: PatternStudy) -> Table:
@@ -143,8 +134,8 @@ def _parameter_table(study: PatternStudy) -> Table:
         rows.append((f"{name}, {UNITS[name.split()[0]]}", *(with_interval_factor(e, k) for e in study.estimates.values())))
     where = ("first", "second")
     columns = ("parameter", *(f"{where[number]}, by {mode}, {index}" for number, mode, index in study.estimates))
-    note = "Found, and the factor by which the 95 % interval reaches up and down. What the data leave open stays near the start."
-    return Table("Parameters", columns, tuple(rows), caption="What each calibration found.", note=note)
+    note = "Estimate, and the factor by which the 95 % interval extends. Undetermined parameters stay near the initial values."
+    return Table("Parameters", columns, tuple(rows), caption="Estimates of each calibration.", note=note)
 
 
 def _undetermined_table(study: PatternStudy) -> Table:
@@ -152,4 +143,4 @@ def _undetermined_table(study: PatternStudy) -> Table:
     for (number, mode, index), estimate in study.estimates.items():
         for sentence in estimate.undetermined[:-1] or ("All combinations are determined.",):
             rows.append((f"{('first', 'second')[number]}, by {mode}, {index}", sentence))
-    return Table("Not determined", ("calibration", "combination"), tuple(rows), caption="What the data of each calibration leave open.")
+    return Table("Not determined", ("calibration", "combination"), tuple(rows), caption="Combinations left open by the data.")

@@ -1,4 +1,4 @@
-"""The eight patterns (a) to (h) of pushing, calibrating and evaluating a lattice of dough, on the virtual twin (spec L6)."""
+"""The eight patterns (a) to (h) of loading, calibration and evaluation of the 2008 report :cite:p:`hirai2008` (chapter 4.3)."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from naibu.identification.lattice_calibration.gauss_newton import (
 from naibu.mechanics.lattices.model.lattice import Lattice
 from naibu.validation.specimens.lattice_twin import FIRST, SECOND, Law, dough_lattice, dough_twin
 
-START = {"K": 40.0, "C1": 30.0, "C2": 50.0}  # mN/mm and mN s/mm: the rough guess of all calibrations
+START = {"K": 40.0, "C1": 30.0, "C2": 50.0}  # mN/mm and mN s/mm: the initial guess of all calibrations
 
-Key = tuple[int, PushMode, Index]  # which pushing, how the virtual dough is pushed, and what counts
+Key = tuple[int, PushMode, Index]  # load case, control of the virtual dough, and fitted index
 
 
 @dataclass(frozen=True, slots=True)
 class Pattern:
-    """One pattern: the pushing that it is evaluated on and how that is done, and the calibration whose parameters it takes."""
+    """One pattern: the load case and control of its evaluation, and the calibration whose parameters it uses."""
 
     letter: str
     pushing: int
@@ -48,7 +48,7 @@ JOINT = (
     Pattern("joint 2", 1, "displacement", (1, "displacement", "joint")),
     Pattern("joint 1 on 2", 1, "displacement", (0, "displacement", "joint")),
 )
-SEPARATE = (  # the report's two sets by displacement, on either pushing
+SEPARATE = (  # the report's two sets under displacement control, on either load case
     Pattern("force 1", 0, "displacement", (0, "displacement", "force")),
     Pattern("force 2", 1, "displacement", (1, "displacement", "force")),
     Pattern("force 1 on 2", 1, "displacement", (0, "displacement", "force")),
@@ -57,16 +57,16 @@ SEPARATE = (  # the report's two sets by displacement, on either pushing
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatternStudy:
-    """All calibrations, and what each pattern gives.
+    """All calibrations, and the indices of each pattern.
 
     Attributes
     ----------
     lattice : Lattice
-        The model.
+        Lattice of the model.
     captures : tuple of Capture
-        First and second pushing.
+        First and second load case.
     estimates : dict
-        By pushing, mode and index.
+        Estimates by load case, control and index.
     found : dict
         Indices of every pattern by its letter or name.
     """
@@ -78,18 +78,18 @@ class PatternStudy:
 
 
 def pattern_study(seed: int = 0, *, law: Law = "finer", spacing_mm: float = 10.0, points: int = 2800) -> PatternStudy:
-    """Calibrate on either pushing by displacement and by force, on shape, on force and on both, and evaluate all patterns.
+    """Calibrate on either load case under displacement and force control, on shape, force and both, and evaluate all patterns.
 
     Parameters
     ----------
     seed : int
-        Of the twin's noise.
+        Seed of the twin's noise.
     law : str
-        The twin's: see `naibu.validation.specimens.lattice_twin.dough_twin`.
+        Law of the twin, see `naibu.validation.specimens.lattice_twin.dough_twin`.
     spacing_mm : float
-        Between the masses of the model, mm.
+        Node spacing of the model, mm.
     points : int
-        Captured points.
+        Number of captured points.
     """
     twin = dough_twin((FIRST, SECOND), law=law, spacing_mm=spacing_mm, seed=seed, points=points)
     lattice = dough_lattice(spacing_mm)
@@ -105,7 +105,7 @@ def pattern_study(seed: int = 0, *, law: Law = "finer", spacing_mm: float = 10.0
 
 
 def calibrated(lattice: Lattice, captures: tuple[Capture, ...], key: Key) -> LatticeEstimate:
-    """Return one calibration; forces count while the indenters keep still, as in the report."""
+    """Return one calibration; forces are fitted while the indenters are at rest, as in the report."""
     number, mode, index = key
     problem = CalibrationProblem.of(lattice, [captures[number]], index=index, mode=mode, window="keep")
     scale = lattice.spacing_mm / 10.0
@@ -113,5 +113,5 @@ def calibrated(lattice: Lattice, captures: tuple[Capture, ...], key: Key) -> Lat
 
 
 def with_interval_factor(estimate: LatticeEstimate, k: int) -> str:
-    """Return a parameter's value, and the factor by which its 95 % interval reaches up and down."""
+    """Return the text of a parameter's value, and the factor by which its 95 % interval extends up and down."""
     return f"{estimate.values[k]:.3g} (x/÷ {np.exp(1.96 * np.sqrt(estimate.covariance[k, k])):.2g})"
