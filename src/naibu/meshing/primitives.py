@@ -145,6 +145,15 @@ def half_ellipsoid(size_mm: Sequence[float], element_size_mm: float, *, cell_typ
 def hemisphere(diameter_mm: float, element_size_mm: float, *, cell_type: str = "hexahedron") -> Mesh:
     """Mesh a hemisphere whose flat side lies on z = 0, centred at the origin; see `half_ellipsoid`.
 
+    Parameters
+    ----------
+    diameter_mm : float
+        Diameter, mm.
+    element_size_mm : float
+        Target size of the cells, mm.
+    cell_type : {"hexahedron", "tetra"}
+        ``"tetra"`` splits every hexahedron into six.
+
     Raises
     ------
     InputError

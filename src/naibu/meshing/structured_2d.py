@@ -16,6 +16,13 @@ DIAGONALS = ("alternating", "one_way")
 def interval(length_mm: float, divisions: int) -> Mesh:
     """Mesh the interval from 0 to `length_mm` with lines of equal length, numbered from left to right.
 
+    Parameters
+    ----------
+    length_mm : float
+        Length, mm.
+    divisions : int
+        Number of lines.
+
     Raises
     ------
     InputError

@@ -173,7 +173,16 @@ def side_nodes(mesh: Mesh, side: str, *, tolerance_mm: float | None = None) -> I
 
 
 def faces_towards(mesh: Mesh, direction: ArrayLike, *, max_angle_deg: float = 45.0) -> IntArray:
-    """Return the boundary faces (f, k) whose outward normal is within `max_angle_deg` of `direction` (3,).
+    """Return the boundary faces (f, k) whose outward normal is near a direction.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Any mesh.
+    direction : array_like, shape (3,)
+        Direction, of any length but zero.
+    max_angle_deg : float
+        Largest angle between normal and direction, degrees.
 
     Raises
     ------

@@ -89,8 +89,21 @@ class Contact:
         return (self.rest - self.start) @ self.rotation
 
     def evaluate(self, displacement: FloatArray, anchors: FloatArray, load: float, *, curvature: bool = True) -> ContactResponse:
-        """Evaluate tractions and their derivatives at every point.
+        """Return gaps, tractions and their derivatives at every point.
 
+        Parameters
+        ----------
+        displacement : ndarray, shape (n, 3)
+            Displacement of the nodes, mm.
+        anchors : ndarray, shape (p, 3)
+            Frictional anchors in the body's frame, mm.
+        load : float
+            Fraction of the body's path.
+        curvature : bool
+            Whether the stiffness includes the curvature of the body's surface.
+
+        Notes
+        -----
         Without the `curvature` of the body the stiffness lacks the geometric term by which a point slips off an edge: it is not the
         derivative of the force then, but prevents equilibrium iterations from cycling there.
         """
@@ -108,7 +121,7 @@ class Contact:
         return response
 
     def scattered(self, force: FloatArray, n_points: int, orientation: FloatArray) -> FloatArray:
-        """Return nodal forces (n, 3) of point forces (p, 3) given in the frame of a body of this `orientation`."""
+        """Return the nodal forces (n, 3), mN, of point forces (p, 3), mN, given in the frame of a body of this `orientation` (3, 3)."""
         world = force @ orientation.T
         out = np.empty((n_points, 3))
         for i in range(3):

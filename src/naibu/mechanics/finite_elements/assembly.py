@@ -87,22 +87,49 @@ class Assembler:
         return replace(self, elements=elements)
 
     def evaluate(self, displacement: FloatArray) -> tuple[float, FloatArray, FloatArray, float]:
-        """Return energy (mN mm), internal forces (n, 3) mN, blocks of the tangent (n_blocks, 3, 3) mN/mm, and the smallest det F.
+        """Return energy, internal forces and tangent stiffness.
 
-        Where the smallest det F is not positive the other values are meaningless.
+        Parameters
+        ----------
+        displacement : ndarray, shape (n, 3)
+            Displacement of the nodes, mm.
+
+        Returns
+        -------
+        energy : float
+            Strain energy, mN mm.
+        force : ndarray, shape (n, 3)
+            Internal forces, mN.
+        blocks : ndarray, shape (n_blocks, 3, 3)
+            Blocks of the tangent, mN/mm, in the order of `pattern`.
+        smallest : float
+            Smallest det F; where it is not positive the other values are meaningless.
         """
         blocks = np.zeros((self.pattern.n_blocks, 3, 3))
         energy, force, smallest = self._run(displacement, self.parameters, blocks)
         return energy, force, blocks, smallest
 
     def forces(self, displacement: FloatArray) -> tuple[float, FloatArray, float]:
-        """Return energy (mN mm), internal forces (n, 3) mN and the smallest det F, without the tangent."""
+        """Return energy (mN mm), internal forces (n, 3), mN, and the smallest det F, without the tangent.
+
+        Parameters
+        ----------
+        displacement : ndarray, shape (n, 3)
+            Displacement of the nodes, mm.
+        """
         return self._run(displacement, self.parameters, np.empty((0, 3, 3)))
 
     def forces_of_parameter(self, displacement: FloatArray, direction: FloatArray) -> FloatArray:
-        """Return the derivative (n, 3) of the internal forces along `direction` (m, 4) in the cells' parameters.
+        """Return the derivative (n, 3) of the internal forces along a direction of the cells' parameters.
 
         Every law is linear in its parameters, so this is the internal force of the parameters `direction`.
+
+        Parameters
+        ----------
+        displacement : ndarray, shape (n, 3)
+            Displacement of the nodes, mm.
+        direction : ndarray, shape (m, 4)
+            Change of the parameters of all cells, kPa.
         """
         return self._run(displacement, direction, np.empty((0, 3, 3)))[1]
 

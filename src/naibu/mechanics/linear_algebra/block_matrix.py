@@ -81,7 +81,15 @@ class BlockPattern:
 
 
 def block_pattern(n_points: int, *connectivities: IntArray) -> BlockPattern:
-    """Return the pattern in which all nodes of a group are coupled, for one or more tables of groups (m, k)."""
+    """Return the sparsity pattern in which all nodes of a group are coupled.
+
+    Parameters
+    ----------
+    n_points : int
+        Number of nodes.
+    *connectivities : ndarray, shape (m, k), int64
+        Tables of groups of nodes: the cells of a mesh, the nodes of contact points.
+    """
     incidence = []
     for table in connectivities:
         rows = np.repeat(np.arange(len(table)), table.shape[1])

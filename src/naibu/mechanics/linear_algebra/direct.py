@@ -178,7 +178,15 @@ class SuperLUSolver:
 
 
 def direct_solver(matrix: sp.bsr_matrix, *, symmetric: bool) -> LinearSolver:
-    """Return the fastest direct solver that is installed, for the pattern of `matrix`."""
+    """Return the fastest direct solver that is installed: PARDISO, else SuperLU.
+
+    Parameters
+    ----------
+    matrix : bsr_matrix, shape (n, n)
+        A matrix with the pattern of those to be factorized.
+    symmetric : bool
+        Whether all matrices will be symmetric.
+    """
     if pardiso_library() is not None:
         return PardisoSolver(matrix, symmetric=symmetric)
     return SuperLUSolver()

@@ -62,7 +62,18 @@ class LinearBody:
         return cls(mesh.points, body, pattern, pattern.positions(mesh.cells))
 
     def stiffness(self, lame_lambda: ArrayLike, shear_modulus: ArrayLike) -> sp.bsr_matrix:
-        """Return the stiffness (n d, n d), mN/mm, for moduli in kPa, one number or one a cell."""
+        """Return the stiffness matrix (n d, n d), mN/mm.
+
+        Parameters
+        ----------
+        lame_lambda, shear_modulus : array_like
+            Lame's constants, kPa, one number or one a cell.
+
+        Raises
+        ------
+        InputError
+            Moduli of another shape, or that are not finite.
+        """
         m, d = self.simplices.n_cells, self.simplices.dimension
         blocks = np.zeros((self.pattern.n_blocks, d, d))
         lame, shear = per_cell(lame_lambda, m, "lame_lambda"), per_cell(shear_modulus, m, "shear_modulus")
@@ -70,7 +81,15 @@ class LinearBody:
         return self.pattern.matrix(blocks)
 
     def forces(self, lame_lambda: ArrayLike, shear_modulus: ArrayLike, displacement: FloatArray) -> FloatArray:
-        """Return the nodal elastic forces (n, d), mN, of a displacement (n, d), mm."""
+        """Return the nodal elastic forces (n, d), mN.
+
+        Parameters
+        ----------
+        lame_lambda, shear_modulus : array_like
+            Lame's constants, kPa, one number or one a cell.
+        displacement : ndarray, shape (n, d)
+            Displacement of the nodes, mm.
+        """
         return elastic_forces(self.simplices, lame_lambda, shear_modulus, displacement)
 
     def factorized(

@@ -82,7 +82,9 @@ def three_element(
     voigt_viscosity, series_viscosity : float
         C1 and C2, kPa s.
     poisson_ratio : float
-        Of the spring, and of the dashpots unless they have their own.
+        Of the spring, and of the dashpots unless they have their own, in (-1, 0.5).
+    voigt_poisson_ratio, series_poisson_ratio : float, optional
+        Of the dashpots.
 
     Raises
     ------
@@ -95,17 +97,49 @@ def three_element(
 
 
 def elastic(young_modulus: float, poisson_ratio: float) -> Rheology:
-    """Return a linear elastic solid; E in kPa."""
+    """Return a linear elastic solid.
+
+    Parameters
+    ----------
+    young_modulus : float
+        E, kPa.
+    poisson_ratio : float
+        In (-1, 0.5).
+    """
     return three_element(young_modulus, 0.0, np.inf, poisson_ratio)
 
 
 def voigt(young_modulus: float, viscosity: float, poisson_ratio: float, *, voigt_poisson_ratio: float | None = None) -> Rheology:
-    """Return a Kelvin-Voigt solid, which recovers completely; E in kPa, C1 in kPa s."""
+    """Return a Kelvin-Voigt solid, which recovers completely.
+
+    Parameters
+    ----------
+    young_modulus : float
+        E, kPa.
+    viscosity : float
+        C1, kPa s.
+    poisson_ratio : float
+        Of the spring, and of the dashpot unless it has its own, in (-1, 0.5).
+    voigt_poisson_ratio : float, optional
+        Of the dashpot.
+    """
     return three_element(young_modulus, viscosity, np.inf, poisson_ratio, voigt_poisson_ratio=voigt_poisson_ratio)
 
 
 def maxwell(young_modulus: float, viscosity: float, poisson_ratio: float, *, series_poisson_ratio: float | None = None) -> Rheology:
-    """Return a Maxwell solid, which flows under any load; E in kPa, C2 in kPa s."""
+    """Return a Maxwell solid, which flows under any load.
+
+    Parameters
+    ----------
+    young_modulus : float
+        E, kPa.
+    viscosity : float
+        C2, kPa s.
+    poisson_ratio : float
+        Of the spring, and of the dashpot unless it has its own, in (-1, 0.5).
+    series_poisson_ratio : float, optional
+        Of the dashpot.
+    """
     return three_element(young_modulus, 0.0, viscosity, poisson_ratio, series_poisson_ratio=series_poisson_ratio)
 
 
@@ -268,6 +302,13 @@ class StepCoefficients:
 
 def per_region(mesh: Mesh, materials: Mapping[str, Rheology]) -> CellRheology:
     """Return the table of materials of a mesh with one material for each region.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Mesh with named regions.
+    materials : mapping of str to Rheology
+        Material of every region, by its name.
 
     Raises
     ------

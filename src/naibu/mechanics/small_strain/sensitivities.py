@@ -74,8 +74,15 @@ class MaterialChange:
     def between(cls, lower: CellRheology, upper: CellRheology, width: float) -> MaterialChange:
         """Return the direction from one table to another nearby, over the difference `width` of the parameter by which they differ.
 
-        Differences of tables cost nothing beside those of motions: so a Poisson ratio, a ramp of moduli or any other parametrisation is
-        differentiated.
+        A difference of tables is cheap compared with one of motions; with it a Poisson ratio, a gradient of moduli or any other
+        parametrisation can be differentiated.
+
+        Parameters
+        ----------
+        lower, upper : CellRheology
+            Tables of materials at two values of the parameter.
+        width : float
+            Difference of the two values, in the unit of the parameter.
 
         Raises
         ------
@@ -145,8 +152,17 @@ def simulate_motion_with_derivatives(
 
     Parameters
     ----------
+    body, materials, density, supports, times, step, mass, load, breaks
+        As for `simulate_motion`.
     directions : sequence of MaterialChange
-        The parameters; `MaterialChange.relative` makes the common ones. The others are those of `simulate`.
+        Directions of differentiation; `MaterialChange.relative` returns the common ones.
+
+    Returns
+    -------
+    Series
+        The motion.
+    SeriesDerivatives
+        Its derivatives.
 
     Raises
     ------
