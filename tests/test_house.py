@@ -108,6 +108,17 @@ def test_everything_public_has_a_docstring() -> None:
     none_of(bare, "modules, and public classes, functions and methods, say what they are")
 
 
+def test_messages_of_the_library_name_no_options() -> None:
+    option = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
+    found = []
+    for path in (p for p in python_files("src") if "cli" not in p.relative_to(SOURCES / "naibu").parts):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        raised = (node for error in ast.walk(tree) if isinstance(error, ast.Raise) for node in ast.walk(error))
+        words = (node for node in raised if isinstance(node, ast.Constant) and isinstance(node.value, str))
+        found += [f"{place(path, node.lineno)} {node.value.strip()[:80]}" for node in words if option.search(node.value)]
+    none_of(found, "errors name arguments of functions; the command line shows them as its options")
+
+
 def test_no_file_holds_what_belongs_elsewhere() -> None:
     parents = [str(parent) for parent in ROOT.parents if parent != parent.parent]
     folders = "|".join(re.escape(folder.rstrip("/")) for folder in ["/home", "/root", "/Users", "/tmp", "/mnt", "/opt", "/srv", *parents])

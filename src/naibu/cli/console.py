@@ -16,12 +16,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import (
     BarColumn,
-    MofNCompleteColumn,
     SpinnerColumn,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
-    TimeRemainingColumn,
 )
 from rich.progress import Progress as Display
 from rich.table import Table
@@ -104,36 +102,12 @@ def _objective(report: ProgressReport) -> str:
 
 
 @contextmanager
-def progress_lines() -> Iterator[Callable[[str, int, float], None]]:
-    """A line for each stage that tells iteration and objective."""
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TextColumn("{task.fields[found]}"), TimeElapsedColumn())
-    with Display(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
-        tasks: dict[str, TaskID] = {"identify": bar.add_task("identify", total=None, found="reading, and solving with the first guess")}
-
-        def tell(stage: str, iteration: int, objective: float) -> None:
-            if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=None, found="")
-            bar.update(tasks[stage], found=f"iteration {iteration + 1}, chi-squared {objective:.0f}")
-
-        yield tell
-
-
-@contextmanager
 def stages() -> Iterator[Callable[[str], None]]:
     """One line that tells the present stage."""
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Display(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
         task = bar.add_task("reading", total=None)
         yield lambda stage: bar.update(task, description=stage)
-
-
-@contextmanager
-def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar for a known number of parts."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Display(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, of: bar.update(task, completed=done, total=of)
 
 
 def say(text: str, style: str | None = None) -> None:

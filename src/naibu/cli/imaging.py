@@ -127,11 +127,10 @@ def track(
         description = tracking.ObjectDescription(**options.described(size_mm), title=title)
     elif options.layer or options.stated_mm:
         raise InputError("--layer and --stated-mm describe an object: give its dimensions too, --size-mm X Y Z")
-    with stages() as tell:
-        tell("finding markers and linking them")
+    with progress_display() as progress:
         run = tracking.track(
             scans, out=out, diameter_mm=diameter_mm, thickness_mm=thickness_mm, polarity=polarity, count=count, mask=mask,
-            spacing_mm=spacing_mm, description=description,
+            spacing_mm=spacing_mm, description=description, progress=progress,
         )  # fmt: skip
     print_table("Markers", run.columns, run.rows)
     say(f"Wrote {out}. Page: {run.page}")

@@ -13,6 +13,7 @@ import numpy as np
 
 from naibu.core.errors import InputError
 from naibu.core.experiment import Layer, Loading, Shape
+from naibu.core.progress import Progress, report_progress
 from naibu.imaging.markers.detection import Polarity
 from naibu.imaging.markers.tracking import TrackedMarkers, track_markers
 from naibu.io.files.provenance import input_record
@@ -63,6 +64,7 @@ def track(
     mask: str | os.PathLike[str] | None = None,
     spacing_mm: Sequence[float] | None = None,
     description: ObjectDescription | None = None,
+    progress: Progress | None = None,
 ) -> TrackRun:
     """Find equal markers in scans of several states, link them, and write an experiment folder.
 
@@ -81,6 +83,8 @@ def track(
         Distance of voxels along x, y, z, mm, for files that do not say.
     description : ObjectDescription, optional
         Shape, loading and layers.
+    progress : callable, optional
+        Called with a `ProgressReport` at every stage.
 
     Raises
     ------
@@ -91,6 +95,7 @@ def track(
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise InputError(f"{target}: exists and is not an empty folder; choose a new folder as `out`, or remove this one first")
     names = _states(scans)
+    report_progress(progress, "reading")
     volumes = [read_volume(path, spacing_mm=spacing_mm) for path in scans]
     masks = None
     if mask is not None:
@@ -99,9 +104,11 @@ def track(
             if not where.same_grid(volume):
                 raise InputError(f"{Path(mask).name} does not lie on the grid of {Path(path).name}; resample the mask, or leave it out")
         masks = [where.values != 0] * len(volumes)
+    report_progress(progress, "detecting and matching markers")
     tracked = track_markers(
         volumes, diameter_mm=diameter_mm, thickness_mm=thickness_mm, polarity=polarity, count=count, masks=masks, names=names
     )
+    report_progress(progress, "writing")
     files = _written(target, tracked, description)
     columns, rows = _table(tracked)
     settings: dict[str, Cell] = {"diameter, mm": diameter_mm, "thickness, mm": thickness_mm, "polarity": tracked.found[0].polarity}
