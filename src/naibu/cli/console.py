@@ -101,15 +101,6 @@ def _objective(report: ProgressReport) -> str:
     return "" if report.objective is None else f"objective {report.objective:.4g}"
 
 
-@contextmanager
-def stages() -> Iterator[Callable[[str], None]]:
-    """One line that tells the present stage."""
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Display(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
-        task = bar.add_task("reading", total=None)
-        yield lambda stage: bar.update(task, description=stage)
-
-
 def say(text: str, style: str | None = None) -> None:
     """Print a line verbatim and unwrapped, so that paths can be copied."""
     console.print(escape(text), style=style, soft_wrap=True, highlight=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from naibu.cli.console import app, print_table, progress_display, say, stages
+from naibu.cli.console import app, print_table, progress_display, say
 from naibu.cli.described import ObjectOptions, PairOptions
 from naibu.core.errors import InputError
 
