@@ -76,8 +76,8 @@ def explicit(lattice: Lattice, n: int, device: str, steps: int, repeats: int, cp
         options: dict[str, Any] = {"step": step, "method": "euler", "precision": precision}
         built, engine = clocked(lambda options=options: WarpLatticeEngine.of(lattice, parameters, device=device, **options))
         session = engine.session(None, constrained)
-        session.advance(32, velocity)
-        taken = least(lambda session=session: session.advance(steps, velocity), repeats) / steps
+        session.step(velocity, steps=32)
+        taken = least(lambda session=session: session.step(velocity, steps=steps), repeats) / steps
         entries, size = 2 * lattice.n_elements, 8 if precision == "double" else 4
         moved = entries * (4 + warp.types.type_size_in_bytes(engine.row.dtype) + 2 * size)
         moved += lattice.n_nodes * size * (6 + 3 + 3 + 1 + 12)
@@ -99,9 +99,9 @@ def implicit(lattice: Lattice, device: str, steps: int, repeats: int, cpu: bool)
     constrained, velocity = pushed(lattice)
     engine = WarpLatticeEngine.of(lattice, parameters, device=device)
     session = engine.session(None, constrained)
-    session.advance(2, velocity)
+    session.step(velocity, steps=2)
     before = session.iterations
-    taken = least(lambda: session.advance(steps, velocity), repeats) / steps
+    taken = least(lambda: session.step(velocity, steps=steps), repeats) / steps
     row(f"{device}, implicit", taken, f"{(session.iterations - before) / (steps * repeats):.1f} iterations")
     if cpu:
         reference = LatticeEngine.of(lattice, parameters)

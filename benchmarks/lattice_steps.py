@@ -22,12 +22,12 @@ import numba
 import numpy as np
 
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
+from naibu.mechanics.lattices.cpu.session import LatticeSession
 from naibu.mechanics.lattices.model.coefficients import explicit_coefficients
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters, box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.octree import octree_lattice
 from naibu.mechanics.lattices.model.state import ConstrainedNodes
 from naibu.mechanics.lattices.simulation.adjoint import push_gradient, recorded_push
-from naibu.mechanics.lattices.simulation.session import LatticeSession
 
 SIDE_MM, MASS_KG, STEP_S = 80.0, 0.63, 2e-3
 GENTLE = (0.03, 0.002, 0.003)  # K, C1, C2 for which explicit steps of 2 ms are stable
@@ -111,7 +111,7 @@ def in_session(lattice: Lattice, parameters: LatticeParameters, steps: int, repe
 
         def one_by_one() -> None:
             for _ in range(steps):
-                session.advance(velocity)
+                session.step(velocity)
 
         return least(one_by_one, steps, repeats)
 
@@ -180,7 +180,7 @@ def jitter(n: int, rate: float, **options: object) -> None:
     constrained, velocity = pushed(lattice)
     engine = LatticeEngine.of(lattice, lattice_parameters(lattice, *factors), step=STEP_S, **options)  # type: ignore[arg-type]
     with LatticeSession.of(engine, constrained=constrained) as session:
-        session.advance(velocity, 5)
+        session.step(velocity, steps=5)
         busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
         try:
             taken, due = [], time.perf_counter()
@@ -188,7 +188,7 @@ def jitter(n: int, rate: float, **options: object) -> None:
                 due = max(due + 1.0 / rate, time.perf_counter()) if rate else 0.0
                 time.sleep(max(due - time.perf_counter(), 0.0)) if rate else None
                 start = time.perf_counter()
-                session.advance(velocity)
+                session.step(velocity)
                 taken.append(time.perf_counter() - start)
         finally:
             busy.kill()

@@ -271,3 +271,33 @@ def test_the_end_of_a_job_keeps_frames(tmp_path: Path, number: signal.Signals) -
     found = series_of(out / "mine.vtkhdf")
     assert found["steps"] > 1 and len(found["VTKHDF/Steps/Values"]) == found["steps"]
     assert not list(out.glob(".*"))
+
+
+TIED = (
+    STUDY.replace('contact = "friction"\nstatic_friction = 0.5', 'contact = "sticking"')
+    .replace('name = "ball"', 'name = "ball"\ncontact = "tied"\nuntil_s = 0.06')
+    .replace("centre_mm = [10.0, 10.0, 28.5]", "centre_mm = [10.0, 10.0, 28.0]")
+)
+
+
+def test_a_study_runs_on_the_kernels_of_the_gpu(tmp_path: Path) -> None:
+    """The kernels of Warp, compiled for the processor, give what the default engine gives, to its tolerance."""
+    pytest.importorskip("warp")
+    study = study_file(tmp_path, TIED.replace("duration_s = 0.2", "duration_s = 0.2\ntolerance = 1e-8"))
+    found = []
+    for device in ("cpu", "warp-cpu"):
+        simulate_lattice(study, tmp_path / device, device=device)
+        numbers = json.loads((tmp_path / device / "mine.json").read_text(encoding="utf-8"))
+        moved = series_of(tmp_path / device / "mine.vtkhdf")["VTKHDF/PointData/displacement_mm"]
+        found.append((moved, np.array(numbers["forces_mN"]["ball"]), np.array(numbers["forces_mN"]["floor"])))
+    for ours, theirs in zip(*found, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-4 * np.abs(theirs).max())
+    assert np.abs(found[0][1]).max() > 1.0 and not found[0][1][-1].any()  # tied, then let go
+
+
+def test_devices_are_named_in_messages(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="device must be one of cpu, cuda, warp-cpu, or a numbered GPU such as cuda:1, not 'gpu'"):
+        simulate_lattice(study_file(tmp_path, TIED), tmp_path / "out", device="gpu")
+    pytest.importorskip("warp")
+    with pytest.raises(InputError, match="contact with friction is computed on 'cpu' only"):
+        simulate_lattice(study_file(tmp_path), tmp_path / "out", device="warp-cpu")

@@ -45,7 +45,9 @@ def reproduce(chapter: ChapterName, *, out: Path = Path("naibu-reproduction"), s
 
 
 @app.command
-def simulate(study: str = "", *, out: Path = Path("naibu-simulation"), resume: bool = False, example: bool = False) -> None:
+def simulate(
+    study: str = "", *, out: Path = Path("naibu-simulation"), resume: bool = False, device: str = "cpu", example: bool = False
+) -> None:
     """Simulate a study, and write its motion for ParaView, an animated page and the numbers.
 
     Without STUDY, the studies that come with naibu are listed. Ctrl-C keeps what has been computed.
@@ -58,6 +60,8 @@ def simulate(study: str = "", *, out: Path = Path("naibu-simulation"), resume: b
         Folder for the files.
     resume
         Resume an interrupted run of a lattice.
+    device
+        Where a lattice is computed: cpu, cuda (an NVIDIA GPU; needs naibu[gpu]), or warp-cpu (the GPU's kernels on the CPU, for tests).
     example
         Print the file of a lattice study as a template for your own: naibu simulate --example > my_study.toml
     """
@@ -79,7 +83,7 @@ def simulate(study: str = "", *, out: Path = Path("naibu-simulation"), resume: b
             if stopping():
                 raise KeyboardInterrupt
 
-        run = simulated(study, out=out, resume=resume, progress=progress)
+        run = simulated(study, out=out, resume=resume, device=device, progress=progress)
     say(f"{time.perf_counter() - began:.0f} s. {', '.join(str(path) for path in run.files)}")
     if not run.finished:
         errors.print(f"Interrupted: {run.frames} of {run.of} frames are kept. The same command with --resume goes on.", soft_wrap=True)

@@ -9,6 +9,7 @@ from .contact.indenter_geometry import (
     plane_geometry,
     sphere_geometry,
 )
+from .contact.indenter_motion import IndenterForce, IndenterVelocity
 from .contact.penalty_contact import Contact
 from .contact.rigid_indenters import (
     RigidIndenter,
@@ -20,6 +21,7 @@ from .contact.rigid_indenters import (
     plane_indenter,
     spherical_indenter,
 )
+from .contact.session_protocol import Engine, Session, StepForces
 from .finite_elements.assembly import Assembler, body_force
 from .finite_elements.boundary_conditions import PrescribedDisplacement
 from .finite_elements.elements import Elements, elements
@@ -29,6 +31,7 @@ from .finite_strain.sensitivities import sensitivities
 from .finite_strain.statics import LoadState, Solution, solve
 from .finite_strain.viscoelasticity import PronySeries, ViscoelasticSolution, simulate_viscoelastic
 from .lattices.cpu.engine import LatticeEngine
+from .lattices.cpu.session import LatticeSession
 from .lattices.gpu.engine import WarpLatticeEngine
 from .lattices.model.hexahedra import lattice_mesh
 from .lattices.model.lattice import (
@@ -46,7 +49,6 @@ from .lattices.model.tetrahedral_springs import volumetric_lattice
 from .lattices.simulation.adjoint import ParameterGradient, RecordedPush, push_gradient, recorded_push
 from .lattices.simulation.contact import ContactMotion, push, push_by_force
 from .lattices.simulation.loading_history import LatticeStudy, StudyBody, StudyFrame, StudyState, run_study
-from .lattices.simulation.session import LatticeSession
 from .linear_algebra.block_matrix import BlockPattern, block_pattern, with_dirichlet_rows
 from .linear_algebra.direct import direct_solver
 from .linear_algebra.multigrid import MultigridSolver, rigid_body_modes
@@ -67,9 +69,12 @@ __all__ = [
     "Contact",
     "ContactMotion",
     "Elements",
+    "Engine",
     "Factorization",
     "Friction",
+    "IndenterForce",
     "IndenterGeometry",
+    "IndenterVelocity",
     "Lattice",
     "LatticeEngine",
     "LatticeParameters",
@@ -95,8 +100,10 @@ __all__ = [
     "RigidIndenter",
     "Series",
     "SeriesDerivatives",
+    "Session",
     "Solution",
     "SolverSettings",
+    "StepForces",
     "StudyBody",
     "StudyFrame",
     "StudyState",

@@ -25,10 +25,10 @@ from naibu.io.files.reading import read_bytes
 from naibu.io.images import read_volume
 from naibu.io.lattice_study_schema import FloorTable, IndenterTable, ObjectTable, StudyFile, load_study
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter, box_indenter, cylindrical_indenter, plane_indenter, spherical_indenter
+from naibu.mechanics.lattices.model.contact_state import begin_contact
 from naibu.mechanics.lattices.model.hexahedra import lattice_mesh
 from naibu.mechanics.lattices.model.lattice import CLASSES, Lattice, box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.octree import octree_lattice
-from naibu.mechanics.lattices.simulation.contact import begin_contact
 from naibu.mechanics.lattices.simulation.loading_history import Drive, LatticeStudy, StudyBody, check_study
 from naibu.mechanics.prescribed_motion import PrescribedMotion
 

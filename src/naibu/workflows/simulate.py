@@ -43,7 +43,12 @@ def named_studies() -> tuple[NamedStudy, ...]:
 
 
 def simulate(
-    study: str | os.PathLike[str], *, out: str | os.PathLike[str], resume: bool = False, progress: Progress | None = None
+    study: str | os.PathLike[str],
+    *,
+    out: str | os.PathLike[str],
+    resume: bool = False,
+    device: str = "cpu",
+    progress: Progress | None = None,
 ) -> SimulationRun:
     """Simulate a study, and write its motion for ParaView, an animated page and the numbers.
 
@@ -57,6 +62,9 @@ def simulate(
         Folder for the files.
     resume : bool
         Whether an interrupted run of a lattice is resumed; the result is the same as without an interruption.
+    device : str
+        Where a lattice is computed: ``"cpu"``, ``"cuda"`` (an NVIDIA GPU; ``"cuda:1"`` for the second), or ``"warp-cpu"`` (the kernels of
+        the GPU on the processor, for tests). Contact with friction is computed on the CPU only.
     progress : callable, optional
         Called with a `ProgressReport` after every frame of a lattice, and after every study of finite elements.
 
@@ -78,9 +86,11 @@ def simulate(
 
     name = os.fspath(study)
     if name != SQUARES_TOGETHER and name not in SLUGS:
-        return simulate_lattice(study, out, resume=resume, tell=tell)
+        return simulate_lattice(study, out, resume=resume, device=device, tell=tell)
     if resume:
         raise InputError(f"{name} takes seconds and keeps nothing to resume from; run it without `resume`")
+    if device != "cpu":
+        raise InputError(f"device is {device!r}, and {name} is a study of finite elements, which run on 'cpu'; choose that, or a lattice")
     files = simulate_study(name, out, progress=progress)
     count = sum(path.suffix == ".vtkhdf" for path in files)
     return SimulationRun(tuple(files), count, count)

@@ -18,9 +18,9 @@ from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.io.files.atomic import write_atomically
 from naibu.io.vtkhdf_series import SeriesFile
+from naibu.mechanics.lattices.model.contact_state import ContactState
 from naibu.mechanics.lattices.model.state import LatticeState
 from naibu.mechanics.lattices.model.surface import surface_of
-from naibu.mechanics.lattices.simulation.contact import ContactState
 from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy, StudyFrame, StudyState, run_study
 from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, motion_html
 from naibu.viewer.tables import Table
@@ -28,6 +28,7 @@ from naibu.workflows.lattice_study import PreparedStudy, prepared_study
 from naibu.workflows.result_folder import result_folder
 
 Tell = Callable[[int, int], None]
+CONTACT_ARRAYS = ("nodes", "mode", "friction", "touched", "centres", "axes")
 PAGE_BYTES = 3_000_000
 PAGE_FRAMES, PAGE_POINTS = 200, 2_000_000
 ARRAYS = {"displacement": "displacement_mm", "velocity": "velocity_mm_per_s", "stretch": "stretch"}
@@ -56,7 +57,7 @@ class SimulationRun:
 
 
 def simulate_lattice(
-    source: str | os.PathLike[str], out: str | os.PathLike[str], *, resume: bool = False, tell: Tell | None = None
+    source: str | os.PathLike[str], out: str | os.PathLike[str], *, resume: bool = False, device: str = "cpu", tell: Tell | None = None
 ) -> SimulationRun:
     """Run a study, and write ``NAME.html``, ``NAME.vtkhdf`` and ``NAME.json``; an interruption keeps the frames computed so far.
 
@@ -70,6 +71,8 @@ def simulate_lattice(
         Folder for the files.
     resume : bool
         Whether an interrupted run goes on; the result is the same as if it had not been interrupted.
+    device : str
+        ``"cpu"``, ``"cuda"`` or ``"cuda:1"`` and so on (an NVIDIA GPU), or ``"warp-cpu"`` (the GPU's kernels on the processor, for tests).
     tell : callable
         Told the frames that are kept, and how many there will be.
 
@@ -92,7 +95,7 @@ def simulate_lattice(
     start = _read_checkpoint(checkpoint, prepared) if resume else None
     series = SeriesFile.begun(path, prepared.mesh) if start is None else SeriesFile.continued(path, prepared.mesh, start.frame + 1)
     with series:
-        state, stopped = _computed(prepared, series, start, tell)
+        state, stopped = _computed(prepared, series, start, device, tell)
         if state is None:
             raise stopped or KeyboardInterrupt
         series.truncate(state.frame + 1)  # what an interruption left of the next one
@@ -109,12 +112,12 @@ def simulate_lattice(
 
 
 def _computed(
-    prepared: PreparedStudy, series: SeriesFile, start: StudyState | None, tell: Tell | None
+    prepared: PreparedStudy, series: SeriesFile, start: StudyState | None, device: str, tell: Tell | None
 ) -> tuple[StudyState | None, BaseException | None]:
     """Append frames; return the last whole one, and what stopped the run before its end."""
     state = start
     try:
-        for frame in run_study(prepared.study, start):
+        for frame in run_study(prepared.study, start, device=device):
             _append(series, prepared, frame)
             state = frame.state
             if tell is not None:
@@ -258,7 +261,7 @@ def _tables(prepared: PreparedStudy, force: FloatArray, moved: FloatArray, times
 
 def _packed(state: StudyState, fingerprint: str) -> bytes:
     """Return a state as an .npz file."""
-    lattice, contact = state.lattice, state.contact
+    lattice, contact = state.lattice, state.lattice.contact
     arrays: dict[str, Any] = {
         "fingerprint": np.array(fingerprint),
         "frame": np.array(state.frame),
@@ -272,7 +275,7 @@ def _packed(state: StudyState, fingerprint: str) -> bytes:
     if lattice.length is not None:
         arrays["length"] = lattice.length
     if contact is not None:
-        arrays |= {f"contact_{name}": getattr(contact, name) for name in ("nodes", "mode", "friction", "touched", "places")}
+        arrays |= {f"contact_{name}": getattr(contact, name) for name in CONTACT_ARRAYS}
     stream = io.BytesIO()
     np.savez(stream, **arrays)
     return stream.getvalue()
@@ -287,10 +290,10 @@ def _read_checkpoint(path: Path, prepared: PreparedStudy) -> StudyState:
         same = str(data["fingerprint"]) == prepared.fingerprint
         contact = None
         if "contact_nodes" in data:
-            contact = ContactState(*(data[f"contact_{name}"] for name in ("nodes", "mode", "friction", "touched", "places")))
-        lattice = LatticeState(data["position"], data["velocity"], data["extension"], data.get("length"))
+            contact = ContactState(*(data[f"contact_{name}"] for name in CONTACT_ARRAYS))
+        lattice = LatticeState(data["position"], data["velocity"], data["extension"], data.get("length"), contact)
         speed, external_work, unsettled = data["numbers"].tolist()
-        state = StudyState(int(data["frame"]), lattice, contact, speed, data["places"], data["work"], external_work, int(unsettled))
+        state = StudyState(int(data["frame"]), lattice, speed, data["places"], data["work"], external_work, int(unsettled))
     except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
         raise InputError(f"{path}: is damaged ({error}); run without `resume`") from error
     if not same:

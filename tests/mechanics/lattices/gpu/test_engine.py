@@ -1,4 +1,4 @@
-"""Lattices on a device of Warp against the engine of the processor, against conservation laws, and compiled for CUDA (spec L1)."""
+"""Lattices on a device of Warp against the engine of the processor, against conservation laws, and compiled for CUDA."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from naibu.core.errors import ConvergenceError, InputError, MissingDependencyError
+from naibu.mechanics.contact.indenter_motion import IndenterVelocity
+from naibu.mechanics.contact.rigid_indenters import plane_indenter
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.gpu.engine import WarpLatticeEngine
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, lattice_parameters
@@ -111,7 +113,7 @@ def test_a_session_goes_on_where_it_was(device, method):
     path[:, 1, 2] = 10.0 * np.sin(0.05 * np.arange(300))
     whole = engine.run(spinning(lattice), 300, constrained, path)
     session = engine.session(spinning(lattice), constrained)
-    reaction = np.concatenate([session.advance(len(part), part) for part in (path[:7], path[7:280], path[280:])])
+    reaction = np.concatenate([session.step(part, steps=len(part)).bodies for part in (path[:7], path[7:280], path[280:])])
     np.testing.assert_array_equal(reaction, whole.reaction)
     np.testing.assert_array_equal(session.state().position, whole.state.position)
 
@@ -121,7 +123,7 @@ def test_both_copies_of_an_extension_stay_the_same_to_the_last_bit(device):
     for method in METHODS:
         engine = WarpLatticeEngine.of(lattice, parameters_of(lattice, each=True), step=EXPLICIT_STEP_S, method=method, device=device)
         session = engine.session(spinning(lattice))
-        session.advance(50)
+        session.step(steps=50)
         copies = session.y.numpy()[engine.lists.places]
         np.testing.assert_array_equal(copies[:, 0], copies[:, 1])
         assert np.abs(copies).max() > 0.0
@@ -165,7 +167,7 @@ def test_energy_of_implicit_steps_never_grows(device, seed):
         start.velocity[:3] = 0.0
     session, found = engine.session(start, constrained), [engine.energy(start)]
     for _ in range(20):
-        session.advance(1)
+        session.step(steps=1)
         found.append(engine.energy(session.state()))
     assert np.diff(found).max() <= 1e-9 * found[0]
 
@@ -234,3 +236,35 @@ def test_bad_states_are_named_and_explicit_steps_that_blow_up_say_so(device):
         engine.run(rest, 1, ConstrainedNodes.of([lattice.n_nodes]))
     with pytest.raises(ConvergenceError, match="blew up within 200 steps"):
         engine.run(spinning(lattice), 200)
+
+
+@pytest.mark.parametrize("method", ["implicit", "symplectic_euler"])
+def test_a_session_changes_its_constraints_and_goes_back_to_a_state(device, method):
+    """Constraints that are let go, a state put back: the same steps give the same numbers to the last bit."""
+    lattice = classic_lattice(box_mask((3, 3, 4)), 10.0, total_mass_kg=0.05)
+    parameters = lattice_parameters(lattice, 40.0, 0.02, 0.5)
+    step = 2e-3 if method == "implicit" else EXPLICIT_STEP_S
+    engine = WarpLatticeEngine.of(lattice, parameters, step=step, method=method, device=device)
+    top, bottom = (np.flatnonzero(lattice.points[:, 2] == z) for z in (lattice.points[:, 2].max(), 0.0))
+    both = ConstrainedNodes.of(bottom, 0) + ConstrainedNodes.of(top, 1)
+    with engine.session(constrained=both) as session:
+        session.step([[0, 0, 0], [0, 0, -20.0]], steps=20)
+        kept = session.state()
+        session.constrain(ConstrainedNodes.of(bottom, 0), 2)
+        first = session.step(steps=20)
+        end = session.positions()
+        session.restore(kept)
+        np.testing.assert_array_equal(session.step(steps=20).bodies, first.bodies)
+        np.testing.assert_array_equal(session.positions(), end)
+        assert session.forces().bodies.shape == (20, 2, 3) and not session.forces().bodies[:, 1].any()
+    expected = engine.run(kept, 20, ConstrainedNodes.of(bottom, 0))
+    np.testing.assert_array_equal(end, expected.state.position)
+
+
+def test_contact_is_refused(device):
+    lattice = classic_lattice(box_mask((2, 2, 2)), 10.0, total_mass_kg=0.05)
+    engine = WarpLatticeEngine.of(lattice, lattice_parameters(lattice, 40.0, 10.0, 50.0), device=device)
+    with pytest.raises(InputError, match="contact is computed by LatticeEngine"):
+        engine.session(indenters=[plane_indenter((0, 0, 0))])
+    with pytest.raises(InputError, match="motions has 1 entries for 0 indenters"):
+        engine.session().step(motions=[IndenterVelocity()])

@@ -10,9 +10,10 @@ import pytest
 from naibu.core.errors import InputError
 from naibu.mechanics.contact.rigid_indenters import box_indenter, cylindrical_indenter, plane_indenter, spherical_indenter
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
+from naibu.mechanics.lattices.model.contact_state import begin_contact
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, general_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState
-from naibu.mechanics.lattices.simulation.contact import begin_contact, displacement_drive, force_drive, hand_over, push, push_by_force
+from naibu.mechanics.lattices.simulation.contact import displacement_drive, force_drive, hand_over, push, push_by_force
 
 GRAVITY = 9810.0  # mm/s^2
 
@@ -116,7 +117,7 @@ def test_static_friction_holds_until_its_limit(pull, slides):
     sideways = np.zeros_like(gravity)
     low = lattice.points[:, 2] < 1.0  # at the height of the floor, so that the block does not tip
     sideways[low, 0] = pull * 0.4 * lattice.total_mass * GRAVITY / low.sum()
-    motion = push(engine, rest.state, floor, 0.0, steps=400, contact=rest.contact, external_force=gravity + sideways)
+    motion = push(engine, rest.state, floor, 0.0, steps=400, external_force=gravity + sideways)
     speed = (lattice.node_mass @ motion.state.velocity[:, 0]) / lattice.total_mass
     if slides:
         assert speed == pytest.approx((1.1 * 0.4 - 0.3) * GRAVITY * 400 * engine.step, rel=0.03)
@@ -137,20 +138,20 @@ def pair(gap, speed):
 def test_pull_off_acts_on_masses_that_leave_slowly(speed, expected):
     lattice, engine, state = pair(0.5, speed)
     floor = [plane_indenter((0, 0, 0), pull_stiffness=3.0, pull_damping=0.2, pull_speed=5.0)]
-    contact = begin_contact(lattice, floor, state)
+    contact = begin_contact(lattice, floor, state.position)
     contact.touched[:] = np.array([[True], [False]])
-    motion = push(engine, state, floor, 0.0, steps=1, contact=contact)
+    motion = push(engine, replace(state, contact=contact), floor, 0.0, steps=1)
     assert -motion.reaction[0, 0, 2] == pytest.approx(expected)
     contact.touched[:] = False
-    assert push(engine, state, floor, 0.0, steps=1, contact=contact).reaction[0, 0, 2] == 0.0
+    assert push(engine, replace(state, contact=contact), floor, 0.0, steps=1).reaction[0, 0, 2] == 0.0
 
 
 def test_pull_off_never_turns_a_mass_around():
     lattice, engine, state = pair(0.5, 2.0)
     floor = [plane_indenter((0, 0, 0), pull_stiffness=1e6, pull_damping=1e6, pull_speed=5.0)]
-    contact = begin_contact(lattice, floor, state)
+    contact = begin_contact(lattice, floor, state.position)
     contact.touched[:] = True
-    motion = push(engine, state, floor, 0.0, steps=1, contact=contact)
+    motion = push(engine, replace(state, contact=contact), floor, 0.0, steps=1)
     assert motion.reaction[0, 0, 2] == pytest.approx(-2 * 0.01 * 2.0 / engine.step)
 
 
@@ -165,7 +166,7 @@ def test_a_released_plate_leaves_the_object():
     motion = push(engine, engine.rest(), bodies, path)
     assert motion.reaction[150, 1, 2] < -100.0
     np.testing.assert_allclose(motion.reaction[-20:, 1], 0.0, atol=1e-9)
-    assert (motion.contact.mode[:, 1] == 0).all()
+    assert (motion.state.contact.mode[:, 1] == 0).all()
     assert motion.reaction[:, 1, 2].max() < 1e-6  # a body without pull-off never pulls
 
 
@@ -187,7 +188,7 @@ def test_a_body_driven_by_a_force_comes_to_balance():
     ("call", "said"),
     [
         (lambda: begin_contact(block()[0], [spherical_indenter((15, 15, 30), 5.0)]), "begins inside the object"),
-        (lambda: begin_contact(block()[0], []), "no body"),
+        (lambda: begin_contact(block()[0], []), "indenters is empty"),
         (lambda: plane_indenter((0, 0, 0), (0, 0, 0)), "length"),
         (lambda: plane_indenter((0, 0, 0), static_friction=0.2, kinetic_friction=0.3), "0.3 (kinetic)"),
         (lambda: box_indenter((0, 0, 0), (1, -1, 1)), "-1"),
@@ -196,7 +197,7 @@ def test_a_body_driven_by_a_force_comes_to_balance():
         (lambda: hand_over(block()[0], "top", [[4.0, 5.0, 0.0]]), "'top'"),
         (lambda: push(block(method="euler", step=1e-5)[1], block()[1].rest(), [plane_indenter((0, 0, 0))], 0.0, steps=1), "implicit"),
         (lambda: push(block()[1], block()[1].rest(), [plane_indenter((0, 0, 0))], np.nan, steps=1), "NaN"),
-        (lambda: push(block()[1], block()[1].rest(), [plane_indenter((0, 0, 0))], np.zeros((4, 2, 3))), "2 bodies"),
+        (lambda: push(block()[1], block()[1].rest(), [plane_indenter((0, 0, 0))], np.zeros((4, 2, 3))), "2 indenters"),
     ],
 )
 def test_bad_input_is_named(call, said):
@@ -227,10 +228,10 @@ def test_a_thrown_block_stops_and_stays():
     weight = GRAVITY * np.outer(lattice.node_mass, [0.0, 0.0, -1.0])
     rest = push(engine, engine.rest(), floor, 0.0, steps=500, external_force=weight)
     thrown = replace(rest.state, velocity=rest.state.velocity + np.array([300.0, 0.0, 0.0]))
-    motion = push(engine, thrown, floor, 0.0, steps=150, contact=rest.contact, external_force=weight)
+    motion = push(engine, thrown, floor, 0.0, steps=150, external_force=weight)
     way = (motion.state.position - rest.state.position)[:, 0].mean()
     assert way == pytest.approx(300.0**2 / (2 * 0.4 * GRAVITY), rel=0.05)
     assert np.abs(motion.state.velocity).max() < 0.5
-    low = lattice.points[motion.contact.nodes, 2] == 0.0
-    assert (motion.contact.mode[low & (motion.contact.mode[:, 0] > 0), 0] == 1).all()
+    low = lattice.points[motion.state.contact.nodes, 2] == 0.0
+    assert (motion.state.contact.mode[low & (motion.state.contact.mode[:, 0] > 0), 0] == 1).all()
     assert np.abs(motion.reaction[-1, 0, :2]).max() < 0.4 * lattice.total_mass * GRAVITY

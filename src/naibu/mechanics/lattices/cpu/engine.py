@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -13,8 +14,10 @@ from naibu._numba.simd import WIDTH, aligned
 from naibu._numba.thread_pool import MOST_PARTS
 from naibu.core.arrays import AnyFloatArray, FloatArray
 from naibu.core.errors import ConvergenceError, InputError
+from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.lattices.cpu.element_blocks import Blocks, explicit_kernel, implicit_kernel
 from naibu.mechanics.lattices.cpu.scratch import KernelTuple, Scratch, ScratchPool
+from naibu.mechanics.lattices.cpu.session import LatticeSession
 from naibu.mechanics.lattices.cpu.stepper import ExplicitStepper, ImplicitStepper, Stepper
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters, require_positive
 from naibu.mechanics.lattices.model.state import (
@@ -25,7 +28,9 @@ from naibu.mechanics.lattices.model.state import (
     Motion,
     checked_velocity,
     explicit_step_limit,
+    followed_lengths,
     require_constrained,
+    require_no_contact,
     require_numbers,
 )
 
@@ -120,6 +125,34 @@ class LatticeEngine:
         """Return the lattice at rest, without any force."""
         return LatticeState(self.lattice.points.copy(), np.zeros_like(self.lattice.points), np.zeros(self.lattice.n_elements))
 
+    def session(
+        self,
+        state: LatticeState | None = None,
+        constrained: ConstrainedNodes | None = None,
+        external_force: ArrayLike | None = None,
+        indenters: Sequence[RigidIndenter] = (),
+    ) -> LatticeSession:
+        """Begin a session, for loops that ask for a few steps at a time.
+
+        Parameters
+        ----------
+        state : LatticeState
+            Where it begins, by default in the reference configuration; copied.
+        constrained : ConstrainedNodes
+            Nodes that bodies move; see `LatticeSession.constrain`.
+        external_force : array_like
+            Forces on the nodes that do not change, mN, broadcast to (n, 3).
+        indenters : sequence of RigidIndenter
+            In contact with the lattice; see `LatticeSession.press`. Of a state in contact, the same ones again.
+
+        Raises
+        ------
+        InputError
+            Shapes that do not fit, NaN, constrained nodes that are not there, an indenter inside the object, other indenters than those of
+            the state, or contact by an explicit method.
+        """
+        return LatticeSession.of(self, state, constrained, external_force, indenters)
+
     def run(
         self,
         state: LatticeState,
@@ -153,6 +186,7 @@ class LatticeEngine:
         constrained = constrained or ConstrainedNodes.none()
         bodies = int(constrained.body.max(initial=-1)) + 1
         path = checked_velocity(velocity, steps, bodies)
+        require_no_contact(state)
         require_constrained(constrained, self.lattice.n_nodes)
         reaction = np.zeros(path.shape)
         with self.scratch() as scratch:
@@ -211,10 +245,7 @@ class LatticeEngine:
 
     def stored_lengths(self, state: LatticeState) -> Any:
         """Return the lengths that the extensions followed (8 nb,), as kernels hold them."""
-        known = state.length
-        if known is None:
-            i, j = self.lattice.elements.T
-            known = np.linalg.norm(state.position[j] - state.position[i], axis=1)
+        known = followed_lengths(self.lattice, state)
         if np.shape(known) != (self.lattice.n_elements,):
             raise InputError(f"the length of the state has shape {np.shape(known)}, the lattice has {self.lattice.n_elements} elements")
         lengths = aligned((WIDTH * self.blocks.n_blocks,), float)

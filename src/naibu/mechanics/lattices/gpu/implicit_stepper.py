@@ -9,16 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from naibu.core.arrays import FloatArray
-from naibu.mechanics.lattices.gpu.device_arrays import compiled, recorded, warp_package
-from naibu.mechanics.lattices.model.state import LatticeState
-
-if TYPE_CHECKING:
-    from naibu.mechanics.lattices.gpu.engine import LatticeSession
+from naibu.mechanics.lattices.gpu.device_arrays import ConstrainedArrays, compiled, recorded, warp_package
+from naibu.mechanics.lattices.gpu.prepared_lattice import PreparedLattice
+from naibu.mechanics.lattices.model.state import LatticeState, followed_lengths
 
 _BATCH = 8  # iterations between two looks at the residual
 _LIMIT = 20_000
@@ -66,13 +64,29 @@ class DeviceSums:
         warp_package().launch(compiled("_explicit_kernels").fold, sums.shape[0], inputs=[values, sums], device=self.device)
 
 
+class SteppedSession(Protocol):
+    """What implicit steps need of a session: `naibu.mechanics.lattices.gpu.session.WarpLatticeSession`."""
+
+    engine: PreparedLattice
+    constrained: ConstrainedArrays
+    x: Any
+    v: Any
+    y: Any
+    external: Any
+    path: Any
+    count: Any
+
+    def collect(self) -> None:
+        """Add up what bodies exert in this step."""
+
+
 @dataclass(slots=True, eq=False)
 class ImplicitSteps:
     """Implicit steps of a session, and the arrays that they need.
 
     Attributes
     ----------
-    session : LatticeSession
+    session : SteppedSession
         What moves.
     lengths : warp array
         Lengths that the extensions followed, mm, at both ends of the elements.
@@ -92,7 +106,7 @@ class ImplicitSteps:
         Which add it up.
     """
 
-    session: LatticeSession
+    session: SteppedSession
     lengths: Any
     smoother: Any
     before: Any
@@ -115,16 +129,14 @@ class ImplicitSteps:
     _batch: Callable[[], None] | None = field(default=None, repr=False)
 
     @classmethod
-    def of(cls, session: LatticeSession, state: LatticeState) -> ImplicitSteps:
+    def of(cls, session: SteppedSession, state: LatticeState) -> ImplicitSteps:
         """Prepare the steps of a session that begins with a state."""
         wp, kernels = warp_package(), compiled("_implicit_kernels")
         engine = session.engine
         lattice, device = engine.lattice, engine.device
         n = lattice.n_nodes
-        known = state.length
+        known = followed_lengths(lattice, state)
         i, j = lattice.elements.T
-        if known is None:
-            known = np.linalg.norm(state.position[j] - state.position[i], axis=1)
         stiff = engine.step**2 / 3.0 * engine.table.numpy()[:, 0][engine.lists.of_elements(engine.row).astype(np.int64)]
         diagonal = lattice.node_mass + np.bincount(i, stiff, minlength=n) + np.bincount(j, stiff, minlength=n)
 
@@ -144,6 +156,10 @@ class ImplicitSteps:
             vectors=DeviceSums(n, wp.vec3d, device),
             moments=DeviceSums(n, kernels.Vector12, device),
         )
+
+    def forget_recorded(self) -> None:
+        """Record the iterations anew at the next step, for other constraints."""
+        self._batch = None
 
     def take(self) -> tuple[int, bool]:
         """Take a step; return the iterations of the solver, and whether rotation had to be held back."""

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.mechanics.lattices.model.coefficients import explicit_coefficients
+from naibu.mechanics.lattices.model.contact_state import ContactState
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
 
 Method = Literal["implicit", "euler", "symplectic_euler"]
@@ -33,12 +34,15 @@ class LatticeState:
     length : ndarray, shape (m,)
         Lengths of the elements that the extensions have followed so far, mm; by default the distances of the masses. They lag behind where
         the implicit method held back what rotation adds, and catch up.
+    contact : ContactState, optional
+        Of the indenters that touch the lattice, so that friction and pull-off go on as they were.
     """
 
     position: FloatArray
     velocity: FloatArray
     extension: FloatArray
     length: FloatArray | None = None
+    contact: ContactState | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,6 +143,29 @@ def require_numbers(values: FloatArray, what: str) -> None:
     if wrong.any():
         at = tuple(int(k) for k in np.argwhere(wrong)[0])
         raise InputError(f"{what} holds {int(wrong.sum())} NaN or infinite values, the first at {at}; leave them out or fill them")
+
+
+def followed_lengths(lattice: Lattice, state: LatticeState) -> FloatArray:
+    """Return the lengths that the extensions followed (m,), mm: by default the distances of the nodes."""
+    if state.length is not None:
+        return state.length
+    i, j = lattice.elements.T
+    return np.asarray(np.linalg.norm(state.position[j] - state.position[i], axis=1))
+
+
+def require_no_contact(state: LatticeState) -> None:
+    """Refuse a state in contact, whose indenters would be left out.
+
+    Raises
+    ------
+    InputError
+        It is in contact.
+    """
+    if state.contact is not None:
+        raise InputError(
+            f"state is in contact with {state.contact.mode.shape[1]} indenters, which these steps leave out; go on by a session or "
+            "`push`, or drop the contact: dataclasses.replace(state, contact=None)"
+        )
 
 
 def require_constrained(constrained: ConstrainedNodes, n_nodes: int) -> None:

@@ -11,13 +11,16 @@ import numpy as np
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
+from naibu.mechanics.contact.session_protocol import Engine, Session
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
+from naibu.mechanics.lattices.model.contact_state import TOUCH_MM, begin_contact
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState, Method
-from naibu.mechanics.lattices.simulation.contact import ContactState, begin_contact, push, push_by_force
+from naibu.mechanics.lattices.simulation.contact import push, push_by_force
+from naibu.mechanics.lattices.simulation.engine_selection import lattice_engine
 from naibu.mechanics.prescribed_motion import PrescribedMotion
 
-_TOUCH_MM = 1e-6
+StudyEngine = Engine[LatticeState, ConstrainedNodes]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,9 +139,7 @@ class StudyState:
     frame : int
         The frame.
     lattice : LatticeState
-        Masses and elements.
-    contact : ContactState, optional
-        Of bodies in contact.
+        Nodes, elements and contacts.
     speed : float
         Of the driven body, mm/s.
     places : ndarray, shape (bodies, 3)
@@ -153,7 +154,6 @@ class StudyState:
 
     frame: int
     lattice: LatticeState
-    contact: ContactState | None
     speed: float
     places: FloatArray
     work: FloatArray
@@ -202,7 +202,7 @@ def tied_nodes(lattice: Lattice, bodies: tuple[StudyBody, ...]) -> tuple[IntArra
     found = []
     for body in bodies:
         begin_contact(lattice, [body.indenter])
-        touched = np.abs(body.indenter.gap(lattice.points)) < _TOUCH_MM
+        touched = np.abs(body.indenter.gap(lattice.points)) < TOUCH_MM
         if not touched.any():
             nearest = float(body.indenter.gap(lattice.points).min())
             raise InputError(
@@ -250,12 +250,13 @@ def begin_study(study: LatticeStudy) -> StudyState:
     check_study(study)
     indenters = [body.indenter for body in study.bodies]
     state = LatticeState(study.lattice.points.copy(), np.zeros_like(study.lattice.points), np.zeros(study.lattice.n_elements))
-    contact = None if study.tied else begin_contact(study.lattice, indenters)
+    if not study.tied:
+        state = replace(state, contact=begin_contact(study.lattice, indenters))
     places = np.array([p.centre for p in indenters], dtype=float).reshape(-1, 3)
-    return StudyState(0, state, contact, 0.0, places, np.zeros(len(indenters)), 0.0, 0)
+    return StudyState(0, state, 0.0, places, np.zeros(len(indenters)), 0.0, 0)
 
 
-def run_study(study: LatticeStudy, start: StudyState | None = None) -> Iterator[StudyFrame]:
+def run_study(study: LatticeStudy, start: StudyState | None = None, *, device: str = "cpu") -> Iterator[StudyFrame]:
     """Compute a study frame by frame; nothing is kept of the frames that were yielded.
 
     Parameters
@@ -265,6 +266,8 @@ def run_study(study: LatticeStudy, start: StudyState | None = None) -> Iterator[
     start : StudyState
         Of the last frame of an earlier run, which then goes on exactly as if it had not stopped. By default the run begins at rest, and
         yields that as its first frame.
+    device : str
+        See `naibu.mechanics.lattices.simulation.engine_selection.lattice_engine`; contact is computed on ``"cpu"`` only.
 
     Raises
     ------
@@ -273,12 +276,18 @@ def run_study(study: LatticeStudy, start: StudyState | None = None) -> Iterator[
     ConvergenceError
         An explicit method blew up.
     """
-    engine = LatticeEngine.of(study.lattice, study.parameters, step=study.step_s, method=study.method, tolerance=study.tolerance)
+    if not study.tied and device != "cpu":
+        raise InputError(f"device is {device!r}, but contact with friction is computed on 'cpu' only; choose that, or tie all bodies")
+    engine = lattice_engine(
+        study.lattice, study.parameters, step=study.step_s, method=study.method, tolerance=study.tolerance, device=device
+    )
     state = start
     if state is None:
         state = begin_study(study)
         yield _frame(study, engine, state, np.zeros((0, len(study.bodies), 3)))
-    advance = _Tied.of(study, engine).advance if study.tied else _Touching(study, engine).advance
+    advance = (
+        _Touching(study, engine).advance if isinstance(engine, LatticeEngine) and not study.tied else _Tied.of(study, engine, state).advance
+    )
     while state.frame < study.frames:
         forces = []
         for sample in range(study.samples):
@@ -288,7 +297,7 @@ def run_study(study: LatticeStudy, start: StudyState | None = None) -> Iterator[
         yield _frame(study, engine, state, np.array(forces).reshape(study.samples, len(study.bodies), 3))
 
 
-def _frame(study: LatticeStudy, engine: LatticeEngine, state: StudyState, force: FloatArray) -> StudyFrame:
+def _frame(study: LatticeStudy, engine: StudyEngine, state: StudyState, force: FloatArray) -> StudyFrame:
     lattice, mass = state.lattice, study.lattice.node_mass
     kinetic = 0.5 * float(mass @ (lattice.velocity**2).sum(axis=1))
     first = max(state.frame - 1, 0) * study.samples
@@ -308,41 +317,43 @@ def _external_work(study: LatticeStudy, before: LatticeState, after: LatticeStat
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Tied:
-    """Steps of masses that bodies hold."""
+    """Steps of nodes that are tied to bodies."""
 
     study: LatticeStudy
-    engine: LatticeEngine
+    session: Session[LatticeState, ConstrainedNodes]
     constrained: tuple[ConstrainedNodes, ...]
     until: IntArray
 
     @classmethod
-    def of(cls, study: LatticeStudy, engine: LatticeEngine) -> _Tied:
+    def of(cls, study: LatticeStudy, engine: StudyEngine, start: StudyState) -> _Tied:
         nodes = tied_nodes(study.lattice, study.bodies)
         ends = [body.tied_until_s for body in study.bodies]
         never = np.iinfo(np.int64).max
         until = np.array([never if end is None or np.isinf(end) else round(end / study.step_s) for end in ends], dtype=np.int64)
-        return cls(study, engine, tuple(ConstrainedNodes.of(mine, k) for k, mine in enumerate(nodes)), until)
+        session = engine.session(start.lattice, external_force=study.external_force)
+        return cls(study, session, tuple(ConstrainedNodes.of(mine, k) for k, mine in enumerate(nodes)), until)
 
     def advance(self, state: StudyState, first: int) -> tuple[StudyState, FloatArray]:
         """Take the steps of a sample, in pieces between which bodies let go."""
         study, last = self.study, first + self.study.sample_steps
         bodies = len(study.bodies)
         stops = [first, *sorted({int(u) for u in self.until if first < u < last}), last]
-        lattice, work, impulse = state.lattice, state.work.copy(), np.zeros((bodies, 3))
+        work, impulse = state.work.copy(), np.zeros((bodies, 3))
         path = _velocities(study, first) if bodies else np.zeros((study.sample_steps, 0, 3))
         for begin, end in pairwise(stops):
             constrained = ConstrainedNodes.none()
             for mine, until in zip(self.constrained, self.until, strict=True):
                 constrained = constrained + mine if until > begin else constrained
             own = path[begin - first : end - first]
-            motion = self.engine.run(lattice, end - begin, constrained, own, study.external_force)
-            lattice = motion.state
-            work += study.step_s * (motion.reaction * own).sum(axis=(0, 2))
-            impulse += study.step_s * motion.reaction.sum(axis=0)
+            self.session.constrain(constrained, bodies)
+            reaction = self.session.step(own, steps=end - begin).bodies
+            work += study.step_s * (reaction * own).sum(axis=(0, 2))
+            impulse += study.step_s * reaction.sum(axis=0)
+        lattice = self.session.state()
         moved = [body.moved(np.array([study.step_s * last]))[0] + body.indenter.centre for body in study.bodies]
         external = state.external_work + _external_work(study, state.lattice, lattice)
         places = np.array(moved).reshape(-1, 3)
-        return StudyState(state.frame, lattice, None, 0.0, places, work, external, 0), impulse / study.sample_s
+        return StudyState(state.frame, lattice, 0.0, places, work, external, 0), impulse / study.sample_s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -358,9 +369,7 @@ class _Touching:
         indenters = [body.indenter for body in study.bodies]
         speed = state.speed
         if driven is None:
-            motion = push(
-                self.engine, state.lattice, indenters, _velocities(study, first), contact=state.contact, external_force=study.external_force
-            )
+            motion = push(self.engine, state.lattice, indenters, _velocities(study, first), external_force=study.external_force)
         else:
             drive = study.bodies[driven].drive
             assert drive is not None
@@ -368,12 +377,13 @@ class _Touching:
             direction = drive.direction / np.linalg.norm(drive.direction)
             motion = push_by_force(
                 self.engine, state.lattice, indenters, np.interp(ends, drive.times, drive.force), driven=driven, direction=direction,
-                indenter_mass=drive.mass_kg, speed=speed, contact=state.contact, external_force=study.external_force,
+                indenter_mass=drive.mass_kg, speed=speed, external_force=study.external_force,
             )  # fmt: skip
             speed = float(motion.speed[-1, driven] @ direction)
         work = state.work + study.step_s * (motion.reaction * motion.speed).sum(axis=(0, 2))
         external = state.external_work + _external_work(study, state.lattice, motion.state)
+        assert motion.state.contact is not None
         after = StudyState(
-            state.frame, motion.state, motion.contact, speed, motion.contact.places, work, external, state.unsettled + motion.unsettled
+            state.frame, motion.state, speed, motion.state.contact.centres, work, external, state.unsettled + motion.unsettled
         )
         return after, motion.reaction.mean(axis=0)

@@ -1,0 +1,110 @@
+"""Motion of rigid indenters during a step: a pose at its end, a velocity, or a force along a guide."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from naibu.core.arrays import FloatArray, as_vector, require_positive
+from naibu.core.errors import InputError
+from naibu.core.rigid_transform import RigidTransform
+from naibu.mechanics.contact.rigid_indenters import RigidIndenter
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class IndenterVelocity:
+    """A velocity of an indenter during a step.
+
+    Attributes
+    ----------
+    velocity : ndarray, shape (3,)
+        Of its reference point, mm/s.
+    angular_velocity : ndarray, shape (3,)
+        rad/s, about the reference point.
+    """
+
+    velocity: ArrayLike = (0.0, 0.0, 0.0)
+    angular_velocity: ArrayLike = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class IndenterForce:
+    """A force that drives a guided indenter during a step; its speed and the reaction are found together.
+
+    Attributes
+    ----------
+    force : float
+        Along the direction, mN.
+    direction : ndarray, shape (3,)
+        In which the indenter is guided; of any length.
+    mass_kg : float
+        Of the indenter.
+    """
+
+    force: float
+    direction: ArrayLike
+    mass_kg: float
+
+    def guide(self) -> FloatArray:
+        """Return the unit vector of the direction.
+
+        Raises
+        ------
+        InputError
+            A direction without length, a force that is not finite, or a mass that is not positive.
+        """
+        along = as_vector("direction", self.direction)
+        if not np.linalg.norm(along) > 0.0:
+            raise InputError("the direction of a driven indenter must have a length")
+        if not np.isfinite(self.force):
+            raise InputError(f"the force on a driven indenter must be finite, not {self.force:g} mN")
+        require_positive("mass_kg", self.mass_kg, "kg")
+        return np.asarray(along / np.linalg.norm(along))
+
+
+IndenterMotion = RigidTransform | IndenterVelocity | IndenterForce
+"""Motion of an indenter in a step: its pose at the end of it, from the position in which it was made; a velocity; or a force."""
+
+Poses = dict[int, tuple[FloatArray, FloatArray]]
+
+
+def indenter_velocities(
+    indenters: Sequence[RigidIndenter], motions: Sequence[IndenterMotion], centres: FloatArray, axes: FloatArray, duration_s: float
+) -> tuple[FloatArray, FloatArray, Poses]:
+    """Return velocities (k, 3), mm/s, and angular velocities (k, 3), rad/s, of indenters, and the centre and axes of those given a pose.
+
+    Parameters
+    ----------
+    indenters : sequence of RigidIndenter
+        As they were made; a pose transforms them.
+    motions : sequence of IndenterMotion
+        One for each indenter, or none: they stand still. Those driven by a force have no velocity yet.
+    centres, axes : ndarray, shape (k, 3) and (k, 3, 3)
+        Where they are, mm, and their axes, in rows.
+    duration_s : float
+        In which a pose is reached.
+
+    Raises
+    ------
+    InputError
+        A pose or velocity that is not finite or not in three dimensions.
+    """
+    velocity, spin, poses = np.zeros((len(indenters), 3)), np.zeros((len(indenters), 3)), {}
+    for k, motion in enumerate(motions):
+        if isinstance(motion, IndenterVelocity):
+            velocity[k] = as_vector(f"velocity of motions[{k}]", motion.velocity)
+            spin[k] = as_vector(f"angular_velocity of motions[{k}]", motion.angular_velocity)
+        elif isinstance(motion, RigidTransform):
+            if motion.rotation.shape != (3, 3):
+                raise InputError(f"motions[{k}] is a pose in {len(motion.rotation)} dimensions; give one in three")
+            body = indenters[k]
+            centre = as_vector(f"the pose of motions[{k}]", motion.applied(np.asarray(body.centre, dtype=float)[None])[0])
+            turned = body.geometry.axes @ motion.rotation.T
+            velocity[k] = (centre - centres[k]) / duration_s
+            spin[k] = Rotation.from_matrix(turned.T @ axes[k]).as_rotvec() / duration_s
+            poses[k] = (centre, turned)
+    return velocity, spin, poses

@@ -1,0 +1,169 @@
+"""Implicit steps of a lattice in contact with rigid indenters: stored state, indenters and the history of their contacts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from naibu.core.arrays import AnyFloatArray, BoolArray, FloatArray, IntArray
+from naibu.mechanics.contact.indenter_geometry import GeometryArrays, packed_geometries
+from naibu.mechanics.contact.rigid_indenters import RigidIndenter
+from naibu.mechanics.lattices.cpu._contact_kernels import FREE, contact_steps
+from naibu.mechanics.lattices.cpu.stepper import MOST_ITERATIONS, ImplicitStepper
+from naibu.mechanics.lattices.model.contact_state import ContactState
+
+PASSES = 20  # solutions in a step, at most
+SECANT_STEPS = 12  # of the speed of an indenter that a force drives
+SLOW = 1e-5  # spacings a step: nodes that slide more slowly stick
+
+
+@dataclass(slots=True, eq=False)
+class ContactStepper:
+    """An implicit stepper with indenters.
+
+    Attributes
+    ----------
+    base : ImplicitStepper
+        State of the lattice, and what its nodes are constrained to.
+    contact : ContactState
+        Changed in place by the steps.
+    geometry : tuple
+        Of the indenters, as the kernels read it.
+    friction : ndarray, shape (k, 2)
+        Static and kinetic coefficients.
+    pull : ndarray, shape (k, 3)
+        K_r, C_r and V_t of pull-off.
+    slow : float
+        Slip velocity, mm/s, below which nodes stick.
+    passes : int
+        Most solutions in a step.
+    """
+
+    base: ImplicitStepper
+    contact: ContactState
+    geometry: GeometryArrays
+    friction: FloatArray
+    pull: FloatArray
+    slow: float
+    passes: int = PASSES
+
+    @classmethod
+    def of(
+        cls, base: ImplicitStepper, indenters: Sequence[RigidIndenter], contact: ContactState, spacing_mm: float, passes: int = PASSES
+    ) -> ContactStepper:
+        """Put indenters beside a lattice; the contact state is copied."""
+        own = ContactState(*(getattr(contact, name).copy() for name in ("nodes", "mode", "friction", "touched", "centres", "axes")))
+        friction = np.array([(p.static_friction, p.kinetic_friction) for p in indenters])
+        pull = np.array([(p.pull_stiffness, p.pull_damping, p.pull_speed) for p in indenters])
+        geometry = packed_geometries([p.geometry for p in indenters])
+        return cls(base, own, geometry, friction, pull, SLOW * spacing_mm / base.step, passes)
+
+    def advance(
+        self, held_velocity: FloatArray, velocity: FloatArray, spin: FloatArray, reactions: tuple[FloatArray, FloatArray]
+    ) -> tuple[int, int, int]:
+        """Take len(velocity) steps; return iterations, passes and the steps whose contacts did not settle.
+
+        Parameters
+        ----------
+        held_velocity : ndarray, shape (steps, bodies, 3)
+            Velocities of the bodies that move constrained nodes, mm/s.
+        velocity, spin : ndarray, shape (steps, k, 3)
+            Velocities, mm/s, and angular velocities, rad/s, of the indenters.
+        reactions : tuple of ndarray
+            Of the bodies and of the indenters, mN, of the shapes of their velocities; filled.
+        """
+        base, contact = self.base, self.contact
+        free = ~np.isin(contact.nodes, base.constrained[0])  # constrained nodes are in no contact
+        contact.mode[~free] = FREE
+        contact.friction[~free] = 0.0
+        history = (contact.mode[free], contact.friction[free], contact.touched[free])
+        indenters = ((self.geometry, contact.axes), contact.centres, self.friction, self.pull, contact.nodes[free])
+        (blocks, tables), (work, inner) = base.kernel, base.scratch
+        for values in reactions:
+            values[:] = 0.0
+        found: tuple[int, int, int] = contact_steps(
+            blocks, tables, (base.position, base.velocity, base.extension, base.length), base.mass, base.external, work, inner, indenters,
+            history, base.constrained, (held_velocity, velocity, spin), base.step, (base.tolerance, MOST_ITERATIONS), reactions,
+            (self.passes, self.slow),
+        )  # fmt: skip
+        contact.mode[free], contact.friction[free], contact.touched[free] = history
+        return found
+
+    def saved(self) -> tuple[AnyFloatArray | IntArray | BoolArray, ...]:
+        """Return copies of all that steps change, for `put_back`."""
+        return tuple(array.copy() for array in self._changing())
+
+    def put_back(self, saved: tuple[AnyFloatArray | IntArray | BoolArray, ...]) -> None:
+        """Undo the steps since `saved`."""
+        for array, old in zip(self._changing(), saved, strict=True):
+            array[...] = old
+
+    def _changing(self) -> tuple[AnyFloatArray | IntArray | BoolArray, ...]:
+        base, contact = self.base, self.contact
+        lattice = (base.position, base.velocity, base.extension, base.length)
+        return (*lattice, contact.mode, contact.friction, contact.touched, contact.centres, contact.axes)
+
+    def copied_contact(self) -> ContactState:
+        """Return a copy of the state of the contacts."""
+        contact = self.contact
+        return replace(
+            contact, mode=contact.mode.copy(), friction=contact.friction.copy(), touched=contact.touched.copy(),
+            centres=contact.centres.copy(), axes=contact.axes.copy(),
+        )  # fmt: skip
+
+
+@dataclass(slots=True, eq=False)
+class DrivenIndenter:
+    """An indenter that a force drives along a guide.
+
+    Attributes
+    ----------
+    number : int
+        Of the indenter.
+    along : ndarray, shape (3,)
+        Unit vector of the guide.
+    inertia : float
+        Mass over the step, kg/s.
+    speed : float
+        Along the guide, mm/s.
+    slope : float
+        Estimate of how its balance changes with its speed, kg/s; improved by every secant step.
+    """
+
+    number: int
+    along: FloatArray
+    inertia: float
+    speed: float
+    slope: float
+
+    def advance(
+        self, stepper: ContactStepper, applied: float, allowed: float, motion: tuple[FloatArray, FloatArray, FloatArray],
+        reactions: tuple[FloatArray, FloatArray],
+    ) -> tuple[int, int, int]:  # fmt: skip
+        """Take one step under the force `applied`, mN, by the secant method, to a balance within `allowed`, mN.
+
+        `motion` are the velocities that `ContactStepper.advance` takes, (1, ...) each; that of this indenter is filled.
+        """
+        saved = stepper.saved()
+
+        def tried(value: float) -> tuple[tuple[int, int, int], float]:
+            motion[1][0, self.number] = value * self.along
+            found = stepper.advance(*motion, reactions)
+            return found, float(reactions[1][0, self.number] @ self.along)
+
+        value = self.speed
+        found, reaction = tried(value)
+        lack = self.inertia * (value - self.speed) + reaction - applied
+        for _ in range(SECANT_STEPS):
+            if abs(lack) <= allowed:
+                break
+            guess = value - lack / self.slope
+            stepper.put_back(saved)
+            found, reaction = tried(guess)
+            new = self.inertia * (guess - self.speed) + reaction - applied
+            self.slope = max((new - lack) / (guess - value), self.inertia) if guess != value else self.slope
+            value, lack = guess, new
+        self.speed = value
+        return found

@@ -1,0 +1,189 @@
+"""Sessions with rigid indenters: poses, velocities and forces; contact that is kept from step to step; constraints beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from naibu.core.errors import InputError
+from naibu.core.rigid_transform import RigidTransform, rotation_matrix
+from naibu.mechanics.contact.indenter_motion import IndenterForce, IndenterVelocity
+from naibu.mechanics.contact.rigid_indenters import RigidIndenter, box_indenter, mesh_indenter, plane_indenter, spherical_indenter
+from naibu.mechanics.contact.session_protocol import Engine
+from naibu.mechanics.lattices.cpu.engine import LatticeEngine
+from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, lattice_parameters
+from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState
+from naibu.mechanics.lattices.simulation.contact import push, push_by_force
+
+LATTICE = classic_lattice(box_mask((3, 3, 3)), 10.0, total_mass_kg=0.1)
+BOTTOM = ConstrainedNodes.of(np.flatnonzero(LATTICE.points[:, 2] == 0.0))
+TOP = np.flatnonzero(LATTICE.points[:, 2] == 30.0)
+FLOOR = plane_indenter((0, 0, 0), static_friction=0.5, kinetic_friction=0.4)
+BALL = spherical_indenter((10.0, 20.0, 40.5), 10.0, static_friction=0.4, kinetic_friction=0.3)
+DOWN = IndenterVelocity((4.0, 0.0, -30.0))
+STILL = IndenterVelocity()
+
+
+def engine(**options: object) -> LatticeEngine:
+    return LatticeEngine.of(LATTICE, lattice_parameters(LATTICE, 40.0, 2.0, 100.0), tolerance=1e-6, **options)  # type: ignore[arg-type]
+
+
+def same(ours: LatticeState, theirs: LatticeState) -> None:
+    np.testing.assert_array_equal(ours.position, theirs.position)
+    np.testing.assert_array_equal(ours.velocity, theirs.velocity)
+    assert ours.contact is not None and theirs.contact is not None
+    for name in ("mode", "friction", "touched", "centres", "axes"):
+        np.testing.assert_array_equal(getattr(ours.contact, name), getattr(theirs.contact, name))
+
+
+def test_a_session_in_contact_takes_the_steps_of_a_push() -> None:
+    made = engine()
+    expected = push(made, made.rest(), [FLOOR, BALL], [[0, 0, 0], [4.0, 0.0, -30.0]], steps=40)
+    with made.session(indenters=[FLOOR, BALL]) as session:
+        forces = [session.step(motions=[STILL, DOWN]).indenters[0] for _ in range(30)]
+        forces += list(session.step(motions=[STILL, DOWN], steps=10).indenters)
+        same(session.state(), expected.state)
+    np.testing.assert_array_equal(forces, expected.reaction)
+    assert forces[-1][1, 2] < -10.0
+    np.testing.assert_array_equal(session.forces().indenters, expected.reaction[30:])
+
+
+def test_poses_lead_where_velocities_do() -> None:
+    made = engine()
+    by_velocity, by_pose = made.session(indenters=[FLOOR, BALL]), made.session(indenters=[FLOOR, BALL])
+    for n in range(20):
+        by_velocity.step(motions=[STILL, DOWN])
+        moved = (n + 1) * made.step * np.array([4.0, 0.0, -30.0])
+        by_pose.step(motions=[STILL, RigidTransform.of(np.eye(3), moved)])
+    np.testing.assert_allclose(by_pose.positions(), by_velocity.positions(), atol=1e-9)
+    np.testing.assert_allclose(by_pose.forces().indenters, by_velocity.forces().indenters, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("by", ["pose", "angular velocity"])
+def test_a_plate_that_turns_twists_what_sticks_to_it(by: str) -> None:
+    """The top follows a rotation about the vertical axis through the middle, the bottom is constrained."""
+    plate = box_indenter((15.0, 15.0, 35.0), (40.0, 40.0, 10.0), static_friction=100.0, kinetic_friction=100.0)
+    made = engine()
+    session = made.session(constrained=BOTTOM, indenters=[plate])
+    session.step(motions=[IndenterVelocity((0.0, 0.0, -20.0))], steps=50)  # 2 mm down
+    pressed = session.positions(TOP)
+    rate, steps = 0.5, 200  # rad/s: 0.2 rad
+    for n in range(steps):
+        turned = rotation_matrix(np.array([0.0, 0.0, rate * made.step * (n + 1)]))
+        pose = RigidTransform(turned, np.array([15.0, 15.0, 35.0]), np.array([15.0, 15.0, 33.0]))
+        session.step(motions=[pose if by == "pose" else IndenterVelocity(angular_velocity=(0.0, 0.0, rate))])
+    middle = np.array([15.0, 15.0, 0.0])
+    expected = (pressed - middle) @ rotation_matrix(np.array([0.0, 0.0, 0.2])).T + middle
+    np.testing.assert_allclose(session.positions(TOP), expected, atol=0.02)
+    contact = session.state().contact
+    assert contact is not None
+    np.testing.assert_allclose(contact.axes[0], rotation_matrix(np.array([0.0, 0.0, 0.2])).T, atol=1e-9)
+
+
+def test_a_force_drives_an_indenter_as_push_by_force_does() -> None:
+    made, plate = engine(), box_indenter((15, 15, 35), (30, 30, 10))
+    force = np.linspace(100.0, 500.0, 25)
+    expected = push_by_force(made, made.rest(), [FLOOR, plate], np.append(500.0, force), driven=1, direction=[0, 0, -1], indenter_mass=0.05)
+    session = made.session(indenters=[FLOOR, plate])
+    for applied in [500.0, *force]:
+        session.step(motions=[STILL, IndenterForce(float(applied), (0, 0, -2.0), 0.05)])
+    np.testing.assert_allclose(session.positions(), expected.state.position, atol=1e-3)
+    assert -session.forces().indenters[0, 1, 2] == pytest.approx(-expected.reaction[-1, 1, 2], abs=1.0)
+
+
+def test_contact_is_not_forgotten() -> None:
+    made = engine()
+    session = made.session(indenters=[FLOOR, BALL])
+    session.step(motions=[STILL, DOWN], steps=30)
+    pressed = session.state()
+    assert session.step(steps=100).indenters[-1, 1, 2] < -5.0  # no motions given: the ball stays, and presses
+    with pytest.raises(InputError, match="in contact with 2 indenters, which these steps leave out"):
+        made.run(pressed, 1)
+    with pytest.raises(InputError, match="in contact with 2 indenters, and indenters has 0"):
+        made.session(pressed)
+    with pytest.raises(InputError, match="in contact with 2 indenters, and there are 1"):
+        push(made, pressed, [FLOOR], 0.0, steps=1)
+    assert made.run(replace(pressed, contact=None), 1).state.contact is None
+
+
+def test_a_state_goes_in_and_out() -> None:
+    made = engine()
+    session = made.session(indenters=[FLOOR, BALL])
+    session.step(motions=[STILL, DOWN], steps=20)
+    kept = session.state()
+    session.step(motions=[STILL, DOWN], steps=10)
+    first = session.state()
+    session.restore(kept)
+    session.step(motions=[STILL, DOWN], steps=10)
+    same(session.state(), first)
+    other = made.session(kept, indenters=[FLOOR, BALL])
+    other.step(motions=[STILL, DOWN], steps=10)
+    same(other.state(), first)
+
+
+def test_momentum_balances_with_the_forces_of_constraints_and_indenters() -> None:
+    made = engine()
+    session = made.session(constrained=BOTTOM, indenters=[BALL])
+    forces = session.step([[2.0, 0.0, 0.0]], [DOWN], steps=100)
+    state = session.state()
+    impulse = made.step * (forces.bodies.sum(axis=(0, 1)) + forces.indenters.sum(axis=(0, 1)))
+    momentum = (LATTICE.node_mass[:, None] * state.velocity).sum(axis=0)
+    np.testing.assert_allclose(momentum, impulse, atol=1e-3 * made.step * np.abs(forces.bodies).sum())
+    bottom = LATTICE.points[BOTTOM.node[::3]]
+    np.testing.assert_allclose(state.position[BOTTOM.node[::3]] - bottom, np.tile([0.4, 0.0, 0.0], (len(bottom), 1)), atol=1e-9)
+    assert forces.indenters[-1, 0, 2] < -10.0
+    assert BALL.gap(state.position - (0.8, 0.0, -6.0)).min() > -0.05
+
+
+def test_a_mesh_of_a_box_presses_as_the_box_does() -> None:
+    corners = np.array([[x, y, z] for z in (-5, 5) for y in (-9, 9) for x in (-9, 9)], dtype=float)
+    sides = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]])
+    triangles = np.concatenate([sides[:, [0, 1, 2]], sides[:, [0, 2, 3]]])
+    made, friction = engine(), {"static_friction": 0.4, "kinetic_friction": 0.3}
+    found = []
+    for body in (
+        box_indenter((15.0, 15.0, 35.2), (18.0, 18.0, 10.0), **friction),
+        mesh_indenter((15.0, 15.0, 35.2), corners, triangles, **friction),
+    ):
+        session = made.session(constrained=BOTTOM, indenters=[body])
+        session.step(motions=[DOWN], steps=60)
+        found.append((session.positions(), session.forces().indenters))
+    np.testing.assert_allclose(found[1][0], found[0][0], atol=1e-6)
+    np.testing.assert_allclose(found[1][1], found[0][1], atol=1e-3)
+    assert found[0][1][-1, 0, 2] < -10.0
+
+
+def test_engines_and_sessions_follow_the_protocol() -> None:
+    stepped: Engine[LatticeState, ConstrainedNodes] = engine()
+    session = stepped.session(constrained=BOTTOM)
+    session.press([BALL])
+    assert session.step(motions=[DOWN]).indenters.shape == (1, 1, 3)
+    session.press([])
+    assert session.step(steps=2).indenters.shape == (2, 0, 3)
+    assert session.forces().bodies.shape == (2, 1, 3)
+
+
+INSIDE: list[RigidIndenter] = [spherical_indenter((15, 15, 30), 5.0)]
+FORCE = IndenterForce(1.0, (0, 0, 1), 0.1)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: engine(method="euler", step=1e-5).session(indenters=[BALL]), "contact needs method='implicit'"),
+        (lambda: engine().session(indenters=INSIDE), "indenters[0], a sphere, begins inside the object"),
+        (lambda: engine().session(indenters=[FLOOR, BALL]).step(motions=[DOWN]), "motions has 1 entries for 2 indenters"),
+        (lambda: engine().session(indenters=[FLOOR, BALL]).step(motions=[FORCE, FORCE]), "one indenter can be driven by a force"),
+        (lambda: engine().session(indenters=[BALL]).step(motions=[IndenterVelocity((np.nan, 0, 0))]), "velocity of motions[0][0] is nan"),
+        (lambda: engine().session(indenters=[BALL]).step(motions=[IndenterForce(1.0, (0, 0, 0), 0.1)]), "must have a length"),
+        (lambda: engine().session(indenters=[BALL]).step(motions=[IndenterForce(1.0, (0, 0, 1), 0.0)]), "mass_kg must be positive"),
+        (lambda: engine().session().step(motions=[DOWN]), "motions has 1 entries for 0 indenters"),
+    ],
+)
+def test_bad_input_is_named(call: Callable[[], object], said: str) -> None:
+    with pytest.raises(InputError) as caught:
+        call()
+    assert said in str(caught.value)
