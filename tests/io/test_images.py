@@ -221,7 +221,7 @@ def test_tiff_stacks_of_other_programs(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- DICOM
 
 
-def dicom_slice(pixels: np.ndarray, place: Any, series: str = "1.2.3", turn: np.ndarray = TURN, **extra: Any) -> Any:
+def dicom_slice(pixels: np.ndarray, position: Any, series: str = "1.2.3", turn: np.ndarray = TURN, **extra: Any) -> Any:
     """Return a DICOM data set of one slice, whose pixels are 1.1 mm high and 0.8 mm wide."""
     pydicom = pytest.importorskip("pydicom")
     from pydicom.dataset import FileDataset, FileMetaDataset
@@ -239,7 +239,7 @@ def dicom_slice(pixels: np.ndarray, place: Any, series: str = "1.2.3", turn: np.
     data.SamplesPerPixel, data.PhotometricInterpretation = 1, "MONOCHROME2"
     data.BitsAllocated = data.BitsStored = 16
     data.HighBit, data.PixelRepresentation = 15, int(pixels.dtype.kind == "i")
-    data.ImagePositionPatient = [f"{v:.6f}" for v in place]
+    data.ImagePositionPatient = [f"{v:.6f}" for v in position]
     data.ImageOrientationPatient = [f"{v:.8f}" for v in turn.T[:2].ravel()]
     data.PixelData = pixels.tobytes()
     for key, value in extra.items():
@@ -350,9 +350,9 @@ def test_enhanced_dicom_files_hold_a_volume_in_one_file(tmp_path: Path) -> None:
     shared.PixelMeasuresSequence, shared.PlaneOrientationSequence = Sequence([measures]), Sequence([plane])
     frames = []
     for k in order:
-        place, frame = Dataset(), Dataset()
-        place.ImagePositionPatient = [f"{v:.6f}" for v in volume.to_physical([0, 0, k])]
-        frame.PlanePositionSequence = Sequence([place])
+        position, frame = Dataset(), Dataset()
+        position.ImagePositionPatient = [f"{v:.6f}" for v in volume.to_physical([0, 0, k])]
+        frame.PlanePositionSequence = Sequence([position])
         frames.append(frame)
     data.SharedFunctionalGroupsSequence, data.PerFrameFunctionalGroupsSequence = Sequence([shared]), Sequence(frames)
     data.save_as(tmp_path / "enhanced.dcm", enforce_file_format=True)

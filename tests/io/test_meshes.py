@@ -179,11 +179,11 @@ def test_gmsh_versions(tmp_path, version):
 
 
 @pytest.mark.parametrize("version", GMSH)
-@pytest.mark.parametrize("share", [0.3, 0.6, 0.8, 0.93])
-def test_cut_off_gmsh_files_are_told(tmp_path, version, share):
+@pytest.mark.parametrize("fraction", [0.3, 0.6, 0.8, 0.93])
+def test_truncated_gmsh_files_are_named(tmp_path, version, fraction):
     data = GMSH[version]()
     path = tmp_path / "a.msh"
-    path.write_bytes(data[: int(share * len(data))])
+    path.write_bytes(data[: int(fraction * len(data))])
     with pytest.raises(InputError, match=r"a\.msh: .*(truncated|has no section|not a number)"):
         read_mesh(path)
 

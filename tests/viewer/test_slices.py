@@ -18,18 +18,18 @@ Array = np.ndarray
 
 def view(shape: tuple[int, int, int] = (5, 8, 6), **changed: object) -> SliceView:
     rng = np.random.default_rng(0)
-    grey = rng.uniform(0.0, 1000.0, shape)
+    intensity = rng.uniform(0.0, 1000.0, shape)
     u = rng.normal(0.0, 2.0, (*shape, 3))
     u[0] = np.nan
-    told = {
+    given = {
         "title": "From <a> to b",
         "sentences": ("It moved.",),
         "spacing_mm": np.array([0.5, 1.0, 2.0]),
-        "images": [("before", grey), ("after", grey + 100.0)],
+        "images": [("before", intensity), ("after", intensity + 100.0)],
         "displacement": u,
         "overlays": [Overlay("displacement, mm", np.linalg.norm(u, axis=-1)), Overlay("volume ratio J", 1.0 + 0.1 * u[..., 0], middle=1.0)],
     }
-    return SliceView(**{**told, **changed})  # type: ignore[arg-type]
+    return SliceView(**{**given, **changed})  # type: ignore[arg-type]
 
 
 def payload(page: str) -> dict:
@@ -47,9 +47,9 @@ def test_values_survive_within_their_steps() -> None:
     data = payload(slices_html(v))
     assert data["size"] == [6, 8, 5]
     image = data["images"][0]
-    grey = image["low"] + unpacked(image["data"]) / 255 * (image["high"] - image["low"])
+    intensity = image["low"] + unpacked(image["data"]) / 255 * (image["high"] - image["low"])
     inside = (v.images[0][1].ravel() > image["low"]) & (v.images[0][1].ravel() < image["high"])
-    assert np.abs(grey - v.images[0][1].ravel())[inside].max() <= 0.51 / 255 * (image["high"] - image["low"])
+    assert np.abs(intensity - v.images[0][1].ravel())[inside].max() <= 0.51 / 255 * (image["high"] - image["low"])
     arrows = unpacked(data["arrows"]["data"], "<i2").reshape(5, 8, 6, 3)
     assert (arrows[0] == -32768).all()
     assert np.abs(arrows[1:] * data["arrows"]["quantum"] - v.displacement[1:]).max() <= 0.51 * data["arrows"]["quantum"]

@@ -52,7 +52,7 @@ def test_squares_follow_the_closed_form(name: str) -> None:
 
 
 def test_squares_differ_only_after_release() -> None:
-    """Same shape while pushed and held; then the elastic one comes back, the viscoplastic one stays, the rheological one does a part."""
+    """Same shape until release; then the elastic one comes back, the viscoplastic one stays, the rheological one does a part."""
     studies = {name: pushed_square(name, step_s=0.1) for name in SQUARES}
     early = [s.series.displacement[s.series.times <= 20.0] for s in studies.values()]
     for other in early[1:]:

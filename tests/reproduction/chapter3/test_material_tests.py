@@ -57,9 +57,9 @@ def made(effect, size, moduli=(300.0, 150.0)) -> Specimens:
 @pytest.mark.parametrize(("effect", "size"), [(CONSTRAINED, 0.0), (COMPLIANCE, 2e-5), (SLACK, 0.8)])
 def test_an_effect_is_found_in_specimens_that_have_it(effect, size):
     specimens = made(effect, size)
-    moduli, found, scatter = explained_spread(specimens, effect)
+    moduli, found, residual_sd = explained_spread(specimens, effect)
     assert moduli == pytest.approx((300.0, 150.0), rel=1e-4)
-    assert scatter < 1e-5
+    assert residual_sd < 1e-5
     if size:
         assert found == pytest.approx(size, rel=1e-3)
     assert explained_spread(specimens, CHANCE)[2] > 0.05
@@ -118,7 +118,7 @@ def test_readings_follow_from_the_mean_heights_of_the_layers():
 
 
 def test_held_block_at_small_strain_widens_by_poissons_ratio_and_no_more():
-    """Between a free bar (nu times the shortening) and a confined one (nothing); symmetric; nothing at the held faces."""
+    """Between a free bar (nu times the shortening) and a confined one (nothing); symmetric; nothing at the constrained faces."""
     block = constrained_block(0.01, 0.3, 4)
     middle = block.transversal_at(0.5)
     assert 0.002 < middle < 0.0035

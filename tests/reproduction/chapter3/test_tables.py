@@ -171,9 +171,9 @@ def test_markers_are_nodes_and_the_interface_lies_half_way() -> None:
     planes = body.mesh.points.reshape(5, 5, 5, 3)
     moved = body.source.displacement.reshape(5, 5, 5, 3)
     assert planes[2, ..., 2] == pytest.approx(30.0)
-    share = ((30.0 - planes[1, ..., 2]) / (planes[3, ..., 2] - planes[1, ..., 2]))[..., None]
-    assert share == pytest.approx(0.5, abs=0.06)
-    assert moved[2] == pytest.approx((1.0 - share) * moved[1] + share * moved[3], abs=1e-9)
+    fraction = ((30.0 - planes[1, ..., 2]) / (planes[3, ..., 2] - planes[1, ..., 2]))[..., None]
+    assert fraction == pytest.approx(0.5, abs=0.06)
+    assert moved[2] == pytest.approx((1.0 - fraction) * moved[1] + fraction * moved[3], abs=1e-9)
     assert simplices(body.mesh).measures.sum() == pytest.approx(40.0**3, rel=0.03)
     assert body.mesh.n_cells == 6 * 64
     inner, report = (body.trial(b).loaded.all(axis=1) for b in ("inner", "all but top and bottom"))  # type: ignore[arg-type]
@@ -181,10 +181,10 @@ def test_markers_are_nodes_and_the_interface_lies_half_way() -> None:
 
 
 def test_noise_biases_least_squares_and_not_the_weighted_balance() -> None:
-    scatter = noise_study(cube(LAYERS), 0.05, 7, 6)
-    assert scatter.over_bound(scatter.weighted) < 1.5
-    assert scatter.over_bound(scatter.plain) > 2.0 * scatter.over_bound(scatter.weighted)
-    assert noise_study(cube(LAYERS), 0.1, 7, 2).bound == pytest.approx(2.0 * scatter.bound, rel=1e-6)
+    study = noise_study(cube(LAYERS), 0.05, 7, 6)
+    assert study.over_bound(study.weighted) < 1.5
+    assert study.over_bound(study.plain) > 2.0 * study.over_bound(study.weighted)
+    assert noise_study(cube(LAYERS), 0.1, 7, 2).bound == pytest.approx(2.0 * study.bound, rel=1e-6)
     assert drawn(noise_section(0, 2)) == 1
 
 

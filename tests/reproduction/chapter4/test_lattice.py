@@ -35,16 +35,16 @@ def cells(table: Table, key: object, what: str) -> list[object]:
 
 
 def test_counts_of_classic_lattices_are_the_closed_form_and_of_octrees_the_printed_ones() -> None:
-    masses, elements = chapter4_octree(sizes=(8, 16)).sections[0].tables
+    nodes, elements = chapter4_octree(sizes=(8, 16)).sections[0].tables
     for n in (8, 16):
         m = n + 1
-        assert cells(masses, m, "ours")[0] == m**3
+        assert cells(nodes, m, "ours")[0] == m**3
         assert cells(elements, m, "ours")[0] == 3 * n * m * m + 6 * n * n * m + 4 * n**3
-        assert cells(masses, m, "ours") == cells(masses, m, "paper")
+        assert cells(nodes, m, "ours") == cells(nodes, m, "paper")
     assert cells(elements, 17, "ours") == cells(elements, 17, "paper")
     assert [a == b for a, b in zip(cells(elements, 9, "ours"), cells(elements, 9, "paper"), strict=True)] == [False, True, False, True]
     assert cells(elements, 9, "ours")[2] == 6497
-    assert cells(masses, 17, "ours saves, %") == pytest.approx(cells(masses, 17, "paper saves, %"), abs=0.01, nan_ok=True)
+    assert cells(nodes, 17, "ours saves, %") == pytest.approx(cells(nodes, 17, "paper saves, %"), abs=0.01, nan_ok=True)
 
 
 def test_octrees_save_memory_and_print_the_papers_cells() -> None:

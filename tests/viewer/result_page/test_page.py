@@ -52,7 +52,7 @@ def cube_surface(n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pressed(points: np.ndarray, height_mm: float) -> np.ndarray:
-    """Volume-conserving compression with bulging sides, held at base and top."""
+    """Volume-conserving compression with bulging sides, fixed at base and top."""
     stretch = height_mm / SIDE_MM
     z = points[:, 2] / SIDE_MM
     wide = 1 + (1 / np.sqrt(stretch) - 1) * (0.25 + 5 * z * (1 - z) * 0.75)

@@ -16,7 +16,7 @@ PRINTED_FORCE_N = {"a": 3803.6, "b": 538.7, "c": 7448.3, "d": 979.5}  # captions
 PRINTED_COUNTS = {"first": (2821, 2795, 3075, 2815, 2811), "second": (2255, 2195, 2213, 2201, 2165)}  # the third and the second corrected
 TWIN_TEXT = (
     "The measurements of the report are not available. A virtual twin replaces the dough: a block of 10 x 5 x 7 cm and 510 g fixed to the "
-    "floor, compressed by two opposite indenters that close at 20 mm/s on the middle of its faces, held, released. Two stereo "
+    "floor, compressed by two opposite indenters that close at 20 mm/s on the middle of its faces, pause and retract. Two stereo "
     f"cameras capture about {POINTS} points at five times, with a noise SD of {POINT_SD_MM:g} mm per coordinate; a sensor on each indenter "
     f"reads its force every 2 ms with a noise SD of {FORCE_SD_MN:g} mN. The loaded faces, the speed of each indenter and the time of the "
     "second capture are our interpretation."
