@@ -32,7 +32,7 @@ from naibu.imaging.volume_correlation.settings import CorrelationSettings
     ],
 )
 def test_a_setting_out_of_range_is_named(name: str, value: Any) -> None:
-    with pytest.raises(InputError, match=rf"^{name} must be .* not {str(value).replace('.', '[.]')}|^{name} must be .* not '{value}'"):
+    with pytest.raises(InputError, match=rf"^{name} must be .*, not "):
         CorrelationSettings(**{name: value})
 
 
