@@ -1,4 +1,4 @@
-"""HDF5 files on disks that may be full.
+"""Writing of HDF5 files that survives a full disk.
 
 The HDF5 library cannot close a file whose last blocks cannot be written: it keeps the file open, and crashes the interpreter when it tries
 again at exit. Here HDF5 writes through a Python stream that remembers the first failure and accepts everything that follows, so that the
@@ -15,7 +15,7 @@ import h5py
 
 
 class ForgivingStream(io.RawIOBase):
-    """A file whose writes never fail; `failure` is what went wrong, and the file is of no use then.
+    """A file stream whose writes never raise; `failure` is the first error, after which the file is invalid.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""TOML and JSON from files, with messages that name the file and the line."""
+"""Parsing of TOML and JSON files; messages name the file and the line."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from naibu.io.files.reading import guarded_reading, read_bytes
 
 
 def parsed_toml(path: str | os.PathLike[str], content: bytes) -> dict[str, Any]:
-    """Return the tables of TOML text; `path` is only named in errors.
+    """Return the tables of TOML text; `path` is only used in messages.
 
     Raises
     ------
@@ -33,12 +33,12 @@ def parsed_toml(path: str | os.PathLike[str], content: bytes) -> dict[str, Any]:
 
 
 def read_json(path: Path) -> Any:
-    """Return what a JSON file holds.
+    """Return the content of a JSON file.
 
     Raises
     ------
     InputError
-        It cannot be read, or is not JSON.
+        The file cannot be read, or is not JSON.
     """
     content = read_bytes(path)
     with guarded_reading(path, "JSON"):
@@ -53,4 +53,4 @@ def _syntax_message(path: str | os.PathLike[str], text: str, error: tomllib.TOML
     lines = text.splitlines()
     number = int(found[1]) if found else len(lines)
     shown = lines[number - 1].strip()[:100] if 0 < number <= len(lines) else ""
-    return f"{path}: line {number} is not valid TOML: {shown!r} ({error}); mend this line: one key = value, text in quotes"
+    return f"{path}: line {number} is not valid TOML: {shown!r} ({error}); correct this line: one key = value, text in quotes"

@@ -1,7 +1,6 @@
-"""What all readers share: files that are read whole, sizes that are believed only where the file can hold them, and one kind of error.
+"""Safe reading of files: regular files only, announced sizes checked against the file, every failure an `InputError`.
 
-A parser, of naibu or of a library, may meet anything in a damaged file. Whatever it raises there reaches the caller as an `InputError`
-that names the file.
+A parser, of naibu or of a library, may raise any exception on a damaged file. It reaches the caller as an `InputError` that names the file.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ LARGEST_RATIO = 1100  # no deflate stream unpacks to more than 1032 times its le
 
 
 class _Decompressor(Protocol):
-    """What the decompressors of zlib, bz2 and lzma have in common."""
+    """Common interface of the decompressors of zlib, bz2 and lzma."""
 
     @property
     def eof(self) -> bool: ...
@@ -32,19 +31,19 @@ class _Decompressor(Protocol):
 
 @contextmanager
 def guarded_reading(path: str | os.PathLike[str], kind: str = "") -> Iterator[None]:
-    """Turn whatever is raised while a file is read into an `InputError` that names the file.
+    """Convert any exception raised while a file is read into an `InputError` that names the file.
 
     Parameters
     ----------
     path : path-like
-        The file, as the user knows it.
+        File, as named by the user.
     kind : str
-        What it was read as, ``"MetaImage"``.
+        Format that was expected, such as ``"MetaImage"``.
 
     Raises
     ------
     InputError
-        The file is damaged, or not what its name says.
+        The file is damaged, or not of the expected format.
     """
     what = f" as {kind}" if kind else ""
     try:
@@ -58,7 +57,7 @@ def guarded_reading(path: str | os.PathLike[str], kind: str = "") -> Iterator[No
     except Exception as error:
         reason = " ".join(str(error).split())[:200]
         said = f"{type(error).__name__}: {reason}" if reason else type(error).__name__
-        mend = "it is damaged or not what its name says: copy or export it again"
+        mend = "it is damaged or of another format: copy or export it again"
         raise InputError(f"{path}: cannot be read{what} ({said}); {mend}") from error
 
 
@@ -68,7 +67,7 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
     Raises
     ------
     InputError
-        It is not there, may not be read, or is a device or a pipe, which might never end.
+        The file does not exist, cannot be read, or is a device or a pipe, which might never end.
     """
     require_regular(path)
     try:
@@ -78,12 +77,12 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
 
 
 def require_regular(path: str | os.PathLike[str]) -> None:
-    """Refuse what is not a regular file: folders, devices, pipes, and what is not there.
+    """Raise an error unless the path is a regular file: for folders, devices, pipes, and missing files.
 
     Raises
     ------
     InputError
-        It is not one.
+        It is not a regular file.
     """
     try:
         mode = os.stat(path).st_mode
@@ -101,12 +100,12 @@ def _unreadable(path: str | os.PathLike[str], error: Exception) -> InputError:
 
 
 def file_beside(header: Path, name: str) -> Path:
-    """Return the file with the data of a header, which must lie in the header's folder or below it.
+    """Return the data file of a header, which must be in the folder of the header or below it.
 
     Raises
     ------
     InputError
-        The name leads elsewhere: a header that was sent along must not make naibu read other files.
+        The name leads elsewhere: a header from another source must not make naibu read other files.
     """
     folder = header.resolve().parent
     try:
@@ -114,12 +113,12 @@ def file_beside(header: Path, name: str) -> Path:
     except (OSError, ValueError) as error:
         raise InputError(f"{header.name}: names the file {name!r} for its data, which cannot be ({error})") from error
     if not found.is_relative_to(folder):
-        raise InputError(f"{header.name}: its data stand in {name!r}, outside the folder of the header; put both files into one folder")
+        raise InputError(f"{header.name}: its data file {name!r} is outside the folder of the header; put both files into one folder")
     return found
 
 
 def require_plausible(path: str | os.PathLike[str], announced: int, stored: int, *, compressed: bool) -> None:
-    """Refuse a header that announces more bytes than the file can hold, before anything of that size is allocated.
+    """Raise an error if a header announces more bytes than the file can contain, before memory of that size is allocated.
 
     Parameters
     ----------
@@ -128,14 +127,14 @@ def require_plausible(path: str | os.PathLike[str], announced: int, stored: int,
     announced : int
         Bytes that the header announces.
     stored : int
-        Bytes that are there.
+        Bytes in the file.
     compressed : bool
-        Whether those are compressed.
+        Whether these are compressed.
 
     Raises
     ------
     InputError
-        There cannot be so many.
+        The file cannot contain so many.
     """
     most = (stored + 1024) * LARGEST_RATIO if compressed else stored
     if announced > most:
@@ -146,21 +145,21 @@ def require_plausible(path: str | os.PathLike[str], announced: int, stored: int,
 
 
 def inflated(data: bytes, most: int, method: str = "zlib") -> bytes:
-    """Decompress data that must not become longer than `most` bytes.
+    """Decompress data to at most `most` bytes.
 
     Parameters
     ----------
     data : bytes
         Compressed data.
     most : int
-        Bytes that they may unpack to.
+        Largest size of the decompressed data, bytes.
     method : {"zlib", "gzip", "bz2", "lzma"}
-        How they were compressed.
+        Compression method.
 
     Raises
     ------
     InputError
-        They unpack to more, are damaged, or are truncated.
+        The decompressed data are larger, or the data are damaged or truncated.
     """
     decompressor: _Decompressor
     match method:
