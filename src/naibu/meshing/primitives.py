@@ -70,7 +70,7 @@ def box(
     size_mm : sequence of 3 floats
         Extents along x, y and z, mm.
     divisions : sequence of 3 ints
-        Cells along x, y and z. Where `layers` or `breaks` cut an axis, each stretch takes its share of them, rounded and at least
+        Cells along x, y and z. Where `layers` or `breaks` cut an axis, each interval gets its proportion, rounded and at least
         one, so that the total of that axis may differ a little.
     layers : sequence of (name, thickness), optional
         Regions from the base up, with their thickness, mm; they must add up to the height. Default: one region, ``"body"``.

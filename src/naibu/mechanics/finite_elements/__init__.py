@@ -1,1 +1,1 @@
-"""Finite elements: shape functions, hyperelastic laws, assembly, and what is prescribed on the boundary."""
+"""Finite elements: shape functions, hyperelastic laws, assembly, and Dirichlet boundary conditions."""

@@ -1,4 +1,4 @@
-"""Internal forces and tangent stiffness of hyperelastic elements, assembled into a fixed block pattern."""
+"""Internal forces and tangent stiffness of hyperelastic elements with mean dilatation :cite:p:`simo1985`, in a fixed block pattern."""
 
 from __future__ import annotations
 
@@ -359,7 +359,7 @@ def _soften(gradients, weights, theta, volume, total_s, s, f, ft_inv, det, stres
         if w == 0.0:
             continue
         scale = (theta / det[q]) ** (1.0 / 3.0)
-        share = w * det[q] / (theta * volume)
+        ratio = w * det[q] / (theta * volume)
         a = tangent[q]
         left, vector = v9[0], v9[1]
         faf = 0.0
@@ -371,8 +371,8 @@ def _soften(gradients, weights, theta, volume, total_s, s, f, ft_inv, det, stres
             faf += v * f[q, i // 3, i % 3]
         wc2 = w * scale * scale
         wc = w * scale
-        geometric = s[q] - total_s * share
-        bb = wc2 * faf / 9.0 + s[q] / 3.0 + total_s * share
+        geometric = s[q] - total_s * ratio
+        bb = wc2 * faf / 9.0 + s[q] / 3.0 + total_s * ratio
         kappa += wc2 * faf / 9.0 + s[q] / 3.0
         for i in range(9):
             bi, pi = ft_inv[q, i // 3, i % 3], stress[q, i // 3, i % 3]
@@ -385,7 +385,7 @@ def _soften(gradients, weights, theta, volume, total_s, s, f, ft_inv, det, stres
             for i in range(3):
                 for j in range(3):
                     g = gradients[q, node, j]
-                    t[3 * node + i] += share * ft_inv[q, i, j] * g
+                    t[3 * node + i] += ratio * ft_inv[q, i, j] * g
                     m[3 * node + i] += vector[3 * i + j] * g
     for i in range(n):
         for j in range(n):

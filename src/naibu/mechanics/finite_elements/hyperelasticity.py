@@ -250,7 +250,7 @@ def invariant_derivatives(code, p, i1, i2, j, d):  # type: ignore[no-untyped-def
     return energy + 0.25 * kappa * (j * j - 1.0 - 2.0 * log_j)
 
 
-@njit(cache=True, fastmath=False, error_model="numpy")  # a flat element gives infinities, which callers tell by det F
+@njit(cache=True, fastmath=False, error_model="numpy")  # a flat element gives infinities; callers check det F
 def inverse_transpose(f, g):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Put F^-T into `g` and return det F."""
     g[0, 0] = f[1, 1] * f[2, 2] - f[1, 2] * f[2, 1]

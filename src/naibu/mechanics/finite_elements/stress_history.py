@@ -1,8 +1,8 @@
 """Assembly with a given second Piola-Kirchhoff history stress beside the hyperelastic law, and recovery of the law's stress.
 
-A stress H that is constant in the reference configuration during a step, such as that of the history variables of a viscoelastic solid,
-derives from the energy ``H : C / 2``. It is evaluated at the same deformation gradient F_bar as the law, so that the tangent of elements
-with mean dilatation remains symmetric.
+A stress H that is constant in the reference configuration during a step, such as that of the history variables of a viscoelastic solid
+:cite:p:`simo1987`, derives from the energy ``H : C / 2``. It is evaluated at the same deformation gradient F_bar as the law, so that the
+tangent of elements with mean dilatation remains symmetric.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ class Newton:
     def _balance(self, internal: FloatArray, contact: FloatArray) -> tuple[FloatArray, float]:
         r = internal - contact - self.problem.external_force
         constrained = self.problem.prescribed.constrained
-        # the floor is a force that would strain the body by 1e-5: it counts where contacts open and nothing presses any more
+        # the floor is a force that would strain the body by 1e-5; it matters where contacts open and no load remains
         floor = 1e-5 * float(self.problem.assembler.parameters[:, 0].max()) * float(np.ptp(self.problem.points, axis=0).max()) ** 2
         scale = float(np.abs(contact).sum() + np.abs(r[constrained]).sum() + np.abs(self.problem.external_force).sum()) + floor
         r[constrained] = 0.0

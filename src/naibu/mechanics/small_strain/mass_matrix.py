@@ -49,7 +49,7 @@ class LumpedMass:
             matrix.data[self._diagonal, a, a] += factor * self.of_node
 
     def accelerations(self, force: FloatArray, constrained: BoolArray, known: FloatArray) -> FloatArray:
-        """Divide by the masses where nothing is known."""
+        """Divide forces by masses at the unconstrained components."""
         return np.where(constrained, known, force / self.of_node[:, None])
 
 

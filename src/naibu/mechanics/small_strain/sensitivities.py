@@ -1,4 +1,4 @@
-"""Sensitivities of a motion to moduli and viscosities, by direct differentiation of the steps of the default method.
+"""Sensitivities of a motion to moduli and viscosities, by direct differentiation of the default method :cite:p:`michaleris1994`.
 
 A step solves ``K v = ...``; its derivative along a change of the materials solves the same system, ``K v' = ...``, with another right side.
 So all derivatives together need one factorization, as the motion does, and some passes over the cells for each; they are exact for
