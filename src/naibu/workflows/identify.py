@@ -135,7 +135,7 @@ def identify(
 def _check_size(loaded: Sequence[Experiment], edge_mm: float) -> None:
     """Refuse elements of no size, and so many that no memory holds them."""
     if not (math.isfinite(edge_mm) and edge_mm >= 0.0):
-        raise InputError(f"element_size_mm is {edge_mm:g}; give a positive length, mm, or 0 for an eighth of the object's height")
+        raise InputError(f"element_size_mm is {edge_mm:g} mm; give a positive length, or 0 for an eighth of the object's height")
     for e in loaded:
         count = math.prod(e.shape.size_mm) / edge_mm**3 if edge_mm > 0.0 else 0.0
         if count > MOST_ELEMENTS:
