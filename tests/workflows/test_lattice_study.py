@@ -18,8 +18,9 @@ from naibu.mechanics.lattices.model.hexahedra import lattice_mesh
 from naibu.mechanics.lattices.model.lattice import classic_lattice
 from naibu.mechanics.lattices.model.octree import octree_lattice
 from naibu.mechanics.lattices.model.surface import surface_of
+from naibu.mechanics.lattices.model.voxels import voxel_mask
 from naibu.validation.specimens.lattice_twin import CUBE_PUSHING, FIRST, SECOND, dough_lattice, dough_parameters
-from naibu.workflows.lattice_study import BASES, NAMED, class_ratios, prepared_study, resampled_mask, study_text
+from naibu.workflows.lattice_study import BASES, NAMED, class_ratios, prepared_study, study_text
 
 
 @pytest.mark.parametrize("name", [*BASES, "cube-pushing-octree-1"])
@@ -94,8 +95,10 @@ def test_voxels_that_divide_the_spacing_give_their_cubes(cells: tuple[int, int, 
     mask = np.random.default_rng(seed).random(cells) < 0.6
     mask[0, 0, 0] = mask[-1, -1, -1] = True
     fine = mask.repeat(voxels[0], 0).repeat(voxels[1], 1).repeat(voxels[2], 2)
-    found = resampled_mask(np.ascontiguousarray(fine.T), 6.0 / np.array(voxels), 6.0)
+    volume = Volume.from_array(fine.T, spacing_mm=6.0 / np.array(voxels), origin_mm=(1.0, 2.0, 3.0))
+    found, frame = voxel_mask(volume, fine.T, 6.0)
     np.testing.assert_array_equal(found, mask)
+    np.testing.assert_allclose(frame.translation, volume.to_physical([-0.5, -0.5, -0.5]))
 
 
 @pytest.mark.parametrize("ending", [".nrrd", ".mha", ".npy"])

@@ -20,6 +20,9 @@ from lattice_studies import STUDY, study_file
 
 from naibu import cli
 from naibu.core.errors import ConvergenceError, InputError
+from naibu.core.rigid_transform import rotation_matrix
+from naibu.core.volume import Volume
+from naibu.io.images import write_volume
 from naibu.viewer.motion_page import STEPS, ColourField, MotionPage, RigidShape, motion_html
 from naibu.workflows import simulate_lattice as workflow
 from naibu.workflows.lattice_study import prepared_study
@@ -119,7 +122,7 @@ def test_an_interruption_leaves_what_is_done_and_goes_on_to_the_same(whole: Path
 
 
 def test_an_interruption_before_the_first_frame_leaves_the_old_files(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def stopped(*_: object) -> object:
+    def stopped(*_: object, **__: object) -> object:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(workflow, "run_study", stopped)
@@ -261,7 +264,7 @@ def test_the_end_of_a_job_keeps_frames(tmp_path: Path, number: signal.Signals) -
     with subprocess.Popen(verb(path, "--out", out), stderr=subprocess.PIPE, text=True) as process:
         try:
             deadline = time.monotonic() + 120.0
-            while time.monotonic() < deadline and not any(p.stat().st_size > 60_000 for p in out.glob(".mine.vtkhdf.*.part")):
+            while time.monotonic() < deadline and not any(p.stat().st_size > 400_000 for p in out.glob(".mine.vtkhdf.*.part")):
                 time.sleep(0.1)
             process.send_signal(number)
             _, said = process.communicate(timeout=60.0)
@@ -301,3 +304,36 @@ def test_devices_are_named_in_messages(tmp_path: Path) -> None:
     pytest.importorskip("warp")
     with pytest.raises(InputError, match="contact with friction is computed on 'cpu' only"):
         simulate_lattice(study_file(tmp_path), tmp_path / "out", device="warp-cpu")
+
+
+ROTATED = rotation_matrix(np.array([0.2, -0.4, 0.3]))
+
+
+@pytest.mark.parametrize("direction", [ROTATED, ROTATED @ np.diag([1.0, 1.0, -1.0])], ids=["right-handed", "left-handed"])
+def test_results_overlay_the_scan(tmp_path: Path, direction: np.ndarray) -> None:
+    """Of a rotated, shifted label volume: hexahedra lie on the labelled voxels, and what moves up does so along its third axis."""
+    labels = np.zeros((6, 7, 8), dtype=np.uint8)  # z, y, x
+    labels[2:4, 1:5, 3:7] = 7
+    labels[2, 1, 3] = 0
+    volume = Volume.from_array(labels, spacing_mm=(4.0, 4.0, 4.0), origin_mm=(-120.0, 35.0, 900.0), direction=direction)
+    write_volume(tmp_path / "scan.nrrd", volume)
+    text = TIED.replace("size_mm = [30, 20, 20]", 'labels = "scan.nrrd"').replace("spacing_mm = 10.0", "spacing_mm = 4.0")
+    text = text.replace("centre_mm = [10.0, 10.0, 28.0]", "centre_mm = [8.0, 8.0, 16.0]").replace(
+        "path = [[0.0, 0, 0, 0], [0.1, 0, 0, -3]]", "path = [[0.0, 0, 0, 0], [0.05, 0, 0, 0.5], [0.1, 0, 0, 0.5]]"
+    )
+    simulate_lattice(study_file(tmp_path, text), tmp_path / "out")
+    found = series_of(tmp_path / "out" / "mine.vtkhdf")
+    points, n = found["VTKHDF/Points"], prepared_study(tmp_path / "mine.toml").study.lattice.n_nodes
+    index = volume.to_index(points[:n])
+    np.testing.assert_allclose(index - 0.5, np.rint(index - 0.5), atol=1e-4)  # nodes are corners of voxels
+    cells = found["VTKHDF/Connectivity"].reshape(-1, 8)[: int((labels == 7).sum())]
+    centres = np.rint(volume.to_index(points[cells].mean(axis=1))).astype(int)
+    assert {tuple(c) for c in centres} == {tuple(v) for v in np.argwhere(labels.T == 7)}
+    edges = points[cells][:, [1, 3, 4]] - points[cells][:, [0]]
+    assert (np.linalg.det(edges) > 0.0).all()
+    moved = found["VTKHDF/PointData/displacement_mm"].reshape(-1, n, 3)[3]
+    tied = int(np.argmax(np.linalg.norm(moved, axis=1)))
+    np.testing.assert_allclose(moved[tied], 0.5 * direction[:, 2], atol=1e-4)
+    frame = json.loads((tmp_path / "out" / "mine.json").read_text(encoding="utf-8"))["scanner_frame"]
+    np.testing.assert_allclose(frame["direction"], direction, atol=1e-6)
+    np.testing.assert_allclose(frame["origin_mm"], volume.to_physical([2.5, 0.5, 1.5]), atol=1e-4)

@@ -16,9 +16,10 @@ import numpy as np
 import scipy.ndimage
 
 from naibu._version import __version__
-from naibu.core.arrays import BoolArray, FloatArray
+from naibu.core.arrays import BoolArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
+from naibu.core.rigid_transform import RigidTransform
 from naibu.core.volume import Volume
 from naibu.io.files.provenance import sha256
 from naibu.io.files.reading import read_bytes
@@ -29,6 +30,7 @@ from naibu.mechanics.lattices.model.contact_state import begin_contact
 from naibu.mechanics.lattices.model.hexahedra import lattice_mesh
 from naibu.mechanics.lattices.model.lattice import CLASSES, Lattice, box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.octree import octree_lattice
+from naibu.mechanics.lattices.model.voxels import cropped_mask, voxel_mask
 from naibu.mechanics.lattices.simulation.loading_history import Drive, LatticeStudy, StudyBody, check_study
 from naibu.mechanics.prescribed_motion import PrescribedMotion
 
@@ -116,8 +118,8 @@ def prepared_study(source: str | os.PathLike[str]) -> PreparedStudy:
             raise InputError(f"{error}; give a file STUDY.toml, or one of the studies {', '.join(NAMED)}") from error
         folder, name = path.parent, path.stem
     settings = load_study(path, content)
-    mask, inputs = _mask(path, folder, settings)
-    study = _study(path, settings, mask)
+    mask, frame, inputs = _mask(path, folder, settings)
+    study = _study(path, settings, mask, frame)
     said = json.dumps([settings.model_dump(mode="json"), inputs, __version__], sort_keys=True)
     inputs = {path.name: hashlib.sha256(content).hexdigest(), **inputs}
     fingerprint = hashlib.sha256(said.encode()).hexdigest()
@@ -125,14 +127,14 @@ def prepared_study(source: str | os.PathLike[str]) -> PreparedStudy:
     return PreparedStudy(name, title, str(source), settings, study, lattice_mesh(study.lattice), inputs, fingerprint)
 
 
-def _mask(path: Path, folder: Path, settings: StudyFile) -> tuple[BoolArray, dict[str, str]]:
-    """Return the voxels of the object, and the hashes of files that they come from."""
+def _mask(path: Path, folder: Path, settings: StudyFile) -> tuple[BoolArray, RigidTransform, dict[str, str]]:
+    """Return the voxels of the object, their frame, and the hashes of files that they come from."""
     table, spacing = settings.object, settings.lattice.spacing_mm
     if table.size_mm is not None or table.cells is not None:
         x, y, z = table.cells if table.cells is not None else [round(edge / spacing) for edge in table.size_mm or ()]
         if x * y * z > _MOST_CELLS:
             raise InputError(f"{path}: [object] {x} x {y} x {z} voxels are more than {_MOST_CELLS}; choose a larger spacing_mm")
-        return box_mask((x, y, z)), {}
+        return box_mask((x, y, z)), RigidTransform.identity(), {}
     assert table.labels is not None
     file = folder / table.labels
     volume = _label_volume(path, file, table)
@@ -141,7 +143,7 @@ def _mask(path: Path, folder: Path, settings: StudyFile) -> tuple[BoolArray, dic
         present = ", ".join(f"{v:g}" for v in np.unique(volume.values)[:8])
         asked = f"label = {table.label}" if table.label else "labels other than 0"
         raise InputError(f"{path}: [object] {asked}: {file} holds no such voxel; its labels are {present}")
-    mask = resampled_mask(chosen, np.asarray(volume.spacing_mm), spacing)
+    mask, frame = voxel_mask(volume, chosen, spacing)
     if not mask.any():
         raise InputError(
             f"{path}: [lattice] spacing_mm = {spacing:g}: no voxel of that edge is half filled by the labels of {file}; make it less"
@@ -155,9 +157,8 @@ def _mask(path: Path, folder: Path, settings: StudyFile) -> tuple[BoolArray, dic
             f"{path}: [object] labels = {table.labels!r}: the object falls into {count} pieces of {', '.join(map(str, sizes[:5]))} voxels; "
             "write largest_piece = true to keep the largest, or choose other labels or a smaller spacing_mm"
         )
-    inside = np.argwhere(mask)
-    (a, b, c), (d, e, f) = inside.min(axis=0), inside.max(axis=0) + 1
-    return mask[a:d, b:e, c:f], {Path(table.labels).name: sha256(file)}
+    mask, frame = cropped_mask(mask, frame, spacing)
+    return mask, frame, {Path(table.labels).name: sha256(file)}
 
 
 def _label_volume(path: Path, file: Path, table: ObjectTable) -> Volume:
@@ -177,36 +178,9 @@ def _label_volume(path: Path, file: Path, table: ObjectTable) -> Volume:
         raise InputError(f"{place}: {error}; save the labels by numpy.save, with the axes x, y, z") from error
 
 
-def resampled_mask(voxels: BoolArray, voxel_mm: FloatArray, spacing_mm: float) -> BoolArray:
-    """Return which cubes of an edge are at least half filled by voxels (nz, ny, nx); the cubes have the axes (x, y, z) and begin with them.
-
-    Parameters
-    ----------
-    voxels : ndarray, shape (nz, ny, nx), bool
-        In the object.
-    voxel_mm : ndarray, shape (3,)
-        Edges of a voxel along x, y, z, mm.
-    spacing_mm : float
-        Edge of a cube, mm.
-    """
-    used = np.argwhere(voxels.T)
-    low, high = used.min(axis=0), used.max(axis=0) + 1
-    share = voxels.T[tuple(slice(a, b) for a, b in zip(low, high, strict=True))].astype(np.float32)
-    for axis in range(3):  # shares of slabs, one axis after the other
-        edges = voxel_mm[axis] * np.arange(share.shape[axis] + 1)
-        count = int(np.ceil(edges[-1] / spacing_mm - 1e-6))
-        filled = np.concatenate([np.zeros((1, *np.delete(share.shape, axis))), np.cumsum(np.moveaxis(share, axis, 0), axis=0)])
-        cuts = np.minimum(spacing_mm * np.arange(count + 1) / voxel_mm[axis], len(edges) - 1.0)
-        below = np.minimum(cuts.astype(np.int64), len(edges) - 2)
-        part = (cuts - below).reshape(-1, *[1] * (share.ndim - 1))
-        integral = filled[below] * (1.0 - part) + filled[below + 1] * part
-        share = np.moveaxis(np.diff(integral, axis=0) * voxel_mm[axis] / spacing_mm, 0, axis)
-    return np.asarray(share >= 0.5 - 1e-6)
-
-
-def _study(path: Path, settings: StudyFile, mask: BoolArray) -> LatticeStudy:
+def _study(path: Path, settings: StudyFile, mask: BoolArray, frame: RigidTransform) -> LatticeStudy:
     simulation = settings.simulation
-    lattice = _lattice(path, settings, mask)
+    lattice = _lattice(path, settings, mask, frame)
     p = settings.parameters
     try:
         parameters = lattice_parameters(lattice, p.K, p.C1, p.C2)
@@ -233,16 +207,18 @@ def _study(path: Path, settings: StudyFile, mask: BoolArray) -> LatticeStudy:
     return study
 
 
-def _lattice(path: Path, settings: StudyFile, mask: BoolArray) -> Lattice:
+def _lattice(path: Path, settings: StudyFile, mask: BoolArray, frame: RigidTransform) -> Lattice:
     table, body = settings.lattice, settings.object
     amount: Mapping[str, Any] = (
         {"total_mass_kg": 1e-3 * body.mass_g} if body.mass_g is not None else {"density": 1e-6 * (body.density_g_per_cm3 or 0.0)}
     )
     try:
         if table.kind == "classic":
-            return classic_lattice(mask, table.spacing_mm, lumping=table.masses, **amount)
+            return classic_lattice(mask, table.spacing_mm, lumping=table.masses, frame=frame, **amount)
         ratios = class_ratios(settings.parameters.K)
-        return octree_lattice(mask, table.spacing_mm, int(table.kind[-1]), lumping=table.masses, class_stiffness=ratios, **amount)
+        return octree_lattice(
+            mask, table.spacing_mm, int(table.kind[-1]), lumping=table.masses, class_stiffness=ratios, frame=frame, **amount
+        )
     except InputError as error:
         raise InputError(f"{path}: [lattice] {error}") from error
 

@@ -130,7 +130,12 @@ def _computed(
 def _append(series: SeriesFile, prepared: PreparedStudy, frame: StudyFrame) -> None:
     lattice, state = prepared.study.lattice, frame.state
     moved = state.lattice.position - lattice.points
-    values = {"displacement": moved, "velocity": state.lattice.velocity, "stretch": mean_stretch(prepared.study, state.lattice.position)}
+    turn = lattice.frame.rotation  # to the scanner's frame, in which the points of the series are
+    values = {
+        "displacement": moved @ turn.T,
+        "velocity": state.lattice.velocity @ turn.T,
+        "stretch": mean_stretch(prepared.study, state.lattice.position),
+    }
     kept = {"displacement", *prepared.settings.output.quantities}
     first = max(state.frame - 1, 0) * prepared.study.samples
     series.append_rows("force_time_s", frame.sample_times, first)
@@ -162,7 +167,7 @@ def _written(prepared: PreparedStudy, series: SeriesFile, state: StudyState, fol
 
 
 def _numbers(prepared: PreparedStudy, series: SeriesFile, state: StudyState) -> dict[str, Any]:
-    study = prepared.study
+    study, lattice = prepared.study, prepared.study.lattice
     count = state.frame * study.samples
     force, energy = series.rows("force_mN")[:count], series.rows("energy_mN_mm")[: state.frame + 1]
     names = [body.name for body in study.bodies]
@@ -176,6 +181,7 @@ def _numbers(prepared: PreparedStudy, series: SeriesFile, state: StudyState) -> 
         "inputs_sha256": prepared.inputs,
         "fingerprint": prepared.fingerprint,
         "units": "mm, kg, s, mN, mN mm",
+        "scanner_frame": {"direction": lattice.frame.rotation.tolist(), "origin_mm": lattice.frame.translation.tolist()},
         "masses": study.lattice.n_nodes,
         "elements": study.lattice.n_elements,
         "mass_kg": study.lattice.total_mass,
@@ -207,7 +213,7 @@ def _page(prepared: PreparedStudy, series: SeriesFile, state: StudyState) -> Mot
     nodes, faces = np.unique(triangles, return_inverse=True)
     most = max(2, min(PAGE_FRAMES, PAGE_POINTS // len(nodes)))
     frames = np.unique(np.linspace(0, state.frame, min(most, state.frame + 1)).round().astype(int))
-    moved = np.stack([series.values(ARRAYS["displacement"], int(k))[nodes] for k in frames]).astype(float)
+    moved = np.stack([series.values(ARRAYS["displacement"], int(k))[nodes] for k in frames]).astype(float) @ study.lattice.frame.rotation
     fields = [ColourField("displacement, mm", np.linalg.norm(moved, axis=2))]
     if "stretch" in prepared.settings.output.quantities:
         stretch = np.stack([series.values(ARRAYS["stretch"], int(k))[nodes] for k in frames]).astype(float)

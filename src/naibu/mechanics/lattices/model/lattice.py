@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
@@ -13,9 +13,11 @@ from scipy.sparse.csgraph import connected_components
 
 from naibu.core.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from naibu.core.errors import InputError
+from naibu.core.rigid_transform import RigidTransform
 
 CLASSES = ("short", "normal", "long")  # edges, face diagonals and space diagonals of a cube
 ZONES = ("core", "surface")
+_HEXAHEDRON = (0, 1, 3, 2, 4, 5, 7, 6)  # VTK's order of corners that are numbered x fastest
 
 ByClass = float | ArrayLike | Mapping[str, "float | Mapping[str, float]"]
 
@@ -45,6 +47,10 @@ class Lattice:
     scale : ndarray, shape (m,)
         How many times stiffer, and more viscous, than between the finest voxels an element is to be so that the solid answers as the
         classic lattice does: see `naibu.mechanics.lattices.model.octree.octree_lattice`. One in classic lattices.
+    cells : ndarray, shape (c, 8), int64, optional
+        Nodes of the cubes in VTK's order of a hexahedron; None of lattices of any other shape.
+    frame : RigidTransform
+        From `points` to the frame of the scanner, in which results are written; the identity where there was no scan.
     """
 
     points: FloatArray
@@ -56,6 +62,8 @@ class Lattice:
     surface_node: BoolArray
     spacing_mm: float
     scale: FloatArray
+    cells: IntArray | None = None
+    frame: RigidTransform = field(default_factory=RigidTransform.identity)
 
     @property
     def n_nodes(self) -> int:
@@ -109,6 +117,7 @@ def classic_lattice(
     density: float | None = None,
     lumping: str = "volume",
     origin: ArrayLike = (0.0, 0.0, 0.0),
+    frame: RigidTransform | None = None,
 ) -> Lattice:
     """Return masses at the corners of all voxels of a mask, each joined to its up to 26 neighbours (spec L2).
 
@@ -126,6 +135,8 @@ def classic_lattice(
         ``"volume"``: every voxel gives an eighth of its mass to each corner; ``"equal"``: all masses are alike, as in the report.
     origin : array_like, shape (3,)
         Position of the corner (0, 0, 0) of the grid, mm.
+    frame : RigidTransform, optional
+        From these positions to the scanner's frame; see `naibu.mechanics.lattices.model.voxels.voxel_mask`.
 
     Raises
     ------
@@ -140,7 +151,8 @@ def classic_lattice(
     volumes = np.full(len(cells), spacing_mm**3)
     masses = lumped_masses(corners, volumes, len(nodes), total_mass_kg=total_mass_kg, density=density, lumping=lumping)
     surface = np.bincount(corners.ravel(), minlength=len(nodes)) < 8
-    return assembled(nodes, pairs, np.zeros(len(pairs), dtype=np.int8), masses, surface, spacing_mm, origin)
+    level = np.zeros(len(pairs), dtype=np.int8)
+    return assembled(nodes, corners, pairs, level, masses, surface, spacing_mm, origin, frame=frame)
 
 
 def box_mask(shape: tuple[int, int, int]) -> BoolArray:
@@ -227,6 +239,7 @@ def lumped_masses(
 
 def assembled(
     nodes: IntArray,
+    corners: IntArray,
     pairs: IntArray,
     level: Int8Array,
     masses: FloatArray,
@@ -234,6 +247,7 @@ def assembled(
     spacing_mm: float,
     origin: ArrayLike,
     scale: FloatArray | None = None,
+    frame: RigidTransform | None = None,
 ) -> Lattice:
     """Return the lattice of masses at grid positions (n, 3) and elements (m, 2), classed by their directions.
 
@@ -247,7 +261,9 @@ def assembled(
     kind = (np.count_nonzero(offset, axis=1) - 1).astype(np.int8)
     zone = (surface[pairs[:, 0]] | surface[pairs[:, 1]]).astype(np.int8)
     points = np.asarray(origin, dtype=float) + spacing_mm * nodes
-    return Lattice(points, pairs, masses, kind, zone, level, surface, float(spacing_mm), np.ones(len(pairs)) if scale is None else scale)
+    factors = np.ones(len(pairs)) if scale is None else scale
+    cells, placed = corners[:, _HEXAHEDRON], frame or RigidTransform.identity()
+    return Lattice(points, pairs, masses, kind, zone, level, surface, float(spacing_mm), factors, cells, placed)
 
 
 def require_connected(pairs: IntArray, n_nodes: int, points: FloatArray) -> None:

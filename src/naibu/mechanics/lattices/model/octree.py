@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from naibu.core.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from naibu.core.errors import InputError
+from naibu.core.rigid_transform import RigidTransform
 from naibu.mechanics.lattices.model.lattice import Lattice, _corner_numbers, assembled, checked_mask, lumped_masses, require_positive
 from naibu.mechanics.lattices.model.octree_compliance_correction import response_factors
 from naibu.mechanics.lattices.model.octree_energy_scaling import OctreeGrid, edge_factors, energy_factors
@@ -29,6 +30,7 @@ def octree_lattice(
     origin: ArrayLike = (0.0, 0.0, 0.0),
     scaling: str = "response",
     class_stiffness: ArrayLike = (1.0, 1.0, 1.0),
+    frame: RigidTransform | None = None,
 ) -> Lattice:
     """Return the octree lattice of a mask (spec L3).
 
@@ -57,6 +59,8 @@ def octree_lattice(
         mean edge of the cubes around an element. See `naibu.mechanics.lattices.model.octree_compliance_correction`.
     class_stiffness : array_like, shape (3,)
         K of short, normal and long elements, in any unit, if they are known to differ much; for ``"response"`` only.
+    frame : RigidTransform, optional
+        As of `classic_lattice`.
 
     Raises
     ------
@@ -78,7 +82,7 @@ def octree_lattice(
     if lumping == "smallest":
         masses = _masses_of_smallest(corners, sizes, len(nodes), filled, float(masses.sum()))
     scale = octree_factors(OctreeGrid(filled, cubes, sizes, nodes, pairs), scaling, class_stiffness)
-    return assembled(nodes, pairs, level, masses, _on_surface(nodes, filled), spacing_mm, origin, scale)
+    return assembled(nodes, corners, pairs, level, masses, _on_surface(nodes, filled), spacing_mm, origin, scale, frame)
 
 
 def octree_factors(grid: OctreeGrid, scaling: str = "response", class_stiffness: ArrayLike = (1.0, 1.0, 1.0)) -> FloatArray:
