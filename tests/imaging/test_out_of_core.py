@@ -204,7 +204,7 @@ def test_what_cannot_be_worked_on_is_told() -> None:
         (lambda: map_overlapping(np.abs, [before.values, after.values[1:]], (1, 1, 1)), "one shape"),
         (lambda: map_overlapping(np.abs, [before.values], (1, 1)), "three whole numbers"),
         (lambda: map_overlapping(np.abs, [before.values], (1, 1, -1)), "three whole numbers"),
-        (lambda: map_overlapping(lambda a: a[1:], [before.values], (1, 1, 1)).compute(scheduler="synchronous"), "as many voxels"),
+        (lambda: map_overlapping(lambda a: a[1:], [before.values], (1, 1, 1)).compute(scheduler="synchronous"), "the voxels that it gets"),
         (lambda: chunked_harris_response(chunked(constant)), "constant"),
         (lambda: chunked_harris_response(chunked(before), response="best"), "response must be"),
         (lambda: chunked_block_matching(chunked(before), chunked(constant)), "deformed volume is constant"),

@@ -6,6 +6,7 @@ import hashlib
 import json
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from naibu.io.marker_tables import import_markers
 from naibu.io.meshes import read_mesh
 from naibu.validation.specimens.textured_sphere import squeezed_ball
 from naibu.workflows.compare_methods import compare_methods
-from naibu.workflows.sense import read_pair, sense_pair
+from naibu.workflows.sense import read_pair, sense_pair, slice_view
 
 Array = np.ndarray
 
@@ -118,6 +119,14 @@ def test_a_single_slice_has_all_files_but_the_mesh(folder: Path, tmp_path: Path)
     assert {p.name for p in run.files} == {p.name for p in (tmp_path / "out").iterdir()}
     assert {"report.html", "displacement.mha", "field.npz", "sense.json"} <= {p.name for p in run.files}
     assert not (tmp_path / "out" / "displacement.vtu").exists()
+
+
+def test_a_field_that_folds_is_named_on_the_page(folder: Path) -> None:
+    pair = read_pair(folder / "before.mha", folder / "after.nrrd")
+    run = sense_pair(pair, method="rigid")
+    assert not any("folds" in sentence for sentence in slice_view(pair, run).sentences)
+    folded = replace(run, figures=run.figures | {"folded_fraction": 0.125})
+    assert any("folds at 12.50%" in sentence for sentence in slice_view(pair, folded).sentences)
 
 
 def test_methods_that_all_fail_say_why(folder: Path, tmp_path: Path) -> None:

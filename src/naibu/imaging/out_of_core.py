@@ -1,8 +1,8 @@
-"""Volumes larger than memory: the same methods block by block, on one computer or on the workers of a Dask cluster (spec S7, S3).
+"""Out-of-core imaging: methods for volumes larger than memory, block by block, on one computer or on a Dask cluster :cite:p:`rocklin2015`.
 
-A block is read with as many voxels around as its result depends on, so that results are those in memory where a method looks only so far:
-block matching and the Harris operator. They need the packages of the extra ``naibu[cluster]``. Nothing is computed before it is asked for:
-`stored` writes results block by block, on the workers of the `distributed.Client` that is open, if there is one.
+A block is read with a margin of the voxels on which its result depends, so that results are those in memory for methods of finite support:
+block matching and the Harris operator. The packages of the extra ``naibu[cluster]`` are needed. Results are computed lazily: `stored`
+writes them block by block, on the workers of the open `distributed.Client`, if there is one.
 """
 
 from __future__ import annotations
@@ -32,21 +32,25 @@ from naibu.imaging.preprocessing.volume_pair import shifted_intensity, to_millim
 
 Box = tuple[slice, slice, slice]
 Function = Callable[..., AnyArray]
-BLOCK = (128, 128, 64)
-# compiled kernels share the cores among themselves: two blocks at a time in one process would only be in each other's way
+BLOCK = (
+    128,
+    128,
+    64,
+)  # voxels along x, y, z: 4 MB in single precision, little memory even with margin and results
+# compiled kernels use all cores: two blocks at a time in one process would compete for them
 _ONE_AT_A_TIME = threading.Lock()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChunkedDisplacement:
-    """Displacement at every voxel, not computed yet.
+    """Displacement field on a grid that is computed lazily, block by block.
 
     Attributes
     ----------
     packed : dask array, shape (nz, ny, nx, 5)
-        Displacement along x, y, z, mm; 1 where it is measured, else 0; quality. They come out of one computation: store them together.
+        Displacement along x, y, z, mm; 1 where it is measured, else 0; quality of the match. One computation gives all.
     grid : Volume
-        Where the voxels lie; it has no values.
+        Frame of the voxels.
     """
 
     packed: Any
@@ -107,17 +111,19 @@ def map_overlapping(
     Raises
     ------
     InputError
-        No volume, shapes that differ, or sizes that are no sizes.
+        No volume, shapes that differ, or invalid sizes.
     MissingDependencyError
         Dask is not installed.
     """
     dask, arrays = _dask()
     size, margin = np.asarray(block), np.asarray(overlap)
     if size.shape != (3,) or margin.shape != (3,) or (size < 1).any() or (margin < 0).any() or aligned < 1:
-        raise InputError(f"block and overlap are three whole numbers of voxels along x, y, z, not {size.tolist()} and {margin.tolist()}")
+        raise InputError(
+            f"block and overlap must be three whole numbers of voxels along x, y, z, not {size.tolist()} and {margin.tolist()}"
+        )
     shapes = {tuple(v.shape) for v in volumes}
     if len(shapes) != 1 or len(next(iter(shapes))) != 3:
-        raise InputError(f"volumes that are worked on together have one shape (nz, ny, nx), not {sorted(shapes)}")
+        raise InputError(f"volumes must have one shape (nz, ny, nx), not {sorted(shapes)}")
     shape = shapes.pop()
     size = aligned * -(-size // aligned)
     extra = () if components is None else (components,)
@@ -156,19 +162,19 @@ def chunked_harris_response(
     Returns
     -------
     dask array, shape (nz, ny, nx), float32
-        The same values as in memory: grey values that are whole numbers bit by bit, others to rounding.
+        The same values as in memory: bit by bit for integer intensities, to rounding for others.
 
     Raises
     ------
     InputError
-        Options that are none, a constant volume, or when computed: unknown voxels.
+        Invalid options, a constant volume, or when computed: unknown voxels.
     """
     if response not in ("ratio", "harris") or k < 0.0:
         raise InputError(f"response must be 'ratio' or 'harris' with k >= 0, not {response!r} with {k}")
     sigmas = default_sigmas(volume.spacing_mm, volume.shape, gradient_sigma_mm, window_sigma_mm)
     known = _moments(volume, block)
     if not known.high > known.low:
-        raise InputError("the volume is constant: it has no interest points")
+        raise InputError("volume is constant: it has no interest points")
     reach = sum(np.maximum(np.ceil(REACH * s / volume.spacing_mm), 1).astype(int) for s in sigmas) + 1
     function = partial(_harris, shift=known.mean, spacing_mm=volume.spacing_mm, sigmas=sigmas, k=k if response == "harris" else None)
     return map_overlapping(function, [volume.values], reach, block=block)
@@ -190,23 +196,23 @@ def chunked_block_matching(
     Parameters
     ----------
     reference, deformed : ChunkedVolume
-        Before and after, on one grid.
+        Volumes before and after the deformation, on one grid.
     matched_block : array_like, shape (3,)
-        The block that is compared, `block` there.
+        Size of the compared block, `block` there, voxels along x, y, z.
     search, measure, sub_voxel, least_range
         As there.
     block : array_like, shape (3,)
-        Size of a block that is worked on at a time, along x, y, z, voxels.
+        Size of a block of the computation, along x, y, z, voxels.
 
     Returns
     -------
     ChunkedDisplacement
-        The same values as in memory: grey values that are whole numbers bit by bit, others to rounding.
+        The same values as in memory: bit by bit for integer intensities, to rounding for others.
 
     Raises
     ------
     InputError
-        Volumes on different grids or without contrast, or sizes that are no sizes.
+        Volumes on different grids or without contrast, or invalid sizes.
     """
     known = _pair(reference, deformed, block)
     spread = known[0].spread
@@ -240,13 +246,13 @@ def chunked_horn_schunck(
     Parameters
     ----------
     reference, deformed : ChunkedVolume
-        Before and after, on one grid.
+        Volumes before and after the deformation, on one grid.
     full_scale : float, optional
         As there; by default from at most a million voxels spread over the volume.
     levels : int
         Number of grids. Blocks begin where all of them have voxels.
     overlap : array_like, shape (3,)
-        Voxels along x, y, z around a block whose grey values count for it.
+        Margin of a block, voxels along x, y, z.
     block : array_like, shape (3,)
         Size of a block along x, y, z, voxels.
     **options
@@ -255,13 +261,13 @@ def chunked_horn_schunck(
     Returns
     -------
     ChunkedDisplacement
-        Every voxel depends on all others, ever less with their distance: the result differs from that in memory by what lies further away
-        than the overlap. A block without contrast, overlap included, is not measured.
+        Every voxel depends on all others, but less with their distance: the result differs from that in memory by the influence from beyond
+        the overlap. A block without contrast, overlap included, is not measured.
 
     Raises
     ------
     InputError
-        Volumes on different grids or without contrast, or options that are none.
+        Volumes on different grids or without contrast, or invalid options.
     """
     _pair(reference, deformed, block)
     scale = _range(reference) if full_scale is None else full_scale
@@ -281,7 +287,7 @@ def stored(arrays: Sequence[Any], targets: Sequence[Any]) -> None:
     Parameters
     ----------
     arrays : sequence of dask arrays
-        What is computed; arrays that share work are best stored together.
+        Arrays to compute; arrays that share work are best stored together.
     targets : sequence of arrays that can be assigned to by slices
         Of the same shapes; Zarr arrays where several processes write. Chunks that divide the blocks are written without waiting.
     """
@@ -292,11 +298,11 @@ def stored(arrays: Sequence[Any], targets: Sequence[Any]) -> None:
 
 
 def _trimmed(function: Function, inner: Box, shape: tuple[int, ...], dtype: Any, *pieces: AnyArray) -> AnyArray:
-    """Return what a function makes of pieces, without the overlap."""
+    """Return the values of a function of pieces, without the overlap."""
     with _ONE_AT_A_TIME:
         values = np.asarray(function(*pieces))
     if values.shape[:3] != pieces[0].shape:
-        raise InputError(f"a function on blocks must return as many voxels as it gets, {pieces[0].shape}, not {values.shape[:3]}")
+        raise InputError(f"function must return the voxels that it gets, {pieces[0].shape}, not {values.shape[:3]}")
     return np.ascontiguousarray(values[inner].reshape(shape), dtype=dtype)
 
 
@@ -307,7 +313,7 @@ def _read(source: Any, box: Box) -> AnyArray:
 def _boxes(
     number: tuple[int, ...], shape: tuple[int, ...], size: IntArray, margin: IntArray, aligned: int
 ) -> tuple[Box, Box, tuple[int, ...]]:
-    """Return what block `number` reads of the volume, which part of that is its own, and how large that is; all along z, y, x."""
+    """Return the box that block `number` reads, its own part of that box, and the shape of that part; all along z, y, x."""
     outer, inner, own = [], [], []
     for n, total, step, more in zip(number, shape, size, margin, strict=True):
         start, stop = n * int(step), min((n + 1) * int(step), total)
@@ -320,7 +326,7 @@ def _boxes(
 
 @dataclass(frozen=True, slots=True)
 class _Moments:
-    """What is known of all grey values that are finite: mean, standard deviation, least and largest."""
+    """Mean, standard deviation, least and largest of the finite intensities of a volume."""
 
     mean: float
     spread: float
@@ -339,7 +345,7 @@ def _moments(volume: ChunkedVolume, block: ArrayLike) -> _Moments:
     found = np.array(dask.compute(*parts, **_scheduler()))
     count, total, low, high = found[:, 0].sum(), math.fsum(found[:, 1]), found[:, 3].min(), found[:, 4].max()
     if not count:
-        raise InputError("the volume has no known voxel")
+        raise InputError("the volume has no finite voxel")
     mean = total / count
     square = math.fsum(found[:, 2] + found[:, 1] * (found[:, 1] / np.maximum(found[:, 0], 1.0) - 2.0 * mean)) / count + mean**2
     return _Moments(float(mean), math.sqrt(max(square, 0.0)), float(low), float(high))
@@ -359,8 +365,8 @@ def _pair(reference: ChunkedVolume, deformed: ChunkedVolume, block: ArrayLike) -
     """Check two volumes that are compared."""
     if not reference.grid.same_grid(deformed.grid):
         raise InputError(
-            f"the volumes lie on different grids ({reference.shape} voxels of {reference.spacing_mm.tolist()} mm; {deformed.shape} of "
-            f"{deformed.spacing_mm.tolist()} mm); bring the deformed one to the grid of the reference first"
+            f"reference and deformed lie on different grids ({reference.shape} voxels of {reference.spacing_mm.tolist()} mm; "
+            f"{deformed.shape} of {deformed.spacing_mm.tolist()} mm); resample deformed to the grid of reference first"
         )
     known = _moments(reference, block), _moments(deformed, block)
     for name, m in zip(("reference", "deformed"), known, strict=True):
@@ -370,7 +376,7 @@ def _pair(reference: ChunkedVolume, deformed: ChunkedVolume, block: ArrayLike) -
 
 
 def _range(volume: ChunkedVolume) -> float:
-    """Return the grey range but for the darkest and brightest 0.5 %, from at most some million voxels."""
+    """Return the intensity range without the darkest and brightest 0.5 %, from at most some million voxels."""
     step = max(1, math.ceil((math.prod(volume.shape) / 1e6) ** (1.0 / 3.0)))
     slices = (volume.block((slice(k, k + 1), slice(None), slice(None))).values[:, ::step, ::step] for k in _every(volume.shape[0], step))
     values = np.concatenate([v.ravel() for v in slices])

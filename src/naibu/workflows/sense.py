@@ -372,7 +372,7 @@ def _sentences(run: SenseRun) -> list[str]:
     else:
         sentences.append("This method states no uncertainty.")
     if isinstance(f["folded_fraction"], float) and f["folded_fraction"] > 0.0:
-        sentences.append(f"The field folds at {f['folded share']:.2%} of the voxels: it is wrong there.")
+        sentences.append(f"The field folds at {f['folded_fraction']:.2%} of the voxels: it is wrong there.")
     return sentences
 
 

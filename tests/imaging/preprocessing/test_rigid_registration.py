@@ -19,8 +19,8 @@ from naibu.imaging.preprocessing.bone_mask import bone_mask, otsu_thresholds
 from naibu.imaging.preprocessing.resampling import positions
 from naibu.imaging.preprocessing.rigid_registration import (
     NotRigidWarning,
-    leftover_motion,
     register_rigid,
+    remaining_motion,
     rigid_displacement,
     rigid_from_points,
     total_displacement,
@@ -61,8 +61,8 @@ def test_a_plane_motion_is_found_from_three_points(angle: float, seed: int) -> N
     [
         (np.eye(3)[:2], "three points or more"),
         (np.outer(np.arange(4.0), [1.0, 2.0, 3.0]), "on one line"),
-        (np.ones((4, 3)), "in one place"),
-        (np.ones((4, 2)), "in one place"),
+        (np.ones((4, 3)), "coincide"),
+        (np.ones((4, 2)), "coincide"),
         (np.full((4, 3), np.nan), "finite"),
         (np.ones((4, 4)), "shape"),
     ],
@@ -168,10 +168,10 @@ def test_grey_values_in_a_bone_mask_give_its_motion() -> None:
 
 def test_a_bone_that_is_not_rigid_is_told() -> None:
     before, after, bone = limb(RigidTransform.identity(), squeeze=0.12)
-    left = leftover_motion(before, after, bone, RigidTransform.identity())
+    left = remaining_motion(before, after, bone, RigidTransform.identity())
     # the ends of the bone are 24 mm from its middle
     assert left.max() > 1.0
-    rigid = leftover_motion(*limb(RigidTransform.identity())[:2], bone, RigidTransform.identity())
+    rigid = remaining_motion(*limb(RigidTransform.identity())[:2], bone, RigidTransform.identity())
     assert rigid.max() < 0.3
     pytest.importorskip("SimpleITK")
     with pytest.warns(NotRigidWarning, match="not"):

@@ -72,7 +72,7 @@ def products(gradient: AnyArray, out: AnyArray) -> None:
 
 @njit(cache=True)
 def _sorted_column(v: AnyArray, k: int, j: int, i: int, out: AnyArray) -> int:
-    """Fill out with the sorted values of the neighbours along y and z, and return how many there are."""
+    """Fill out with the sorted values of the neighbours along y and z, and return their number."""
     nz, ny, _ = v.shape
     n = 0
     for z in range(max(k - 1, 0), min(k + 2, nz)):

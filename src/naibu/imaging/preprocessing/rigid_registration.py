@@ -1,4 +1,7 @@
-"""Rigid motion: from corresponding points in closed form (spec S2), or from grey values inside a mask."""
+"""Rigid registration: of corresponding points in closed form :cite:p:`horn1987`, or of intensities in a mask.
+
+Intensities are registered by mutual information :cite:p:`mattes2003` with SimpleITK :cite:p:`lowekamp2013`.
+"""
 
 from __future__ import annotations
 
@@ -17,25 +20,27 @@ from naibu.core.rigid_transform import RigidTransform
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.resampling import covered, positions, require_mask, resampled_to_grid
 
-# of the largest extent of the points: narrower ones leave a rotation open
-NARROW = 1e-6
-HISTOGRAM_BINS = 32
+NARROW = 1e-6  # of the largest extent of the points: below it, to rounding, they lie on one line and leave the rotation about it open
+HISTOGRAM_BINS = 32  # of the joint histogram of mutual information
+FEWEST_VOXELS = 20  # of a part of a mask whose own motion is estimated; empirical
+# residuals of neighbouring voxels are correlated: eight count as one; motions within two standard deviations count as none
+CORRELATED, SIGNIFICANT = 8.0, 2.0
 
 
 class NotRigidWarning(UserWarning):
-    """What was taken for a rigid body moved in another way."""
+    """The points or the mask of a rigid registration did not move rigidly."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigidRegistration:
-    """Rigid transform found by registration, and what it leaves.
+    """Rigid transform found by registration, with residuals.
 
     Attributes
     ----------
     transform : RigidTransform
         ``x' = R x + t``.
     residuals_mm : ndarray, shape (n,)
-        Distance of each point, or of each part of the mask, from where it was found, after the transform, mm.
+        Distance of each transformed point, or of each part of the mask, from its measured position, mm.
     """
 
     transform: RigidTransform
@@ -54,7 +59,7 @@ def total_displacement(displacement: ArrayLike, transform: RigidTransform, grid:
     ----------
     displacement : array_like, shape (nz, ny, nx, 3)
         Displacement v, mm, measured against the deformed volume resampled through `transform`
-        (`naibu.imaging.preprocessing.resampling.resampled_to_grid` with ``through=transform.applied``).
+        (`naibu.imaging.resampled_to_grid` with ``through=transform.applied``).
     transform : RigidTransform
         ``R x + t``.
     grid : Volume
@@ -63,7 +68,7 @@ def total_displacement(displacement: ArrayLike, transform: RigidTransform, grid:
     Returns
     -------
     ndarray, shape (nz, ny, nx, 3)
-        mm.
+        Total displacement, mm.
     """
     points = positions(grid)
     return np.asarray(transform.applied(points + np.asarray(displacement, dtype=float)) - points)
@@ -74,15 +79,15 @@ def rigid_displacement(transform: RigidTransform, grid: Volume) -> FloatArray:
     return transform.displacement(positions(grid))
 
 
-def rigid_from_points(initial: ArrayLike, deformed: ArrayLike, *, rigid_within_mm: float | None = None) -> RigidRegistration:
-    """Return the rigid motion that carries points best onto their counterparts, in closed form (spec S2, Horn 1987).
+def rigid_from_points(reference: ArrayLike, deformed: ArrayLike, *, rigid_within_mm: float | None = None) -> RigidRegistration:
+    """Return the least-squares rigid registration of corresponding points, in closed form :cite:p:`horn1987`.
 
     Parameters
     ----------
-    initial, deformed : array_like, shape (n, d)
-        The same points before and after, mm, d = 2 or 3; n of at least 3.
+    reference, deformed : array_like, shape (n, d)
+        Positions of the same points in the reference and the deformed configuration, mm, d = 2 or 3; n of at least 3.
     rigid_within_mm : float, optional
-        Warn where the root mean square of the residuals exceeds this, mm: the points are then not on one rigid body.
+        Warn where the root mean square of the residuals exceeds this, mm: the points do not belong to one rigid body.
 
     Returns
     -------
@@ -92,7 +97,7 @@ def rigid_from_points(initial: ArrayLike, deformed: ArrayLike, *, rigid_within_m
     Raises
     ------
     InputError
-        Fewer than three points, points in one place or, in space, on one line, or shapes that do not fit.
+        Fewer than three points, points that coincide or, in space, lie on one line, or shapes that do not fit.
 
     Warns
     -----
@@ -101,22 +106,18 @@ def rigid_from_points(initial: ArrayLike, deformed: ArrayLike, *, rigid_within_m
 
     Notes
     -----
-    In space the rotation is the unit quaternion that belongs to the largest eigenvalue of Horn's 4 x 4 matrix, in a plane the angle of
-    (3.36). ``tau = mean(x') - R mean(x)``; the report's (8) shows the opposite sign.
-
-    References
-    ----------
-    B. K. P. Horn: Closed-form solution of absolute orientation using unit quaternions. J. Opt. Soc. Am. A 4 (1987) 629-642.
+    In space the rotation is the unit quaternion of the largest eigenvalue of Horn's 4 x 4 matrix, in a plane the angle of equation 3.36 in
+    :cite:t:`hirai2008`. ``t = mean(x') - R mean(x)``; equation 8 there has the opposite sign.
     """
-    x, y = np.asarray(initial, dtype=float), np.asarray(deformed, dtype=float)
+    x, y = np.asarray(reference, dtype=float), np.asarray(deformed, dtype=float)
     if x.ndim != 2 or x.shape != y.shape or x.shape[1] not in (2, 3):
-        raise InputError(f"corresponding points must have one shape (n, 2) or (n, 3), not {x.shape} and {y.shape}")
+        raise InputError(f"reference and deformed must have one shape (n, 2) or (n, 3), not {x.shape} and {y.shape}")
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
-        raise InputError("corresponding points must be finite; leave out those that were not found")
+        raise InputError("reference and deformed must be finite; leave out points that were not found")
     if len(x) < 3:
-        raise InputError(f"a rigid motion is found from three points or more, not from {len(x)}")
+        raise InputError(f"reference and deformed must hold three points or more, not {len(x)}")
     middle_x, middle_y = x.mean(axis=0), y.mean(axis=0)
-    for points, name in ((x - middle_x, "initial"), (y - middle_y, "deformed")):
+    for points, name in ((x - middle_x, "reference"), (y - middle_y, "deformed")):
         _require_spread(points, name)
     m = (x - middle_x).T @ (y - middle_y)
     rotation = _rotation_from_quaternion(_best_quaternion(m)) if x.shape[1] == 3 else _plane_rotation(m)
@@ -130,9 +131,9 @@ def rigid_from_points(initial: ArrayLike, deformed: ArrayLike, *, rigid_within_m
 def _require_spread(centred: FloatArray, name: str) -> None:
     extents = np.linalg.svd(centred, compute_uv=False)
     if not extents[0] > 0.0:
-        raise InputError(f"all {name} points are in one place: choose points that are apart")
+        raise InputError(f"all points of {name} coincide: choose points that are apart")
     if centred.shape[1] == 3 and extents[1] < NARROW * extents[0]:
-        raise InputError(f"all {name} points lie on one line, which leaves the rotation about it open: choose one beside it")
+        raise InputError(f"all points of {name} lie on one line, which leaves the rotation about it open: add a point off the line")
 
 
 def _best_quaternion(m: FloatArray) -> FloatArray:
@@ -165,7 +166,7 @@ def _warn_unless_rigid(motion: RigidRegistration, within_mm: float | None, what:
     if within_mm is not None and motion.rms_mm > within_mm:
         worst = int(np.argmax(motion.residuals_mm))
         warnings.warn(
-            f"what was taken for rigid is not: {motion.rms_mm:.3f} mm remain (root mean square) where {within_mm:g} mm are allowed, most "
+            f"the motion is not rigid: the residual is {motion.rms_mm:.3f} mm (root mean square), above {within_mm:g} mm, and largest "
             f"at {what} {worst} with {motion.residuals_mm[worst]:.3f} mm; check the correspondence or the mask",
             NotRigidWarning,
             stacklevel=3,
@@ -184,33 +185,34 @@ def register_rigid(
     seed: int = 1,
     rigid_within_mm: float | None = None,
 ) -> RigidRegistration:
-    """Return the rigid motion that fits the grey values inside a mask, by SimpleITK (spec S2).
+    """Return the rigid registration of the intensities in a mask, by mutual information with SimpleITK.
 
     Parameters
     ----------
     reference, deformed : Volume
-        Before and after; their grids may differ.
+        Volumes before and after the deformation; their grids may differ.
     mask : array_like, shape (nz, ny, nx)
-        Voxels of the reference that move rigidly, as from `naibu.imaging.preprocessing.bone_mask.bone_mask`; it should reach a little over
-        the bone, for its edge holds most of the contrast.
+        Voxels of the reference that move rigidly, as from `naibu.imaging.bone_mask`; it should reach a little over the bone, whose edge has
+        most of the contrast.
     start : RigidTransform, optional
-        First guess; by default the centres of grey mass are brought together.
+        Initial transform; by default the translation between the intensity-weighted centroids.
     levels : int
-        Grids, each twice as coarse as the next, that are gone through from coarse to fine.
+        Number of grids, each twice as coarse as the next, from coarse to fine.
     widening_mm : float
-        On coarse grids the mask reaches further by ``widening_mm (2^level - 1)``, mm: what surrounds a bone guides it from afar.
+        On coarse grids the mask is dilated by ``widening_mm (2^level - 1)``, mm, 0 or more: the surroundings of a bone have contrast that
+        is visible from further away.
     sampling : float
-        Share of the mask's voxels that the metric looks at.
+        Fraction of the voxels of the mask in the metric, above 0 up to 1.
     seed : int
-        Of that sample.
+        Seed of that sample.
     rigid_within_mm : float, optional
-        Warn where parts of the mask move by more than this against the motion found, mm (root mean square); by default half the largest
+        Warn where parts of the mask move by more than this relative to the transform, mm (root mean square); by default half the largest
         spacing.
 
     Returns
     -------
     RigidRegistration
-        Its residuals are the leftover motions of eight parts of the mask.
+        Its residuals are the remaining motions of eight parts of the mask.
 
     Raises
     ------
@@ -224,13 +226,13 @@ def register_rigid(
     NotRigidWarning
         The bone is not rigid, or the registration failed.
     """
-    sitk = optional_package("SimpleITK", "rigid registration of grey values", "naibu[imaging]")
+    sitk = optional_package("SimpleITK", "rigid registration of intensities", "naibu[imaging]")
     inside = require_mask(mask, reference)
     fixed, moving = (_image(sitk, v.with_values(np.asarray(v.values, dtype=np.float32))) for v in (reference, deformed))
     transform = _start(sitk, fixed, moving, reference, inside, start)
     away = ndimage.distance_transform_edt(~inside, sampling=reference.spacing_mm[::-1])
     for level in range(levels)[::-1]:
-        # far from the answer a bone alone attracts no one: begin with what is about it
+        # far from the solution the metric of a bone alone is flat: begin with its surroundings
         near = away <= widening_mm * (2**level - 1)
         method = _method(sitk, level, float(reference.spacing_mm.min()), sampling, seed)
         method.SetMetricFixedMask(_image(sitk, reference.with_values(near.astype(np.uint8))))
@@ -239,9 +241,9 @@ def register_rigid(
             method.Execute(fixed, moving)
         except RuntimeError as error:
             reason = str(error).strip().splitlines()[-1]
-            raise InputError(f"rigid registration failed ({reason}); do the volumes overlap? give a start or a larger mask") from error
+            raise InputError(f"rigid registration failed ({reason}); do the volumes overlap? give start or a larger mask") from error
     motion = _motion(transform)
-    found = RigidRegistration(motion, leftover_motion(reference, deformed, inside, motion))
+    found = RigidRegistration(motion, remaining_motion(reference, deformed, inside, motion))
     _warn_unless_rigid(found, float(reference.spacing_mm.max()) / 2 if rigid_within_mm is None else rigid_within_mm, "part")
     return found
 
@@ -263,51 +265,50 @@ def _method(sitk: Any, level: int, spacing_mm: float, sampling: float, seed: int
     return method
 
 
-def leftover_motion(reference: Volume, deformed: Volume, mask: ArrayLike, motion: RigidTransform, parts: int = 8) -> FloatArray:
-    """Return how far parts of a mask move against a rigid motion (parts,), mm, by least squares on the grey values of each.
+def remaining_motion(reference: Volume, deformed: Volume, mask: ArrayLike, motion: RigidTransform, parts: int = 8) -> FloatArray:
+    """Return the motion (parts,), mm, of parts of a mask relative to a rigid transform, by least squares on the intensities of each.
 
     Parameters
     ----------
     reference, deformed : Volume
-        Before and after.
+        Volumes before and after the deformation.
     mask : array_like, shape (nz, ny, nx)
         Voxels of the reference that should move rigidly.
     motion : RigidTransform
-        Motion found.
+        Rigid transform of the whole mask.
     parts : int
-        The mask is halved along its longest extent until there are so many; a power of two.
+        Number of parts, a power of two; the mask is halved along its longest extent.
     """
     inside = require_mask(mask, reference)
     back = resampled_to_grid(deformed, reference, through=motion.applied)
     inside = inside & covered(deformed, reference, through=motion.applied)
     active = [a for a in range(3) if reference.shape[2 - a] > 1]
-    grey = np.asarray(reference.values, dtype=float)
-    slopes = np.stack([np.gradient(0.5 * (grey + back.values), reference.spacing_mm[a], axis=2 - a)[inside] for a in active], axis=1)
-    # at the edge of what the deformed volume covers differences are not known
-    known = np.isfinite(slopes).all(axis=1)
-    inside[inside], slopes = known, slopes[known]
-    change = (back.values - grey)[inside]
+    intensity = np.asarray(reference.values, dtype=float)
+    gradient = np.stack([np.gradient(0.5 * (intensity + back.values), reference.spacing_mm[a], axis=2 - a)[inside] for a in active], axis=1)
+    # gradients are not known at the edge of the deformed volume
+    known = np.isfinite(gradient).all(axis=1)
+    inside[inside], gradient = known, gradient[known]
+    change = (back.values - intensity)[inside]
     left = []
     for part in _halved(positions(reference)[inside], np.arange(len(change)), parts):
-        # a change of gain between the scans is no motion
-        columns = np.column_stack([slopes[part], np.ones(len(part)), grey[inside][part]])
-        left.append(_sure_length(columns, -change[part], len(active)) if len(part) > 20 else 0.0)
+        # a gain and an offset between the volumes are no motion
+        columns = np.column_stack([gradient[part], np.ones(len(part)), intensity[inside][part]])
+        left.append(_significant_length(columns, -change[part], len(active)) if len(part) > FEWEST_VOXELS else 0.0)
     return np.array(left)
 
 
-def _sure_length(columns: FloatArray, right: FloatArray, d: int) -> float:
-    """Return the length of the first d unknowns of a least-squares problem, without the directions that its noise may explain."""
+def _significant_length(columns: FloatArray, right: FloatArray, d: int) -> float:
+    """Return the length of the first d unknowns of a least-squares problem along the directions in which they exceed their noise."""
     normal = np.linalg.pinv(columns.T @ columns, rcond=1e-10)
     solution = normal @ (columns.T @ right)
-    # what is left is alike at neighbouring voxels: it counts as one in eight
-    variance = 8.0 * float(np.mean((columns @ solution - right) ** 2))
+    variance = CORRELATED * float(np.mean((columns @ solution - right) ** 2))
     spread, directions = np.linalg.eigh(normal[:d, :d])
     along = directions.T @ solution[:d]
-    return float(np.linalg.norm(along[np.abs(along) > 2.0 * np.sqrt(variance * np.maximum(spread, 0.0))]))
+    return float(np.linalg.norm(along[np.abs(along) > SIGNIFICANT * np.sqrt(variance * np.maximum(spread, 0.0))]))
 
 
 def _halved(points: FloatArray, which: IntArray, parts: int) -> list[IntArray]:
-    if parts <= 1 or len(which) < 20:
+    if parts <= 1 or len(which) < FEWEST_VOXELS:
         return [which]
     centred = points[which] - points[which].mean(axis=0)
     along = centred @ np.linalg.eigh(centred.T @ centred)[1][:, -1]
@@ -325,7 +326,7 @@ def _image(sitk: Any, volume: Volume) -> Any:
 
 
 def _start(sitk: Any, fixed: Any, moving: Any, reference: Volume, mask: BoolArray, start: RigidTransform | None) -> Any:
-    """Return the first guess, turning about the middle of the mask."""
+    """Return the initial transform, which rotates about the centroid of the mask."""
     transform = sitk.VersorRigid3DTransform()
     centre = positions(reference)[mask].mean(axis=0)
     if start is None:

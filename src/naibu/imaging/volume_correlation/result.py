@@ -110,7 +110,7 @@ class CorrelationResult:
         local = self._local(points_mm)
         out = self.grid.values(self.coefficients, local)
         out[~np.isfinite(self._cells_at(local)[:, 0, 0])] = np.nan
-        for motion, here in self._in_bodies(local):
+        for motion, here in self._in_inclusions(local):
             out[here] = motion.displacement(local[here])
         return np.asarray(out @ self.volume.direction.T)
 
@@ -159,7 +159,7 @@ class CorrelationResult:
     def _local(self, points_mm: ArrayLike) -> FloatArray:
         return self.volume.to_index(points_mm) * self.volume.spacing_mm
 
-    def _in_bodies(self, local_mm: FloatArray) -> Iterator[tuple[InclusionMotion, BoolArray]]:
+    def _in_inclusions(self, local_mm: FloatArray) -> Iterator[tuple[InclusionMotion, BoolArray]]:
         if not self.motions:
             return
         at = np.rint(local_mm / self.volume.spacing_mm).astype(int)
@@ -171,7 +171,7 @@ class CorrelationResult:
 
     def _covariance(self, local_mm: FloatArray) -> FloatArray:
         out, r = self._cells_at(local_mm), self.volume.direction
-        for motion, here in self._in_bodies(local_mm):
+        for motion, here in self._in_inclusions(local_mm):
             out[here] = r @ motion.displacement_covariance(local_mm[here]) @ r.T
         return out
 
