@@ -223,7 +223,7 @@ def test_frames_are_left_out_of_a_page_that_would_be_too_large() -> None:
     np.testing.assert_allclose(unpacked(packed), moved[::2], atol=np.abs(moved).max() / STEPS)
     with pytest.raises(InputError, match=r"limit is 0\.1 MB"):
         motion_html(page, 100_000)
-    with pytest.raises(InputError, match="positions must have the shape"):
+    with pytest.raises(InputError, match="positions must have shape"):
         MotionPage(**{name: getattr(page, name) for name in page.__slots__} | {"positions": np.zeros((s, 2, 3))})
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
@@ -12,6 +11,7 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
+from naibu.viewer.embedding import embedded_json
 
 STEPS = 32_000  # quantisation levels of the 16-bit numbers that the page stores
 
@@ -80,7 +80,7 @@ def animation_html(title: str, times_s: FloatArray, bodies: tuple[MovingBody, ..
         "bodies": [_packed(body, low, high) for body in bodies],
     }
     template = files("naibu.viewer").joinpath("assets/animation.html").read_text(encoding="utf-8")
-    data = json.dumps(payload, separators=(",", ":")).replace("</", "<\\/")
+    data = embedded_json(payload)
     return template.replace("$TITLE", escape(title)).replace("$NOTE", escape(note)).replace("$DATA", data)
 
 

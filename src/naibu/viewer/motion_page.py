@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import base64
-import gzip
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray, Int16Array, IntArray
+from naibu.core.arrays import FloatArray, Int16Array, IntArray, require_shape
 from naibu.core.errors import InputError
+from naibu.viewer.embedding import embedded_bytes, embedded_json
 from naibu.viewer.page_frame import asset, page_html
 from naibu.viewer.tables import Table, provenance_section, table_html
 from naibu.viewer.ticks import ticks_between
@@ -121,8 +119,7 @@ class MotionPage:
             **{f.name: (f.values, (s, n)) for f in self.fields},
         }
         for name, (array, shape) in shapes.items():
-            if np.shape(array) != shape:
-                raise InputError(f"{self.title!r}: {name} must have the shape {shape}, not {np.shape(array)}")
+            require_shape(f"{self.title!r}: {name}", array, shape)
         if not s or not self.fields:
             raise InputError(f"{self.title!r}: a motion needs at least one frame and at least one field")
 
@@ -155,7 +152,7 @@ def _thinned(page: MotionPage) -> MotionPage:
 
 
 def _html(page: MotionPage) -> str:
-    data = json.dumps(_packed(page), separators=(",", ":"), allow_nan=False).replace("</", "<\\/")
+    data = embedded_json(_packed(page))
     lead = "".join(f"<p>{escape(s)}</p>" for s in page.sentences)
     tables = "".join(table_html(t) for t in page.tables)
     curves = f'<div class="curves">{force_curves(page)}</div>' if len(page.force_times) and len(page.bodies) else ""
@@ -179,7 +176,7 @@ def _packed(page: MotionPage) -> dict[str, object]:
         "faces": page.faces.ravel().tolist(),
         "reference": np.round(page.reference, 3).ravel().tolist(),
         "quantum": quantum,
-        "displacement": _zipped(_differences(whole)),
+        "displacement": embedded_bytes(_differences(whole)),
         "fields": [_levels(f) for f in page.fields],
         "bodies": [
             {"name": b.name, "kind": b.kind, "size": b.size.tolist(), "axes": np.round(b.axes, 6).ravel().tolist()} for b in page.bodies
@@ -205,11 +202,8 @@ def _levels(colours: ColourField) -> dict[str, object]:
         low = -high
     span = (high - low) or 1.0
     levels = np.rint((colours.values - low) / span * LEVELS).astype(np.uint8)
-    return {"name": colours.name, "low": low, "high": low + span, "diverging": colours.diverging, "levels": _zipped(levels.tobytes())}
-
-
-def _zipped(data: bytes) -> str:
-    return base64.b64encode(gzip.compress(data, compresslevel=9, mtime=0)).decode("ascii")
+    shown = {"name": colours.name, "low": low, "high": low + span, "diverging": colours.diverging}
+    return shown | {"levels": embedded_bytes(levels.tobytes())}
 
 
 def force_curves(page: MotionPage) -> str:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import gzip
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -14,6 +11,7 @@ import numpy as np
 
 from naibu.core.arrays import AnyFloatArray
 from naibu.core.errors import InputError
+from naibu.viewer.embedding import embedded_bytes, embedded_json
 from naibu.viewer.tables import Table, table_html
 
 GREY_LEVELS = 255
@@ -100,7 +98,7 @@ def slices_html(view: SliceView) -> str:
         "arrows": _arrows(view.displacement[steps]),
     }
     template = (files("naibu.viewer") / "assets" / "slices.html").read_text(encoding="utf-8")
-    data = json.dumps(payload, separators=(",", ":"), allow_nan=False).replace("</", "<\\/")
+    data = embedded_json(payload)
     words = "".join(f"<p>{escape(s)}</p>" for s in view.sentences)
     tables = "".join(table_html(t) for t in view.tables)
     return template.replace("$TITLE", escape(view.title)).replace("$WORDS", words).replace("$TABLES", tables).replace("$DATA", data)
@@ -144,12 +142,8 @@ def _arrows(displacement: AnyFloatArray) -> dict[str, object]:
     largest = float(np.abs(displacement[known]).max()) if known.any() else 1.0
     quantum = (largest or 1.0) / 32000.0
     whole = np.where(known[..., None], np.round(np.nan_to_num(displacement) / quantum), -32768).astype("<i2")
-    return {"quantum": quantum, "data": _zipped(np.ascontiguousarray(whole).tobytes())}
+    return {"quantum": quantum, "data": embedded_bytes(np.ascontiguousarray(whole).tobytes(), level=6)}
 
 
 def _packed(values: AnyFloatArray) -> str:
-    return _zipped(np.ascontiguousarray(np.round(values).astype(np.uint8)).tobytes())
-
-
-def _zipped(data: bytes) -> str:
-    return base64.b64encode(gzip.compress(data, compresslevel=6, mtime=0)).decode("ascii")
+    return embedded_bytes(np.ascontiguousarray(np.round(values).astype(np.uint8)).tobytes(), level=6)

@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-import base64
-import gzip
 import json
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from naibu.core.arrays import FloatArray, IntArray
+from naibu.viewer.embedding import embedded_bytes
 from naibu.viewer.json_values import jsonable
 from naibu.viewer.result_page.payload import Scene
 
@@ -60,7 +59,7 @@ def packed_scene(scene: Scene) -> dict[str, object]:
 def packed_scenes(scenes: Sequence[Scene]) -> str:
     """Return all scenes as base64-encoded, gzipped JSON; equal scenes give equal text."""
     text = json.dumps({"scenes": [packed_scene(s) for s in scenes]}, separators=(",", ":"), allow_nan=False, ensure_ascii=False)
-    return base64.b64encode(gzip.compress(text.encode(), compresslevel=9, mtime=0)).decode("ascii")
+    return embedded_bytes(text.encode())
 
 
 def thinned(scene: Scene) -> Scene:

@@ -12,7 +12,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.arrays import FloatArray, IntArray, require_shape
 from naibu.core.errors import InputError
 from naibu.viewer.json_values import jsonable
 from naibu.viewer.tables import Table
@@ -125,8 +125,7 @@ class Scene:
             shapes[f"steps[{i}].surface"] = (step.surface, (n, 3))
             shapes[f"steps[{i}].markers"] = (step.markers, (k, 3))
         for name, (array, shape) in shapes.items():
-            if np.shape(array) != shape:
-                raise InputError(f"scene {self.name!r}: {name} must have shape {shape}, not {np.shape(array)}")
+            require_shape(f"scene {self.name!r}: {name}", array, shape)
 
     @property
     def label(self) -> str:
