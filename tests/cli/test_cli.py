@@ -206,7 +206,7 @@ IDENTIFY_MISTAKES = {
     "unknown state": (("PRESS", "--state", "press/squeezed"), ("'squeezed'", "pressed_more")),
     "state of another": (("PRESS", "--state", "cube/pressed"), ("'cube'", "press")),
     "free state": (("PRESS", "--state", "press/initial"), ("press/initial", "not loaded", "pressed")),
-    "no element size": (("PRESS", "--element-size-mm", "-3"), ("-3 mm", "positive")),
+    "no element size": (("PRESS", "--element-size-mm", "-3"), ("--element-size-mm", "-3", "positive")),
     "too many elements": (("PRESS", "--element-size-mm", "0.1"), ("0.1 mm", "elements")),
     "unknown law": (("PRESS", "--law", "rubber"), ("rubber", "neo_hookean")),
     "unknown option": (("PRESS", "--knwon", "firm"), ("--knwon",)),
@@ -288,7 +288,7 @@ def test_report_needs_results(naibu: Run, press: Press) -> None:
 @pytest.mark.parametrize("verb", ["identify", "predict"])
 def test_a_solve_that_diverges_says_so(naibu: Run, press: Press, monkeypatch: pytest.MonkeyPatch, verb: str) -> None:
     # Newton's method finds no equilibrium beyond a tenth of the load
-    for way in ("solve", "relax"):
+    for way in ("solve", "pseudo_transient"):
         found = getattr(Newton, way)
         monkeypatch.setattr(Newton, way, lambda self, u, anchors, load, way=found: None if load > 0.1 else way(self, u, anchors, load))
     inputs = (press.folder, *COARSE) if verb == "identify" else (press.results, press.folder, "--state", "pressed")
