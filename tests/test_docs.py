@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import re
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from naibu.io.experiment_folder import schema
 from naibu.io.experiment_folder.reader import read_experiment
 from naibu.io.experiment_folder.state_csv import OPTIONAL, REQUIRED, STATUSES
 from naibu.mechanics.finite_elements.hyperelasticity import LAWS
+from naibu.mechanics.linear_algebra.solver_selection import DIRECT_LIMIT, RECYCLING_FROM, SolverName
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 PAGE = (DOCS / "experiment_folder.rst").read_text(encoding="utf-8")
@@ -61,6 +63,14 @@ def test_every_law_is_told() -> None:
     concepts = (DOCS / "concepts.rst").read_text(encoding="utf-8")
     for law in LAWS:
         assert f"``{law}``" in concepts
+
+
+def test_every_linear_solver_is_told() -> None:
+    concepts = (DOCS / "concepts.rst").read_text(encoding="utf-8")
+    for name in get_args(SolverName):
+        assert name == "automatic" or f"``{name}``" in concepts
+    for limit in (DIRECT_LIMIT, DIRECT_LIMIT // 10, RECYCLING_FROM):
+        assert f"{limit:,} unknowns".replace(",", " ") in concepts
 
 
 @pytest.mark.parametrize("page", ["motion", "viscoelasticity", "fields", "sensing", "lattices"])
