@@ -20,7 +20,7 @@ NOBODY = 61234  # a user without an entry in the system's list
 KERNEL = "from naibu._numba.compilation import njit\n\n\n@njit(cache=True)\ndef twice(x):\n    return 2 * x\n"
 ASK = """
 from naibu._numba.cache_folder import cache_folder
-from naibu._numba.compilation import reported_compilation
+from naibu._numba.reports import reported_compilation
 from naibu.kernel import twice
 compiled = []
 with reported_compilation(lambda kernel, done: compiled.append(kernel)):

@@ -22,7 +22,7 @@ OUTER = (
 APART = "from naibu._numba.compilation import njit\n\n\n@njit(cache=True)\ndef apart(x):\n    return 2 * x\n"
 ASK = """
 {}
-from naibu._numba.compilation import reported_compilation
+from naibu._numba.reports import reported_compilation
 from naibu._numba.cache_folder import cache_folder
 from naibu.outer import outer
 from naibu.apart import apart
@@ -197,7 +197,7 @@ raise SystemExit(len(list(cache_folder().glob('*.lock'))))
 def test_threads_compile_a_kernel_once(tmp_path: Path) -> None:
     small_package(tmp_path)
     threads = (
-        "from threading import Thread\nfrom naibu.outer import outer\nfrom naibu._numba.compilation import reported_compilation\n"
+        "from threading import Thread\nfrom naibu.outer import outer\nfrom naibu._numba.reports import reported_compilation\n"
         "seen, found = [], []\n"
         "with reported_compilation(lambda kernel, done: seen.append((kernel, done))):\n"
         "    threads = [Thread(target=lambda: found.append(outer(1))) for _ in range(4)]\n"

@@ -8,9 +8,8 @@ one compiles it and the others wait.
 
 from __future__ import annotations
 
-import contextlib
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache as cached
 from pathlib import Path
 from typing import Any
@@ -18,28 +17,13 @@ from typing import Any
 import numba
 
 from naibu._numba.kernel_digest import kernel_digest, named_apart
+from naibu._numba.reports import report
 from naibu._numba.versions import passes
 
 try:
     from naibu._numba.kernel_files import KernelFile
 except Exception:  # whatever a changed interface raises
     KernelFile = None  # type: ignore[assignment,misc]
-
-Listener = Callable[[str, bool], None]
-_listeners: list[Listener] = []
-
-
-@contextlib.contextmanager
-def reported_compilation(listener: Listener) -> Iterator[None]:
-    """Within this context, call ``listener(kernel, done)`` before and after each compilation of a kernel, in the thread that compiles.
-
-    Kernels that another kernel calls are compiled within it.
-    """
-    _listeners.append(listener)
-    try:
-        yield
-    finally:
-        _listeners.remove(listener)
 
 
 def njit(function: Callable[..., Any] | None = None, *, cache: bool = False, **options: Any) -> Any:
@@ -115,11 +99,11 @@ class CachedCompiler:
         return found
 
     def _reported(self, args: Any, return_type: Any) -> Any:
-        _tell(self._label, False)
+        report(self._label, False)
         try:
             return self._compile(args, return_type)
         finally:
-            _tell(self._label, True)
+            report(self._label, True)
 
 
 @cached
@@ -146,8 +130,3 @@ def _trial() -> bool:
 
 def _compiled(kernel: Any) -> Any:
     return kernel._compiler.compile((numba.types.float64,), None)
-
-
-def _tell(kernel: str, done: bool) -> None:
-    for listener in tuple(_listeners):
-        listener(kernel, done)
