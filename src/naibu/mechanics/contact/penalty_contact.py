@@ -177,22 +177,7 @@ class ContactResponse:
 
 @njit(cache=True, nogil=True)
 def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
-    geometry,
-    axes,
-    y,
-    anchors,
-    k_n,
-    k_t,
-    mu,
-    tied,
-    curvature,
-    gap,
-    force,
-    tangential,
-    slip,
-    stiffness,
-    tangential_stiffness,
-    anchor_stiffness,
+    geometry, axes, y, anchors, k_n, k_t, mu, tied, curvature, gap, force, friction, slip, stiffness, friction_stiffness, anchor_stiffness
 ):
     """Tractions of all points and their derivatives (per unit of area); see the module's text for the law."""
     n, e = np.empty(3), np.empty(3)
@@ -226,7 +211,7 @@ def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
         sliding = not tied and size > mu[q] * p
         ratio = mu[q] * p / size if sliding else 1.0
         for i in range(3):
-            tangential[q, i] = ratio * e[i]
+            friction[q, i] = ratio * e[i]
             force[q, i] = p * n[i] - ratio * e[i]
         for i in range(3):
             for j in range(3):
@@ -239,7 +224,7 @@ def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
                         projected_a -= e[i] * e[m] / (size * size) * k_t[q] * ((1.0 if m == j else 0.0) - n[m] * n[j])
                     dt = ratio * projected + mu[q] * dp * n[j] * e[i] / size
                     da = ratio * projected_a
-                tangential_stiffness[q, i, j] = dt
+                friction_stiffness[q, i, j] = dt
                 stiffness[q, i, j] = dt - dp * n[i] * n[j] - curvature * p * h[i, j]
                 anchor_stiffness[q, i, j] = da
             if sliding:
