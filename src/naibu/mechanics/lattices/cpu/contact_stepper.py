@@ -102,6 +102,7 @@ class ContactStepper:
 
     def _changing(self) -> tuple[AnyFloatArray | IntArray | BoolArray, ...]:
         base, contact = self.base, self.contact
+        assert base.length is not None  # as of all implicit steps
         lattice = (base.position, base.velocity, base.extension, base.length)
         return (*lattice, contact.mode, contact.friction, contact.touched, contact.centres, contact.axes)
 

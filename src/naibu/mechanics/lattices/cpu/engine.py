@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numba
 import numpy as np
@@ -221,7 +221,7 @@ class LatticeEngine:
         kinetic = 0.5 * float((self.lattice.node_mass * (state.velocity**2).sum(axis=1)).sum())
         return kinetic + 0.5 * float((self.parameters.stiffness * state.extension**2).sum())
 
-    def stored(self, state: LatticeState) -> tuple[Any, Any, Any]:
+    def stored(self, state: LatticeState) -> tuple[AnyFloatArray, AnyFloatArray, AnyFloatArray]:
         """Return position, velocity (3 pad,) and extension (8 nb,) as the kernels hold them, copied.
 
         Raises
@@ -243,24 +243,24 @@ class LatticeEngine:
         y[self.blocks.lane] = state.extension
         return self.by_component(state.position, kind), self.by_component(state.velocity, kind), y
 
-    def stored_lengths(self, state: LatticeState) -> Any:
+    def stored_lengths(self, state: LatticeState) -> FloatArray:
         """Return the lengths that the extensions followed (8 nb,), as kernels hold them."""
         known = followed_lengths(self.lattice, state)
         if np.shape(known) != (self.lattice.n_elements,):
             raise InputError(f"the length of the state has shape {np.shape(known)}, the lattice has {self.lattice.n_elements} elements")
-        lengths = aligned((WIDTH * self.blocks.n_blocks,), float)
+        lengths: FloatArray = aligned((WIDTH * self.blocks.n_blocks,), float)
         lengths[self.blocks.lane] = known
         return lengths
 
-    def read(self, x: Any, v: Any, y: Any) -> LatticeState:
+    def read(self, x: AnyFloatArray, v: AnyFloatArray, y: AnyFloatArray) -> LatticeState:
         """Return the state that arrays of the kernels hold."""
         n = self.lattice.n_nodes
         position, velocity = (np.ascontiguousarray(a.reshape(3, -1)[:, :n].T, dtype=np.float64) for a in (x, v))
         return LatticeState(position, velocity, y[self.blocks.lane].astype(np.float64))
 
-    def by_component(self, values: FloatArray, kind: Any) -> Any:
+    def by_component(self, values: FloatArray, kind: np.dtype[np.floating] | type[float]) -> AnyFloatArray:
         """Return values of the masses (n, 3) as kernels hold them, (3 pad,)."""
-        result = aligned((3 * len(self.mass),), kind)
+        result: AnyFloatArray = aligned((3 * len(self.mass),), kind)
         result.reshape(3, -1)[:, : len(values)] = values.T
         return result
 
@@ -291,7 +291,7 @@ class LatticeEngine:
 
 
 def _kernel(
-    lattice: Lattice, parameters: LatticeParameters, step: float, method: Method, blocks: Blocks, mass: Any, threads: int
+    lattice: Lattice, parameters: LatticeParameters, step: float, method: Method, blocks: Blocks, mass: AnyFloatArray, threads: int
 ) -> tuple[KernelTuple, ScratchPool]:
     if method == "implicit":
         return implicit_kernel(lattice, parameters, step, blocks, mass)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from naibu._numba.thread_pool import ALONE, PARTS, STOP, new_control, start_workers, stop_workers
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import AnyFloatArray, FloatArray, IntArray
 from naibu.mechanics.lattices.cpu._explicit_kernels import explicit_steps, explicit_worker
 from naibu.mechanics.lattices.cpu._implicit_kernels import implicit_steps
 from naibu.mechanics.lattices.cpu.scratch import KernelTuple, Scratch
@@ -29,13 +28,13 @@ class Stepper(ABC):
         Of the elements, as blocks store them, mm; explicit methods leave the lengths alone.
     """
 
-    position: Any
-    velocity: Any
-    extension: Any
-    length: Any
+    position: AnyFloatArray
+    velocity: AnyFloatArray
+    extension: AnyFloatArray
+    length: FloatArray | None
 
     @abstractmethod
-    def constrain(self, entries: tuple[Any, ...], bodies: int) -> None:
+    def constrain(self, entries: KernelTuple, bodies: int) -> None:
         """Hold masses from now on: node, direction, weight and body of every held component."""
 
     @abstractmethod
@@ -54,14 +53,14 @@ class Stepper(ABC):
 class ExplicitStepper(Stepper):
     """Explicit steps, in parts that helpers can take."""
 
-    kernel: tuple[Any, ...]
-    external: Any
+    kernel: KernelTuple
+    external: AnyFloatArray
     step: float
     forward: bool
-    control: Any = None
-    data: tuple[Any, ...] = ()
+    control: IntArray = field(default_factory=lambda: new_control(1))
+    data: KernelTuple = ()
 
-    def constrain(self, entries: tuple[Any, ...], bodies: int) -> None:
+    def constrain(self, entries: KernelTuple, bodies: int) -> None:
         """Hold masses from now on."""
         self.close()
         blocks, tables, masses, parts = self.kernel
@@ -91,8 +90,7 @@ class ExplicitStepper(Stepper):
 
     def close(self) -> None:
         """Send helpers away."""
-        if self.control is not None:
-            stop_workers(self.control)
+        stop_workers(self.control)
 
 
 @dataclass(slots=True, eq=False)
@@ -101,13 +99,13 @@ class ImplicitStepper(Stepper):
 
     kernel: KernelTuple
     scratch: Scratch
-    external: Any
+    external: AnyFloatArray
     step: float
-    mass: Any
+    mass: AnyFloatArray
     tolerance: float
-    constrained: tuple[Any, ...] = ()
+    constrained: KernelTuple = ()
 
-    def constrain(self, entries: tuple[Any, ...], bodies: int) -> None:
+    def constrain(self, entries: KernelTuple, bodies: int) -> None:
         """Hold masses from now on."""
         self.constrained = entries
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import warp as wp
 
+AnyDtype = Any  # of generic kernels: Warp compiles them for the types that their arrays have
 SLICE = 32  # masses whose lists lie side by side: the threads of a warp
 FOLD = 32  # numbers that one thread adds up
 
@@ -24,13 +25,13 @@ def forces(
     start: wp.array[wp.int32],
     degree: wp.array[wp.int32],
     neighbour: wp.array[wp.int32],
-    row: wp.array[Any],
-    table: wp.array[Any],
-    x: wp.array[Any],
-    v: wp.array[Any],
-    y: wp.array[Any],
-    external: wp.array[Any],
-    f: wp.array[Any],
+    row: wp.array[AnyDtype],
+    table: wp.array[AnyDtype],
+    x: wp.array[AnyDtype],
+    v: wp.array[AnyDtype],
+    y: wp.array[AnyDtype],
+    external: wp.array[AnyDtype],
+    f: wp.array[AnyDtype],
 ) -> None:
     """Set f to the forces on the masses and move the extensions on by a step of Euler's; rows of the table are A, B, D dt and G dt."""
     i = wp.tid()
@@ -63,10 +64,10 @@ def drive(
     body: wp.array[wp.int32],
     velocity: wp.array2d[wp.vec3d],
     count: wp.array[wp.int32],
-    mass: wp.array[Any],
-    v: wp.array[Any],
+    mass: wp.array[AnyDtype],
+    v: wp.array[AnyDtype],
     step: wp.float64,
-    f: wp.array[Any],
+    f: wp.array[AnyDtype],
     push: wp.array[wp.vec3d],
 ) -> None:
     """Change the force on a held mass so that it takes on the velocity of its bodies in step `count` along the held directions.
@@ -106,13 +107,13 @@ def collect(
 
 @wp.kernel
 def move(
-    inverse_mass: wp.array[Any],
-    f: wp.array[Any],
-    step: Any,
+    inverse_mass: wp.array[AnyDtype],
+    f: wp.array[AnyDtype],
+    step: AnyDtype,
     forward: wp.int32,
     count: wp.array[wp.int32],
-    x: wp.array[Any],
-    v: wp.array[Any],
+    x: wp.array[AnyDtype],
+    v: wp.array[AnyDtype],
 ) -> None:
     """Move a mass by a step: by the velocity before it if `forward`, else by that after it; count the step."""
     i = wp.tid()
@@ -128,7 +129,7 @@ def move(
 
 
 @wp.kernel
-def fold(values: wp.array[Any], sums: wp.array[Any]) -> None:
+def fold(values: wp.array[AnyDtype], sums: wp.array[AnyDtype]) -> None:
     """Set sums[c] to the sum of values[c], values[c + p], ..., p being the number of sums."""
     c = wp.tid()
     k = c

@@ -8,11 +8,9 @@ counted by halves, once at each end.
 
 from __future__ import annotations
 
-from typing import Any
-
 import warp as wp
 
-from naibu.mechanics.lattices.gpu._explicit_kernels import FOLD, SLICE
+from naibu.mechanics.lattices.gpu._explicit_kernels import FOLD, SLICE, AnyDtype
 
 wp.set_module_options({"enable_backward": False})
 
@@ -71,7 +69,7 @@ def residual(
     start: wp.array[wp.int32],
     degree: wp.array[wp.int32],
     neighbour: wp.array[wp.int32],
-    row: wp.array[Any],
+    row: wp.array[AnyDtype],
     table: wp.array[wp.vec4d],
     mass: wp.array[wp.float64],
     x: wp.array[wp.vec3d],
@@ -117,7 +115,7 @@ def multiply(
     start: wp.array[wp.int32],
     degree: wp.array[wp.int32],
     neighbour: wp.array[wp.int32],
-    row: wp.array[Any],
+    row: wp.array[AnyDtype],
     table: wp.array[wp.vec4d],
     mass: wp.array[wp.float64],
     x: wp.array[wp.vec3d],
@@ -285,7 +283,7 @@ def weigh(
     start: wp.array[wp.int32],
     degree: wp.array[wp.int32],
     neighbour: wp.array[wp.int32],
-    row: wp.array[Any],
+    row: wp.array[AnyDtype],
     table: wp.array[wp.vec4d],
     stiffness: wp.array[wp.float64],
     mass: wp.array[wp.float64],
@@ -330,7 +328,7 @@ def extend(
     start: wp.array[wp.int32],
     degree: wp.array[wp.int32],
     neighbour: wp.array[wp.int32],
-    row: wp.array[Any],
+    row: wp.array[AnyDtype],
     table: wp.array[wp.vec4d],
     x: wp.array[wp.vec3d],
     v: wp.array[wp.vec3d],

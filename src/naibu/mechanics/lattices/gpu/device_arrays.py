@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from naibu._numba.compilation import njit
 from naibu.core.arrays import AnyArray, FloatArray, Int32Array, IntArray
 from naibu.core.errors import InputError
 from naibu.core.optional_packages import optional_package
+from naibu.mechanics.lattices.gpu.warp_types import WarpArray
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes
 
@@ -21,7 +22,7 @@ _PART = 64  # entries of held masses that one thread adds up
 _CODES = 256  # different elements that a byte can number
 
 
-def warp_package() -> Any:
+def warp_package() -> ModuleType:
     """Return Warp, told to leave the standard output alone unless something is wrong.
 
     Raises
@@ -29,19 +30,19 @@ def warp_package() -> Any:
     MissingDependencyError
         It is not installed.
     """
-    wp = optional_package("warp", "moving lattices on a GPU", "naibu[gpu]")
+    wp: ModuleType = optional_package("warp", "moving lattices on a GPU", "naibu[gpu]")
     if wp.config.log_level == wp.LOG_INFO:
         wp.config.log_level = wp.LOG_WARNING
     return wp
 
 
-def compiled(name: str) -> Any:
+def compiled(name: str) -> ModuleType:
     """Return a module of kernels beside this one, which can be loaded only where Warp is."""
     warp_package()
     return importlib.import_module(f"naibu.mechanics.lattices.gpu.{name}")
 
 
-def chosen_device(device: str | None) -> Any:
+def chosen_device(device: str | None) -> object:
     """Return a device of Warp: the one named, else the current CUDA device, else the processor.
 
     Raises
@@ -59,7 +60,7 @@ def chosen_device(device: str | None) -> Any:
         ) from error
 
 
-def recorded(launches: Callable[[], None], device: Any) -> Callable[[], None]:
+def recorded(launches: Callable[[], None], device: object) -> Callable[[], None]:
     """Record launches of kernels, which do nothing yet, and return a function that gives them all to the device at once."""
     wp = warp_package()
     for name in ("_explicit_kernels", "_implicit_kernels"):
@@ -85,13 +86,13 @@ class NeighbourLists:
         Where an element stands in the lists of its two masses.
     """
 
-    start: Any
-    degree: Any
-    neighbour: Any
+    start: WarpArray
+    degree: WarpArray
+    neighbour: WarpArray
     places: Int32Array
 
     @classmethod
-    def of(cls, lattice: Lattice, device: Any) -> NeighbourLists:
+    def of(cls, lattice: Lattice, device: object) -> NeighbourLists:
         """Put the elements of a lattice on a device.
 
         Raises
@@ -118,7 +119,7 @@ class NeighbourLists:
         result[self.places[:, 1]] = values
         return result
 
-    def of_elements(self, listed: Any) -> FloatArray:
+    def of_elements(self, listed: WarpArray) -> FloatArray:
         """Return the values (m,) of the elements from an array of the lists."""
         return np.asarray(listed.numpy()[self.places[:, 0]], dtype=np.float64)
 
@@ -192,18 +193,18 @@ class ConstrainedArrays:
 
     count: int
     bodies: int
-    first: Any
-    node: Any
-    direction: Any
-    weight: Any
-    body: Any
-    push: Any
-    entry: Any
-    part: Any
+    first: WarpArray
+    node: WarpArray
+    direction: WarpArray
+    weight: WarpArray
+    body: WarpArray
+    push: WarpArray
+    entry: WarpArray
+    part: WarpArray
     part_body: IntArray
 
     @classmethod
-    def of(cls, constrained: ConstrainedNodes, device: Any) -> ConstrainedArrays:
+    def of(cls, constrained: ConstrainedNodes, device: object) -> ConstrainedArrays:
         """Put held components on a device."""
         wp = warp_package()
         order = np.argsort(constrained.node, kind="stable")
@@ -214,8 +215,9 @@ class ConstrainedArrays:
         begins = [np.arange(end - size, end, _PART) for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
         part = np.append(np.concatenate([np.zeros(0, np.int64), *begins]), len(node))
 
-        def numbers(values: IntArray) -> Any:
-            return wp.array(values.astype(np.int32), dtype=wp.int32, device=device)
+        def numbers(values: IntArray) -> WarpArray:
+            made: WarpArray = wp.array(values.astype(np.int32), dtype=wp.int32, device=device)
+            return made
 
         return cls(
             len(node),

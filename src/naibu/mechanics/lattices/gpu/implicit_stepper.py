@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.mechanics.lattices.gpu.device_arrays import ConstrainedArrays, compiled, recorded, warp_package
 from naibu.mechanics.lattices.gpu.prepared_lattice import PreparedLattice
+from naibu.mechanics.lattices.gpu.warp_types import WarpArray
 from naibu.mechanics.lattices.model.state import LatticeState, followed_lengths
 
 _BATCH = 8  # iterations between two looks at the residual
@@ -35,7 +36,7 @@ class DeviceSums:
         Where.
     """
 
-    def __init__(self, n: int, dtype: Any, device: Any) -> None:
+    def __init__(self, n: int, dtype: object, device: object) -> None:
         wp, fold = warp_package(), compiled("_explicit_kernels").FOLD
         sizes = [-(-n // fold)]
         while sizes[-1] > 1:
@@ -43,24 +44,24 @@ class DeviceSums:
         self.levels = [wp.zeros(size, dtype=dtype, device=device) for size in sizes]
         self.device = device
 
-    def of(self, values: Any) -> FloatArray:
+    def of(self, values: WarpArray) -> FloatArray:
         """Return the sum of values of the masses."""
         self._fold(values, self.levels[0])
         return self._folded(self.levels[-1])
 
-    def dot(self, a: Any, b: Any, into: Any) -> None:
+    def dot(self, a: WarpArray, b: WarpArray, into: WarpArray) -> None:
         """Set `into` (1,) to a . b."""
         levels = [*self.levels[:-1], into]
         warp_package().launch(compiled("_implicit_kernels").products, levels[0].shape[0], inputs=[a, b, levels[0]], device=self.device)
         self._folded(into, read=False)
 
-    def _folded(self, into: Any, *, read: bool = True) -> FloatArray:
+    def _folded(self, into: WarpArray, *, read: bool = True) -> FloatArray:
         levels = [*self.levels[:-1], into]
         for values, sums in pairwise(levels):
             self._fold(values, sums)
         return np.array(into.numpy()[0], dtype=float) if read else np.zeros(0)
 
-    def _fold(self, values: Any, sums: Any) -> None:
+    def _fold(self, values: WarpArray, sums: WarpArray) -> None:
         warp_package().launch(compiled("_explicit_kernels").fold, sums.shape[0], inputs=[values, sums], device=self.device)
 
 
@@ -69,12 +70,12 @@ class SteppedSession(Protocol):
 
     engine: PreparedLattice
     constrained: ConstrainedArrays
-    x: Any
-    v: Any
-    y: Any
-    external: Any
-    path: Any
-    count: Any
+    x: WarpArray
+    v: WarpArray
+    y: WarpArray
+    external: WarpArray
+    path: WarpArray
+    count: WarpArray
 
     def collect(self) -> None:
         """Add up what bodies exert in this step."""
@@ -107,22 +108,22 @@ class ImplicitSteps:
     """
 
     session: SteppedSession
-    lengths: Any
-    smoother: Any
-    before: Any
-    r: Any
-    z: Any
-    p: Any
-    q: Any
-    norm: Any
-    goal: Any
-    curvature: Any
-    new: Any
-    turns: Any
-    scalar: Any
-    node_scalar: Any
-    node_vector: Any
-    node_moments: Any
+    lengths: WarpArray
+    smoother: WarpArray
+    before: WarpArray
+    r: WarpArray
+    z: WarpArray
+    p: WarpArray
+    q: WarpArray
+    norm: WarpArray
+    goal: WarpArray
+    curvature: WarpArray
+    new: WarpArray
+    turns: WarpArray
+    scalar: WarpArray
+    node_scalar: WarpArray
+    node_vector: WarpArray
+    node_moments: WarpArray
     scalars: DeviceSums
     vectors: DeviceSums
     moments: DeviceSums
@@ -140,17 +141,29 @@ class ImplicitSteps:
         stiff = engine.step**2 / 3.0 * engine.table.numpy()[:, 0][engine.lists.of_elements(engine.row).astype(np.int64)]
         diagonal = lattice.node_mass + np.bincount(i, stiff, minlength=n) + np.bincount(j, stiff, minlength=n)
 
-        def zeros(dtype: Any, size: int = n) -> Any:
-            return wp.zeros(size, dtype=dtype, device=device)
+        def zeros(dtype: object, size: int = n) -> WarpArray:
+            made: WarpArray = wp.zeros(size, dtype=dtype, device=device)
+            return made
 
+        before, r, z, p, q, node_vector = (zeros(wp.vec3d) for _ in range(6))
+        norm, goal, curvature, new, scalar = (zeros(wp.float64, 1) for _ in range(5))
         return cls(
             session=session,
             lengths=wp.array(engine.lists.at_both_ends(known, np.float64), dtype=wp.float64, device=device),
             smoother=wp.array(1.0 / diagonal, dtype=wp.float64, device=device),
-            **{name: zeros(wp.vec3d) for name in ("before", "r", "z", "p", "q", "node_vector")},
-            **{name: zeros(wp.float64, 1) for name in ("norm", "goal", "curvature", "new", "scalar")},
+            before=before,
+            r=r,
+            z=z,
+            p=p,
+            q=q,
+            norm=norm,
+            goal=goal,
+            curvature=curvature,
+            new=new,
+            scalar=scalar,
             turns=zeros(wp.int32, 1),
             node_scalar=zeros(wp.float64),
+            node_vector=node_vector,
             node_moments=zeros(kernels.Vector12),
             scalars=DeviceSums(n, wp.float64, device),
             vectors=DeviceSums(n, wp.vec3d, device),
@@ -194,26 +207,26 @@ class ImplicitSteps:
             session.collect()
         return iterations, self._advance(lost)
 
-    def _launch(self, name: str, size: int, *inputs: Any) -> None:
+    def _launch(self, name: str, size: int, *inputs: object) -> None:
         kernel = getattr(compiled("_implicit_kernels"), name)
         warp_package().launch(kernel, size, inputs=list(inputs), device=self.session.engine.device)
 
-    def _on_masses(self, name: str, *inputs: Any) -> None:
+    def _on_masses(self, name: str, *inputs: object) -> None:
         self._launch(name, self.session.engine.lattice.n_nodes, *inputs)
 
-    def _on_lists(self, name: str, *inputs: Any) -> None:
+    def _on_lists(self, name: str, *inputs: object) -> None:
         engine = self.session.engine
         self._on_masses(name, engine.lists.start, engine.lists.degree, engine.lists.neighbour, engine.row, engine.table, *inputs)
 
-    def _number(self, value: float) -> Any:
+    def _number(self, value: float) -> object:
         return warp_package().float64(value)
 
-    def _release(self, values: Any) -> None:
+    def _release(self, values: WarpArray) -> None:
         constrained = self.session.constrained
         if constrained.count:
             self._launch("release", constrained.masses, constrained.first, constrained.node, constrained.direction, values)
 
-    def _dot(self, a: Any, b: Any) -> float:
+    def _dot(self, a: WarpArray, b: WarpArray) -> float:
         self.scalars.dot(a, b, self.scalar)
         return float(self.scalar.numpy()[0])
 
@@ -262,7 +275,7 @@ class ImplicitSteps:
         self._on_masses("turn", *scalars, self.new, self.z, self.p)
         self._launch("accept", 1, *scalars, self.new, self.turns)
 
-    def _rigid(self, impulse: Any) -> tuple[Any, Any, Any]:
+    def _rigid(self, impulse: WarpArray) -> tuple[object, object, object]:
         """Return centre, speed and spin of the rigid motion that has the momenta of an impulse on the masses."""
         wp, engine, x = warp_package(), self.session.engine, self.session.x
         self._on_masses("weighted", engine.mass, x, self.node_vector)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from naibu.mechanics.lattices.gpu.device_arrays import (
     chosen_device,
     warp_package,
 )
+from naibu.mechanics.lattices.gpu.warp_types import WarpArray
 from naibu.mechanics.lattices.model.coefficients import explicit_coefficients, implicit_coefficients
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters, require_positive
 from naibu.mechanics.lattices.model.state import (
@@ -54,13 +55,13 @@ class PreparedLattice:
     step: float
     method: Method
     tolerance: float
-    device: Any
+    device: object
     lists: NeighbourLists
-    row: Any
-    table: Any
-    stiffness: Any
-    mass: Any
-    inverse_mass: Any
+    row: WarpArray
+    table: WarpArray
+    stiffness: WarpArray
+    mass: WarpArray
+    inverse_mass: WarpArray
 
     @classmethod
     def of(

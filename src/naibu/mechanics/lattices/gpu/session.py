@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,6 +22,7 @@ from naibu.mechanics.lattices.gpu.device_arrays import (
 )
 from naibu.mechanics.lattices.gpu.implicit_stepper import ImplicitSteps
 from naibu.mechanics.lattices.gpu.prepared_lattice import PreparedLattice
+from naibu.mechanics.lattices.gpu.warp_types import WarpArray
 from naibu.mechanics.lattices.model.lattice import Lattice
 from naibu.mechanics.lattices.model.state import (
     ConstrainedNodes,
@@ -67,14 +67,14 @@ class WarpLatticeSession:
 
     engine: PreparedLattice
     constrained: ConstrainedArrays
-    x: Any
-    v: Any
-    f: Any
-    external: Any
-    y: Any
-    path: Any
-    parts: Any
-    count: Any
+    x: WarpArray
+    v: WarpArray
+    f: WarpArray
+    external: WarpArray
+    y: WarpArray
+    path: WarpArray
+    parts: WarpArray
+    count: WarpArray
     taken: int = 0
     iterations: int = 0
     rotation_limited: int = 0

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -188,7 +186,7 @@ def _corner_block(grid: BoolArray) -> BoolArray:
 def _cube_content(grid: BoolArray, exposed: BoolArray, at: IntArray, size: int) -> tuple[BoolArray, BoolArray, BoolArray]:
     """Return which cubes are full, which are empty, and which have a voxel with a face on the fine surface."""
     count = len(grid) // size
-    blocks: tuple[Any, ...] = tuple((at // size).T)
+    blocks: tuple[IntArray, ...] = tuple((at // size).T)
     by_cube = grid.reshape(count, size, count, size, count, size)
     touched = exposed.reshape(count, size, count, size, count, size).any(axis=(1, 3, 5))
     full, used = np.asarray(by_cube.all(axis=(1, 3, 5))), np.asarray(by_cube.any(axis=(1, 3, 5)))

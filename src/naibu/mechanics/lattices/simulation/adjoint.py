@@ -7,18 +7,18 @@ Its gradient is that of the numbers that the steps computed, to rounding, not an
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from naibu._numba.compilation import njit
 from naibu._numba.simd import WIDTH, aligned, inverse_root, load, splat, store
-from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.arrays import AnyFloatArray, FloatArray, IntArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.mechanics.lattices.cpu._explicit_kernels import drive, element_forces, move
 from naibu.mechanics.lattices.cpu.element_blocks import explicit_tables
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
+from naibu.mechanics.lattices.cpu.scratch import KernelTuple
 from naibu.mechanics.lattices.model.lattice import LatticeParameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState, checked_velocity, require_constrained, require_numbers
 
@@ -45,11 +45,11 @@ class RecordedPush:
     observed: IntArray
     positions: FloatArray
     reaction: FloatArray
-    constrained: tuple[Any, ...]
+    constrained: tuple[IntArray, FloatArray, FloatArray, IntArray]
     velocity: FloatArray
-    external: Any
+    external: AnyFloatArray
     stretch: int
-    kept: tuple[Any, Any, Any]
+    kept: tuple[FloatArray, FloatArray, FloatArray]
 
     @property
     def memory_mb(self) -> float:
@@ -158,7 +158,7 @@ class ParameterGradient:
 
 
 def push_gradient(
-    push: RecordedPush, by_position: ArrayLike, by_reaction: ArrayLike | None = None, groups: NDArray[np.integer[Any]] | None = None
+    push: RecordedPush, by_position: ArrayLike, by_reaction: ArrayLike | None = None, groups: NDArray[np.integer] | None = None
 ) -> ParameterGradient:
     """Return the gradient of a number from its derivatives with respect to observed positions and reactions.
 
@@ -210,14 +210,12 @@ def push_gradient(
         engine.method == "euler", push.observed, push.stretch, push.kept, marks.reshape(len(marks), -1), forces, adjoint, sums,
     )  # fmt: skip
     count = int(labels.max()) + 1
-    by_parameter = _by_parameter(engine, labels, tables[4], rows, sums, count)
+    by_parameter = _by_parameter(engine, labels, rows, sums, count)
     start = (np.ascontiguousarray(a.reshape(3, pad)[:, : lattice.n_nodes].T) for a in adjoint[:2])
     return ParameterGradient(*by_parameter, *start)
 
 
-def _by_parameter(
-    engine: LatticeEngine, labels: IntArray, marked: Any, rows: IntArray, sums: tuple[Any, ...], count: int
-) -> list[FloatArray]:
+def _by_parameter(engine: LatticeEngine, labels: IntArray, rows: IntArray, sums: KernelTuple, count: int) -> list[FloatArray]:
     """Return the derivatives with respect to K, C1 and C2 of all groups, from those with respect to the tables."""
     lane = engine.blocks.lane
     place = rows[lane // WIDTH] + lane % WIDTH
@@ -227,11 +225,10 @@ def _by_parameter(
     found: list[FloatArray] = []
     tiny = 1e-30  # the derivative by a complex step is exact to rounding
     for shift in range(3):
-        moved: list[Any] = [v[example].astype(complex) for v in (p.stiffness, p.voigt_damping, p.series_damping)]
+        moved = [v[example].astype(complex) for v in (p.stiffness, p.voigt_damping, p.series_damping)]
         moved[shift] += 1j * tiny
-        changed = explicit_tables(
-            LatticeParameters(moved[0], moved[1], moved[2], p.voigt_fraction[example]), engine.step, engine.method == "euler"
-        )
+        perturbed = LatticeParameters(moved[0], moved[1], moved[2], p.voigt_fraction[example])  # a complex step
+        changed = explicit_tables(perturbed, engine.step, engine.method == "euler")
         total = sum(sums[c][spots] * changed[c].imag / tiny for c in range(4))
         found.append(np.asarray(np.bincount(group, total, minlength=count), dtype=np.float64))
     return found

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -173,7 +172,7 @@ def driven_steps(
     return DrivenMotion(replace(engine.read(x, v, y), length=lengths[engine.blocks.lane]), reaction, after, reaction_change)
 
 
-def _stored_change(engine: LatticeEngine, change: StateChange) -> tuple[Any, Any, Any]:
+def _stored_change(engine: LatticeEngine, change: StateChange) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return derivatives as the kernels hold them: (p, 3 pad), (p, 3 pad), (p, 8 nb)."""
     count, pad, n = len(change.position), len(engine.mass), engine.lattice.n_nodes
     x, v = (aligned((count, 3 * pad), float) for _ in range(2))
@@ -184,7 +183,7 @@ def _stored_change(engine: LatticeEngine, change: StateChange) -> tuple[Any, Any
     return x, v, y
 
 
-def _read_change(engine: LatticeEngine, stored: tuple[Any, Any, Any]) -> StateChange:
+def _read_change(engine: LatticeEngine, stored: tuple[FloatArray, FloatArray, FloatArray]) -> StateChange:
     count, n = len(stored[0]), engine.lattice.n_nodes
     x, v = (np.ascontiguousarray(a.reshape(count, 3, len(engine.mass))[:, :, :n].transpose(0, 2, 1)) for a in stored[:2])
     return StateChange(x, v, stored[2][:, engine.blocks.lane])
