@@ -1,11 +1,11 @@
-"""What the classic ways of sensing reach on a volume pair with known displacement, and how much faster they are than loops in NumPy.
+"""Accuracy of classic methods on a volume pair with known displacement, and their speed compared with loops in NumPy.
 
 Run: python benchmarks/sense_classic.py CASE.npz [--loops]
 
 CASE.npz holds ref and deformed (nx, ny, nz), spacing (3,), the true displacement u (3, nx, ny, nz), mm, the mask of the object, and the
-rigid part of the motion (4, 4). The rigid start is found from the bones where SimpleITK is installed and the case has bones, and is taken
-from the case elsewhere. Errors are mean / median / 95th percentile of the end-point error in the object, mm, counting voxels without an
-answer as displaced by the rigid motion alone.
+rigid part of the motion (4, 4). The rigid registration is found from the bones where SimpleITK is installed and the case has bones, and is
+taken from the case elsewhere. Errors are mean / median / 95th percentile of the end-point error in the object, mm, counting voxels without
+a displacement as displaced by the rigid motion alone.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ BLOCK, SEARCH = (3, 3, 3), (15, 15, 1)
 
 @dataclass(frozen=True)
 class Case:
-    """A pair, its truth, and the rigid motion between its parts."""
+    """Pair of volumes, its true displacement, and its rigid motion."""
 
     reference: Volume
     deformed: Volume
@@ -57,7 +57,7 @@ class Case:
     rigid_from: str
 
     @property
-    def brought_back(self) -> Volume:
+    def registered(self) -> Volume:
         """The deformed volume in the frame of the reference."""
         return resampled_to_grid(self.deformed, self.reference, through=self.rigid.applied)
 
@@ -91,11 +91,11 @@ def timed(work: Callable[[], T], repeat: int = 1) -> tuple[float, T]:
 def show(case: Case, name: str, seconds: float, vectors: Array, valid: Array) -> None:
     whole = total_displacement(np.where(np.isfinite(vectors), vectors, 0.0), case.rigid, case.reference)
     error = end_point_error(whole, case.truth, case.mask)
-    told = f"{error.mean_mm:5.2f} / {error.median_mm:4.2f} / {error.p95_mm:5.2f}"
-    share = (valid & case.mask).sum() / case.mask.sum()
+    shown = f"{error.mean_mm:5.2f} / {error.median_mm:4.2f} / {error.p95_mm:5.2f}"
+    fraction = (valid & case.mask).sum() / case.mask.sum()
     rms = intensity_rms(case.reference, case.deformed, whole, region=case.mask, frame="reference")
     print(
-        f"{name:44s} {told}   {share:5.0%}   {folded_fraction(whole, case.reference, case.mask):6.1%}   {rms:6.1f}   {seconds:7.2f} s",
+        f"{name:44s} {shown}   {fraction:5.0%}   {folded_fraction(whole, case.reference, case.mask):6.1%}   {rms:6.1f}   {seconds:7.2f} s",
         flush=True,
     )
 
@@ -112,7 +112,7 @@ def features_and_relaxation(case: Case) -> None:
     seconds_match, candidates = timed(matched, 3)
     print(f"\n{len(x1)} and {len(x2)} interest points in {seconds_points:.2f} s, {len(candidates)} candidates in {seconds_match:.2f} s")
     truth = {tuple(np.round(x, 6)): u for x, u in zip(x1, at_points(case, x1), strict=True)}
-    print("strength      matches  right (< 2 mm)  iterations  tetrahedra  RMS grey   error of the dense field, mm       all steps")
+    print("strength      matches  right (< 2 mm)  iterations  tetrahedra  residual   error of the dense field, mm       all steps")
     for strength in STRENGTHS:
         relaxed(candidates, strength=strength)
         seconds, found = timed(lambda kind=strength: relaxed(candidates, strength=kind), 3)
@@ -120,12 +120,12 @@ def features_and_relaxation(case: Case) -> None:
         seconds_dense, dense = timed(lambda field=sparse: dense_from_sparse(field, case.reference, outside="affine"))
         off = np.linalg.norm(sparse.vectors - [truth[tuple(np.round(x, 6))] for x in sparse.points], axis=1)
         error = end_point_error(dense.vectors, case.truth, case.mask)
-        told = f"{error.mean_mm:5.2f} / {error.median_mm:4.2f} / {error.p95_mm:5.2f}"
+        shown = f"{error.mean_mm:5.2f} / {error.median_mm:4.2f} / {error.p95_mm:5.2f}"
         rms = intensity_rms(case.reference, case.deformed, dense.vectors, region=case.mask, frame="reference")
         simplices = len(triangulated(sparse.points, case.reference).simplices)
         total = seconds_points + seconds_match + seconds
         print(
-            f"{strength:12s} {len(found):8d} {np.mean(off < 2.0):14.0%} {len(found.energies):11d} {simplices:11d} {rms:9.1f}   {told}     "
+            f"{strength:12s} {len(found):8d} {np.mean(off < 2.0):14.0%} {len(found.energies):11d} {simplices:11d} {rms:9.1f}   {shown}     "
             f"{total:.2f} + {seconds_dense:.2f} s dense",
             flush=True,
         )
@@ -138,7 +138,7 @@ def at_points(case: Case, points: Array) -> Array:
 
 
 def dense_methods(case: Case) -> None:
-    back = case.brought_back
+    back = case.registered
     a, b = case.reference, back
     methods: dict[str, Callable[[], DisplacementField]] = {
         "block matching SAD 3x3x3 in 31x31x3": lambda: block_matching(a, b, block=BLOCK, search=SEARCH),
@@ -153,7 +153,7 @@ def dense_methods(case: Case) -> None:
         ),
         "hybrid, pyramid": lambda: hybrid_flow(a, b, block=(7, 7, 5), search=(8, 8, 4), least_range=400.0),
     }
-    print("\nafter the rigid start                        mean / median / 95 %, mm   measured   folded   RMS grey   time")
+    print("\nafter the rigid registration                 mean / median / 95 %, mm   measured   folded   residual   time")
     show(case, "rigid motion alone", 0.0, np.zeros_like(case.truth), np.ones(a.shape, dtype=bool))
     for name, work in methods.items():
         warm_up(a, name)
@@ -175,17 +175,17 @@ def warm_up(a: Volume, name: str) -> None:
 
 
 def against_loops(case: Case) -> None:
-    """Print times beside those of loops in NumPy and SciPy, one thread, that do the same.
+    """Print times and those of equivalent loops in NumPy and SciPy on one thread.
 
     The loops do a part (200 voxels, 27 of 2883 displacements, 4 of 40 steps, 1 iteration), and their time is scaled to the whole.
     """
-    a, b = (np.nan_to_num(v.values.astype(np.float32)) for v in (case.reference, case.brought_back))
+    a, b = (np.nan_to_num(v.values.astype(np.float32)) for v in (case.reference, case.registered))
     volume, other = case.reference, case.reference.with_values(b)
     print("\nthe same in NumPy                              NumPy s (of CPU)     naibu s (of CPU)     ratio (of CPU)")
     blocks = lambda: block_matching(volume, other, block=BLOCK, search=SEARCH, sub_voxel=False)  # noqa: E731
-    places = int(np.prod([2 * s + 1 for s in SEARCH]))
+    displacements = int(np.prod([2 * s + 1 for s in SEARCH]))
     compare("full-volume block matching, loop over voxels", lambda: loop_voxels(a, b, 200), a.size / 200, blocks)
-    compare("the same, NumPy loop over displacements", lambda: loop_block_matching(a, b, (1, 1, 1), (1, 1, 1)), places / 27, blocks)
+    compare("the same, NumPy loop over displacements", lambda: loop_block_matching(a, b, (1, 1, 1), (1, 1, 1)), displacements / 27, blocks)
     compare("Horn-Schunck, 40 steps, 4 of them", lambda: loop_horn_schunck(a, b, 4), 10, lambda: horn_schunck(volume, other, **AS_REPORTED))
     rng = np.random.default_rng(0)
     points = positions(volume)[case.mask][rng.integers(0, case.mask.sum(), 800)]
@@ -253,13 +253,13 @@ def loop_voxels(a: Array, b: Array, n: int) -> Array:
 
 
 def loop_horn_schunck(a: Array, b: Array, steps: int) -> Array:
-    slopes = np.gradient(0.5 * (a + b))
-    change, squares = b - a, sum(g * g for g in slopes)
+    gradient = np.gradient(0.5 * (a + b))
+    change, squares = b - a, sum(g * g for g in gradient)
     u = [np.zeros_like(a) for _ in range(3)]
     for _ in range(steps):
         mean = [sum(np.roll(c, s, axis) for axis in range(3) for s in (-1, 1)) / 6.0 for c in u]
-        factor = 4.0 * (sum(g * m for g, m in zip(slopes, mean, strict=True)) + change) / (1.0 + 4.0 * squares)
-        u = [m - g * factor for g, m in zip(slopes, mean, strict=True)]
+        factor = 4.0 * (sum(g * m for g, m in zip(gradient, mean, strict=True)) + change) / (1.0 + 4.0 * squares)
+        u = [m - g * factor for g, m in zip(gradient, mean, strict=True)]
     return np.stack(u)
 
 

@@ -1,12 +1,12 @@
-"""How near volume correlation comes to a known displacement, and what each of its parts is good for.
+"""Accuracy of digital volume correlation on pairs with known displacement, with and without each of its parts.
 
 Run: python benchmarks/sense_volumes.py CASE.npz [CASE.npz ...] [--ablation] [--progress]
 
 CASE.npz holds ref and deformed (nx, ny, nz), spacing (3,), the true displacement u (3, nx, ny, nz), mm, labels of tissues, the mask of the
 object, and meta, which names the kind of the case. Errors are mean / median / 95th percentile of the end-point error in the object, mm,
-over voxels with an answer; "answered" is their share. "gradient" is the root mean square error of the displacement gradient by central
-differences of the voxels' displacement, "covered" the share of voxels whose true displacement lies in the 95 % ellipsoid of the stated
-covariance. A first pair of small volumes compiles everything; times are wall and processor time of one run, the peak is that of the
+over voxels with a displacement; "measured" is their fraction. "gradient" is the root mean square error of the displacement gradient by
+central differences of the voxels' displacement, "covered" the fraction of voxels whose true displacement lies in the 95 % ellipsoid of the
+stated covariance. A first pair of small volumes compiles everything; times are wall and processor time of one run, the peak is that of the
 process so far.
 """
 
@@ -38,12 +38,12 @@ ABLATION = {
     "default": CorrelationSettings(),
     "no local gain": CorrelationSettings(local_gain=False),
     "not robust": CorrelationSettings(robust=np.inf),
-    "no volume term": CorrelationSettings(dilatation_penalty=False),
-    "one weight": CorrelationSettings(adaptive_weight=False),
-    "no stiff bodies": CorrelationSettings(rigid_inclusions=False),
-    "slopes of both": CorrelationSettings(gradients="mean"),
-    "slopes of the deformed": CorrelationSettings(gradients="deformed"),
-    "no scatter of place": CorrelationSettings(jitter_sd_voxels=0.0),
+    "no dilatation penalty": CorrelationSettings(dilatation_penalty=False),
+    "fixed weights": CorrelationSettings(adaptive_weight=False),
+    "no rigid inclusions": CorrelationSettings(rigid_inclusions=False),
+    "gradients of both": CorrelationSettings(gradients="mean"),
+    "gradients of the deformed": CorrelationSettings(gradients="deformed"),
+    "no sub-voxel jitter": CorrelationSettings(jitter_sd_voxels=0.0),
 }
 
 
@@ -62,17 +62,17 @@ def compile_all() -> None:
 
 def score(case: dict[str, Array], found: CorrelationResult) -> dict[str, Any]:
     truth, mask, labels = np.moveaxis(zyx(case["u"]), 0, -1), zyx(case["mask"]), zyx(case["labels"])
-    answered = mask & found.valid
-    off = np.where(answered[..., None], found.displacement.vectors - truth, 0.0)
+    measured = mask & found.valid
+    off = np.where(measured[..., None], found.displacement.vectors - truth, 0.0)
     length = np.linalg.norm(off, axis=-1)
     kind = json.loads(str(case["meta"]))["kind"]
-    out: dict[str, Any] = {"answered": answered.sum() / mask.sum(), "mm": (length[answered].mean(), np.median(length[answered]))}
-    out["mm"] += (np.percentile(length[answered], 95),)
-    out["tissues"] = {name: length[answered & np.isin(labels, which)].mean() for name, which in TISSUES[kind].items()}
-    core = ndimage.binary_erosion(answered, border_value=0)
-    slopes = [np.gradient(off, s, axis=axis)[core] for axis, s in zip((2, 1, 0), case["spacing"], strict=True)]
-    out["gradient"] = float(np.sqrt(np.mean(np.square(slopes))))
-    some = np.argwhere(answered)
+    out: dict[str, Any] = {"measured": measured.sum() / mask.sum(), "mm": (length[measured].mean(), np.median(length[measured]))}
+    out["mm"] += (np.percentile(length[measured], 95),)
+    out["tissues"] = {name: length[measured & np.isin(labels, which)].mean() for name, which in TISSUES[kind].items()}
+    core = ndimage.binary_erosion(measured, border_value=0)
+    gradients = [np.gradient(off, s, axis=axis)[core] for axis, s in zip((2, 1, 0), case["spacing"], strict=True)]
+    out["gradient"] = float(np.sqrt(np.mean(np.square(gradients))))
+    some = np.argwhere(measured)
     some = some[np.random.default_rng(0).choice(len(some), min(len(some), 20000), replace=False)]
     covariance = found.covariance_at(found.volume.to_physical(some[:, ::-1]))
     error = off[tuple(some.T)]
@@ -85,15 +85,15 @@ def show(name: str, case: dict[str, Array], settings: CorrelationSettings, progr
     reference, deformed = (Volume.from_array(zyx(case[key]), spacing_mm=case["spacing"]) for key in ("ref", "deformed"))
     wall, busy = time.perf_counter(), time.process_time()
     found = correlate_volumes(
-        reference, deformed, settings=settings, progress=(lambda text: print("   ", text, flush=True)) if progress else None
+        reference, deformed, settings=settings, progress=(lambda report: print("   ", report, flush=True)) if progress else None
     )
     wall, busy = time.perf_counter() - wall, time.process_time() - busy
     s = score(case, found)
-    told = " / ".join(f"{v:.3f}" for v in s["mm"])
+    shown = " / ".join(f"{v:.3f}" for v in s["mm"])
     tissues = "  ".join(f"{tissue} {v:.3f}" for tissue, v in s["tissues"].items())
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(
-        f"{name:26s} {told}   {tissues}   {s['gradient']:.4f}   {s['covered']:6.1%}   {s['answered']:6.1%}   {wall:6.1f} ({busy:.1f}) s"
+        f"{name:26s} {shown}   {tissues}   {s['gradient']:.4f}   {s['covered']:6.1%}   {s['measured']:6.1%}   {wall:6.1f} ({busy:.1f}) s"
         f"   {peak:.0f} MB",
         flush=True,
     )
@@ -103,11 +103,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", nargs="+")
     parser.add_argument("--ablation", action="store_true", help="also without each of the parts")
-    parser.add_argument("--progress", action="store_true", help="tell every step")
+    parser.add_argument("--progress", action="store_true", help="print every step")
     arguments = parser.parse_args()
     compile_all()
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
-    print("                           mean / median / 95 %, mm   tissues, mm   gradient   covered   answered   wall (processor)   peak")
+    print("                           mean / median / 95 %, mm   tissues, mm   gradient   covered   measured   wall (processor)   peak")
     for path in arguments.cases:
         case = dict(np.load(path))
         meta = json.loads(str(case["meta"]))

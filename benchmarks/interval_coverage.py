@@ -1,4 +1,4 @@
-"""Are the stated intervals right? Virtual specimens with known truth, solved on another mesh: ``python benchmarks/coverage.py [DRAWS]``.
+"""Are the stated intervals right? Virtual specimens with known truth, solved on another mesh: ``interval_coverage.py [DRAWS]``.
 
 Two gels between sticking and slipping plates, 0.15 mm noise a coordinate; prints the errors of the modulus ratio and of Poisson's
 ratio, and the share of 95 % intervals that hold the truth.
