@@ -23,7 +23,7 @@ def fitted(calibration: Calibration) -> dict[str, float]:
     out = {}
     for load_case, fit in zip(calibration.load_cases, calibration.match.fits, strict=True):
         whole = np.isfinite(fit.residual).all(axis=1) & ~load_case.specimen.marker_filled.any(axis=1)
-        out[load_case.label] = float(np.sqrt((fit.residual[whole] ** 2).sum(axis=1).mean()))
+        out[load_case.name] = float(np.sqrt((fit.residual[whole] ** 2).sum(axis=1).mean()))
     return out
 
 

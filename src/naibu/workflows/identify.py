@@ -173,7 +173,7 @@ def _compared(
 
     try:
         if not interrupted:
-            compared = {t.label: _baselines(t, values) for t in calibration.load_cases}
+            compared = {t.name: _baselines(t, values) for t in calibration.load_cases}
             for label, distance in equilibrium_gap_baseline(calibration).items():
                 compared[label]["equilibrium gap"] = distance
         if not interrupted and left_in_turn:

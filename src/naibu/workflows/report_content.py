@@ -62,10 +62,10 @@ def accuracy_table(calibration: Calibration, baselines: Mapping[str, Mapping[str
     unseen = {f"{r.experiment}/{r.state}": r.rms_mm for r in left_out}
     rows = []
     for load_case, fit in zip(calibration.load_cases, calibration.match.fits, strict=True):
-        compared = baselines.get(load_case.label, {})
-        extra = ([unseen.get(load_case.label)] if unseen else []) + [compared.get(n) for n in names]
+        compared = baselines.get(load_case.name, {})
+        extra = ([unseen.get(load_case.name)] if unseen else []) + [compared.get(n) for n in names]
         rows.append(
-            (*_accuracy_row(load_case.label, accuracy(load_case.specimen, fit)), *(None if v is None else round(v, 3) for v in extra))
+            (*_accuracy_row(load_case.name, accuracy(load_case.specimen, fit)), *(None if v is None else round(v, 3) for v in extra))
         )
     columns = (*_ACCURACY_COLUMNS, *(["left out mm"] if unseen else []), *(f"{n} mm" for n in names))
     note = "Root mean square over markers measured completely in both states."

@@ -137,7 +137,7 @@ def write_identification(
     write_atomically(folder / IDENTIFICATION_FILE, _text(_identification_summary(calibration, model, baselines, left_out)))
     values = model.parameters.values()
     for load_case, fit in zip(calibration.load_cases, calibration.match.fits, strict=True):
-        series = folder / f"{load_case.label.replace('/', '_')}.vtkhdf"
+        series = folder / f"{load_case.name.replace('/', '_')}.vtkhdf"
         states = fit.solution.states
         mesh = load_case.specimen.reshaped(values).mesh
         write_vtkhdf_series(series, mesh, [s.load for s in states], {"displacement_mm": [s.displacement for s in states]})
@@ -149,8 +149,8 @@ def _identification_summary(
 ) -> dict[str, Any]:
     load_cases = {}
     for load_case, fit in zip(calibration.load_cases, calibration.match.fits, strict=True):
-        load_cases[load_case.label] = _figures(accuracy(load_case.specimen, fit)) | {
-            "baselines_rms_3d_mm": dict(baselines.get(load_case.label, {})),
+        load_cases[load_case.name] = _figures(accuracy(load_case.specimen, fit)) | {
+            "baselines_rms_3d_mm": dict(baselines.get(load_case.name, {})),
             "linear_solver": fit.solution.linear_solver,
             "reactions_mN": _reactions(fit.solution),
         }

@@ -466,7 +466,7 @@ def broken() -> dict[str, tuple[str, str, list[FieldLoadCase], Zones, dict[str, 
     unfit = replace(zones, known_lambda=np.full_like(zones.known_lambda, np.nan))
     far = np.where(mesh.points[:, 1:] == 100.0, True, body.constrained[:, None])
     return {
-        "no load case": ("field", "no load case is given", [], zones, {}),
+        "no load case": ("field", "give at least one load case", [], zones, {}),
         "method": ("field", "method 'svd' is not known", [one], zones, {"method": "svd"}),
         "law": ("field", "law 'rubber' is not known", [one], zones, {"law": "rubber"}),
         "about": ("field", "has no use for it", [one], zones, {"about": (1.0, 0.3)}),

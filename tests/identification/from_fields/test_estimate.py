@@ -384,7 +384,7 @@ def test_moduli_and_logarithms_are_inverse() -> None:
 def test_bad_input_is_named() -> None:
     body = layered()
     trials, zones = body.load_cases(sd_mm=0.1), body.zones()
-    with pytest.raises(InputError, match="at least one load case"):
+    with pytest.raises(InputError, match="give at least one load case"):
         identify_field(body.mesh, [], zones)
     with pytest.raises(InputError, match="law 'rubber'"):
         identify_field(body.mesh, trials, zones, law="rubber")  # type: ignore[arg-type]

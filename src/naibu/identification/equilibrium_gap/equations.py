@@ -20,6 +20,7 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.load_cases import KNOWN, FieldLoadCase, Zones
+from naibu.identification.load_case import require_load_cases
 from naibu.mechanics.finite_elements.linear_simplices import Simplices, simplices
 from naibu.mechanics.finite_elements.modulus_derivatives import SimplexLaw, cell_tangents, unit_forces
 
@@ -232,8 +233,7 @@ def load_case_equations(
         No load case, shapes that do not fit the mesh, known cells without moduli, or a load case in which no node gives an equation.
     """
     body = simplices(mesh, thickness_mm=thickness_mm)
-    if not load_cases:
-        raise InputError("no load case is given: the equilibrium gap needs the measured field of at least one")
+    require_load_cases(load_cases)
     _check_zones(zones, mesh)
     return tuple(_equations_of(mesh, body, load_case, zones, law) for load_case in load_cases)
 

@@ -39,6 +39,7 @@ from naibu.identification.from_fields.segmentation import EXPLICIT, Segmentation
 from naibu.identification.from_fields.sensitivities import FieldModel, Point, logarithms, moduli_of, young_and_poisson
 from naibu.identification.from_fields.truncated_newton import truncated_step
 from naibu.identification.from_fields.uncertainty import Uncertainty, information_at, report, resolution, resolution_report
+from naibu.identification.load_case import require_load_cases
 
 FEW = 12  # zones up to which no penalty is needed by default
 START_POISSON_RATIO = 0.4
@@ -161,8 +162,7 @@ def identify_field(
     ConvergenceError
         No equilibrium at the start, or a measured field that does not fix how the loaded nodes move.
     """
-    if not load_cases:
-        raise InputError("give at least one load case")
+    require_load_cases(load_cases)
     if len(zones.of_cell) != mesh.n_cells:
         raise InputError(f"the zones are of a mesh of {len(zones.of_cell)} cells, this mesh has {mesh.n_cells}")
     recipe = _Recipe(FieldModel(mesh, load_cases, zones, law), bounds or Bounds(), [], progress)

@@ -65,6 +65,11 @@ class FieldLoadCase:
             raise InputError(f"load case {name!r}: the field has no valid point")
         return cls(name, field, mask, force)
 
+    @property
+    def n_data(self) -> int:
+        """Number of measured components."""
+        return int(self.field.valid.sum() * self.field.points.shape[1])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Zones:

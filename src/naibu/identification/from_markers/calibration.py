@@ -53,7 +53,7 @@ class Calibration:
     def warm_starts(self) -> dict[str, SolvedLoadCase]:
         """The solved load cases by label, for other searches to start from."""
         pairs = zip(self.load_cases, self.match.fits, strict=True)
-        return {load_case.label: SolvedLoadCase(fit, self.match.parameters) for load_case, fit in pairs}
+        return {load_case.name: SolvedLoadCase(fit, self.match.parameters) for load_case, fit in pairs}
 
 
 def calibrate(

@@ -156,7 +156,7 @@ class Matcher:
         try:
             solution = solve(problem, settings=_PATH, solver=self._solvers.get(index), warm_start=warm_start)
         except ConvergenceError as error:
-            raise ConvergenceError(f"{load_case.label}: {error}") from error
+            raise ConvergenceError(f"{load_case.name}: {error}") from error
         newton = Newton(problem, _PATH, self._solvers.get(index))
         path = self._path_derivatives(load_case, values, solution, newton)
         self._solvers[index] = newton.solver
@@ -267,7 +267,7 @@ class Matcher:
         """
         free = self.parameters.free
         inner = np.array([p.inner((start or {}).get(p.name, p.value)) for p in free])
-        fits = self.evaluate(self.parameters.values(inner), [(warm_starts or {}).get(t.label) for t in self.load_cases])
+        fits = self.evaluate(self.parameters.values(inner), [(warm_starts or {}).get(t.name) for t in self.load_cases])
         now = self.normal_equations(fits, inner)
         history, damping, rough, status = [now.objective], 1e-3, True, Status.ITERATION_LIMIT
         try:
@@ -326,7 +326,7 @@ class Matcher:
         equations = self.normal_equations(fits, inner)
         hessian, data = equations.hessian, equations.data
         chi_squared = float(sum(np.nansum((f.residual / f.sd) ** 2) for f in fits))
-        n_data = int(sum(np.isfinite(f.residual).sum() for f in fits))
+        n_data = sum(load_case.n_data for load_case in self.load_cases)
         effective = float(np.trace(np.linalg.solve(hessian, data)))
         dof = n_data - effective
         factor = max(1.0, chi_squared / max(dof, 1.0))

@@ -56,9 +56,14 @@ class MarkerLoadCase:
     free_sd: FloatArray
 
     @property
-    def label(self) -> str:
+    def name(self) -> str:
         """``experiment/state``."""
         return f"{self.specimen.experiment.name}/{self.state}"
+
+    @property
+    def n_data(self) -> int:
+        """Number of measured coordinates."""
+        return int(np.isfinite(self.measured).sum())
 
     @classmethod
     def of(cls, specimen: Specimen, state: str, noise: NoiseModel) -> MarkerLoadCase:

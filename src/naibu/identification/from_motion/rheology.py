@@ -20,6 +20,7 @@ from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.parameters import Parameter, ParameterSet, Scale
 from naibu.core.progress import Progress, report_progress
+from naibu.identification.load_case import require_load_cases
 from naibu.mechanics.small_strain.dynamics import Load, Series, simulate_motion
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.mechanics.small_strain.rheology import CellRheology, Rheology, per_region, three_element
@@ -129,6 +130,11 @@ class MotionLoadCase:
         given = load if load is None or callable(load) else np.array(load, dtype=float)
         body = LinearBody.of(mesh, thickness_mm=thickness_mm)
         return cls(name, mesh, body, tuple(supports), times, points, u, sd_mm, density, given, forces, force_sd_mn, step_s)
+
+    @property
+    def n_data(self) -> int:
+        """Number of measured components of displacements and forces."""
+        return sum(int(np.isfinite(values[1:]).sum()) for values in (self.displacement, *self.force.values()))
 
     def simulated(self, materials: CellRheology) -> Series:
         """Return the motion with these materials."""
@@ -242,8 +248,7 @@ def identify_motion(load_cases: Sequence[MotionLoadCase], parameters: ParameterS
     ConvergenceError
         A motion cannot be computed.
     """
-    if not load_cases:
-        raise InputError("no load case is given")
+    require_load_cases(load_cases)
     if not parameters.free:
         raise InputError("all parameters are known: free at least one")
     problem = _Problem(tuple(load_cases), parameters, progress)

@@ -79,7 +79,7 @@ def equilibrium_gap_baseline(calibration: Calibration) -> dict[str, float]:
             continue
         body = load_case.specimen.reshaped(values)
         moved = body.marker_points + body.observation @ displacement
-        out[load_case.label] = rms(load_case.measured - registration(moved, load_case.measured).applied(moved))
+        out[load_case.name] = rms(load_case.measured - registration(moved, load_case.measured).applied(moved))
     return out
 
 

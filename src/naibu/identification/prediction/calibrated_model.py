@@ -56,7 +56,7 @@ class CalibratedModel:
     def of(cls, calibration: Calibration, provenance: Mapping[str, Any] | None = None) -> CalibratedModel:
         """Take the model from a calibration."""
         c = calibration
-        labels = tuple(t.label for t in c.load_cases)
+        labels = tuple(t.name for t in c.load_cases)
         return cls(
             c.settings, c.match.parameters, c.match.covariance, c.noise, c.match.noise_factor, c.known_materials, labels, provenance or {}
         )
