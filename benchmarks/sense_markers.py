@@ -1,11 +1,11 @@
-"""What following markers reaches: washers in CT, particles, the report's own states, echoes of ultrasound; right, wrong, error, seconds.
+"""Marker tracking benchmark: washers in CT, particles, the states of the report, ultrasound echoes; right, wrong, error, seconds.
 
 Run: python benchmarks/sense_markers.py [CASE.npz ...] [--seeds 0 1 2] [--particles 35000]
 
 CASE.npz holds ref and deformed (nx, ny, nz), spacing (3,), and the true centres markers_ref and markers_def (n, 3), mm; the outer diameter
-of the washers (2.8 mm) is all that is told. Particles are pressed to 0.7 or 0.58 of their height, turned and shifted by several spacings,
-and a tenth vanish or appear; noise is 2 % of a spacing. The states of the report are relinked without their numbers. trackpy is run on the
-same points where it is installed. The first call compiles; seconds are those of the second.
+of the washers (2.8 mm) is the only setting. Particles are compressed to 0.7 or 0.58 of their height, rotated and shifted by several
+spacings, and a tenth vanish or appear; noise is 2 % of a spacing. The states of the report are linked again without their labels. trackpy
+is run on the same points where it is installed. The first call compiles; seconds are those of the second.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ WASHER_MM = 2.8
 
 
 def timed(run: Callable[[], T]) -> tuple[T, str]:
-    """Return what a call gives, and how long it took: on a busy machine the time of all threads together tells more."""
+    """Return the result of a call and its time; on a busy machine the CPU time of all threads is more reliable."""
     start, used = time.perf_counter(), time.process_time()
     out = run()
     return out, f"{time.perf_counter() - start:.1f} s ({time.process_time() - used:.1f} s of all threads)"
 
 
 def gel(path: Path) -> str:
-    """Find and link the washers of two volumes with default settings."""
+    """Track the washers of two volumes with default settings."""
     case = dict(np.load(path))
     volumes = [Volume.from_array(np.ascontiguousarray(case[k].T), spacing_mm=case["spacing"]) for k in ("ref", "deformed")]
     tracked, seconds = timed(lambda: track_markers(volumes, diameter_mm=WASHER_MM))
@@ -61,7 +61,7 @@ def gel(path: Path) -> str:
 
 def particles(seed: int, n: int, stretch: float, degrees: float) -> str:
     cloud = particle_cloud(n, seed, stretch=stretch, degrees=degrees, vanish=0.1, appear=0.1)
-    links, seconds = timed(lambda: link_markers(cloud.reference, cloud.moving))
+    links, seconds = timed(lambda: link_markers(cloud.reference, cloud.deformed))
     right, possible, wrong = cloud.judged(links.pairs)
     moved = np.median(cloud.displacement)
     return f"{n} particles, moved {moved:.1f} spacings: {right / possible:.2%} right, {wrong} wrong of {len(links)}; {seconds}" + peer(
@@ -70,7 +70,7 @@ def particles(seed: int, n: int, stretch: float, degrees: float) -> str:
 
 
 def peer(cloud: Cloud) -> str:
-    """Link the same particles with trackpy, told a search range of one spacing: what it can do without a motion model."""
+    """Link the same particles with trackpy, with a search range of one spacing and no motion model."""
     try:
         import trackpy
     except ImportError:
@@ -79,7 +79,7 @@ def peer(cloud: Cloud) -> str:
     if len(cloud.reference) > 5000:
         return "; trackpy: not tried on so many"
     try:
-        levels, seconds = timed(lambda: list(trackpy.link_iter([cloud.reference, cloud.moving], search_range=1.0)))
+        levels, seconds = timed(lambda: list(trackpy.link_iter([cloud.reference, cloud.deformed], search_range=1.0)))
     except trackpy.SubnetOversizeException:
         return "; trackpy: gives up (sub-network too large)"
     first, second = (dict(zip(ids, range(len(ids)), strict=True)) for _, ids in levels)
@@ -89,7 +89,7 @@ def peer(cloud: Cloud) -> str:
 
 
 def report_states(seed: int) -> list[str]:
-    """Link every measured state to the free one without their numbers."""
+    """Link every measured state to the reference state without their labels."""
     rng, rows = np.random.default_rng(seed), []
     for name in datasets.names():
         experiment = datasets.load(name)

@@ -2,10 +2,10 @@
 From scans to a prediction, where the truth is known
 ====================================================
 
-A virtual gel of two layers with 64 washers inside is pressed by a plate and scanned three times by a virtual CT scanner, each time in
-another pose. The washers are found and linked in the volumes, the moduli are identified from the first pressed state, and the second one
-is predicted. Here everything is known, so that every step can be judged. The gel was computed on a finer mesh than the one on which it is
-identified.
+A virtual gel of two layers with 64 washers inside is compressed by a plate and scanned three times by a virtual CT scanner, each time in
+another pose. The washers are detected and linked in the volumes, the moduli are identified from the first compressed state, and the second
+one is predicted. The ground truth is known, so that every step can be judged. The gel is computed on a finer mesh than the one on which it
+is identified.
 """
 
 import tempfile
@@ -38,8 +38,7 @@ gel = virtual_specimen(described, TRUTH, settings=ModelSettings(element_size_mm=
 scans = scanned_states(gel, spacing_mm=(0.7, 0.7, 0.7), seed=5)
 
 # %%
-# The washers of every scan, and what the scanner saw of them. Grey values of one slice, free and pressed; circles are the washers found
-# within a millimetre of it.
+# One slice of the scans of the reference and of a compressed state; circles are the washers detected within a millimetre of it.
 
 tracked = track_markers([scan.volume for scan in scans.values()], diameter_mm=2.8, thickness_mm=0.3, polarity="bright", names=list(scans))
 
@@ -55,17 +54,17 @@ for shown, name, markers in zip(axes, scans, tracked.markers, strict=False):
     shown.plot(markers.points[near, 0], markers.points[near, 2], "o", mfc="none", mec="tab:orange", ms=10)
     shown.set(title=name, xlabel="x, mm")
 axes[0].set_ylabel("z, mm")
-figure.colorbar(drawn, ax=axes, label="grey value")
+figure.colorbar(drawn, ax=axes, label="intensity")
 plt.show()
 
 for scan, name, markers in zip(scans.values(), tracked.names, tracked.markers, strict=True):
     missed = cKDTree(scan.markers.points).query(markers.points[np.isfinite(markers.points).all(axis=1)])[0]
-    print(f"{name}: {len(missed)} of {len(gel.free)} washers found, centres off by {np.median(missed):.3f} mm (median)")
+    print(f"{name}: {len(missed)} of {len(gel.free)} washers detected, median centre error {np.median(missed):.3f} mm")
 
 # %%
-# The markers go into a folder as measured ones do, and the rest is what is done with measurements. The firm gel is known.
+# The markers are written to a folder, and treated as measured ones from here on. The moduli of the firm gel are known.
 
-xy_step, z_step = tracked.steps_mm  # rounding to such steps would leave positions as uncertain as they are
+xy_step, z_step = tracked.steps_mm  # rounding steps of the same standard deviation as the positions
 with tempfile.TemporaryDirectory() as aside:
     folder = write_experiment_folder(
         Path(aside) / "gel",
@@ -92,14 +91,14 @@ for parameter in found.model.parameters.free:
         )
 
 # %%
-# How far the washers moved in the state that was not used, and how far the prediction misses where they were seen.
+# Displacement of the washers in the state that was not used, and distance from their predicted to their detected positions.
 
 moved = np.linalg.norm(unseen.measured_in_object - unseen.specimen.marker_points, axis=1)
 missed = np.linalg.norm(unseen.residual, axis=1)
 figure, shown = plt.subplots(figsize=(7, 4), layout="constrained")
 drawn = shown.scatter(moved, missed, c=unseen.specimen.marker_points[:, 2], cmap="viridis")
-shown.set(xlabel="distance the washer moved, mm", ylabel="distance to its prediction, mm")
+shown.set(xlabel="displacement of the washer, mm", ylabel="distance to its prediction, mm")
 shown.set_ylim(bottom=0.0)
 shown.set_title(f"pressed to 32 mm, predicted from 35 mm: {np.sqrt(np.nanmean(missed**2)):.2f} mm RMS")
-figure.colorbar(drawn, label="height in the free gel, mm")
+figure.colorbar(drawn, label="height in the reference configuration, mm")
 plt.show()

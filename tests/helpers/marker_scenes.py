@@ -1,4 +1,4 @@
-"""Markers whose places are known exactly: spheres and discs in volumes, moving echoes with ghosts in speckle, clouds under large strain."""
+"""Markers whose positions are known: spheres and discs in volumes, moving echoes with ghosts in speckle, strained clouds."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def render_spheres(
     direction: Array | None = None,
     radii: Array | None = None,
 ) -> Volume:
-    """Grey values averaged over 4 x 4 x 4 points of every voxel near a sphere; centres (n, 3) are index times spacing, mm."""
+    """Intensities averaged over 4 x 4 x 4 points of every voxel near a sphere; centres (n, 3) are index times spacing, mm."""
     step, fine = np.array(spacing), (np.arange(4) + 0.5) / 4 - 0.5
     values = np.full(shape, background)
     for n, c in enumerate(centres):
@@ -36,9 +36,9 @@ def render_spheres(
         x, y, z = np.meshgrid(*axes, indexing="ij")
         inside = ((x - c[0]) ** 2 + (y - c[1]) ** 2 + (z - c[2]) ** 2 < r**2).astype(float)
         size = high - low
-        share = inside.reshape(size[0], 4, size[1], 4, size[2], 4).mean(axis=(1, 3, 5))
+        fraction = inside.reshape(size[0], 4, size[1], 4, size[2], 4).mean(axis=(1, 3, 5))
         box = tuple(slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))
-        values[box] += contrast * share.T
+        values[box] += contrast * fraction.T
     values = values + noise * np.random.default_rng(seed).standard_normal(shape)
     return Volume.from_array(values.astype(np.float32), spacing_mm=spacing, origin_mm=(7.0, -3.0, 11.0), direction=direction)
 
@@ -52,10 +52,10 @@ def lattice(n: tuple[int, int, int], pitch: float, jitter: float, seed: int = 0,
 
 @dataclass(frozen=True)
 class Cloud:
-    """Two states of particles of which some vanish and some appear, and which moving one every reference one is (-1: none)."""
+    """Two states of particles of which some vanish and some appear, and the deformed index of every reference one (-1: none)."""
 
     reference: Array
-    moving: Array
+    deformed: Array
     truth: Array
     displacement: Array  # of the particles that are in both, in spacings
 

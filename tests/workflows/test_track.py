@@ -59,18 +59,18 @@ def test_an_experiment_folder_comes_out(scans: list[Path], tmp_path: Path) -> No
     assert nearest.min(axis=1).max() < 0.15
     # the same number is the same bead
     assert np.abs(after - truth[nearest.argmin(axis=1)] @ SQUEEZE).max() < 0.2
-    told = json.loads((tmp_path / "mine" / "tracking.json").read_text())
-    assert [row[2] for row in told["tables"][0]["rows"]] == [len(LATTICE)] * 2
-    assert set(told["settings"]) >= {"scan of initial", "scan of pressed"}
-    assert "SHA-256" in told["settings"]["scan of pressed"]
+    summary = json.loads((tmp_path / "mine" / "tracking.json").read_text())
+    assert [row[2] for row in summary["tables"][0]["rows"]] == [len(LATTICE)] * 2
+    assert set(summary["settings"]) >= {"scan of initial", "scan of pressed"}
+    assert "SHA-256" in summary["settings"]["scan of pressed"]
     assert run.page.read_text().startswith("<!DOCTYPE html>")
-    # the identification learns how certain the places are
+    # the identification learns how certain the positions are
     assert (experiment.xy_step_mm, experiment.z_step_mm) == pytest.approx(run.tracked.steps_mm)
     sd = np.nanmedian(run.tracked.sd_mm[..., 2])
     assert experiment.z_step_mm == pytest.approx(np.sqrt(12.0) * sd, rel=1e-6)
 
 
-def test_tables_alone_where_nothing_is_told_of_the_object(scans: list[Path], tmp_path: Path) -> None:
+def test_tables_alone_where_the_object_is_not_described(scans: list[Path], tmp_path: Path) -> None:
     track(scans, out=tmp_path / "tables", diameter_mm=DIAMETER)
     assert {p.name for p in (tmp_path / "tables").iterdir()} == {"initial.csv", "pressed.csv", "tracking.html", "tracking.json"}
 

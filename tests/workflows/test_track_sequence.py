@@ -60,7 +60,7 @@ def cine(tmp_path_factory: pytest.TempPathFactory) -> Cine:
     grid = empty_grid([0.0, 0.0, -0.5], [48.0, 34.0, 0.5], (PIXEL_MM, PIXEL_MM, 3.0))
     grid = Volume.from_array(grid.values, spacing_mm=grid.spacing_mm, origin_mm=(0.0, 0.0, 0.0))
     gel = Scatterers.drawn(lambda x: np.ones(len(x)), [-3, -3, -3], [51, 37, 3], per_mm3=12.0 / DEVICE.cell_mm3, seed=1)
-    body = VirtualObject.of(lambda x: np.ones(len(x)), MARKERS, MarkerKind(1.5, grey=20.0))
+    body = VirtualObject.of(lambda x: np.ones(len(x)), MARKERS, MarkerKind(1.5, intensity=20.0))
     motions = [motion(frame) for frame in range(FRAMES)]
     scans = list(ultrasound_sequence(body, gel, motions, grid, DEVICE, seed=3))
     frames = np.concatenate([scan.volume.values for scan in scans])

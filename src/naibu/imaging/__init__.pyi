@@ -17,7 +17,7 @@ from .feature_matching.scattered_interpolation import Triangulation, dense_from_
 from .markers.detection import DetectedMarkers, detect_markers
 from .markers.point_matching import Links, link_markers
 from .markers.sequence_tracking import TrackedSequence, track_sequence
-from .markers.settings import SequenceSettings
+from .markers.settings import DetectionSettings, LinkSettings, SequenceSettings
 from .markers.tracking import TrackedMarkers, track_markers
 from .measure_displacement import MeasuredDisplacement, measure_displacement
 from .out_of_core import ChunkedDisplacement, chunked_block_matching, chunked_harris_response, chunked_horn_schunck
@@ -35,8 +35,10 @@ __all__ = [
     "CorrelationResult",
     "CorrelationSettings",
     "DetectedMarkers",
+    "DetectionSettings",
     "ErrorSummary",
     "InterestPoints",
+    "LinkSettings",
     "Links",
     "MeasuredDisplacement",
     "PotentialMatches",

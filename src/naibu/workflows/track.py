@@ -1,4 +1,4 @@
-"""Follow markers from scans to an experiment folder, with a page that shows what was found, linked and rejected."""
+"""Marker tracking from scans of several states to an experiment folder, with a page of detections, links and rejections."""
 
 from __future__ import annotations
 
@@ -33,18 +33,46 @@ ENDINGS = (".nii.gz", ".ome.tif", ".ome.tiff")
 
 @dataclass(frozen=True, slots=True)
 class ObjectDescription:
-    """What the experiment folder says of the object beside its markers; see `naibu.core.experiment.Experiment`."""
+    """The object of an experiment folder, besides its markers; see `naibu.core.experiment.Experiment`.
+
+    Attributes
+    ----------
+    shape : Shape
+        Kind and extents, mm.
+    loading : Loading
+        How it is loaded.
+    layers : tuple of Layer
+        Materials from the base up.
+    stated_mm : mapping of str to float, optional
+        Stated platen positions by name of the state, mm.
+    title : str
+        Title of the experiment.
+    """
 
     shape: Shape
     loading: Loading
     layers: tuple[Layer, ...] = ()
     stated_mm: Mapping[str, float] | None = None
-    title: str = "Markers followed through scans"
+    title: str = "Markers tracked through scans"
 
 
 @dataclass(frozen=True, slots=True)
 class TrackRun:
-    """Markers, what became of them in every state, and the files."""
+    """Markers in every state and the files that hold them.
+
+    Attributes
+    ----------
+    tracked : TrackedMarkers
+        Positions, links and rejected candidates.
+    columns : tuple of str
+        Headers of `rows`, with units.
+    rows : tuple of tuple
+        One row a state.
+    page : Path
+        ``tracking.html``.
+    files : tuple of Path
+        All others.
+    """
 
     tracked: TrackedMarkers
     columns: tuple[str, ...]
@@ -66,30 +94,35 @@ def track(
     description: ObjectDescription | None = None,
     progress: Progress | None = None,
 ) -> TrackRun:
-    """Find equal markers in scans of several states, link them, and write an experiment folder.
+    """Track equal markers through scans of several states, and write an experiment folder.
 
     Parameters
     ----------
     scans : sequence of path-like
-        Volumes of the states, the free one first, then in the order in which they were reached.
+        Volumes of the states, the reference state first, then in the order in which they were reached.
     out : path-like
         Folder to make: an experiment folder where a description is given, the tables of the states alone otherwise; beside them the page
         ``tracking.html`` and the numbers ``tracking.json``.
     diameter_mm, thickness_mm, polarity, count
         See `naibu.imaging.markers.detection.detect_markers`.
     mask : path-like, optional
-        Volume on the grid of every scan, not zero where markers may lie.
+        Volume on the grid of every scan, nonzero where markers may lie.
     spacing_mm : sequence of float, optional
-        Distance of voxels along x, y, z, mm, for files that do not say.
+        Voxel spacing along x, y, z, mm, for files without it.
     description : ObjectDescription, optional
         Shape, loading and layers.
     progress : callable, optional
-        Called with a `ProgressReport` at every stage.
+        Called with a `naibu.core.progress.ProgressReport` at every stage.
+
+    Returns
+    -------
+    TrackRun
+        Tracks and files.
 
     Raises
     ------
     InputError
-        Scans that cannot be read, two of one name, markers that cannot be found or linked, or a folder that is in use.
+        Scans that cannot be read, two of one name, markers that cannot be found or linked, or a folder that is not empty.
     """
     target = Path(out)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
@@ -104,21 +137,23 @@ def track(
             if not where.same_grid(volume):
                 raise InputError(f"{Path(mask).name} does not lie on the grid of {Path(path).name}; resample the mask, or leave it out")
         masks = [where.values != 0] * len(volumes)
-    report_progress(progress, "detecting and matching markers")
     tracked = track_markers(
-        volumes, diameter_mm=diameter_mm, thickness_mm=thickness_mm, polarity=polarity, count=count, masks=masks, names=names
-    )
+        volumes, diameter_mm=diameter_mm, thickness_mm=thickness_mm, polarity=polarity, count=count, masks=masks, names=names,
+        progress=progress,
+    )  # fmt: skip
     report_progress(progress, "writing")
     files = _written(target, tracked, description)
     columns, rows = _table(tracked)
     settings: dict[str, Cell] = {"diameter, mm": diameter_mm, "thickness, mm": thickness_mm, "polarity": tracked.found[0].polarity}
     settings |= input_record({**{f"scan of {name}": scan for name, scan in zip(names, scans, strict=True)}, "mask": mask})
-    page, numbers = write_chapter(Chapter("tracking", "Markers followed", (_section(tracked, columns, rows),), settings), target)
+    page, numbers = write_chapter(
+        Chapter("tracking", "Markers tracked through scans", (_section(tracked, columns, rows),), settings), target
+    )
     return TrackRun(tracked, columns, rows, page, (*files, numbers))
 
 
 def _states(scans: Sequence[str | os.PathLike[str]]) -> list[str]:
-    """Names of the states: the first is ``initial``, the others bear the names of their files."""
+    """Return the names of the states: ``initial``, then the names of the files."""
     names = ["initial"]
     for scan in scans[1:]:
         name = Path(scan).name
@@ -142,26 +177,26 @@ def _written(target: Path, tracked: TrackedMarkers, description: ObjectDescripti
 
 
 def _table(tracked: TrackedMarkers) -> tuple[tuple[str, ...], tuple[tuple[Cell, ...], ...]]:
-    columns = ("state", "found", "linked", "of these in doubt", "missing", "rejected", "standard deviation x, y, z (median), mm")
+    columns = ("state", "found", "linked", "of these suspect", "missing", "rejected", "standard deviation x, y, z (median), mm")
     rows: list[tuple[Cell, ...]] = []
     for s, name in enumerate(tracked.names):
         flags, found = tracked.flags[s], tracked.found[s]
         known = flags != "missing"
         sd = np.nanmedian(tracked.sd_mm[s][known], axis=0)
         rejected = "; ".join(f"{n} {why}" for why, n in Counter(r.reason for r in found.rejected).most_common(3))
-        told = f"{len(found.rejected)}: {rejected}" if rejected else "0"
+        summary = f"{len(found.rejected)}: {rejected}" if rejected else "0"
         doubtful, missing = int((flags == "suspect").sum()), int((~known).sum())
-        rows.append((name, len(found), int(known.sum()), doubtful, missing, told, ", ".join(f"{v:.3f}" for v in sd)))
+        rows.append((name, len(found), int(known.sum()), doubtful, missing, summary, ", ".join(f"{v:.3f}" for v in sd)))
     return columns, tuple(rows)
 
 
 def _section(tracked: TrackedMarkers, columns: tuple[str, ...], rows: tuple[tuple[Cell, ...], ...]) -> Section:
     words = (
-        f"{len(tracked.ids)} markers of the free state were found again in at least one other state. A link is in doubt where it is less "
-        "probable than one half, or where the marker departs from the smooth motion of its neighbours; such markers are not used by an "
-        "identification.",
+        f"{len(tracked.ids)} markers of the reference state were found again in at least one other state. A link is suspect where its "
+        "probability is below one half, or where the marker is an outlier to the smooth motion of its neighbours; suspect markers are not "
+        "used by an identification.",
     )
-    table = Table("Markers", columns, rows, caption="found in every scan, and linked to the free state")
+    table = Table("Markers", columns, rows, caption="found in every scan, and linked to the reference state")
     return Section("Markers", words, (table,), tuple(_figure(tracked, s) for s in range(1, len(tracked.names))))
 
 
@@ -173,12 +208,12 @@ def _figure(tracked: TrackedMarkers, s: int) -> Figure:
             _projection(axis, before, after, flags, a, b)
         canvas.axes[0].legend(loc="upper left", bbox_to_anchor=(0.0, -0.18), ncols=4, frameon=False)
 
-    caption = "Arrows from where the markers were to where they are; seen along y, x and z."
+    caption = "Displacement of the markers from the reference state, seen along y, x and z."
     return Figure(f"State {tracked.names[s]}", caption, draw, (10.5, 4.2))
 
 
 def _projection(axis: Axes, before: np.ndarray, after: np.ndarray, flags: np.ndarray, a: int, b: int) -> None:
-    for flag, colour, label in (("ok", "#2a788e", "linked"), ("suspect", "#d95f02", "in doubt")):
+    for flag, colour, label in (("ok", "#2a788e", "linked"), ("suspect", "#d95f02", "suspect")):
         some = flags == flag
         if not some.any():
             continue

@@ -10,9 +10,11 @@ from marker_scenes import lattice, render_spheres
 from scipy.spatial import cKDTree
 
 from naibu.core.errors import InputError
+from naibu.core.progress import ProgressReport
 from naibu.core.rigid_transform import rotation_matrix
 from naibu.core.volume import Volume
 from naibu.imaging.markers.detection import DetectedMarkers, detect_markers
+from naibu.imaging.markers.settings import DetectionSettings
 from naibu.imaging.markers.washers import slice_profile
 
 GRID = lattice((4, 4, 3), 5.0, 0.8)
@@ -129,7 +131,7 @@ def test_what_cannot_be_searched_is_refused() -> None:
     ):
         with pytest.raises(InputError, match=words):
             detect_markers(volume, **arguments)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="all voxels are 1000"):
+    with pytest.raises(InputError, match="all voxels of volume are 1000"):
         detect_markers(volume.with_values(np.full(volume.shape, 1000)), diameter_mm=2.0)
     broken = volume.values.copy()
     broken[3, 4, 5] = np.nan
@@ -141,3 +143,39 @@ def test_an_empty_volume_says_what_contrast_there_was() -> None:
     nothing = render_spheres(np.zeros((0, 3)), noise=20.0)
     with pytest.raises(InputError, match=r"contrast of [\d.]+, [\d.]+ times the noise"):
         detect_markers(nothing, diameter_mm=2.0)
+
+
+def test_settings_decide_what_is_a_marker() -> None:
+    volume = render_spheres(GRID)
+    found = detect_markers(volume, diameter_mm=2.0)
+    with pytest.raises(InputError, match=r"\(100000 times are needed\)"):
+        detect_markers(volume, diameter_mm=2.0, settings=DetectionSettings(min_contrast=1e5))
+    with pytest.raises(InputError, match="too small"):
+        detect_markers(volume, diameter_mm=2.0, settings=DetectionSettings(size_range=(3.0, 4.0)))
+    with pytest.raises(InputError, match="no stronger than noise"):
+        detect_markers(volume, diameter_mm=2.0, settings=DetectionSettings(above_chance=1e4))
+    close = detect_markers(volume, diameter_mm=2.0, settings=DetectionSettings(min_distance=3.0))
+    assert len(close) < len(found)
+
+
+def test_detection_settings_out_of_range_are_refused() -> None:
+    for arguments, words in (
+        ({"min_contrast": 0.0}, "min_contrast must be positive"),
+        ({"outlier_sd": -1.0}, "outlier_sd must be positive"),
+        ({"size_ratio": 0.9}, "size_ratio must lie between 1 and infinity"),
+        ({"content_ratio": np.nan}, "content_ratio must lie"),
+        ({"elongation_ratio": 0.0}, "elongation_ratio must lie"),
+        ({"spread_sd": -1.0}, "spread_sd must lie"),
+        ({"min_distance": -0.1}, "min_distance must lie"),
+        ({"above_chance": np.inf}, "above_chance must lie"),
+        ({"size_range": (2.2, 0.4)}, "size_range must be two increasing positive numbers"),
+    ):
+        with pytest.raises(InputError, match=words):
+            DetectionSettings(**arguments)  # type: ignore[arg-type]
+
+
+def test_progress_of_a_detection_is_reported() -> None:
+    reports: list[ProgressReport] = []
+    detect_markers(render_spheres(GRID), diameter_mm=2.0, progress=reports.append)
+    assert [r.stage for r in reports] == ["finding peaks", "fitting blobs", "locating markers", "locating markers"]
+    assert [r.done for r in reports] == [0, 1, 2, 3] and reports[-1].fraction == 1.0

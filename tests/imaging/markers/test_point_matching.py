@@ -11,11 +11,12 @@ from marker_scenes import Cloud, lattice, particle_cloud
 from naibu import datasets
 from naibu.core.errors import InputError
 from naibu.imaging.markers.point_matching import link_markers
+from naibu.imaging.markers.settings import LinkSettings
 
 
 def judged(cloud: Cloud) -> tuple[float, float]:
-    """Return the share of possible links that are right, and the share of links that are wrong."""
-    right, possible, wrong = cloud.judged(link_markers(cloud.reference, cloud.moving).pairs)
+    """Return the fraction of possible links that are right, and the fraction of links that are wrong."""
+    right, possible, wrong = cloud.judged(link_markers(cloud.reference, cloud.deformed).pairs)
     return right / possible, wrong / max(right + wrong, 1)
 
 
@@ -67,12 +68,12 @@ def test_links_do_not_depend_on_the_order_of_markers_or_on_the_unit(seed: int, s
     assert len(links) == len(x)
 
 
-def test_no_marker_is_used_twice_and_strangers_stay_alone() -> None:
+def test_no_marker_is_used_twice_and_unmatched_ones_stay_alone() -> None:
     cloud = particle_cloud(2000, 7, vanish=0.2, appear=0.2)
-    links = link_markers(cloud.reference, cloud.moving)
+    links = link_markers(cloud.reference, cloud.deformed)
     assert len(set(links.pairs[:, 0])) == len(set(links.pairs[:, 1])) == len(links)
-    everything = np.sort(np.concatenate([links.pairs[:, 1], links.unmatched_moving]))
-    assert (everything == np.arange(len(cloud.moving))).all()
+    everything = np.sort(np.concatenate([links.pairs[:, 1], links.unmatched_deformed]))
+    assert (everything == np.arange(len(cloud.deformed))).all()
     assert len(links.unmatched_reference) == len(cloud.reference) - len(links)
     wrong = cloud.truth[links.pairs[:, 0]] != links.pairs[:, 1]
     assert links.confidence[wrong].mean() < links.confidence[~wrong].mean()
@@ -105,10 +106,10 @@ def test_measured_washers_are_linked_as_the_report_numbers_them(name: str, state
 def test_clouds_that_cannot_be_linked_are_refused() -> None:
     points = np.random.default_rng(0).uniform(size=(20, 3))
     for a, b, words in (
-        (points[:2], points, "holds 2 markers"),
+        (points[:2], points, "reference_points has 2 rows; at least 3 are needed"),
         (points, points[:, :2], "same dimension"),
         (points[:, :1], points, "shape"),
-        (np.where(np.arange(20)[:, None] == 3, np.nan, points), points, "leave incomplete markers out"),
+        (np.where(np.arange(20)[:, None] == 3, np.nan, points), points, r"reference_points\[3, 0\] is nan"),
         (np.ones((5, 3)), points, "no structure"),
     ):
         with pytest.raises(InputError, match=words):
@@ -118,7 +119,39 @@ def test_clouds_that_cannot_be_linked_are_refused() -> None:
 
 
 @pytest.mark.parametrize("n", [20, 100, 300, 900])
-def test_strangers_are_not_linked(n: int) -> None:
+def test_unrelated_clouds_are_not_linked(n: int) -> None:
     rng = np.random.default_rng(n)
     with pytest.raises(InputError, match="no common structure"):
         link_markers(rng.uniform(size=(n, 3)), rng.uniform(size=(n, 3)))
+
+
+def test_both_ways_of_linking_find_the_same_links() -> None:
+    cloud = particle_cloud(300, 4, waviness=0.1, vanish=0.0, appear=0.0)
+    whole, grown = (link_markers(cloud.reference, cloud.deformed, settings=LinkSettings(assign_up_to=n)) for n in (600, 0))
+    for links in (whole, grown):
+        right, possible, _ = cloud.judged(links.pairs)
+        assert right > 0.97 * possible
+
+
+def test_limits_of_the_residual_decide_which_links_are_kept() -> None:
+    cloud = particle_cloud(900, 2, noise=0.08)
+    kept = [len(link_markers(cloud.reference, cloud.deformed, settings=LinkSettings(residual_factor=f))) for f in (1.5, 4.5)]
+    assert kept[0] < 0.95 * kept[1]
+    links = link_markers(cloud.reference, cloud.deformed, settings=LinkSettings(residual_bounds=(0.0, 0.1)))
+    assert links.residual_mm.max() < 0.25  # points are about one spacing apart, which varies from place to place
+
+
+def test_link_settings_out_of_range_are_refused() -> None:
+    for arguments, words in (
+        ({"assign_up_to": -1}, "assign_up_to must lie between 0 and infinity"),
+        ({"min_agreement": 1.2}, "min_agreement must lie between 0 and 1"),
+        ({"min_mean_confidence": -0.1}, "min_mean_confidence must lie"),
+        ({"residual_factor": 0.0}, "residual_factor must be positive"),
+        ({"spline_residual_factor": np.nan}, "spline_residual_factor must be positive"),
+        ({"residual_bounds": (0.8, 0.15)}, "residual_bounds must be two increasing numbers"),
+        ({"spline_residual_bounds": (0.1,)}, "spline_residual_bounds must be two"),
+        ({"search_radii": ()}, "search_radii must be increasing"),
+        ({"search_radii": (4.0, 2.0)}, "search_radii must be increasing"),
+    ):
+        with pytest.raises(InputError, match=words):
+            LinkSettings(**arguments)  # type: ignore[arg-type]

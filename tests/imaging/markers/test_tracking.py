@@ -96,24 +96,25 @@ def test_joint_positions_are_better_and_say_so() -> None:
         before, after = (np.sqrt(np.mean((p - truth)[:, :, 2] ** 2)) for p in (measured, better.points))
         gains.append(after / before)
         ratio.append((better.points - truth) / np.sqrt(np.einsum("snii->sni", better.covariance)))
-        assert better.departing.mean() < 0.01
+        assert better.outliers.mean() < 0.01
     assert max(gains) < 0.75
     assert 0.8 < np.sqrt(np.mean(np.square(ratio))) < 1.25
 
 
-def test_a_position_that_departs_is_told_and_left_alone() -> None:
+def test_an_outlier_is_reported_and_not_updated() -> None:
     x = lattice((4, 4, 4), 10.0, 0.5)
     states = np.stack([x, x * (1.1, 1.1, 0.85)])
     states[1, 20] += (0.0, 3.0, 0.0)
     better = joint_positions(states, np.broadcast_to(1e-3 * np.eye(3), (2, 64, 3, 3)).copy())
-    assert np.flatnonzero(better.departing[1]).tolist() == [20]
+    assert np.flatnonzero(better.outliers[1]).tolist() == [20]
     assert (better.points[1, 20] == states[1, 20]).all()
 
 
 def test_what_cannot_be_followed_is_refused() -> None:
     volumes = scans([GRID, pressed(GRID, 0.85)])
     for arguments, words in (
-        ({"volumes": volumes[:1]}, "at least two volumes"),
+        ({"volumes": volumes[:1]}, "volumes must be at least two"),
+        ({"volumes": volumes, "min_confidence": 1.5}, "min_confidence must lie between 0 and 1, not 1.5"),
         ({"volumes": volumes, "names": ["a"]}, "names has 1 entries for 2"),
         ({"volumes": volumes, "names": ["a", "a"]}, "names must differ"),
         ({"volumes": volumes, "masks": [None]}, "masks has 1"),

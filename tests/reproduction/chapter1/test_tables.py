@@ -114,8 +114,8 @@ def test_the_phantom_is_a_calf() -> None:
     kinds = phantom.tissue(np.array(list(at.values())))
     assert [TISSUES[k] for k in kinds] == list(at)
     around = np.column_stack([*(np.array(TIBIA)[:, None] + 11.0 * np.array([np.cos(t := np.linspace(0, 6, 40)), np.sin(t)])), 0.0 * t])
-    assert phantom.grey(around).max() < 60.0 < phantom.grey(np.array([at["bone"]]))[0]  # dark rim, bright marrow
-    assert (CalfPhantom(1).grey(around + np.array([40.0, 20.0, 0.0])) != 4.0).any()
+    assert phantom.intensity(around).max() < 60.0 < phantom.intensity(np.array([at["bone"]]))[0]  # dark rim, bright marrow
+    assert (CalfPhantom(1).intensity(around + np.array([40.0, 20.0, 0.0])) != 4.0).any()
     assert judged_slices(calf_case(0, pixels=16, slices=29).reference) == slice(10, 51)
 
 

@@ -33,8 +33,8 @@ CLEAN_CT = CTDevice(noise=0.0, blur_mm=0.0, cupping=0.0, offset=0.0)
 GEL = 1000.0
 
 
-def uniform(grey: float = GEL):
-    return lambda x: np.full(len(x), grey)
+def uniform(intensity: float = GEL):
+    return lambda x: np.full(len(x), intensity)
 
 
 def volume_of(kind: MarkerKind) -> float:
@@ -52,7 +52,7 @@ def centroid(volume: Volume, background: float = GEL) -> Array:
     return volume.to_physical((extra[..., None] * index).sum(axis=(0, 1, 2)) / extra.sum())
 
 
-BALL = MarkerKind(3.0, grey=3000.0)
+BALL = MarkerKind(3.0, intensity=3000.0)
 PLACE = st.tuples(*[st.floats(-1.0, 1.0)] * 3)
 
 
@@ -62,7 +62,7 @@ def test_a_ball_keeps_its_volume_and_its_place(place: tuple[float, ...], spacing
     body = VirtualObject.of(uniform(), [place], BALL)
     found = scan(body, Still(), empty_grid([-6] * 3, [6] * 3, spacing), CTDevice(0.0, blur, 0.0, 0.0), seed=0, samples=1)
     extra = found.volume.values.astype(float) - GEL
-    contained = extra.sum() * np.prod(spacing) / (BALL.grey - GEL)
+    contained = extra.sum() * np.prod(spacing) / (BALL.intensity - GEL)
     assert contained == pytest.approx(volume_of(BALL), rel=0.02)
     assert (np.abs(centroid(found.volume) - place) <= 0.02 * np.array(spacing)).all()
     np.testing.assert_allclose(found.markers.points, [place])
@@ -73,7 +73,7 @@ def test_a_flat_washer_fills_its_share_of_every_slice(height: float) -> None:
     body = VirtualObject.of(uniform(), [[0.1, -0.2, height]], STEEL_WASHER)
     spacing = (0.25, 0.25, 0.5)
     values = scan(body, Still(), empty_grid([-4] * 3, [4] * 3, spacing), CLEAN_CT, seed=0, samples=1).volume.values.astype(float)
-    found = (values - GEL).sum(axis=(1, 2)) * np.prod(spacing) / (STEEL_WASHER.grey - GEL) / volume_of(STEEL_WASHER)
+    found = (values - GEL).sum(axis=(1, 2)) * np.prod(spacing) / (STEEL_WASHER.intensity - GEL) / volume_of(STEEL_WASHER)
     faces = -4.25 + 0.5 * np.arange(len(found) + 1)
     half = 0.5 * STEEL_WASHER.thickness_mm
     inside = np.clip(np.minimum(faces[1:], height + half) - np.maximum(faces[:-1], height - half), 0.0, None)
@@ -89,7 +89,7 @@ def test_a_washer_keeps_its_volume_and_its_place_however_it_lies(place: tuple[fl
     grid = empty_grid([-5] * 3, [5] * 3, spacing)
     found = scan(body, Still(), grid, CTDevice(0.0, blur, 0.0, 0.0), seed=0, samples=1).volume
     extra = found.values.astype(float) - GEL
-    assert extra.sum() * np.prod(spacing) / (STEEL_WASHER.grey - GEL) == pytest.approx(volume_of(STEEL_WASHER), rel=0.02)
+    assert extra.sum() * np.prod(spacing) / (STEEL_WASHER.intensity - GEL) == pytest.approx(volume_of(STEEL_WASHER), rel=0.02)
     # a washer thinner than a slice tells its height by the point spread function alone
     assert (np.abs(centroid(found) - place) <= 0.02 * spacing).all()
     z, y, x = np.indices(extra.shape)
@@ -153,9 +153,9 @@ def pressed() -> MeshMotion:
 def test_a_solved_model_moves_there_and_back(pressed: MeshMotion) -> None:
     rng = np.random.default_rng(0)
     inside = rng.uniform([-11, -9, 0.5], [11, 9, 15.5], (400, 3))
-    places = pressed.to_space(inside)
-    assert np.linalg.norm(places - inside, axis=1).max() > 2.0
-    np.testing.assert_allclose(pressed.to_material(places), inside, atol=1e-8)
+    positions = pressed.to_space(inside)
+    assert np.linalg.norm(positions - inside, axis=1).max() > 2.0
+    np.testing.assert_allclose(pressed.to_material(positions), inside, atol=1e-8)
     # nodes go where the model says
     np.testing.assert_allclose(pressed.to_space(pressed.mesh.points), pressed.mesh.points + pressed.displacement, atol=1e-9)
     # the plate has left its place: there is no material where it pressed
@@ -165,11 +165,11 @@ def test_a_solved_model_moves_there_and_back(pressed: MeshMotion) -> None:
 def test_a_solved_model_carries_markers_and_texture(pressed: MeshMotion) -> None:
     """Markers lie where the model says, and texture read where the model carries a point is that of the point."""
     block = layered_block((24.0, 20.0, 16.0), ((GEL, np.inf),), texture=100.0, seed=1)
-    places = np.array([[6.0, 4.0, 12.0], [-6.0, -3.0, 5.0], [0.0, 0.0, 8.0]])
-    body = VirtualObject.of(uniform(), places, BALL)
+    positions = np.array([[6.0, 4.0, 12.0], [-6.0, -3.0, 5.0], [0.0, 0.0, 8.0]])
+    body = VirtualObject.of(uniform(), positions, BALL)
     grid = empty_grid([-16.25, -13.25, -2.25], [16, 13, 18], 0.5)
     found = scan(body, pressed, grid, CLEAN_CT, seed=0, samples=1)
-    np.testing.assert_allclose(found.markers.points, pressed.to_space(places), atol=1e-12)
+    np.testing.assert_allclose(found.markers.points, pressed.to_space(positions), atol=1e-12)
     for i, truth in enumerate(found.markers.points):
         low = np.floor(grid.to_index(truth)).astype(int) - 4
         assert (np.abs(centroid(found.volume.cropped(low, low + 10)) - truth) < 0.02 * 0.5).all(), i
@@ -179,8 +179,8 @@ def test_a_solved_model_carries_markers_and_texture(pressed: MeshMotion) -> None
     material_point = pressed.to_material(grid.to_physical([[i, j, k]]))
     assert textured.values[k, j, i] == pytest.approx(block(material_point)[0], abs=0.5)
     # volume: the gel keeps its volume to what a Poisson ratio of .45 leaves
-    share = (textured.values > 500).sum() * 0.125 / (24 * 20 * 16)
-    assert share == pytest.approx(_volume(pressed), rel=0.01)
+    fraction = (textured.values > 500).sum() * 0.125 / (24 * 20 * 16)
+    assert fraction == pytest.approx(_volume(pressed), rel=0.01)
 
 
 def _volume(motion: MeshMotion) -> float:
@@ -252,8 +252,8 @@ def test_the_streaks_of_a_disc_are_those_of_abels_integral() -> None:
     step = 0.25
     s = step * np.hypot(x, y)
     sub = (np.arange(8) + 0.5) / 8 - 0.5
-    share = np.mean([step * np.hypot(x + a, y + b) <= radius for a in sub for b in sub], axis=0, dtype=np.float32)
-    found = streaks(share[None], np.array([step, step, 1.0]), loss)[0]
+    fraction = np.mean([step * np.hypot(x + a, y + b) <= radius for a in sub for b in sub], axis=0, dtype=np.float32)
+    found = streaks(fraction[None], np.array([step, step, 1.0]), loss)[0]
     expected = -loss * 8.0 / np.pi * np.sqrt(np.maximum(radius**2 - s**2, 0.0))
     inside, outside = s < 0.9 * radius, (s > 1.1 * radius) & (s < 9.0)
     assert np.abs(found - expected)[inside].max() < 0.04 * np.abs(expected).max()
@@ -262,7 +262,7 @@ def test_the_streaks_of_a_disc_are_those_of_abels_integral() -> None:
 
 def test_streaks_join_markers_and_only_markers() -> None:
     grid = empty_grid([-15, -15, 0], [15, 15, 4], 0.5)
-    pair = VirtualObject.of(uniform(), [[-6.0, 0.0, 2.0], [6.0, 0.0, 2.0]], MarkerKind(3.0, grey=3600.0))
+    pair = VirtualObject.of(uniform(), [[-6.0, 0.0, 2.0], [6.0, 0.0, 2.0]], MarkerKind(3.0, intensity=3600.0))
     plain, hardened = (
         scan(pair, Still(), grid, CTDevice(0.0, 0.0, 0.0, 0.0, streaks_per_mm=s), seed=0, samples=1).volume.values.astype(float)
         for s in (0.0, 0.1)
@@ -286,9 +286,9 @@ def test_textures_have_unit_spread_and_repeat() -> None:
 
 
 def test_layers_and_bubbles_are_where_they_are_said_to_be() -> None:
-    grey = layered_block((10.0, 8.0, 6.0), ((500.0, 2.0), (900.0, np.inf)), texture=0.0, bubbles=[((0.0, 0.0, 4.0), 1.0)])
+    intensity = layered_block((10.0, 8.0, 6.0), ((500.0, 2.0), (900.0, np.inf)), texture=0.0, bubbles=[((0.0, 0.0, 4.0), 1.0)])
     points = np.array([[0, 0, 1], [4.9, 3.9, 5.9], [0, 0, 4.5], [0, 0, 6.1], [5.1, 0, 1], [0, 0, -0.1]], dtype=float)
-    np.testing.assert_array_equal(grey(points), [500.0, 900.0, 0.0, 0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(intensity(points), [500.0, 900.0, 0.0, 0.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("name", ["ct_test_piece", "ct_two_material_1"])
@@ -296,7 +296,7 @@ def test_measured_states_are_scanned_anew(name: str) -> None:
     """Every trusted, complete marker of the report's measurements is a washer at its measured place, and texture goes with the gel."""
     experiment = datasets.load(name)
     spacing = np.array([1.0, 1.0, 1.0])
-    scans = rescanned(experiment, spacing_mm=spacing, kind=MarkerKind(3.0, grey=3600.0), device=CLEAN_CT)
+    scans = rescanned(experiment, spacing_mm=spacing, kind=MarkerKind(3.0, intensity=3600.0), device=CLEAN_CT)
     measured = [s for s in experiment.states if s.markers is not None]
     assert set(scans) == {s.name for s in measured}
     for state in measured:
@@ -335,7 +335,7 @@ def test_nonsense_is_refused() -> None:
     for work, told in (
         (lambda: MarkerKind(0.0), "positive diameter"),
         (lambda: MarkerKind(2.0, 0.3, 2.5), "larger than its hole"),
-        (lambda: VirtualObject.of(uniform(), [[np.nan, 0, 0]], BALL), "finite places"),
+        (lambda: VirtualObject.of(uniform(), [[np.nan, 0, 0]], BALL), "finite positions"),
         (lambda: VirtualObject.of(uniform(), [[0.0, 0, 0]], BALL, normals=[[0.0, 0, 0]]), "length zero"),
         (lambda: scan(body, Still(), grid, CLEAN_CT, seed=0, samples=0), "at least one sample"),
         (lambda: empty_grid([0, 0, 0], [1, 1, -1], 1.0), "low < high"),

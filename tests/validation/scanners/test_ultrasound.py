@@ -14,7 +14,7 @@ from naibu.validation.scanners.motions import FormulaMotion, Still
 from naibu.validation.scanners.ultrasound import Ghost, Scatterers, UltrasoundDevice, ultrasound, ultrasound_sequence
 
 LINEAR = UltrasoundDevice(spread_mm=(0.5, 0.25, 0.8), noise=0.0, range_db=None)
-BEAD = MarkerKind(2.0, grey=30.0)
+BEAD = MarkerKind(2.0, intensity=30.0)
 
 
 def even(level: float = 1.0):
@@ -146,7 +146,7 @@ def test_volumes_of_ultrasound_have_three_axes_of_speckle() -> None:
     device = UltrasoundDevice(spread_mm=(0.5, 0.3, 0.5), noise=0.0, range_db=None)
     grid = empty_grid([0, 0, 0], [10, 10, 10], 0.5)
     seen = Scatterers.drawn(even(), [-2, -2, -2], [12, 12, 12], per_mm3=15.0 / device.cell_mm3, seed=0)
-    found = ultrasound(VirtualObject.of(even(), [[5.0, 5.0, 5.0]], MarkerKind(2.0, grey=40.0)), seen, Still(), grid, device, seed=0)
+    found = ultrasound(VirtualObject.of(even(), [[5.0, 5.0, 5.0]], MarkerKind(2.0, intensity=40.0)), seen, Still(), grid, device, seed=0)
     assert found.volume.values[10, 10, 10] == pytest.approx(40.0, rel=0.1)
     far = found.volume.values[::4, :4, ::4]
     assert far.mean() / far.std() == pytest.approx(1.913, rel=0.25)

@@ -1,5 +1,5 @@
 # mypy: disallow-untyped-decorators=False
-"""Numba kernels behind `naibu.imaging.markers.detection`: peaks, their contrast to what lies around, and Gaussian blobs fitted to them."""
+"""Numba kernels for `naibu.imaging.markers.detection`: local maxima, their contrast, and Gaussian blobs :cite:p:`marquardt1963`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from naibu.core.arrays import AnyArray, BoolArray, FloatArray, IntArray
 
 # background, height, centre (3), and the lower triangle, row by row, of the Cholesky factor of the inverse covariance (6)
 BLOB_PARAMETERS = 11
-_ROUNDS = 25
+_ROUNDS = 25  # Levenberg-Marquardt steps at most; empirical
 _DONE = 1e-4  # of the step of the centre, in units of the start's width
 
 
@@ -43,8 +43,8 @@ def mark_peaks(v: AnyArray, allowed: BoolArray, reach: IntArray, least: float, p
 
 
 @njit(cache=True, parallel=True)
-def shell_contrast(v: AnyArray, peaks: IntArray, shell: IntArray, share: float, out: FloatArray) -> None:
-    """Fill out (n,) with how far v at the peaks (n, 3) lies above that share of the voxels at the offsets `shell` (m, 3); all z, y, x."""
+def shell_contrast(v: AnyArray, peaks: IntArray, shell: IntArray, fraction: float, out: FloatArray) -> None:
+    """Fill out (n,) with v at the peaks (n, 3) less that quantile of the voxels at the offsets `shell` (m, 3); all z, y, x."""
     nz, ny, nx = v.shape
     for p in prange(len(peaks)):
         around = np.empty(len(shell))
@@ -53,7 +53,7 @@ def shell_contrast(v: AnyArray, peaks: IntArray, shell: IntArray, share: float, 
             j = min(max(peaks[p, 1] + shell[s, 1], 0), ny - 1)
             i = min(max(peaks[p, 2] + shell[s, 2], 0), nx - 1)
             around[s] = v[k, j, i]
-        out[p] = v[peaks[p, 0], peaks[p, 1], peaks[p, 2]] - np.sort(around)[int(share * (len(shell) - 1))]
+        out[p] = v[peaks[p, 0], peaks[p, 1], peaks[p, 2]] - np.sort(around)[int(fraction * (len(shell) - 1))]
 
 
 @njit(cache=True)
@@ -68,7 +68,7 @@ def _window(centre: FloatArray, spacing: FloatArray, radius: FloatArray, shape: 
 
 
 @njit(cache=True)
-def _blob(p: FloatArray, x: float, y: float, z: float, slope: FloatArray) -> float:
+def _blob(p: FloatArray, x: float, y: float, z: float, derivatives: FloatArray) -> float:
     """Return the blob p at a point (mm) and fill its derivatives (11,) by the parameters."""
     dx, dy, dz = x - p[2], y - p[3], z - p[4]
     u0 = p[5] * dx + p[6] * dy + p[8] * dz
@@ -76,24 +76,24 @@ def _blob(p: FloatArray, x: float, y: float, z: float, slope: FloatArray) -> flo
     u2 = p[10] * dz
     e = np.exp(-0.5 * (u0 * u0 + u1 * u1 + u2 * u2))
     f = p[1] * e
-    slope[0], slope[1] = 1.0, e
-    slope[2], slope[3], slope[4] = f * p[5] * u0, f * (p[6] * u0 + p[7] * u1), f * (p[8] * u0 + p[9] * u1 + p[10] * u2)
-    slope[5], slope[6], slope[7] = -f * u0 * dx, -f * u0 * dy, -f * u1 * dy
-    slope[8], slope[9], slope[10] = -f * u0 * dz, -f * u1 * dz, -f * u2 * dz
+    derivatives[0], derivatives[1] = 1.0, e
+    derivatives[2], derivatives[3], derivatives[4] = f * p[5] * u0, f * (p[6] * u0 + p[7] * u1), f * (p[8] * u0 + p[9] * u1 + p[10] * u2)
+    derivatives[5], derivatives[6], derivatives[7] = -f * u0 * dx, -f * u0 * dy, -f * u1 * dy
+    derivatives[8], derivatives[9], derivatives[10] = -f * u0 * dz, -f * u1 * dz, -f * u2 * dz
     return float(p[0] + f)
 
 
 @njit(cache=True)
 def _gather(v: AnyArray, sign: float, low: IntArray, high: IntArray, spacing: FloatArray, others: FloatArray, data: FloatArray) -> None:
     """Fill data (k, 4) with x, y, z (mm) and value of the voxels of a window, less the blobs `others` (m, 11)."""
-    n, slope = 0, np.empty(11)
+    n, derivatives = 0, np.empty(11)
     for k in range(low[2], high[2]):
         for j in range(low[1], high[1]):
             for i in range(low[0], high[0]):
                 x, y, z = i * spacing[0], j * spacing[1], k * spacing[2]
                 value = sign * v[k, j, i]
                 for m in range(len(others)):
-                    value -= _blob(others[m], x, y, z, slope) - others[m, 0]
+                    value -= _blob(others[m], x, y, z, derivatives) - others[m, 0]
                 data[n, 0], data[n, 1], data[n, 2], data[n, 3] = x, y, z, value
                 n += 1
 
@@ -101,16 +101,16 @@ def _gather(v: AnyArray, sign: float, low: IntArray, high: IntArray, spacing: Fl
 @njit(cache=True)
 def _normal_equations(p: FloatArray, data: FloatArray, matrix: FloatArray, right: FloatArray) -> float:
     """Fill J^T J and J^T r of a blob at the data (k, 4); return the sum of squared residuals."""
-    slope = np.empty(11)
+    derivatives = np.empty(11)
     matrix[:], right[:] = 0.0, 0.0
     total = 0.0
     for n in range(len(data)):
-        r = data[n, 3] - _blob(p, data[n, 0], data[n, 1], data[n, 2], slope)
+        r = data[n, 3] - _blob(p, data[n, 0], data[n, 1], data[n, 2], derivatives)
         total += r * r
         for a in range(11):
-            right[a] += slope[a] * r
+            right[a] += derivatives[a] * r
             for b in range(a + 1):
-                matrix[a, b] += slope[a] * slope[b]
+                matrix[a, b] += derivatives[a] * derivatives[b]
     for a in range(11):
         for b in range(a):
             matrix[b, a] = matrix[a, b]
@@ -128,8 +128,8 @@ def _acceptable(p: FloatArray, start: FloatArray, radius: FloatArray, least: Flo
 
 
 @njit(cache=True)
-def _hold(p: FloatArray, start: FloatArray, variance: float, tilt: float, matrix: FloatArray, right: FloatArray) -> float:
-    """Add to the normal equations what is known of the shape beforehand: widths within a factor, `tilt` as weight; return its misfit."""
+def _add_prior(p: FloatArray, start: FloatArray, variance: float, tilt: float, matrix: FloatArray, right: FloatArray) -> float:
+    """Add the prior on the shape to the normal equations: widths near those of the start, `tilt` as weight; return its misfit."""
     total = 0.0
     for a in range(5, 11):
         diagonal = a == 5 or a == 7 or a == 10
@@ -150,7 +150,7 @@ def _fit_one(
     start, damping = p.copy(), 1.0
     matrix, right = np.zeros((11, 11)), np.zeros(11)
     trial_matrix, trial_right = np.zeros((11, 11)), np.zeros(11)
-    total = _normal_equations(p, data, matrix, right) + _hold(p, start, variance, tilt, matrix, right)
+    total = _normal_equations(p, data, matrix, right) + _add_prior(p, start, variance, tilt, matrix, right)
     width = 1.0 / p[5]
     for _ in range(_ROUNDS):
         damped = matrix.copy()
@@ -159,7 +159,7 @@ def _fit_one(
         step = np.linalg.solve(damped, right)
         trial = p + step
         if _acceptable(trial, start, radius, least):
-            trial_total = _normal_equations(trial, data, trial_matrix, trial_right) + _hold(
+            trial_total = _normal_equations(trial, data, trial_matrix, trial_right) + _add_prior(
                 trial, start, variance, tilt, trial_matrix, trial_right
             )
             if trial_total <= total:
@@ -197,16 +197,16 @@ def fit_blobs(
     out: FloatArray,
     covariance: FloatArray,
 ) -> None:
-    """Fit a Gaussian blob around every start, the others near it taken away.
+    """Fit a Gaussian blob around every start, the others near it subtracted.
 
     Parameters
     ----------
     v : ndarray, shape (nz, ny, nx)
-        Grey values; `sign` is -1 where the blobs are darker than what lies around.
+        Intensities; `sign` is -1 where the blobs are darker than their surroundings.
     variance : float
-        Of the noise of a voxel: how firmly a blob is held to its usual shape where it is faint.
+        Of the noise of a voxel, intensity^2: weight of the prior on the shape, which matters for faint blobs.
     tilt : float
-        How firmly the axes of the blobs are held to those of the volume, relative to that; a huge number allows no other.
+        Weight of the prior on the axes of the blobs, those of the volume, relative to that; a huge number constrains them.
     blobs : ndarray, shape (n, 11)
         Starts: see `BLOB_PARAMETERS`; positions are indices times spacing, mm.
     first, near : ndarray, shape (n + 1,), (m,)

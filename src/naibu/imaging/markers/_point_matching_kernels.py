@@ -1,8 +1,5 @@
 # mypy: disallow-untyped-decorators=False
-"""Numba kernels behind `naibu.imaging.markers.point_matching`.
-
-Nearest points, local affine motion, guesses that are tried, links that grow.
-"""
+"""Numba kernels for `naibu.imaging.markers.point_matching`: nearest points, local affine fits, guesses, and growth of links."""
 
 from __future__ import annotations
 
@@ -12,8 +9,8 @@ from numba import prange
 from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray, IntArray
 
-# a local gradient is held to the one expected as firmly as this many neighbours at one spacing would do
-HOLD = 0.5
+# weight of the prior on a local deformation gradient: that of this many neighbours at a distance of one spacing; empirical
+PRIOR = 0.5
 
 
 @njit(cache=True)
@@ -68,7 +65,7 @@ def _nearest(
 def _affine(
     x: FloatArray, y: FloatArray, w: FloatArray, count: int, expected: FloatArray, scale: float, value: FloatArray, gradient: FloatArray
 ) -> None:
-    """Fit y = value + gradient x, weighted, the gradient held to the one expected; x (c, d) are offsets, y (c, d) positions."""
+    """Fit y = value + gradient x, weighted, with a prior on the gradient; x (c, d) are offsets, y (c, d) positions."""
     d = x.shape[1]
     matrix, right = np.zeros((d + 1, d + 1)), np.zeros((d + 1, d))
     for c in range(count):
@@ -78,7 +75,7 @@ def _affine(
                 matrix[a, b] += xa * (1.0 if b == 0 else x[c, b - 1])
             for b in range(d):
                 right[a, b] += xa * y[c, b]
-    hold = HOLD * scale * scale
+    hold = PRIOR * scale * scale
     for a in range(d):
         matrix[a + 1, a + 1] += hold
         for b in range(d):
@@ -94,7 +91,7 @@ def _affine(
 @njit(cache=True)
 def _aligned_once(
     x: FloatArray,
-    moving: FloatArray,
+    deformed: FloatArray,
     origin: FloatArray,
     width: float,
     dims: IntArray,
@@ -109,7 +106,7 @@ def _aligned_once(
     gradient: FloatArray,
     seen: FloatArray,
 ) -> int:
-    """Pair the first k offsets x with the nearest moving points within reach and refit; return how many are paired, and distances."""
+    """Pair the first k offsets x with the nearest deformed points within reach and refit; return the number of pairs; fill distances."""
     d = x.shape[1]
     offsets, targets, weights, at = np.empty((k + 1, d)), np.empty((k + 1, d)), np.ones(k + 1), np.empty(d)
     offsets[0], targets[0] = 0.0, anchor
@@ -119,10 +116,10 @@ def _aligned_once(
             at[a] = value[a]
             for b in range(d):
                 at[a] += gradient[a, b] * x[c, b]
-        p, distance = _nearest(moving, origin, width, dims, starts, members, at, reach)
+        p, distance = _nearest(deformed, origin, width, dims, starts, members, at, reach)
         seen[c] = distance if p >= 0 else np.inf
         if p >= 0:
-            offsets[count], targets[count] = x[c], moving[p]
+            offsets[count], targets[count] = x[c], deformed[p]
             count += 1
     _affine(offsets, targets, weights, count, start, scale, value, gradient)
     return count - 1
@@ -132,7 +129,7 @@ def _aligned_once(
 def try_guesses(
     reference: FloatArray,
     neighbours: IntArray,
-    moving: FloatArray,
+    deformed: FloatArray,
     origin: FloatArray,
     width: float,
     dims: IntArray,
@@ -146,22 +143,22 @@ def try_guesses(
     score: FloatArray,
     found: FloatArray,
 ) -> None:
-    """Try whether the surroundings of a reference point look like those of a moving one.
+    """Try whether the neighbours of a reference point are found again around a deformed one under an affine motion.
 
     Parameters
     ----------
     reference, neighbours : ndarray, shape (n, d), (n, k)
         Points, and the nearest ones around each, the closest first.
-    moving, origin, width, dims, starts, members
+    deformed, origin, width, dims, starts, members
         Points (m, d) and the grid that holds them.
     scales : ndarray, shape (g,)
-        Typical distance of neighbours among the moving points there.
+        Typical distance of neighbours among the deformed points there.
     seeds, targets, gradients : ndarray, shape (g,), (g,), (g, d, d)
-        Guesses: a reference point, the moving point that it may be, and the deformation gradient to start from.
+        Guesses: a reference point, the deformed point that it may be, and the initial deformation gradient.
     tight : float
         Distance, in scales, within which a neighbour counts as found.
     score, found : ndarray, shape (g,), (g, d, d)
-        Filled with the share of neighbours found again, and the gradient that found them.
+        Filled with the fraction of neighbours found again, and the gradient that found them.
     """
     d, k = reference.shape[1], neighbours.shape[1]
     for g in prange(len(seeds)):
@@ -169,24 +166,24 @@ def try_guesses(
         for c in range(k):
             for a in range(d):
                 x[c, a] = reference[neighbours[seeds[g], c], a] - reference[seeds[g], a]
-        value, gradient, seen = moving[targets[g]].copy(), gradients[g].copy(), np.empty(k)
-        anchor, few = moving[targets[g]].copy(), min(k, 3 * d - 1)
+        value, gradient, seen = deformed[targets[g]].copy(), gradients[g].copy(), np.empty(k)
+        anchor, few = deformed[targets[g]].copy(), min(k, 3 * d - 1)
         scale = scales[g]
         score[g] = 0.0
         found[g] = gradient
         if (
             2
             * _aligned_once(
-                x, moving, origin, width, dims, starts, members, few, 0.45 * scale, scale, gradients[g], anchor, value, gradient, seen
+                x, deformed, origin, width, dims, starts, members, few, 0.45 * scale, scale, gradients[g], anchor, value, gradient, seen
             )
             < few
         ):
             continue
         for some, reach in ((few, 0.4), (min(k, 5 * d), 0.4), (k, 0.35), (k, 0.3), (k, 0.3)):
             _aligned_once(
-                x, moving, origin, width, dims, starts, members, some, reach * scale, scale, gradients[g], anchor, value, gradient, seen
+                x, deformed, origin, width, dims, starts, members, some, reach * scale, scale, gradients[g], anchor, value, gradient, seen
             )
-        _aligned_once(x, moving, origin, width, dims, starts, members, k, 0.3 * scale, scale, gradients[g], anchor, value, gradient, seen)
+        _aligned_once(x, deformed, origin, width, dims, starts, members, k, 0.3 * scale, scale, gradients[g], anchor, value, gradient, seen)
         ratio = abs(np.linalg.det(gradient)) / max(abs(np.linalg.det(gradients[g])), 1e-12)
         if 0.4 < ratio < 2.5:
             hits = 0.0
@@ -201,7 +198,7 @@ def _predicted(
     p: int,
     reference: FloatArray,
     neighbours: IntArray,
-    moving: FloatArray,
+    deformed: FloatArray,
     link: IntArray,
     gradients: FloatArray,
     scale: float,
@@ -210,7 +207,7 @@ def _predicted(
     value: FloatArray,
     gradient: FloatArray,
 ) -> int:
-    """Predict where a reference point went from up to `most` linked neighbours, itself left out; return how many there are."""
+    """Predict the deformed position of a point from up to `most` linked neighbours, itself left out; return their number."""
     d = reference.shape[1]
     x, y, w, expected = np.empty((most, d)), np.empty((most, d)), np.empty(most), np.zeros((d, d))
     count, total = 0, 0.0
@@ -221,7 +218,7 @@ def _predicted(
         square = 0.0
         for a in range(d):
             x[count, a] = reference[q, a] - reference[p, a]
-            y[count, a] = moving[link[q], a]
+            y[count, a] = deformed[link[q], a]
             square += x[count, a] ** 2
         w[count] = 1.0 / (square / (scale * scale) + 0.5)
         expected += w[count] * gradients[q]
@@ -253,7 +250,7 @@ def _propose_one(
     t: int,
     reference: FloatArray,
     neighbours: IntArray,
-    moving: FloatArray,
+    deformed: FloatArray,
     origin: FloatArray,
     width: float,
     dims: IntArray,
@@ -275,9 +272,9 @@ def _propose_one(
     value, gradient = np.zeros(d), np.zeros((d, d))
     proposal[t], distance[t] = -1, np.inf
     predicted[t] = np.nan
-    if _predicted(p, reference, neighbours, moving, link, gradients, scales[p], most, robust, value, gradient) > 0:
+    if _predicted(p, reference, neighbours, deformed, link, gradients, scales[p], most, robust, value, gradient) > 0:
         predicted[t], fitted[t] = value, gradient
-        q, away = _nearest(moving, origin, width, dims, starts, members, value, reach[p])
+        q, away = _nearest(deformed, origin, width, dims, starts, members, value, reach[p])
         if q >= 0:
             proposal[t], distance[t] = q, away
 
@@ -286,7 +283,7 @@ def _propose_one(
 def propose(
     reference: FloatArray,
     neighbours: IntArray,
-    moving: FloatArray,
+    deformed: FloatArray,
     origin: FloatArray,
     width: float,
     dims: IntArray,
@@ -304,7 +301,7 @@ def propose(
     distance: FloatArray,
     fitted: FloatArray,
 ) -> None:
-    """Propose a moving point for every active reference point: the nearest one to where its linked neighbours predict it.
+    """Propose a deformed point for every active reference point: the nearest one to its position predicted by linked neighbours.
 
     Fills, for every active point, the prediction (NaN without linked neighbours), the proposal (-1 for none within its `reach`), its
     distance from the prediction, and the local gradient. Other arguments: see `try_guesses`; `link` (n,) and `gradients` (n, d, d) are
@@ -315,7 +312,7 @@ def propose(
             t,
             reference,
             neighbours,
-            moving,
+            deformed,
             origin,
             width,
             dims,
@@ -339,7 +336,7 @@ def propose(
 def propose_few(
     reference: FloatArray,
     neighbours: IntArray,
-    moving: FloatArray,
+    deformed: FloatArray,
     origin: FloatArray,
     width: float,
     dims: IntArray,
@@ -357,13 +354,13 @@ def propose_few(
     distance: FloatArray,
     fitted: FloatArray,
 ) -> None:
-    """Do the same as `propose` in one thread: waking others costs more than a few points."""
+    """Do the same as `propose` in one thread, for few points."""
     for t in range(len(active)):
         _propose_one(
             t,
             reference,
             neighbours,
-            moving,
+            deformed,
             origin,
             width,
             dims,
@@ -394,7 +391,7 @@ def settle(
     fitted: FloatArray,
     gradients: FloatArray,
 ) -> int:
-    """Accept proposals, the closer one where two want the same moving point; return how many links are new or changed."""
+    """Accept proposals, the closer one where two share a deformed point; return how many links are new or changed."""
     changed = 0
     for t in range(len(active)):
         p, q = active[t], proposal[t]
@@ -418,7 +415,7 @@ def settle(
 
 @njit(cache=True)
 def frontier(neighbours: IntArray, link: IntArray, tries: IntArray, most: int, near: int, active: IntArray) -> int:
-    """List unlinked points whose nearest neighbours are linked, but not where most of those tried in vain; return their number."""
+    """List unlinked points with linked nearest neighbours, unless more of these have failed; return their number."""
     count = 0
     for p in range(len(link)):
         if link[p] >= 0 or tries[p] >= most:

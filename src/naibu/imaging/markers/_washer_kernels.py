@@ -1,5 +1,5 @@
 # mypy: disallow-untyped-decorators=False
-"""Numba kernels behind `naibu.imaging.markers.washers`: what slices thicker than a washer tell of its place."""
+"""Numba kernels for `naibu.imaging.markers.washers`: likelihood of the height and tilt of a washer in slices thicker than it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def _looked_up(table: FloatArray, step: float, at: float) -> float:
 
 @njit(cache=True, parallel=True)
 def column_sums(patches: AnyArray, background: FloatArray, seen: BoolArray, out: FloatArray) -> None:
-    """Fill out (n, nj, ni) with the sums of patches (n, nk, nj, ni) over the slices `seen` (n, nk), the background (n,) taken away."""
+    """Fill out (n, nj, ni) with the sums of patches (n, nk, nj, ni) over the slices `seen` (n, nk), less the background (n,)."""
     n, nk, nj, ni = patches.shape
     for p in prange(n):
         for j in range(nj):
@@ -38,7 +38,7 @@ def column_sums(patches: AnyArray, background: FloatArray, seen: BoolArray, out:
 def _misfit(
     patch: AnyArray, columns: FloatArray, profile: FloatArray, step: float, at: float, slope: FloatArray, best: FloatArray
 ) -> float:
-    """Return the least squared residual of a plate over its height and background; fill these two in `best`."""
+    """Return the least squared residual of a plate over its contrast and background; fill these two in `best`."""
     nk = patch.shape[0]
     sm, smm, sw, sww, smw, n = 0.0, 0.0, 0.0, 0.0, 0.0, 0
     for c in range(len(columns)):
@@ -70,28 +70,28 @@ def weigh_plates(
     sd: FloatArray,
     residual: FloatArray,
 ) -> None:
-    """Weigh all heights and tilts of a plate by their likelihood.
+    """Weight all heights and tilts of a plate by their posterior probability.
 
     Parameters
     ----------
     patches : ndarray, shape (n, nk, nj, ni)
-        Grey values around every plate, k along its thin axis.
+        Intensities around every plate, k along its thin axis.
     columns : ndarray, shape (n, c, 5)
-        Of the columns that the plate covers: j, i, share of the plate, and distance from its centre along j and i, mm.
+        Columns that the plate covers: j, i, fraction of the plate, and distance from its centre along j and i, mm.
     profile, step : ndarray, float
-        What a slice sees of a plate so many slices away, tabulated at this step.
+        Fraction of a plate inside a slice at a distance in slices, tabulated at this step.
     heights : ndarray, shape (n, h)
         Heights that are tried, slices from the first of the patch.
     slopes : ndarray, shape (t,)
         Tilts that are tried, slices per mm.
     tilt_sd : ndarray, shape (1,)
-        Standard deviation of the tilts before anything is seen, slices per mm.
+        Prior standard deviation of the tilts, slices per mm.
     variance : float
-        Of the noise, as many times that of a voxel as voxels share theirs.
+        Of the noise of a voxel, times the number of voxels with common noise.
     mean, sd : ndarray, shape (n,)
         Filled with the mean and the standard deviation of the height, slices.
     residual : ndarray, shape (n, nk, c)
-        Filled with what the best plate leaves.
+        Filled with the residual of the best plate, intensity.
     """
     n, h, t = len(patches), heights.shape[1], len(slopes)
     for p in prange(n):

@@ -1,9 +1,10 @@
-"""Markers in a volume: washers and beads, dark or bright, found and located to a fraction of a voxel (spec S9 a, b).
+"""Marker detection in CT and MR volumes :cite:p:`hirai2008` (chapter 2): washers and beads, dark or bright, located to sub-voxel accuracy.
 
-The volume is smoothed to the size of the markers; peaks are compared with the shell around them, so that edges of the object, slow shading
-and noise do not count; the threshold is the valley below the population of strongest peaks. A Gaussian blob is fitted to each, its
-neighbours taken away, so that markers that touch are told apart; what differs from the population in size, shape or content (bubbles,
-streaks, specks) is rejected, and reported as such. Washers thinner than a slice are placed by `naibu.imaging.markers.washers`.
+The volume is smoothed to the size of the markers, and local maxima are candidates, as in particle tracking :cite:p:`crocker1996`. Their
+contrast is that to the shell around them, so that edges of the object, slow shading and noise do not count; the threshold is the valley
+below the population of strongest peaks. A Gaussian blob is fitted to each peak by the Levenberg-Marquardt method :cite:p:`marquardt1963`,
+with its neighbours subtracted, so that markers that touch are separated. Blobs that differ from the population in size, shape or content
+(bubbles, streaks, specks) are rejected, and reported as such. Washers thinner than a slice are located by `naibu.imaging.markers.washers`.
 """
 
 from __future__ import annotations
@@ -17,43 +18,40 @@ from scipy.spatial import cKDTree
 
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from naibu.core.errors import InputError
+from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
 from naibu.imaging.markers._blob_kernels import BLOB_PARAMETERS, fit_blobs
-from naibu.imaging.markers.peaks import POPULATION, SMOOTHING, STANDING_OUT, Peaks, find_peaks, noise_level, shell_reach, valley
+from naibu.imaging.markers.peaks import POPULATION, SMOOTHING, Peaks, find_peaks, noise_level, shell_reach, valley
+from naibu.imaging.markers.settings import DetectionSettings
 from naibu.imaging.markers.washers import placed_plates
 from naibu.imaging.preprocessing.filters import smoothed
 from naibu.imaging.preprocessing.resampling import require_mask
 
 Polarity = Literal["bright", "dark", "auto"]
 
-# what is kept lies within these ratios of the stated diameter, and of the population's median; the latter widen with its own spread
-DIAMETERS = (0.4, 2.2)
-SIZE_RATIO, CONTENT_RATIO, ELONGATION_RATIO, SPREADS = 1.28, 1.8, 1.5, 5.0
-# of so many markers and more, those that differ from the median by so many standard deviations in size, content and thickness together are
-# none
-MANY_ALIKE, FAR_APART = 20, 7.5
-# by how much the score of half of the markers exceeds that of the strongest voxel of noise: blobs fitted to noise are stronger than that
-ABOVE_CHANCE = 5.5
-SAME_MARKER = 0.45  # diameters: two fits closer than this are one marker
-# plates whose fitted width is below the second of these, in slices, and that lie this close (cosine) to an axis of the volume, are placed
-# across it by their profile; below the first one their slices are weighed, too
+# Empirical values, judged by tests/imaging/markers/test_detection.py and benchmarks/sense_markers.py, unless said otherwise.
+MANY_ALIKE = 20  # markers from which on outliers in size, content and thickness together are sought
+# standard deviations of the logarithms of size, content and thickness that are assumed at least: 4 % and 10 %
+SIZE_SD, CONTENT_SD, THICKNESS_SD = 0.04, 0.1, 0.1
+# plates whose fitted width is below the second of these, in slices, and that lie this close (cosine) to an axis of the volume, are located
+# across it by their radial profile; below the first one along it, too
 HIDDEN, UNRESOLVED, UPRIGHT = 0.6, 1.0, 0.94
-# thickness of a washer of which only the diameter is known, in diameters: rather thin, so that slices leave rather more open than less
+# thickness of a washer of which only the diameter is known, in diameters: that of an M1 washer, 0.3 mm of 2.8 mm
 THIN = 0.11
-SAMPLED = 0.08  # a plate that two slices show is misplaced by about so much of a slice, as its profile is no Gaussian
-THINNEST = 0.3  # width of a fitted blob, voxels
-MOST_SHARED = 50.0  # voxels that share their noise: what smoothing leaves of it tells how many
-CONSTRAINED, FREE = 1e12, 1.0  # axes of a blob: those of the volume, or its own
-# windows of the fits: half their width in diameters, and voxels besides; the first is for a look only
+SAMPLED = 0.08  # bias, in slices, of the Gaussian fit to a plate that two slices show, whose profile is not Gaussian
+THINNEST = 0.3  # least width of a fitted blob, voxels
+MOST_SHARED = 50.0  # largest number of voxels with common noise; smoothing tells it, as it averages less of such noise
+CONSTRAINED, FREE = 1e12, 1.0  # weight of the prior on the axes of a blob: those of the volume, or any
+# windows of the fits: half their width in diameters, and voxels besides; the first is for a quick look
 ROUNDS = ((0.55, 0.5), (0.75, 1.0))
-# after the first look: share of the valley of the scores below which nothing is looked at again, and share of the better polarity's energy
-# that the other one must reach to be looked at again
+# after the first look: fraction of the valley of the scores below which no blob is fitted again, and fraction of the better polarity's
+# energy that the other one must reach to be fitted again
 HOPELESS, WORTH = 0.4, 0.25
 NO_BLOB, FAINTER = "no blob of that size fits", "fainter than the others"
 
 
 class Rejected(NamedTuple):
-    """Something that was found and is no marker: where (3,), mm, and why."""
+    """A candidate that is no marker: its position (3,), mm, and why it was rejected."""
 
     point: FloatArray
     reason: str
@@ -61,22 +59,22 @@ class Rejected(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectedMarkers:
-    """Markers found in one volume, in the order of z, y, x.
+    """Markers of one volume, in the order of z, y, x.
 
     Attributes
     ----------
     points : ndarray, shape (n, 3)
         Centres in the frame of the scan, mm.
     covariance : ndarray, shape (n, 3, 3)
-        Of the centres, mm^2; of the fit, and of what slices thicker than a marker leave open.
+        Of the centres, mm^2; includes the uncertainty along an axis on which the slices are thicker than a marker.
     size_mm : ndarray, shape (n,)
-        Diameter of the disc as wide as the marker looks, blur included.
+        Diameter of the disc as wide as the marker in the image, blur included.
     score : ndarray, shape (n,)
         Signal to noise: root of the sum of squares of the fitted blob over its voxels, by the standard deviation of a voxel's noise.
     polarity : str
         ``"bright"`` or ``"dark"``.
     rejected : tuple of Rejected
-        What stood out and is no marker.
+        Candidates that are no markers.
     """
 
     points: FloatArray
@@ -117,7 +115,7 @@ class _Fits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Look:
-    """Peaks of one polarity and the blobs that have been fitted to them so far (n, 11), NaN where none fits."""
+    """Peaks of one polarity and the blobs fitted to them so far (n, 11), NaN where none fits."""
 
     sign: float
     smooth_noise: float
@@ -138,7 +136,7 @@ class _Look:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Found:
-    """Markers of one polarity, and what is none."""
+    """Markers of one polarity, and rejected candidates."""
 
     sign: float
     kept: _Fits
@@ -149,11 +147,11 @@ class _Found:
         return float((self.kept.score**2).sum())
 
     @property
-    def told(self) -> str:
-        """How many were rejected and why, in words."""
+    def summary(self) -> str:
+        """How many candidates were rejected and why, in words."""
         reasons = [r.reason for r in self.rejected]
         counts = {reason: reasons.count(reason) for reason in dict.fromkeys(reasons)}
-        return "rejected: " + ", ".join(f"{n} {reason}" for reason, n in counts.items()) if counts else "nothing else stood out"
+        return "rejected: " + ", ".join(f"{n} {reason}" for reason, n in counts.items()) if counts else "there was no other candidate"
 
 
 def detect_markers(
@@ -164,23 +162,29 @@ def detect_markers(
     polarity: Polarity = "auto",
     mask: ArrayLike | None = None,
     count: int | None = None,
+    settings: DetectionSettings | None = None,
+    progress: Progress | None = None,
 ) -> DetectedMarkers:
-    """Find equal markers in a volume.
+    """Detect equal markers in a volume, to sub-voxel accuracy.
 
     Parameters
     ----------
     volume : Volume
         CT, MR or microscope scan.
     diameter_mm : float
-        Diameter of a bead, or outer diameter of a washer; 30 % off does little harm.
+        Diameter of a bead, or outer diameter of a washer, mm; an error of 30 % does little harm.
     thickness_mm : float, optional
-        Of a washer, where known: places it better along an axis on which the slices are thicker than it.
+        Thickness of a washer, mm, at most its diameter: locates it better along an axis on which the slices are thicker.
     polarity : {"auto", "bright", "dark"}
-        Whether markers are brighter or darker than what lies around; ``"auto"`` takes the one whose peaks stand out more.
+        Whether markers are brighter or darker than their surroundings; ``"auto"`` takes the one with more contrast.
     mask : array_like of bool, shape (nz, ny, nx), optional
         Where markers may lie.
     count : int, optional
-        How many markers there are: the `count` strongest are kept.
+        Number of markers, 1 or more: the `count` strongest are kept.
+    settings : DetectionSettings, optional
+        How markers are separated from other peaks.
+    progress : callable, optional
+        Called with a `naibu.core.progress.ProgressReport` at every stage.
 
     Returns
     -------
@@ -190,30 +194,36 @@ def detect_markers(
     Raises
     ------
     InputError
-        No marker found, or fewer than `count`; a diameter that is not positive, below the size of a voxel or beyond that of the volume; an
-        empty or ill-shaped mask; a volume without contrast.
+        No marker found, or fewer than `count`; a diameter below the size of a voxel or beyond that of the volume; a thickness that is not
+        positive or above the diameter; an empty mask or one of another shape; a volume that is not finite or without contrast.
     """
     allowed = _checked(volume, diameter_mm, thickness_mm, polarity, mask, count)
+    how = settings if settings is not None else DetectionSettings()
+    report_progress(progress, "finding peaks", done=0, total=3)
     values = np.ascontiguousarray(volume.values, dtype=np.float32)
     smooth = smoothed(values, SMOOTHING * diameter_mm / volume.spacing_mm)
     signs = {"bright": (1.0,), "dark": (-1.0,), "auto": (1.0, -1.0)}[polarity]
-    looks = [_first_look(values, find_peaks(smooth, sign, allowed, volume.spacing_mm, diameter_mm), volume, diameter_mm) for sign in signs]
-    worth = WORTH * max(_settled(look, diameter_mm, count)[0].energy for look in looks)
-    looks = [look for look in looks if len(looks) == 1 or _settled(look, diameter_mm, count)[0].energy >= worth]
-    found = max((_found(values, look, volume, diameter_mm, count) for look in looks), key=lambda f: f.energy)
+    peaks = [find_peaks(smooth, sign, allowed, volume.spacing_mm, diameter_mm, how.min_contrast) for sign in signs]
+    looks = [_first_look(values, some, volume, diameter_mm) for some in peaks]
+    worth = WORTH * max(_settled(look, diameter_mm, count, how)[0].energy for look in looks)
+    looks = [look for look in looks if len(looks) == 1 or _settled(look, diameter_mm, count, how)[0].energy >= worth]
+    report_progress(progress, "fitting blobs", done=1, total=3)
+    found = max((_found(values, look, volume, diameter_mm, count, how) for look in looks), key=lambda f: f.energy)
     if count is not None and len(found.kept.score) < count:
         raise InputError(
-            f"{len(found.kept.score)} markers found, {count} asked for; {found.told}. Lower count, or check diameter_mm and mask"
+            f"{len(found.kept.score)} markers found, {count} asked for; {found.summary}. Lower count, or check diameter_mm and mask"
         )
     if not len(found.kept.score):
         what = "bright or dark" if polarity == "auto" else polarity
         strongest, noise = max((look.strongest, look.smooth_noise) for look in looks)
         raise InputError(
             f"no {what} marker of about {diameter_mm:g} mm was found: the strongest peak of that size has a contrast of {strongest:.3g}, "
-            f"{strongest / noise:.1f} times the noise ({STANDING_OUT:g} times are needed); {found.told}. "
+            f"{strongest / noise:.1f} times the noise ({how.min_contrast:g} times are needed); {found.summary}. "
             "Check diameter_mm, polarity and mask"
         )
-    centres, covariance = _placed(values * np.float32(found.sign), found.kept, volume.spacing_mm, diameter_mm, thickness_mm)
+    report_progress(progress, "locating markers", done=2, total=3)
+    centres, covariance = _located(values * np.float32(found.sign), found.kept, volume.spacing_mm, diameter_mm, thickness_mm)
+    report_progress(progress, "locating markers", done=3, total=3)
     return _reported(volume, found, centres, covariance)
 
 
@@ -221,7 +231,7 @@ def _checked(
     volume: Volume, diameter_mm: float, thickness_mm: float | None, polarity: str, mask: ArrayLike | None, count: int | None
 ) -> BoolArray:
     if min(volume.shape) < 3:
-        raise InputError(f"markers are sought in volumes of at least 3 voxels along every axis, not {volume.shape} (z, y, x)")
+        raise InputError(f"volume must have at least 3 voxels along every axis, not {volume.shape} (z, y, x)")
     spacing, extent = volume.spacing_mm, volume.spacing_mm * np.array(volume.shape[::-1])
     if not (np.isfinite(diameter_mm) and 1.2 * spacing.min() <= diameter_mm <= 0.5 * extent.max()):
         raise InputError(
@@ -237,15 +247,15 @@ def _checked(
     if count is not None and count < 1:
         raise InputError(f"count is {count}; leave it out where the number of markers is not known")
     if volume.values.dtype.kind == "f" and not np.isfinite(volume.values).all():
-        raise InputError("the volume holds values that are not finite; mask or repair them")
+        raise InputError("volume holds values that are not finite; mask or repair them")
     allowed = np.ones(volume.shape, dtype=bool) if mask is None else require_mask(mask, volume)
     if float(np.ptp(volume.values[allowed])) == 0.0:
-        raise InputError(f"all voxels are {volume.values[allowed][0]}: there is nothing to find")
+        raise InputError(f"all voxels of volume are {volume.values[allowed][0]}: there is nothing to find")
     return allowed
 
 
 def _first_look(values: Float32Array, peaks: Peaks, volume: Volume, diameter: float) -> _Look:
-    """Fit blobs to the inner part of the peaks above the threshold, each by itself."""
+    """Fit a blob to the inner part of every peak above the threshold, each by itself."""
     spacing = volume.spacing_mm
     some = peaks.contrast >= peaks.threshold
     at = peaks.index[some, ::-1] * spacing
@@ -257,10 +267,10 @@ def _first_look(values: Float32Array, peaks: Peaks, volume: Volume, diameter: fl
     return _fitted_again(values, look, diameter, ROUNDS[0], CONSTRAINED, alone=True) if len(at) else look
 
 
-def _found(values: Float32Array, look: _Look, volume: Volume, diameter: float, count: int | None) -> _Found:
-    """Fit blobs again, in wider windows, what the neighbours' last fits say taken away; return the markers and what was rejected.
+def _found(values: Float32Array, look: _Look, volume: Volume, diameter: float, count: int | None, how: DetectionSettings) -> _Found:
+    """Fit blobs again, in wider windows, with the neighbours' last fits subtracted; return the markers and the rejected candidates.
 
-    Their axes are those of the volume, at last their own where the markers are not thinner than the slices.
+    Their axes are those of the volume, and in the last round free where the markers are not thinner than the slices.
     """
     spacing = volume.spacing_mm
     failed: list[Rejected] = []
@@ -276,28 +286,28 @@ def _found(values: Float32Array, look: _Look, volume: Volume, diameter: float, c
         look = look.chosen(np.flatnonzero(good)[~hopeless])
         thin = tilt == FREE and _thin(look.shape(np.isfinite(look.fits[:, 0])), spacing) is not None
         look = _fitted_again(values, look, diameter, window, CONSTRAINED if thin else tilt, alone=False)
-    found, failures = _settled(look, diameter, count)
+    found, failures = _settled(look, diameter, count, how)
     return _Found(found.sign, found.kept, (*failed, *failures, *found.rejected))
 
 
-def _settled(look: _Look, diameter: float, count: int | None) -> tuple[_Found, list[Rejected]]:
-    """Return which fits are markers, and which peaks no blob fits."""
+def _settled(look: _Look, diameter: float, count: int | None, how: DetectionSettings) -> tuple[_Found, list[Rejected]]:
+    """Return the fits that are markers, and the peaks to which no blob fits."""
     good = np.isfinite(look.fits[:, 0])
     fits = look.shape(good)
-    keep, rejected = _population(fits, diameter, count)
-    # the strongest of so many peaks of noise is seldom stronger
+    keep, rejected = _population(fits, diameter, count, how)
+    # the largest of n standard normal variables seldom exceeds sqrt(2 log n)
     room = np.prod(np.maximum(2.0 * np.sqrt(np.pi) * SMOOTHING * diameter / look.spacing, 1.0))
     shared = np.clip((look.smooth_noise / look.noise) ** 2 * room, 1.0, MOST_SHARED)
     above = fits.score[keep] / np.sqrt(shared) - np.sqrt(2.0 * np.log(look.voxels))
-    by_chance = np.full(len(keep), True) if len(keep) and np.median(above) < ABOVE_CHANCE else above < 0.0
-    rejected += [Rejected(p, "no stronger than noise may be") for p in fits.centres[keep[by_chance]]]
+    by_chance = np.full(len(keep), True) if len(keep) and np.median(above) < how.above_chance else above < 0.0
+    rejected += [Rejected(p, "no stronger than noise") for p in fits.centres[keep[by_chance]]]
     kept = fits.chosen(keep[~by_chance])
     kept.covariance[:] *= shared
     return _Found(look.sign, kept, tuple(rejected)), [Rejected(p, NO_BLOB) for p in look.starts[~good, 2:5]]
 
 
 def _fitted_again(values: Float32Array, look: _Look, diameter: float, window: tuple[float, float], tilt: float, *, alone: bool) -> _Look:
-    """Fit every blob within a window of so many diameters and voxels, those near it taken away unless `alone`."""
+    """Fit every blob within a window of so many diameters and voxels, those near it subtracted unless `alone`."""
     known = np.isfinite(look.fits)
     start = np.where(known, look.fits, look.starts)
     reach = 2.0 * float((window[0] * diameter + window[1] * look.spacing).max())
@@ -340,23 +350,23 @@ def _neighbours(pairs: IntArray, present: BoolArray) -> tuple[IntArray, IntArray
     return np.searchsorted(both[:, 0], np.arange(len(present) + 1)), np.ascontiguousarray(both[:, 1], dtype=np.int64)
 
 
-def _population(fits: _Fits, diameter: float, count: int | None) -> tuple[IntArray, list[Rejected]]:
-    """Choose the fits that are markers: of the stated diameter, strong, like the others, and not twice the same."""
+def _population(fits: _Fits, diameter: float, count: int | None, how: DetectionSettings) -> tuple[IntArray, list[Rejected]]:
+    """Choose the fits that are markers: of the stated diameter, strong, similar to the others, and not the same twice."""
     reasons = np.full(len(fits.score), "", dtype=object)
-    reasons[fits.size < DIAMETERS[0] * diameter] = "too small"
-    reasons[fits.size > DIAMETERS[1] * diameter] = "too large"
+    reasons[fits.size < how.size_range[0] * diameter] = "too small"
+    reasons[fits.size > how.size_range[1] * diameter] = "too large"
     order = np.argsort(-fits.score, kind="stable")
     rank = np.empty(len(order), dtype=int)
     rank[order] = np.arange(len(order))
-    for a, b in cKDTree(fits.centres).query_pairs(SAME_MARKER * diameter) if len(order) else ():
-        reasons[a if rank[a] > rank[b] else b] = "the same as a stronger one"
+    for a, b in cKDTree(fits.centres).query_pairs(how.min_distance * diameter) if len(order) else ():
+        reasons[a if rank[a] > rank[b] else b] = "same as a stronger one"
     good = reasons == ""
     if count is None and good.any():
         reasons[good & (fits.score < valley(fits.score[good]))] = FAINTER
     features = {
-        "size unlike the others": (np.log(fits.size), np.log(SIZE_RATIO)),
-        "content unlike the others": (np.log(fits.content), np.log(CONTENT_RATIO)),
-        "shape unlike the others": (np.log(fits.widths[:, 0] / fits.widths[:, 1]), np.log(ELONGATION_RATIO)),
+        "size differs from the others": (np.log(fits.size), np.log(how.size_ratio)),
+        "content differs from the others": (np.log(fits.content), np.log(how.content_ratio)),
+        "shape differs from the others": (np.log(fits.widths[:, 0] / fits.widths[:, 1]), np.log(how.elongation_ratio)),
     }
     for reason, (feature, tolerance) in features.items():
         good = reasons == ""
@@ -365,15 +375,19 @@ def _population(fits: _Fits, diameter: float, count: int | None) -> tuple[IntArr
         likely = good & (rank < np.sort(rank[good])[min(count or good.sum(), good.sum()) - 1] + 1)
         middle = np.median(feature[likely])
         spread = 1.4826 * float(np.median(np.abs(feature[likely] - middle)))
-        reasons[good & (np.abs(feature - middle) > max(tolerance, SPREADS * spread))] = reason
+        reasons[good & (np.abs(feature - middle) > max(tolerance, how.spread_sd * spread))] = reason
     good = reasons == ""
     if good.sum() >= MANY_ALIKE:
         apart = np.zeros(len(reasons))
-        for feature, floor in ((np.log(fits.size), 0.04), (np.log(fits.content), 0.1), (np.log(fits.widths[:, 2]), 0.1)):
+        for feature, floor in (
+            (np.log(fits.size), SIZE_SD),
+            (np.log(fits.content), CONTENT_SD),
+            (np.log(fits.widths[:, 2]), THICKNESS_SD),
+        ):
             off = feature - np.median(feature[good])
             middle, tail = np.percentile(np.abs(off[good]), (50.0, 95.0))
-            apart += (off / max(floor, 1.4826 * float(middle), 0.51 * float(tail))) ** 2  # of normal variables both are the deviation
-        reasons[good & (apart > FAR_APART**2)] = "unlike the others as a whole"
+            apart += (off / max(floor, 1.4826 * float(middle), 0.51 * float(tail))) ** 2  # both estimate the SD of a normal variable
+        reasons[good & (apart > how.outlier_sd**2)] = "differs from the others in size, content and thickness together"
     keep = order[reasons[order] == ""]
     if count is not None:
         reasons[keep[count:]] = "weaker than those asked for"
@@ -381,10 +395,10 @@ def _population(fits: _Fits, diameter: float, count: int | None) -> tuple[IntArr
     return keep, [Rejected(fits.centres[i], str(reasons[i])) for i in np.flatnonzero(reasons != "")]
 
 
-def _placed(
+def _located(
     bright: Float32Array, fits: _Fits, spacing: FloatArray, diameter: float, thickness: float | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return centres and covariances, those of plates thinner than the slices from the slices."""
+    """Return centres and covariances; plates thinner than the slices are located by `placed_plates`."""
     axis = _thin(fits, spacing)
     if axis is None:
         return fits.centres, fits.covariance

@@ -1,10 +1,9 @@
-"""Positions of markers in several states, each made better by all the others through the smooth motion between the states (spec S9).
+"""Joint localisation of markers in several states, by a Gaussian process model of the motion between them :cite:p:`rasmussen2006`.
 
-A washer thinner than the slices may lie anywhere in the one that shows it, but seldom so in all states, and its neighbours tell where it
-can have gone. The motion from the first state is a Gaussian process: affine, and a kernel of which the amplitude is found from the markers
-themselves (restricted likelihood), so that a kink in the motion is kept where there is one. Every marker is predicted from the others
-alone, and its positions in all states are updated with what they are known to be (a Kalman update); markers that are well placed already
-hardly move.
+A washer thinner than the slices may lie anywhere in the one that shows it, but seldom so in all states, and its neighbours constrain its
+motion. The motion from the first state is affine plus a Gaussian process, whose amplitude is estimated by restricted maximum likelihood
+:cite:p:`patterson1971`, so that sharp changes of the motion are kept. Every marker is predicted from the others alone, and its positions in
+all states are updated with that prediction by a Kalman update :cite:p:`kalman1960`; markers that are well located already hardly move.
 """
 
 from __future__ import annotations
@@ -18,29 +17,40 @@ from scipy.spatial.distance import cdist
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 
-# fewer markers tell too little of a motion, more are not treated as a whole
+# Empirical values, judged by tests/imaging/markers/test_tracking.py and benchmarks/sense_markers.py, unless said otherwise.
+# fewer markers do not determine a motion; more would need too large a dense matrix
 FEWEST, MOST = 12, 600
-# amplitudes of the kernel that are tried, in units of the median variance, for points within a box of one
+# amplitudes of the kernel that are tried, in units of the median variance, for points scaled to a unit box
 AMPLITUDES = np.logspace(-3.0, 7.0, 16)
-# by how much stated variances may be too small; that they are too large is not believed, as errors that neighbours share do not show
+# range of the estimated factor of the stated variances; not below 1, as errors common to neighbours do not show
 CALIBRATION = (1.0, 9.0)
-# a position that departs from its prediction by more than so many standard deviations is left alone
+# a position further than so many standard deviations from its prediction is an outlier, and not updated
 APART = 4.0
-LOCAL = 14  # neighbours that tell the gradient of the motion at a marker
+LOCAL = 14  # neighbours from which the deformation gradient at a marker is fitted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointPositions:
-    """Positions (s, n, d), mm, and covariances (s, n, d, d), mm^2, after the update; which departed and were left alone (s, n)."""
+    """Positions of markers after the update.
+
+    Attributes
+    ----------
+    points : ndarray, shape (s, n, d)
+        Positions, mm.
+    covariance : ndarray, shape (s, n, d, d)
+        Of the positions, mm^2.
+    outliers : ndarray, shape (s, n), bool
+        Positions that disagree with their prediction, and were not updated.
+    """
 
     points: FloatArray
     covariance: FloatArray
-    departing: BoolArray
+    outliers: BoolArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Motion:
-    """Of one state: what the others predict (k, d) and its variance, factors of the stated variances (d,), gradients (k, d, d)."""
+    """Of one state: predictions from the others (k, d) with variances, factors of the stated variances (d,), gradients (k, d, d)."""
 
     seen: IntArray
     predicted: FloatArray
@@ -50,20 +60,20 @@ class _Motion:
 
 
 def joint_positions(points: FloatArray, covariance: FloatArray) -> JointPositions:
-    """Update the positions of markers in all states with what the smooth motion between the states tells.
+    """Update the positions of markers in all states with their predictions from the smooth motion between the states.
 
     Parameters
     ----------
     points : ndarray, shape (s, n, d)
-        Markers in the free and in other states, mm; NaN where one is not seen. States of which too few are seen stay as they are.
+        Markers in the reference and other states, mm; NaN where one is not seen. States with too few are not changed.
     covariance : ndarray, shape (s, n, d, d)
         Of the positions, mm^2.
     """
     motions = [_motion(points[0], p, covariance[0], c) for p, c in zip(points[1:], covariance[1:], strict=True)]
     states = [s for s, motion in enumerate(motions, start=1) if motion is not None]
-    departing = np.zeros(points.shape[:2], dtype=bool)
+    outliers = np.zeros(points.shape[:2], dtype=bool)
     if not states:
-        return JointPositions(points, covariance, departing)
+        return JointPositions(points, covariance, outliers)
     scale = np.ones((len(points), points.shape[2]))
     for s in states:
         scale[s] = np.sqrt(_there(motions[s - 1]).calibration)
@@ -71,8 +81,8 @@ def joint_positions(points: FloatArray, covariance: FloatArray) -> JointPosition
     updated, stated = points.copy(), covariance * scale[:, None, :, None] * scale[:, None, None, :]
     after = stated.copy()
     for i in range(points.shape[1]):
-        _update(i, [(s, _there(motions[s - 1])) for s in states], points, stated, updated, after, departing)
-    return JointPositions(updated, after, departing)
+        _update(i, [(s, _there(motions[s - 1])) for s in states], points, stated, updated, after, outliers)
+    return JointPositions(updated, after, outliers)
 
 
 def _there(motion: _Motion | None) -> _Motion:
@@ -114,7 +124,7 @@ def _predicted(x: FloatArray, y: FloatArray, noise: FloatArray) -> tuple[FloatAr
     best: tuple[float, FloatArray, float] | None = None
     for amplitude in AMPLITUDES * typical:
         matrix = amplitude * kernel + np.diag(noise)
-        # positive definite on what is orthogonal to affine motions, and made so elsewhere
+        # positive definite on the complement of affine motions, and made so elsewhere
         matrix += linear @ linear.T * (10.0 * np.abs(matrix).max())
         try:
             factor = cho_factor(matrix)
@@ -134,7 +144,7 @@ def _predicted(x: FloatArray, y: FloatArray, noise: FloatArray) -> tuple[FloatAr
         return y, np.full(len(y), np.inf), 1.0
     _, inverse, scale = best
     alone = np.diag(inverse)
-    # the variance of what a marker misses is that of the motion there and its own
+    # the variance of a leave-one-out residual is that of the motion there and that of the marker
     variance = np.maximum(scale / alone - scale * noise, 0.02 * scale * noise)
     return y - (inverse @ y) / alone, variance, scale
 
@@ -146,7 +156,7 @@ def _update(
     stated: FloatArray,
     updated: FloatArray,
     after: FloatArray,
-    departing: BoolArray,
+    outliers: BoolArray,
 ) -> None:
     """Update one marker in all states that see it; arrays are filled in place."""
     d = points.shape[2]
@@ -159,13 +169,13 @@ def _update(
     for s, innovation, variance, gradient in rows:
         total = stated[s, i] + gradient @ stated[0, i] @ gradient.T + variance
         if float(innovation @ np.linalg.solve(total, innovation)) > APART**2 * d:
-            departing[s, i] = True
+            outliers[s, i] = True
         else:
             kept.append((s, innovation, variance, gradient))
     if not kept:
         return
     m = len(kept)
-    # unknowns: how far the free and the m other positions are off; innovations are the latter less the gradient times the former
+    # unknowns: errors of the reference and the m other positions; innovations are the latter less the gradient times the former
     prior = np.zeros(((m + 1) * d, (m + 1) * d))
     prior[:d, :d] = stated[0, i]
     observe, noise, seen = np.zeros((m * d, (m + 1) * d)), np.zeros((m * d, m * d)), np.zeros(m * d)

@@ -1,4 +1,4 @@
-"""Peaks that may be markers: voxels that stand out from the shell around them, by how much, and above what noise."""
+"""Candidate peaks of markers: local maxima, their contrast to the shell around them, and the noise level."""
 
 from __future__ import annotations
 
@@ -10,26 +10,25 @@ from scipy.spatial import cKDTree
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from naibu.imaging.markers._blob_kernels import mark_peaks, shell_contrast
 
-# smoothing, and where the shell lies, in diameters; share of the shell that must lie below a peak: edges show half of it, and touching
-# markers a few directions
-SMOOTHING, SHELL, SHELL_SHARE = 0.25, 1.0, 0.67
-# a peak stands out by so many standard deviations of the smoothed noise
-STANDING_OUT = 4.0
-# the noise is that of the calmer blocks of so many voxels an edge, each looked at in so many places an edge
+# Empirical values, judged by tests/imaging/markers/test_detection.py and benchmarks/sense_markers.py, unless said otherwise.
+# SD of the Gaussian, and radius of the shell, in diameters; fraction of the shell that must lie below a peak: at a flat edge half of it
+# does, and touching markers cover a few directions
+SMOOTHING, SHELL, SHELL_FRACTION = 0.25, 1.0, 0.67
+# the noise is that of the calmer blocks of so many voxels an edge, sampled at so many points an edge
 CALM_BLOCK, CALM_SAMPLES = 6, 3
-# of more peaks only those above the valley of contrast are looked at closely
+# of more peaks only those above the valley of contrast are fitted, which bounds the time
 MANY = 100_000
-# the population of peaks: bandwidth of the density of the logarithm of contrast; a valley is at most this share of the modes beside it,
-# and divides populations that differ by this ratio
+# the population of peaks: bandwidth of the density of the logarithm of contrast; a valley is at most this fraction of the modes beside it,
+# and divides populations whose medians differ by this ratio
 BANDWIDTH, VALLEY, APART = 0.08, 0.5, 1.6
-# of two peaks closer than this many diameters the weaker belongs to the stronger: a tilted washer shows one in each of two slices
+# of two peaks closer than this, in diameters, the weaker belongs to the stronger: a tilted washer shows one in each of two slices
 ONE_PEAK = 0.62
-POPULATION = 5  # fewer tell nothing about each other
+POPULATION = 5  # fewer peaks have no statistics
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Peaks:
-    """Peaks of one polarity: smoothed grey values and background there, contrast, all in the sign that makes markers bright."""
+    """Peaks of one polarity, all in the sign that makes markers bright."""
 
     sign: float
     index: IntArray  # z, y, x
@@ -37,23 +36,23 @@ class Peaks:
     level: FloatArray
     noise: float
     threshold: float
-    strongest: float  # contrast of any, whether it stands out or not
+    strongest: float  # largest contrast, even below the threshold
 
 
-def find_peaks(smooth: Float32Array, sign: float, allowed: BoolArray, spacing: FloatArray, diameter: float) -> Peaks:
-    """Return the peaks that stand out, the strongest first."""
+def find_peaks(smooth: Float32Array, sign: float, allowed: BoolArray, spacing: FloatArray, diameter: float, min_contrast: float) -> Peaks:
+    """Return the peaks whose contrast exceeds `min_contrast` times the noise, the strongest first."""
     v = smooth if sign > 0 else -smooth
     reach = shell_reach(diameter, spacing)
     noise = noise_level(v, allowed, reach)
     mark = np.zeros(v.shape, dtype=bool)
-    mark_peaks(v, allowed, reach, 0.5 * STANDING_OUT * noise, mark)
+    mark_peaks(v, allowed, reach, 0.5 * min_contrast * noise, mark)
     index = np.argwhere(mark)
     contrast = np.empty(len(index))
     shell = np.unique(np.round(SHELL * diameter * directions() / spacing[::-1]).astype(np.int64), axis=0)
-    shell_contrast(v, index, shell, SHELL_SHARE, contrast)
+    shell_contrast(v, index, shell, SHELL_FRACTION, contrast)
     strongest = float(contrast.max()) if len(contrast) else 0.0
     order = np.argsort(-contrast, kind="stable")
-    order = order[contrast[order] > STANDING_OUT * noise]
+    order = order[contrast[order] > min_contrast * noise]
     order = order[_strongest(index[order, ::-1] * spacing, ONE_PEAK * diameter)]
     index, contrast = index[order], contrast[order]
     level = v[tuple(index.T)].astype(float) - contrast
@@ -62,12 +61,12 @@ def find_peaks(smooth: Float32Array, sign: float, allowed: BoolArray, spacing: F
 
 
 def shell_reach(diameter: float, spacing: FloatArray) -> IntArray:
-    """Return how many voxels away (3,), along z, y, x, a marker of that diameter, mm, no longer shows."""
+    """Return the radius of the shell (3,), voxels along z, y, x, about a marker of that diameter, mm."""
     return np.asarray(np.maximum(np.round(SHELL * diameter / spacing[::-1]), 1).astype(np.int64))
 
 
 def _strongest(points: FloatArray, reach: float) -> BoolArray:
-    """Return which of points (n, 3), in falling order of strength, have no stronger one within reach that counts itself."""
+    """Tell which of points (n, 3), in decreasing order of strength, have no kept stronger one within reach."""
     keep = np.ones(len(points), dtype=bool)
     pairs = cKDTree(points).query_pairs(reach, output_type="ndarray") if len(points) else np.zeros((0, 2), dtype=np.int64)
     for strong, weak in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]:  # the first of a pair is the stronger
@@ -77,9 +76,9 @@ def _strongest(points: FloatArray, reach: float) -> BoolArray:
 
 
 def noise_level(v: Float32Array, allowed: BoolArray, reach: IntArray) -> float:
-    """Return a standard deviation of the noise: of differences to the mean of six voxels `reach` away, in the calmer ones of small blocks.
+    """Return the standard deviation of the noise: of differences to the mean of six voxels `reach` away, in the calmer of small blocks.
 
-    Edges and markers disturb the blocks that they lie in; padding without noise does not count.
+    Blocks with edges or markers vary more, and are left out; so is padding without noise.
     """
     tall = [n // CALM_BLOCK for n in v.shape]
     inner = [np.linspace(r, n - 1 - r, max(t, 1) * CALM_SAMPLES).round().astype(int) for r, n, t in zip(reach, v.shape, tall, strict=True)]

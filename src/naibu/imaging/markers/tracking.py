@@ -1,6 +1,6 @@
-"""Markers followed from volume to volume: found in each, linked to the first, and placed in all of them together (spec S9).
+"""Marker tracking from volume to volume: detected in each, linked to the first, and located in all of them together.
 
-The result is what an experiment folder holds: the same number is the same marker in all states.
+The result is what an experiment folder holds: the same label is the same marker in all states.
 """
 
 from __future__ import annotations
@@ -14,15 +14,16 @@ from numpy.typing import ArrayLike, NDArray
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.markers import Markers
+from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
 from naibu.imaging.markers.detection import DetectedMarkers, Polarity, detect_markers
 from naibu.imaging.markers.joint_localization import joint_positions
 from naibu.imaging.markers.point_matching import Links, link_markers
+from naibu.imaging.markers.settings import DetectionSettings, LinkSettings, require_between
 from naibu.imaging.markers.thin_plate_assignment import spline_through
 
-FEWEST_COMMON = 4  # an experiment needs so many markers in common with the free state
-SUSPECT = 0.5  # links less probable than this are suspect
-NEARLY_ALL = 0.97  # share of the markers whose links from the state before need no comparison with direct ones
+FEWEST_COMMON = 4  # markers in common with the reference state that an experiment needs: those of one tetrahedron
+NEARLY_ALL = 0.97  # fraction of linked markers from which on links by way of the previous state are taken as they are; empirical
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,32 +33,33 @@ class TrackedMarkers:
     Attributes
     ----------
     names : tuple of str
-        Names of the states, the free one first.
+        Names of the states, the reference state first.
     markers : tuple of Markers
-        Of every state: positions, mm, under the same labels, NaN where a marker was not found. Links in doubt are not trusted.
+        Of every state: positions, mm, under the same labels, NaN where a marker was not found. Uncertain links are not trusted.
     covariance : ndarray, shape (s, n, 3, 3)
         Of the positions, mm^2; NaN where there is none.
     confidence : ndarray, shape (s, n)
-        Probability that the link to the free state is right; 1 in the free state, 0 where there is no link.
-    departure_mm : ndarray, shape (s, n)
-        Distance of a marker from where its neighbours predict it, before positions were made better together; NaN where there is no link.
+        Probability that the link to the reference state is right; 1 in the reference state, 0 where there is no link.
+    residual_mm : ndarray, shape (s, n)
+        Residual from the local affine fit to the neighbours, before the joint localisation, mm; NaN where there is no link. See
+        `naibu.imaging.markers.point_matching.Links`.
     flags : ndarray of str, shape (s, n)
         ``"ok"``, ``"missing"`` or ``"suspect"``.
     found : tuple of DetectedMarkers
-        All that was found in every state, and what was rejected.
+        Detections in every state, with rejected candidates.
     """
 
     names: tuple[str, ...]
     markers: tuple[Markers, ...]
     covariance: FloatArray
     confidence: FloatArray
-    departure_mm: FloatArray
+    residual_mm: FloatArray
     flags: NDArray[np.str_]
     found: tuple[DetectedMarkers, ...]
 
     @property
     def ids(self) -> IntArray:
-        """Labels (n,), 1 for the lowest marker of the free state."""
+        """Labels (n,), 1 for the lowest marker of the reference state."""
         return self.markers[0].ids
 
     @property
@@ -72,13 +74,13 @@ class TrackedMarkers:
 
     @property
     def steps_mm(self) -> tuple[float, float]:
-        """Steps across and along z, mm, that leave coordinates rounded to them as uncertain as these are (median): root 12 of the sd."""
+        """Rounding steps across and along z, mm, of the same standard deviation as the median one: sqrt(12) times it."""
         x, y, z = np.sqrt(12.0) * np.nanmedian(self.sd_mm, axis=(0, 1))
         return 0.5 * float(x + y), float(z)
 
     @property
     def states(self) -> dict[str, Markers]:
-        """Markers of the other states than the free one by name, in order: what `naibu.io.marker_tables.write_experiment_folder` takes."""
+        """Markers of the states after the first by name, in order, as `naibu.io.marker_tables.write_experiment_folder` takes them."""
         return dict(zip(self.names[1:], self.markers[1:], strict=True))
 
 
@@ -93,43 +95,59 @@ def track_markers(
     names: Sequence[str] | None = None,
     joint: bool = True,
     seed: int = 0,
+    min_confidence: float = 0.5,
+    detection: DetectionSettings | None = None,
+    linking: LinkSettings | None = None,
+    progress: Progress | None = None,
 ) -> TrackedMarkers:
-    """Find equal markers in the volumes of several states of an object, and tell which is which.
+    """Detect equal markers in the volumes of several states of an object, and link them between the states.
 
     Parameters
     ----------
     volumes : sequence of Volume
-        The free state first, then the others in the order in which they were reached: each is linked by way of the one before.
+        The reference state first, then the others in the order in which they were reached: each is linked by way of the previous one.
     diameter_mm, thickness_mm, polarity, count
-        See `naibu.imaging.markers.detection.detect_markers`. What ``"auto"`` finds in the first volume holds for all.
+        See `naibu.imaging.markers.detection.detect_markers`. The polarity that ``"auto"`` finds in the first volume holds for all.
     masks : sequence of array_like of bool or None, optional
         Where markers may lie, for every volume.
     names : sequence of str, optional
-        Of the states; ``initial``, ``state_1``, ... where left out.
+        Names of the states; ``initial``, ``state_1``, ... by default.
     joint : bool
-        Whether positions are made better by all states together, through the smooth motion between them: matters most for washers thinner
+        Whether positions are improved by all states together, through the smooth motion between them: matters most for washers thinner
         than the slices. See `naibu.imaging.markers.joint_localization`.
     seed : int
-        Of the draw of the points from which links grow.
+        Of the random choice of the points from which links grow.
+    min_confidence : float
+        Probability below which a link is flagged as suspect, 0 to 1.
+    detection : DetectionSettings, optional
+        How markers are separated from other peaks.
+    linking : LinkSettings, optional
+        How links are searched for.
+    progress : callable, optional
+        Called with a `naibu.core.progress.ProgressReport` before each state.
 
     Returns
     -------
     TrackedMarkers
-        Markers of the free state that were found in at least one other, and where they are in every state.
+        Markers of the reference state that were found in at least one other, with their positions in every state.
 
     Raises
     ------
     InputError
         Fewer than two volumes, lists of other lengths, volumes without markers (the state is named), or a state with fewer than four
-        markers in common with the free one.
+        markers in common with the reference state.
     """
+    require_between("min_confidence", min_confidence, 0.0, 1.0)
     states = _names(volumes, masks, names)
     where = list(masks) if masks is not None else [None] * len(volumes)
     found: list[DetectedMarkers] = []
-    for name, volume, mask in zip(states, volumes, where, strict=True):
+    for number, (name, volume, mask) in enumerate(zip(states, volumes, where, strict=True)):
+        report_progress(progress, f"detecting markers in {name}", done=number, total=len(volumes))
         sign: Polarity = found[0].polarity if found else polarity
         try:
-            markers = detect_markers(volume, diameter_mm=diameter_mm, thickness_mm=thickness_mm, polarity=sign, mask=mask, count=count)
+            markers = detect_markers(
+                volume, diameter_mm=diameter_mm, thickness_mm=thickness_mm, polarity=sign, mask=mask, count=count, settings=detection
+            )
         except InputError as error:
             raise InputError(f"state {name!r}: {error}") from error
         if len(markers) < FEWEST_COMMON:
@@ -138,29 +156,30 @@ def track_markers(
                 "check diameter_mm and polarity, or the mask"
             )
         found.append(markers)
-    link, confidence, departure = linked_states([m.points for m in found], names=states, seed=seed)
-    return _tracked(states, tuple(found), link, confidence, departure, joint=joint)
+    link, confidence, residual = linked_states([m.points for m in found], names=states, seed=seed, settings=linking)
+    report_progress(progress, "linking markers", done=len(volumes), total=len(volumes))
+    return _tracked(states, tuple(found), link, confidence, residual, joint=joint, min_confidence=min_confidence)
 
 
 def linked_states(
-    points: Sequence[ArrayLike], *, names: Sequence[str] | None = None, seed: int = 0
+    points: Sequence[ArrayLike], *, names: Sequence[str] | None = None, seed: int = 0, settings: LinkSettings | None = None
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Link the markers of every state to those of the first, by way of the state before where that helps.
+    """Link the markers of every state to those of the first, by way of the previous state where that helps.
 
     Parameters
     ----------
     points : sequence of array_like, shape (n_s, d)
         Markers of every state, mm, in any order.
     names : sequence of str, optional
-        Of the states, for messages.
-    seed : int
+        Names of the states, for messages.
+    seed, settings
         See `naibu.imaging.markers.point_matching.link_markers`.
 
     Returns
     -------
     link : ndarray, shape (s, n), int64
-        Number of every marker of the first state among those of state s; -1 where it has none.
-    confidence, departure_mm : ndarray, shape (s, n)
+        Index, among the markers of state s, of every marker of the first state; -1 where it has none.
+    confidence, residual_mm : ndarray, shape (s, n)
         See `TrackedMarkers`.
 
     Raises
@@ -172,11 +191,11 @@ def linked_states(
     states = list(names) if names is not None else _numbered(len(clouds))
     n = len(clouds[0])
     link, confidence = np.full((len(clouds), n), -1, dtype=np.int64), np.zeros((len(clouds), n))
-    departure = np.full((len(clouds), n), np.nan)
-    link[0], confidence[0], departure[0] = np.arange(n), 1.0, 0.0
+    residual = np.full((len(clouds), n), np.nan)
+    link[0], confidence[0], residual[0] = np.arange(n), 1.0, 0.0
     for s in range(1, len(clouds)):
         try:
-            links = _linked(clouds, link, s, seed)
+            links = _linked(clouds, link, s, seed, settings)
         except InputError as error:
             raise InputError(f"state {states[s]!r} against {states[0]!r}: {error}") from error
         if len(links) < FEWEST_COMMON:
@@ -185,24 +204,24 @@ def linked_states(
                 f"{FEWEST_COMMON} are needed; check that both show the same object, or add a state between them"
             )
         here = links.pairs[:, 0]
-        link[s, here], confidence[s, here], departure[s, here] = links.pairs[:, 1], links.confidence, links.departure_mm
-    return link, confidence, departure
+        link[s, here], confidence[s, here], residual[s, here] = links.pairs[:, 1], links.confidence, links.residual_mm
+    return link, confidence, residual
 
 
-def _linked(clouds: list[FloatArray], link: IntArray, s: int, seed: int) -> Links:
-    """Link state s to the first: from where the state before was, or directly, whichever gives more links that can be believed."""
+def _linked(clouds: list[FloatArray], link: IntArray, s: int, seed: int, settings: LinkSettings | None) -> Links:
+    """Link state s to the first: from the positions in the previous state, or directly, whichever has the larger total confidence."""
     tried: list[Links] = []
     if s > 1:
         seen = link[s - 1] >= 0
         here = clouds[s - 1][link[s - 1, seen]]
-        before = link_markers(here, clouds[s], seed=seed) if seen.sum() >= FEWEST_COMMON else None
+        before = link_markers(here, clouds[s], seed=seed, settings=settings) if seen.sum() >= FEWEST_COMMON else None
         if before is not None and len(before) >= FEWEST_COMMON:
             known = np.flatnonzero(seen)[before.pairs[:, 0]]
             expected = spline_through(clouds[0], known, clouds[s][before.pairs[:, 1]])
-            tried.append(link_markers(clouds[0], clouds[s], predicted=expected, seed=seed))
+            tried.append(link_markers(clouds[0], clouds[s], predicted=expected, seed=seed, settings=settings))
             if len(tried[0]) >= NEARLY_ALL * min(len(clouds[0]), len(clouds[s])):
                 return tried[0]
-    tried.append(link_markers(clouds[0], clouds[s], seed=seed))
+    tried.append(link_markers(clouds[0], clouds[s], seed=seed, settings=settings))
     return max(tried, key=lambda links: float(links.confidence.sum()))
 
 
@@ -211,32 +230,33 @@ def _tracked(
     found: tuple[DetectedMarkers, ...],
     link: IntArray,
     confidence: FloatArray,
-    departure: FloatArray,
+    residual: FloatArray,
     *,
     joint: bool,
+    min_confidence: float,
 ) -> TrackedMarkers:
     keep = np.flatnonzero((link[1:] >= 0).any(axis=0))
-    link, confidence, departure = link[:, keep], confidence[:, keep], departure[:, keep]
+    link, confidence, residual = link[:, keep], confidence[:, keep], residual[:, keep]
     points, covariance = np.full((*link.shape, 3), np.nan), np.full((*link.shape, 3, 3), np.nan)
     for s, markers in enumerate(found):
         seen = link[s] >= 0
         points[s, seen], covariance[s, seen] = markers.points[link[s, seen]], markers.covariance[link[s, seen]]
-    doubtful = confidence < SUSPECT
+    doubtful = confidence < min_confidence
     if joint:
         usable = np.where(doubtful[:, :, None], np.nan, points)
         better = joint_positions(usable, covariance)
         sure = ~doubtful
         points[sure], covariance[sure] = better.points[sure], better.covariance[sure]
-        doubtful |= better.departing
+        doubtful |= better.outliers
     flags = np.where(link < 0, "missing", np.where(doubtful, "suspect", "ok"))
     ids = np.arange(1, len(keep) + 1)
     states = tuple(Markers.from_arrays(ids, p, f != "suspect") for p, f in zip(points, flags, strict=True))
-    return TrackedMarkers(names, states, covariance, confidence, departure, flags, found)
+    return TrackedMarkers(names, states, covariance, confidence, residual, flags, found)
 
 
 def _names(volumes: Sequence[Volume], masks: Sequence[ArrayLike | None] | None, names: Sequence[str] | None) -> tuple[str, ...]:
     if len(volumes) < 2:
-        raise InputError(f"markers are followed through at least two volumes, not {len(volumes)}; to find them in one, use detect_markers")
+        raise InputError(f"volumes must be at least two to track markers, not {len(volumes)}; to detect them in one, use detect_markers")
     for what, given in (("masks", masks), ("names", names)):
         if given is not None and len(given) != len(volumes):
             raise InputError(f"{what} has {len(given)} entries for {len(volumes)} volumes; give one for each")

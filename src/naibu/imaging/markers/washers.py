@@ -1,8 +1,8 @@
-"""Centres of washers thinner than the slices that show them (spec S9).
+"""Localisation of washers thinner than the slices of a volume: the posterior mean of height and tilt.
 
-A plate that lies wholly inside one slice may lie anywhere in it, and where it reaches into the next one a small share of its grey value
-means a large share of its thickness: the centroid of the grey values is off by up to a third of a slice. Here every height and tilt is
-weighed by how well it explains the slices; the result is the mean, with a standard deviation that says how much the slices leave open.
+A plate inside one slice may lie anywhere in it, and where it reaches into the next one a small fraction of the intensity means a large
+fraction of its thickness: the intensity-weighted centroid is off by up to a third of a slice. Here every height and tilt on a grid is
+weighted by its likelihood; the result is the posterior mean, with the posterior standard deviation.
 """
 
 from __future__ import annotations
@@ -15,31 +15,33 @@ from scipy.special import erf
 from naibu.core.arrays import AnyFloatArray, FloatArray, IntArray
 from naibu.imaging.markers._washer_kernels import column_sums, weigh_plates
 
-# of a plate that hangs in the gel: standard deviation and greatest slope of a tilt that is tried
+# Empirical values, judged by tests/imaging/markers/test_detection.py and benchmarks/sense_markers.py, unless said otherwise.
+# prior of the tilt of a plate in the gel: standard deviation and largest value of its slope, and number of slopes that are tried
 TILT_SD, STEEPEST, TILTS = 0.12, 0.32, 9
 HEIGHTS, REACH_SLICES = 45, 0.85
-# blur across the slices that is tried, slices; plates by which it is chosen
+# blur across the slices that is tried, slices; number of plates by which it is chosen
 BLURS, CHOOSING = (0.0, 0.2, 0.35, 0.5), 20
-# a blur is believed if it lowers the mean squared residual to this share: a little is gained by hiding faults of the model
+# a blur is accepted if it lowers the mean squared residual below this fraction: a small gain may be due to model errors
 BLURRED = 0.93
-# what the model leaves out (a hole, sampling, a bent plate) displaces heights by about so much, slices
+# standard deviation, in slices, of the bias of heights by what is not modelled: the hole, sampling, a bent plate
 MODEL_SD = 0.04
-# slices in which a plate shows at least this share of what it shows in the one that sees most of it
+# fraction of the strongest slice of a plate from which on a slice counts
 SEEN = 0.15
-TABLE_STEP = 0.01
-# columns are used where the plate covers at least this share of what it covers at most
+TABLE_STEP = 0.01  # of the tabulated slice profile, slices
+# columns of voxels are used where the plate covers at least this fraction of its best covered column
 COVERED = 0.04
-CENTRINGS = 4  # the profile is learned and moved in turn so often
+CENTRINGS = 4  # rounds in which the radial profile is estimated and fitted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedPlates:
-    """Where plates lie.
+    """Positions of plates.
 
     Attributes
     ----------
     centres_mm, sd_mm : ndarray, shape (n, 3)
-        Place (index times spacing along x, y, z) and its standard deviation, mm; NaN where a plate is too close to the edge of the volume.
+        Position (index times spacing along x, y, z) and its standard deviation, mm; NaN where a plate is too close to the edge of the
+        volume.
     """
 
     centres_mm: FloatArray
@@ -56,24 +58,24 @@ def placed_plates(
     thickness_mm: float,
     along: bool,
 ) -> PlacedPlates:
-    """Find the centres of equal plates that are thin along an axis of the volume.
+    """Return the centres of equal plates that are thin along an axis of the volume.
 
-    Across that axis a radial profile, learned from the plates themselves, is moved until it fits; along it the slices are weighed.
+    Across that axis a radial profile, estimated from the plates themselves, is fitted; along it heights and tilts are weighted.
 
     Parameters
     ----------
     values : ndarray, shape (nz, ny, nx)
-        Grey values, plates brighter than what lies around.
+        Intensities, plates brighter than their surroundings.
     spacing_mm : ndarray, shape (3,)
         Spacing of voxels along x, y, z, mm.
     centres_mm : ndarray, shape (n, 3)
-        Index times spacing, mm: right to about a voxel.
+        Index times spacing, mm, accurate to about a voxel.
     axis : int
         The thin axis: 0, 1, 2 for x, y, z.
     diameter_mm, thickness_mm : float
-        Of the plates.
+        Of the plates, mm.
     along : bool
-        Whether to place them along the thin axis, too; else the coordinate given stays, and its standard deviation is NaN.
+        Whether to locate them along the thin axis, too; else the given coordinate is kept, and its standard deviation is NaN.
     """
     order = [axis, *(a for a in (2, 1, 0) if a != axis)]  # k, j, i
     turned, spacing, centres = np.moveaxis(values, 2 - axis, 0), spacing_mm[order], centres_mm[:, order]
@@ -87,10 +89,10 @@ def placed_plates(
     middle = middle[inside]
     patches = _patches(turned, middle, half)
     off = centres[inside] - middle * spacing
-    off[:, 1:], across_sd, share = _centred(patches, off[:, 1:], spacing, half, diameter_mm)
+    off[:, 1:], across_sd, fraction = _centred(patches, off[:, 1:], spacing, half, diameter_mm)
     deviation = np.full(len(middle), np.nan)
     if along:
-        columns = _columns(share, off[:, 1:], spacing, half)
+        columns = _columns(fraction, off[:, 1:], spacing, half)
         mean, deviation = _weighed(patches, columns, off[:, 0] / spacing[0] + half[0], thickness_mm / spacing[0], spacing[0])
         off[:, 0] = (mean - half[0]) * spacing[0]
     rows = np.flatnonzero(inside)[:, None]
@@ -100,7 +102,7 @@ def placed_plates(
 
 
 def slice_profile(thickness: float, blur: float) -> FloatArray:
-    """Return the share of a plate that a slice sees at distances of 0, `TABLE_STEP`, ...; thickness, blur and distances in slices."""
+    """Return the fraction of a plate inside a slice at distances of 0, `TABLE_STEP`, ...; thickness, blur and distances in slices."""
     at = np.arange(0.0, 0.5 + 0.5 * thickness + 4.0 * blur + 2.0 * TABLE_STEP, TABLE_STEP)
     if blur < TABLE_STEP:
         return np.asarray(np.maximum(np.minimum(at + 0.5 * thickness, 0.5) - np.maximum(at - 0.5 * thickness, -0.5), 0.0) / thickness)
@@ -123,10 +125,10 @@ def _patches(turned: AnyFloatArray, middle: IntArray, half: IntArray) -> FloatAr
 def _centred(
     patches: FloatArray, off: FloatArray, spacing: FloatArray, half: IntArray, diameter_mm: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Move a radial profile over the sums along the thin axis until it fits.
+    """Fit a radial profile to the sums along the thin axis.
 
-    Returns the offsets (n, 2) of the centres from the middles of the patches along j and i, mm, their standard deviations, and what the
-    profile is at every column (n, nj, ni).
+    Returns the offsets (n, 2) of the centres from the middles of the patches along j and i, mm, their standard deviations, and the value of
+    the profile at every column (n, nj, ni).
     """
     n, _, nj, ni = patches.shape
     dj, di = (np.arange(nj) - half[1]) * spacing[1], (np.arange(ni) - half[2]) * spacing[2]
@@ -166,7 +168,7 @@ def _radial(distance: FloatArray, sums: FloatArray, step: float, reach: float) -
 def _fitted_centres(
     sums: FloatArray, centres: FloatArray, dj: FloatArray, di: FloatArray, at: FloatArray, typical: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Fit height, background and place of the profile to every plate's sums, one Gauss-Newton step; return centres and sd (n, 2)."""
+    """Fit height, background and position of the profile to the sums of every plate, one Gauss-Newton step: centres, SD (n, 2)."""
     small = 1e-3 * float(at[-1])
     moved, sd = centres.copy(), np.zeros_like(centres)
     for p, (c, seen) in enumerate(zip(centres, sums, strict=True)):
@@ -188,17 +190,19 @@ def _fitted_centres(
     return moved, sd
 
 
-def _columns(share: FloatArray, off: FloatArray, spacing: FloatArray, half: IntArray) -> FloatArray:
-    """Return for every plate the columns it covers: j, i, share, and distances from its centre along j and i, mm (n, c, 5)."""
-    n, nj, ni = share.shape
+def _columns(fraction: FloatArray, off: FloatArray, spacing: FloatArray, half: IntArray) -> FloatArray:
+    """Return the columns that every plate covers: j, i, fraction, and distances from its centre along j and i, mm (n, c, 5)."""
+    n, nj, ni = fraction.shape
     dj, di = (np.arange(nj) - half[1]) * spacing[1] - off[:, :1], (np.arange(ni) - half[2]) * spacing[2] - off[:, 1:]
-    covering = np.argsort(-share.reshape(n, -1), axis=1)[:, : int((share > COVERED * share.max()).reshape(n, -1).sum(axis=1).max())]
+    covering = np.argsort(-fraction.reshape(n, -1), axis=1)[
+        :, : int((fraction > COVERED * fraction.max()).reshape(n, -1).sum(axis=1).max())
+    ]
     j, i, rows = covering // ni, covering % ni, np.arange(n)[:, None]
-    return np.stack([j.astype(float), i.astype(float), share[rows, j, i], dj[rows, j], di[rows, i]], axis=2)
+    return np.stack([j.astype(float), i.astype(float), fraction[rows, j, i], dj[rows, j], di[rows, i]], axis=2)
 
 
 def _weighed(patches: FloatArray, columns: FloatArray, start: FloatArray, thickness: float, pitch: float) -> tuple[FloatArray, FloatArray]:
-    """Return the mean height and its standard deviation (n,), slices: with the blur and noise that explain the plates best."""
+    """Return the posterior mean height and its standard deviation (n,), slices, with the blur and noise of least residual."""
     some = np.linspace(0, len(patches) - 1, min(len(patches), CHOOSING)).astype(int)
     noise = _noise(patches)
     tried = []
@@ -224,17 +228,17 @@ def _run(
 
 
 def _noise(patches: FloatArray) -> float:
-    """Return a variance of the noise from the corners of the patches."""
+    """Return the variance of the noise from the corners of the patches."""
     corners = np.concatenate([patches[:, :, j, i].ravel() - np.median(patches[:, :, j, i]) for j in (0, -1) for i in (0, -1)])
     return float(max((1.4826 * np.median(np.abs(corners))) ** 2, 1e-12 * float(np.ptp(patches)) ** 2, 1e-300))
 
 
 def _voxels_sharing_noise(patches: FloatArray) -> float:
-    """Return how many neighbouring voxels share their noise, from the likeness of neighbours on the rims of patches (n, nk, nj, ni)."""
+    """Return the number of voxels with common noise, from the correlation of neighbours on the rims of patches (n, nk, nj, ni)."""
     shared = 1.0
     for rims in (patches[:, :, (0, -1), :], np.swapaxes(patches[:, :, :, (0, -1)], 2, 3)):
         away = rims - rims.mean(axis=3, keepdims=True)
-        alike = float((away[..., 1:] * away[..., :-1]).mean() / max(float((away**2).mean()), 1e-300))
-        alike = float(np.clip(alike, 0.0, 0.7))
-        shared *= (1.0 + alike) / (1.0 - alike)
+        correlation = float((away[..., 1:] * away[..., :-1]).mean() / max(float((away**2).mean()), 1e-300))
+        correlation = float(np.clip(correlation, 0.0, 0.7))
+        shared *= (1.0 + correlation) / (1.0 - correlation)
     return shared

@@ -72,25 +72,25 @@ class CalfPhantom:
         out[inside] = kind
         return out
 
-    def grey(self, material: FloatArray) -> FloatArray:
+    def intensity(self, material: FloatArray) -> FloatArray:
         """Return the grey value (n,), of 256 levels, at material points (n, 3), mm; 4 in air."""
         out = np.full(len(material), 4.0)
         depth = _depth(material)
         inside = np.flatnonzero(depth > 0.0)
         m, d = material[inside], depth[inside]
         border, into = _fat_depth(m), (_into_tibia(m), _into_fibula(m))
-        grey = np.full(len(m), 122.0)  # skin
+        intensity = np.full(len(m), 122.0)  # skin
         fat = (d >= _SKIN_MM) & (d < border)
-        grey[fat] = self._fat(m[fat])
+        intensity[fat] = self._fat(m[fat])
         muscle = (d >= border) & (into[0] <= 0.0) & (into[1] <= 0.0)
-        grey[muscle] = np.where(d[muscle] < border[muscle] + _FASCIA_MM, 62.0, self._muscle(m[muscle]))
+        intensity[muscle] = np.where(d[muscle] < border[muscle] + _FASCIA_MM, 62.0, self._muscle(m[muscle]))
         for x, y, along_x, along_y, radius, value in _VESSELS:
-            grey[np.hypot(m[:, 0] - x - along_x * m[:, 2], m[:, 1] - y - along_y * m[:, 2]) < radius] = value
+            intensity[np.hypot(m[:, 0] - x - along_x * m[:, 2], m[:, 1] - y - along_y * m[:, 2]) < radius] = value
         for depth_in_bone, rim in zip(into, (3.4, 2.2), strict=True):
-            grey[depth_in_bone > 0.0] = 22.0
+            intensity[depth_in_bone > 0.0] = 22.0
             marrow = depth_in_bone > rim
-            grey[marrow] = 178.0 + 13.0 * self._lobules(m[marrow]) + 6.0 * self._grain(m[marrow])
-        out[inside] = grey
+            intensity[marrow] = 178.0 + 13.0 * self._lobules(m[marrow]) + 6.0 * self._grain(m[marrow])
+        out[inside] = intensity
         return out
 
     def _fat(self, m: FloatArray) -> FloatArray:
@@ -172,18 +172,18 @@ def calf_case(seed: int = 0, *, pixels: int = PIXELS, slices: int = SLICES, moti
     step = FIELD_OF_VIEW_MM / pixels
     corner = (-0.5 * step * (pixels - 1), -0.5 * step * (pixels - 1), -0.5 * SLICE_GAP_MM * (slices - 1))
     grid = Volume.from_array(np.zeros((slices, pixels, pixels), np.uint8), spacing_mm=(step, step, SLICE_GAP_MM), origin_mm=corner)
-    body = VirtualObject.of(phantom.grey, np.zeros((0, 3)), PLASTIC_BEAD, air=4.0)
+    body = VirtualObject.of(phantom.intensity, np.zeros((0, 3)), PLASTIC_BEAD, air=4.0)
     taken = []
     states: tuple[Motion, Motion] = (Still(), FormulaMotion(moved.to_space, moved.to_material))
     for number, (state, gain) in enumerate(zip(states, (1.0, 1.03), strict=True)):
         seen = scan(body, state, grid, MRDevice(noise=noise, gain=gain), seed=100 * seed + number)
         levels = np.minimum(seen.volume.values, 255).astype(np.uint8)
         taken.append(with_slices_between(seen.volume.with_values(levels)))
-    places = positions(taken[0]).reshape(-1, 3)
-    tissue = phantom.tissue(places)
-    truth = np.zeros_like(places)
-    truth[tissue != _AIR] = moved.to_space(places[tissue != _AIR]) - places[tissue != _AIR]
-    after = phantom.tissue(moved.to_material(places)) != _AIR
+    points = positions(taken[0]).reshape(-1, 3)
+    tissue = phantom.tissue(points)
+    truth = np.zeros_like(points)
+    truth[tissue != _AIR] = moved.to_space(points[tissue != _AIR]) - points[tissue != _AIR]
+    after = phantom.tissue(moved.to_material(points)) != _AIR
     shape = taken[0].shape
     return CalfCase(taken[0], taken[1], truth.reshape(*shape, 3), tissue.reshape(shape), after.reshape(shape), moved)
 

@@ -1,5 +1,5 @@
 # mypy: disallow-untyped-decorators=False
-"""Numba kernels behind `naibu.validation.scanners.ct_mr`: shares of voxels that markers fill, projections, echoes."""
+"""Numba kernels for `naibu.validation.scanners`: voxel fractions filled by markers, parallel projections :cite:p:`kak1988`, echoes."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ import numpy as np
 from naibu._numba.compilation import njit
 from naibu.core.arrays import AnyArray, FloatArray, IntArray
 
-# a pixel is split into so many by so many points for projection, or its rays would comb the detector
+# a pixel is projected as so many by so many points, or rays would leave gaps on the detector
 _SPLIT = 3
 
 
 @njit(cache=True, inline="always")
 def _covered(distance: float, width: float) -> float:
-    """Return the share of a cell of this width that lies on the near side of a face at this distance ahead of its middle."""
+    """Return the fraction of a cell of this width on the near side of a face at this distance from its centre."""
     return min(max(distance / width + 0.5, 0.0), 1.0)
 
 
 @njit(cache=True)
 def _covered_by_marker(x: FloatArray, cell: FloatArray, normal: FloatArray, shape: FloatArray) -> float:
-    """Return the share of a cell (3,), mm, at x (3,) from the middle of a marker that lies in it; see `fill_markers` for its shape."""
+    """Return the fraction of a cell (3,), mm, at x (3,) from the centre of a marker inside it; see `fill_markers` for its shape."""
     outer, inner, half = 0.5 * shape[0], 0.5 * shape[1], 0.5 * shape[2]
     along, slab = 0.0, 1.0
     if half > 0.0:
@@ -45,24 +45,24 @@ def _covered_by_marker(x: FloatArray, cell: FloatArray, normal: FloatArray, shap
 
 @njit(cache=True)
 def fill_markers(
-    share: AnyArray, spacing: FloatArray, centres: FloatArray, normals: FloatArray, shape: FloatArray, parts: IntArray
+    fraction: AnyArray, spacing: FloatArray, centres: FloatArray, normals: FloatArray, shape: FloatArray, parts: IntArray
 ) -> None:
-    """Set share (nz, ny, nx) to that of every voxel which rigid markers fill.
+    """Add to fraction (nz, ny, nx) that of every voxel inside rigid markers.
 
     Parameters
     ----------
-    share : ndarray, shape (nz, ny, nx)
-        Changed in place; markers that overlap do not fill a voxel twice.
+    fraction : ndarray, shape (nz, ny, nx)
+        Changed in place; at most 1 where markers overlap.
     spacing : ndarray, shape (3,)
         Of voxels along x, y, z, mm.
     centres, normals : ndarray, shape (k, 3)
-        Index times spacing, mm, and unit vectors; normals mean nothing for balls.
+        Index times spacing, mm, and unit vectors; normals of balls are not used.
     shape : ndarray, shape (3,)
         Outer diameter, diameter of the hole, and thickness, mm; thickness 0 for a ball.
     parts : ndarray, shape (3,)
-        Cells per voxel along x, y, z; in each, faces count as flat.
+        Cells per voxel along x, y, z; in each, faces are taken as flat.
     """
-    nz, ny, nx = share.shape
+    nz, ny, nx = fraction.shape
     outer, half = 0.5 * shape[0], 0.5 * shape[2]
     reach = np.sqrt(outer * outer + half * half)
     size = np.array([nx, ny, nz])
@@ -84,22 +84,22 @@ def fill_markers(
                             for a in range(parts[0]):
                                 x[0] = (i + (a + 0.5) / parts[0] - 0.5) * spacing[0] - centres[m, 0]
                                 filled += _covered_by_marker(x, cell, normals[m], shape)
-                    share[k, j, i] = min(share[k, j, i] + filled / (parts[0] * parts[1] * parts[2]), 1.0)
+                    fraction[k, j, i] = min(fraction[k, j, i] + filled / (parts[0] * parts[1] * parts[2]), 1.0)
 
 
 @njit(cache=True)
-def projected(share: AnyArray, dx: float, dy: float, angles: FloatArray, step: float, out: FloatArray) -> None:
-    """Add to out (views, n) the length, mm, of the rays of parallel views in what fills share (ny, nx) of the pixels.
+def projected(fraction: AnyArray, dx: float, dy: float, angles: FloatArray, step: float, out: FloatArray) -> None:
+    """Add to out (views, n) the length, mm, of the rays of parallel views inside a material.
 
-    The detector is centred on the middle of the slice, its elements are `step` mm apart.
+    It fills a fraction (ny, nx) of the pixels. The detector is centred on the slice, its elements are `step` mm apart.
     """
-    ny, nx = share.shape
+    ny, nx = fraction.shape
     middle = out.shape[1] // 2
     for j in range(ny):
         for i in range(nx):
-            if share[j, i] == 0.0:
+            if fraction[j, i] == 0.0:
                 continue
-            length = share[j, i] * dx * dy / (step * _SPLIT * _SPLIT)
+            length = fraction[j, i] * dx * dy / (step * _SPLIT * _SPLIT)
             for part in range(_SPLIT * _SPLIT):
                 x = (i - 0.5 * (nx - 1) + (part % _SPLIT + 0.5) / _SPLIT - 0.5) * dx
                 y = (j - 0.5 * (ny - 1) + (part // _SPLIT + 0.5) / _SPLIT - 0.5) * dy
@@ -132,7 +132,7 @@ def add_echoes(
     real: FloatArray,
     imaginary: FloatArray,
     spacing: FloatArray,
-    places: FloatArray,
+    positions: FloatArray,
     strengths: FloatArray,
     spread: FloatArray,
     axis: int,
@@ -146,31 +146,31 @@ def add_echoes(
         The field, changed in place.
     spacing : ndarray, shape (3,)
         Of voxels along x, y, z, mm.
-    places : ndarray, shape (n, 3)
+    positions : ndarray, shape (n, 3)
         Index times spacing, mm.
     strengths : ndarray, shape (n,)
-        Amplitudes at the middle of an echo.
+        Amplitudes at the centre of an echo.
     spread : ndarray, shape (3,)
         Standard deviation of the amplitude along x, y, z, mm.
     axis : int
         Along which the beam runs: 0 for x, 1 for y, 2 for z.
     turns : float
-        Turns of the phase per mm along it.
+        Cycles of the phase per mm along it.
     """
     nz, ny, nx = real.shape
     size = np.array([nx, ny, nz])
     most = int(np.ceil((6.0 * spread / spacing).max())) + 3
     weight = np.empty((3, most))
     low, high = np.zeros(3, dtype=np.int64), np.zeros(3, dtype=np.int64)
-    for p in range(len(places)):
+    for p in range(len(positions)):
         if strengths[p] == 0.0:
             continue
         for a in range(3):
-            low[a] = max(int(np.ceil((places[p, a] - 3.0 * spread[a]) / spacing[a])), 0)
-            high[a] = min(int(np.floor((places[p, a] + 3.0 * spread[a]) / spacing[a])) + 1, size[a])
+            low[a] = max(int(np.ceil((positions[p, a] - 3.0 * spread[a]) / spacing[a])), 0)
+            high[a] = min(int(np.floor((positions[p, a] + 3.0 * spread[a]) / spacing[a])) + 1, size[a])
             for i in range(low[a], high[a]):
-                weight[a, i - low[a]] = np.exp(-0.5 * ((i * spacing[a] - places[p, a]) / spread[a]) ** 2)
-        phase = 2.0 * np.pi * turns * places[p, axis]
+                weight[a, i - low[a]] = np.exp(-0.5 * ((i * spacing[a] - positions[p, a]) / spread[a]) ** 2)
+        phase = 2.0 * np.pi * turns * positions[p, axis]
         re, im = strengths[p] * np.cos(phase), -strengths[p] * np.sin(phase)
         for k in range(low[2], high[2]):
             for j in range(low[1], high[1]):

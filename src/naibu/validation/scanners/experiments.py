@@ -1,4 +1,4 @@
-"""Scans of whole experiments: of virtual specimens, and of the measured marker states of the report anew (spec S10)."""
+"""Virtual scans of whole experiments: of virtual specimens, and of the measured marker states of the report."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from naibu.core.volume import Volume
 from naibu.validation.scanners.ct_mr import STEEL_WASHER, MarkerKind, VirtualObject, VirtualScan, empty_grid, scan
 from naibu.validation.scanners.imaging_artifacts import CTDevice, Device
 from naibu.validation.scanners.motions import MatchedMotion, MeshMotion, Motion, PosedMotion, Still
-from naibu.validation.scanners.textures import Grey, Texture, layered_block
+from naibu.validation.scanners.textures import Intensity, Texture, layered_block
 from naibu.validation.specimens.marker_phantoms import Scanner, VirtualSpecimen
 
 
@@ -29,9 +29,9 @@ def rescanned(
     reach_mm: float = 9.0,
     seed: int = 0,
 ) -> Mapping[str, VirtualScan]:
-    """Scan the measured marker states of an experiment anew.
+    """Scan the measured marker states of an experiment with a virtual scanner.
 
-    The body is what lies within `reach_mm` of a marker of the free state; between the markers its texture follows a thin-plate spline. Each
+    The body is all within `reach_mm` of a marker of the reference state; between the markers its texture follows a thin-plate spline. Each
     state is a scan of its own, with its own noise; markers that are missing or not trusted in a state are not in its scan.
 
     Parameters
@@ -39,13 +39,13 @@ def rescanned(
     experiment : Experiment
         Measured in three dimensions.
     spacing_mm : array_like, shape (3,)
-        Of the voxels.
+        Spacing of the voxels along x, y, z, mm.
     kind : MarkerKind
-        What the markers are.
+        Shape and intensity of the markers.
     device : Device, optional
         `CTDevice` by default.
     reach_mm, seed : float, int
-        Thickness of gel around the outermost markers; seed of texture and noise.
+        Thickness of gel around the outermost markers, mm; seed of texture and noise.
 
     Returns
     -------
@@ -55,14 +55,14 @@ def rescanned(
     Raises
     ------
     InputError
-        Fewer than five markers are complete in a state and in the free one.
+        Fewer than five markers are complete in a state and in the reference state.
     """
     scans: dict[str, VirtualScan] = {}
     free = experiment.states[0]
     rest, _ = _complete(free)
     texture, near = Texture.drawn(4.0, seed=seed), cKDTree(rest)
 
-    def grey(material: FloatArray) -> FloatArray:
+    def intensity(material: FloatArray) -> FloatArray:
         return np.where(near.query(material)[0] < reach_mm, 1040.0 + 7.0 * texture(material), 0.0)
 
     for number, state in enumerate(s for s in experiment.states if s.markers is not None):
@@ -70,7 +70,7 @@ def rescanned(
         known = experiment.initial.aligned(ids)
         both = np.isfinite(known).all(axis=1)
         motion: Motion = Still() if state is free else MatchedMotion(known[both], points[both])
-        shown = VirtualObject.of(grey, points, kind, ids=ids)
+        shown = VirtualObject.of(intensity, points, kind, ids=ids)
         grid = empty_grid(points.min(axis=0) - reach_mm - 2.0, points.max(axis=0) + reach_mm + 2.0, spacing_mm)
         scans[state.name] = scan(shown, _Elsewhere(motion, grid), grid, device or CTDevice(), seed=seed + 100 * number, samples=1)
     return scans
@@ -79,7 +79,7 @@ def rescanned(
 def scanned_states(
     specimen: VirtualSpecimen,
     *,
-    grey: Grey | None = None,
+    intensity: Intensity | None = None,
     spacing_mm: ArrayLike = (0.58, 0.58, 1.0),
     kind: MarkerKind = STEEL_WASHER,
     device: Device | None = None,
@@ -94,28 +94,29 @@ def scanned_states(
     ----------
     specimen : VirtualSpecimen
         With the solutions of its loaded states (`naibu.validation.specimens.marker_phantoms.virtual_specimen`).
-    grey : callable, optional
-        Grey value (n,) at points (n, 3), mm, of the free object; by default a gel with a little texture and brighter layers higher up.
+    intensity : callable, optional
+        Intensity (n,) at points (n, 3), mm, of the reference configuration; by default a gel with a little texture and brighter layers
+        higher up.
     spacing_mm : array_like, shape (3,)
-        Of the voxels.
+        Spacing of the voxels along x, y, z, mm.
     kind : MarkerKind
-        What the markers are.
+        Shape and intensity of the markers.
     device : Device, optional
         `CTDevice` by default.
     poses : Scanner, optional
-        How far the object is shifted, turned and tilted from scan to scan; by default 5 mm, 5 and 0.5 degrees.
+        Random translation, rotation and tilt of the object from scan to scan; by default 5 mm, 5 and 0.5 degrees.
     margin_mm : float
-        Air around the object.
+        Air around the object, mm.
     samples, seed : int
         See `naibu.validation.scanners.ct_mr.scan`; poses and noise are drawn anew for every state.
 
     Returns
     -------
     dict of str to VirtualScan
-        By name of the state, the free one first.
+        By name of the state, the reference state first.
     """
     experiment, nodes = specimen.experiment, specimen.model.mesh.points
-    shown = grey or layered_block(
+    shown = intensity or layered_block(
         experiment.shape.size_mm, [(1040.0 + 30.0 * n, at.to_base_mm) for n, at in enumerate(experiment.layers)], seed=seed
     )
     body = VirtualObject.of(shown, specimen.free, kind, ids=experiment.initial.ids)
@@ -132,7 +133,7 @@ def scanned_states(
 
 
 class _Elsewhere:
-    """Texture after a slow motion, tabulated every few voxels; markers stay where they are."""
+    """Texture after a slow motion, tabulated every few voxels; markers are not moved."""
 
     def __init__(self, motion: Motion, grid: Volume, every_mm: float = 3.0) -> None:
         size = grid.spacing_mm * (np.array(grid.shape[::-1]) - 1)
@@ -151,7 +152,7 @@ class _Elsewhere:
 
 
 def _complete(state: State) -> tuple[FloatArray, IntArray]:
-    """Return places (k, 3) and labels of the complete, trusted markers of a state."""
+    """Return positions (k, 3) and labels of the complete, trusted markers of a state."""
     markers = state.markers
     good = np.zeros(0, dtype=bool) if markers is None else markers.trusted & np.isfinite(markers.points).all(axis=1)
     if markers is None or good.sum() < 5:

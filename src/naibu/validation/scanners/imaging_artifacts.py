@@ -1,4 +1,4 @@
-"""What CT and MR scanners make of the grey values of an object: blur, shading, streaks, noise, rounding (spec S10)."""
+"""Image formation of CT and MR scanners: blur, shading, streaks, noise, rounding; Rician noise after :cite:t:`gudbjartsson1995`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Blur = float | tuple[float, float, float]
 
 
 class Device(Protocol):
-    """Turns the grey values of the object into those of a scan."""
+    """Maps the intensities of the object to those of a scan."""
 
     @property
     def blur_mm(self) -> Blur:
@@ -24,18 +24,18 @@ class Device(Protocol):
         ...
 
     def recorded(self, values: Float32Array, metal: Float32Array, spacing: FloatArray, rng: np.random.Generator) -> UInt16Array:
-        """Return what is recorded.
+        """Return the recorded intensities, uint16.
 
         Parameters
         ----------
         values : ndarray, shape (nz, ny, nx)
-            Blurred grey values.
+            Blurred intensities.
         metal : ndarray, shape (nz, ny, nx)
-            Share of every voxel that markers fill, not blurred.
+            Fraction of every voxel that markers fill, not blurred.
         spacing : ndarray, shape (3,)
-            Of the voxels along x, y, z, mm.
+            Spacing of the voxels along x, y, z, mm.
         rng : Generator
-            Draws the noise.
+            Source of the noise.
         """
         ...
 
@@ -47,18 +47,18 @@ class CTDevice:
     Attributes
     ----------
     noise : float
-        Standard deviation of the noise, normally distributed, of which most is correlated over `correlation` pixels within a slice.
+        Standard deviation of the normally distributed noise, intensity; most of it is correlated over `correlation` pixels within a slice.
     blur_mm : float or tuple of float
         Standard deviation of the point spread function, mm.
     cupping, offset : float
-        Share by which the middle of a slice is too dark; grey value of air.
+        Fraction by which the centre of a slice is too dark; intensity of air.
     correlation : float
         Standard deviation of the smooth part of the noise, pixels; 0 for white noise.
     streaks_per_mm : float
-        Share by which a ray's attenuation by markers is measured too low for every mm of them that it crosses: dark bands between markers
-        and bright rays around them (see `naibu.validation.scanners.metal_artifacts`). 0 for none.
-    metal_grey : float
-        Grey value of markers above that of what lies around, by which streaks are scaled.
+        Fraction by which the attenuation of a ray by markers is underestimated for every mm of them that it crosses: dark bands between
+        markers and bright streaks around them (see `naibu.validation.scanners.metal_artifacts`). 0 for none.
+    metal_contrast : float
+        Intensity of markers above that of their surroundings, which scales the streaks.
     """
 
     noise: float = 35.0
@@ -67,20 +67,20 @@ class CTDevice:
     offset: float = 100.0
     correlation: float = 0.8
     streaks_per_mm: float = 0.0
-    metal_grey: float = 2600.0
+    metal_contrast: float = 2600.0
 
     def __post_init__(self) -> None:
         _require_not_negative(self, "noise", "blur_mm", "correlation", "streaks_per_mm")
 
     def recorded(self, values: Float32Array, metal: Float32Array, spacing: FloatArray, rng: np.random.Generator) -> UInt16Array:
-        """Return what is recorded of blurred grey values (nz, ny, nx) with markers in them; see `Device`."""
+        """Return the recorded intensities of blurred ones (nz, ny, nx) with markers; see `Device`."""
         _, ny, nx = values.shape
         x, y = (np.arange(nx) - 0.5 * (nx - 1)) * spacing[0], (np.arange(ny) - 0.5 * (ny - 1)) * spacing[1]
         wide = 0.4 * max(nx * spacing[0], ny * spacing[1])
         cup = 1.0 - self.cupping * np.exp(-(x[None, :] ** 2 + y[:, None] ** 2) / wide**2)
         shown = values * cup + self.offset
         if self.streaks_per_mm > 0.0:
-            shown += self.metal_grey * streaks(metal, spacing, self.streaks_per_mm)
+            shown += self.metal_contrast * streaks(metal, spacing, self.streaks_per_mm)
         if self.noise > 0.0:
             shown += self.noise * self._grain(values.shape, rng)
         return np.asarray(np.clip(np.rint(shown), 0, 65535), dtype=np.uint16)
@@ -97,18 +97,18 @@ class CTDevice:
 
 @dataclass(frozen=True, slots=True)
 class MRDevice:
-    """An MR scanner: Rician noise, and a coil that sees better on one side (fixed in the scanner).
+    """An MR scanner: Rician noise, and a coil that is more sensitive on one side (fixed in the scanner).
 
     Attributes
     ----------
     noise : float
-        Standard deviation of the normally distributed noise of each of the two channels; the magnitude has Rice's distribution.
+        Standard deviation of the normally distributed noise of each of the two channels; the magnitude has a Rician distribution.
     blur_mm : float or tuple of float
         Standard deviation of the point spread function, mm.
     shading : float
-        Share by which the signal varies over the field of view.
+        Fraction by which the signal varies over the field of view.
     gain : float
-        Factor on all grey values, which differs from scan to scan.
+        Factor on all intensities, which differs from scan to scan.
     """
 
     noise: float = 12.0
@@ -120,7 +120,7 @@ class MRDevice:
         _require_not_negative(self, "noise", "blur_mm", "gain")
 
     def recorded(self, values: Float32Array, metal: Float32Array, spacing: FloatArray, rng: np.random.Generator) -> UInt16Array:
-        """Return what is recorded of blurred grey values (nz, ny, nx); see `Device`."""
+        """Return the recorded intensities of blurred ones (nz, ny, nx); see `Device`."""
         z, y, x = (np.linspace(-1.0, 1.0, n).reshape([-1 if a == b else 1 for b in range(3)]) for a, n in enumerate(values.shape))
         coil = 1.0 + 0.5 * self.shading * (0.7 * np.sin(1.5 * y + 0.3) + 0.5 * np.cos(2.0 * x) + 0.2 * z)
         real = self.gain * values * coil + self.noise * rng.standard_normal(values.shape, dtype=np.float32)

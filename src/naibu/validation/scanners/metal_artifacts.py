@@ -1,7 +1,7 @@
-"""Streaks of metal in CT slices: what a filtered back projection makes of rays that metal hardens (spec S10).
+"""Metal artefacts in CT slices: beam hardening in a filtered back projection :cite:p:`kak1988`.
 
-Metal takes the soft part of the beam away, so that twice as much of it weakens a ray less than twice. Rays through two markers therefore
-come out too bright, and the reconstruction shows dark bands between them and bright rays around.
+Metal absorbs the soft part of the beam, so that twice as much of it attenuates a ray less than twice. Rays through two markers are
+therefore too bright, and the reconstruction shows dark bands between them and bright streaks around.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from naibu.core.arrays import Float32Array, FloatArray
 from naibu.core.errors import InputError
 from naibu.validation.scanners._render_kernels import back_projected, projected
 
-VIEWS = 180
+VIEWS = 180  # one a degree
 
 
 def streaks(metal: Float32Array, spacing_mm: FloatArray, loss_per_mm: float, *, views: int = VIEWS) -> Float32Array:
-    """Return what reconstructed slices show beside the metal.
+    """Return the streaks of metal in reconstructed slices.
 
     Parameters
     ----------
     metal : ndarray, shape (nz, ny, nx)
-        Share of every voxel that metal fills.
+        Fraction of every voxel that metal fills.
     spacing_mm : ndarray, shape (3,)
-        Of the voxels along x, y, z, mm; the rays lie in slices.
+        Spacing of the voxels along x, y, z, mm; the rays lie in slices.
     loss_per_mm : float
         A ray that crosses p mm of metal is measured as ``p (1 - loss_per_mm p)``.
     views : int
@@ -32,16 +32,16 @@ def streaks(metal: Float32Array, spacing_mm: FloatArray, loss_per_mm: float, *, 
     Returns
     -------
     ndarray, shape (nz, ny, nx)
-        Error of the reconstructed share of metal: the filtered back projection of ``-loss_per_mm p^2``. In and around one round disc of
+        Error of the reconstructed fraction of metal: the filtered back projection of ``-loss_per_mm p^2``. In and around one round disc of
         radius r it is ``-loss_per_mm (8 / pi) sqrt(r^2 - s^2)`` at distance s from the middle, and zero outside.
 
     Raises
     ------
     InputError
-        Less than two views.
+        Fewer than two views.
     """
     if views < 2:
-        raise InputError(f"views is {views}; a slice needs two at least")
+        raise InputError(f"views is {views}; at least two are needed")
     out = np.zeros(metal.shape, dtype=np.float32)
     filled = np.flatnonzero(metal.reshape(len(metal), -1).any(axis=1))
     if not len(filled):
@@ -58,12 +58,7 @@ def streaks(metal: Float32Array, spacing_mm: FloatArray, loss_per_mm: float, *, 
 
 
 def ramp_filtered(projections: FloatArray, step_mm: float) -> FloatArray:
-    """Return projections (views, n) convolved with the ramp filter of Ramachandran and Lakshminarayanan, per mm.
-
-    References
-    ----------
-    A. C. Kak, M. Slaney: Principles of Computerized Tomographic Imaging. IEEE Press (1988), equation (61) of chapter 3.
-    """
+    """Return projections (views, n) convolved with the ramp (Ram-Lak) filter, per mm: equation (61) of chapter 3 of :cite:t:`kak1988`."""
     n = projections.shape[1]
     size = 1 << int(np.ceil(np.log2(2 * n)))
     at = np.fft.fftfreq(size, 1.0 / size).round()

@@ -1,4 +1,4 @@
-"""Where the material of a virtual object lies in a scan, and back: from a formula, a solved model, or matched points (spec S10)."""
+"""Motions of virtual objects, from material points to positions and back: from a formula, a solved model, or matched points."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from naibu.core.mesh import Mesh
 from naibu.core.rigid_transform import RigidTransform
 from naibu.meshing.point_location import interpolation_operator, locate, operator_of
 
-# Newton for the material point at a place in space: iterations, step of the differences and accuracy, mm
+# Newton's method for the material point at a position: iterations at most, step of the differences and accuracy, mm
 _MOST_ITERATIONS, _STEP, _ACCURACY = 40, 1e-3, 1e-7
 
 
 class Motion(Protocol):
-    """Takes material points (n, 3), mm, to where they lie in a scan, and back; NaN where there is no material."""
+    """Maps material points (n, 3), mm, to their positions in a scan, and back; NaN where there is no material."""
 
     def to_space(self, material: FloatArray) -> FloatArray:
         """Return positions (n, 3), mm, of material points (n, 3), mm."""
@@ -34,7 +34,7 @@ class Motion(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Still:
-    """The object as it was made."""
+    """No motion: the reference configuration."""
 
     def to_space(self, material: FloatArray) -> FloatArray:
         """Return the points."""
@@ -47,7 +47,7 @@ class Still:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FormulaMotion:
-    """A motion given by a formula; without a formula for the way back it is found by Newton's method.
+    """A motion given by a formula; without a formula for its inverse, that is found by Newton's method.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class FormulaMotion:
                 return found
             found[active] += _newton_step(self.to_space, found[active], away)
         raise ConvergenceError(
-            f"the motion cannot be inverted at {len(active)} places, the first at {positions[active[0]].round(3).tolist()} mm; "
+            f"the motion cannot be inverted at {len(active)} positions, the first at {positions[active[0]].round(3).tolist()} mm; "
             "it may fold there"
         )
 
@@ -107,9 +107,9 @@ class MeshMotion:
     Attributes
     ----------
     mesh : Mesh
-        The free body, solid cells.
+        The reference configuration, solid cells.
     displacement : ndarray, shape (n, 3)
-        Of its nodes, mm.
+        Displacement of its nodes, mm.
     """
 
     mesh: Mesh
@@ -124,7 +124,7 @@ class MeshMotion:
         object.__setattr__(self, "_moved", moved)
 
     def to_space(self, material: FloatArray) -> FloatArray:
-        """Return positions (n, 3), mm, of material points (n, 3), mm, which must lie in the mesh or close by."""
+        """Return positions (n, 3), mm, of material points (n, 3), mm, which must lie in or near the mesh."""
         return np.asarray(material + interpolation_operator(self.mesh, material) @ self.displacement)
 
     def to_material(self, positions: FloatArray) -> FloatArray:
@@ -140,7 +140,7 @@ class MeshMotion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedMotion:
-    """A motion seen in another pose of the object in the scanner.
+    """A motion in another pose of the object in the scanner.
 
     Attributes
     ----------
@@ -163,9 +163,9 @@ class PosedMotion:
 
 
 class MatchedMotion:
-    """The smooth motion through measured markers: thin-plate splines both ways, exact at the markers.
+    """The smooth motion through measured markers: thin-plate splines :cite:p:`bookstein1989` both ways, exact at the markers.
 
-    The two ways are not exact inverses of each other between the markers: what is drawn there looks like the object, and is no truth.
+    The two splines are not exact inverses of each other between the markers, where the motion is plausible, not a ground truth.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ class MatchedMotion:
     Raises
     ------
     InputError
-        Fewer than five markers, shapes that do not fit, or coordinates that are not finite.
+        Fewer than five markers, shapes that do not match, or coordinates that are not finite.
     """
 
     def __init__(self, material: ArrayLike, positions: ArrayLike) -> None:
