@@ -1,12 +1,12 @@
 """How long a step of a lattice takes on a device of Warp, beside the engine of the processor, and how far their results differ.
 
-A cube of 80 mm and 630 g, its floor held, a stamp pressing on its top. Steps are those of one call on a state that stays on the device;
-compilation, and the way of the state to the device and back, are not counted. Explicit steps are half as long as
+A cube of 80 mm and 630 g, its floor constrained, a stamp pressing on its top. Steps are those of one call on a state that stays on the
+device; compilation, and the way of the state to the device and back, are not counted. Explicit steps are half as long as
 `explicit_step_limit` allows. Bytes are those that an explicit step cannot avoid to move: the lists of neighbours with their rows of
-coefficients and extensions, and the masses once each.
+coefficients and extensions, and the nodes once each.
 
 Run: ``python benchmarks/lattice_gpu.py [--device cuda:0] [--sizes 8,16,32,64,128] [--steps 100] [--no-cpu] [--no-implicit]``;
-128 is the lattice of 129^3 masses and 27 million elements, which takes minutes to build.
+128 is the lattice of 129^3 nodes and 27 million elements, which takes minutes to build.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from naibu.mechanics.lattices.model.lattice import Lattice, box_mask, classic_la
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, Motion, explicit_step_limit
 
 SIDE_MM, MASS_KG = 80.0, 0.63
-GENTLE = (0.03, 0.002, 0.003)  # K, C1, C2 at 9^3 masses
+GENTLE = (0.03, 0.002, 0.003)  # K, C1, C2 at 9^3 nodes
 STIFF = (10.0, 5.0, 10.0)
 
 
@@ -132,7 +132,7 @@ def main() -> None:
     print(f"Warp {warp.__version__}, {cores}, load {os.getloadavg()[0]:.1f} at the start")
     for n in (int(size) for size in asked.sizes.split(",")):
         built, lattice = clocked(lambda n=n: classic_lattice(box_mask((n,) * 3), SIDE_MM / n, total_mass_kg=MASS_KG))
-        print(f"{n + 1}^3 masses, {lattice.n_elements} elements, built in {built:.1f} s, peak {peak_gb():.2f} GB", flush=True)
+        print(f"{n + 1}^3 nodes, {lattice.n_elements} elements, built in {built:.1f} s, peak {peak_gb():.2f} GB", flush=True)
         explicit(lattice, n, device, asked.steps, asked.repeats, not asked.no_cpu)
         if not asked.no_implicit:
             implicit(lattice, device, max(asked.steps // 10, 2), asked.repeats, not asked.no_cpu)

@@ -1,6 +1,6 @@
 """How long a step of a lattice takes: explicit and implicit, classic and octree, beside a plain loop and NumPy; jitter; gradients.
 
-A cube of 80 mm and 630 g with 9^3, 17^3 and 33^3 masses. The references take the explicit Euler step of the same elements: one in
+A cube of 80 mm and 630 g with 9^3, 17^3 and 33^3 nodes. The references take the explicit Euler step of the same elements: one in
 NumPy, one as a plain Numba loop over the elements on one thread, as one would write it first. Each time is the least over many repeats,
 and that of a step in a long call, without what the call itself costs; `cpu` is the time of the processor (all threads), `wall` that of
 the clock, which on a shared machine counts what others do. Rows of sessions are single steps, called one by one, with all that a call
@@ -86,7 +86,7 @@ def numpy_steps(lattice: Lattice, coefficients: tuple[np.ndarray, ...], steps: i
 
 
 def pushed(lattice: Lattice) -> tuple[ConstrainedNodes, np.ndarray]:
-    """Return a floor that holds the lowest masses and a stamp of 20 mm on the top, and their velocities."""
+    """Return a floor that holds the lowest nodes and a stamp of 20 mm on the top, and their velocities."""
     x, y, z = lattice.points.T
     stamp = (z > SIDE_MM - 0.1) & (np.abs(x - 40.0) < 10.1) & (np.abs(y - 40.0) < 10.1)
     return ConstrainedNodes.of(np.flatnonzero(z < 0.1), 0) + ConstrainedNodes.of(np.flatnonzero(stamp), 1), np.array(
@@ -136,7 +136,7 @@ def sizes(n: int, repeats: int) -> None:
     lattice = classic_lattice(box_mask((n,) * 3), SIDE_MM / n, total_mass_kg=MASS_KG)
     gentle, stiff = lattice_parameters(lattice, *(p * 8.0 / n for p in GENTLE)), lattice_parameters(lattice, *STIFF)
     steps = {8: 500, 16: 100}.get(n, 20)
-    print(f"{n + 1}^3 masses, {lattice.n_elements} elements")
+    print(f"{n + 1}^3 nodes, {lattice.n_elements} elements")
     reference = references(lattice, gentle, steps, repeats)
     team = (1, 2) if lattice.n_elements >= 20_000 else (1,)
     for precision in ("double", "single"):

@@ -65,12 +65,12 @@ def test_the_series_holds_every_frame(whole: Path) -> None:
     assert found["steps"] == FRAMES + 1 and told["times_s"] == found["VTKHDF/Steps/Values"].tolist() and told["finished"]
     moved = found["VTKHDF/PointData/displacement_mm"].reshape(FRAMES + 1, n, 3)
     assert (moved[0] == 0.0).all() and moved[5, :, 2].min() < -1.0
-    # the sphere moves on its path, and no mass is inside of it
+    # the sphere moves on its path, and no node is inside of it
     place = np.array(told["places_mm"]["ball"])
     np.testing.assert_allclose(place[5], [10.0, 10.0, 25.5], atol=1e-9)
     distance = np.linalg.norm(study.lattice.points + moved[5] - place[5], axis=1)
     assert 8.0 - 1e-3 < distance.min() < 8.1
-    # mean stretch of the elements at a mass, by hand
+    # mean stretch of the elements at a node, by hand
     i, j = study.lattice.elements.T
     x = study.lattice.points + moved[5]
     strain = np.linalg.norm(x[j] - x[i], axis=1) / study.lattice.lengths - 1.0
@@ -79,7 +79,7 @@ def test_the_series_holds_every_frame(whole: Path) -> None:
 
 
 def test_forces_momentum_and_mass_balance(whole: Path) -> None:
-    """What is written obeys Newton: the impulses of floor and ball are the momentum of all masses."""
+    """What is written obeys Newton: the impulses of floor and ball are the momentum of all nodes."""
     told = json.loads((whole / "out" / "mine.json").read_text(encoding="utf-8"))
     found = series_of(whole / "out" / "mine.vtkhdf")
     study = prepared_study(whole / "mine.toml").study
@@ -174,7 +174,7 @@ def test_steps_that_blow_up_leave_the_frames_before(tmp_path: Path) -> None:
         "[0.1, 0, 0, -3]", "[0.05, 0, 0, 0], [0.1, 0, 0, -3]"
     )
     path = study_file(tmp_path, text)
-    with pytest.raises(ConvergenceError, match=r"blew up.*The first 0\.0[24] s are kept"):
+    with pytest.raises(ConvergenceError, match=r"diverged.*The first 0\.0[24] s are kept"):
         simulate_lattice(path, tmp_path / "out")
     assert series_of(tmp_path / "out" / "mine.vtkhdf")["steps"] in (2, 3)
 

@@ -98,7 +98,7 @@ class ObjectTable(_Table):
 
 
 class LatticeTable(_Table):
-    """``[lattice]``: masses and elements."""
+    """``[lattice]``: nodes and elements."""
 
     kind: Literal["classic", "octree-0", "octree-1", "octree-2"] = "classic"
     spacing_mm: Positive
@@ -296,8 +296,8 @@ _MENDS = {
     "parameters": "add a table [parameters] with K = 40.0, C1 = 20.0 and C2 = 60.0",
     "simulation": "add a table [simulation] with duration_s = 5.0",
     "K": "stiffness of an element, mN/mm",
-    "C1": "damper beside the spring, mN s/mm",
-    "C2": "damper in line with the spring, mN s/mm",
+    "C1": "dashpot beside the spring, mN s/mm",
+    "C2": "dashpot in line with the spring, mN s/mm",
     "size_mm": "write three positive lengths along x, y, z, for example size_mm = [100, 50, 70]",
     "spacing_mm": "write the edge of a voxel, for example spacing_mm = 10.0",
     "duration_s": "write how long is computed, for example duration_s = 5.0",

@@ -244,7 +244,7 @@ def _bodies(path: Path, settings: StudyFile, lattice: Lattice) -> tuple[StudyBod
         try:
             begin_contact(lattice, [body.indenter])
         except InputError as error:
-            told = re.sub(r"^body 0, an? \w+, ", "the indenter ", str(error))
+            told = re.sub(r"^indenters\[0\], an? \w+, ", "the indenter ", str(error))
             raise InputError(f"{path}: [[indenter]] number {k + 1} centre_mm = {table.centre_mm}: {told}") from error
         bodies.append(body)
     names = [body.name for body in bodies]

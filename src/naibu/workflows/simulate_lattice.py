@@ -86,7 +86,7 @@ def simulate_lattice(
     InputError
         What `naibu.workflows.lattice_study.prepared_study` refuses, a folder that cannot be written, or nothing to resume.
     ConvergenceError
-        An explicit method blew up; the frames before are kept.
+        An explicit method diverged; the frames before are kept.
     """
     prepared = prepared_study(source)
     folder = result_folder(out)
@@ -148,7 +148,7 @@ def _append(series: SeriesFile, prepared: PreparedStudy, frame: StudyFrame) -> N
 
 
 def mean_stretch(study: LatticeStudy, position: FloatArray) -> FloatArray:
-    """Return how much longer than at rest the elements at every mass are on average (n,), as a share of their length."""
+    """Return how much longer than at rest the elements at every node are on average (n,), as a fraction of their length."""
     lattice = study.lattice
     i, j = lattice.elements.T
     rest = lattice.lengths
@@ -241,7 +241,7 @@ def _sentences(prepared: PreparedStudy, state: StudyState, force: FloatArray) ->
     lattice = study.lattice
     found = [
         f"{lattice.n_nodes} masses, {1e3 * lattice.total_mass:.4g} g in all, joined by {lattice.n_elements} elements of a spring and "
-        f"two dampers; {study.frames * study.frame_s:g} s in steps of {1e3 * study.step_s:g} ms."
+        f"two dashpots; {study.frames * study.frame_s:g} s in steps of {1e3 * study.step_s:g} ms."
     ]
     if state.frame < study.frames:
         found.append(f"The run was interrupted: this is the part until {state.frame * study.frame_s:g} s.")

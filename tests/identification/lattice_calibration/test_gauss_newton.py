@@ -91,7 +91,7 @@ def test_forces_add_what_shapes_alone_do_not_tell(lattice: Lattice, capture: Cap
 
 
 def test_force_pushed_forces_tell_next_to_nothing(lattice: Lattice, capture: Capture, unknowns: LatticeUnknowns) -> None:
-    """Whatever the parameters, the lattice answers a force with the same force, less the inertia of the masses that it acts on."""
+    """Whatever the parameters, the lattice answers a force with the same force, less the inertia of the nodes that it acts on."""
     by_force, by_displacement = (
         evaluated(CalibrationProblem.of(lattice, [capture], unknowns, index="force", mode=mode), np.log(list(THREE.values()))).information
         for mode in ("force", "displacement")
@@ -291,7 +291,7 @@ def test_wrong_problems_are_told(lattice: Lattice, capture: Capture, unknowns: L
     with pytest.raises(InputError, match="starts inside of the object"):
         PushedLattice.of(lattice, inside)
     beside = replace(SQUEEZE, faces=(PushedFace((-9.0, 0.0, 0.0), (-8.0, 50.0, 50.0), (1.0, 0.0, 0.0)),))
-    with pytest.raises(InputError, match="touches no mass"):
+    with pytest.raises(InputError, match="touches no node"):
         PushedLattice.of(lattice, beside)
     with pytest.raises(InputError, match="laws are"):
         dough_twin(law="other")  # type: ignore[arg-type]

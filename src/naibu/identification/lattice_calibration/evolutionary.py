@@ -1,4 +1,4 @@
-"""Calibration by evolution: CMA-ES and a genetic algorithm, on the report's own indices, in parallel processes or on a cluster (spec L6).
+"""Calibration of lattices by CMA-ES :cite:p:`hansen2001` and a genetic algorithm :cite:p:`goldberg1989`, in parallel.
 
 Both need no derivatives and no start near the truth; both need hundreds to thousands of simulated pushings where `calibrate_lattice` needs
 about a hundred.

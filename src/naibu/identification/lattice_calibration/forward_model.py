@@ -1,4 +1,4 @@
-"""Lattices pushed, kept and released by rigid bodies, by displacement or by force, and what is captured of it (spec L4, L6)."""
+"""Forward model of lattice calibration: pushing, holding and releasing by rigid faces :cite:p:`hirai2008` (chapter 4.3)."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from naibu.mechanics.lattices.simulation.tangent_linear import Loads, ParameterC
 
 PushMode = Literal["displacement", "force"]
 SAMPLE_S = 2e-3  # of the force sensor
-QUICK_S = 0.06  # after a change of motion, in which long steps would smear what the dampers do
+QUICK_S = 0.06  # after a change of motion, in which long steps would smear the response of the dashpots
 
 
 @dataclass(frozen=True, slots=True)
 class PushedFace:
-    """A rigid body: at rest it touches the masses in a box, and moves with a constant velocity while it pushes.
+    """A rigid body: at rest it touches the nodes in a box, and moves with a constant velocity while it pushes.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class PushedFace:
 
 @dataclass(frozen=True, slots=True)
 class Pushing:
-    """An operation: push, keep, release; masses on the floor, the lowest ones, stay where they are.
+    """An operation: push, keep, release; nodes on the floor, the lowest ones, stay where they are.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class Pushing:
         return self.push_s + self.keep_s
 
     def touched(self, lattice: Lattice) -> tuple[IntArray, ...]:
-        """Return the masses that every indenter touches.
+        """Return the nodes that every indenter touches.
 
         Raises
         ------
@@ -84,7 +84,7 @@ class Pushing:
             inside = ((lattice.points >= np.array(indenter.low) - slack) & (lattice.points <= np.array(indenter.high) + slack)).all(axis=1)
             if not inside.any():
                 raise InputError(
-                    f"{self.name}: indenter {k} between {indenter.low} and {indenter.high} mm touches no mass; its box must hold some"
+                    f"{self.name}: indenter {k} between {indenter.low} and {indenter.high} mm touches no node; its box must contain some"
                 )
             if not lattice.surface_node[inside].all():
                 raise InputError(f"{self.name}: indenter {k} starts inside of the object; move its box to the surface")
@@ -162,7 +162,7 @@ class Reproduced:
     Attributes
     ----------
     positions : ndarray, shape (captures, n, 3)
-        Of the masses at the times of capture, mm.
+        Of the nodes at the times of capture, mm.
     force : ndarray, shape (samples, indenters, 3)
         Forces of the indenters while they touch, mN, mean over each `PushedLattice.long_step`.
     positions_change : ndarray, shape (p, captures, n, 3)
@@ -190,7 +190,7 @@ class PushedLattice:
     pushing : Pushing
         What is done.
     mode : str
-        ``"displacement"``: touched masses follow the indenters; ``"force"``: they share the measured forces by the area around them.
+        ``"displacement"``: touched nodes follow the indenters; ``"force"``: they share the measured forces by the area around them.
     step : float
         s.
     long_step : float
@@ -308,7 +308,7 @@ class PushedLattice:
 
 
 def tributary_shares(lattice: Lattice, nodes: IntArray) -> FloatArray:
-    """Return the share (k,) of a force that each of the masses of a flat patch takes.
+    """Return the share (k,) of a force that each of the nodes of a flat patch takes.
 
     Rigid points in the middle of every face of a voxel take equal forces and hand a quarter to each corner (bilinear weights).
     """

@@ -1,4 +1,4 @@
-"""Parameters of a lattice from captured shapes and forces, by Gauss and Newton with exact derivatives (spec L6).
+"""Gauss-Newton identification of lattice parameters from captured shapes and forces :cite:p:`nocedal2006`.
 
 The residuals are the signed distances of captured points from the computed surface, and computed minus measured forces, both in units of
 their noise: their sum of squares is chi-squared, and what the report weighs by hand, shape against force, needs no weight. The report's own

@@ -1,4 +1,4 @@
-"""How far captured points and forces lie from computed ones: S_shape and S_force of the report, and their gradients (spec L6)."""
+"""Shape and force misfit of the report, S_shape and S_force :cite:p:`hirai2008` (chapter 4.3), with their gradients."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class ShapeDifference:
     total : float
         Sum of the distances that count, mm.
     gradient : ndarray, shape (n, 3)
-        Derivative of `total` with respect to the positions of the masses.
+        Derivative of `total` with respect to the positions of the nodes.
     distance : ndarray, shape (k,)
         Of every captured point, mm.
     counted : ndarray, shape (k,), bool
@@ -68,7 +68,7 @@ def closest_points(points: ArrayLike, hull: TriangleTree, positions: ArrayLike) 
     hull : TriangleTree
         The surface.
     positions : array_like, shape (n, 3)
-        Deformed positions of its masses, mm.
+        Deformed positions of its nodes, mm.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def closest_points(points: ArrayLike, hull: TriangleTree, positions: ArrayLike) 
     asked = checked_points(points, "points")
     deformed = np.ascontiguousarray(positions, dtype=float)
     if np.isnan(deformed).any():
-        raise InputError(f"{int(np.isnan(deformed).any(axis=1).sum())} masses have positions that are NaN; the computed motion blew up")
+        raise InputError(f"{int(np.isnan(deformed).any(axis=1).sum())} nodes have positions that are NaN; the computed motion diverged")
     boxes = hull.boxes(deformed)
     k = len(asked)
     found = Closest(np.empty(k), np.zeros(k, dtype=np.int64), np.empty((k, 3)), np.empty((k, 3)))

@@ -1,4 +1,4 @@
-"""The parameters of a lattice that are sought: K, C1 and C2 by class of element, and by zone where these differ (spec L1, L6)."""
+"""Unknown parameters of a lattice: K, C1 and C2 by class of element, and by zone :cite:p:`hirai2008` (chapter 4.3)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ UNITS = {"K": "mN/mm", "C1": "mN s/mm", "C2": "mN s/mm"}
 VOIGT_FRACTION = 0.7  # has no effect
 MOST_NAMED = 4  # parameters of a combination
 FRACTION_NOTE = (
-    "a, the Voigt part's share of the length at rest, changes neither force nor shape (only the extension Z - a L enters): "
+    "a, the Voigt part's fraction of the length at rest, changes neither force nor shape (only the extension Z - a L enters): "
     "no measurement of either can identify it."
 )
 

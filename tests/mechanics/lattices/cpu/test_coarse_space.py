@@ -91,7 +91,7 @@ def test_the_solution_is_the_same_with_fewer_iterations(name, between, monkeypat
 @pytest.mark.parametrize("between", [False, True])
 @pytest.mark.parametrize("name", SPECIMENS)
 def test_coarse_functions_reproduce_linear_fields(name, between, monkeypatch):
-    """Hat functions add up to any linear field where the masses are; and what goes down is the transpose of what comes up."""
+    """Hat functions add up to any linear field where the nodes are; and what goes down is the transpose of what comes up."""
     helped(monkeypatch, between)
     lattice, parameters = SPECIMENS[name]
     engine = LatticeEngine.of(lattice, parameters)
@@ -101,7 +101,7 @@ def test_coarse_functions_reproduce_linear_fields(name, between, monkeypatch):
     slope = rng.normal(size=(3, 3))
     fine = (weights[2], weights[3])
     count = int(fine[0].max()) + 1
-    nodes = np.zeros((count, 3))  # where the coarse nodes are: the places whose interpolation gives the masses
+    nodes = np.zeros((count, 3))  # where the coarse nodes are: the places whose interpolation gives the nodes of the lattice
     share = np.zeros((n, count))
     np.add.at(share, (np.arange(n)[:, None], fine[0]), fine[1])
     np.testing.assert_allclose(share.sum(axis=1), 1.0, atol=1e-12)

@@ -232,9 +232,9 @@ def test_bad_states_are_named_and_explicit_steps_that_blow_up_say_so(device):
     ):
         with pytest.raises(InputError, match=said):
             engine.run(state, 1)
-    with pytest.raises(InputError, match="held masses have the numbers"):
+    with pytest.raises(InputError, match="constrained nodes have the numbers"):
         engine.run(rest, 1, ConstrainedNodes.of([lattice.n_nodes]))
-    with pytest.raises(ConvergenceError, match="blew up within 200 steps"):
+    with pytest.raises(ConvergenceError, match="diverged within 200 steps"):
         engine.run(spinning(lattice), 200)
 
 

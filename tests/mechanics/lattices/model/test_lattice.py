@@ -1,4 +1,4 @@
-"""Lattices against closed forms, conservation laws and counts (spec L1, L2, A2)."""
+"""Lattices against closed forms, conservation laws and counts."""
 
 from __future__ import annotations
 
@@ -94,12 +94,12 @@ def test_the_coefficients_of_the_step_have_their_limits(k, c1, c2):
         assert a * h == pytest.approx(c1 if np.isinf(c2) else c1 * c2 / (c1 + c2))
     elif np.isinf(c2):
         assert (a, b, decay, g) == pytest.approx((c1 / h + k / 2, k, 1.0, 1.0))
-    elif k == 5e9:  # the spring is rigid: only the series damper is left
+    elif k == 5e9:  # the spring is rigid: only the series dashpot is left
         assert a * h == pytest.approx(c2, rel=1e-5)
 
 
 def test_relaxation_of_one_element_is_exact():
-    """Stretched evenly in one step and held: y decays exponentially and the mean tension of a step is C2 times its fall."""
+    """Stretched evenly in one step and constrained: y decays exponentially and the mean tension of a step is C2 times its fall."""
     k, c1, c2, h, stretch, length = 3.0, 0.4, 0.9, 2e-3, 0.05, 10.0
     lattice = single()
     engine = LatticeEngine.of(lattice, lattice_parameters(lattice, k, c1, c2), step=h)
@@ -112,7 +112,7 @@ def test_relaxation_of_one_element_is_exact():
     t = h * np.arange(1, 200)
     y = y1 * np.exp(-t / tau)
     assert motion.state.extension[0] == pytest.approx(y[-1], rel=1e-9)
-    np.testing.assert_allclose(motion.reaction[2:, 1, 2], c2 * (y[:-1] - y[1:]) / h, rtol=1e-9)  # the mass stops in the second step
+    np.testing.assert_allclose(motion.reaction[2:, 1, 2], c2 * (y[:-1] - y[1:]) / h, rtol=1e-9)  # the node stops in the second step
     np.testing.assert_allclose(motion.reaction[2:, 0], -motion.reaction[2:, 1], atol=1e-12)
     assert length + stretch == pytest.approx(motion.state.position[1, 2])
 
@@ -360,7 +360,7 @@ BOX = classic_lattice(box_mask((2, 2, 2)), 1.0, density=1e-6)
         (lambda: lattice_parameters(BOX, np.ones(3), 1.0, 1.0), "(3,)"),
         (lambda: engine().run(LatticeState(np.full((27, 3), np.nan), np.zeros((27, 3)), np.zeros(BOX.n_elements)), 1), "NaN"),
         (lambda: engine().run(engine().rest(), 1, ConstrainedNodes.of([27])), "0 to 26"),
-        (lambda: engine().run(engine().rest(), 1, ConstrainedNodes.of([2]) + ConstrainedNodes.of([2], 1)), "mass 2 is held twice"),
+        (lambda: engine().run(engine().rest(), 1, ConstrainedNodes.of([2]) + ConstrainedNodes.of([2], 1)), "node 2 is constrained twice"),
         (lambda: engine().run(engine().rest(), 1, ConstrainedNodes.of([2]), np.zeros((2, 1, 3))), "(2, 1, 3)"),
         (lambda: engine(step=0.0), "the step"),
         (lambda: engine(method="heun"), "heun"),

@@ -1,4 +1,4 @@
-"""Octree lattices: the printed counts, connections, masses (spec L3)."""
+"""Octree lattices: the printed counts, connections, masses."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_the_misprints_contradict_the_memory_of_the_same_paper():
 
 @pytest.mark.parametrize(("kind", "total"), [(0, 0.6117), (1, 0.5985), (2, 0.5835)])
 def test_the_printed_mass_rule_loses_mass(kind, total):
-    """0.864 g at masses of fine voxels, 5.04 g (those of 5^3 masses) at the others; their sum falls short of 630 g."""
+    """0.864 g at nodes of fine voxels, 5.04 g (those of 5^3 nodes) at the others; their sum falls short of 630 g."""
     lattice = octree_lattice(box_mask((8, 8, 8)), 10.0, kind, total_mass_kg=0.63, lumping="smallest")
     np.testing.assert_allclose(np.unique(lattice.node_mass), [0.63 / 729, 0.63 / 125])
     assert lattice.total_mass == pytest.approx(total, abs=5e-5)
@@ -77,7 +77,7 @@ def test_an_octree_of_the_finest_cubes_is_the_classic_lattice():
 
 
 def test_cubes_of_one_size_scale_with_their_edge():
-    """Springs K between masses l apart make a solid of stiffness K / l: a lattice twice as coarse needs twice the K."""
+    """Springs K between nodes l apart make a solid of stiffness K / l: a lattice twice as coarse needs twice the K."""
     mask = box_mask((8, 8, 8))
     lattice = octree_lattice(mask, 1.0, 0, density=1e-6, scaling="edge")
     inner = (

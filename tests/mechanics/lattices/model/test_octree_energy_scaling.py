@@ -1,4 +1,4 @@
-"""Octree lattices answer as the classic lattice does: energies, forces, shape of the surface, frequencies (spec L3)."""
+"""Octree lattices respond as the classic lattice does: energies, forces, shape of the surface, frequencies."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def numbers_in(classic, octree):
 
 
 def top_moves(motion: Callable) -> Callable:
-    """Hold the floor, and move the masses of the top (x, y in half edges from its middle)."""
+    """Hold the floor, and move the nodes of the top (x, y in half edges from its middle)."""
 
     def load(lattice):
         low, high = lattice.points.min(axis=0), lattice.points.max(axis=0)
@@ -122,7 +122,7 @@ def test_a_cube_with_a_fine_surface_answers_as_the_classic_one(kind, load):
 
 @pytest.mark.parametrize("load", LOADS)
 def test_a_cube_with_coarse_corners_answers_with_the_forces_of_the_classic_one(load):
-    """The corners are eight cubes of a quarter of the edge: masses that hang there move by some strain times a voxel."""
+    """The corners are eight cubes of a quarter of the edge: nodes that hang there move by some strain times a voxel."""
     classic, octree = pair(box_mask((8, 8, 8)), 2)
     works, shapes = zip(*(answer(lattice, lattice.scale, LOADS[load]) for lattice in (classic, octree)), strict=True)
     assert works[1] == pytest.approx(works[0], rel=0.045)
@@ -145,7 +145,7 @@ def test_a_cube_of_17_masses_an_edge(kind, shape_limit, load):
 
 @pytest.mark.parametrize(("mask", "shape_limit"), [(ellipsoid((14, 12, 10)), 0.04), (angle(10), 0.02)], ids=["ellipsoid", "L"])
 def test_other_bodies_answer_as_the_classic_lattice(mask, shape_limit):
-    """A motion of the ends of the surface that took no part in the rule: held below, moved askew above."""
+    """A motion of the ends of the surface that took no part in the rule: constrained below, moved askew above."""
     classic, octree = pair(mask, 0)
 
     def load(lattice):

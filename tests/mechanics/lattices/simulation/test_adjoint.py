@@ -1,4 +1,4 @@
-"""Gradients of pushes against finite differences (spec L6)."""
+"""Adjoint gradients against finite differences."""
 
 from __future__ import annotations
 

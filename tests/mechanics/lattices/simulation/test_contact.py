@@ -1,4 +1,4 @@
-"""Pushing lattices: hand-over, unilateral contact, Coulomb friction, pull-off, reactions (spec L4, L5)."""
+"""Pushing lattices: bilinear weights, unilateral contact, Coulomb friction, pull-off, reactions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_bilinear_weights_are_opposite_areas_and_snap():
     x, y = lattice.points[corners][..., 0], lattice.points[corners][..., 1]
     assert (lattice.points[corners][..., 2] == 10.0).all()
     np.testing.assert_allclose(weights.sum(axis=1), 1.0)
-    np.testing.assert_allclose((weights * x).sum(axis=1), [13.0, 10.0, 20.0])  # the second and third stand on lines of masses
+    np.testing.assert_allclose((weights * x).sum(axis=1), [13.0, 10.0, 20.0])  # the second and third stand on lines of nodes
     np.testing.assert_allclose((weights * y).sum(axis=1), [4.0, 4.0, 10.0])
 
 
@@ -128,7 +128,7 @@ def test_static_friction_holds_until_its_limit(pull, slides):
 
 
 def pair(gap, speed):
-    """Two masses one above the other, the lower one at a gap over the floor; both leave it."""
+    """Two nodes one above the other, the lower one at a gap over the floor; both leave it."""
     lattice = general_lattice([[0.0, 0.0, gap], [0.0, 0.0, gap + 10.0]], [[0, 1]], [0.01, 0.01])
     engine = LatticeEngine.of(lattice, lattice_parameters(lattice, 100.0, 1.0, np.inf))
     return lattice, engine, LatticeState(lattice.points, np.full((2, 3), (0.0, 0.0, speed)), np.zeros(1))

@@ -57,7 +57,7 @@ def driven(**changes: object) -> LatticeStudy:
 
 
 def test_a_study_is_the_pushing_that_calibration_computes() -> None:
-    """The box of the study and the box of masses of a `Pushing` touch the same masses, and what follows is the same motion."""
+    """The box of the study and the box of nodes of a `Pushing` touch the same nodes, and what follows is the same motion."""
     pushing = Pushing("push", (PushedFace((0.0, 10.0, 10.0), (0.0, 20.0, 20.0), (20.0, 0.0, 0.0)),), 0.1, 0.1, 0.12, (0.0, 0.1, 0.2, 0.32))
     expected = PushedLattice.of(LATTICE, pushing).run(SOFT, tolerance=1e-6)
     box = box_indenter((-2.5, 15.0, 15.0), (5.0, 10.0, 10.0))
@@ -140,7 +140,7 @@ def test_what_cannot_be_run_is_told() -> None:
     for study, words in (
         (touching(method="euler"), "needs method 'implicit'"),
         (touching(bodies=(floor, moving("ball", ball, path, tied_until_s=1.0))), "floor cannot be in contact"),
-        (tied(bodies=(moving("ball", ball, path, tied_until_s=1.0),)), "ball touches no mass, the nearest is 3.077"),
+        (tied(bodies=(moving("ball", ball, path, tied_until_s=1.0),)), "ball touches no node, the nearest is 3.077"),
         (driven(bodies=(*driven().bodies, moving("ball", spherical_indenter((15.0, 15.0, 60.0), 5.0), path))), "ball cannot move"),
         (touching(bodies=(floor, still("ball", spherical_indenter((15.0, 15.0, 25.0), 10.0)))), "begins inside the object"),
     ):

@@ -1,4 +1,4 @@
-"""Sessions against runs of many steps, and what decides whether helpers are asked; no test looks at a clock of the machine's."""
+"""Sessions against runs of many steps, and what decides whether workers are asked; no test looks at a clock of the machine's."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_sessions_of_one_engine_do_not_disturb_one_another():
 
 
 def test_who_takes_a_part_changes_nothing():
-    """Runs with helpers, and with the team at rest, give the same to the last bit."""
+    """Runs with workers, and with the pool at rest, give the same to the last bit."""
     found = []
     for alone in (False, True):
         session = LatticeSession.of(engine(method="euler", step=1e-4, threads=4), constrained=CONSTRAINED)
@@ -116,7 +116,7 @@ def test_the_team_rests_longer_after_each_stall_and_forgets_them():
 def test_a_helper_that_is_late_is_waited_for_and_stalls_the_team():
     control = thread_pool.new_control(2)
     control[thread_pool.DONE] = 2
-    assert nogil_wait(control) == 0  # compiled before the helper begins
+    assert nogil_wait(control) == 0  # compiled before the worker begins
     thread_pool.publish(control, 7)
     assert control[thread_pool.JOB] == 7
     assert {thread_pool.claim(control), thread_pool.claim(control)} == {0, 1}
@@ -186,7 +186,7 @@ def test_a_session_that_blows_up_says_so():
         for _ in range(2000):
             session.step(PUSH)
     assert session.steps <= 2000
-    with pytest.raises(ConvergenceError, match="blew up"):
+    with pytest.raises(ConvergenceError, match="diverged"):
         session.state()
 
 
@@ -198,7 +198,7 @@ def test_a_session_that_blows_up_says_so():
         (lambda s: s.step(np.zeros((2, 2))), "do not fit"),
         (lambda s: s.step(PUSH, steps=0), "steps must be at least 1, not 0"),
         (lambda s: s.constrain(ConstrainedNodes.of([10_000])), "the lattice has 0 to"),
-        (lambda s: s.constrain(CONSTRAINED + CONSTRAINED), "held twice"),
+        (lambda s: s.constrain(CONSTRAINED + CONSTRAINED), "constrained twice"),
         (lambda s: LatticeSession.of(s.engine, external_force=[np.inf, 0.0, 0.0]), "external_force"),
     ],
 )

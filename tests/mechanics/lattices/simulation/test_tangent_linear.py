@@ -29,7 +29,7 @@ def parameters(lattice: Lattice) -> LatticeParameters:
 
 
 def pushed(lattice: Lattice, given: LatticeParameters, changes: tuple[ParameterChange, ...] = (), tolerance: float = 1e-10) -> DrivenMotion:
-    """A face moved inwards, the one across pushed by a force, the floor held."""
+    """A face moved inwards, the one across pushed by a force, the floor constrained."""
     engine = LatticeEngine.of(lattice, given, step=STEP_S, tolerance=tolerance)
     p = lattice.points
     constrained = ConstrainedNodes.of(np.flatnonzero(p[:, 2] == 0.0), 0) + ConstrainedNodes.of(
@@ -100,7 +100,7 @@ def test_a_run_in_two_parts_is_the_run_in_one(lattice: Lattice) -> None:
 
 
 def test_what_a_body_pushes_with_is_answered_but_for_inertia(lattice: Lattice) -> None:
-    """The answer of the lattice to a force is the force less the momentum that the loaded masses took up."""
+    """The answer of the lattice to a force is the force less the momentum that the loaded nodes took up."""
     found = pushed(lattice, parameters(lattice))
     p = lattice.points
     loaded = np.flatnonzero((p[:, 0] == 80.0) & (p[:, 2] > 10.0))

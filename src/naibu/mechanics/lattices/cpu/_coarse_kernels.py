@@ -1,4 +1,4 @@
-"""Kernels of the coarse correction in the implicit solver of lattices: between masses and coarse nodes, and the small dense solve.
+"""Kernels of the coarse correction in the implicit solver of lattices: between nodes and coarse nodes, and the small dense solve.
 
 `coarse` is the tuple that `lattice_coarse.coarse_space` makes: steps, vectors, further ones, small, weights and memory (see there); its
 arrays are empty where an engine does without.
@@ -12,7 +12,7 @@ from naibu._numba.compilation import njit
 from naibu._numba.simd import WIDTH, load, splat, store, total
 
 _FAST = {"contract", "nsz"}
-# places in the memory: held components known of, inverse in use, work done, and work from which on a new inverse costs little
+# places in the memory: constrained components known of, inverse in use, work done, and work from which on a new inverse costs little
 NODES, SLOT, CREDIT, PRICE = range(4)
 
 
@@ -133,7 +133,7 @@ def _from_nodes(steps, vectors):  # type: ignore[no-untyped-def]  # pragma: no c
 
 @njit(cache=True, fastmath=_FAST)
 def correct(coarse):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Turn the sums of columns of masses, of all parts, into what they are to be given back; return the scalar product of the two."""
+    """Turn the sums of columns of nodes, of all parts, into what they are to be given back; return the scalar product of the two."""
     steps, vectors, further, small, _, memory = coarse
     scale, inverse = small[1], small[3]
     slot, right, values = memory[2][SLOT], vectors[3], vectors[4]
@@ -191,7 +191,7 @@ def assemble(elements, directions, stiff, corner, weight, dense, diagonal):  # t
 
 @njit(cache=True)
 def add_constrained(constrained, smoother, corner, weight, dense, diagonal):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add what it costs that coarse functions do not move held components: the diagonal of the matrix there, as `assemble` does."""
+    """Add what it costs that coarse functions do not move constrained components: the diagonal of the matrix there, as `assemble` does."""
     node, direction = constrained[0], constrained[1]
     for h in range(len(node)):
         i = node[h]
@@ -228,7 +228,7 @@ def _invert(a):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 @njit(cache=True)
 def build(coarse, smoother, constrained, slot):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Invert the coarse matrix while components are held, into a slot."""
+    """Invert the coarse matrix while components are constrained, into a slot."""
     _, _, _, (base, scale, diagonal, inverse), (corner, weight, fine_corner, fine_weight), _ = coarse
     dense, nothing, flat = base.copy(), np.zeros((0, 0, 0, 0)), np.zeros((0, 0))
     add_constrained(constrained, smoother, corner, weight, dense, flat)
@@ -246,7 +246,7 @@ def build(coarse, smoother, constrained, slot):  # type: ignore[no-untyped-def] 
 
 @njit(cache=True)
 def begin(coarse):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Forget what was held before, so that a run does not depend on those before it."""
+    """Drop the constraints of the last run, so that a run does not depend on those before it."""
     if len(coarse[5][2]):
         coarse[5][2][SLOT] = 0
         coarse[5][2][CREDIT] = 0
@@ -254,7 +254,7 @@ def begin(coarse):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 @njit(cache=True)
 def _knows(memory, constrained):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return whether the second inverse is that for these held components."""
+    """Return whether the second inverse is that for these constrained components."""
     node, direction, state = memory
     if state[NODES] != len(constrained[0]):
         return False
@@ -269,7 +269,7 @@ def _knows(memory, constrained):  # type: ignore[no-untyped-def]  # pragma: no c
 
 @njit(cache=True)
 def follow(coarse, smoother, constrained, at_once):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Make the inverse that of the held components: at once, or when the solver has worked so much that a new one is cheap beside it.
+    """Make the inverse that of the constrained components, at once or when enough work was done that a new one costs little in comparison.
 
     Until then the one in use goes on; it is only slower.
     """
@@ -296,6 +296,6 @@ def follow(coarse, smoother, constrained, at_once):  # type: ignore[no-untyped-d
 
 @njit(cache=True)
 def begin_with(inner, constrained):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Prepare the solver, whose arrays are `inner`, for a run in which these components are held."""
+    """Prepare the solver, whose arrays are `inner`, for a run in which these components are constrained."""
     begin(inner[8])
     follow(inner[8], inner[3], constrained, True)

@@ -17,7 +17,7 @@ from naibu.mechanics.lattices.cpu._implicit_kernels import add_momenta, add_reac
 
 FREE, STICK, SLIDE = range(3)
 PASSES = 20
-REFINED = 4  # times that the drag of a mass is found anew within a step
+REFINED = 4  # times that the viscous coefficient of a node is updated within a step
 AGREED = 0.01  # relative error of the friction at which a step is settled
 
 
@@ -74,7 +74,7 @@ def _constraints(candidates, mode, near, surface, step, constrained, fixed):  # 
 
 @njit(cache=True)
 def _complete(mass, k, velocity, begin, count, constrained):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add to the directions begin to count the ones that are orthogonal to them, in which the mass moves with body k."""
+    """Add to the directions begin to count the ones that are orthogonal to them, in which the node moves with body k."""
     node, direction, speed, body = constrained
     t = np.empty(3)
     while count - begin < 3:
@@ -114,7 +114,7 @@ def _forces(constrained, fixed, count, row, r, pad, step, near, force):  # type:
 
 @njit(cache=True)
 def _slip(v, velocity, normal, i, pad, slip):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Set slip to the velocity at which mass i slides over a body, mm/s, and return its size."""
+    """Set slip to the velocity at which node i slides over a body, mm/s, and return its size."""
     away = 0.0
     for a in range(3):
         slip[a] = v[a * pad + i] - velocity[a]
@@ -126,7 +126,7 @@ def _slip(v, velocity, normal, i, pad, slip):  # type: ignore[no-untyped-def]  #
 
 @njit(cache=True)
 def _begin(mode, friction, near, sliding, drag, v, candidates, surface, pad, slow):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Let masses that hardly slide stick, and give the others the drag that makes the friction of the step before."""
+    """Let nodes that hardly slide stick, and give the others the drag that makes the friction of the step before."""
     slip = np.empty(3)
     drag[:] = 0.0
     for c in range(mode.shape[0]):
@@ -158,7 +158,7 @@ def _load(candidates, mass, smoother, drag, sliding, surface, step, pad, heavy, 
 
 @njit(cache=True)
 def _dragged(candidates, mode, drag, sliding, near, surface, v, pad, force, applied):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Set applied (c, bodies, 3) to the friction on sliding masses, and give the normal part of the drag to `force`."""
+    """Set applied (c, bodies, 3) to the friction on sliding nodes, and give the normal part of the drag to `force`."""
     slip = np.empty(3)
     for c in range(mode.shape[0]):
         i = candidates[c]
@@ -174,7 +174,7 @@ def _dragged(candidates, mode, drag, sliding, near, surface, v, pad, force, appl
 
 @njit(cache=True)
 def _judge(modes, seen, friction, v, candidates, surface, pad, bounds):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Change modes that the solution contradicts, and the drag of sliding masses; return how many changed.
+    """Change modes that the solution contradicts, and the drag of sliding nodes; return how many changed.
 
     `modes` are mode, friction that is given as a force, drag, the limits mu_k N (the mean of passes: alone they swing), and how often a
     mass began to touch in this step and had its drag changed, which ends circles; `seen` are `near`, gaps after the step, forces and
@@ -230,7 +230,7 @@ def _judge(modes, seen, friction, v, candidates, surface, pad, bounds):  # type:
 
 @njit(cache=True)
 def _pull_off(touched, mode, pull, near, surface, v, mass, candidates, step, pad, right, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add the impulses of pull-off to `right`: on masses that touched a body and leave it slowly, never more than stops them."""
+    """Add the impulses of pull-off to `right`: on nodes that touched a body and leave it slowly, never more than stops them."""
     for c in range(mode.shape[0]):
         i = candidates[c]
         for k in range(mode.shape[1]):

@@ -1,6 +1,6 @@
-"""Explicit steps of a lattice, many in one call (spec L1): the forces of blocks of elements, and the motion of the masses."""
+"""Explicit Euler steps of a mass-spring-dashpot lattice, many in one call :cite:p:`hirai2008` (chapter 4.3)."""
 
-# arrays of masses hold x, y and z one after the other, each with `pad` places; y is the extension of the Voigt parts, as blocks store it
+# arrays of nodes hold x, y and z one after the other, each with `pad` places; y is the extension of the Voigt parts, as blocks store it
 from __future__ import annotations
 
 from naibu._numba.compilation import njit
@@ -8,7 +8,7 @@ from naibu._numba.simd import WIDTH, inverse_root, load, splat, store
 from naibu._numba.thread_pool import ALONE, JOB, PARTS, adapt, claim, finish, next_part, publish, wait
 
 _FAST = {"contract", "nsz"}
-FORCES = 0  # the first job of a step; the second one moves the masses
+FORCES = 0  # the first job of a step; the second one moves the nodes
 
 
 @njit(cache=True, fastmath=_FAST)
@@ -44,10 +44,10 @@ def element_forces(first, second, rows, tables, x, v, y, f, pad, begin, end):  #
 
 @njit(cache=True, fastmath=_FAST)
 def drive(constrained, velocity, v, f, mass, step, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Change the forces on held masses so that they take on the velocity of their bodies (bodies, 3), mm/s, along the held directions.
+    """Change the forces on constrained nodes so that they take on the velocity of their bodies (bodies, 3), mm/s, along the directions.
 
-    `constrained` are mass, direction (h, 3), weight and body of every held component; what the bodies exert, mN, is added to `reaction`
-    (bodies, 3).
+    `constrained` are node, direction (h, 3), weight and body of every constrained component; what the bodies exert, mN, is added to
+    `reaction` (bodies, 3).
     """
     node, direction, weight, body = constrained
     pad = len(mass)
@@ -63,7 +63,7 @@ def drive(constrained, velocity, v, f, mass, step, reaction):  # type: ignore[no
 
 @njit(cache=True, fastmath=_FAST)
 def move(x, v, f, inverse_mass, step, forward, pad, begin, end):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Move masses by a step: by the velocity before it if `forward` (Euler's method as in the report), by that after it if not."""
+    """Move nodes by a step: by the velocity before it if `forward` (Euler's method as in the report), by that after it if not."""
     dt = splat(step)
     for axis in range(3):
         xa, va, fa = x[axis * pad : (axis + 1) * pad], v[axis * pad : (axis + 1) * pad], f[axis * pad : (axis + 1) * pad]
@@ -76,7 +76,7 @@ def move(x, v, f, inverse_mass, step, forward, pad, begin, end):  # type: ignore
 
 @njit(cache=True, fastmath=_FAST)
 def _gather(forces, external, low, high, begin, end, p, pad):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add to the forces of part p what other parts and external forces exert on the masses begin to end."""
+    """Add to the forces of part p what other parts and external forces exert on the nodes begin to end."""
     f = forces[p]
     for axis in range(3):
         for q in range(len(low)):
@@ -91,7 +91,7 @@ def _gather(forces, external, low, high, begin, end, p, pad):  # type: ignore[no
 
 @njit(cache=True, fastmath=_FAST)
 def _part(job, p, data):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Do part p of a step's first job, the forces of its blocks, or of the second, the motion of its masses; see `explicit_steps`."""
+    """Do part p of a step's first job, the forces of its blocks, or of the second, the motion of its nodes; see `explicit_steps`."""
     (first, second, rows), parts, tables, (x, v, y), (mass, inverse_mass), external, constrained, (now, shares), forces, (step, forward) = (
         data
     )
@@ -112,7 +112,7 @@ def _part(job, p, data):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 @njit(cache=True)
 def _share(control, job, data):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Have all parts of a job done; return how many naps it took to wait for helpers."""
+    """Have all parts of a job done; return how many naps it took to wait for workers."""
     alone, part = control[PARTS] == 1 or control[ALONE] > 0, 0
     if not alone:
         publish(control, job)
@@ -139,15 +139,15 @@ def explicit_worker(control, data):  # type: ignore[no-untyped-def]  # pragma: n
 
 @njit(cache=True, nogil=True)
 def explicit_steps(control, data, velocity, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Take len(velocity) steps, alone or with helpers, who change nothing in the result; reaction (steps, bodies, 3) is filled.
+    """Take len(velocity) steps, alone or with workers, who change nothing in the result; reaction (steps, bodies, 3) is filled.
 
-    `data` are blocks (first, second, rows), parts, tables, the state x, v, y, which is changed, masses with their inverses, external
-    forces or none, what is held as in `drive`, the velocities of bodies (bodies, 3) in a step and each part's reactions
+    `data` are blocks (first, second, rows), parts, tables, the state x, v, y, which is changed, nodal masses with their inverses, external
+    forces or none, what is constrained as in `drive`, the velocities of bodies (bodies, 3) in a step and each part's reactions
     (parts, bodies, 3), each part's forces (parts, 3 pad), and the step with whether it is forward (Euler's).
 
-    Part p has the blocks parts[0][p] to parts[0][p + 1], which touch the masses parts[2][p] to parts[3][p] and have forces of their own;
-    it moves the masses parts[1][p] to parts[1][p + 1], among them the held ones parts[4][p] to parts[4][p + 1]. Sums are made in the same
-    order each time.
+    Part p has the blocks parts[0][p] to parts[0][p + 1], which touch the nodes parts[2][p] to parts[3][p] and have forces of their own;
+    it moves the nodes parts[1][p] to parts[1][p + 1], among them the constrained ones parts[4][p] to parts[4][p + 1]. Sums are made in the
+    same order each time.
     """
     now, shares = data[7]
     for n in range(len(velocity)):

@@ -1,4 +1,4 @@
-"""The linear-implicit step of a lattice (spec L1): stable for every K, C1, C2 and step, whatever the tolerance of its solver.
+"""Linear-implicit steps :cite:p:`baraff1998` of a lattice, stable for every K, C1, C2, step length and solver tolerance.
 
 With f the mean tension of an element while its length changes evenly (`implicit_coefficients`), the velocity after a step solves
 ``A v1 = M v0 - h G^T (b y0) + h f_ext``, ``A = M + h^2 G^T a G``. Were it solved exactly and lengths linear in the step, kinetic energy and
@@ -98,7 +98,7 @@ def rigid_part(x, mass, impulse, out):  # type: ignore[no-untyped-def]  # pragma
     values, vectors = np.linalg.eigh(inertia)
     w = np.zeros(3)
     for k in range(3):
-        if values[k] > 1e-12 * values[2]:  # masses in a line do not turn about it
+        if values[k] > 1e-12 * values[2]:  # nodes in a line do not turn about it
             w += (vectors[:, k] * spin).sum() / values[k] * vectors[:, k]
     for i in range(pad):
         d0, d1, d2 = x[i] - centre[0], x[pad + i] - centre[1], x[2 * pad + i] - centre[2]
@@ -143,7 +143,7 @@ def settle(first, second, rows, stiff, axes, mass, constrained, x, v, r, p, q): 
 
 @njit(cache=True, fastmath=_FAST)
 def extend(first, second, rows, tables, axes, lengths, x, v, y, step):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Move on extensions y and the lengths they know of after the masses moved to x with the velocity v.
+    """Move on extensions y and the lengths they know of after the nodes moved to x with the velocity v.
 
     Leaves in axes[1] what the rotation of elements added to the lengths, and in axes[0] what that added to the extensions.
     Returns the energy that
@@ -183,7 +183,7 @@ def extend(first, second, rows, tables, axes, lengths, x, v, y, step):  # type: 
 
 @njit(cache=True, fastmath=_FAST)
 def constrain(constrained, v, pad):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Give held components of v (3 pad,) their speeds."""
+    """Give constrained components of v (3 pad,) their speeds."""
     node, direction, speed = constrained[0], constrained[1], constrained[2]
     for h in range(len(node)):
         i = node[h]
@@ -210,9 +210,9 @@ def new_velocity(blocks, tables, x, v, y, mass, right, work, inner, constrained,
     """Improve v to the velocity after a step, `right` being the momenta with the impulses of external forces before.
 
     `tables` are a, b, E, g, K and h^2 a; `work` the arrays axes (3, 8 nb) and r, p, q (3 pad,); `inner` those of `conjugate_gradients`;
-    `constrained` mass, direction (h, 3), speed and body of every held component; `solver` the tolerance and the most iterations. Leaves in
-    r minus the impulses that hold the masses; returns the number of iterations and the energy that the early end of the solver dissipates,
-    mN mm.
+    `constrained` node, direction (h, 3), speed and body of every constrained component; `solver` the tolerance and the most iterations.
+    Leaves in r minus the impulses that hold the nodes; returns the number of iterations and the energy that the early end of the solver
+    dissipates, mN mm.
     """
     first, second, rows = blocks
     axes, r, p, q = work
@@ -227,7 +227,7 @@ def new_velocity(blocks, tables, x, v, y, mass, right, work, inner, constrained,
 
 @njit(cache=True, fastmath=_FAST)
 def add_reactions(constrained, r, pad, step, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add to `reaction` (bodies, 3) the forces, mN, by which bodies hold masses, from the residual r of a step."""
+    """Add to `reaction` (bodies, 3) the forces, mN, by which bodies constrain nodes, from the residual r of a step."""
     node, direction, _, body = constrained
     for h in range(len(node)):
         i = node[h]
@@ -238,9 +238,9 @@ def add_reactions(constrained, r, pad, step, reaction):  # type: ignore[no-untyp
 
 @njit(cache=True, fastmath=_FAST)
 def advance(blocks, tables, x, v, before, y, lengths, mass, axes, step, lost):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Move masses, extensions and the lengths these know of on by the new velocity v; `before` is the old one.
+    """Move nodes, extensions and the lengths these know of on by the new velocity v; `before` is the old one.
 
-    Returns whether rotation had to be held back; then the lengths lag behind, and the next steps catch up.
+    Returns whether rotation had to be limited; then the lengths lag behind, and the next steps catch up.
     """
     first, second, rows = blocks
     pad = len(mass)
@@ -274,8 +274,8 @@ def implicit_steps(blocks, tables, state, mass, external, work, inner, constrain
 
     The state x, v, y and lengths is changed, reaction (steps, bodies, 3), zero before, is filled.
 
-    `constrained` are mass, direction, weight and body of held components, which move by their weights times the velocity (steps, bodies,
-    3) of their bodies. Returns the number of iterations, and in how many steps rotation had to be held back.
+    `constrained` are node, direction, weight and body of constrained components, which move by their weights times the velocity (steps,
+    bodies, 3) of their bodies. Returns the number of iterations, and in how many steps rotation had to be limited.
     """
     x, v, y, lengths = state
     iterations, checked = 0, 0

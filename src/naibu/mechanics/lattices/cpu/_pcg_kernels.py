@@ -89,7 +89,7 @@ def _turn(p, r, smoother, beta):  # type: ignore[no-untyped-def]  # pragma: no c
 
 @njit(cache=True, fastmath=_FAST)
 def project(constrained, q, pad):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Take the held components out of q; the directions at one mass are orthogonal."""
+    """Take the constrained components out of q; the directions at one node are orthogonal."""
     node, direction = constrained[0], constrained[1]
     for h in range(len(node)):
         i = node[h]
@@ -112,7 +112,7 @@ def _scaled_square(r, smoother):  # type: ignore[no-untyped-def]  # pragma: no c
 
 @njit(cache=True, fastmath=_FAST)
 def conjugate_gradients(first, second, rows, inner, constrained, goal, limit, helped):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Set w to about A^-1 r with held components zero, until the square of the residual's norm, times `smoother`, is below `goal`.
+    """Set w to about A^-1 r with constrained components zero, until the square of the residual's norm, times `smoother`, is below `goal`.
 
     `inner` are h^2 a, axes, mass, smoother, w, r, p, q and what coarse functions need, which is used if `helped`. Returns the number of
     iterations and whether the goal was reached or the limit.

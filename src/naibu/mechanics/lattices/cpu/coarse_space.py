@@ -1,10 +1,10 @@
 """Coarse functions that help the implicit solver of a lattice: what neighbours pass on slowly, they see at once.
 
-Hat functions of a grid over the lattice at rest, linear in x, y and z, take the residual of the masses to few coarse nodes, where a small
-matrix is inverted, and its solution back. The matrix is that of the lattice at rest, in which components that are held count as if their
-masses hung on springs as stiff as all their elements. It is only a preconditioner: where the lattice has turned or is held elsewhere than
-it knows of, the solver takes more iterations, nothing else. On large lattices a grid between the masses and the coarse one is added, of
-which only the diagonal is used. Positions are all that is needed, so that every mask, octree or mesh will do.
+Hat functions of a grid over the lattice at rest, linear in x, y and z, take the residual of the nodes to few coarse nodes, where a small
+matrix is inverted, and its solution back. The matrix is that of the lattice at rest, in which components that are constrained count as if
+their nodes hung on springs as stiff as all their elements. It is only a preconditioner: where the lattice has turned or is constrained
+elsewhere than it knows of, the solver takes more iterations, nothing else. On large lattices a grid between the nodes and the coarse one is
+added, of which only the diagonal is used. Positions are all that is needed, so that every mask, octree or mesh will do.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _BETWEEN = 2.7  # its spacings
 _MOST = 378  # unknowns of the small matrix
 _SHARE = 2.5  # numbers of the small matrix for each element, at most: it takes about a fifth of the time of their multiplication
 _SHIFT = 1e-5  # of the diagonal, added so that the inverse is positive definite in single precision, whatever the masses are
-_WORTH = 0.05  # mean share of the mass in the diagonal above which the diagonal does alone
+_WORTH = 0.05  # mean fraction of the mass in the diagonal above which the diagonal does alone
 _FEW = 7_000  # elements below which it does as well
 _LANE = 3  # what eight values at a time cost beside one
 _PRICE = 2  # how many iterations' multiplications of an element a number of the small matrix's cube is worth, to rebuild it at leisure
@@ -43,17 +43,17 @@ def coarse_space(lattice: Lattice, stiff: FloatArray, diagonal: FloatArray, smoo
     smoother : ndarray, shape (pad,)
         Its inverse.
     pad, parts : int
-        Places of an array of masses, and how many threads sum up apart.
+        Places of an array of nodes, and how many threads sum up apart.
 
     Returns
     -------
     tuple
-        Steps from the masses to the nodes of a grid: lanes from masses to columns of masses along z, lanes from these to lines along x, and
+        Steps from the nodes to the nodes of a grid: lanes from nodes to columns of nodes along z, lanes from these to lines along x, and
         shares from lines to nodes. Their vectors: columns of every part, what goes back to them, lines, and right sides and values of
-        nodes. Steps and vectors from that grid to a coarser one, if there are two. Matrix without held components (3, n, 3, n); inverse
-        diagonal of the finer grid twice, its diagonal; inverse of the matrix twice: without held components and with those last held.
-        Nodes (n, 8) and weights of every mass on the coarser grid and on the finer one. Memory: held masses and directions, and the
-        numbers of `lattice_coarse_kernels`.
+        nodes. Steps and vectors from that grid to a coarser one, if there are two. Matrix without constrained components (3, n, 3, n);
+        inverse diagonal of the finer grid twice, its diagonal; inverse of the matrix twice: without constrained components and with those
+        last constrained. Nodes (n, 8) and weights of every node on the coarser grid and on the finer one. Memory: constrained nodes and
+        directions, and the numbers of `lattice_coarse_kernels`.
     """
     if lattice.n_elements < _FEW or lattice.node_mass.sum() > _WORTH * diagonal.sum():
         return _nothing()
@@ -92,7 +92,7 @@ def coarse_space(lattice: Lattice, stiff: FloatArray, diagonal: FloatArray, smoo
 
 
 def _cells(lattice: Lattice) -> IntArray:
-    """Return how many cells the coarse grid has along each axis: as many as its small matrix and the spacing of the masses allow."""
+    """Return how many cells the coarse grid has along each axis: as many as its small matrix and the spacing of the nodes allow."""
     extent = np.ptp(lattice.points, axis=0)
     most = min(_MOST, np.sqrt(_SHARE * lattice.n_elements))
     cells = np.ones(3, dtype=np.int64)
@@ -136,7 +136,7 @@ def _corners(place: FloatArray, cells: IntArray) -> tuple[IntArray, FloatArray]:
 
 
 def _add_masses(dense: FloatArray, mass: FloatArray, corner: IntArray, weight: FloatArray, count: int) -> None:
-    """Add the masses to the coarse matrix, and ones where it has no node."""
+    """Add the nodal masses to the coarse matrix, and ones where it has no node."""
     size = dense.shape[1]
     pairs = (corner[:, :, None] * size + corner[:, None, :]).ravel()
     values = (mass[:, None, None] * weight[:, :, None] * weight[:, None, :]).ravel()

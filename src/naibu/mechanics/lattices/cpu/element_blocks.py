@@ -1,4 +1,4 @@
-"""Elements in blocks of eight whose masses stand in a row, so that vectors of numbers can be loaded as they lie (see `simd`)."""
+"""Elements in blocks of eight whose nodes stand in a row, so that vectors of numbers can be loaded as they lie (see `simd`)."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ _STRIDE = 4  # a neighbour along y, z or a diagonal, and the two beside it along
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Blocks:
-    """Where elements are stored: lane k of block b joins the masses first[b] + k and second[b] + k, or none.
+    """Where elements are stored: lane k of block b joins the nodes first[b] + k and second[b] + k, or none.
 
     Attributes
     ----------
     first, second : ndarray, shape (nb,), int64
-        Masses of lane 0. `first` is a multiple of eight and grows, so that what the blocks of eight masses share is loaded once.
+        Nodes of lane 0. `first` is a multiple of eight and grows, so that what the blocks of eight nodes share is loaded once.
     lane : ndarray, shape (m,), int64
         8 b + k of every element.
     n_nodes : int
-        Number of masses; arrays of masses have eight more places, which lanes without element may read.
+        Number of nodes; arrays of nodes have eight more places, which lanes without element may read.
     """
 
     first: IntArray
@@ -77,7 +77,7 @@ class Blocks:
 
 
 def _spread(first: IntArray) -> IntArray:
-    """Return an order of blocks that keeps `first` sorted but sets apart blocks whose second masses overlap.
+    """Return an order of blocks that keeps `first` sorted but sets apart blocks whose second nodes overlap.
 
     These are neighbours by their distance; a processor stalls where it loads what it has just stored in other pieces.
     """
@@ -99,9 +99,9 @@ def explicit_tables(parameters: LatticeParameters, step: float, forward: bool) -
 def explicit_kernel(
     parameters: LatticeParameters, step: float, blocks: Blocks, mass: AnyFloatArray, threads: int, forward: bool
 ) -> KernelTuple:
-    """Return what explicit steps need: blocks, tables, masses with their inverses, and the parts of each thread.
+    """Return what explicit steps need: blocks, tables, nodal masses with their inverses, and the parts of each thread.
 
-    A part has blocks and masses; the masses that its blocks touch begin and end at the last two.
+    A part has blocks and nodes; the nodes that its blocks touch begin and end at the last two.
     """
     rows, tables = blocks.patterns(*explicit_tables(parameters, step, forward), dtype=mass.dtype.type)
     inverse = np.divide(1.0, mass, out=np.zeros_like(mass), where=mass > 0.0)

@@ -1,4 +1,4 @@
-"""Lattices in motion: states, held masses, and engines that take many steps in one call (spec L1)."""
+"""Engine of mass-spring-dashpot lattices on the processor: explicit :cite:p:`hirai2008` and linear-implicit steps."""
 
 from __future__ import annotations
 
@@ -170,18 +170,18 @@ class LatticeEngine:
         steps : int
             How many.
         constrained : ConstrainedNodes
-            Masses that bodies move.
+            Nodes that bodies move.
         velocity : array_like
             Velocity of the bodies, mm/s, broadcast to (steps, bodies, 3).
         external_force : array_like
-            Forces on the masses that do not change, mN, broadcast to (n, 3).
+            Forces on the nodes that do not change, mN, broadcast to (n, 3).
 
         Raises
         ------
         InputError
             Shapes that do not fit, or NaN.
         ConvergenceError
-            The explicit method blew up.
+            The explicit method diverged.
         """
         constrained = constrained or ConstrainedNodes.none()
         bodies = int(constrained.body.max(initial=-1)) + 1
@@ -259,7 +259,7 @@ class LatticeEngine:
         return LatticeState(position, velocity, y[self.blocks.lane].astype(np.float64))
 
     def by_component(self, values: FloatArray, kind: np.dtype[np.floating] | type[float]) -> AnyFloatArray:
-        """Return values of the masses (n, 3) as kernels hold them, (3 pad,)."""
+        """Return values of the nodes (n, 3) as kernels hold them, (3 pad,)."""
         result: AnyFloatArray = aligned((3 * len(self.mass),), kind)
         result.reshape(3, -1)[:, : len(values)] = values.T
         return result
@@ -270,7 +270,7 @@ class LatticeEngine:
         return found if stepper.length is None else replace(found, length=stepper.length[self.blocks.lane])
 
     def check(self, stepper: Stepper, steps: int) -> None:
-        """Check that explicit steps did not blow up; the implicit ones cannot.
+        """Check that explicit steps did not diverge; the implicit ones cannot.
 
         Raises
         ------
@@ -285,7 +285,7 @@ class LatticeEngine:
         if not (np.isfinite(stepper.velocity).all() and moved < reach):
             limit = explicit_step_limit(self.lattice, self.parameters)
             raise ConvergenceError(
-                f"the explicit steps of {self.step:g} s blew up within {steps} steps; the springs and dampers allow about {limit:.2g} s: "
+                f"the explicit steps of {self.step:g} s diverged within {steps} steps; the springs and dashpots allow about {limit:.2g} s: "
                 "take shorter steps, or method='implicit', which is stable for all parameters"
             )
 
@@ -304,7 +304,7 @@ def _check(
     require_positive(step, "the step", "s")
     require_positive(tolerance, "the tolerance", "")
     if tolerance >= 1.0:
-        raise InputError(f"the tolerance is a share of the residual and must be below 1, not {tolerance:g}")
+        raise InputError(f"the tolerance is a fraction of the residual and must be below 1, not {tolerance:g}")
     if len(parameters.stiffness) != lattice.n_elements:
         raise InputError(f"there are parameters for {len(parameters.stiffness)} elements, the lattice has {lattice.n_elements}")
     if method not in ("implicit", "euler", "symplectic_euler"):

@@ -23,7 +23,7 @@ class Stepper(ABC):
     Attributes
     ----------
     position, velocity : ndarray, shape (3 pad,)
-        x, y and z of all masses one after the other, mm and mm/s.
+        x, y and z of all nodes one after the other, mm and mm/s.
     extension, length : ndarray, shape (8 nb,)
         Of the elements, as blocks store them, mm; explicit methods leave the lengths alone.
     """
@@ -35,23 +35,23 @@ class Stepper(ABC):
 
     @abstractmethod
     def constrain(self, entries: KernelTuple, bodies: int) -> None:
-        """Hold masses from now on: node, direction, weight and body of every held component."""
+        """Constrain nodes from now on: node, direction, weight and body of every constrained component."""
 
     @abstractmethod
     def advance(self, velocity: FloatArray, reaction: FloatArray, *, alone: bool = False) -> tuple[int, int]:
-        """Take steps and fill the reactions, (steps, bodies, 3) both; return iterations and how often rotation was held back.
+        """Take steps and fill the reactions, (steps, bodies, 3) both; return iterations and how often rotation was limited.
 
-        If `alone`, no helper is asked.
+        If `alone`, no worker is asked.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Send helpers away, if there are any."""
+        """Stop the workers, if there are any."""
 
 
 @dataclass(slots=True, eq=False)
 class ExplicitStepper(Stepper):
-    """Explicit steps, in parts that helpers can take."""
+    """Explicit steps, in parts that workers can take."""
 
     kernel: KernelTuple
     external: AnyFloatArray
@@ -61,7 +61,7 @@ class ExplicitStepper(Stepper):
     data: KernelTuple = ()
 
     def constrain(self, entries: KernelTuple, bodies: int) -> None:
-        """Hold masses from now on."""
+        """Constrain nodes from now on."""
         self.close()
         blocks, tables, masses, parts = self.kernel
         count = len(parts[0]) - 1
@@ -74,13 +74,13 @@ class ExplicitStepper(Stepper):
         forces = np.zeros((count, len(self.position)), kind)
         self.data = (blocks, (*parts, mine), tables, state, masses, self.external, constrained, driven, forces, how)
         self.control = new_control(count)
-        if count > 1:  # returns at once, compiled, lest helpers compile while steps wait
+        if count > 1:  # returns at once, compiled, lest workers compile while steps wait
             stop_workers(self.control)
             explicit_worker(self.control, self.data)
 
     def advance(self, velocity: FloatArray, reaction: FloatArray, *, alone: bool = False) -> tuple[int, int]:
         """Take steps and fill the reactions."""
-        if self.control[STOP]:  # closed in between; helpers may still be on their way out
+        if self.control[STOP]:  # closed in between; workers may still be on their way out
             self.control = new_control(int(self.control[PARTS]))
         if alone:
             self.control[ALONE] = max(self.control[ALONE], len(velocity))
@@ -89,7 +89,7 @@ class ExplicitStepper(Stepper):
         return 0, 0
 
     def close(self) -> None:
-        """Send helpers away."""
+        """Stop the workers."""
         stop_workers(self.control)
 
 
@@ -106,7 +106,7 @@ class ImplicitStepper(Stepper):
     constrained: KernelTuple = ()
 
     def constrain(self, entries: KernelTuple, bodies: int) -> None:
-        """Hold masses from now on."""
+        """Constrain nodes from now on."""
         self.constrained = entries
 
     def advance(self, velocity: FloatArray, reaction: FloatArray, *, alone: bool = False) -> tuple[int, int]:
@@ -120,4 +120,4 @@ class ImplicitStepper(Stepper):
         return found
 
     def close(self) -> None:
-        """There are no helpers to send away."""
+        """There are no workers to send away."""

@@ -1,10 +1,10 @@
-"""Kernels of lattices on a GPU, for NVIDIA Warp (spec L1): forces gathered mass by mass, held masses, motion, and sums.
+"""Explicit steps of a mass-spring-dashpot lattice :cite:p:`hirai2008` (chapter 4.3) as kernels for NVIDIA Warp.
 
 This module needs Warp; `naibu.mechanics.lattices.gpu.engine` loads it where it is asked for.
 
-Every element stands in the lists of both its masses, each time with an extension of its own. Both are moved on from differences that are
+Every element stands in the lists of both its nodes, each time with an extension of its own. Both are moved on from differences that are
 the exact negatives of each other, and so stay the same to the last bit: no two threads ever write to one place, and no sum depends on
-which thread comes first. Lists of `SLICE` masses lie side by side, so that neighbouring threads read neighbouring places.
+which thread comes first. Lists of `SLICE` nodes lie side by side, so that neighbouring threads read neighbouring places.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import warp as wp
 
 AnyDtype = Any  # of generic kernels: Warp compiles them for the types that their arrays have
-SLICE = 32  # masses whose lists lie side by side: the threads of a warp
+SLICE = 32  # nodes whose lists lie side by side: the threads of a warp
 FOLD = 32  # numbers that one thread adds up
 
 wp.set_module_options({"enable_backward": False})
@@ -33,7 +33,7 @@ def forces(
     external: wp.array[AnyDtype],
     f: wp.array[AnyDtype],
 ) -> None:
-    """Set f to the forces on the masses and move the extensions on by a step of Euler's; rows of the table are A, B, D dt and G dt."""
+    """Set f to the forces on the nodes and move the extensions on by a step of Euler's; rows of the table are A, B, D dt and G dt."""
     i = wp.tid()
     at = start[i // SLICE] + i % SLICE
     xi = x[i]
@@ -70,7 +70,7 @@ def drive(
     f: wp.array[AnyDtype],
     push: wp.array[wp.vec3d],
 ) -> None:
-    """Change the force on a held mass so that it takes on the velocity of its bodies in step `count` along the held directions.
+    """Change the force on a constrained node so that it takes on the velocity of its bodies in step `count`, along its directions.
 
     The entries ``first[k]`` to ``first[k + 1]`` hold the k-th mass; `push` takes what each exerts, mN.
     """
@@ -115,7 +115,7 @@ def move(
     x: wp.array[AnyDtype],
     v: wp.array[AnyDtype],
 ) -> None:
-    """Move a mass by a step: by the velocity before it if `forward`, else by that after it; count the step."""
+    """Move a node by a step: by the velocity before it if `forward`, else by that after it; count the step."""
     i = wp.tid()
     old = v[i]
     new = old + step * (inverse_mass[i] * f[i])

@@ -28,7 +28,7 @@ def constrain(
     count: wp.array[wp.int32],
     v: wp.array[wp.vec3d],
 ) -> None:
-    """Give the held components of a mass the velocity of their bodies in step `count`."""
+    """Give the constrained components of a node the velocity of their bodies in step `count`."""
     k = wp.tid()
     i = node[first[k]]
     new = v[i]
@@ -39,7 +39,7 @@ def constrain(
 
 @wp.kernel
 def release(first: wp.array[wp.int32], node: wp.array[wp.int32], direction: wp.array[wp.vec3d], values: wp.array[wp.vec3d]) -> None:
-    """Take the held components out of the values of a mass."""
+    """Take the constrained components out of the values of a node."""
     k = wp.tid()
     i = node[first[k]]
     free = values[i]
@@ -57,7 +57,7 @@ def support(
     step: wp.float64,
     push: wp.array[wp.vec3d],
 ) -> None:
-    """Set the forces by which bodies hold a mass, from the residual of a step."""
+    """Set the forces by which bodies hold a node, from the residual of a step."""
     k = wp.tid()
     i = node[first[k]]
     for h in range(first[k], first[k + 1]):
@@ -204,7 +204,7 @@ def accept(
 
 @wp.kernel
 def products(a: wp.array[wp.vec3d], b: wp.array[wp.vec3d], sums: wp.array[wp.float64]) -> None:
-    """Set sums[c] to the sum of a . b over the masses c, c + p, ..., p being the number of sums."""
+    """Set sums[c] to the sum of a . b over the nodes c, c + p, ..., p being the number of sums."""
     c = wp.tid()
     k = c
     s = wp.dot(a[c], b[c])
@@ -217,7 +217,7 @@ def products(a: wp.array[wp.vec3d], b: wp.array[wp.vec3d], sums: wp.array[wp.flo
 
 @wp.kernel
 def weighted(mass: wp.array[wp.float64], values: wp.array[wp.vec3d], result: wp.array[wp.vec3d]) -> None:
-    """Multiply values by the masses."""
+    """Multiply values by the nodal masses."""
     i = wp.tid()
     result[i] = mass[i] * values[i]
 
@@ -226,7 +226,7 @@ def weighted(mass: wp.array[wp.float64], values: wp.array[wp.vec3d], result: wp.
 def moments(
     mass: wp.array[wp.float64], x: wp.array[wp.vec3d], centre: wp.vec3d, impulse: wp.array[wp.vec3d], result: wp.array[Vector12]
 ) -> None:
-    """Set the momentum and the angular momentum of an impulse on a mass, and its moments xx, yy, zz, yz, zx, xy about the centre."""
+    """Set the momentum and the angular momentum of an impulse on a node, and its moments xx, yy, zz, yz, zx, xy about the centre."""
     i = wp.tid()
     d = x[i] - centre
     s = wp.cross(d, impulse[i])
@@ -295,7 +295,7 @@ def weigh(
     step: wp.float64,
     energies: wp.array[wp.vec3d],
 ) -> None:
-    """Set what the elements at a mass, and the change of its velocity, dissipate, and what the rotation stores: linear and square part."""
+    """Set what the elements at a node, and the change of its velocity, dissipate, and what the rotation stores: linear and square part."""
     i = wp.tid()
     at = start[i // SLICE] + i % SLICE
     half = wp.float64(0.5)
@@ -337,7 +337,7 @@ def extend(
     y: wp.array[wp.float64],
     lengths: wp.array[wp.float64],
 ) -> None:
-    """Move on extensions and the lengths they know of, with a share of what the rotation adds."""
+    """Move on extensions and the lengths they know of, with a fraction of what the rotation adds."""
     i = wp.tid()
     at = start[i // SLICE] + i % SLICE
     xi = x[i]
@@ -358,7 +358,7 @@ def extend(
 
 @wp.kernel
 def shift(step: wp.float64, v: wp.array[wp.vec3d], count: wp.array[wp.int32], x: wp.array[wp.vec3d]) -> None:
-    """Move a mass by its velocity; count the step."""
+    """Move a node by its velocity; count the step."""
     i = wp.tid()
     x[i] = x[i] + step * v[i]
     if i == 0:

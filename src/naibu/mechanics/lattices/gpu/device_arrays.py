@@ -1,4 +1,4 @@
-"""Arrays of a lattice on a device of Warp: lists of neighbours, coefficients, held masses, and sums that always come out alike."""
+"""Arrays of a lattice on a device of Warp: lists of neighbours, coefficients, constrained nodes, and sums that always come out alike."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from naibu.mechanics.lattices.gpu.warp_types import WarpArray
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes
 
-_PART = 64  # entries of held masses that one thread adds up
+_PART = 64  # entries of constrained nodes that one thread adds up
 _CODES = 256  # different elements that a byte can number
 
 
@@ -72,18 +72,18 @@ def recorded(launches: Callable[[], None], device: object) -> Callable[[], None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NeighbourLists:
-    """Neighbours of all masses on a device, those of `SLICE` masses side by side.
+    """Neighbours of all nodes on a device, those of `SLICE` nodes side by side.
 
     Attributes
     ----------
     start : warp array (slices,), int32
-        Where the lists of a slice begin; the s-th neighbour of mass i stands at ``start[i // SLICE] + SLICE s + i % SLICE``.
+        Where the lists of a slice begin; the s-th neighbour of node i stands at ``start[i // SLICE] + SLICE s + i % SLICE``.
     degree : warp array (n,), int32
-        Number of elements at a mass.
+        Number of elements at a node.
     neighbour : warp array (entries,), int32
-        Masses at the other ends.
+        Nodes at the other ends.
     places : ndarray, shape (m, 2), int32
-        Where an element stands in the lists of its two masses.
+        Where an element stands in the lists of its two nodes.
     """
 
     start: WarpArray
@@ -171,7 +171,7 @@ def _numbered(k, c1, c2, codes, chosen):  # type: ignore[no-untyped-def]  # prag
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConstrainedArrays:
-    """Held components on a device, in the order of their masses.
+    """Constrained components on a device, in the order of their nodes.
 
     Attributes
     ----------
@@ -179,8 +179,8 @@ class ConstrainedArrays:
         Number of components.
     bodies : int
         Number of bodies.
-    first : warp array (masses + 1,), int32
-        Where the components of every held mass begin.
+    first : warp array (nodes + 1,), int32
+        Where the components of every constrained node begin.
     node, direction, weight, body : warp array (count,)
         As in `ConstrainedNodes`.
     push : warp array (count,), vec3d
@@ -205,7 +205,7 @@ class ConstrainedArrays:
 
     @classmethod
     def of(cls, constrained: ConstrainedNodes, device: object) -> ConstrainedArrays:
-        """Put held components on a device."""
+        """Put constrained components on a device."""
         wp = warp_package()
         order = np.argsort(constrained.node, kind="stable")
         node, body = constrained.node[order], constrained.body[order]
@@ -235,7 +235,7 @@ class ConstrainedArrays:
 
     @property
     def masses(self) -> int:
-        """Number of held masses."""
+        """Number of constrained nodes."""
         return int(self.first.shape[0]) - 1
 
     def reactions(self, parts: FloatArray, bodies: int) -> FloatArray:

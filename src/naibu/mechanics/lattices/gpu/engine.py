@@ -1,4 +1,4 @@
-"""Lattices in motion on an NVIDIA GPU, through NVIDIA Warp: the steps of `naibu.mechanics.lattices.cpu.engine`, to rounding (spec L1).
+"""Engine of lattices on an NVIDIA GPU through NVIDIA Warp: the steps of `LatticeEngine`, to rounding.
 
 Warp is an optional package (``pip install "naibu[gpu]"``). It also compiles for the processor, slower than `LatticeEngine`, which is how
 the steps are tested where there is no GPU.
@@ -75,7 +75,7 @@ class WarpLatticeEngine(PreparedLattice):
         InputError
             Shapes that do not fit, or NaN.
         ConvergenceError
-            The explicit method blew up.
+            The explicit method diverged.
         """
         session = self.session(state, constrained, external_force)
         reaction = session.take_path(checked_velocity(velocity, steps, session.constrained.bodies))

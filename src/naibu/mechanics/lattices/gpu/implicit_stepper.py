@@ -24,12 +24,12 @@ _LIMIT = 20_000
 
 
 class DeviceSums:
-    """Sums over the masses in an order that depends on their number only.
+    """Sums over the nodes in an order that depends on their number only.
 
     Parameters
     ----------
     n : int
-        Number of masses.
+        Number of nodes.
     dtype : warp type
         Of what is added up.
     device : warp device
@@ -45,7 +45,7 @@ class DeviceSums:
         self.device = device
 
     def of(self, values: WarpArray) -> FloatArray:
-        """Return the sum of values of the masses."""
+        """Return the sum of values of the nodes."""
         self._fold(values, self.levels[0])
         return self._folded(self.levels[-1])
 
@@ -102,7 +102,7 @@ class ImplicitSteps:
     scalar : warp array (1,)
         For other sums.
     node_scalar, node_vector, node_moments : warp array (n,)
-        What is added up over the masses.
+        What is added up over the nodes.
     scalars, vectors, moments : DeviceSums
         Which add it up.
     """
@@ -175,7 +175,7 @@ class ImplicitSteps:
         self._batch = None
 
     def take(self) -> tuple[int, bool]:
-        """Take a step; return the iterations of the solver, and whether rotation had to be held back."""
+        """Take a step; return the iterations of the solver, and whether rotation had to be limited."""
         session = self.session
         constrained = session.constrained
         warp_package().copy(self.before, session.v)
@@ -287,7 +287,7 @@ class ImplicitSteps:
             [[s[7] + s[8], -s[11], -s[10]], [-s[11], s[6] + s[8], -s[9]], [-s[10], -s[9], s[6] + s[7]]],
         )
         values, vectors = np.linalg.eigh(inertia)
-        turns = values > 1e-12 * values[2]  # masses in a line do not turn about it
+        turns = values > 1e-12 * values[2]  # nodes in a line do not turn about it
         spin = vectors[:, turns] @ ((vectors[:, turns].T @ s[3:6]) / values[turns])
         return centre, wp.vec3d(*(s[:3] / weight)), wp.vec3d(*spin)
 
@@ -315,7 +315,7 @@ class ImplicitSteps:
         return 0.0
 
     def _advance(self, lost: float) -> bool:
-        """Move masses and extensions on; return whether rotation had to be held back."""
+        """Move nodes and extensions on; return whether rotation had to be limited."""
         session, engine = self.session, self.session.engine
         step = self._number(engine.step)
         moving = [engine.stiffness, engine.mass, session.x, session.v, self.before, session.y, self.lengths, step]

@@ -130,7 +130,7 @@ def _check(lattice: Lattice, parameters: LatticeParameters, step: float, method:
     require_positive(step, "the step", "s")
     require_positive(tolerance, "the tolerance", "")
     if tolerance >= 1.0:
-        raise InputError(f"the tolerance is a share of the residual and must be below 1, not {tolerance:g}")
+        raise InputError(f"the tolerance is a fraction of the residual and must be below 1, not {tolerance:g}")
     if len(parameters.stiffness) != lattice.n_elements:
         raise InputError(f"there are parameters for {len(parameters.stiffness)} elements, the lattice has {lattice.n_elements}")
     if method not in ("implicit", "euler", "symplectic_euler"):

@@ -48,13 +48,13 @@ class WarpLatticeSession:
     engine : PreparedLattice
         Lattice, parameters and method.
     constrained : ConstrainedArrays
-        Held masses.
+        Constrained nodes.
     x, v, f, external : warp array
-        Position (mm), velocity (mm/s), force and external force (mN) of the masses; the last may be empty.
+        Position (mm), velocity (mm/s), force and external force (mN) of the nodes; the last may be empty.
     y : warp array
         Extensions, mm, at both ends of the elements.
     path, parts, count : warp array
-        Velocities of the bodies and forces of parts of held masses in the coming steps, and the number of those taken.
+        Velocities of the bodies and forces of parts of constrained nodes in the coming steps, and the number of those taken.
     taken : int
         Steps so far.
     iterations : int
@@ -237,7 +237,7 @@ class WarpLatticeSession:
         Raises
         ------
         ConvergenceError
-            The explicit method blew up.
+            The explicit method diverged.
         """
         position, velocity = (np.array(a.numpy(), dtype=np.float64).reshape(-1, 3) for a in (self.x, self.v))
         lists = self.engine.lists
@@ -289,7 +289,7 @@ class WarpLatticeSession:
         if not (np.isfinite(state.velocity).all() and np.abs(state.position - engine.lattice.points).max() < reach):
             limit = explicit_step_limit(engine.lattice, engine.parameters)
             raise ConvergenceError(
-                f"the explicit steps of {engine.step:g} s blew up within {self.taken} steps; the springs and dampers allow about "
+                f"the explicit steps of {engine.step:g} s diverged within {self.taken} steps; the springs and dashpots allow about "
                 f"{limit:.2g} s: take shorter steps, or method='implicit', which is stable for all parameters"
             )
         return state

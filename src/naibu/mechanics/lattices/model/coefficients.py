@@ -1,4 +1,4 @@
-"""Coefficients of three-element (Jeffreys) springs for explicit and implicit steps."""
+"""Coefficients of three-element (Jeffreys) elements for explicit and implicit steps :cite:p:`hirai2008` (chapter 4.3)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from naibu.mechanics.lattices.model.lattice import LatticeParameters
 
 
 def explicit_coefficients(parameters: LatticeParameters) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return A, B, D, G of every element: tension ``A l' + B y`` and ``y' = D l' - G y`` of the extension y = Z - a L (spec L1)."""
+    """Return A, B, D, G of every element: tension ``A l' + B y`` and ``y' = D l' - G y`` of the extension y = Z - a L."""
     k, c1, c2 = parameters.stiffness, parameters.voigt_damping, parameters.series_damping
     share = series_share(parameters)
     return c1 * share, k * share, share, k / (c1 + c2)
@@ -21,7 +21,7 @@ def series_share(parameters: LatticeParameters) -> FloatArray:
 
 
 def implicit_coefficients(parameters: LatticeParameters, step: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return a, b, E, g of every element for a step in s (spec L1).
+    """Return a, b, E, g of every element for a step in s.
 
     While the length changes evenly by dl, ``y1 = E y0 + g dl`` is exact and the mean tension is ``a dl + b y0``; all are finite and not
     negative for every K, C1 >= 0 and C2 > 0.

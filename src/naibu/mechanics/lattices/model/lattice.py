@@ -1,4 +1,4 @@
-"""Lattices of masses joined by three-element springs and dampers: geometry, masses and parameters (spec L1, L2)."""
+"""Mass-spring-dashpot lattices of three-element (Jeffreys) elements :cite:p:`hirai2008` (chapter 4.3)."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ class Lattice:
     points : ndarray, shape (n, 3)
         Positions at rest, mm; sorted by z, then y, then x where they stand on a grid.
     elements : ndarray, shape (m, 2), int64
-        Numbers of the two masses of every element, the smaller one first.
+        Numbers of the two nodes of every element, the smaller one first.
     node_mass : ndarray, shape (n,)
         kg.
     element_class : ndarray, shape (m,), int8
         0 short, 1 normal, 2 long: see `CLASSES`.
     element_zone : ndarray, shape (m,), int8
-        0 core, 1 surface, which has a mass on the surface: see `ZONES`.
+        0 core, 1 surface, which has a node on the surface: see `ZONES`.
     element_level : ndarray, shape (m,), int8
         Level of the octree, 0 for the finest voxels.
     surface_node : ndarray, shape (n,), bool
-        Masses on the surface.
+        Nodes on the surface.
     spacing_mm : float
         Edge of the finest voxels, mm; the mean length of elements where there are none.
     scale : ndarray, shape (m,)
@@ -67,7 +67,7 @@ class Lattice:
 
     @property
     def n_nodes(self) -> int:
-        """Number of masses."""
+        """Number of nodes."""
         return len(self.points)
 
     @property
@@ -89,16 +89,16 @@ class Lattice:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LatticeParameters:
-    """Parameters of the three-element elements of a lattice (spec L1).
+    """Parameters of the three-element elements of a lattice.
 
     Attributes
     ----------
     stiffness : ndarray, shape (m,)
         K of the spring, mN/mm.
     voigt_damping : ndarray, shape (m,)
-        C1 of the damper beside the spring, mN s/mm.
+        C1 of the dashpot beside the spring, mN s/mm.
     series_damping : ndarray, shape (m,)
-        C2 of the damper in line with both, mN s/mm; infinite for Kelvin-Voigt elements, which leave no residual displacement.
+        C2 of the dashpot in line with both, mN s/mm; infinite for Kelvin-Voigt elements, which leave no residual displacement.
     voigt_fraction : ndarray, shape (m,)
         Part `a` of the length at rest that the Voigt part takes. It changes neither force nor shape: only the extension Z - a L enters.
     """
@@ -119,9 +119,9 @@ def classic_lattice(
     origin: ArrayLike = (0.0, 0.0, 0.0),
     frame: RigidTransform | None = None,
 ) -> Lattice:
-    """Return masses at the corners of all voxels of a mask, each joined to its up to 26 neighbours (spec L2).
+    """Return nodes at the corners of all voxels of a mask, each joined to its up to 26 neighbours.
 
-    Two masses are joined where a voxel has both as corners.
+    Two nodes are joined where a voxel has both as corners.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def classic_lattice(
     total_mass_kg, density : float
         One of the two: kg, or kg/mm^3.
     lumping : str
-        ``"volume"``: every voxel gives an eighth of its mass to each corner; ``"equal"``: all masses are alike, as in the report.
+        ``"volume"``: every voxel gives an eighth of its mass to each corner; ``"equal"``: all nodal masses are equal, as in the report.
     origin : array_like, shape (3,)
         Position of the corner (0, 0, 0) of the grid, mm.
     frame : RigidTransform, optional
@@ -249,7 +249,7 @@ def assembled(
     scale: FloatArray | None = None,
     frame: RigidTransform | None = None,
 ) -> Lattice:
-    """Return the lattice of masses at grid positions (n, 3) and elements (m, 2), classed by their directions.
+    """Return the lattice of nodes at grid positions (n, 3) and elements (m, 2), classed by their directions.
 
     Raises
     ------
@@ -267,7 +267,7 @@ def assembled(
 
 
 def require_connected(pairs: IntArray, n_nodes: int, points: FloatArray) -> None:
-    """Check that all masses hang together.
+    """Check that all nodes are connected.
 
     Raises
     ------
@@ -294,7 +294,7 @@ def lattice_parameters(
     *,
     scaled: bool = True,
 ) -> LatticeParameters:
-    """Return the parameters of all elements (spec L1, L2).
+    """Return the parameters of all elements.
 
     Each argument is one number, an array (m,) with one number an element, or a mapping with the keys ``"short"``, ``"normal"``, ``"long"``
     or ``"core"``, ``"surface"``; values may be mappings with the keys of the other kind.
@@ -302,7 +302,7 @@ def lattice_parameters(
     Parameters
     ----------
     lattice : Lattice
-        The masses and elements.
+        The nodes and elements.
     stiffness, voigt_damping, series_damping, voigt_fraction : float, array_like or mapping
         K (mN/mm), C1, C2 (mN s/mm) and a. K and C1 may be zero, C2 may be infinite.
     scaled : bool
@@ -400,38 +400,38 @@ def voxel_parameters(lattice: Lattice, mask: BoolArray, values: ArrayLike, origi
 
 
 def general_lattice(points: ArrayLike, elements: ArrayLike, node_mass: ArrayLike) -> Lattice:
-    """Return the lattice of any masses and elements; all elements count as short ones of the core, and no mass as on the surface.
+    """Return the lattice of any nodes and elements; all elements count as short ones of the core, and no node as on the surface.
 
     Parameters
     ----------
     points : array_like, shape (n, 3)
         Positions at rest, mm.
     elements : array_like, shape (m, 2)
-        Numbers of the two masses of every element.
+        Numbers of the two nodes of every element.
     node_mass : array_like, shape (n,)
         kg.
 
     Raises
     ------
     InputError
-        Shapes that do not fit, NaN, masses that are not positive, elements without length, given twice or between masses that are
+        Shapes that do not fit, NaN, masses that are not positive, elements without length, given twice or between nodes that are
         not there, or a lattice in pieces.
     """
     at, pairs, masses = np.asarray(points, dtype=float), np.asarray(elements, dtype=np.int64), np.asarray(node_mass, dtype=float)
     if at.ndim != 2 or at.shape[1] != 3 or masses.shape != (len(at),) or pairs.ndim != 2 or pairs.shape[1] != 2:
         raise InputError(
-            f"points, elements and masses must have shapes (n, 3), (m, 2) and (n,), not {at.shape}, {pairs.shape}, {masses.shape}"
+            f"points, elements and node_mass must have shapes (n, 3), (m, 2) and (n,), not {at.shape}, {pairs.shape}, {masses.shape}"
         )
     if not np.isfinite(at).all():
         raise InputError(f"{int((~np.isfinite(at)).any(axis=1).sum())} of {len(at)} points are NaN or infinite; leave them out")
     if not (np.isfinite(masses) & (masses > 0.0)).all():
         raise InputError(f"masses must be positive; the least is {np.nanmin(masses):g} kg")
     if not len(pairs) or pairs.min() < 0 or pairs.max() >= len(at):
-        raise InputError(f"elements join masses 0 to {len(at) - 1}; give at least one, and none beyond")
+        raise InputError(f"elements join nodes 0 to {len(at) - 1}; give at least one, and none beyond")
     pairs = np.sort(pairs, axis=1)
     lengths = np.linalg.norm(at[pairs[:, 1]] - at[pairs[:, 0]], axis=1)
     if not (lengths > 0.0).all():
-        raise InputError(f"element {int(np.argmin(lengths))} joins two masses at one place; merge them")
+        raise InputError(f"element {int(np.argmin(lengths))} joins two nodes at one place; merge them")
     if len(np.unique(pairs, axis=0)) < len(pairs):
         raise InputError(f"{len(pairs) - len(np.unique(pairs, axis=0))} elements are given twice; add up their stiffness instead")
     require_connected(pairs, len(at), at)

@@ -1,4 +1,4 @@
-"""Octree lattices: fine voxels where one sees and touches, coarse ones inside (spec L3)."""
+"""Octree lattices: fine voxels near the visible surface, coarse ones inside :cite:p:`hirai2008` (chapter 4.3)."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def octree_lattice(
     class_stiffness: ArrayLike = (1.0, 1.0, 1.0),
     frame: RigidTransform | None = None,
 ) -> Lattice:
-    """Return the octree lattice of a mask (spec L3).
+    """Return the octree lattice of a mask.
 
     A cube that the object fills is split while a face of it lies on the part of the surface that is to be fine: all of it (type 0), or all
-    but the floor (types 1 and 2). Type 2 keeps cubes of two voxels whole in the corners of the object. Masses are the corners of all
-    cubes; within each cube its corners are joined, but where another mass lies between them.
+    but the floor (types 1 and 2). Type 2 keeps cubes of two voxels whole in the corners of the object. Nodes are the corners of all
+    cubes; within each cube its corners are joined, but where another node lies between them.
 
     Parameters
     ----------
@@ -47,14 +47,14 @@ def octree_lattice(
     total_mass_kg, density : float
         One of the two: kg, or kg/mm^3.
     lumping : str
-        ``"volume"``, ``"equal"``, or ``"smallest"``: the report's rule, by which a mass at cubes of several sizes takes that of the
+        ``"volume"``, ``"equal"``, or ``"smallest"``: the report's rule, by which a node at cubes of several sizes takes that of the
         smallest; it loses mass (up to a quarter of it).
     origin : array_like, shape (3,)
         Position of the corner (0, 0, 0) of the grid, mm.
     scaling : str
         Rule for `Lattice.scale`: ``"response"``, such that forces and the shape of the surface are those of the classic lattice;
-        ``"energy"``, quicker, with the same energy in uniform strain, but softer as masses on faces of coarser cubes yield; ``"edge"``, the
-        mean edge of the cubes around an element. See `naibu.mechanics.lattices.model.octree_compliance_correction`.
+        ``"energy"``, quicker, with the same energy in uniform strain, but softer as nodes on faces of coarser cubes are compliant;
+        ``"edge"``, the mean edge of the cubes around an element. See `naibu.mechanics.lattices.model.octree_compliance_correction`.
     class_stiffness : array_like, shape (3,)
         K of short, normal and long elements, in any unit, if they are known to differ much; for ``"response"`` only.
     frame : RigidTransform, optional
@@ -84,7 +84,7 @@ def octree_lattice(
 
 
 def octree_factors(grid: OctreeGrid, scaling: str = "response", class_stiffness: ArrayLike = (1.0, 1.0, 1.0)) -> FloatArray:
-    """Return the factors (m,) by which K, C1 and C2 of the elements of an octree are to be multiplied (spec L3).
+    """Return the factors (m,) by which K, C1 and C2 of the elements of an octree are to be multiplied.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def octree_factors(grid: OctreeGrid, scaling: str = "response", class_stiffness:
 
 
 def _finest_first(corners: IntArray, nodes: IntArray, sizes: IntArray) -> tuple[IntArray, IntArray]:
-    """Number the masses at the finest cubes first, so that rows of them are alike: blocks of elements are then better filled."""
+    """Number the nodes at the finest cubes first, so that rows of them are alike: blocks of elements are then better filled."""
     least = np.full(len(nodes), np.iinfo(np.int64).max)
     np.minimum.at(least, corners.ravel(), np.repeat(sizes, corners.shape[1]))
     order = np.argsort(least, kind="stable")
@@ -122,7 +122,7 @@ def _finest_first(corners: IntArray, nodes: IntArray, sizes: IntArray) -> tuple[
 
 
 def _masses_of_smallest(corners: IntArray, sizes: IntArray, n_nodes: int, filled: BoolArray, total: float) -> FloatArray:
-    """Return masses (n,), kg, by the report's rule: that of a mass in the classic lattice of the smallest cubes that it touches."""
+    """Return masses (n,), kg, by the report's rule: that of a node in the classic lattice of the smallest cubes that it touches."""
     least = np.full(n_nodes, np.iinfo(np.int64).max)
     np.minimum.at(least, corners.ravel(), np.repeat(sizes, 8))
     steps = np.array(list(np.ndindex(2, 2, 2)))
@@ -194,7 +194,7 @@ def _cube_content(grid: BoolArray, exposed: BoolArray, at: IntArray, size: int) 
 
 
 def _leaf_elements(corners: IntArray, nodes: IntArray, sizes: IntArray) -> tuple[IntArray, Int8Array]:
-    """Return the elements (m, 2) of cubes, and the levels of the smallest cubes that have them; none has a mass on it."""
+    """Return the elements (m, 2) of cubes, and the levels of the smallest cubes that have them; none has a node on it."""
     first, second = np.triu_indices(8, 1)
     pairs = np.sort(np.stack([corners[:, first].ravel(), corners[:, second].ravel()], axis=1), axis=1)
     level = np.repeat(np.log2(sizes).astype(np.int8), len(first))
@@ -207,7 +207,7 @@ def _leaf_elements(corners: IntArray, nodes: IntArray, sizes: IntArray) -> tuple
     offset = nodes[pairs[:, 1]] - nodes[pairs[:, 0]]
     span = np.abs(offset).max(axis=1)
     blocked = np.zeros(len(pairs), dtype=bool)
-    for parts in 2 ** np.arange(1, int(span.max()).bit_length()):  # masses stand at multiples of a finer edge
+    for parts in 2 ** np.arange(1, int(span.max()).bit_length()):  # nodes stand at multiples of a finer edge
         for k in range(1, parts, 2):
             longer = np.flatnonzero((span >= parts) & ~blocked)
             between = _key(nodes[pairs[longer, 0]] + offset[longer] * k // parts, stride)

@@ -1,16 +1,17 @@
-"""Factors of the elements of octree lattices that keep forces and the shape of the surface (spec L3).
+"""Element factors of octree lattices that keep forces and surface shape of the classic lattice.
 
-Masses that hang on the edges and faces of coarser cubes are held by the finer side only, so that an octree that has the energy of the
+Nodes that hang on the edges and faces of coarser cubes are constrained by the finer side only, so that an octree that has the energy of the
 classic lattice in uniform strain (`naibu.mechanics.lattices.model.octree_energy_scaling.energy_factors`) yields there and is too soft, the
 more so the more levels it has. Elements of like surroundings get one more factor each, found by the method of Gauss and Newton such that
 the octree takes the energies of the classic lattice in two kinds of tests:
 
-- The surface is moved by any polynomial up to the fourth degree which leaves the inner masses of a classic lattice in equilibrium. Its
+- The surface is moved by any polynomial up to the fourth degree which leaves the inner nodes of a classic lattice in equilibrium. Its
   energy there is known without solving anything.
-- The floor is held and forces are put on the rest of the surface, smooth ones and some on spots. The classic lattice is solved for them
-  once, if it has at most `LOADED_MASSES` masses.
+- The floor is constrained and forces are put on the rest of the surface, smooth ones and some on spots. The classic lattice is solved for
+them
+  once, if it has at most `LOADED_MASSES` nodes.
 
-Energies of pairs of motions tell forces and displacements of the surface; of what the inner masses do nothing is asked.
+Energies of pairs of motions determine forces and displacements of the surface; inner nodes do not enter.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ def response_factors(grid: OctreeGrid, start: FloatArray, class_stiffness: Float
     grid : OctreeGrid
         The octree.
     start : ndarray, shape (m,)
-        Factors that need correction only for the yielding of masses on edges and faces of coarser cubes.
+        Factors that need correction only for the compliance of nodes on edges and faces of coarser cubes.
     class_stiffness : ndarray, shape (3,)
         K of short, normal and long elements of the classic lattice, in any unit.
     """
@@ -104,7 +105,7 @@ class _Elements:
     Attributes
     ----------
     longer : csr_matrix, shape (m, 3 n)
-        How much longer elements become by displacements of the masses.
+        How much longer elements become by displacements of the nodes.
     stiffness : ndarray, shape (m,)
         Before correction.
     group : ndarray, shape (m,)
@@ -112,7 +113,7 @@ class _Elements:
     parts : ndarray, shape (groups + 1,)
         Where the groups begin, and the last one ends.
     nodes : ndarray, shape (n, 3)
-        Positions of the masses on the grid.
+        Positions of the nodes on the grid.
     """
 
     longer: sp.csr_matrix
@@ -133,7 +134,7 @@ class _Elements:
 
 
 def lengthening(nodes: IntArray, pairs: IntArray) -> sp.csr_matrix:
-    """Return the map (m, 3 n) from small displacements of masses at grid positions (n, 3) to the lengthening of elements (m, 2)."""
+    """Return the map (m, 3 n) from small displacements of nodes at grid positions (n, 3) to the lengthening of elements (m, 2)."""
     offset = nodes[pairs[:, 1]] - nodes[pairs[:, 0]]
     unit = offset / np.linalg.norm(offset, axis=1)[:, None]
     columns = 3 * pairs[:, [1, 1, 1, 0, 0, 0]] + np.array([0, 1, 2, 0, 1, 2])
@@ -157,14 +158,14 @@ class _EnergyTest:
 
     @classmethod
     def of_motions(cls, elements: _Elements, moved: BoolArray, motions: FloatArray) -> _EnergyTest:
-        """Move some masses (n,) by motions (n, 3, p)."""
+        """Move some nodes (n,) by motions (n, 3, p)."""
         constrained = np.flatnonzero(np.repeat(moved, 3))
         imposed = elements.longer[:, constrained] @ motions.reshape(len(moved) * 3, -1)[constrained]
         return cls(elements, ~moved, np.asarray(imposed), None)
 
     @classmethod
     def of_forces(cls, elements: _Elements, constrained: BoolArray, forces: FloatArray) -> _EnergyTest:
-        """Hold some masses (n,), and put forces (n, 3, p) on others."""
+        """Hold some nodes (n,), and put forces (n, 3, p) on others."""
         return cls(elements, ~constrained, None, forces[~constrained].reshape(3 * int((~constrained).sum()), -1))
 
     def evaluated(self, logarithms: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -250,7 +251,7 @@ def _monomials(positions: FloatArray, powers: IntArray) -> FloatArray:
 
 
 def _balanced(powers: IntArray, stiffness: FloatArray, spacing: float) -> FloatArray:
-    """Return coefficients (p, 3, q) of a basis of the polynomial motions that all 26 elements of a mass balance, wherever it is."""
+    """Return coefficients (p, 3, q) of a basis of the polynomial motions that all 26 elements of a node balance, wherever it is."""
     degree = int(powers.max())
     places = np.array(list(product(np.linspace(-1.0, 1.0, degree + 1), repeat=3)))
     here = _monomials(places, powers)
@@ -263,7 +264,7 @@ def _balanced(powers: IntArray, stiffness: FloatArray, spacing: float) -> FloatA
 
 
 def _classic_elements(filled: BoolArray, direction: IntArray) -> IntArray:
-    """Return the masses (k, 3) from which an element of the classic lattice leads in a direction."""
+    """Return the nodes (k, 3) from which an element of the classic lattice leads in a direction."""
     padded = np.pad(filled, 1)
     joined = np.zeros(tuple(n + 1 for n in filled.shape), dtype=bool)
     ways = [{0: (0, 1), 1: (1,), -1: (0,)}[int(d)] for d in direction]  # in which of the two voxels along each axis it may lie
@@ -273,7 +274,7 @@ def _classic_elements(filled: BoolArray, direction: IntArray) -> IntArray:
 
 
 def _classic_masses(filled: BoolArray) -> IntArray:
-    """Return the positions (n, 3) of the masses of the classic lattice."""
+    """Return the positions (n, 3) of the nodes of the classic lattice."""
     used = np.zeros(tuple(n + 1 for n in filled.shape), dtype=bool)
     for step in product((0, 1), repeat=3):
         used[tuple(slice(s, s + n) for s, n in zip(step, filled.shape, strict=True))] |= filled
@@ -281,7 +282,7 @@ def _classic_masses(filled: BoolArray) -> IntArray:
 
 
 def _orthonormal_forces(grid: OctreeGrid, loaded: BoolArray, stiffness: FloatArray) -> FloatArray:
-    """Return forces (n, 3, p) on some masses, orthonormal by the energies of the classic lattice that is held at the floor under them."""
+    """Return forces (n, 3, p) on some nodes, orthonormal by the energies of the classic lattice with its floor constrained."""
     masses = _classic_masses(grid.filled)
     forces = _forces(grid, loaded)
     number = np.full(tuple(n + 1 for n in grid.filled.shape), -1, dtype=np.int64)

@@ -1,9 +1,9 @@
-"""Factors of the elements of octree lattices that keep the energy of the classic lattice in uniform strain (spec L3).
+"""Element factors of octree lattices that keep the energy of the classic lattice in uniform strain.
 
 By one factor an element K, C1 and C2 are multiplied alike, so that relaxation times stay. `edge_factors` takes the mean edge of the cubes
 around an element, `energy_factors` what a cube, a piece of the surface or one of its edges would have in the classic lattice: given to the
-elements along its own directions, and handed down where finer masses stand on them. Both are too soft where masses hang on the edges and
-faces of coarser cubes, for these are held by the finer side only: see `naibu.mechanics.lattices.model.octree_compliance_correction`.
+elements along its own directions, and handed down where finer nodes stand on them. Both are too soft where nodes hang on the edges and
+faces of coarser cubes, for these are constrained by the finer side only: see `naibu.mechanics.lattices.model.octree_compliance_correction`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class OctreeGrid:
     sizes : ndarray, shape (k,), int64
         Their edges, in voxels.
     nodes : ndarray, shape (n, 3), int64
-        Positions of the masses.
+        Positions of the nodes.
     pairs : ndarray, shape (m, 2), int64
         Masses of the elements.
     """
@@ -68,7 +68,7 @@ class OctreeGrid:
         return constrained
 
     def around_masses(self) -> IntArray:
-        """Return the edges of the cubes in the eight octants around the masses, 0 outside (n, 8)."""
+        """Return the edges of the cubes in the eight octants around the nodes, 0 outside (n, 8)."""
         constrained = self.sizes_at()
         return np.stack([constrained[tuple((self.nodes + step).T)] for step in _OCTANTS], axis=1)
 
@@ -78,7 +78,7 @@ class OctreeGrid:
         return np.stack([constrained[tuple(((middle - step) // 2 + 1).T)] for step in _OCTANTS], axis=1)
 
     def hanging(self, around: IntArray) -> IntArray:
-        """Return in how many octants around the masses there is a cube of which they are no corner (n,)."""
+        """Return in how many octants around the nodes there is a cube of which they are no corner (n,)."""
         return np.asarray((self.nodes[:, None, :] % np.maximum(around, 1)[:, :, None] != 0).any(axis=2).sum(axis=1))
 
 
@@ -89,7 +89,7 @@ def edge_factors(grid: OctreeGrid) -> FloatArray:
 
 
 def energy_factors(grid: OctreeGrid) -> FloatArray:
-    """Return factors (m,) that give every cube, with its share of the surface, the energy it has as a classic lattice in uniform strain.
+    """Return factors (m,) that give every cube, with its fraction of the surface, the energy it has as a classic lattice in uniform strain.
 
     Springs K on the edges, face and space diagonals of voxels belong to voxels by 1/4, 1/2 and 1. A cube of h voxels an edge has their
     energy with h K instead. On the surface the classic lattice has more than its voxels' shares, 1/4 and 1/2 for each face: a face of h
@@ -154,7 +154,7 @@ def _handed_down(grid: OctreeGrid, begin: IntArray, directions: IntArray, spans:
 
 
 def _edge_remainders(grid: OctreeGrid) -> FloatArray:
-    """Return what the classic lattice has along edges of voxels beyond the shares of voxels and faces, for all elements (m,)."""
+    """Return what the classic lattice has along edges of voxels beyond the fractions of voxels and faces, for all elements (m,)."""
     offset, span = grid.offset, grid.span
     along = grid.element_class == 0
     low = np.minimum(grid.nodes[grid.pairs[:, 0]], grid.nodes[grid.pairs[:, 1]])
@@ -179,8 +179,8 @@ def _edge_remainders(grid: OctreeGrid) -> FloatArray:
 def surroundings(grid: OctreeGrid) -> IntArray:
     """Return numbers (m,) of groups of elements of like surroundings, whatever their size and orientation.
 
-    Alike are the class, and in units of the element's own cube the cubes around its middle and around its masses, with the number of those
-    on whose edges or faces a mass hangs.
+    Alike are the class, and in units of the element's own cube the cubes around its middle and around its nodes, with the number of those
+    on whose edges or faces a node hangs.
     """
     around, middle = grid.around_masses(), grid.around_middles()
     hanging, level = grid.hanging(around), np.log2(grid.span).astype(np.int64)

@@ -32,8 +32,8 @@ class LatticeState:
     extension : ndarray, shape (m,)
         How much longer than at rest the Voigt part of every element is, y = Z - a L, mm.
     length : ndarray, shape (m,)
-        Lengths of the elements that the extensions have followed so far, mm; by default the distances of the masses. They lag behind where
-        the implicit method held back what rotation adds, and catch up.
+        Lengths of the elements that the extensions have followed so far, mm; by default the distances of the nodes. They lag behind where
+        the implicit method limited what rotation adds, and catch up.
     contact : ContactState, optional
         Of the indenters that touch the lattice, so that friction and pull-off go on as they were.
     """
@@ -47,16 +47,16 @@ class LatticeState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConstrainedNodes:
-    """Components of masses that move as rigid bodies do.
+    """Components of nodes that move as rigid bodies do.
 
     Attributes
     ----------
     node : ndarray, shape (h,), int64
-        Masses; one occurs once for each direction in which it is held.
+        Nodes; one occurs once for each direction in which it is constrained.
     direction : ndarray, shape (h, 3)
-        Unit vectors, orthogonal where they belong to one mass.
+        Unit vectors, orthogonal where they belong to one node.
     weight : ndarray, shape (h,)
-        Share of the body's velocity that the mass takes on.
+        Fraction of the body's velocity that the node takes on.
     body : ndarray, shape (h,), int64
         Number of the body.
     """
@@ -68,12 +68,12 @@ class ConstrainedNodes:
 
     @classmethod
     def none(cls) -> ConstrainedNodes:
-        """Hold nothing."""
+        """Constrain nothing."""
         return cls(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
 
     @classmethod
     def of(cls, nodes: ArrayLike, body: int = 0, *, axes: Sequence[int] = (0, 1, 2), weight: ArrayLike = 1.0) -> ConstrainedNodes:
-        """Hold masses along axes of the frame by a body, with a weight, or one a mass."""
+        """Constrain nodes along axes of the frame by a body, with a weight, or one a node."""
         chosen = np.atleast_1d(np.asarray(nodes, dtype=np.int64))
         share = np.broadcast_to(np.asarray(weight, dtype=float), chosen.shape)
         k = len(axes)
@@ -82,7 +82,7 @@ class ConstrainedNodes:
         )
 
     def __add__(self, other: ConstrainedNodes) -> ConstrainedNodes:
-        """Hold what either holds."""
+        """Constrain what either constrains."""
         pairs = ((getattr(self, name), getattr(other, name)) for name in ("node", "direction", "weight", "body"))
         return ConstrainedNodes(*(np.concatenate(pair) for pair in pairs))
 
@@ -100,7 +100,7 @@ class Motion:
     iterations : float
         Mean number of iterations of the solver in a step.
     held_back : int
-        Steps in which the stretching by rotation was held back so that the energy does not grow; other than zero for steps of large turns.
+        Steps in which the stretching by rotation was limited so that the energy does not grow; other than zero for steps of large turns.
     """
 
     state: LatticeState
@@ -169,22 +169,22 @@ def require_no_contact(state: LatticeState) -> None:
 
 
 def require_constrained(constrained: ConstrainedNodes, n_nodes: int) -> None:
-    """Check held masses.
+    """Check constrained nodes.
 
     Raises
     ------
     InputError
-        A mass that is not there, directions that are not of unit length, or two that are not orthogonal at one mass.
+        A node that is not there, directions that are not of unit length, or two that are not orthogonal at one node.
     """
     if not len(constrained.node):
         return
     if constrained.node.min() < 0 or constrained.node.max() >= n_nodes:
         raise InputError(
-            f"held masses have the numbers {constrained.node.min()} to {constrained.node.max()}, the lattice has 0 to {n_nodes - 1}"
+            f"constrained nodes have the numbers {constrained.node.min()} to {constrained.node.max()}, the lattice has 0 to {n_nodes - 1}"
         )
-    require_numbers(constrained.direction, "the direction of held masses")
+    require_numbers(constrained.direction, "the direction of constrained nodes")
     if np.abs(np.linalg.norm(constrained.direction, axis=1) - 1.0).max() > 1e-6:
-        raise InputError("the directions of held masses must be of unit length; divide them by their norm")
+        raise InputError("the directions of constrained nodes must be of unit length; divide them by their norm")
     order = np.argsort(constrained.node, kind="stable")
     node, direction = constrained.node[order], constrained.direction[order]
     for apart in range(1, min(4, len(node))):
@@ -192,13 +192,13 @@ def require_constrained(constrained: ConstrainedNodes, n_nodes: int) -> None:
         cosine = np.abs((direction[apart:] * direction[:-apart]).sum(axis=1))[together]
         if len(cosine) and cosine.max() > 1e-6:
             bad = int(node[apart:][together][int(np.argmax(cosine))])
-            raise InputError(f"mass {bad} is held twice in directions that are not orthogonal; hold each component by one body only")
+            raise InputError(f"node {bad} is constrained twice in directions that are not orthogonal; hold each component by one body only")
 
 
 def explicit_step_limit(lattice: Lattice, parameters: LatticeParameters) -> float:
     """Return a step, s, up to which explicit steps are stable for small motions; a bound, reached within about a factor of two.
 
-    From Gershgorin's bound of the damping and of the stiffness of all elements at a mass, and the elements' own times (C1 + C2) / K.
+    From Gershgorin's bound of the damping and of the stiffness of all elements at a node, and the elements' own times (C1 + C2) / K.
     """
     a, b, _, g = explicit_coefficients(parameters)
     ends = lattice.elements.ravel()

@@ -1,4 +1,4 @@
-"""Masses, springs and dampers on the edges of tetrahedra, from their volumes (spec A2)."""
+"""Mass-spring-dashpot lattices on tetrahedral meshes: stiffness from volumes :cite:p:`vangelder1998`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def volumetric_lattice(
     damping_ratio: float = 1.0,
     series_damping: float = np.inf,
 ) -> tuple[Lattice, LatticeParameters]:
-    """Return the three-element lattice on the edges of a mesh of tetrahedra (spec A2).
+    """Return the three-element lattice on the edges of a mesh of tetrahedra.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Gradients of what a push gives with respect to the parameters of a lattice: the discrete adjoint of the explicit steps (spec L1, L6).
+"""Discrete adjoint of explicit lattice steps: gradients with respect to the parameters :cite:p:`griewank2008`.
 
 The steps are run once and kept at a few of them; the adjoint goes backwards, running each stretch between two of these again.
 Its gradient is that of the numbers that the steps computed, to rounding, not an approximation of that of the continuous motion.
@@ -77,18 +77,18 @@ def recorded_push(
     observed : array_like, shape (k,)
         Numbers of steps after which positions are wanted, growing.
     constrained : ConstrainedNodes
-        Masses that bodies move.
+        Nodes that bodies move.
     velocity : array_like, shape (steps, bodies, 3)
         Of the bodies, mm/s.
     external_force : array_like
-        Constant forces on the masses, mN, broadcast to (n, 3).
+        Constant forces on the nodes, mN, broadcast to (n, 3).
 
     Raises
     ------
     InputError
         An engine of another method or precision, shapes that do not fit, NaN, or observations that are not within the steps.
     ConvergenceError
-        The steps blew up.
+        The steps diverged.
     """
     if engine.method == "implicit" or engine.mass.dtype != np.float64:
         raise InputError("gradients need explicit steps in double precision: an engine with method='symplectic_euler' or 'euler'")
@@ -132,7 +132,7 @@ def recorded_push(
         reaction,
     )
     if not (np.isfinite(x).all() and np.isfinite(reaction).all()):
-        raise ConvergenceError(f"the explicit steps of {engine.step:g} s blew up; take shorter ones (see explicit_step_limit)")
+        raise ConvergenceError(f"the explicit steps of {engine.step:g} s diverged; take shorter ones (see explicit_step_limit)")
     pad = len(engine.mass)
     positions = seen.reshape(len(times), 3, pad)[:, :, : engine.lattice.n_nodes].transpose(0, 2, 1)
     return RecordedPush(engine, times, np.ascontiguousarray(positions), reaction, entries, path, external, stretch, kept)
@@ -177,7 +177,7 @@ def push_gradient(
     Raises
     ------
     InputError
-        Shapes that do not fit, NaN, or series dampers that are infinite.
+        Shapes that do not fit, NaN, or series dashpots that are infinite.
     """
     engine = push.engine
     lattice, pad = engine.lattice, len(engine.mass)
@@ -194,7 +194,7 @@ def push_gradient(
             raise InputError(f"{what} has shape {array.shape}, the push needs {shape}")
         require_numbers(array.astype(float), what)
     if not np.isfinite(engine.parameters.series_damping).all():
-        raise InputError("a series damper is infinite, so that nothing can be said of its change; give C2 a large number instead")
+        raise InputError("a series dashpot is infinite, so that nothing can be said of its change; give C2 a large number instead")
     blocks = engine.blocks
     # equal elements of one group share their coefficients and the sums over them; the label keeps groups apart
     rows, tables = blocks.patterns(
@@ -293,7 +293,7 @@ def _backward(  # type: ignore[no-untyped-def]  # pragma: no cover
 
 @njit(cache=True, fastmath=_FAST)
 def _masses_back(masses, constrained, step, forward, forces, ax, av, f):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Take the derivatives ax, av after the motion of the masses to those before it, and set f to those with respect to forces."""
+    """Take the derivatives ax, av after the motion of the nodes to those before it, and set f to those with respect to forces."""
     mass, inverse_mass = masses
     pad = len(mass)
     node, direction, _, body = constrained
@@ -309,7 +309,7 @@ def _masses_back(masses, constrained, step, forward, forces, ax, av, f):  # type
         for a in range(3):
             speed += direction[h, a] * av[a * pad + i]
             reaction += direction[h, a] * forces[body[h], a]
-        for a in range(3):  # held components do not depend on the forces, but the reaction does
+        for a in range(3):  # constrained components do not depend on the forces, but the reaction does
             av[a * pad + i] -= direction[h, a] * (speed + mass[i] / step * reaction)
             f[a * pad + i] -= direction[h, a] * (step * inverse_mass[i] * speed + reaction)
     if forward:

@@ -1,4 +1,4 @@
-"""Pushing lattices: by rigid bodies with friction and pull-off, or by points that four masses share (spec L4, L5)."""
+"""Pushing lattices: rigid indenters in contact, or displacements and forces of points :cite:p:`hirai2008` (chapter 4.3)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from naibu.mechanics.lattices.model.contact_state import begin_contact
 from naibu.mechanics.lattices.model.lattice import Lattice
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState, checked_velocity, require_numbers
 
-SNAP = 0.25  # a point nearer to a line of masses than this share of the spacing stands on it (equation 5 of the ICAT 2007 paper)
+SNAP = 0.25  # a point nearer to a line of nodes than this fraction of the spacing stands on it (:cite:p:`hirai2008`, chapter 4.3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +63,7 @@ def push(
 
     Nodes cannot enter an indenter. They stick to it while their tangential force is below the static friction, else slide against the
     kinetic one; both follow from the forces of the same step, which is solved again until all contacts agree with its solution. Nodes that
-    leave an indenter at less than V_t are held back by ``K_r gap + C_r speed``, but never by more than stops them.
+    leave an indenter at less than V_t are pulled back by ``K_r gap + C_r speed``, but never by more than stops them.
 
     Parameters
     ----------
@@ -182,21 +182,21 @@ def _motion(
 
 
 def hand_over(lattice: Lattice, face: str, points: ArrayLike, *, snap: float = SNAP) -> tuple[IntArray, FloatArray]:
-    """Return the four masses (p, 4) of the cell of a face that every point of a rigid body falls into, and their weights (p, 4) (spec L4).
+    """Return the four nodes (p, 4) of the cell of a face that every point of a rigid body falls into, and their weights (p, 4).
 
-    The weights are the areas opposite to the masses, as shares of the cell. A point within `snap` of the
-    spacing from a line of masses stands on it.
+    The weights are the areas opposite to the nodes, as fractions of the cell. A point within `snap` of the
+    spacing from a line of nodes stands on it.
 
     Parameters
     ----------
     lattice : Lattice
-        With masses on a grid.
+        With nodes on a grid.
     face : str
-        ``"-x"``, ``"+x"``, ``"-y"``, ``"+y"``, ``"-z"`` or ``"+z"``: the outermost layer of masses on that side.
+        ``"-x"``, ``"+x"``, ``"-y"``, ``"+y"``, ``"-z"`` or ``"+z"``: the outermost layer of nodes on that side.
     points : array_like, shape (p, 3)
         Positions, mm; the component across the face is not used.
     snap : float
-        Share of the spacing, below one half.
+        Fraction of the spacing, below one half.
 
     Raises
     ------
@@ -228,16 +228,16 @@ def hand_over(lattice: Lattice, face: str, points: ArrayLike, *, snap: float = S
     weights = np.stack([(1 - s) * (1 - t), (1 - s) * t, s * (1 - t), s * t], axis=1)
     if (corners[weights > 0.0] < 0).any():
         bad = int(np.argmax(((corners < 0) & (weights > 0.0)).any(axis=1)))
-        raise InputError(f"point {bad} lies over a cell of the face {face} that lacks masses; use masses of the finest voxels there")
+        raise InputError(f"point {bad} lies over a cell of the face {face} that lacks nodes; use nodes of the finest voxels there")
     return np.where(corners < 0, 0, corners), np.where(corners < 0, 0.0, weights)
 
 
 def displacement_drive(
     lattice: Lattice, face: str, points: ArrayLike, body: int = 0, *, axes: Sequence[int] = (0, 1, 2)
 ) -> ConstrainedNodes:
-    """Return how masses move when the points of a rigid body hand their displacement over to them (spec L4).
+    """Return how nodes move when the points of a rigid body hand their displacement over to them.
 
-    A mass takes on the share of the displacement that the weights of all points add up to, at most all of it.
+    A node takes on the fraction of the displacement that the weights of all points add up to, at most all of it.
 
     Parameters
     ----------
@@ -260,7 +260,7 @@ def displacement_drive(
 
 
 def force_drive(lattice: Lattice, face: str, points: ArrayLike, force: ArrayLike) -> FloatArray:
-    """Return forces on the masses (n, 3), mN, from a force on a rigid body that its points share equally and hand over (spec L4).
+    """Return forces on the nodes (n, 3), mN, from a force on a rigid body that its points share equally and hand over.
 
     Parameters
     ----------

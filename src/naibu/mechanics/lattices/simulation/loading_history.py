@@ -1,4 +1,4 @@
-"""Studies of lattices: bodies that push by a programme, computed frame by frame so that a run can stop and go on (spec L4, L5)."""
+"""Studies of lattices: indenters that follow loading histories, computed frame by frame and resumable."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class StudyBody:
     drive : Drive, optional
         Force that moves it instead; one body of a study at most, and the others then stand still.
     tied_until_s : float, optional
-        Masses that touch it at the start move with it until then, s, and are free of it afterwards; infinite for ever. None for contact.
+        Nodes that touch it at the start move with it until then, s, and are free of it afterwards; infinite for ever. None for contact.
     """
 
     name: str
@@ -121,7 +121,7 @@ class LatticeStudy:
 
     @property
     def tied(self) -> bool:
-        """Whether masses are tied to the bodies, rather than in contact with them."""
+        """Whether nodes are tied to the bodies, rather than in contact with them."""
         return any(body.tied_until_s is not None for body in self.bodies) or not self.bodies
 
     @property
@@ -191,12 +191,12 @@ class StudyFrame:
 
 
 def tied_nodes(lattice: Lattice, bodies: tuple[StudyBody, ...]) -> tuple[IntArray, ...]:
-    """Return the masses that are tied to every body: those on its surface at the start, and on no earlier body's.
+    """Return the nodes that are tied to every body: those on its surface at the start, and on no earlier body's.
 
     Raises
     ------
     InputError
-        A body that touches no mass, or starts inside the object.
+        A body that touches no node, or starts inside the object.
     """
     free = np.ones(lattice.n_nodes, dtype=bool)
     found = []
@@ -206,7 +206,7 @@ def tied_nodes(lattice: Lattice, bodies: tuple[StudyBody, ...]) -> tuple[IntArra
         if not touched.any():
             nearest = float(body.indenter.gap(lattice.points).min())
             raise InputError(
-                f"{body.name} touches no mass, the nearest is {nearest:.4g} mm away: a body can be tied to what it touches at the start"
+                f"{body.name} touches no node, the nearest is {nearest:.4g} mm away: a body can be tied to what it touches at the start"
             )
         found.append(np.flatnonzero(touched & free))
         free &= ~touched
@@ -274,7 +274,7 @@ def run_study(study: LatticeStudy, start: StudyState | None = None, *, device: s
     InputError
         What `check_study` refuses.
     ConvergenceError
-        An explicit method blew up.
+        An explicit method diverged.
     """
     if not study.tied and device != "cpu":
         raise InputError(f"device is {device!r}, but contact with friction is computed on 'cpu' only; choose that, or tie all bodies")

@@ -1,4 +1,4 @@
-"""Derivatives of a lattice's motion with respect to its parameters, computed along with it (spec L6).
+"""Tangent-linear lattice steps: derivatives with respect to the parameters along with the motion :cite:p:`griewank2008`.
 
 The derivative of an implicit step is one more solve with the step's matrix for every parameter: with w = e . (v_j - v_i) of an element and
 its impulse T = h b y + h^2 a w along e, ``A v1' = M v0' + h f' + sum (+-) [q e + T e']`` where
@@ -26,7 +26,7 @@ from naibu.mechanics.lattices.model.lattice import LatticeParameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState, checked_velocity, require_constrained, require_numbers
 
 _FAST = {"contract", "nsz"}
-_STEP = 1e-5  # share of a parameter, for the central differences of the coefficients of a step
+_STEP = 1e-5  # fraction of a parameter, for the central differences of the coefficients of a step
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,12 +40,12 @@ class ParameterChange:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Loads:
-    """Masses that share the force of a body.
+    """Nodes that share the force of a body.
 
     Attributes
     ----------
     node : ndarray, shape (k,), int64
-        Masses.
+        Nodes.
     share : ndarray, shape (k,)
         Part of the body's force that each one takes; they sum to one for each body.
     body : ndarray, shape (k,), int64
@@ -81,7 +81,7 @@ class DrivenMotion:
         After the last step.
     reaction : ndarray, shape (steps, bodies, 3)
         Forces of the bodies on the lattice, mN; of a body that pushes by force what the lattice answers: its force less the inertia of
-        the masses that share it.
+        the nodes that share it.
     state_change : StateChange
         Derivatives of the state along p directions.
     reaction_change : ndarray, shape (p, steps, bodies, 3)
@@ -124,11 +124,11 @@ def driven_steps(
     steps : int
         How many.
     constrained : ConstrainedNodes
-        Masses that bodies move.
+        Nodes that bodies move.
     velocity : array_like
         Velocities of the bodies, mm/s, broadcast to (steps, bodies, 3).
     loads : Loads
-        Masses that share the forces of bodies.
+        Nodes that share the forces of bodies.
     force : array_like
         Forces of the bodies, mN, broadcast to (steps, bodies, 3).
     changes : sequence of ParameterChange
@@ -266,7 +266,7 @@ def _changed_extension(first, second, rows, gain, changed, change, lengths, x, x
 
 @njit(cache=True)
 def _answer(loads, force, v, before, mass, step, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add to `reaction` (bodies, 3) the force of bodies less the inertia of the masses that share it."""
+    """Add to `reaction` (bodies, 3) the force of bodies less the inertia of the nodes that share it."""
     node, share, body = loads
     pad = len(mass)
     for k in range(len(node)):
