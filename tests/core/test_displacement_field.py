@@ -6,12 +6,14 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from naibu.core.rotation import rotation_matrix
 
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
+from naibu.core.rigid_transform import rotation_matrix
 from naibu.core.volume import Volume
+from naibu.identification.equilibrium_gap.equations import nodal_field
+from naibu.identification.from_fields.load_cases import FieldLoadCase
 
 SHAPE = (3, 4, 5)
 
@@ -100,3 +102,17 @@ def test_what_does_not_fit_is_refused() -> None:
         DisplacementField.on_grid(grid, unknown).at_points(step=0)
     with pytest.raises(InputError, match="not positive semidefinite"):
         DisplacementField.from_arrays(np.eye(3), np.eye(3), covariance=np.tile(np.diag([1.0, -1.0, 1.0]), (3, 1, 1)))
+
+
+def test_identification_takes_a_field_on_a_grid() -> None:
+    mesh = Mesh.from_arrays([[0, 0, 0], [9, 0, 0], [0, 9, 0], [0, 0, 9]], [[0, 1, 2, 3]], "tetra")
+    grid = Volume.from_array(np.zeros((3, 3, 3)), spacing_mm=(1.0, 1.0, 1.0))
+    valid = np.ones((3, 3, 3), dtype=bool)
+    valid[0, 0, 1] = False
+    case = FieldLoadCase.of(
+        "push", DisplacementField.on_grid(grid, affine(grid.positions()), valid=valid), mesh, loaded=[True, False, False, False]
+    )
+    assert len(case.field.points) == 26
+    np.testing.assert_allclose(case.field.vectors, affine(case.field.points), atol=1e-12)
+    nodal = nodal_field(DisplacementField.on_grid(grid, affine(grid.positions())), mesh)
+    np.testing.assert_allclose(nodal.displacement[0], affine(mesh.points[0]), atol=1e-12)

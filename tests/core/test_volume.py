@@ -33,7 +33,7 @@ def test_a_crop_keeps_its_place() -> None:
 
 
 @pytest.mark.parametrize(
-    ("values", "options", "told"),
+    ("values", "options", "message"),
     [
         (np.zeros((2, 2, 2, 3)), {"spacing_mm": (1, 1, 1)}, "three axes"),
         (np.full((2, 2, 2), np.nan), {"spacing_mm": (1, 1, 1)}, r"voxel \(0, 0, 0\)"),
@@ -41,6 +41,6 @@ def test_a_crop_keeps_its_place() -> None:
         (np.zeros((2, 2, 2)), {"spacing_mm": (1, 1, 1), "direction": [[1, 0.2, 0], [0, 1, 0], [0, 0, 1]]}, "orthonormal"),
     ],
 )
-def test_bad_volumes_are_refused(values: np.ndarray, options: dict, told: str) -> None:
-    with pytest.raises(InputError, match=told):
+def test_bad_volumes_are_refused(values: np.ndarray, options: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
         Volume.from_array(values, **options)

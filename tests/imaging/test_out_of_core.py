@@ -39,7 +39,7 @@ def motion(x: np.ndarray) -> np.ndarray:
 
 
 def scans(shape: tuple[int, int, int] = (22, 50, 61)) -> tuple[Volume, Volume]:
-    """Return two scans of whole grey values."""
+    """Return two scans of integer intensities."""
     before, after, _ = pair(grid(shape, (1.0, 0.9, 1.3)), motion, seed=4, wave_mm=(5.0, 16.0), noise=3.0)
     return tuple(v.with_values(np.clip(np.rint(10.0 * v.values), 0, None).astype(np.uint16)) for v in (before, after))
 
@@ -196,11 +196,11 @@ def test_memory_does_not_grow_with_the_volume(tmp_path: Path) -> None:
     print(f"peak {peaks[0] / 1e6:.1f}, {peaks[1] / 1e6:.1f} MB in blocks, {in_memory[0] / 1e6:.0f}, {in_memory[1] / 1e6:.0f} MB in memory")
 
 
-def test_what_cannot_be_worked_on_is_told() -> None:
+def test_invalid_arguments_are_refused() -> None:
     before, after = scans((12, 30, 30))
     constant = before.with_values(np.full(before.shape, 3, dtype=np.uint16))
     other = Volume.from_array(after.values, spacing_mm=(1, 1, 1))
-    for work, told in (
+    for work, message in (
         (lambda: map_overlapping(np.abs, [before.values, after.values[1:]], (1, 1, 1)), "one shape"),
         (lambda: map_overlapping(np.abs, [before.values], (1, 1)), "three whole numbers"),
         (lambda: map_overlapping(np.abs, [before.values], (1, 1, -1)), "three whole numbers"),
@@ -211,5 +211,5 @@ def test_what_cannot_be_worked_on_is_told() -> None:
         (lambda: chunked_horn_schunck(chunked(before), chunked(other)), "different grids"),
         (lambda: chunked_block_matching(chunked(before), chunked(after), matched_block=(2, 3, 3)), "must be odd"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             work()

@@ -34,13 +34,13 @@ def at(grid: Volume, points: Array) -> tuple[Array, ...]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    place = tmp_path_factory.mktemp("scans")
+    path = tmp_path_factory.mktemp("scans")
     before, after, truth, mask = squeezed_ball(seed=3)
-    write_volume(place / "before.mha", before)
-    write_volume(place / "after.nrrd", after)
-    write_volume(place / "mask.nii.gz", before.with_values(mask.astype(np.uint8)))
-    write_displacement(place / "truth.mha", truth, before)
-    return place
+    write_volume(path / "before.mha", before)
+    write_volume(path / "after.nrrd", after)
+    write_volume(path / "mask.nii.gz", before.with_values(mask.astype(np.uint8)))
+    write_displacement(path / "truth.mha", truth, before)
+    return path
 
 
 # what classic methods reach on this pair; the rigid motion alone leaves a bump of 1.5 mm
@@ -85,10 +85,10 @@ def test_files_are_what_other_programs_read(folder: Path, tmp_path: Path) -> Non
     before, after = (import_markers(tmp_path / f"{name}.csv") for name in ("initial", "pressed"))
     assert 100 < len(before) < 400
     assert np.abs(after.points - before.points - run.measured.displacement.vectors[at(pair.reference, before.points)]).max() < 1e-6
-    told = json.loads((tmp_path / "sense.json").read_text())
-    assert told["figures"]["median_error_mm"] < 0.15
-    assert set(told["inputs"]) == {"reference", "deformed", "mask", "truth"}
-    assert told["inputs"]["deformed"] == f"after.nrrd, SHA-256 {hashlib.sha256((folder / 'after.nrrd').read_bytes()).hexdigest()}"
+    numbers = json.loads((tmp_path / "sense.json").read_text())
+    assert numbers["figures"]["median_error_mm"] < 0.15
+    assert set(numbers["inputs"]) == {"reference", "deformed", "mask", "truth"}
+    assert numbers["inputs"]["deformed"] == f"after.nrrd, SHA-256 {hashlib.sha256((folder / 'after.nrrd').read_bytes()).hexdigest()}"
     page = (tmp_path / "report.html").read_text()
     assert "standard deviation of the displacement" in page
     assert not re.search(r"(?:src|href)=\"https?:", page)

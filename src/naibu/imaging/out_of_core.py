@@ -32,11 +32,8 @@ from naibu.imaging.preprocessing.volume_pair import shifted_intensity, to_millim
 
 Box = tuple[slice, slice, slice]
 Function = Callable[..., AnyArray]
-BLOCK = (
-    128,
-    128,
-    64,
-)  # voxels along x, y, z: 4 MB in single precision, little memory even with margin and results
+# voxels along x, y, z: 4 MB in single precision, little memory even with margin and results
+BLOCK = (128, 128, 64)
 # compiled kernels use all cores: two blocks at a time in one process would compete for them
 _ONE_AT_A_TIME = threading.Lock()
 

@@ -34,10 +34,10 @@ from naibu.viewer.slices import Overlay, SliceView, slices_html
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.result_folder import result_folder
 
-MESH_CELLS = 60_000  # of the file for ParaView, which shows as many without delay
-FIELD_POINTS = 40_000  # of the field for the identification, far more than it has unknowns
+# bounds of the size of files: hexahedra for ParaView, and points of the field for the identification
+MESH_CELLS, FIELD_POINTS = 60_000, 40_000
 MARKER_TABLES, MARKERS = ("initial", "pressed"), 250
-LEAST_CERTAIN = 4.0  # median standard deviations: positions of a larger one make no markers
+LEAST_CERTAIN = 4.0  # median standard deviations; positions of a larger one make no markers; empirical
 # what the figures of a run mean, with their units
 FIGURES = {
     "measured_fraction": "measured fraction of the object",

@@ -1,4 +1,4 @@
-"""Pyramids: which axes are halved, that voxel 0 stays in its place, and that fields go up and down without being changed."""
+"""Pyramids: which axes are halved, that voxel 0 keeps its position, and that fields are unchanged from level to level."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_the_number_of_levels_can_be_given() -> None:
     assert len(levels_of((48, 48, 48), np.ones(3), 1)) == 1
 
 
-def test_ramps_of_grey_keep_their_place() -> None:
+def test_intensity_ramps_keep_their_position() -> None:
     shape = (24, 48, 52)
     fine = Level(np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.ones(shape, bool), np.ones(3), np.ones(3, np.int64))
     slope = np.array([0.7, -0.4, 1.1])

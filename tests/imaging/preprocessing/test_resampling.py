@@ -67,14 +67,14 @@ def test_a_linear_function_is_kept_by_any_grid(interpolation: str, direction: np
 
 
 def test_a_smooth_function_is_met_with_the_order_of_the_interpolation() -> None:
-    grey = texture(3, (15.0, 25.0))
+    pattern = texture(3, (15.0, 25.0))
     errors: dict[str, list[float]] = {"linear": [], "cubic": []}
     points = np.random.default_rng(1).uniform(12, 28, (500, 3))
     for h in (2.0, 1.0):
         frame = Volume.from_array(np.zeros((int(40 / h),) * 3), spacing_mm=(h, h, h))
-        volume = frame.with_values(grey(positions(frame)))
+        volume = frame.with_values(pattern(positions(frame)))
         for kind, found in errors.items():
-            found.append(float(np.abs(sampled(volume, points, interpolation=kind) - grey(points)).max()))
+            found.append(float(np.abs(sampled(volume, points, interpolation=kind) - pattern(points)).max()))
     assert np.log2(errors["linear"][0] / errors["linear"][1]) == pytest.approx(2.0, abs=0.3)
     assert np.log2(errors["cubic"][0] / errors["cubic"][1]) > 3.5
 

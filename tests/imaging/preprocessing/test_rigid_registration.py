@@ -1,4 +1,4 @@
-"""Rigid motion from points against an independent solution, and from grey values against known truth."""
+"""Rigid motion from points against an independent solution, and from intensities against known truth."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_plane_motion_is_found_from_three_points(angle: float, seed: int) -> N
 
 
 @pytest.mark.parametrize(
-    ("points", "told"),
+    ("points", "message"),
     [
         (np.eye(3)[:2], "three points or more"),
         (np.outer(np.arange(4.0), [1.0, 2.0, 3.0]), "on one line"),
@@ -67,12 +67,12 @@ def test_a_plane_motion_is_found_from_three_points(angle: float, seed: int) -> N
         (np.ones((4, 4)), "shape"),
     ],
 )
-def test_points_that_leave_the_motion_open_are_refused(points: np.ndarray, told: str) -> None:
-    with pytest.raises(InputError, match=told):
+def test_points_that_leave_the_motion_open_are_refused(points: np.ndarray, message: str) -> None:
+    with pytest.raises(InputError, match=message):
         rigid_from_points(points, points)
 
 
-def test_points_that_do_not_move_rigidly_are_told() -> None:
+def test_points_that_do_not_move_rigidly_cause_a_warning() -> None:
     x = np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10.0]])
     y = x * [1.0, 1.0, 1.2]
     with pytest.warns(NotRigidWarning, match="point 3"):
@@ -94,7 +94,7 @@ def test_a_displacement_before_a_rigid_motion_adds_up() -> None:
 def limb(move: RigidTransform, seed: int = 0, squeeze: float = 0.0) -> tuple[Volume, Volume, np.ndarray]:
     """Return two scans of muscle about a dark bone with bright marrow, and where the bone is; the bone squeezed where asked for."""
     frame = Volume.from_array(np.zeros((24, 64, 64)), spacing_mm=(1.5, 1.5, 2.0))
-    grey = texture(seed, (6.0, 18.0))
+    pattern = texture(seed, (6.0, 18.0))
 
     def scan(x: np.ndarray) -> np.ndarray:
         centre = np.array([48.0, 44.0, 24.0])
@@ -104,8 +104,8 @@ def limb(move: RigidTransform, seed: int = 0, squeeze: float = 0.0) -> tuple[Vol
         r = np.hypot(d[..., 0], 1.3 * d[..., 1]) * (1 + 0.08 * np.cos(3 * np.arctan2(d[..., 1], d[..., 0])))
         body = np.hypot(x[..., 0] - 48, x[..., 1] - 48)
         marrow, bone, inside = (1 / (1 + np.exp((r - a) / 0.6)) for a in (8.0, 12.0, 1e9))
-        v = 300 + 0.5 * (grey(x) - 100)
-        v = v * (1 - bone) + bone * (40 + marrow * (700 + 0.8 * (grey(x) - 100)))
+        v = 300 + 0.5 * (pattern(x) - 100)
+        v = v * (1 - bone) + bone * (40 + marrow * (700 + 0.8 * (pattern(x) - 100)))
         return v * inside / (1 + np.exp((body - 40) / 0.8))
 
     x = positions(frame)
@@ -155,7 +155,7 @@ def test_otsu_parts_classes_where_brute_force_does() -> None:
         otsu_thresholds(np.ones(5))
 
 
-def test_grey_values_in_a_bone_mask_give_its_motion() -> None:
+def test_intensities_in_a_bone_mask_give_its_motion() -> None:
     pytest.importorskip("SimpleITK")
     before, after, bone = limb(MOVE)
     with warnings.catch_warnings():
@@ -166,7 +166,7 @@ def test_grey_values_in_a_bone_mask_give_its_motion() -> None:
     assert found.rms_mm < 0.5
 
 
-def test_a_bone_that_is_not_rigid_is_told() -> None:
+def test_a_bone_that_is_not_rigid_causes_a_warning() -> None:
     before, after, bone = limb(RigidTransform.identity(), squeeze=0.12)
     left = remaining_motion(before, after, bone, RigidTransform.identity())
     # the ends of the bone are 24 mm from its middle

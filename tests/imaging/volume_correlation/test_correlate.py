@@ -1,4 +1,4 @@
-"""Volume correlation on textured bodies in air that move exactly as they are told: the material at x is evaluated where it came from."""
+"""Volume correlation on textured objects in air with an exact motion: intensities are evaluated where the material came from."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def frame(shape: tuple[int, int, int] = (40, 44, 48), spacing: tuple[float, floa
 
 
 RADII = np.array([15.0, 14.0, 13.0])
-SCALE = np.array([2.0, 1.0, 1.0])  # of the long body, along x
+SCALE = np.array([2.0, 1.0, 1.0])  # of the long object, along x
 
 
 def depth(x: Array, scale: Array | float = 1.0) -> Array:
@@ -46,15 +46,15 @@ def scans(
     plain: Callable[[Array], Array] | None = None,
     scale: Array | float = 1.0,
 ) -> tuple[Volume, Volume]:
-    """Return scans before and after; `back` tells where material at a place came from, `plain` in what share it has no texture."""
+    """Return reference and deformed scan; `back` maps positions to the reference, `plain` gives the fraction without texture."""
     pattern, rng = texture(0, (5.0, 14.0)), np.random.default_rng(1)
 
-    def grey(x: Array) -> Array:
+    def intensity(x: Array) -> Array:
         own = 0.0 if plain is None else plain(x)
         return (200.0 + (1.0 - own) * (pattern(x) - 100.0)) / (1.0 + np.exp(-4.0 * depth(x, scale)))
 
     x = positions(grid)
-    before, after = (v + NOISE * rng.standard_normal(v.shape) for v in (grey(x), grey(back(x))))
+    before, after = (v + NOISE * rng.standard_normal(v.shape) for v in (intensity(x), intensity(back(x))))
     return grid.with_values(before), grid.with_values(after)
 
 
@@ -114,7 +114,7 @@ def test_a_uniform_compression_has_its_gradient() -> None:
     assert np.linalg.norm(errors(found, displacement), axis=1).mean() < 0.08
 
 
-def test_layers_are_told_apart() -> None:
+def test_layers_of_different_strain_are_resolved() -> None:
     z = np.linspace(-20.0, 60.0, 4001)
     slope = np.where(z < 20.0, 0.90, 0.98)
     after_z = np.concatenate([[0.0], np.cumsum(0.5 * (slope[1:] + slope[:-1]) * np.diff(z))]) + z[0]
@@ -147,7 +147,7 @@ def test_the_covariance_covers_the_truth() -> None:
     covered = np.einsum("ni,ni->n", e, np.linalg.solve(found.covariance_at(inside), e[..., None])[..., 0]) < CHI_SQUARED_95
     assert np.linalg.norm(e, axis=1).mean() < 0.12
     assert 0.9 <= covered.mean() <= 0.999
-    # and is no wider than it must be: errors are a fair share of it
+    # and is no wider than it must be: errors are a fair fraction of it
     assert np.sqrt((e**2).sum() / np.einsum("nii->", found.covariance_at(inside))) > 0.3
 
 
@@ -164,7 +164,7 @@ def test_vectors_turn_with_the_axes_of_the_scanner() -> None:
     turn = rotation_matrix(np.array([0.3, -0.5, 0.9]))
     turned = [Volume.from_array(v.values, spacing_mm=v.spacing_mm, origin_mm=(5.0, 6.0, 7.0), direction=turn) for v in (before, after)]
     other = correlate_volumes(*turned)
-    # the same grey values give the same numbers, to the last bit
+    # the same intensities give the same numbers, to the last bit
     assert np.array_equal(other.coefficients, found.coefficients)
     at = np.argwhere(found.valid)[::97, ::-1]
     assert np.allclose(other.displacement.vectors[other.valid], found.displacement.vectors[found.valid] @ turn.T, atol=1e-9)
@@ -202,7 +202,7 @@ def test_a_field_is_what_identification_takes() -> None:
         found.at_points(step=0)
 
 
-def test_a_stiff_body_moves_as_one() -> None:
+def test_a_rigid_inclusion_has_a_rigid_motion() -> None:
     # the ball keeps its shape, what is about it is squeezed, and both agree on its surface
     move, _ = affine(np.diag([1.03, 1.03, 0.93]), np.zeros(3))
 
@@ -238,7 +238,7 @@ def test_a_stiff_body_moves_as_one() -> None:
 def test_every_part_can_be_left_out(settings: CorrelationSettings) -> None:
     before, after, _ = waved()
     found = correlate_volumes(before, after, settings=settings)
-    # least squares is the worst of them: air that comes into the place of the surface weighs as much as all texture
+    # least squares is the worst of them: air that moves to where the surface was has as much weight as all texture
     assert np.linalg.norm(errors(found, waves()[0]), axis=1).mean() < 0.3
 
 

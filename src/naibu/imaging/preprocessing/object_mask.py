@@ -9,9 +9,9 @@ from naibu.core.arrays import BoolArray
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.bone_mask import otsu_thresholds
 
-# upper bound of the threshold, in fractions from the mean of the air to that of the object: skin and cartilage are darker than the mean
+# empirical: upper bound of the threshold, in fractions from the mean of the air to that of the object: skin is darker than the mean
 DIMMEST = 0.3
-CLOSING = 2  # voxels: radius of the morphological closing that bridges noise at the surface
+CLOSING = 2  # empirical, voxels: radius of the morphological closing that bridges noise at the surface
 
 
 def object_mask(volume: Volume, *, margin: int = 0) -> BoolArray:

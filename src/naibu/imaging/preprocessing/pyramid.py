@@ -11,7 +11,7 @@ from naibu.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from naibu.imaging.preprocessing._interpolation_kernels import refine
 from naibu.imaging.preprocessing.filters import smoothed
 
-# voxels along an axis below which it is not halved again: fewer show too little of the object
+# empirical: voxels along an axis below which it is not halved again: fewer show too little of the object
 SMALLEST = 12
 # SD, voxels, of the Gaussian against aliasing before every second voxel is dropped
 BLUR = 0.8

@@ -13,7 +13,7 @@ from naibu.imaging.volume_correlation._warp_kernels import warp_voxels
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable
 
-INSIDE = 0.5  # fraction of a cell in the object above which its dilatation is penalised
+INSIDE = 0.5  # empirical: fraction of a cell in the object above which its dilatation is penalised
 REACH = 7  # nodes along an axis with which a cubic B-spline overlaps
 APART = 3  # rows of cells that share nodes with one row
 

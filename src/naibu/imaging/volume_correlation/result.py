@@ -18,8 +18,8 @@ from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
 from naibu.imaging.volume_correlation.rigid_inclusions import InclusionMotion
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable
 
-VOXELS_PER_CELL = 6  # at which the random fields are evaluated: their covariance varies little within a cell
-SHARED = 0.7  # cells: SD of the window in which cells share their samples
+VOXELS_PER_CELL = 6  # at which the random fields are evaluated: splines vary little within a cell
+SHARED = 0.7  # empirical, cells: SD of the window in which cells share their samples
 STILL = 0.1  # voxels: step below which a cell has converged
 # empirical: displacement that is not resolved, of the root mean square second derivative times the square of the resolved length
 UNRESOLVED = 0.055

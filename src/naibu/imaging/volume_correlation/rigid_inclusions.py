@@ -15,11 +15,10 @@ from naibu.imaging.volume_correlation._warp_kernels import OUTSIDE, sample_splin
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.intensity_comparison import IntensityComparison
 
-# sub-voxel jitter SD, voxels: less than the field's, for six unknowns do not fit noise
-JITTER = 0.05
-STEPS, CONVERGED_MM = 6, 1e-3
-INTERPOLATED = 0.02  # voxels: SD of the interpolation bias, which no number of voxels averages out
-FOLLOWS = 0.4  # voxels: SD of the field about the rigid motion of an inclusion
+# empirical, voxels: sub-voxel jitter SD, less than the field's, for six unknowns do not fit noise; SD of the interpolation bias, which no
+# number of voxels averages out; SD of the field about the rigid motion of an inclusion
+JITTER, INTERPOLATED, FOLLOWS = 0.05, 0.02, 0.4
+STEPS, CONVERGED_MM = 6, 1e-3  # Gauss-Newton steps, and the step at which they end, far below any accuracy of the images
 # empirical: an inclusion is rigid if its mean bounded residual is at most so many times that of the field, which also fits noise
 RIGID = 1.3
 LEAST_VOXELS = 50  # too few for six unknowns and a test

@@ -13,7 +13,7 @@ from naibu.core.errors import InputError
 Gradients = Literal["reference", "mean", "deformed"]
 # fraction of the image intensity gradient that is taken from the reference
 REFERENCE_FRACTION: dict[Gradients, float] = {"reference": 1.0, "mean": 0.5, "deformed": 0.0}
-LEAST_SAMPLES = 8
+LEAST_SAMPLES = 8  # a 3 x 3 covariance of fewer is too uncertain to weight data by
 
 
 @dataclass(frozen=True, slots=True)
