@@ -10,13 +10,14 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
 from naibu import cli
 from naibu._numba.reports import report
-from naibu.cli.cold_start import SECONDS, CompilationNotice, first_run
+from naibu.cli.cold_start import SECONDS, TERMINATED, CompilationNotice, first_run
 from naibu.workflows import warm_up
 
 
@@ -89,6 +90,15 @@ def test_a_signal_ends_a_compilation_within_two_seconds(number: signal.Signals, 
     assert took < 2.0 + busy
     assert not [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
     assert all(path.suffix in (".nbc", ".lock") for path in (tmp_path / "cache").rglob("*") if path.is_file())
+
+
+@pytest.mark.parametrize("interruption", [KeyboardInterrupt(), SystemExit(TERMINATED)])
+def test_an_interruption_that_was_dropped_by_a_callback_is_raised_in_place_of_what_follows(interruption: BaseException) -> None:
+    with pytest.raises(type(interruption)), first_run("identify", Console(file=io.StringIO())):
+        sys.unraisablehook(SimpleNamespace(exc_type=type(interruption), exc_value=interruption))  # type: ignore[arg-type]
+        raise RuntimeError("no compiled object yet")
+    with pytest.raises(RuntimeError), first_run("identify", Console(file=io.StringIO())):
+        raise RuntimeError("no compiled object yet")
 
 
 def test_doctor_compiles_everything_when_asked(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -97,9 +97,15 @@ def _prompt_end(compiling: Callable[[], bool]) -> Iterator[None]:
     before = signal.getsignal(signal.SIGTERM)
     if before is signal.SIG_DFL:
         signal.signal(signal.SIGTERM, _terminated)
-    hook, sys.unraisablehook = sys.unraisablehook, _without_interruptions
+    lost: list[BaseException] = []
+    hook, sys.unraisablehook = sys.unraisablehook, _keeping_interruptions(lost)
     try:
         yield
+    except Exception as error:
+        # LLVM drops what is raised in its callbacks, and fails afterwards for want of what the callback was to do
+        if lost:
+            raise lost[0] from error
+        raise
     finally:
         sys.unraisablehook = hook
         if before is signal.SIG_DFL:
@@ -114,10 +120,16 @@ def _terminated(number: int, frame: FrameType | None) -> None:
     sys.exit(TERMINATED)
 
 
-def _without_interruptions(unraisable: sys.UnraisableHookArgs) -> None:
-    """Print what could not be raised, but for the end that was asked for in a callback of LLVM: the watch sees to that."""
-    if not issubclass(unraisable.exc_type, KeyboardInterrupt | SystemExit):
-        sys.__unraisablehook__(unraisable)
+def _keeping_interruptions(lost: list[BaseException]) -> Callable[[sys.UnraisableHookArgs], None]:
+    """Return a hook that prints what could not be raised, but keeps interruptions in a list."""
+
+    def hook(unraisable: sys.UnraisableHookArgs) -> None:
+        if isinstance(unraisable.exc_value, KeyboardInterrupt | SystemExit):
+            lost.append(unraisable.exc_value)
+        else:
+            sys.__unraisablehook__(unraisable)
+
+    return hook
 
 
 def _watch(signals: socket.socket, compiling: Callable[[], bool]) -> None:
