@@ -128,7 +128,7 @@ def scene(specimen: Specimen, state: str, fit: LoadCaseFit, measured: FloatArray
         steps.append(Step(label, s.load * travel, body.mesh.points[nodes] + s.displacement[nodes], markers, boxes))
     layer = marker_layers(specimen.marker_points[:, 2], experiment.nominal_spacing_mm)
     sd = np.sqrt((fit.sd**2).mean(axis=1))
-    # a marker whose free place was completed from the lattice counts in no figure of accuracy, here neither
+    # a marker whose reference position was completed from the lattice counts in no figure of accuracy, here neither
     shown = np.where(np.any(specimen.marker_filled, axis=1)[:, None], np.nan, measured)
     return Scene(
         f"{experiment.name}/{state}", experiment.name, state, faces, body.mesh.points[nodes], tuple(steps), body.marker_ids,

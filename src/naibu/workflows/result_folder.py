@@ -198,7 +198,7 @@ def _residual_csv(calibration: Calibration) -> str:
     writer.writerow(["experiment", "state", "marker", *axes, "initial_completed"])
     for load_case, fit in zip(calibration.load_cases, calibration.match.fits, strict=True):
         for i, marker in enumerate(load_case.specimen.marker_ids):
-            # a file, like the page, tells predicted minus measured
+            # a file, like the page, states predicted minus measured
             numbers = [_number(v, 4) for v in (*-fit.residual[i], *fit.sd[i])]
             writer.writerow(
                 [load_case.specimen.experiment.name, load_case.state, int(marker), *numbers, int(load_case.specimen.marker_filled[i].any())]
@@ -238,7 +238,7 @@ def write_prediction(folder: Path, model: CalibratedModel, prediction: Predictio
 
 
 def _predicted_csv(p: Prediction) -> str:
-    """A row for every marker of the free state; NaN where its place in the free state is not known, or not trusted."""
+    """A row for every marker of the reference configuration; NaN where its position there is not known, or not trusted."""
     rows = {int(i): (*point, sd) for i, point, sd in zip(p.specimen.marker_ids, p.points, p.sd_mm, strict=True)}
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

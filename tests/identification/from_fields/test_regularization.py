@@ -50,9 +50,9 @@ def a_step(height: float = 10.0) -> np.ndarray:
 
 
 def test_total_variation_of_a_step_is_area_times_jump() -> None:
-    penalty = TotalVariation(GRAPH, rounding=1e-6, share=1.0)
+    penalty = TotalVariation(GRAPH, rounding=1e-6, bulk_weight=1.0)
     assert penalty.value(a_step()) == pytest.approx(1600.0 * np.hypot(np.log(2.0), 0.3), rel=1e-4)
-    assert TotalVariation(GRAPH, rounding=1e-6, share=0.0).value(a_step()) == pytest.approx(1600.0 * np.log(2.0), rel=1e-4)
+    assert TotalVariation(GRAPH, rounding=1e-6, bulk_weight=0.0).value(a_step()) == pytest.approx(1600.0 * np.log(2.0), rel=1e-4)
 
 
 def test_both_moduli_jump_cheaper_at_one_place_than_at_two() -> None:
@@ -76,7 +76,7 @@ def test_laplacian_tends_to_the_integral_of_the_squared_gradient_of_a_line() -> 
     assert penalty.value(theta) == pytest.approx(0.5 * 0.01**2 * 100.0 * 390.0, rel=1e-9)
 
 
-@pytest.mark.parametrize("penalty", [TotalVariation(GRAPH), TotalVariation(GRAPH, rounding=0.3, share=0.4), Laplacian(GRAPH)])
+@pytest.mark.parametrize("penalty", [TotalVariation(GRAPH), TotalVariation(GRAPH, rounding=0.3, bulk_weight=0.4), Laplacian(GRAPH)])
 @settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 10_000), size=st.sampled_from([0.01, 0.3, 2.0]))
 def test_gradient_and_majoriser(penalty: TotalVariation | Laplacian, seed: int, size: float) -> None:

@@ -256,9 +256,9 @@ def _require_agreement(names: Sequence[str], parts: Sequence[tuple[FloatArray, F
         start += len(right)
     if len(parts) < 2 or max(together) < UNEXPLAINED:
         return
-    for (matrix, right), share in zip(parts, together, strict=True):
+    for (matrix, right), fraction in zip(parts, together, strict=True):
         if not right.any():
-            alone.append(share)
+            alone.append(fraction)
             continue
         found = np.linalg.lstsq(matrix, right, rcond=RANK_TOLERANCE)[0]
         alone.append(float(np.linalg.norm(matrix @ found - right) / np.linalg.norm(right)))

@@ -58,7 +58,7 @@ class _Sweep:
     pulls: tuple[tuple[FloatArray, FloatArray], ...]
 
     def displacements(self, systems: Sequence[LoadCaseEquations], step: FloatArray) -> tuple[FloatArray, ...]:
-        """Return the balanced displacement (n, d), mm, of every load case after a step (u,), kPa, of the moduli."""
+        """Return the equilibrated displacement (n, d), mm, of every load case after a step (u,), kPa, of the moduli."""
         return tuple(b.field.displacement - residual - moduli @ step for b, (residual, moduli) in zip(systems, self.pulls, strict=True))
 
 
@@ -144,7 +144,7 @@ def weighted_equilibrium_gap(
     max_sweeps : int
         Linearisations; each factorizes one matrix a load case.
     tolerance : float
-        The search ends when a step would change no modulus by more than this share of the largest of its zone.
+        The search ends when a step would change no modulus by more than this fraction of the largest of its zone.
 
     Returns
     -------
@@ -183,7 +183,7 @@ def _start(least: EquilibriumGapEstimate, size: float) -> FloatArray:
 def _descended(search: _Search, moduli: FloatArray, max_sweeps: int, tolerance: float) -> tuple[_Sweep, FloatArray, int, Status]:
     """Gauss-Newton with step halving; returns the last sweep, its moduli, the number of sweeps and how it ended."""
     sweep = search.swept(moduli, [system.field.displacement for system in search.systems])
-    # gradient and objective hold at displacements that balance, to which the measured ones are brought first
+    # gradient and objective hold at displacements in equilibrium, to which the measured ones are corrected first
     sweep, count, fresh = search.swept(moduli, sweep.displacements(search.systems, np.zeros_like(moduli))), 2, True
     while True:
         step, length = search.step(sweep, moduli), 1.0
@@ -239,8 +239,8 @@ def _solved(load_case: str, matrix: sp.csr_matrix, sides: FloatArray) -> FloatAr
 
 def _shared(load_case: str) -> InputError:
     return InputError(
-        f"load case {load_case!r}: the noise of the balances is singular, for nodes share the data of the same points, or have no noise "
-        "of their own; make the points the nodes of the mesh, or give interpolation_sd_mm, or standard deviations > 0"
+        f"load case {load_case!r}: the covariance of the equilibrium equations is singular, for nodes share the data of the same points, "
+        "or have no noise of their own; make the points the nodes of the mesh, or give interpolation_sd_mm, or standard deviations > 0"
     )
 
 

@@ -174,7 +174,7 @@ def identify_field(
 
 @dataclass(slots=True, eq=False)
 class _Recipe:
-    """The steps of an identification, told as they are made."""
+    """The steps of an identification, recorded and reported."""
 
     model: FieldModel
     bounds: Bounds

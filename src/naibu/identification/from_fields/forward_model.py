@@ -35,7 +35,7 @@ from naibu.meshing.point_location import interpolation_operator
 
 LawName = Literal["linear", "neo_hookean"]
 EXACT = 1e-3  # standard deviation ascribed to data that are called exact, as a fraction of the largest displacement: models are not exact
-SURFACE_STRAIN = 1.0  # standard deviation of the strain along loaded nodes: holds those near which nothing was measured
+SURFACE_STRAIN = 1.0  # standard deviation of the strain along loaded nodes: constrains those near which nothing was measured
 NEWTON_TOLERANCE = 1e-9  # residual force over the force on the loaded nodes
 NEWTON_ITERATIONS = 12
 
@@ -258,7 +258,7 @@ class Solvers:
 def equilibrium(
     law: FieldLaw, solvers: Solvers, lame: FloatArray, shear: FloatArray, load_case: FieldLoadCase, guess: FloatArray, owner: bytes
 ) -> tuple[FloatArray, Factorization]:
-    """Return the displacement (n, d), mm, in balance, with the loaded components as in `guess`, and the factorized tangent there.
+    """Return the displacement (n, d), mm, in equilibrium, with the loaded components as in `guess`, and the factorized tangent there.
 
     Raises
     ------
@@ -288,7 +288,7 @@ def equilibrium(
 def loaded_from_rest(
     law: FieldLaw, points: FloatArray, lame: FloatArray, shear: FloatArray, load_case: FieldLoadCase, moved: FloatArray
 ) -> FloatArray:
-    """Return the displacement (n, d), mm, in balance under a law of finite strain, the loaded components moved in steps to `moved` (n, d).
+    """Return the displacement (n, d), mm, in equilibrium under a finite-strain law, the loaded components moved in steps to `moved` (n, d).
 
     Raises
     ------

@@ -198,16 +198,16 @@ def _line_search(at: Linearised, step: Step, objective: Objective, value: float)
     """Return the first point along the step, halved again and again, at which the objective falls; None where it never does."""
     point = at.point
     moved = at.forward(step.theta[:, None], [b[:, None] for b in step.loaded])
-    share = 1.0
-    while share >= SHORTEST_FRACTION:
-        guesses = [u + share * du.reshape(u.shape) for u, du in zip(point.states, moved, strict=True)]
+    fraction = 1.0
+    while fraction >= SHORTEST_FRACTION:
+        guesses = [u + fraction * du.reshape(u.shape) for u, du in zip(point.states, moved, strict=True)]
         try:
-            found = at.model.evaluate(objective.clipped(point.theta + share * step.theta), guesses)
+            found = at.model.evaluate(objective.clipped(point.theta + fraction * step.theta), guesses)
         except ConvergenceError:  # moduli or motions that a body of finite strain cannot follow
-            share *= 0.5
+            fraction *= 0.5
             continue
         new = objective.value(found)
-        if new <= value - 1e-4 * share * step.promise:
+        if new <= value - 1e-4 * fraction * step.promise:
             return found, new
-        share *= 0.5
+        fraction *= 0.5
     return None

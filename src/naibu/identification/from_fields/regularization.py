@@ -19,7 +19,7 @@ from naibu.identification.from_fields.load_cases import KNOWN, Zones
 
 RegularizationName = Literal["total_variation", "laplacian"]
 ROUNDING = 0.02  # jumps of a logarithm below this count quadratically in total variation
-BULK_SHARE = 1.0  # weight of ln(kappa / mu) beside ln mu
+BULK_WEIGHT = 1.0  # weight of ln(kappa / mu) beside ln mu
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,15 +115,15 @@ class Regularization(Protocol):
 
 
 class _OnJumps:
-    """Common part: jumps of ln mu and of `share` ln(kappa / mu) across faces."""
+    """Common part: jumps of ln mu and of `bulk_weight` ln(kappa / mu) across faces."""
 
-    def __init__(self, graph: ZoneGraph, share: float) -> None:
-        if not share >= 0.0:
-            raise InputError(f"the weight of ln(kappa / mu) must not be negative, not {share:g}")
+    def __init__(self, graph: ZoneGraph, bulk_weight: float) -> None:
+        if not bulk_weight >= 0.0:
+            raise InputError(f"the weight of ln(kappa / mu) must not be negative, not {bulk_weight:g}")
         self.graph = graph
         jump = graph.difference()
         self._shear = sp.hstack([jump, sp.csr_matrix(jump.shape)], format="csr")
-        self._ratio = sp.hstack([sp.csr_matrix(jump.shape), share * jump], format="csr")
+        self._ratio = sp.hstack([sp.csr_matrix(jump.shape), bulk_weight * jump], format="csr")
 
     def jumps_squared(self, theta: FloatArray) -> FloatArray:
         """Return the squared jump of the two logarithms across every face (e,)."""
@@ -144,8 +144,8 @@ class TotalVariation(_OnJumps):
 
     name = "total_variation"
 
-    def __init__(self, graph: ZoneGraph, *, rounding: float = ROUNDING, share: float = BULK_SHARE) -> None:
-        super().__init__(graph, share)
+    def __init__(self, graph: ZoneGraph, *, rounding: float = ROUNDING, bulk_weight: float = BULK_WEIGHT) -> None:
+        super().__init__(graph, bulk_weight)
         if not rounding > 0.0:
             raise InputError(f"the rounding of total variation must be positive, not {rounding:g}")
         self.rounding = rounding
@@ -168,8 +168,8 @@ class Laplacian(_OnJumps):
 
     name = "laplacian"
 
-    def __init__(self, graph: ZoneGraph, *, share: float = BULK_SHARE) -> None:
-        super().__init__(graph, share)
+    def __init__(self, graph: ZoneGraph, *, bulk_weight: float = BULK_WEIGHT) -> None:
+        super().__init__(graph, bulk_weight)
         self._matrix = self.weighted(graph.area / np.maximum(graph.distance, 1e-300))
 
     def value(self, theta: FloatArray) -> float:

@@ -121,8 +121,8 @@ def _by_discrepancy(solve: Solve, first: float, target: float) -> WeightChoice:
     met = next(i for i, t in enumerate(trials) if t.misfit <= limit)
     if met and trials[met].misfit < limit / (1.0 + CLOSE):
         above, below = trials[met - 1], trials[met]
-        share = np.log(limit / below.misfit) / np.log(above.misfit / below.misfit)
-        weight = float(np.exp((1.0 - share) * np.log(below.weight) + share * np.log(above.weight)))
+        fraction = np.log(limit / below.misfit) / np.log(above.misfit / below.misfit)
+        weight = float(np.exp((1.0 - fraction) * np.log(below.weight) + fraction * np.log(above.weight)))
         trials.insert(met, solve(weight, below.found))
         met = next(i for i, t in enumerate(trials) if t.misfit <= (1.0 + CLOSE) * limit)
     return WeightChoice(

@@ -22,13 +22,13 @@ from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.progress import Progress, report_progress
 from naibu.identification.from_fields.gauss_newton import Bounds, Objective, SearchSettings, search
 from naibu.identification.from_fields.load_cases import KNOWN, Zones
-from naibu.identification.from_fields.regularization import BULK_SHARE, ZoneGraph
+from naibu.identification.from_fields.regularization import BULK_WEIGHT, ZoneGraph
 from naibu.identification.from_fields.sensitivities import Concentrated, FieldModel, Point
 
 CLUSTERS = (20, 8)  # to begin with, one after the other: the better end counts
 LIKE = 0.005  # difference of logarithms of moduli between neighbours that belong together at once
 CLEAR = 0.25  # jump of logarithms beyond which a border counts no more when regions are merged: noise and errors of models seldom make such
-PRIOR_SD = 1.0  # of the logarithms about the clusters' means while merging: of what the data do not tell
+PRIOR_SD = 1.0  # of the logarithms about the clusters' means while merging: of what the data do not determine
 ROUNDS = 8
 ROUGHLY = SearchSettings(max_iterations=12, tolerance=1e-5)  # while the regions may still change
 EXPLICIT = 500  # zones up to which cells at borders may change sides: it takes the whole Hessian
@@ -85,7 +85,7 @@ def clusters(graph: ZoneGraph, theta: FloatArray, most: int) -> IntArray:
     ndarray, shape (count,), int64
         Cluster of every zone.
     """
-    features = theta.reshape(2, -1).T * [1.0, BULK_SHARE]
+    features = theta.reshape(2, -1).T * [1.0, BULK_WEIGHT]
     a, b = graph.pairs.T
     same = np.linalg.norm(features[a] - features[b], axis=1) < LIKE
     links = sp.coo_matrix((np.ones(int(same.sum())), (a[same], b[same])), shape=(graph.count, graph.count))
@@ -222,7 +222,7 @@ def border_moves(graph: ZoneGraph, labels: IntArray, theta: FloatArray, quadrati
     """
     n, labels = graph.count, labels.copy()
     values = theta.reshape(2, -1)
-    jumps = np.hypot(values[0][:, None] - values[0], BULK_SHARE * (values[1][:, None] - values[1]))
+    jumps = np.hypot(values[0][:, None] - values[0], BULK_WEIGHT * (values[1][:, None] - values[1]))
     hessian = quadratic.hessian.reshape(2, n, 2, n)
     own = hessian[:, np.arange(n), :, np.arange(n)]  # (n, 2, 2)
     gradient = quadratic.gradient.reshape(2, n).copy()
@@ -316,7 +316,7 @@ class Criterion:
 
 def jump_costs(jump: FloatArray) -> FloatArray:
     """Return what jumps (2, ...) of the logarithms cost an area: their length, up to that of a clear one."""
-    return np.asarray(np.minimum(np.hypot(jump[0], BULK_SHARE * jump[1]), CLEAR))
+    return np.asarray(np.minimum(np.hypot(jump[0], BULK_WEIGHT * jump[1]), CLEAR))
 
 
 def _from_clusters(model: FieldModel, criterion: Criterion, start: Point, bounds: Bounds, most: int) -> tuple[IntArray, Point, int]:

@@ -107,7 +107,7 @@ class FieldModel:
 
     @property
     def n_free(self) -> float:
-        """Number of measured components less the number of loaded ones that they determine: what is left to tell of moduli.
+        """Number of measured components less the number of loaded ones that they determine: what remains to determine moduli.
 
         Before a first point was found, as if all loaded components were determined.
         """
@@ -138,7 +138,7 @@ class FieldModel:
         shared: dict[bytes, Factorization] = {}
         for t, (o, guess) in enumerate(zip(self.observed, guesses, strict=True)):
             key = np.packbits(o.load_case.loaded).tobytes()
-            if self.law.linear and key in shared:  # one matrix for all load cases that are loaded at the same places
+            if self.law.linear and key in shared:  # one matrix for all load cases that are loaded at the same nodes
                 residual = self.law.forces(lame, shear, guess) - o.load_case.external_force
                 residual[o.load_case.loaded] = 0.0
                 u, factor = guess - shared[key].solve(residual.ravel()).reshape(guess.shape), shared[key]
@@ -326,7 +326,7 @@ class Concentrated:
     response : list of ndarray, shape (n_b, k)
         By how much the loaded components follow, with a minus sign, mm.
     offset : list of ndarray, shape (n_b,)
-        How far they are from their best place now, mm.
+        Distance from their present optimum, mm.
     """
 
     hessian: FloatArray
@@ -397,7 +397,7 @@ class BoundaryPreconditioner:
 
 
 def _alike(one: Observed, other: Observed) -> bool:
-    """Whether two load cases are measured at the same points and loaded at the same places, and differ in accuracy alone."""
+    """Whether two load cases are measured at the same points and loaded at the same nodes, and differ in accuracy alone."""
     same = one.operator.shape == other.operator.shape and np.array_equal(one.loaded, other.loaded)
     if not same or not np.array_equal(one.operator.indices, other.operator.indices):
         return False

@@ -36,7 +36,7 @@ def _plane_faces(mesh: Mesh, height: float) -> IntArray:
 def rigid_bodies(
     experiment: Experiment, mesh: Mesh, faces: IntArray, normal_stiffness: float, tangential_stiffness: float
 ) -> list[Contact]:
-    """Return the table and the indenters; an indenter starts where it touches the free object. Stiffnesses in kPa/mm."""
+    """Return the table and the indenters; an indenter starts where it touches the undeformed object. Stiffnesses in kPa/mm."""
     stick = Friction(STICK, tangential_stiffness)
     loading, size = experiment.loading, experiment.shape.size_mm
 

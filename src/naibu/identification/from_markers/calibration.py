@@ -153,7 +153,7 @@ def initial_parameters(specimens: Sequence[Specimen], states: Mapping[str, Seque
         found[p.name] = p
     for s in specimens:
         for p in _material_parameters(s, known_materials, reference) + _friction_parameters(s):
-            if p.name not in found or (found[p.name].fixed and not p.fixed):  # free wherever one experiment can tell it
+            if p.name not in found or (found[p.name].fixed and not p.fixed):  # free wherever one experiment determines it
                 found[p.name] = p
         offset = base_offset(s.experiment)
         found.setdefault(offset, Parameter(offset, 0.0, "mm", prior_sd=0.5))
@@ -174,7 +174,7 @@ def _material_parameters(s: Specimen, known_materials: KnownMaterials, reference
     out = []
     for m in s.experiment.materials:
         given = known_materials.young_moduli.get(m)
-        # without a known material in the body its modulus cannot be told from displacements: one body of one material has no scale
+        # without a known material in the body its modulus does not follow from displacements: one body of one material has no scale
         alone = len(s.experiment.materials) == 1 and given is None
         out.append(Parameter(young_modulus(m), given or reference, "kPa", "log", prior_sd=2.0, fixed=given is not None or alone))
         out.append(Parameter(poisson_ratio(m), START_POISSON_RATIO, "", "incompressibility", prior_sd=1.0))

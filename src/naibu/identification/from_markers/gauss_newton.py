@@ -195,7 +195,7 @@ class Matcher:
         placed = pose.applied(moved)
         predicted = placed / enlargement  # residuals stay in the file's millimetres: a smaller scale must not make them smaller
         turned = np.einsum("ij,kjl->kil", pose.rotation, gradient)
-        rotated = specimen.placement.pose.rotation.T  # noise of the free scan, turned into the object's frame
+        rotated = specimen.placement.pose.rotation.T  # noise of the reference scan, turned into the object's frame
         both = np.einsum("kij,jl->kil", turned, rotated)
         sd = np.sqrt(load_case.sd**2 + np.einsum("kil,kl->ki", both**2, load_case.free_sd**2))
         du = path[-1]
@@ -372,7 +372,7 @@ def _bounded_step(hessian: FloatArray, gradient: FloatArray, limits: FloatArray)
 
 
 def _first_pose(specimen: Specimen, points: FloatArray, measured: FloatArray) -> RigidTransform:
-    """Pose that brings `points` to the `measured` ones; without data that of the free scan."""
+    """Pose that brings `points` to the `measured` ones; without data that of the reference scan."""
     if np.isfinite(measured).all(axis=1).sum() >= 4:
         return registration(points, measured)
     pose, centre = specimen.placement.pose, points.mean(axis=0)

@@ -6,7 +6,7 @@ import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 
-FILLED_SD_MM = 0.35  # how far a marker lies from its lattice place (threads give way while the gel cures)
+FILLED_SD_MM = 0.35  # how far a marker lies from its lattice position (threads give way while the gel cures)
 
 
 def lattice_indices(ids: IntArray, points: FloatArray) -> IntArray | None:

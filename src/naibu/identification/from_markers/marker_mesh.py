@@ -53,7 +53,7 @@ def marker_mesh(experiment: Experiment, state: str) -> MarkerMesh:
         Two-dimensional data, a height not along z, no positions, no lattice, or an inverted cell.
     """
     if experiment.dimensions != 3 or experiment.up_axis != "z":
-        raise InputError(f"experiment {experiment.name!r}: force balance needs three-dimensional markers and a height along z")
+        raise InputError(f"experiment {experiment.name!r}: the equilibrium gap needs three-dimensional markers and a height along z")
     free, loaded, seen = _grids(experiment, state)
     planes: list[tuple[int, float | None]]
     planes = [(k, None) for k in range(len(free))] + [(k, h) for h in _interfaces(experiment) if (k := _gap(free, h)) is not None]
@@ -64,8 +64,8 @@ def marker_mesh(experiment: Experiment, state: str) -> MarkerMesh:
         if h is None:
             points[at], moved[at], measured[at] = free[k], loaded[k], seen[k]
         else:
-            share = ((h - free[k, ..., 2]) / (free[k + 1, ..., 2] - free[k, ..., 2]))[..., None]
-            points[at], moved[at] = ((1.0 - share) * a[k] + share * a[k + 1] for a in (free, loaded))
+            fraction = ((h - free[k, ..., 2]) / (free[k + 1, ..., 2] - free[k, ..., 2]))[..., None]
+            points[at], moved[at] = ((1.0 - fraction) * a[k] + fraction * a[k + 1] for a in (free, loaded))
     return _assembled(f"{experiment.name}/{state}", experiment, points, moved, measured)
 
 
@@ -77,12 +77,12 @@ def _grids(experiment: Experiment, state: str) -> tuple[FloatArray, FloatArray, 
     read = np.where(initial.trusted[:, None], initial.points, np.nan), markers.aligned(initial.ids)
     index = lattice_indices(initial.ids, read[0]) if len(initial) else None
     if index is None:
-        raise InputError(f"experiment {experiment.name!r}: its markers are not numbered on a lattice, so force balance cannot use them")
+        raise InputError(f"experiment {experiment.name!r}: its markers are not numbered on a lattice, which the equilibrium gap needs")
     place = placement(experiment)
     free, loaded = (place.to_object(completed(initial.ids, r)[0]) for r in read)
     whole = np.isfinite(free).all(axis=1)
     if (whole & np.isfinite(loaded).all(axis=1)).sum() < 8:
-        raise InputError(f"{experiment.name}/{state} shares fewer than 8 complete markers with the free state; measure more")
+        raise InputError(f"{experiment.name}/{state} shares fewer than 8 complete markers with the reference configuration; measure more")
     pose = registration(free[whole], loaded[whole])
     loaded = (loaded - pose.position) @ pose.rotation + pose.centre
     size = index.max(axis=0) + 1
@@ -110,8 +110,8 @@ def _gap(free: FloatArray, height: float) -> int | None:
     k = int(np.searchsorted(z, height)) - 1
     if not 0 <= k < len(z) - 1:
         return None
-    share = (height - z[k]) / (z[k + 1] - z[k])
-    return k if ON_LAYER < share < 1.0 - ON_LAYER else None
+    fraction = (height - z[k]) / (z[k + 1] - z[k])
+    return k if ON_LAYER < fraction < 1.0 - ON_LAYER else None
 
 
 def _assembled(label: str, experiment: Experiment, points: FloatArray, moved: FloatArray, measured: BoolArray) -> MarkerMesh:

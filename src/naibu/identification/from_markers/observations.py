@@ -72,7 +72,7 @@ class MarkerLoadCase:
         Raises
         ------
         InputError
-            The state has no positions, or fewer than four markers in common with the free state.
+            The state has no positions, or fewer than four markers in common with the reference configuration.
         """
         experiment = specimen.experiment
         markers = experiment.state(state).markers
@@ -80,7 +80,7 @@ class MarkerLoadCase:
             raise InputError(f"{experiment.name}/{state} has no measured positions; give its file or leave the state out")
         measured = markers.aligned(specimen.marker_ids) * specimen.placement.scale
         if np.isfinite(measured).any(axis=1).sum() < 4:
-            raise InputError(f"{experiment.name}/{state} shares fewer than 4 trusted markers with the free state")
+            raise InputError(f"{experiment.name}/{state} shares fewer than 4 trusted markers with the reference configuration")
         sd = noise.standard_deviation(experiment.xy_step_mm, experiment.z_step_mm)
         return cls(specimen, state, measured, sd, np.where(specimen.marker_filled, FILLED_SD_MM, sd))
 

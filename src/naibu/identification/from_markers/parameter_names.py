@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from naibu.core.experiment import Experiment
 
-SHAPE_NAMES: dict[str, tuple[str, ...]] = {"mooney_rivlin": ("c01_share",), "yeoh": ("c20_ratio", "c30_ratio")}
+SHAPE_NAMES: dict[str, tuple[str, ...]] = {"mooney_rivlin": ("c01_fraction",), "yeoh": ("c20_ratio", "c30_ratio")}
 
 
 def young_modulus(material: str) -> str:
@@ -18,7 +18,7 @@ def poisson_ratio(material: str) -> str:
 
 
 def shape_parameter(material: str, name: str) -> str:
-    """Name of a dimensionless parameter of the law of `material`, such as ``c01_share``."""
+    """Name of a dimensionless parameter of the law of `material`, such as ``c01_fraction``."""
     return f"{material}: {name}"
 
 
@@ -40,7 +40,7 @@ def joint_friction(experiment: Experiment, height: float) -> str:
 
 
 def base_offset(experiment: Experiment) -> str:
-    """Name of the height by which all markers lie above their supposed place in the object, mm."""
+    """Name of the height by which all markers lie above their supposed position in the object, mm."""
     return f"{experiment.name}: base_offset"
 
 

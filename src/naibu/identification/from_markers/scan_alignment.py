@@ -47,13 +47,15 @@ def placement(experiment: Experiment) -> Placement:
     Raises
     ------
     InputError
-        Fewer than four complete markers in the free state.
+        Fewer than four complete markers in the reference configuration.
     """
     scale = np.array([experiment.xy_scale, experiment.xy_scale, 1.0])
     known = experiment.initial.points[experiment.initial.trusted]
     points = known[np.isfinite(known).all(axis=1)] * scale
     if len(points) < 4:
-        raise InputError(f"experiment {experiment.name!r}: only {len(points)} complete markers in the free state; at least 4 are needed")
+        raise InputError(
+            f"experiment {experiment.name!r}: only {len(points)} complete markers in the reference configuration; at least 4 are needed"
+        )
     turn = _lattice_turn(points, experiment.nominal_spacing_mm) if experiment.nominal_spacing_mm else 0.0
     rotation = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
     turned = points @ rotation

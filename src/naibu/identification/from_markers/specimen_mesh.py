@@ -55,10 +55,10 @@ def on_straight_base(points: FloatArray, height: float, base: float) -> FloatArr
     base : float
         Height of the straight-sided part below it, mm; the nodes are spread over the whole body.
     """
-    share = np.clip(points[:, 2] / height, 0.0, 1.0)
-    z = share * (height + base)
+    fraction = np.clip(points[:, 2] / height, 0.0, 1.0)
+    z = fraction * (height + base)
     wanted = 1.0 - np.clip((z - base) / height, 0.0, 1.0) ** 2
-    had = 1.0 - share**2
+    had = 1.0 - fraction**2
     apex = had < 1e-9
     stretch = np.where(apex, 1.0, np.sqrt(wanted / np.where(apex, 1.0, had)))
     return np.column_stack([points[:, :2] * stretch[:, None], z])

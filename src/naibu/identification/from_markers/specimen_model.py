@@ -59,7 +59,7 @@ class ModelSettings:
         What the rigid bodies do to the surface sideways: rub with a friction coefficient for each pair of materials, hold it, or hold it
         by tangential springs.
     joined : {"tied", "sliding"}
-        What holds separately cast blocks together.
+        Bond between separately cast blocks.
     element_size_mm : float
         Edge of the hexahedra, smaller under a bar; 0 takes a seventh to a ninth of the object's height.
     normal_stiffness : float
@@ -91,11 +91,11 @@ class Specimen:
     settings : ModelSettings
         Law, contact, mesh size.
     placement : Placement
-        Where the object lies in its free scan.
+        Where the object lies in its reference scan.
     mesh : Mesh
         In the object's frame, mm.
     marker_ids : ndarray, shape (k,), int64
-        Trusted markers whose position in the free state is known, or known in part and completed from the lattice.
+        Trusted markers whose position in the reference configuration is known, or known in part and completed from the lattice.
     marker_points : ndarray, shape (k, 3)
         Their positions in the object's frame, mm.
     marker_filled : ndarray, shape (k, 3), bool
@@ -136,7 +136,7 @@ class Specimen:
 
     @property
     def has_unknown_base(self) -> bool:
-        """Whether the object may reach below its nominal shape: a half ellipsoid whose base the file does not place."""
+        """Whether the object may extend below its nominal shape: a half ellipsoid whose base height is not stated."""
         return self.experiment.shape.kind == "half_ellipsoid" and self.experiment.base_z_mm is None
 
     @property
@@ -167,7 +167,7 @@ class Specimen:
         return np.array([r, r, 1.0])
 
     def marker_motion(self, name: str, values: Mapping[str, float]) -> FloatArray | None:
-        """Return how the markers' places (k, 3) in the free object move with a parameter; None for other parameters."""
+        """Return how the markers' positions (k, 3) in the undeformed object move with a parameter; None for other parameters."""
         if name in (base_offset(self.experiment), straight_base(self.experiment)):
             return np.tile([0.0, 0.0, 1.0], (len(self.marker_points), 1))
         if name == pixel_scale(self.experiment):  # the centre of the lattice stays the centre of the object

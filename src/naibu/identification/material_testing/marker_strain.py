@@ -19,7 +19,7 @@ from naibu.core.markers import Markers
 from naibu.identification.material_testing.uniaxial import PoissonRatio
 
 REACH = 1.8  # distances to the nearest neighbour: includes the 26 neighbours of a marker in a cubic lattice
-FLAT = 0.1  # a neighbourhood whose thinnest extent is below this fraction of its widest tells nothing across
+FLAT = 0.1  # a neighbourhood whose thinnest extent is below this fraction of its widest does not determine strain across it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,7 +31,7 @@ class MarkerStrain:
     ids : ndarray, shape (k,), int64
         Markers around which a map could be fitted.
     points : ndarray, shape (k, 3)
-        Centres of the neighbourhoods in the free state, mm.
+        Centres of the neighbourhoods in the reference configuration, mm.
     gradients : ndarray, shape (k, 3, 3)
         Deformation gradients F.
     volume_ratio, volume_ratio_sd : ndarray, shape (k,)
@@ -78,7 +78,7 @@ def marker_strain(initial: Markers, deformed: Markers, *, sd_mm: float = 0.15, r
     sd_mm : float
         Standard deviation of a coordinate in either state, mm.
     reach_mm : float, optional
-        Radius of a neighbourhood in the free state, mm; by default 1.8 times the median distance of nearest neighbours.
+        Radius of a neighbourhood in the reference configuration, mm; by default 1.8 times the median distance of nearest neighbours.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def poisson_ratio_from_markers(
     """Compute Poisson's ratio from the change of volume inside a compressed body, averaged over all neighbourhoods.
 
     With J = det F and l the stretch of the material along `axis`, ``nu = (1 - mean ln J / mean ln l) / 2`` (Hencky strains). Where
-    friction holds the sides back, the pressure is higher than in a free bar and the volume shrinks more at the same l: the true ratio
+    friction constrains the sides, the pressure is higher than in a free bar and the volume shrinks more at the same l: the true ratio
     is then a little closer to 0.5 than what is returned.
 
     Parameters

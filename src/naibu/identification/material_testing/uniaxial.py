@@ -36,7 +36,7 @@ class Specimen:
     perimeter : float
         Of the cross-section, mm.
     height : float
-        Distance of the loaded faces in the free state, mm.
+        Distance of the loaded faces in the reference configuration, mm.
     """
 
     area: float
@@ -65,7 +65,7 @@ class Specimen:
 
     @property
     def bonded_stiffening(self) -> float:
-        """Apparent over true Young's modulus where both faces are held, ``1 + 2 S^2`` with the shape factor S.
+        """Apparent over true Young's modulus where both faces are constrained, ``1 + 2 S^2`` with the shape factor S.
 
         Gent and Lindley 1959: incompressible, small strain, circular or nearly square cross-section. Computed cylinders with S from 0.2 to
         0.6 are another 6 to 7 % stiffer.
@@ -75,7 +75,7 @@ class Specimen:
 
 @dataclass(frozen=True, slots=True)
 class CompressionTest:
-    """What a compression test tells.
+    """Result of a compression test.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class CompressionTest:
     interval : tuple of float
         Confidence interval of Young's modulus, kPa.
     apparent_modulus : float
-        Young's modulus without the correction for held faces, kPa.
+        Young's modulus without the correction for constrained faces, kPa.
     slack, slack_standard_error : float
         Displacement at which the fitted curve starts, mm; 0 where no slack was asked for.
     strain_range : tuple of float
@@ -135,7 +135,7 @@ def compression_test(
     force : array_like, shape (n,)
         Compressive force, mN, positive.
     specimen : Specimen
-        Measures in the free state.
+        Measures in the reference configuration.
     curve : {"neo_hookean", "linear"}
         Shape of the curve; the linear one underestimates its bending and overestimates the modulus at large strain.
     slack : bool
@@ -196,7 +196,7 @@ class SpecimenMean:
     Attributes
     ----------
     mean, standard_deviation, standard_error : float
-        The mean, the scatter between specimens, and the uncertainty of the mean.
+        The mean, the SD between specimens, and the uncertainty of the mean.
     interval : tuple of float
         Confidence interval of the mean (Student's t).
     """
@@ -271,7 +271,7 @@ def poisson_ratio(
     Parameters
     ----------
     longitudinal_strain, transversal_strain : float
-        Change of length over length in the free state; negative where shortened.
+        Change of length over length in the reference configuration; negative where shortened.
     longitudinal_sd, transversal_sd, correlation : float
         Standard deviations of the strains, and the correlation of their errors.
     definition : str

@@ -20,7 +20,7 @@ from naibu.identification.from_markers.parameter_names import platen_position
 from naibu.identification.from_markers.specimen_model import Specimen, specimen
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 
-LAYER_GAP = 0.4  # a new marker layer starts where the height jumps by this share of the markers' spacing
+LAYER_GAP = 0.4  # a new marker layer starts where the height jumps by this fraction of the markers' spacing
 UNKNOWN_SD = {"tilt_x": 0.007, "tilt_y": 0.007, "bar_offset": 0.5, "bar_yaw": 0.01, "base_offset": 0.5, "friction": 0.5}
 PLATEN_POSITION_SD_MM = {"given": 0.3, "markers": 0.15, "stated": 1.0}
 
@@ -36,8 +36,8 @@ class Prediction:
     state : str
         Name of the state.
     points : ndarray, shape (k, 3)
-        Predicted positions of ``specimen.marker_ids``, printed mm, in the frame of the free scan, or registered to the measured markers
-        where the state has some.
+        Predicted positions of ``specimen.marker_ids``, printed mm, in the frame of the reference scan, or registered to the measured
+        markers where the state has some.
     sd_mm : ndarray, shape (k,)
         Standard deviation of a coordinate (root mean square over the three), mm: parameters, boundary conditions and model misfit.
     registered : bool
@@ -85,7 +85,7 @@ def predict_state(
     model : CalibratedModel
         From `calibrate`.
     experiment : Experiment
-        The object and its free state; the loaded state may be measured or not.
+        The object and its reference configuration; the loaded state may be measured or not.
     state : str
         Name of the loaded state.
     platen_position_mm : float, optional
@@ -160,7 +160,7 @@ def _relative(p: Parameter, model: CalibratedModel, experiment: Experiment, note
         value = float(np.exp(np.mean([np.log(q.value) for q in same]))) if same else default
         notes.append(f"friction of {subject} was not identified; {value:.2f} is taken from {_subjects(same) or 'nothing'}")
         return Parameter(p.name, value, p.unit, p.scale, prior_sd=UNKNOWN_SD["friction"])
-    if kind in ("poisson_ratio", "c01_share", "c20_ratio", "c30_ratio"):
+    if kind in ("poisson_ratio", "c01_fraction", "c20_ratio", "c30_ratio"):
         if not similar:
             return p
         notes.append(f"{kind} of {subject} was not identified; the mean of the model's materials is taken")
@@ -223,13 +223,13 @@ def _platen_position(
 
 
 def _unmeasured(body: Specimen, state: str, model: CalibratedModel) -> MarkerLoadCase:
-    """A load case without data: its pose is that of the free scan."""
+    """A load case without data: its pose is that of the reference scan."""
     sd = model.noise.standard_deviation(body.experiment.xy_step_mm, body.experiment.z_step_mm)
     return MarkerLoadCase(body, state, np.full(body.marker_points.shape, np.nan), sd, np.broadcast_to(sd, body.marker_points.shape))
 
 
 def marker_layers(heights: FloatArray, spacing: float | None) -> IntArray:
-    """Return the index (k,) of the horizontal layer of every marker, from their heights (k,) in the free state, mm."""
+    """Return the index (k,) of the horizontal layer of every marker, from their heights (k,) in the reference configuration, mm."""
     order = np.argsort(heights)
     gap = LAYER_GAP * (spacing or 10.0)
     index = np.empty(len(heights), dtype=np.int64)

@@ -35,7 +35,7 @@ class HomogeneousState:
     stretches : ndarray, shape (3,)
         Along x, y, z.
     nominal_stress : ndarray, shape (3,)
-        Force over the area of the free state along x, y, z, kPa; tension is positive.
+        Force over the area in the reference configuration along x, y, z, kPa; tension is positive.
     """
 
     stretches: FloatArray
@@ -169,7 +169,7 @@ def _free_stretch(material: Material, stretches: Callable[[float], tuple[float, 
 
 @dataclass(frozen=True, slots=True)
 class ThickShell:
-    """A thick sphere, or a long cylinder held lengthwise, under inner and outer pressure at small strain (Lamé).
+    """A thick sphere, or a long cylinder constrained lengthwise, under inner and outer pressure at small strain (Lamé).
 
     Attributes
     ----------
@@ -263,7 +263,7 @@ def plate_penetration(pressure: float, normal_stiffness: float, ramp_mm: float) 
     Parameters
     ----------
     pressure : float
-        Per unit of area of the free state, kPa, not negative.
+        Per unit of area of the reference configuration, kPa, not negative.
     normal_stiffness : float
         kPa/mm.
     ramp_mm : float

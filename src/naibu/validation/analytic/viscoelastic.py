@@ -46,27 +46,27 @@ def creep_strain(elements: Elements, stress_kpa: float, loaded_s: float, times_s
 
 
 def ramp_stress(elements: Elements, strain: float, ramp_s: float, times_s: ArrayLike) -> FloatArray:
-    """Return the stress (k,), kPa, of a strain that grows evenly until `ramp_s` and is then held.
+    """Return the stress (k,), kPa, of a strain that grows evenly until `ramp_s` and is then kept.
 
     ``s = Cbar e' + r^2 E tau (1 - exp(-t / tau)) e'`` on the ramp, where ``r^2 E tau = r C2``; afterwards the second term, as it then is,
     fades with tau. At `ramp_s` itself the value just before is returned.
     """
-    share, dashpot, rate = _derived(elements)
+    fraction, dashpot, rate = _derived(elements)
     t = np.asarray(times_s, dtype=float)
     speed, on = strain / ramp_s, np.minimum(t, ramp_s)
-    grown = share**2 * elements[0] * speed * (on if rate == 0.0 else -np.expm1(-rate * on) / rate)
+    grown = fraction**2 * elements[0] * speed * (on if rate == 0.0 else -np.expm1(-rate * on) / rate)
     return np.asarray(np.where(t <= ramp_s, dashpot * speed, 0.0) + grown * np.exp(-rate * np.maximum(t - ramp_s, 0.0)))
 
 
 def residual_strain(elements: Elements, strain: float, ramp_s: float, held_s: float) -> float:
     """Return what stays for good of a strain that was made in `ramp_s`, held for `held_s`, and then released.
 
-    It is the stress integrated over both and divided by C2: the series damper's share.
+    It is the stress integrated over both and divided by C2: the series dashpot's part.
     """
-    share, dashpot, rate = _derived(elements)
+    fraction, dashpot, rate = _derived(elements)
     if np.isinf(elements[2]):
         return 0.0
-    speed, stiff = strain / ramp_s, share**2 * elements[0]
+    speed, stiff = strain / ramp_s, fraction**2 * elements[0]
     if rate == 0.0:
         return float(dashpot * strain / elements[2])
     tau, peak = 1.0 / rate, stiff * speed / rate * -np.expm1(-rate * ramp_s)
@@ -121,13 +121,13 @@ def free_motion(
     system[:n, n : 2 * n] = np.eye(n)
     y = np.concatenate([*start, *[np.zeros(n)] * p])
     for i, (connection, elements) in enumerate(parts):
-        share, dashpot, rate = _derived(elements)
+        fraction, dashpot, rate = _derived(elements)
         here = slice((2 + i) * n, (3 + i) * n)
         system[n : 2 * n, n : 2 * n] -= inverse @ connection * dashpot
         system[n : 2 * n, here] -= inverse @ connection
         system[here, here] = -rate * np.eye(n)
-        system[here, n : 2 * n] = share**2 * elements[0] * np.eye(n)
-        y[here] = share**2 * elements[0] * start[0]
+        system[here, n : 2 * n] = fraction**2 * elements[0] * np.eye(n)
+        y[here] = fraction**2 * elements[0] * start[0]
     states = np.array([expm(system * t) @ y for t in np.asarray(times_s, dtype=float)])
     return states[:, :n], states[:, n : 2 * n]
 
@@ -135,5 +135,5 @@ def free_motion(
 def _derived(elements: Elements) -> tuple[float, float, float]:
     """Return r, Cbar and 1 / tau."""
     modulus, first, second = elements
-    share = 1.0 if np.isinf(second) else second / (first + second)
-    return share, first * share, 0.0 if np.isinf(second) else modulus / (first + second)
+    fraction = 1.0 if np.isinf(second) else second / (first + second)
+    return fraction, first * fraction, 0.0 if np.isinf(second) else modulus / (first + second)

@@ -212,7 +212,7 @@ def marker_lattice(experiment: Experiment) -> FloatArray:
     Raises
     ------
     InputError
-        The experiment tells neither.
+        The experiment states neither.
     """
     spacing, margin = experiment.nominal_spacing_mm, experiment.nominal_margin_mm
     if experiment.shape.kind == "box" and spacing and margin is not None:

@@ -37,7 +37,7 @@ def squeezed_ball(
     seed : int
         Of texture and noise.
     noise : float
-        Standard deviation of the grey values, whose texture has one of 30.
+        Standard deviation of the intensities, whose texture has one of 30.
     turn_deg, shift_mm : float and three float
         The rigid part of the motion: a turn about z through the middle of the ball, and a shift.
     bump_mm : float
