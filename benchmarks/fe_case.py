@@ -75,7 +75,7 @@ def pardiso(matrix: sp.bsr_matrix) -> LinearSolver:
 
 
 class Cholesky:
-    """Naibu's direct solver for peers; analyses anew only where entries that vanish in the free state have joined the pattern."""
+    """Naibu's direct solver for peers; repeats the symbolic analysis only if the pattern has grown."""
 
     def __init__(self) -> None:
         self._solver: LinearSolver | None = None

@@ -138,13 +138,13 @@ def sizes(n: int, repeats: int) -> None:
     steps = {8: 500, 16: 100}.get(n, 20)
     print(f"{n + 1}^3 nodes, {lattice.n_elements} elements")
     reference = references(lattice, gentle, steps, repeats)
-    team = (1, 2) if lattice.n_elements >= 20_000 else (1,)
+    thread_counts = (1, 2) if lattice.n_elements >= 20_000 else (1,)
     for precision in ("double", "single"):
-        for threads in team:
+        for threads in thread_counts:
             cpu, wall, _ = timed(lattice, gentle, steps, repeats, method="euler", precision=precision, threads=threads)
             told = f"plain loop over this: {reference[threads > 1] / (cpu, wall)[threads > 1]:.2f}"
             row(f"explicit, {precision}, {threads} thread(s)", cpu, wall, told)
-    for threads in team:
+    for threads in thread_counts:
         row(f"explicit, session, {threads} thread(s)", *in_session(lattice, gentle, steps, repeats, method="euler", threads=threads))
     constrained, velocity = pushed(lattice)
     engine = LatticeEngine.of(lattice, gentle, method="euler", threads=1)

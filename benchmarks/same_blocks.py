@@ -14,7 +14,7 @@ from naibu.validation.specimens.specimen_matching import block_match
 
 
 def half(number: int, upper: bool) -> np.ndarray:
-    """Markers (2, 5, 5, 3), mm, of the lower or upper half of a cube in its free state."""
+    """Markers (2, 5, 5, 3), mm, of the lower or upper half of an unloaded cube."""
     markers = datasets.load(f"ct_two_material_{number}").initial
     wanted = np.arange(51, 101) if upper else np.arange(1, 51)
     return markers.aligned(wanted).reshape(2, 5, 5, 3)

@@ -205,7 +205,7 @@ IDENTIFY_MISTAKES = {
     "two scales": (("PRESS", "--known", "firm", "--known", "soft"), ("only one material",)),
     "unknown state": (("PRESS", "--state", "press/squeezed"), ("'squeezed'", "pressed_more")),
     "state of another": (("PRESS", "--state", "cube/pressed"), ("'cube'", "press")),
-    "free state": (("PRESS", "--state", "press/initial"), ("press/initial", "not loaded", "pressed")),
+    "unloaded state": (("PRESS", "--state", "press/initial"), ("press/initial", "not loaded", "pressed")),
     "no element size": (("PRESS", "--element-size-mm", "-3"), ("--element-size-mm", "-3", "positive")),
     "too many elements": (("PRESS", "--element-size-mm", "0.1"), ("0.1 mm", "elements")),
     "unknown law": (("PRESS", "--law", "rubber"), ("rubber", "neo_hookean")),
@@ -225,7 +225,7 @@ def test_identify_refuses(naibu: Run, press: Press, mistake: str) -> None:
 PREDICT_MISTAKES = {
     "no state chosen": (("MODEL", "PRESS"), ("2 loaded states", "pressed_more", "--state")),
     "unknown state": (("MODEL", "PRESS", "--state", "squeezed"), ("'squeezed'", "pressed_more")),
-    "free state": (("MODEL", "PRESS", "--state", "initial"), ("press/initial", "not loaded")),
+    "unloaded state": (("MODEL", "PRESS", "--state", "initial"), ("press/initial", "not loaded")),
     "too low": (("MODEL", "PRESS", "--state", "pressed", "--height-mm", "17"), ("17 mm", "30 %", "60 mm")),
     "too high": (("MODEL", "PRESS", "--state", "pressed", "--height-mm", "61"), ("61 mm", "60 mm")),
     "not a number": (("MODEL", "PRESS", "--state", "pressed", "--height-mm", "nan"), ("nan mm",)),

@@ -19,7 +19,7 @@ def grid(
 
 
 def texture(seed: int = 0, wave_mm: tuple[float, float] = (6.0, 20.0), n: int = 60) -> Callable[[Array], Array]:
-    """Return grey values at positions (..., 3): waves of random directions, grey about 100 with standard deviation 30."""
+    """Return intensities at positions (..., 3): waves of random directions, about 100 with standard deviation 30."""
     rng = np.random.default_rng(seed)
     direction = rng.standard_normal((n, 3))
     direction /= np.linalg.norm(direction, axis=1)[:, None]

@@ -124,7 +124,7 @@ def test_the_density_makes_the_mass(tmp_path: Path) -> None:
     assert study.lattice.total_mass == pytest.approx(1.25e-3 * 3 * 2 * 2)  # 12 cm^3
 
 
-def test_forces_and_velocities_move_pushers(tmp_path: Path) -> None:
+def test_forces_and_velocities_move_indenters(tmp_path: Path) -> None:
     by_velocity = STUDY.replace("path = [[0.0, 0, 0, 0], [0.1, 0, 0, -3]]", "velocity = [[0.05, 0, 0, -30], [0.1, 1, 0, 0]]")
     body = prepared_study(study_file(tmp_path, by_velocity)).study.bodies[1]
     np.testing.assert_allclose(

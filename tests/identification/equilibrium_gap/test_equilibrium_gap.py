@@ -286,7 +286,7 @@ def test_a_mesh_coarser_than_the_truth_errs_less_as_it_is_refined() -> None:
 
 
 def cramer_rao(body: PushedBody, zones: Zones, sd_mm: float) -> np.ndarray:
-    """Bound of the moduli's covariance if every node is measured: the displacement depends on them and on that of the held nodes.
+    """Bound of the moduli's covariance if every node is measured: the displacement depends on them and on that of the constrained nodes.
 
     Dense and by differentiating the solution, which `weighted_equilibrium_gap` never does.
     """
@@ -319,7 +319,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_covariance_of_the_whitened_balance_is_the_cramer_rao_bound(name: str) -> None:
+def test_the_covariance_of_the_weighted_gap_is_the_cramer_rao_bound(name: str) -> None:
     body, sd = CASES[name]
     zones = body.zones()
     exact = [replace(t, field=DisplacementField.from_arrays(t.field.points, t.field.vectors, sd_mm=sd)) for t in body.load_cases()]
@@ -330,7 +330,7 @@ def test_the_covariance_of_the_whitened_balance_is_the_cramer_rao_bound(name: st
 
 
 def scatter(body: PushedBody, sd: float, draws: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Errors (draws, u) of the whitened balance and of least squares, chi squared over its expectation (draws,), and the bound (u, u)."""
+    """Errors (draws, u) of the weighted gap and of least squares, chi squared over its expectation (draws,), and the bound (u, u)."""
     zones = body.zones()
     truth = true(body, zones)
     white, plain, chi = [], [], []

@@ -125,7 +125,7 @@ def constrained_cylinder(diameter: float, height: float, element_mm: float) -> t
 
 @pytest.mark.parametrize(("diameter", "height"), [(30.0, 35.0), (35.0, 20.0), (35.0, 15.0)])
 def test_correction_for_held_faces_against_computed_specimens(diameter, height):
-    """Gent and Lindley's factor for the report's cylinders: it leaves 6-7 % of the modulus, held faces add 16-80 %."""
+    """Gent and Lindley's factor for the report's cylinders: it leaves 6-7 % of the modulus, bonded faces add 16-80 %."""
     specimen = Specimen.cylinder(diameter, height)
     options = {"slack": False, "strain_range": (0.001, 0.1)}
     d, force = constrained_cylinder(diameter, height, 3.5)

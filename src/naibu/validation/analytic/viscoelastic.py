@@ -1,6 +1,6 @@
 """Closed solutions of the three-element solid in one dimension, and its motion by matrix exponentials.
 
-With a spring E, a damper C1 beside it and a damper C2 in series: ``r = C2 / (C1 + C2)``, ``tau = (C1 + C2) / E`` and
+With a spring E, a dashpot C1 in parallel and a dashpot C2 in series: ``r = C2 / (C1 + C2)``, ``tau = (C1 + C2) / E`` and
 ``Cbar = C1 C2 / (C1 + C2)``. Any E >= 0, C1 >= 0 and C2 in (0, inf] may be given, so these hold for elastic, Voigt and Maxwell solids too.
 Nothing here uses the kernels or the time steps of `naibu.mechanics`.
 """
