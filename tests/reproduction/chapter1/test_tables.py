@@ -99,10 +99,13 @@ def test_the_plate_pushes_up_and_the_sides_bulge() -> None:
 
 
 def test_the_volumes_show_the_motion() -> None:
-    """Without noise the second scan carried back by the truth is the first one, but for blur; nothing moved, or half of it, is not."""
+    """Without noise the second scan warped back by the truth is the first one, but for blur; warped by none or half of it, it is not."""
     case = calf_case(1, pixels=128, slices=5, noise=0.0)
     inside = case.leg & np.isfinite(case.truth[..., 0])
-    left = [intensity_rms(case.reference, case.deformed, share * case.truth, region=inside, frame="reference") for share in (0.0, 0.5, 1.0)]
+    left = [
+        intensity_rms(case.reference, case.deformed, fraction * case.truth, region=inside, frame="reference")
+        for fraction in (0.0, 0.5, 1.0)
+    ]
     assert left[2] < 0.25 * left[1] < 0.25 * left[0]
     back = intensity_rms(case.reference, case.deformed, np.where(case.leg[..., None], case.truth, np.nan), region=case.tissue_after)
     assert back < 0.25 * left[0]
@@ -168,13 +171,13 @@ def test_printed_rows_are_the_report_s(chapter: Chapter) -> None:
         assert float(ours["RMS, cm"]) < 0.6 * printed[11]  # type: ignore[arg-type]
     for printed in PAPER["1.3"]:
         ours = row(third, f"paper, {printed[0]}")
-        shown = ("points before", "points after", "matches", "tetrahedra", "RMS (1.29), grey levels")
+        shown = ("points before", "points after", "matches", "tetrahedra", "RMS (1.29), intensity levels")
         assert [ours[c] for c in shown] == printed[1:6]
 
 
 def test_our_rows_are_in_order_of_merit(chapter: Chapter) -> None:
     third = table(chapter, "Table 1.3")
-    rms, mean = "RMS (1.29), grey levels", "field: mean error, mm"
+    rms, mean = "RMS (1.29), intensity levels", "field: mean error, mm"
     still, bone = "ours, nothing moved", "ours, bone's motion alone"
     for way in WAYS:
         assert number(third, f"ours, {way}", mean) < number(third, bone, mean) < number(third, still, mean)

@@ -1,5 +1,5 @@
 # mypy: disallow-untyped-decorators=False
-"""The motion of the calf phantom: a plate pushes soft tissue past two rigid bones, and every volume is kept (spec S10)."""
+"""The motion of the calf phantom: a plate compresses soft tissue against two rigid bones, and volumes are preserved."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray
 from naibu.core.rigid_transform import RigidTransform
 
-# places of the bones' axes, mm, and the largest distance of their surfaces from them
+# positions of the axes of the bones, mm, and the largest distance of their surfaces from them
 TIBIA, FIBULA = (-13.0, -21.0), (24.0, -8.0)
 TIBIA_REACH, FIBULA_REACH = 14.8, 6.3
-# what moves with the fibula reaches a little further, for the fibula shifts in the frame of the flow
+# the region that moves with the fibula is a little larger, as the fibula moves in the frame of the flow, mm
 _SHIFTS = 1.0
-# from those distances outwards, over these widths, bone hands over to soft tissue
+# widths, outwards from those distances, over which the motion of bone blends into that of soft tissue, mm
 _TIBIA_BLEND, _FIBULA_BLEND = 16.0, 11.0
-# the flow of the plate: half its width, and where and over what depth its push ebbs away, mm
+# the flow of the plate: half its width, and at and over what depth it decays, mm
 _HALF_WIDTH, _EBB_AT, _EBB_OVER = 28.0, 20.0, 9.0
 _ALONG_AT, _ALONG_OVER = 4.0, 38.0
-# the fibula against the tibia: velocities along x and y, mm, and turn, rad; muscle along the leg, mm
+# the fibula relative to the tibia: velocities along x and y, mm, and rotation, rad; slide of the muscle along the leg, mm
 _FIBULA_MOTION = (0.5, -0.6, 0.018)
 _SLIDE, _SLIDE_AT, _SLIDE_OVER = 0.9, 15.0, 10.0
-# the leg as a whole, which is the motion of the tibia: turns about x, y, z, degrees, and shift, mm
+# the leg as a whole, which is the motion of the tibia: rotations about x, y, z, degrees, and translation, mm
 _TURNS_DEG, _SHIFT_MM = (0.5, -0.4, 3.0), (2.4, -1.8, 0.9)
 _STEPS = 5
-# further than this from the middle of the leg there is no tissue to move, mm
+# distance from the centre of the leg beyond which there is no tissue, mm
 _FARTHEST = 70.0
 
 
@@ -43,19 +43,19 @@ def leg_pose() -> RigidTransform:
 
 @dataclass(frozen=True, slots=True)
 class CalfMotion:
-    """Where the tissue of the calf lies after a plate has pushed from below (against y), mm; a `naibu.validation.scanners.motions.Motion`.
+    """Motion of the tissue of the calf under a plate from below (against y); a `naibu.validation.scanners.motions.Motion`.
 
     The tissue follows a steady flow for one unit of time in the frame of the tibia, and that frame moves rigidly. The flow is the curl of a
-    stream function, so that volumes are kept; within the bones it is that of a rigid body. The way back is the flow backwards: both ways
-    are exact but for the error of the Runge-Kutta steps, some 1e-5 mm.
+    stream function, so that volumes are preserved; within the bones it is that of a rigid body. The inverse is the reversed flow: both are
+    exact but for the error of the Runge-Kutta steps, some 1e-5 mm.
 
     Attributes
     ----------
-    push_mm : float
+    plate_velocity_mm : float
         Velocity of the plate, mm per unit of time: the skin under its middle moves by nearly as much.
     """
 
-    push_mm: float = 12.0
+    plate_velocity_mm: float = 12.0
 
     def to_space(self, material: FloatArray) -> FloatArray:
         """Return positions (n, 3), mm, of material points (n, 3), mm."""
@@ -67,7 +67,7 @@ class CalfMotion:
 
     def _carried(self, points: FloatArray, time: float) -> FloatArray:
         out = np.empty((len(points), 3))
-        _follow(np.ascontiguousarray(points), time, self.push_mm, _STEPS, out)
+        _follow(np.ascontiguousarray(points), time, self.plate_velocity_mm, _STEPS, out)
         return out
 
 

@@ -1,4 +1,4 @@
-"""A calf in an MR scanner, before and after a plate is pressed against it: what stands for the report's volumes (spec S1, S10)."""
+"""MR phantom of a calf before and after compression by a plate, in place of the volumes of :cite:t:`hirai2008` (chapter 1)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from naibu.validation.scanners.textures import Texture
 Tissue = Literal["air", "skin", "fat", "muscle", "bone"]
 TISSUES: tuple[Tissue, ...] = get_args(Tissue)
 FIELD_OF_VIEW_MM, SLICE_GAP_MM = 200.0, 2.0
-PIXELS, SLICES = 256, 29  # 57 slices with those put between
+PIXELS, SLICES = 256, 29  # 57 slices with the interpolated ones
 _AIR, _SKIN, _FAT, _MUSCLE, _BONE = range(5)
 _SKIN_MM, _FASCIA_MM = 2.0, 0.9
 # middles of the muscles' cross-sections at z = 0, mm, and their drift along the leg
@@ -32,7 +32,7 @@ _DRIFT = np.array(
     [(0.10, 0.02), (0.06, -0.04), (-0.05, 0.06), (0.02, 0.10), (-0.03, 0.02), (0.04, 0.05), (0.02, -0.08), (0.08, -0.05), (-0.06, 0.08),
      (0.10, 0.05), (-0.08, 0.06), (0.05, 0.10), (-0.12, -0.04)]
 )  # fmt: skip
-# x, y, drift along x and y per mm, radius, mm, and grey value: slow veins are bright, fast vessels are dark
+# x, y, drift along x and y per mm, radius, mm, and intensity: slow veins are bright, fast vessels are dark
 _VESSELS = (
     (4.0, 2.0, 0.03, 0.05, 1.8, 35.0), (7.5, 3.0, 0.02, 0.04, 1.4, 235.0), (15.0, 0.0, -0.05, 0.02, 1.5, 30.0),
     (12.0, -20.0, 0.04, 0.03, 1.3, 240.0), (-4.0, 33.0, 0.10, 0.02, 1.6, 240.0), (24.0, 28.0, -0.08, 0.05, 1.4, 25.0),
@@ -43,7 +43,7 @@ _VESSELS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalfPhantom:
-    """The free calf: skin, a ring of fat, muscles parted by septa, two bones with marrow, vessels; the leg runs along z.
+    """The undeformed calf: skin, a ring of fat, muscles separated by septa, two bones with marrow, vessels; the leg runs along z.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class CalfPhantom:
         return out
 
     def intensity(self, material: FloatArray) -> FloatArray:
-        """Return the grey value (n,), of 256 levels, at material points (n, 3), mm; 4 in air."""
+        """Return the intensity (n,), of 256 levels, at material points (n, 3), mm; 4 in air."""
         out = np.full(len(material), 4.0)
         depth = _depth(material)
         inside = np.flatnonzero(depth > 0.0)
@@ -105,20 +105,20 @@ class CalfPhantom:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalfCase:
-    """Two scans of the calf, and what truly happened.
+    """Two scans of the calf, with the true motion.
 
     Attributes
     ----------
     reference, deformed : Volume
-        Before and after the push, 256 grey levels, with slices put between.
+        Before and after the compression, 256 intensity levels, with interpolated slices.
     truth : ndarray, shape (nz, ny, nx, 3)
-        Displacement of the tissue at the voxels of the initial volume, mm.
+        Displacement of the tissue at the voxels of the reference volume, mm.
     tissue : ndarray, shape (nz, ny, nx), int8
         Tissue at these voxels, as its number in `TISSUES`.
     tissue_after : ndarray, shape (nz, ny, nx), bool
         Where tissue lies in the deformed volume.
     motion : Motion
-        Which made it.
+        The true motion.
     """
 
     reference: Volume
@@ -152,7 +152,7 @@ class CalfCase:
 
 
 def calf_case(seed: int = 0, *, pixels: int = PIXELS, slices: int = SLICES, motion: Motion | None = None, noise: float = 4.0) -> CalfCase:
-    """Scan the phantom before and after the push, as the report did: slices 2 mm apart, one put between each two.
+    """Scan the phantom before and after the compression, as the report did: slices 2 mm apart, one interpolated between each two.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def calf_case(seed: int = 0, *, pixels: int = PIXELS, slices: int = SLICES, moti
     motion : Motion, optional
         By default `naibu.reproduction.chapter1.calf_motion.CalfMotion`.
     noise : float
-        Of each channel of the scanner, grey levels.
+        Standard deviation of the noise of each channel of the scanner, intensity levels.
     """
     phantom = CalfPhantom(seed)
     moved = CalfMotion() if motion is None else motion

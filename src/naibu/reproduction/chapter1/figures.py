@@ -1,4 +1,4 @@
-"""The figures of chapter 1 and of section 3.5, each a function that paints on a canvas."""
+"""The figures of chapter 1 and of section 3.5, each a function that draws on a canvas."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MARGIN_MM, ARROWS_APART_MM = 6.0, 5.0
 
 
 class Found(Protocol):
-    """A displacement that was measured."""
+    """A measured displacement, by method."""
 
     @property
     def name(self) -> str:
@@ -46,7 +46,7 @@ class Found(Protocol):
 
 
 def the_case(case: CalfCase, at: int) -> Draw:
-    """Draw a slice before and after, and how far its tissue moves."""
+    """Draw a slice of the reference and the deformed volume, and the displacement of its tissue."""
 
     def draw(canvas: Canvas) -> None:
         axes = canvas.subplots(1, 3, sharey=True)
@@ -64,7 +64,7 @@ def the_case(case: CalfCase, at: int) -> Draw:
 
 
 def match_panels(case: CalfCase, chosen: Sequence[Matched]) -> Draw:
-    """Draw the matches of strengths on an image after the push: from where points were to where they were found."""
+    """Draw the matches of strengths on the deformed image, from reference points to their matches."""
 
     def draw(canvas: Canvas) -> None:
         for axis, way in zip(np.atleast_1d(canvas.subplots(1, len(chosen), sharey=True)), chosen, strict=True):
@@ -130,15 +130,15 @@ def net_panels(case: CalfCase, chosen: Sequence[Matched]) -> Draw:
 
 
 def check_panels(case: CalfCase, points: CheckPoints, back: Mapping[str, FloatArray]) -> Draw:
-    """Draw check points where they were and where fields carry them back to."""
+    """Draw check points and their positions moved back by the fields."""
 
     def draw(canvas: Canvas) -> None:
         for axis, (name, ends) in zip(np.atleast_1d(canvas.subplots(1, len(back), sharey=True)), back.items(), strict=True):
             axis.imshow(case.reference.values[0], extent=_extent(case.reference), alpha=0.75, **GREY)
             axis.plot(*points.reference_mm[:, :2].T, "+", ms=11, mew=1.6, color="#f0e442", label="where it was")
             axis.plot(*ends[:, :2].T, "x", ms=8, mew=1.6, color="#009e73", label="moved back")
-            for number, place in enumerate(points.reference_mm):
-                axis.annotate(str(number), place[:2], (6, 5), textcoords="offset points", color="white", fontsize=8)
+            for number, point in enumerate(points.reference_mm):
+                axis.annotate(str(number), point[:2], (6, 5), textcoords="offset points", color="white", fontsize=8)
             axis.set(title=name)
             _about(axis, case, case.leg)
         canvas.axes[0].legend(loc="lower right", fontsize=8, facecolor="0.1", labelcolor="white", framealpha=0.7)
@@ -209,7 +209,7 @@ def _slice_and_cut(axes: AnyArray, case: CalfCase, values: FloatArray, at: int, 
 
 
 def resampled_slices(case: CalfCase, fields: Mapping[str, FloatArray], which: Sequence[int]) -> Draw:
-    """Draw slices after the push, the volume before as fields warp it, and the differences."""
+    """Draw deformed slices, the reference volume warped by the fields, and the differences."""
 
     def draw(canvas: Canvas) -> None:
         axes = canvas.subplots(1 + 2 * len(fields), len(which), squeeze=False, sharex=True, sharey=True)
@@ -217,7 +217,7 @@ def resampled_slices(case: CalfCase, fields: Mapping[str, FloatArray], which: Se
         shown: Any = None
         for axis, k in zip(axes[0], which, strict=True):
             axis.imshow(case.deformed.values[k], extent=extent, **GREY)
-            axis.set(title=f"slice {k}: after the push")
+            axis.set(title=f"slice {k}: deformed")
         for number, (name, vectors) in enumerate(fields.items()):
             computed = warped(case.reference, inverse_displacement(vectors, case.reference), case.reference)
             for column, k in enumerate(which):
@@ -229,7 +229,7 @@ def resampled_slices(case: CalfCase, fields: Mapping[str, FloatArray], which: Se
                 lower.set(title="computed less measured")
         for axis in axes.ravel():
             _about(axis, case, case.tissue_after)
-        canvas.colorbar(shown, ax=list(axes.ravel()), label="grey levels", shrink=0.35, extend="both")
+        canvas.colorbar(shown, ax=list(axes.ravel()), label="intensity levels", shrink=0.35, extend="both")
 
     return draw
 

@@ -1,4 +1,4 @@
-"""Section 3.5 of the report on the calf phantom: block matching, optical flow and their hybrid, in an image and in a volume (spec S7)."""
+"""Section 3.5 of :cite:t:`hirai2008` on the calf phantom: block matching, optical flow and their hybrid, in an image and a volume."""
 
 from __future__ import annotations
 
@@ -67,17 +67,18 @@ def flow_section(case: CalfCase, image: CalfCase, others: Mapping[str, FloatArra
     at = case.reference.shape[0] // 2
     lost = 100.0 * float(np.mean(plane[0].errors_mm[np.isfinite(plane[0].errors_mm)] > LOST_MM))
     text = (
-        "As in the report the two states are first brought together by points on the tibia (3.36). 'As the report' stands for its "
-        "settings: whole voxels; templates of 5 x 5 pixels searched for by 30 and 35 pixels in the image, 3 x 3 x 3 voxels by 15, 15 and "
-        "1 in the volume; templates with a grey range up to 30 left out; Horn-Schunck with lambda = 4 and 40 iterations; one grid. The "
-        "report puts zero where nothing was measured; here that is left out of the errors and told beside them.",
+        "As in the report the two states are first registered by points on the tibia (3.36). 'As the report' stands for its "
+        "settings: whole voxels; templates of 5 x 5 pixels searched for within 30 and 35 pixels in the image, 3 x 3 x 3 voxels within 15, "
+        "15 and 1 in the volume; templates with an intensity range up to 30 left out; Horn-Schunck with lambda = 4 and 40 "
+        "iterations; one grid. The report takes zero where nothing was measured; here such voxels are left out of the "
+        "errors, and their fraction is shown.",
         "The report judges by eye: block matching for the skin, Horn-Schunck for the inside. In the image the mean errors in skin and "
-        "fat, and in muscle, bear that out; but neither measures the calf. Most templates are found well, as the median shows, and "
+        "fat, and in muscle, confirm that; but neither measures the calf. Most templates are found well, as the median shows, and "
         f"{lost:.0f} % of them end more than {LOST_MM:g} mm off. Horn-Schunck on one grid cannot follow motions "
-        "of ten pixels. The hybrid takes the templates' answer wherever there is contrast, the wrong ones with it, and is no better than "
-        "the templates alone. Unlike in the report Lucas-Kanade errs less than Horn-Schunck on one grid.",
-        "Grids from coarse to fine change the order: Horn-Schunck is then better in every tissue than anything on one grid, and volume "
-        "correlation, which also knows that bones are rigid and that volume hardly changes, is better still.",
+        "of ten pixels. The hybrid takes the result of block matching wherever there is contrast, wrong matches included, and is no better "
+        "than block matching alone. Unlike in the report Lucas-Kanade errs less than Horn-Schunck on one grid.",
+        "Coarse-to-fine grids change the order: Horn-Schunck is then better in every tissue than any method on one grid, and digital "
+        "volume correlation, with rigid inclusions for the bones and a dilatation penalty, is better still.",
     )
     note = "Errors are lengths of vectors against the true motion of the tissue, where the method measured."
     tables = (
@@ -92,7 +93,7 @@ def flow_section(case: CalfCase, image: CalfCase, others: Mapping[str, FloatArra
     )
     chosen = [m for m in plane if not m.name.startswith(("SSD", "NCC"))]
     figures = (
-        Figure("Figs. 3.26-3.28, 3.30", "Displacement in the image, motion of the bone included, and its error; grey: not "
+        Figure("Figs. 3.26-3.28, 3.30", "Displacement in the image, motion of the bone included, and its error; gray: not "
                "measured.", drawn.flow_panels(image, chosen, 0), (10.0, 12.0)),
         Figure("Fig. 3.30, volume", "The same by methods in three dimensions, in the middle slice.",
                drawn.flow_panels(case, space, at), (10.0, 12.0)),

@@ -1,4 +1,4 @@
-"""What chapter 1 computes: points matched by every strength, nets and fields from them, and their errors (spec S4 to S8)."""
+"""Feature matching of chapter 1 of :cite:t:`hirai2008`: matches by every strength, Delaunay nets and fields, and their errors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from naibu.reproduction.chapter1.calf_motion import TIBIA
 from naibu.reproduction.chapter1.calf_phantom import FIELD_OF_VIEW_MM, CalfCase
 
 WAYS: tuple[Strength, ...] = tuple(STRENGTHS)
-# half the report's boxes, voxels of its pixel size; they grow with the distance from the middle of a slice, by how much it does not say
+# half the boxes of the report, voxels of its pixel size; they grow with the distance from the centre of a slice, at a rate it does not say
 MATCH, SEARCH, GROWTH = (4, 4, 1), (8, 8, 1), 1.0
 REPORT_PIXEL_MM = FIELD_OF_VIEW_MM / 256
 LEAST_SCORE = 0.6
@@ -30,26 +30,26 @@ ALPHA_STEP, ALPHA_MAX, MOST_ITERATIONS = 0.1, 10.0, 101
 RIGHT_MM = 2.0
 CHECK_POINTS, CHECK_POINTS_APART_MM, CHECK_POINTS_UNDER_MM = 10, 15.0, 3.0
 # of the report's 57 slices those from 10 to 50 count
-FIRST_SHARE, LAST_SHARE = 10 / 56, 50 / 56
+FIRST_FRACTION, LAST_FRACTION = 10 / 56, 50 / 56
 _RIM_MM = 13.0  # where points on the tibia are picked: at its surface, nearly
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matched:
-    """Matches of one strength and what they give.
+    """Matches of one strength, and the field from them.
 
     Attributes
     ----------
     name : str
-        Of the strength; ``"correlation alone"`` without relaxation.
+        Name of the strength; ``"correlation alone"`` without relaxation.
     matches : PotentialMatches
         The match set.
     errors_mm : ndarray, shape (n,)
-        How far every matched point lies from where its partner truly went, mm; in an image, within the slice.
+        Distance of every matched point from the true position of its partner, mm; in an image, within the slice.
     net : Triangulation
-        Delaunay net of the points before.
+        Delaunay net of the reference points.
     dense : DisplacementField
-        Its quality is 1 inside the net; outside it is continued by the affine motion that fits all points best.
+        Its quality is 1 inside the net; outside it is extrapolated by the least-squares affine motion of all points.
     """
 
     name: str
@@ -60,11 +60,11 @@ class Matched:
 
     @property
     def right_percent(self) -> float:
-        """Share of matches within 2 mm of the truth, %."""
+        """Fraction of matches within 2 mm of the truth, %."""
         return 100.0 * float(np.mean(self.errors_mm < RIGHT_MM))
 
     def moved_back(self, points_mm: FloatArray, grid: Volume) -> FloatArray:
-        """Return where points after (k, 3), mm, came from by the net of the matched points after."""
+        """Return the reference positions of deformed points (k, 3), mm, by the net of the matched deformed points."""
         backward = DisplacementField.from_arrays(self.matches.deformed_mm, self.matches.reference_mm - self.matches.deformed_mm)
         vectors = dense_from_sparse(backward, grid, outside="affine").vectors
         at = [sampled(grid.with_values(component), points_mm) for component in np.moveaxis(vectors, -1, 0)]
@@ -74,7 +74,7 @@ class Matched:
 def picked_registration(case: CalfCase) -> RigidRegistration:
     """Return the motion of the tibia from points picked on its rim, as the report does: three in an image, eighteen in a volume.
 
-    Points are picked as well as a hand can: at the voxels that hold them in either state.
+    Points are picked with the accuracy of a voxel, as by hand.
     """
     grid = case.reference
     plane = grid.shape[0] == 1
@@ -82,8 +82,8 @@ def picked_registration(case: CalfCase) -> RigidRegistration:
     rim = np.array(TIBIA) + _RIM_MM * np.column_stack([np.cos(angles), np.sin(angles)])
     first, last = grid.to_physical([(0, 0, 0), (0, 0, grid.shape[0] - 1)])[:, 2]
     heights = [first] if plane else list(first + (last - first) * np.array([0.25, 0.5, 0.75]))
-    places = np.concatenate([np.column_stack([rim, np.full(len(rim), z)]) for z in heights])
-    before, after = (grid.to_physical(np.rint(grid.to_index(p))) for p in (places, case.motion.to_space(places)))
+    points = np.concatenate([np.column_stack([rim, np.full(len(rim), z)]) for z in heights])
+    before, after = (grid.to_physical(np.rint(grid.to_index(p))) for p in (points, case.motion.to_space(points)))
     if not plane:
         return rigid_from_points(before, after)
     found = rigid_from_points(before[:, :2], after[:, :2])
@@ -95,16 +95,16 @@ def picked_registration(case: CalfCase) -> RigidRegistration:
 def candidates_of(
     reference: Volume, deformed: Volume, counts: tuple[int, int], rigid: RigidTransform | None, *, reach: float = 1.0
 ) -> tuple[Candidates, InterestPoints, InterestPoints]:
-    """Return pairs that look alike, and the interest points before and after.
+    """Return candidate pairs, and the interest points of the reference and the deformed volume.
 
     Parameters
     ----------
     reference, deformed : Volume
-        Before and after.
+        The image pair.
     counts : tuple of int
-        Interest points before and after.
+        Interest points in the reference and the deformed volume.
     rigid : RigidTransform, optional
-        Which carries the points before to where they are searched for; without it the search box does not grow.
+        Motion to the centres of the search boxes; without it these do not grow.
     reach : float
         Factor on the search box along x and y.
     """
@@ -129,13 +129,13 @@ def potential_matches(pairs: Candidates, strength: Strength | None) -> Potential
 
 
 def match_errors(case: CalfCase, found: PotentialMatches) -> FloatArray:
-    """Return how far matches (n,) lie from where their points truly went, mm; in an image, within the slice."""
+    """Return the distance of matches (n,) from their true positions, mm; in an image, within the slice."""
     away = found.deformed_mm - case.motion.to_space(found.reference_mm)
     return np.asarray(np.linalg.norm(away[:, :2] if case.reference.shape[0] == 1 else away, axis=1))
 
 
 def matched(case: CalfCase, pairs: Candidates, strength: Strength | None) -> Matched:
-    """Return what the match set of one strength gives."""
+    """Return the matches of one strength, with net and field."""
     found = potential_matches(pairs, strength)
     field = sparse_displacement(found)
     net = triangulated(field.points, case.reference)
@@ -144,9 +144,9 @@ def matched(case: CalfCase, pairs: Candidates, strength: Strength | None) -> Mat
 
 
 def continued(vectors: FloatArray, grid: Volume) -> FloatArray:
-    """Return a displacement (nz, ny, nx, 3), mm, whose unknown vectors are those of the nearest voxel that has one.
+    """Return a displacement (nz, ny, nx, 3), mm, with unknown vectors replaced by those of the nearest known voxel.
 
-    Tissue that has left the outline of the leg can be moved back through such a field only: the way back begins outside.
+    Tissue that has left the outline of the leg needs such a field to be moved back, as the inverse motion begins outside.
     """
     unknown = np.asarray(~np.isfinite(vectors).all(axis=-1))
     nearest = ndimage.distance_transform_edt(unknown, sampling=grid.spacing_mm[::-1], return_distances=False, return_indices=True)
@@ -155,18 +155,18 @@ def continued(vectors: FloatArray, grid: Volume) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckPoints:
-    """Ten points that strike the eye, in an image before and after (k, 3), mm."""
+    """Ten conspicuous points of the reference and the deformed image (k, 3), mm."""
 
     reference_mm: FloatArray
     deformed_mm: FloatArray
 
     def errors_mm(self, ends_mm: FloatArray) -> FloatArray:
-        """Return how far the points after, moved back to these ends (k, 3), are from those before (k,), mm."""
+        """Return the distance (k,), mm, of deformed points, moved back to these positions (k, 3), from the reference points."""
         return np.asarray(np.linalg.norm(ends_mm - self.reference_mm, axis=1))
 
 
 def check_points(case: CalfCase) -> CheckPoints:
-    """Return the strongest interest points of an image of the calf, under the skin and apart, and where their tissue truly lies after."""
+    """Return the strongest interest points of an image of the calf, under the skin and apart, with their true deformed positions."""
     deep = ndimage.distance_transform_edt(case.leg[0], sampling=case.reference.spacing_mm[1::-1]) > CHECK_POINTS_UNDER_MM
     found = interest_points(case.reference, count=CHECK_POINTS, min_distance_mm=CHECK_POINTS_APART_MM, mask=deep[None])
     after = case.motion.to_space(found.points_mm)
@@ -177,7 +177,7 @@ def check_points(case: CalfCase) -> CheckPoints:
 def judged_slices(grid: Volume) -> slice:
     """Return the slices that count, those from 10 to 50 where there are 57."""
     last = grid.shape[0] - 1
-    return slice(round(FIRST_SHARE * last), round(LAST_SHARE * last) + 1)
+    return slice(round(FIRST_FRACTION * last), round(LAST_FRACTION * last) + 1)
 
 
 def judged(case: CalfCase) -> tuple[BoolArray, BoolArray]:
@@ -189,7 +189,7 @@ def judged(case: CalfCase) -> tuple[BoolArray, BoolArray]:
 
 @dataclass(frozen=True, slots=True)
 class NoiseRow:
-    """Mean over draws of noise: matches, and the share of them that is right, %."""
+    """Mean over noise realisations: matches, and the fraction of right ones, %."""
 
     noise: float
     registered: bool
@@ -201,7 +201,7 @@ class NoiseRow:
 
 
 def under_noise(case: CalfCase, counts: tuple[int, int], levels: tuple[float, ...], draws: int, seed: int) -> list[NoiseRow]:
-    """Match one image pair with more and more noise, with and without registration first, by every strength."""
+    """Match one image pair with increasing noise, with and without registration first, by every strength."""
     rigid = picked_registration(case).transform
     rows = []
     for level in levels:

@@ -1,4 +1,4 @@
-"""Chapter 1 of the report: inner deformation of a calf from MR images, and section 3.5 with it (spec S1 to S8, S10)."""
+"""Chapter 1 of :cite:t:`hirai2008`: inner deformation of a calf from MR images, with section 3.5."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ NOISE_LEVELS = (0.0, 10.0, 20.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calf:
-    """The volumes and all that is computed of them once: the middle slice as an image, matches in both, and the default's field.
+    """The volumes and all results: the middle slice as an image, matches in both, and the field of the default method.
 
     Attributes
     ----------
@@ -47,13 +47,13 @@ class Calf:
     plane, space : list of Matched
         Correlation alone and the four strengths, in the image and in the volumes.
     counts : tuple of tuple of int
-        Interest points before and after, in the image and in the volumes.
+        Interest points of the reference and the deformed state, in the image and in the volumes.
     candidates : tuple of int
-        Pairs that look alike.
+        Candidate pairs.
     rigid : RigidRegistration
         Motion of the tibia in the volumes from picked points.
     default : ndarray, shape (nz, ny, nx, 3)
-        Displacement by naibu's default, mm; NaN where it has none.
+        Displacement by the default method of naibu, mm; NaN outside the object.
     """
 
     case: CalfCase
@@ -75,7 +75,7 @@ def chapter1(
     space_points: tuple[int, int] = (1000, 5000),
     draws: int = 4,
 ) -> Chapter:
-    """Reproduce chapter 1 and section 3.5 on a phantom in place of the report's volumes, which are lost.
+    """Reproduce chapter 1 and section 3.5 on a phantom in place of the volumes of the report, which are lost.
 
     Parameters
     ----------
@@ -84,9 +84,9 @@ def chapter1(
     pixels, slices : int
         Along x and y, and scanned; the report has 256 and 29, to which 28 are added by interpolation.
     plane_points, space_points : tuple of int
-        Interest points before and after, in the image and in the volumes.
+        Interest points of the reference and the deformed state, in the image and in the volumes.
     draws : int
-        Of noise, for the table of matches under noise.
+        Realisations of noise, for the table of matches under noise.
     """
     calf = examined(calf_case(seed, pixels=pixels, slices=slices), plane_points, space_points)
     sections = (
@@ -123,15 +123,15 @@ def _case_section(calf: Calf) -> Section:
     length = np.linalg.norm(case.truth[case.leg], axis=-1)
     inner = np.linalg.norm(leg_pose().inverse().applied(_places(case) + case.truth[case.leg]) - _places(case), axis=-1)
     text = (
-        "The report's MR volumes of a volunteer's calf are lost. In their place stands a phantom of a calf (skin, fat, muscles with septa, "
-        "tibia and fibula with marrow, vessels, textures that the tissue carries), scanned by a virtual MR scanner with noise, blur, "
-        "uneven sensitivity and another gain at the second scan: slices 2 mm apart, one put between each two, 256 grey levels. A plate "
-        "pushes from below; tissue keeps its volume, the bones move rigidly, the tibia by "
-        f"{leg_pose().angle_deg:.1f} degrees. What matters: the true motion of every point is known, which the report could not know.",
+        "The report's MR volumes of a volunteer's calf are lost. They are replaced by a phantom of a calf (skin, fat, muscles with septa, "
+        "tibia and fibula with marrow, vessels, textures that move with the tissue), scanned by a virtual MR scanner with noise, blur, "
+        "uneven sensitivity and another gain in the second scan: slices 2 mm apart, one interpolated between each two, 256 intensity "
+        "levels. A plate compresses it from below; tissue preserves its volume, the bones move rigidly, the tibia by "
+        f"{leg_pose().angle_deg:.1f} degrees. The true motion of every point is known, which it was not in the report.",
         f"Here {nx} x {ny} x {nz} voxels (the report: 256 x 256 x 57). Tissue moves by {np.median(length):.1f} mm (median) and up to "
-        f"{length.max():.1f} mm, {inner.max() / case.reference.spacing_mm[0]:.0f} pixels after the motion of the bone is taken out. "
-        "The report's numbers stand beside ours to show that the same quantities are meant, not that they must agree.",
-        "As in the report the bone's motion comes from points picked by hand: here voxels on the rim of the tibia, right to half a voxel.",
+        f"{length.max():.1f} mm, {inner.max() / case.reference.spacing_mm[0]:.0f} pixels after the motion of the bone is removed. "
+        "The numbers of the report are shown for comparison of the quantities; they need not agree.",
+        "As in the report the bone's motion comes from points picked by hand: here voxels on the rim of the tibia, to half a voxel.",
     )
     figure = Figure("Figs. 1.3, 3.21", "The middle slice before and after, and the true displacement.",
                     drawn.the_case(case, nz // 2), (10.5, 3.6))  # fmt: skip
@@ -150,14 +150,14 @@ def _registration(calf: Calf) -> Table:
     plane = picked_registration(calf.image)
     middle = calf.image.reference.origin_mm[2]
     slab = tibia[np.abs(tibia[:, 2] - middle) < 1e-6]
-    for name, found, places, axes in (
+    for name, found, points, axes in (
         ("image: three points (3.36)", plane, slab, 2),
         ("volumes: eighteen points (Horn)", calf.rigid, tibia, 3),
     ):
-        off = np.linalg.norm((found.transform.applied(places) - leg_pose().applied(places))[:, :axes], axis=1)
+        off = np.linalg.norm((found.transform.applied(points) - leg_pose().applied(points))[:, :axes], axis=1)
         rows.append((name, found.transform.angle_deg, found.rms_mm, float(off.mean()), float(off.max())))
     columns = ("registration", "angle, degrees", "residual at the points, RMS mm", "error over the tibia, mean mm", "largest, mm")
-    note = f"The true motion turns the leg by {leg_pose().angle_deg:.2f} degrees, 3.00 of them within the slices."
+    note = f"The true motion rotates the leg by {leg_pose().angle_deg:.2f} degrees, 3.00 of them within the slices."
     caption = "Motion of the tibia from points picked to the nearest voxel, against the true one."
     return Table("Registration", columns, tuple(rows), caption=caption, note=note)
 
@@ -174,12 +174,12 @@ def _plane_section(calf: Calf, draws: int, seed: int) -> Section:
         "That the report's approach is better than Chen's, as it concludes from 72 against 63 matches, is not seen here.",
     )
     figures = (
-        Figure("Matches", "From where points were to where they were found, on the slice after the push.",
+        Figure("Matches", "From reference points to their matches, on the deformed slice.",
                drawn.match_panels(calf.image, chosen), (9.0, 4.0)),
         Figure("Energy", "Energy (1.5), and number of matches, in every iteration.",
                drawn.energies({"image": calf.plane[1:], "volumes": calf.space[1:]}), (9.0, 4.6)),
         Figure("Fig. 1.4", "Delaunay net, dense field inside it, and its error.", drawn.net_panels(calf.image, chosen), (10.5, 6.6)),
-        Figure("Fig. 1.5", "Check points moved back from the slice after the push.", drawn.check_panels(calf.image, points, back),
+        Figure("Fig. 1.5", "Check points moved back from the deformed slice.", drawn.check_panels(calf.image, points, back),
                (9.0, 4.0)),
     )  # fmt: skip
     tables = (_table_1_1(calf), _table_of_noise(calf, draws, seed), _table_1_2(calf, points))
@@ -218,7 +218,7 @@ def _table_of_noise(calf: Calf, draws: int, seed: int) -> Table:
         case = (group[0].noise, "by bone" if group[0].registered else "no, wider search", group[0].candidates)
         rows.append((*case, "right matches", *(r.right for r in group)))
         rows.append((*case, "of all, %", *(r.right_percent for r in group)))
-    columns = ("added noise, sd in grey levels", "registered", "candidate pairs", "", *names)
+    columns = ("added noise, SD in intensity levels", "registered", "candidate pairs", "", *names)
     caption = "The same slices with noise added, registered first or searched in a box 2.75 times as wide."
     return Table("Matches under noise", columns, tuple(rows), caption=caption, note=f"Means over {draws} draws of the noise.")
 
@@ -242,9 +242,9 @@ def _table_1_2(calf: Calf, points: CheckPoints) -> Table:
     note = (
         "The printed RMSE does not follow from the printed errors: 0.396 and 0.417 are the roots of their means, without the square; "
         "their root mean squares are 0.180 and 0.202 cm. Our check points are the strongest interest points 3 mm under the skin and at "
-        "least 15 mm apart; their true places after the push are known. A point may also be among the matches, as the report's with "
-        "0.000 may have been. They are moved back by the net that the matched points make after the push; outside it by the affine motion "
-        "that fits all matches."
+        "least 15 mm apart; their true deformed positions are known. A point may also be among the matches, as the report's with "
+        "0.000 may have been. They are moved back by the net of the matched deformed points; outside it by the affine motion that fits all "
+        "matches."
     )
     return Table("Table 1.2", columns, tuple(rows), caption="Ten check points moved back: distance from where they were.", note=note)
 
@@ -263,19 +263,19 @@ def _space_section(calf: Calf) -> Section:
         "default": (calf.default, everywhere),
     }
     whole = {"direction26": chosen[0].dense.vectors, "default": continued(calf.default, case.reference)}
-    which = [round(share * (nz - 1)) for share in (15 / 56, 30 / 56, 45 / 56)]
+    which = [round(fraction * (nz - 1)) for fraction in (15 / 56, 30 / 56, 45 / 56)]
     text = (
         "The report's approach in volumes is the strength 'direction26' (1.23), RPFM is 'chen'. Both the report's and our matches of the "
-        "two differ too little to prefer one: 26.00 against 26.35 grey levels in the report.",
-        "The grey difference (1.29) counts slices 10 to 50 of 57 as in the report, and in them the tissue after the push. It has a floor, "
-        "noise and interpolation, which the true displacement shows, and says little about errors where tissue is uniform: the error "
-        "of the field against the truth stands beside it.",
+        "two differ too little to prefer one: 26.00 against 26.35 intensity levels in the report.",
+        "The RMS intensity residual (1.29) counts slices 10 to 50 of 57 as in the report, and in them the deformed tissue. It has a floor "
+        "of noise and interpolation, which the true displacement shows, and is insensitive to errors where tissue is uniform: the error of "
+        "the field against the truth is shown, too.",
     )
     figures = (
         Figure("Fig. 1.9", "Displacement of the nodes of the net.", drawn.node_displacements(chosen), (10.0, 4.0)),
         Figure("Fig. 1.10", "Dense field and error, in the middle slice and in a cut along the leg at x = 0.",
                drawn.cuts(case, fields, nz // 2), (10.0, 9.0)),
-        Figure("Fig. 6 (paper)", "Slices after the push, the volume before as the fields warp it, and differences.",
+        Figure("Fig. 6 (paper)", "Deformed slices, the reference volume warped by the fields, and differences.",
                drawn.resampled_slices(case, whole, which), (9.0, 12.0)),
     )  # fmt: skip
     return Section("Volumes (Table 1.3 and Table I of the paper)", text, (table_1_3(calf),), figures)
@@ -298,24 +298,22 @@ def table_1_3(calf: Calf) -> Table:
     true = np.where(case.leg[..., None], case.truth, np.nan)
     rows.append(("true displacement", *(None,) * 4, *_judged(case, true, None), None))
     columns = (
-        "way", "points before", "points after", "matches", "tetrahedra", "RMS (1.29), grey levels", "field: mean error, mm",
+        "way", "points before", "points after", "matches", "tetrahedra", "RMS (1.29), intensity levels", "field: mean error, mm",
         "median, mm", "95 %, mm", "measured, %", "right, %",
     )  # fmt: skip
     first, last = judged_slices(case.reference).start, judged_slices(case.reference).stop - 1
     note = (
-        f"Slices {first} to {last} of {case.reference.shape[0]}, tissue alone. Fields from matches are continued outside their net by the "
-        "affine motion that fits all matches, and judged there too; 'measured' is the tissue inside the net. Where a field folds nothing "
-        "leads back to the volume before: such voxels do not count in the RMS, and are white in the figure below. Right matches lie within "
+        f"Slices {first} to {last} of {case.reference.shape[0]}, tissue alone. Fields from matches are extrapolated outside their net by "
+        "the affine motion that fits all matches, and evaluated there, too; 'measured' is the tissue inside the net. Where a field "
+        "folds it has no inverse: such voxels do not count in the RMS, and are white in the figure below. Right matches lie within "
         f"{RIGHT_MM:g} mm of the truth."
     )
-    return Table(
-        "Table 1.3", columns, tuple(rows), caption="Matches in volumes, the dense field, and the grey difference that is left.", note=note
-    )
+    return Table("Table 1.3", columns, tuple(rows), caption="Matches in volumes, the dense field, and the intensity residual.", note=note)
 
 
 def _judged(case: CalfCase, vectors: FloatArray, measured: BoolArray | None) -> tuple[float, float, float, float, float]:
     before, after = judged(case)
     rms = intensity_rms(case.reference, case.deformed, continued(vectors, case.reference), region=after)
     error = end_point_error(vectors, case.truth, before)
-    share = error.coverage if measured is None else float(measured[before].mean())
-    return rms, error.mean_mm, error.median_mm, error.p95_mm, 100.0 * share
+    fraction = error.coverage if measured is None else float(measured[before].mean())
+    return rms, error.mean_mm, error.median_mm, error.p95_mm, 100.0 * fraction
