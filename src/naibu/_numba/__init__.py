@@ -1,1 +1,5 @@
-"""All that naibu uses of Numba beyond its public interface: a cache of kernels by content."""
+"""All that naibu uses of Numba and llvmlite beyond their public interfaces.
+
+`compilation` compiles kernels and keeps them in files named by what their machine code depends on; `simd` and `thread_pool` (over
+`atomics`) write LLVM instructions. Each has a plain substitute for versions of Numba where it does not work (`versions`).
+"""

@@ -57,10 +57,12 @@ class ProcessLock:
             return self
         start = time.monotonic()
         try:
-            while time.monotonic() - start < self._longest:
+            while True:
                 try:
                     _take(self._descriptor)
                 except BlockingIOError:
+                    if time.monotonic() - start > self._longest:
+                        break
                     time.sleep(0.02)
                 except OSError:
                     break

@@ -1,6 +1,7 @@
 """The command-line application, its output and error consoles: lines, tables, progress, failures.
 
-Exit codes: 0 done, 1 the installation is not sound (``doctor``), 2 input that cannot be used, 3 a solve that failed, 130 interrupted.
+Exit codes: 0 done, 1 the installation is not sound (``doctor``), 2 input that cannot be used, 3 a solve that failed, 130 interrupted,
+143 terminated.
 """
 
 from __future__ import annotations
