@@ -66,7 +66,7 @@ def test_the_series_holds_every_frame(whole: Path) -> None:
     moved = found["VTKHDF/PointData/displacement_mm"].reshape(FRAMES + 1, n, 3)
     assert (moved[0] == 0.0).all() and moved[5, :, 2].min() < -1.0
     # the sphere moves on its path, and no node is inside of it
-    place = np.array(told["places_mm"]["ball"])
+    place = np.array(told["positions_mm"]["ball"])
     np.testing.assert_allclose(place[5], [10.0, 10.0, 25.5], atol=1e-9)
     distance = np.linalg.norm(study.lattice.points + moved[5] - place[5], axis=1)
     assert 8.0 - 1e-3 < distance.min() < 8.1
@@ -83,7 +83,7 @@ def test_forces_momentum_and_mass_balance(whole: Path) -> None:
     told = json.loads((whole / "out" / "mine.json").read_text(encoding="utf-8"))
     found = series_of(whole / "out" / "mine.vtkhdf")
     study = prepared_study(whole / "mine.toml").study
-    assert told["mass_kg"] == pytest.approx(0.012) and told["masses"] == study.lattice.n_nodes
+    assert told["mass_kg"] == pytest.approx(0.012) and told["nodes"] == study.lattice.n_nodes
     force = np.array([told["forces_mN"]["floor"], told["forces_mN"]["ball"]])
     times = np.array(told["force_times_s"])
     assert len(times) == force.shape[1] and times[-1] == pytest.approx(0.2)

@@ -1,4 +1,4 @@
-"""What may stand in the file of a lattice study (``naibu simulate STUDY.toml``), and how a mistake in it is told to the user."""
+"""Schema of the file of a lattice study (``naibu simulate STUDY.toml``), and the messages about mistakes in it."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ class IndenterTable(_Surface):
             )
         self._driven()
         if self.until_s is not None and self.contact != "tied":
-            raise ValueError('until_s tells when a tied indenter lets go; write contact = "tied", or remove it')
+            raise ValueError('until_s is the time at which a tied indenter lets go; write contact = "tied", or remove it')
         return self
 
     def _driven(self) -> None:
@@ -296,12 +296,12 @@ _MENDS = {
     "parameters": "add a table [parameters] with K = 40.0, C1 = 20.0 and C2 = 60.0",
     "simulation": "add a table [simulation] with duration_s = 5.0",
     "K": "stiffness of an element, mN/mm",
-    "C1": "dashpot beside the spring, mN s/mm",
-    "C2": "dashpot in line with the spring, mN s/mm",
+    "C1": "dashpot parallel to the spring, mN s/mm",
+    "C2": "dashpot in series with the spring, mN s/mm",
     "size_mm": "write three positive lengths along x, y, z, for example size_mm = [100, 50, 70]",
     "spacing_mm": "write the edge of a voxel, for example spacing_mm = 10.0",
     "duration_s": "write how long is computed, for example duration_s = 5.0",
-    "centre_mm": "write the place of its centre at the start, for example centre_mm = [50.0, 25.0, 95.0]",
+    "centre_mm": "write the position of its centre at the start, for example centre_mm = [50.0, 25.0, 95.0]",
     "shape": 'write shape = "box", "cylinder" or "sphere"',
 }
 _UNITS = ("_mm_per_s2", "_mN_s_per_mm", "_mN_per_mm", "_mm_per_s", "_g_per_cm3", "_mm", "_s", "_g")

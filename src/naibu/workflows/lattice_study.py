@@ -1,4 +1,4 @@
-"""From the file of a study to the lattice and the bodies that are computed; the studies that naibu brings along."""
+"""Prepare lattice studies: from a study file, or a study that comes with naibu, to the lattice and its indenters."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class PreparedStudy:
     source : str
         File or name that it was asked by.
     settings : StudyFile
-        What the file says.
+        Contents of the file.
     study : LatticeStudy
         What is computed.
     mesh : Mesh
@@ -77,7 +77,7 @@ class PreparedStudy:
 
 
 def study_text(name: str) -> str:
-    """Return the file of a study that naibu brings along.
+    """Return the file of a study that comes with naibu.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def prepared_study(source: str | os.PathLike[str]) -> PreparedStudy:
     Parameters
     ----------
     source : str or path-like
-        Name of a study in `NAMED`, or a file.
+        Name of a study that comes with naibu, or a file.
 
     Raises
     ------
@@ -170,7 +170,7 @@ def _label_volume(path: Path, file: Path, table: ObjectTable) -> Volume:
         except InputError as error:
             raise InputError(f"{place}: {error}") from error
     if table.voxel_mm is None:
-        raise InputError(f"{place}: an array does not tell its voxels; add voxel_mm = [1.0, 1.0, 1.0]")
+        raise InputError(f"{place}: an array does not state its voxel size; add voxel_mm = [1.0, 1.0, 1.0]")
     try:
         values = np.load(file, allow_pickle=False)
         return Volume.from_array(np.asarray(values).T, spacing_mm=table.voxel_mm)

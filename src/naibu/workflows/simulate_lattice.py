@@ -1,4 +1,4 @@
-"""Run studies of lattices and keep them: a series for ParaView that grows while it runs, numbers, an animated page, and where to go on."""
+"""Run studies of lattices: a series for ParaView that grows during the run, numbers, an animated page, and a checkpoint to resume from."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def _append(series: SeriesFile, prepared: PreparedStudy, frame: StudyFrame) -> N
     first = max(state.frame - 1, 0) * prepared.study.samples
     series.append_rows("force_time_s", frame.sample_times, first)
     series.append_rows("force_mN", frame.force, first)
-    series.append_rows("place_mm", state.places[None], state.frame)
+    series.append_rows("position_mm", state.positions[None], state.frame)
     energies = [frame.kinetic, frame.spring, state.external_work, *state.work]
     series.append_rows("energy_mN_mm", np.array([energies]), state.frame)
     series.append_rows("momentum_kg_mm_per_s", frame.momentum[None], state.frame)
@@ -171,7 +171,7 @@ def _numbers(prepared: PreparedStudy, series: SeriesFile, state: StudyState) -> 
     count = state.frame * study.samples
     force, energy = series.rows("force_mN")[:count], series.rows("energy_mN_mm")[: state.frame + 1]
     names = [body.name for body in study.bodies]
-    places = series.rows("place_mm")[: state.frame + 1]
+    positions = series.rows("position_mm")[: state.frame + 1]
     return {
         "study": prepared.title,
         "naibu": __version__,
@@ -182,17 +182,17 @@ def _numbers(prepared: PreparedStudy, series: SeriesFile, state: StudyState) -> 
         "fingerprint": prepared.fingerprint,
         "units": "mm, kg, s, mN, mN mm",
         "scanner_frame": {"direction": lattice.frame.rotation.tolist(), "origin_mm": lattice.frame.translation.tolist()},
-        "masses": study.lattice.n_nodes,
+        "nodes": study.lattice.n_nodes,
         "elements": study.lattice.n_elements,
         "mass_kg": study.lattice.total_mass,
-        "steps_whose_contacts_did_not_settle": state.unsettled,
+        "steps_with_unsettled_contacts": state.unsettled,
         "times_s": series.times()[: state.frame + 1].tolist(),
         "kinetic_mN_mm": energy[:, 0].tolist(),
         "springs_mN_mm": energy[:, 1].tolist(),
         "work_of_external_force_mN_mm": energy[:, 2].tolist(),
         "work_mN_mm": {name: energy[:, 3 + k].tolist() for k, name in enumerate(names)},
         "momentum_kg_mm_per_s": series.rows("momentum_kg_mm_per_s")[: state.frame + 1].tolist(),
-        "places_mm": {name: places[:, k].tolist() for k, name in enumerate(names)},
+        "positions_mm": {name: positions[:, k].tolist() for k, name in enumerate(names)},
         "force_times_s": series.rows("force_time_s")[:count].tolist(),
         "forces_mN": {name: force[:, k].tolist() for k, name in enumerate(names)},
     }
@@ -222,7 +222,7 @@ def _page(prepared: PreparedStudy, series: SeriesFile, state: StudyState) -> Mot
     bodies = [RigidShape(name, shape.name, shape.size, shape.axes) for name, shape in shapes]
     count = state.frame * study.samples
     force = series.rows("force_mN")[:count]
-    places = series.rows("place_mm")[frames].reshape(len(frames), len(bodies), 3)
+    positions = series.rows("position_mm")[frames].reshape(len(frames), len(bodies), 3)
     times = series.times()[frames]
     provenance = {
         "naibu": __version__,
@@ -232,7 +232,7 @@ def _page(prepared: PreparedStudy, series: SeriesFile, state: StudyState) -> Mot
     }
     return MotionPage(
         prepared.title, _sentences(prepared, state, force), times, faces.reshape(-1, 3), study.lattice.points[nodes], moved, fields, bodies,
-        places, series.rows("force_time_s")[:count], force, _tables(prepared, force, moved, times), provenance,
+        positions, series.rows("force_time_s")[:count], force, _tables(prepared, force, moved, times), provenance,
     )  # fmt: skip
 
 
@@ -274,7 +274,7 @@ def _packed(state: StudyState, fingerprint: str) -> bytes:
         "position": lattice.position,
         "velocity": lattice.velocity,
         "extension": lattice.extension,
-        "places": state.places,
+        "positions": state.positions,
         "work": state.work,
         "numbers": np.array([state.speed, state.external_work, float(state.unsettled)]),
     }
@@ -299,7 +299,7 @@ def _read_checkpoint(path: Path, prepared: PreparedStudy) -> StudyState:
             contact = ContactState(*(data[f"contact_{name}"] for name in CONTACT_ARRAYS))
         lattice = LatticeState(data["position"], data["velocity"], data["extension"], data.get("length"), contact)
         speed, external_work, unsettled = data["numbers"].tolist()
-        state = StudyState(int(data["frame"]), lattice, speed, data["places"], data["work"], external_work, int(unsettled))
+        state = StudyState(int(data["frame"]), lattice, speed, data["positions"], data["work"], external_work, int(unsettled))
     except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
         raise InputError(f"{path}: is damaged ({error}); run without `resume`") from error
     if not same:

@@ -15,7 +15,14 @@ import pytest
 from naibu.core import optional_packages
 from naibu.core.errors import ConvergenceError, InputError, MissingDependencyError
 from naibu.identification.lattice_calibration.evolutionary import cost_of, evaluator, search_cma_es, search_genetic
-from naibu.identification.lattice_calibration.forward_model import SAMPLE_S, Capture, PushedFace, PushedLattice, Pushing, tributary_shares
+from naibu.identification.lattice_calibration.forward_model import (
+    SAMPLE_S,
+    Capture,
+    PushedFace,
+    PushedLattice,
+    Pushing,
+    tributary_fractions,
+)
 from naibu.identification.lattice_calibration.gauss_newton import CalibrationProblem, Index, calibrate_lattice, evaluated, indices
 from naibu.identification.lattice_calibration.unknowns import FRACTION_NOTE, LatticeUnknowns, identifiability
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
@@ -125,10 +132,10 @@ def test_indices_of_the_truth_are_those_of_the_noise(lattice: Lattice, truth: La
 
 def test_bilinear_shares_of_a_patch(lattice: Lattice) -> None:
     nodes = np.flatnonzero(lattice.points[:, 0] == 0.0)
-    shares = tributary_shares(lattice, nodes)
+    fractions = tributary_fractions(lattice, nodes)
     y, z = lattice.points[nodes, 1], lattice.points[nodes, 2]
     at_edge = (np.isin(y, (0.0, 50.0)).astype(int)) + np.isin(z, (0.0, 75.0))
-    np.testing.assert_allclose(shares, 0.5**at_edge / (0.5**at_edge).sum())
+    np.testing.assert_allclose(fractions, 0.5**at_edge / (0.5**at_edge).sum())
 
 
 def test_unknowns_by_class_and_zone() -> None:

@@ -248,9 +248,9 @@ class PushedLattice:
             if force is None:
                 raise InputError(f"{pushing.name}: pushing by force needs the measured forces")
             measured = averaged(np.asarray(force, dtype=float), round(step / SAMPLE_S))
-            shares = [tributary_shares(lattice, nodes) for nodes in touched]
+            fractions = [tributary_fractions(lattice, nodes) for nodes in touched]
             body = np.repeat(np.arange(len(touched)), [len(n) for n in touched])
-            loads = Loads(np.concatenate(touched), np.concatenate(shares), body)
+            loads = Loads(np.concatenate(touched), np.concatenate(fractions), body)
         elif mode == "displacement":
             for k, nodes in enumerate(touched):
                 constrained = constrained + ConstrainedNodes.of(np.setdiff1d(nodes, ground), k)
@@ -307,8 +307,8 @@ class PushedLattice:
         return [(a, b, 1 if any(k <= a < k + quick for k in starts) else ratio) for a, b in pairwise(stops)]
 
 
-def tributary_shares(lattice: Lattice, nodes: IntArray) -> FloatArray:
-    """Return the share (k,) of a force that each of the nodes of a flat patch takes.
+def tributary_fractions(lattice: Lattice, nodes: IntArray) -> FloatArray:
+    """Return the fraction (k,) of a force that each of the nodes of a flat patch takes.
 
     Rigid points in the middle of every face of a voxel take equal forces and hand a quarter to each corner (bilinear weights).
     """
@@ -323,8 +323,8 @@ def tributary_shares(lattice: Lattice, nodes: IntArray) -> FloatArray:
     # a face is two triangles that share its diagonal: a corner off it gets half of its triangle, one on it a quarter of both
     part = np.where(length == length.max(axis=1, keepdims=True), 0.5, 0.25) * area[:, None]
     quarter = np.bincount(corners.ravel(), part.ravel(), minlength=lattice.n_nodes)
-    share = quarter[nodes]
-    return np.asarray(share / share.sum())
+    fraction = quarter[nodes]
+    return np.asarray(fraction / fraction.sum())
 
 
 def averaged(samples: FloatArray, count: int) -> FloatArray:

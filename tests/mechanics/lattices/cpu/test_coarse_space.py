@@ -102,10 +102,10 @@ def test_coarse_functions_reproduce_linear_fields(name, between, monkeypatch):
     fine = (weights[2], weights[3])
     count = int(fine[0].max()) + 1
     nodes = np.zeros((count, 3))  # where the coarse nodes are: the places whose interpolation gives the nodes of the lattice
-    share = np.zeros((n, count))
-    np.add.at(share, (np.arange(n)[:, None], fine[0]), fine[1])
-    np.testing.assert_allclose(share.sum(axis=1), 1.0, atol=1e-12)
-    nodes = np.linalg.lstsq(share, lattice.points, rcond=None)[0]
+    fraction = np.zeros((n, count))
+    np.add.at(fraction, (np.arange(n)[:, None], fine[0]), fine[1])
+    np.testing.assert_allclose(fraction.sum(axis=1), 1.0, atol=1e-12)
+    nodes = np.linalg.lstsq(fraction, lattice.points, rcond=None)[0]
     vectors[4][:, :count] = slope @ nodes.T
     _from_nodes(steps, vectors)
     zero, p = np.zeros((3, pad), np.float32), np.zeros((3, pad), np.float32)
@@ -120,7 +120,7 @@ def test_coarse_functions_reproduce_linear_fields(name, between, monkeypatch):
     gather(steps[0], vectors[0][0], r, 0, pad - 8)
     _to_nodes(steps, vectors)
     assert float((vectors[3][:, :count] * c).sum()) == pytest.approx(float((p * r).sum(dtype=float)), rel=1e-4, abs=1e-3)
-    np.testing.assert_allclose(vectors[3][:, :count].T, share.T @ r[:, :n].T, atol=1e-3)
+    np.testing.assert_allclose(vectors[3][:, :count].T, fraction.T @ r[:, :n].T, atol=1e-3)
     if between:  # from the finer grid to the coarser one
         values = rng.normal(size=vectors[3].shape).astype(np.float32)
         values[:, count:] = 0.0
@@ -128,8 +128,8 @@ def test_coarse_functions_reproduce_linear_fields(name, between, monkeypatch):
         np.add.at(coarse, (np.arange(n)[:, None], weights[0]), weights[1])
         gather(further[0], less[0][0], values, 0, values.shape[1])
         _to_nodes(further, less)
-        nested = np.linalg.lstsq(share, coarse, rcond=None)[0]
-        if np.linalg.matrix_rank(share) == count:
+        nested = np.linalg.lstsq(fraction, coarse, rcond=None)[0]
+        if np.linalg.matrix_rank(fraction) == count:
             np.testing.assert_allclose(less[3][:, : coarse.shape[1]].T, nested.T @ values[:, :count].T, atol=1e-4)
 
 

@@ -98,7 +98,7 @@ def test_the_driven_body_is_in_balance() -> None:
     times = study.step_s * np.arange(1, 151)
     applied = np.interp(times, [0.0, 0.1], [0.0, 400.0]).sum() * study.step_s
     assert 0.05 * frames[-1].state.speed == pytest.approx(applied + force.sum() * study.sample_s, abs=2e-3 * applied)
-    assert frames[-1].state.places[1, 2] < 24.9
+    assert frames[-1].state.positions[1, 2] < 24.9
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,7 @@ def same(a: StudyFrame, b: StudyFrame) -> None:
     )
     for name in ("position", "velocity", "extension"):
         assert (getattr(a.state.lattice, name) == getattr(b.state.lattice, name)).all()
-    assert (a.force == b.force).all() and (a.state.work == b.state.work).all() and (a.state.places == b.state.places).all()
+    assert (a.force == b.force).all() and (a.state.work == b.state.work).all() and (a.state.positions == b.state.positions).all()
 
 
 def test_a_body_lets_go_when_it_is_to() -> None:
@@ -130,7 +130,7 @@ def test_a_body_lets_go_when_it_is_to() -> None:
     times = np.concatenate([f.sample_times for f in frames])
     force = np.concatenate([f.force for f in frames])[:, 1]
     assert (force[times > 0.15 + 0.008] == 0.0).all() and (np.abs(force[times < 0.15 - 0.008]).max(axis=1) > 0.0).all()
-    np.testing.assert_allclose(frames[-1].state.places[1], [-2.5 - 5.0, 15.0, 10.0])
+    np.testing.assert_allclose(frames[-1].state.positions[1], [-2.5 - 5.0, 15.0, 10.0])
 
 
 def test_what_cannot_be_run_is_told() -> None:

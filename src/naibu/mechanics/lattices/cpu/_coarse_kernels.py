@@ -63,9 +63,9 @@ def turn_with(lanes, sums, p, r, smoother, beta, begin, end):  # type: ignore[no
 
 
 @njit(cache=True, fastmath=_FAST)
-def _collect(share, sources, sums):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _collect(fraction, sources, sums):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add weighted sources (3, p) to sums (3, q), one by one."""
-    target, weight, shift = share
+    target, weight, shift = fraction
     x, y, z, s0, s1, s2 = sources[0, shift:], sources[1, shift:], sources[2, shift:], sums[0], sums[1], sums[2]
     for i in range(len(target)):
         for k in range(target.shape[1]):
@@ -76,9 +76,9 @@ def _collect(share, sources, sums):  # type: ignore[no-untyped-def]  # pragma: n
 
 
 @njit(cache=True, fastmath=_FAST)
-def _spread(share, sources, sums):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _spread(fraction, sources, sums):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Set sources (3, p) to weighted sums (3, q): the transpose of `_collect`."""
-    target, weight, shift = share
+    target, weight, shift = fraction
     x, y, z, s0, s1, s2 = sources[0, shift:], sources[1, shift:], sources[2, shift:], sums[0], sums[1], sums[2]
     for i in range(len(target)):
         a, b, c = x.dtype.type(0), x.dtype.type(0), x.dtype.type(0)
@@ -105,7 +105,7 @@ def _times(inverse, right, out):  # type: ignore[no-untyped-def]  # pragma: no c
 @njit(cache=True, fastmath=_FAST)
 def _to_nodes(steps, vectors):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Take the sums of columns (parts, 3, p), which are cleared, to nodes."""
-    _, rows, share = steps
+    _, rows, fraction = steps
     columns, given, lines, right, _ = vectors
     zero = splat(columns.dtype.type(0))
     for axis in range(3):
@@ -120,7 +120,7 @@ def _to_nodes(steps, vectors):  # type: ignore[no-untyped-def]  # pragma: no cov
         for i in range(0, right.shape[1], WIDTH):
             store(right[axis], i, zero)
     gather(rows, lines, given, 0, WIDTH * (len(rows[0]) - 1))
-    _collect(share, lines, right)
+    _collect(fraction, lines, right)
 
 
 @njit(cache=True, fastmath=_FAST)
@@ -163,7 +163,7 @@ def _product(a, b):  # type: ignore[no-untyped-def]  # pragma: no cover
 @njit(cache=True)
 def assemble(elements, directions, stiff, corner, weight, dense, diagonal):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add the stiffness of elements, as coarse functions see it, to `dense` (3, n, 3, n) and `diagonal` (3, n); either may be empty."""
-    node, share = np.empty(16, np.int64), np.empty(16)
+    node, fraction = np.empty(16, np.int64), np.empty(16)
     for m in range(len(elements)):
         count = 0
         for side in range(2):
@@ -175,18 +175,18 @@ def assemble(elements, directions, stiff, corner, weight, dense, diagonal):  # t
                 while h < count and node[h] != c:
                     h += 1
                 if h == count:
-                    node[h], share[h] = c, 0.0
+                    node[h], fraction[h] = c, 0.0
                     count += 1
-                share[h] += w
+                fraction[h] += w
         for h in range(count):
             for a in range(3):
-                along = stiff[m] * share[h] * directions[m, a]
+                along = stiff[m] * fraction[h] * directions[m, a]
                 if diagonal.size:
-                    diagonal[a, node[h]] += along * share[h] * directions[m, a]
+                    diagonal[a, node[h]] += along * fraction[h] * directions[m, a]
                 if dense.size:
                     for k in range(count):
                         for b in range(3):
-                            dense[a, node[h], b, node[k]] += along * share[k] * directions[m, b]
+                            dense[a, node[h], b, node[k]] += along * fraction[k] * directions[m, b]
 
 
 @njit(cache=True)

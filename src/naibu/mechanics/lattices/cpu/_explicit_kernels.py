@@ -92,9 +92,18 @@ def _gather(forces, external, low, high, begin, end, p, pad):  # type: ignore[no
 @njit(cache=True, fastmath=_FAST)
 def _part(job, p, data):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Do part p of a step's first job, the forces of its blocks, or of the second, the motion of its nodes; see `explicit_steps`."""
-    (first, second, rows), parts, tables, (x, v, y), (mass, inverse_mass), external, constrained, (now, shares), forces, (step, forward) = (
-        data
-    )
+    (
+        (first, second, rows),
+        parts,
+        tables,
+        (x, v, y),
+        (mass, inverse_mass),
+        external,
+        constrained,
+        (now, fractions),
+        forces,
+        (step, forward),
+    ) = data
     cuts, nodes, low, high, mine = parts
     pad, f = len(mass), forces[p]
     if job == FORCES:
@@ -105,8 +114,8 @@ def _part(job, p, data):  # type: ignore[no-untyped-def]  # pragma: no cover
     _gather(forces, external, low, high, nodes[p], nodes[p + 1], p, pad)
     begin, end = mine[p], mine[p + 1]
     own = (constrained[0][begin:end], constrained[1][begin:end], constrained[2][begin:end], constrained[3][begin:end])
-    shares[p] = 0.0
-    drive(own, now, v, f, mass, step, shares[p])
+    fractions[p] = 0.0
+    drive(own, now, v, f, mass, step, fractions[p])
     move(x, v, f, inverse_mass, step, forward, pad, nodes[p], nodes[p + 1])
 
 
@@ -149,7 +158,7 @@ def explicit_steps(control, data, velocity, reaction):  # type: ignore[no-untype
     it moves the nodes parts[1][p] to parts[1][p + 1], among them the constrained ones parts[4][p] to parts[4][p + 1]. Sums are made in the
     same order each time.
     """
-    now, shares = data[7]
+    now, fractions = data[7]
     for n in range(len(velocity)):
         now[:] = velocity[n]
         naps = 0
@@ -157,5 +166,5 @@ def explicit_steps(control, data, velocity, reaction):  # type: ignore[no-untype
             naps += _share(control, job, data)
         adapt(control, naps)
         reaction[n] = 0.0
-        for p in range(len(shares)):
-            reaction[n] += shares[p]
+        for p in range(len(fractions)):
+            reaction[n] += fractions[p]

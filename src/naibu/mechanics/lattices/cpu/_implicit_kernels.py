@@ -134,10 +134,10 @@ def settle(first, second, rows, stiff, axes, mass, constrained, x, v, r, p, q): 
         for i in range(len(v)):
             p[i] = v[i] - q[i]
     curvature = multiply(first, second, rows, stiff, axes, mass, p, q)
-    share = dot(p, r) / curvature if curvature > 0.0 else 0.0
+    fraction = dot(p, r) / curvature if curvature > 0.0 else 0.0
     for i in range(len(v)):
-        v[i] += share * p[i]
-        r[i] -= share * q[i]
+        v[i] += fraction * p[i]
+        r[i] -= fraction * q[i]
     return 0.0
 
 
@@ -259,8 +259,8 @@ def advance(blocks, tables, x, v, before, y, lengths, mass, axes, step, lost):  
     if linear + square <= dissipated:
         return False
     root = np.sqrt(linear * linear + 4.0 * square * dissipated)  # share s of the addition: linear s + square s^2 = dissipated
-    share = 2.0 * dissipated / (linear + root) if linear + root > 0.0 else 0.0
-    left = splat(y.dtype.type(1.0 - share))
+    fraction = 2.0 * dissipated / (linear + root) if linear + root > 0.0 else 0.0
+    left = splat(y.dtype.type(1.0 - fraction))
     e0, e1 = axes[0], axes[1]
     for i in range(0, len(y), WIDTH):
         store(y, i, load(y, i) - left * load(e0, i))

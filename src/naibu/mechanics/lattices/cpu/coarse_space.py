@@ -21,7 +21,7 @@ _LEAST = 3.5  # spacings between coarse nodes; closer ones take more work than i
 _FAR = 5.5  # spacings between coarse nodes from which a grid between pays
 _BETWEEN = 2.7  # its spacings
 _MOST = 378  # unknowns of the small matrix
-_SHARE = 2.5  # numbers of the small matrix for each element, at most: it takes about a fifth of the time of their multiplication
+_FRACTION = 2.5  # numbers of the small matrix for each element, at most: it takes about a fifth of the time of their multiplication
 _SHIFT = 1e-5  # of the diagonal, added so that the inverse is positive definite in single precision, whatever the masses are
 _WORTH = 0.05  # mean fraction of the mass in the diagonal above which the diagonal does alone
 _FEW = 7_000  # elements below which it does as well
@@ -94,7 +94,7 @@ def coarse_space(lattice: Lattice, stiff: FloatArray, diagonal: FloatArray, smoo
 def _cells(lattice: Lattice) -> IntArray:
     """Return how many cells the coarse grid has along each axis: as many as its small matrix and the spacing of the nodes allow."""
     extent = np.ptp(lattice.points, axis=0)
-    most = min(_MOST, np.sqrt(_SHARE * lattice.n_elements))
+    most = min(_MOST, np.sqrt(_FRACTION * lattice.n_elements))
     cells = np.ones(3, dtype=np.int64)
     for k in range(2, int(extent.max() / (_LEAST * lattice.spacing_mm)) + 1):
         more = np.maximum(np.rint(k * extent / extent.max()), 1).astype(np.int64)
@@ -166,11 +166,11 @@ def _steps(place: FloatArray, cells: IntArray, used: IntArray, pad: int, parts: 
     most = np.argsort(-weight, axis=1, kind="stable")[:, : int((weight > 0.0).sum(axis=1).max(initial=1))]
     corner, weight = np.take_along_axis(corner, most, axis=1), np.take_along_axis(weight, most, axis=1)
     node = np.minimum(np.searchsorted(used, corner), len(used) - 1)
-    shares = (node.astype(np.uint64), np.where(used[node] == corner, weight, 0.0).astype(np.float32), WIDTH)
+    fractions = (node.astype(np.uint64), np.where(used[node] == corner, weight, 0.0).astype(np.float32), WIDTH)
     n_columns, n_lines = (WIDTH * (-(-k // WIDTH) + 2) for k in counts)
     nodes = (3, -(-len(used) // WIDTH) * WIDTH)
     shapes = ((parts, 3, n_columns), (3, n_columns), (3, n_lines), nodes, nodes)
-    return (columns, rows, shares), tuple(aligned(shape, np.float32) for shape in shapes)
+    return (columns, rows, fractions), tuple(aligned(shape, np.float32) for shape in shapes)
 
 
 def _reduced(place: FloatArray, axis: int, cells: IntArray) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:

@@ -166,9 +166,9 @@ def descend(
     """Move v along p to the least energy, r with it; set z to the residual times the smoother."""
     i = wp.tid()
     if going(norm, goal, curvature):
-        share = norm[0] / curvature[0]
-        v[i] = v[i] + share * p[i]
-        left = r[i] - share * q[i]
+        fraction = norm[0] / curvature[0]
+        v[i] = v[i] + fraction * p[i]
+        left = r[i] - fraction * q[i]
         r[i] = left
         z[i] = smoother[i] * left
 
@@ -272,10 +272,10 @@ def balance(
 
 
 @wp.kernel
-def correct(share: wp.float64, p: wp.array[wp.vec3d], v: wp.array[wp.vec3d]) -> None:
+def correct(fraction: wp.float64, p: wp.array[wp.vec3d], v: wp.array[wp.vec3d]) -> None:
     """Add share times p to v."""
     i = wp.tid()
-    v[i] = v[i] + share * p[i]
+    v[i] = v[i] + fraction * p[i]
 
 
 @wp.kernel
@@ -333,7 +333,7 @@ def extend(
     x: wp.array[wp.vec3d],
     v: wp.array[wp.vec3d],
     step: wp.float64,
-    share: wp.float64,
+    fraction: wp.float64,
     y: wp.array[wp.float64],
     lengths: wp.array[wp.float64],
 ) -> None:
@@ -351,8 +351,8 @@ def extend(
         after = x[j] + step * v[j] - moved
         length = wp.sqrt(wp.dot(after, after))
         turned = length - lengths[at] - change
-        y[at] = c[2] * y[at] + c[3] * change + share * (c[3] * turned)
-        lengths[at] = length - (wp.float64(1.0) - share) * turned
+        y[at] = c[2] * y[at] + c[3] * change + fraction * (c[3] * turned)
+        lengths[at] = length - (wp.float64(1.0) - fraction) * turned
         at += SLICE
 
 

@@ -309,9 +309,9 @@ class ImplicitSteps:
             self._on_masses("add_rigid", session.x, *self._rigid(self.z), self._number(-1.0), self.p)
         self._multiply(always=True)
         curvature = self._dot(self.p, self.q)
-        share = self._dot(self.p, self.r) / curvature if curvature > 0.0 else 0.0
-        self._on_masses("correct", self._number(share), self.p, session.v)
-        self._on_masses("correct", self._number(-share), self.q, self.r)
+        fraction = self._dot(self.p, self.r) / curvature if curvature > 0.0 else 0.0
+        self._on_masses("correct", self._number(fraction), self.p, session.v)
+        self._on_masses("correct", self._number(-fraction), self.q, self.r)
         return 0.0
 
     def _advance(self, lost: float) -> bool:
@@ -322,10 +322,10 @@ class ImplicitSteps:
         self._on_lists("weigh", *moving, self.node_vector)
         dissipated, linear, square = self.vectors.of(self.node_vector)
         allowed = max(float(dissipated) + lost, 0.0)
-        share = 1.0
+        fraction = 1.0
         if linear + square > allowed:
             root = np.sqrt(linear * linear + 4.0 * square * allowed)  # linear s + square s^2 = allowed
-            share = 2.0 * allowed / (linear + root) if linear + root > 0.0 else 0.0
-        self._on_lists("extend", session.x, session.v, step, self._number(share), session.y, self.lengths)
+            fraction = 2.0 * allowed / (linear + root) if linear + root > 0.0 else 0.0
+        self._on_lists("extend", session.x, session.v, step, self._number(fraction), session.y, self.lengths)
         self._on_masses("shift", step, session.v, session.count, session.x)
         return bool(linear + square > allowed)

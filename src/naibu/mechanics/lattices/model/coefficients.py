@@ -11,11 +11,11 @@ from naibu.mechanics.lattices.model.lattice import LatticeParameters
 def explicit_coefficients(parameters: LatticeParameters) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return A, B, D, G of every element: tension ``A l' + B y`` and ``y' = D l' - G y`` of the extension y = Z - a L."""
     k, c1, c2 = parameters.stiffness, parameters.voigt_damping, parameters.series_damping
-    share = series_share(parameters)
-    return c1 * share, k * share, share, k / (c1 + c2)
+    fraction = series_fraction(parameters)
+    return c1 * fraction, k * fraction, fraction, k / (c1 + c2)
 
 
-def series_share(parameters: LatticeParameters) -> FloatArray:
+def series_fraction(parameters: LatticeParameters) -> FloatArray:
     """Return C2 / (C1 + C2) of every element, also where C2 is infinite."""
     return 1.0 / (1.0 + parameters.voigt_damping / parameters.series_damping)
 
@@ -27,11 +27,11 @@ def implicit_coefficients(parameters: LatticeParameters, step: float) -> tuple[F
     negative for every K, C1 >= 0 and C2 > 0.
     """
     k, c1, c2 = parameters.stiffness, parameters.voigt_damping, parameters.series_damping
-    share = series_share(parameters)
+    fraction = series_fraction(parameters)
     x = k * step / (c1 + c2)
     decay = np.exp(-x)
     first, second = _exponential_means(x)
-    return (c1 * share + share**2 * k * step * second) / step, k * share * first, decay, share * first
+    return (c1 * fraction + fraction**2 * k * step * second) / step, k * fraction * first, decay, fraction * first
 
 
 def _exponential_means(x: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -17,7 +17,7 @@ from naibu.core.arrays import BoolArray, FloatArray, IntArray
 
 _OCTANTS = np.array(list(np.ndindex(2, 2, 2)))
 _FACES = np.array([(-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1)])
-_SHARES = np.array([0.25, 0.5, 1.0])  # of an edge, a face diagonal and a space diagonal that belongs to one voxel
+_FRACTIONS = np.array([0.25, 0.5, 1.0])  # of an edge, a face diagonal and a space diagonal that belongs to one voxel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,10 +97,10 @@ def energy_factors(grid: OctreeGrid) -> FloatArray:
     """
     first, second = np.triu_indices(8, 1)
     offset = _OCTANTS[second] - _OCTANTS[first]
-    share = _SHARES[np.count_nonzero(offset, axis=1) - 1]
+    fraction = _FRACTIONS[np.count_nonzero(offset, axis=1) - 1]
     begin = grid.cubes[:, None, :] + grid.sizes[:, None, None] * _OCTANTS[first]
     exposed = _exposed_parts(grid)
-    factors = np.outer(grid.sizes.astype(float), share)
+    factors = np.outer(grid.sizes.astype(float), fraction)
     for face, part in zip(_FACES, exposed, strict=True):
         axis, side = int(np.flatnonzero(face)[0]), int(face.sum() > 0)
         on_face = (offset[:, axis] == 0) & (_OCTANTS[first][:, axis] == side)

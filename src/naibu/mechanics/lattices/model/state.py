@@ -75,10 +75,10 @@ class ConstrainedNodes:
     def of(cls, nodes: ArrayLike, body: int = 0, *, axes: Sequence[int] = (0, 1, 2), weight: ArrayLike = 1.0) -> ConstrainedNodes:
         """Constrain nodes along axes of the frame by a body, with a weight, or one a node."""
         chosen = np.atleast_1d(np.asarray(nodes, dtype=np.int64))
-        share = np.broadcast_to(np.asarray(weight, dtype=float), chosen.shape)
+        fraction = np.broadcast_to(np.asarray(weight, dtype=float), chosen.shape)
         k = len(axes)
         return cls(
-            np.repeat(chosen, k), np.tile(np.eye(3)[list(axes)], (len(chosen), 1)), np.repeat(share, k), np.full(k * len(chosen), body)
+            np.repeat(chosen, k), np.tile(np.eye(3)[list(axes)], (len(chosen), 1)), np.repeat(fraction, k), np.full(k * len(chosen), body)
         )
 
     def __add__(self, other: ConstrainedNodes) -> ConstrainedNodes:

@@ -142,7 +142,7 @@ class StudyState:
         Nodes, elements and contacts.
     speed : float
         Of the driven body, mm/s.
-    places : ndarray, shape (bodies, 3)
+    positions : ndarray, shape (bodies, 3)
         Centres of the bodies, mm.
     work : ndarray, shape (bodies,)
         Work of the bodies on the object since the start, mN mm.
@@ -155,7 +155,7 @@ class StudyState:
     frame: int
     lattice: LatticeState
     speed: float
-    places: FloatArray
+    positions: FloatArray
     work: FloatArray
     external_work: float
     unsettled: int
@@ -252,8 +252,8 @@ def begin_study(study: LatticeStudy) -> StudyState:
     state = LatticeState(study.lattice.points.copy(), np.zeros_like(study.lattice.points), np.zeros(study.lattice.n_elements))
     if not study.tied:
         state = replace(state, contact=begin_contact(study.lattice, indenters))
-    places = np.array([p.centre for p in indenters], dtype=float).reshape(-1, 3)
-    return StudyState(0, state, 0.0, places, np.zeros(len(indenters)), 0.0, 0)
+    positions = np.array([p.centre for p in indenters], dtype=float).reshape(-1, 3)
+    return StudyState(0, state, 0.0, positions, np.zeros(len(indenters)), 0.0, 0)
 
 
 def run_study(study: LatticeStudy, start: StudyState | None = None, *, device: str = "cpu") -> Iterator[StudyFrame]:
@@ -352,8 +352,8 @@ class _Tied:
         lattice = self.session.state()
         moved = [body.moved(np.array([study.step_s * last]))[0] + body.indenter.centre for body in study.bodies]
         external = state.external_work + _external_work(study, state.lattice, lattice)
-        places = np.array(moved).reshape(-1, 3)
-        return StudyState(state.frame, lattice, 0.0, places, work, external, 0), impulse / study.sample_s
+        positions = np.array(moved).reshape(-1, 3)
+        return StudyState(state.frame, lattice, 0.0, positions, work, external, 0), impulse / study.sample_s
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -46,14 +46,14 @@ class Loads:
     ----------
     node : ndarray, shape (k,), int64
         Nodes.
-    share : ndarray, shape (k,)
+    fraction : ndarray, shape (k,)
         Part of the body's force that each one takes; they sum to one for each body.
     body : ndarray, shape (k,), int64
         Number of the body.
     """
 
     node: IntArray
-    share: FloatArray
+    fraction: FloatArray
     body: IntArray
 
     @classmethod
@@ -163,7 +163,7 @@ def driven_steps(
     reaction, reaction_change = np.zeros(path.shape), np.zeros((len(changes), *path.shape))
     with engine.scratch() as (work, inner):
         _driven_steps(
-            blocks, own, rows, tables, (x, v, y, lengths), tangents, engine.mass, (loads.node, loads.share, loads.body), pushed, work,
+            blocks, own, rows, tables, (x, v, y, lengths), tangents, engine.mass, (loads.node, loads.fraction, loads.body), pushed, work,
             inner, (constrained.node, constrained.direction, constrained.weight, constrained.body), path, engine.step,
             (engine.tolerance, engine.tolerance if tolerance is None else tolerance, 20_000), reaction, reaction_change,
         )  # fmt: skip
@@ -267,12 +267,12 @@ def _changed_extension(first, second, rows, gain, changed, change, lengths, x, x
 @njit(cache=True)
 def _answer(loads, force, v, before, mass, step, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add to `reaction` (bodies, 3) the force of bodies less the inertia of the nodes that share it."""
-    node, share, body = loads
+    node, fraction, body = loads
     pad = len(mass)
     for k in range(len(node)):
         for a in range(3):
             at = a * pad + node[k]
-            reaction[body[k], a] += share[k] * force[body[k], a] - mass[node[k]] * (v[at] - before[at]) / step
+            reaction[body[k], a] += fraction[k] * force[body[k], a] - mass[node[k]] * (v[at] - before[at]) / step
 
 
 @njit(cache=True, nogil=True)
@@ -300,7 +300,7 @@ def _driven_steps(  # type: ignore[no-untyped-def]  # pragma: no cover
     xd, vd, yd = tangents
     first, second, rows = blocks
     axes, r, aside, q = work
-    node, share, body = loads
+    node, fraction, body = loads
     own = (tables[1], tables[2], tables[3], tables[5])
     constrained_node, direction, weight, constrained_by = constrained
     speed, weightless = np.zeros(len(constrained_node)), np.zeros_like(force[0])
@@ -316,7 +316,7 @@ def _driven_steps(  # type: ignore[no-untyped-def]  # pragma: no cover
         right[:] = 0
         for k in range(len(node)):
             for a in range(3):
-                right[a * pad + node[k]] += step * share[k] * force[n, body[k], a]
+                right[a * pad + node[k]] += step * fraction[k] * force[n, body[k], a]
         add_momenta(mass, v, 1.0, right)
         for h in range(len(constrained_node)):
             speed[h] = weight[h] * (direction[h] * velocity[n, constrained_by[h]]).sum()
