@@ -1,11 +1,11 @@
-"""Moduli from displacement fields with default settings, beside what was asked of them: ``python benchmarks/field_identification.py``.
+"""Moduli from displacement fields with default settings, beside their goals: ``python benchmarks/field_identification.py``.
 
-    python benchmarks/field_identification.py elements regions unseen      # the cube of the report's chapter 3; some ten minutes
+    python benchmarks/field_identification.py elements regions unseen      # the cube of chapter 3 of Hirai et al. (2008); some ten minutes
     python benchmarks/field_identification.py inclusion                    # 24 000 unknown tetrahedra, two minutes
     python benchmarks/field_identification.py large                        # 100 000 unknown tetrahedra
     python benchmarks/field_identification.py --seeds 5 --repetitions 20   # shorter
 
-Noise is normal, independent at every point, and given as a share of the largest displacement of its trial. `elements`, `regions` and
+Noise is normal, independent at every point, and given as a fraction of the largest displacement of its load case. `elements`, `regions` and
 `unseen` measure the nodes of the mesh that made the data, as the report does; `inclusion` and `large` measure a grid of points in a body
 that was solved on a finer mesh. Every row ends with the goal and whether it was met.
 """
@@ -45,7 +45,7 @@ TRUTH = np.array(list(LAYERS.values()))  # Young's modulus, kPa, and Poisson's r
 
 
 def noisy(body: PushedBody, states: Sequence[Array], noise: float, seed: int) -> list[FieldLoadCase]:
-    """Trials measured at the nodes; without noise they are called exact."""
+    """Load cases measured at the nodes; without noise they are treated as exact."""
     rng = np.random.default_rng(seed)
     out = []
     for k, u in enumerate(states):
@@ -76,7 +76,7 @@ def row(text: str, met: bool | None) -> None:
 
 
 def elements(seeds: int, repetitions: int) -> None:
-    """A pair of moduli for each of the 192 lower elements, nothing told of the layers."""
+    """A pair of moduli for each of the 192 lower elements, without knowledge of the layers."""
     print("\n(a) a pair of moduli an element, layers unknown; medians over elements, then over seeds")
     print("trials  noise     E, %        nu         told the layers     under TV: E, %    regions   goal")
     goals = {(1, 0.0): (1e-6, np.inf), (1, 1e-3): (3e-3, 5e-4), (1, 1e-2): (3e-2, 5e-3), (4, 1e-3): (3e-3, 5e-4), (4, 1e-2): (3e-2, 5e-3)}

@@ -1,8 +1,8 @@
-"""How near any smooth model could come to the markers: ``python benchmarks/noise_floor.py MODEL_FOLDER_OF_NAIBU_DEMO``.
+"""How close any smooth model could come to the markers: ``python benchmarks/noise_floor.py MODEL_FOLDER_OF_NAIBU_DEMO``.
 
-To the residuals of the calibrated model (``residuals.csv``) a polynomial in the free positions is added, of growing degree. What remains,
-with the degrees of freedom counted, falls towards the noise of placing and reading the markers; what the same polynomial does for markers
-left out of its fit tells from where on it follows noise.
+A polynomial of increasing degree in the reference positions is added to the residuals of the calibrated model (``residuals.csv``). What
+remains, with the degrees of freedom counted, approaches the noise of placing and reading the markers; the residual of markers left out of
+the fit shows from which degree on it follows noise.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ DEGREES = (0, 1, 2, 3)
 
 
 def residuals(path: Path) -> dict[str, dict[int, np.ndarray]]:
-    """Residuals (3,), mm, by trial and marker."""
+    """Residuals (3,), mm, by load case and marker."""
     out: dict[str, dict[int, np.ndarray]] = {}
     with path.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
@@ -41,7 +41,7 @@ def smoothed(points: np.ndarray, residual: np.ndarray, degree: int) -> tuple[flo
 
 
 def main() -> None:
-    """Print one line for each trial and degree."""
+    """Print one line for each load case and degree."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path, help="of results, with residuals.csv")
     for label, rows in residuals(parser.parse_args().folder / "residuals.csv").items():
