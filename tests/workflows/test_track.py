@@ -27,10 +27,10 @@ def beads(where: np.ndarray, seed: int) -> Volume:
     """Bright beads, blurred by a voxel, in a noisy body."""
     frame = Volume.from_array(np.zeros((28, 44, 44)), spacing_mm=(0.9, 0.9, 1.0))
     x = positions(frame)
-    grey = 100.0 + np.random.default_rng(seed).normal(0.0, 8.0, frame.shape)
+    intensity = 100.0 + np.random.default_rng(seed).normal(0.0, 8.0, frame.shape)
     for p in where:
-        grey += 250.0 / (1.0 + np.exp((np.linalg.norm(x - p, axis=-1) - 0.5 * DIAMETER) / 0.35))
-    return frame.with_values(grey)
+        intensity += 250.0 / (1.0 + np.exp((np.linalg.norm(x - p, axis=-1) - 0.5 * DIAMETER) / 0.35))
+    return frame.with_values(intensity)
 
 
 @pytest.fixture(scope="module")

@@ -252,8 +252,8 @@ def test_the_verb_does_what_the_function_does(
     options = ("--pixel-mm", PIXEL_MM, "--diameter-mm", 2.5, "--frame-rate-hz", RATE_HZ, "--count", 5, "--polarity", "bright")
     region = ("--region-mm", *BELOW_GHOSTS)
     assert run_verb(monkeypatch, cine.path, *options, *region, "--out", tmp_path / "verb") == 0
-    told = capsys.readouterr().out
-    assert "tracks.csv" in told and "tracks.html" in told
+    message = capsys.readouterr().out
+    assert "tracks.csv" in message and "tracks.html" in message
     run = track_sequence_file(
         cine.path, out=tmp_path / "function", pixel_mm=PIXEL_MM, diameter_mm=2.5, frame_rate_hz=RATE_HZ, region_mm=BELOW_GHOSTS, count=5
     )

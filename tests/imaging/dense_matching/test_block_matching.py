@@ -96,14 +96,14 @@ def test_correlation_is_blind_to_gain_and_offset() -> None:
 
 def test_blocks_without_contrast_are_not_measured() -> None:
     frame = grid((6, 20, 24))
-    grey = texture()(positions(frame))
-    grey[:, :, :12] = 80.0
-    volume = frame.with_values(grey)
+    intensity = texture()(positions(frame))
+    intensity[:, :, :12] = 80.0
+    volume = frame.with_values(intensity)
     found = block_matching(volume, volume, search=(2, 2, 1), least_range=1.0)
     assert not found.valid[:, :, :11].any() and np.isnan(found.vectors[:, :, :11]).all()
     zero = block_matching(volume, volume, search=(2, 2, 1), least_range=1.0, unmeasured="zero")
     assert (zero.vectors[:, :, :11] == 0.0).all() and not zero.valid[:, :, :11].any()
-    block = grey[1:4, 4:7, 13:16]
+    block = intensity[1:4, 4:7, 13:16]
     assert intensity_range(volume, (3, 3, 3))[2, 5, 14] == pytest.approx(np.ptp(block))
     with pytest.raises(InputError, match="lower least_range"):
         block_matching(volume, volume, least_range=1e6)
@@ -136,16 +136,16 @@ def test_bad_pairs_and_sizes_are_refused() -> None:
     volume = frame.with_values(texture()(positions(frame)))
     shifted = Volume.from_array(volume.values, spacing_mm=(1, 1, 1), origin_mm=(1, 0, 0))
     tenth = Volume.from_array(volume.values, spacing_mm=(0.1, 0.1, 0.1), origin_mm=volume.origin_mm)
-    for other, told in (
+    for other, message in (
         (shifted, "different grids"),
         (tenth, "other units"),
         (frame, "constant"),
         (frame.with_values(np.full(frame.shape, np.nan)), "do not overlap"),
         (frame.with_values(np.where(volume.values > 150, np.inf, volume.values)), "infinite"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             block_matching(volume, other)
-    for options, told in (
+    for options, message in (
         ({"block": (4, 3, 3)}, "block must be odd"),
         ({"block": (3, 3)}, "three whole numbers"),
         ({"search": (-1, 0, 0)}, "at least 0"),
@@ -153,5 +153,5 @@ def test_bad_pairs_and_sizes_are_refused() -> None:
         ({"measure": "best"}, "measure must be"),
         ({"mask": np.zeros(frame.shape)}, "empty"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             block_matching(volume, volume, **options)

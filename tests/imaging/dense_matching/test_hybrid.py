@@ -19,7 +19,7 @@ def motion(x: np.ndarray) -> np.ndarray:
 
 
 def ranges(volume: Volume, half: tuple[int, int, int]) -> np.ndarray:
-    """Return the grey range of the block about every voxel, in the order z, y, x, voxel by voxel."""
+    """Return the intensity range of the block about every voxel, in the order z, y, x, voxel by voxel."""
     v = volume.values
     out = np.empty(v.shape)
     for index in np.ndindex(v.shape):
@@ -65,12 +65,12 @@ def test_each_method_fails_where_the_other_helps() -> None:
     shift = np.array([4.0, -2.0, 0.0])
     fine, faint = texture(4, (3.0, 6.0)), texture(5, (14.0, 30.0))
 
-    def grey(p: np.ndarray) -> np.ndarray:
+    def intensity(p: np.ndarray) -> np.ndarray:
         textured = p[..., 0] < 43.0
         return np.where(textured, fine(p), 100.0 + 0.08 * (faint(p) - 100.0))
 
     rng = np.random.default_rng(0)
-    before, after = (frame.with_values(grey(p) + 0.4 * rng.standard_normal(frame.shape)) for p in (x, x - shift))
+    before, after = (frame.with_values(intensity(p) + 0.4 * rng.standard_normal(frame.shape)) for p in (x, x - shift))
     start = {"data_weight": 0.2, "full_scale": 40.0}
     options = {"block": (5, 5, 1), "search": (6, 6, 0), "least_range": 20.0}
     hybrid = hybrid_flow(before, after, **options, **start)

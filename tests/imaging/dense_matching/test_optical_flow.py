@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -9,6 +11,7 @@ from scenes import grid, inner, pair, texture
 from scipy.sparse.linalg import spsolve
 
 from naibu.core.errors import InputError
+from naibu.core.progress import ProgressReport
 from naibu.core.rigid_transform import rotation_matrix
 from naibu.core.volume import Volume
 from naibu.imaging.dense_matching.optical_flow import AS_REPORTED, horn_schunck, lucas_kanade
@@ -22,10 +25,10 @@ def wave(frame: Volume, shift: Array, length_mm: float = 36.0) -> tuple[Volume, 
     x = positions(frame)
     axes = [a for a in range(3) if frame.shape[2 - a] > 1]
 
-    def grey(p: Array) -> Array:
+    def intensity(p: Array) -> Array:
         return 100.0 + sum(25.0 * np.sin(2 * np.pi * p[..., a] / length_mm + a) for a in axes)
 
-    return frame.with_values(grey(x)), frame.with_values(grey(x - shift))
+    return frame.with_values(intensity(x)), frame.with_values(intensity(x - shift))
 
 
 @pytest.mark.parametrize("shape", [(16, 20, 24), (1, 36, 40)])
@@ -136,7 +139,7 @@ def test_windows_on_one_edge_are_not_valid() -> None:
 def test_bad_options_are_refused() -> None:
     frame = grid((6, 14, 16))
     volume = frame.with_values(texture()(positions(frame)))
-    for solve, options, told in (
+    for solve, options, message in (
         (horn_schunck, {"iterations": 0}, "iterations must be 1"),
         (horn_schunck, {"data_weight": 0.0}, "positive"),
         (lucas_kanade, {"window": (4, 3, 3)}, "odd"),
@@ -146,7 +149,17 @@ def test_bad_options_are_refused() -> None:
         (horn_schunck, {"start": np.zeros((2, 2, 2, 3))}, "must have shape"),
         (horn_schunck, {"mask": np.zeros(frame.shape)}, "empty"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             solve(volume, volume, **options)
     with pytest.raises(InputError, match="constant"):
         horn_schunck(volume, frame)
+
+
+@pytest.mark.parametrize("solve", [horn_schunck, lucas_kanade])
+def test_every_grid_is_reported(solve: Callable[..., object]) -> None:
+    frame = grid((12, 40, 40))
+    volume = frame.with_values(texture()(positions(frame)))
+    reports: list[ProgressReport] = []
+    solve(volume, volume, levels=2, progress=reports.append)
+    assert [(r.done, r.total) for r in reports] == [(0, 2), (1, 2), (2, 2)]
+    assert len({r.stage for r in reports}) == 1

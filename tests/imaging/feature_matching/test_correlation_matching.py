@@ -53,10 +53,10 @@ def test_scores_are_those_of_numpy(shape: tuple[int, int, int]) -> None:
 def test_turned_boxes_match_what_was_turned() -> None:
     frame = grid((24, 40, 40), (1.0, 1.0, 1.2))
     motion = RigidTransform.of(rotation_matrix(np.array([0.05, -0.1, 0.5])), [2.0, -3.0, 1.0])
-    grey, x = texture(1, (5.0, 12.0)), positions(frame)
+    intensity, x = texture(1, (5.0, 12.0)), positions(frame)
     about = frame.to_physical([20, 20, 12])
     motion = RigidTransform.of(motion.rotation, motion.translation + about - motion.rotation @ about)
-    before, after = frame.with_values(grey(x)), frame.with_values(grey(motion.inverse().applied(x)))
+    before, after = frame.with_values(intensity(x)), frame.with_values(intensity(motion.inverse().applied(x)))
     points = frame.to_physical(np.array([20, 20, 12]) + RNG.integers(-5, 6, (10, 3)))
     options = {"rigid": motion, "least_score": -1.0, "search": (1, 1, 1)}
     turned = candidate_matches(before, after, points, motion.applied(points), turned_boxes=True, **options)

@@ -56,11 +56,11 @@ def test_the_response_is_that_of_the_formula() -> None:
 
 
 def test_voxels_of_any_shape_give_the_same_response() -> None:
-    grey = texture(2, (8.0, 16.0))
+    intensity = texture(2, (8.0, 16.0))
     options = {"gradient_sigma_mm": 1.5, "window_sigma_mm": 3.0}
     fine = Volume.from_array(np.zeros((40, 40, 40)), spacing_mm=(1.0, 1.0, 1.0))
     thick = Volume.from_array(np.zeros((20, 40, 40)), spacing_mm=(1.0, 1.0, 2.0))
-    a, b = (harris_response(v.with_values(grey(positions(v))), **options) for v in (fine, thick))
+    a, b = (harris_response(v.with_values(intensity(positions(v))), **options) for v in (fine, thick))
     inside = inner((20, 40, 40), 5)
     relative = np.abs(a[::2][inside] - b[inside]).max() / a[::2][inside].max()
     assert relative < 0.15

@@ -154,7 +154,7 @@ def test_false_matches_are_removed_while_the_energy_grows(kind: str, dimension: 
     wrong_before = (c.pairs[by_score, 0] != c.pairs[by_score, 1]).sum()
     wrong = (found.pairs[:, 0] != found.pairs[:, 1]).sum()
     assert wrong_before > 0.3 * len(by_score)
-    # grey residuals tell what the correlation has told already: the report finds this strength the weakest
+    # intensity residuals repeat the information of the correlation: the report finds this strength the weakest
     assert wrong < (0.4 if kind == "residual" else 0.2) * wrong_before
     assert len(found) == len(c.reference_mm)
     assert len(found.energies) > 2 and (np.diff(found.energies) >= 0.0).all()

@@ -91,10 +91,10 @@ def test_thin_washers_in_thick_slices_have_honest_heights() -> None:
     y, x = np.arange(85) * 0.4, np.arange(85) * 0.4
     z = np.arange(20.0)
     for c in centres:
-        share = np.clip(np.minimum(z + 0.5, c[2] + 0.5 * thick) - np.maximum(z - 0.5, c[2] - 0.5 * thick), 0.0, None)
+        fraction = np.clip(np.minimum(z + 0.5, c[2] + 0.5 * thick) - np.maximum(z - 0.5, c[2] - 0.5 * thick), 0.0, None)
         r = np.hypot(y[:, None] - c[1], x - c[0])
         disc = 1.0 / (1.0 + np.exp((r - 0.5 * diameter) / 0.1))
-        values += 2500.0 * share[:, None, None] * disc
+        values += 2500.0 * fraction[:, None, None] * disc
     volume = Volume.from_array(values + 20.0 * rng.standard_normal(values.shape), spacing_mm=spacing)
     found = detect_markers(volume, diameter_mm=diameter, thickness_mm=thick)
     misses(found, centres, reach=0.6)

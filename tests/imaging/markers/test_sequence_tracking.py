@@ -1,4 +1,4 @@
-"""Marker tracking in sequences of ultrasound images: through gaps, and told from ghosts."""
+"""Marker tracking in sequences of ultrasound images: through gaps, with ghosts rejected."""
 
 from __future__ import annotations
 

@@ -100,7 +100,7 @@ def test_a_washer_keeps_its_volume_and_its_place_however_it_lies(place: tuple[fl
 
 
 def test_a_voxel_is_the_mean_of_what_lies_in_it() -> None:
-    """A face that cuts voxels: their grey value is the share below it."""
+    """A face that cuts voxels: their intensity is the fraction below it."""
     for level in (0.25, 0.5, 0.75):
         body = VirtualObject.of(lambda x, level=level: np.where(x[:, 2] < 3.0 - 0.5 + level, GEL, 0.0), np.zeros((0, 3)), BALL)
         found = scan(body, Still(), empty_grid([0, 0, 0], [4, 4, 6], 1.0), CLEAN_CT, seed=0, samples=4).volume.values
@@ -332,7 +332,7 @@ def test_lost_markers_are_not_scanned() -> None:
 def test_nonsense_is_refused() -> None:
     grid = empty_grid([0, 0, 0], [4, 4, 4], 1.0)
     body = VirtualObject.of(uniform(), [[1.0, 1, 1]], BALL)
-    for work, told in (
+    for work, message in (
         (lambda: MarkerKind(0.0), "positive diameter"),
         (lambda: MarkerKind(2.0, 0.3, 2.5), "larger than its hole"),
         (lambda: VirtualObject.of(uniform(), [[np.nan, 0, 0]], BALL), "finite positions"),
@@ -346,5 +346,5 @@ def test_nonsense_is_refused() -> None:
         (lambda: streaks(np.ones((1, 3, 3), dtype=np.float32), np.ones(3), 0.1, views=1), "views"),
         (lambda: rescanned(datasets.load("us_agar")), "complete markers"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             work()

@@ -108,7 +108,7 @@ def test_ghosts_stand_where_they_are_sent_and_are_no_markers() -> None:
     assert len(found.markers) == 1
 
 
-def test_amplitudes_are_compressed_to_grey_levels() -> None:
+def test_amplitudes_are_compressed_to_intensity_levels() -> None:
     device = UltrasoundDevice(noise=0.0, range_db=40.0, white=30.0)
     quiet = Scatterers.drawn(even(1e-9), [0, 0, -1], [20, 20, 1], per_mm3=1.0, seed=0)
     markers = VirtualObject.of(even(), [[10.0, 14.0, 0.0]], BEAD)
@@ -153,11 +153,11 @@ def test_volumes_of_ultrasound_have_three_axes_of_speckle() -> None:
 
 
 def test_nonsense_is_refused() -> None:
-    for work, told in (
+    for work, message in (
         (lambda: UltrasoundDevice(frequency_mhz=0.0), "positive numbers"),
         (lambda: UltrasoundDevice(beam=3), "axis 0, 1 or 2"),
         (lambda: Scatterers.drawn(even(), [0, 0, 0], [1, 1, -1], per_mm3=1.0, seed=0), "low < high"),
         (lambda: Scatterers.drawn(even(0.0), [0, 0, 0], [9, 9, 9], per_mm3=1.0, seed=0), "no scatterer"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             work()

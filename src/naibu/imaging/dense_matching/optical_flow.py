@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import BoolArray, Float32Array, IntArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
+from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
 from naibu.imaging.dense_matching._optical_flow_kernels import horn_schunck_step, linearize, lucas_kanade_step
 from naibu.imaging.preprocessing._filter_kernels import median, products
@@ -47,6 +48,7 @@ def horn_schunck(
     accelerated: bool = True,
     mask: ArrayLike | None = None,
     start: ArrayLike | None = None,
+    progress: Progress | None = None,
 ) -> DisplacementField:
     """Return the displacement by Horn-Schunck optical flow: brightness constancy with a smoothness penalty :cite:p:`horn1981`.
 
@@ -74,6 +76,8 @@ def horn_schunck(
         Voxels of the reference whose intensities count; the field is continued smoothly outside.
     start : array_like, shape (nz, ny, nx, 3), optional
         Initial displacement, mm; zero by default.
+    progress : callable, optional
+        Called with a `naibu.core.progress.ProgressReport` before every grid, and at the end.
 
     Returns
     -------
@@ -103,12 +107,14 @@ def horn_schunck(
     grids = pyramid(a, b, wanted, reference.spacing_mm, levels)
     u = _start(start, reference, grids)
     for number, grid in enumerate(grids):
+        report_progress(progress, "optical flow (Horn-Schunck)", done=number, total=len(grids))
         with _threads_worth(grid):
             if number:
                 u = refined(u, grids[number - 1], grid)
             for _ in range(warps):
                 u = _relaxed(u, grid, weight, iterations, accelerated)
                 u = _median(u) if median_filter else u
+    report_progress(progress, "optical flow (Horn-Schunck)", done=len(grids), total=len(grids))
     return _result(u, reference, a, b, wanted)
 
 
@@ -124,6 +130,7 @@ def lucas_kanade(
     median_filter: bool = True,
     mask: ArrayLike | None = None,
     start: ArrayLike | None = None,
+    progress: Progress | None = None,
 ) -> DisplacementField:
     """Return the displacement by Lucas-Kanade optical flow: least squares in a window about every voxel :cite:p:`lucas1981`.
 
@@ -150,6 +157,8 @@ def lucas_kanade(
         Voxels of the reference whose intensities count.
     start : array_like, shape (nz, ny, nx, 3), optional
         Initial displacement, mm; zero by default.
+    progress : callable, optional
+        Called with a `naibu.core.progress.ProgressReport` before every grid, and at the end.
 
     Returns
     -------
@@ -173,6 +182,7 @@ def lucas_kanade(
     u = _start(start, reference, grids)
     eigenvalue = np.zeros(reference.shape, dtype=np.float32)
     for number, grid in enumerate(grids):
+        report_progress(progress, "optical flow (Lucas-Kanade)", done=number, total=len(grids))
         with _threads_worth(grid):
             if number:
                 u = refined(u, grids[number - 1], grid)
@@ -180,6 +190,7 @@ def lucas_kanade(
             for _ in range(warps):
                 _solve_windows(u, grid, size // 2, least_eigenvalue, damping, eigenvalue)
                 u = _median(u) if median_filter else u
+    report_progress(progress, "optical flow (Lucas-Kanade)", done=len(grids), total=len(grids))
     found = _result(u, reference, a, b, wanted)
     # a window with gradients along one direction only has an eigenvalue of rounding error
     fixed = eigenvalue > max(least_eigenvalue, 1e-6 * float(eigenvalue.max()))

@@ -1,4 +1,4 @@
-"""Marker tracking in image sequences such as B-mode ultrasound :cite:p:`hirai2008` (chapter 2.2): through gaps, and told from ghosts.
+"""Marker tracking in image sequences such as B-mode ultrasound :cite:p:`hirai2008` (chapter 2.2): through gaps, with ghosts rejected.
 
 Detect-and-link tracking as of particles :cite:p:`crocker1996`, with the links found over all frames at once by dynamic programming
 (`naibu.imaging.markers.sequence_paths`): a marker may be unseen for many frames. Tracks that are weak, short, or a weaker copy of another
