@@ -1,5 +1,6 @@
-"""Coarse functions that help the implicit solver of a lattice: what neighbours pass on slowly, they see at once.
+"""Coarse space of a two-level preconditioner for the implicit solver of a lattice :cite:p:`toselli2005`.
 
+Neighbours pass a residual on slowly; coarse functions spread it over the lattice at once.
 Hat functions of a grid over the lattice at rest, linear in x, y and z, take the residual of the nodes to few coarse nodes, where a small
 matrix is inverted, and its solution back. The matrix is that of the lattice at rest, in which components that are constrained count as if
 their nodes hung on springs as stiff as all their elements. It is only a preconditioner: where the lattice has turned or is constrained

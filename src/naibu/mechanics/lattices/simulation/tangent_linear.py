@@ -303,12 +303,9 @@ def _driven_steps(  # type: ignore[no-untyped-def]  # pragma: no cover
     node, fraction, body = loads
     own = (tables[1], tables[2], tables[3], tables[5])
     constrained_node, direction, weight, constrained_by = constrained
-    speed, weightless = np.zeros(len(constrained_node)), np.zeros_like(force[0])
-    now, still, pad = (
-        (constrained_node, direction, speed, constrained_by),
-        (constrained_node, direction, np.zeros(len(constrained_node)), constrained_by),
-        len(mass),
-    )
+    speed, at_rest, weightless = np.zeros(len(constrained_node)), np.zeros(len(constrained_node)), np.zeros_like(force[0])
+    now, still = (constrained_node, direction, speed, constrained_by), (constrained_node, direction, at_rest, constrained_by)
+    pad = len(mass)
     right, before, old_lengths = np.zeros_like(x), np.zeros_like(x), np.zeros_like(lengths)
     begin_with(inner, now)
     for n in range(len(velocity)):
