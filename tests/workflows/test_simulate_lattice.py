@@ -20,6 +20,7 @@ from lattice_studies import STUDY, study_file
 
 from naibu import cli
 from naibu.core.errors import ConvergenceError, InputError
+from naibu.core.progress import ProgressReport
 from naibu.core.rigid_transform import rotation_matrix
 from naibu.core.volume import Volume
 from naibu.io.images import write_volume
@@ -34,11 +35,11 @@ FRAMES = 10
 def run_until(path: Path, out: Path, frame: int | None = None, **options: bool) -> object:
     """Run a study, and interrupt it when a frame is kept."""
 
-    def tell(done: int, of: int) -> None:
-        if done == frame and of == FRAMES:
+    def progress(report: ProgressReport) -> None:
+        if report.done == frame and report.total == FRAMES:
             raise KeyboardInterrupt
 
-    return simulate_lattice(path, out, tell=tell, **options)
+    return simulate_lattice(path, out, progress=progress, **options)
 
 
 def series_of(path: Path) -> dict[str, np.ndarray]:

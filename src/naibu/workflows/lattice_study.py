@@ -44,7 +44,7 @@ _MOST_CELLS = 20_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PreparedStudy:
-    """A study with what its files are made from.
+    """A study prepared to run: settings, lattice, mesh and provenance.
 
     Attributes
     ----------
@@ -224,7 +224,7 @@ def _lattice(path: Path, settings: StudyFile, mask: BoolArray, frame: RigidTrans
 
 
 def class_ratios(stiffness: float | Mapping[str, Any]) -> tuple[float, ...]:
-    """Return what the factors of an octree need to know of K: those of short, normal and long elements, of the core where zones differ.
+    """Return the ratios of K that the factors of an octree depend on: short, normal and long, of the core where zones differ.
 
     Where they are alike, or one is 0, the factors are those of equal ones.
     """

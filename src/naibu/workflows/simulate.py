@@ -7,7 +7,7 @@ import tomllib
 from dataclasses import dataclass
 
 from naibu.core.errors import InputError
-from naibu.core.progress import Progress, report_progress
+from naibu.core.progress import Progress
 from naibu.workflows.lattice_study import NAMED, study_text
 from naibu.workflows.simulate_lattice import SimulationRun, simulate_lattice
 from naibu.workflows.simulate_study import SLUGS, SQUARES_TOGETHER, simulate_study
@@ -81,12 +81,9 @@ def simulate(
         An explicit method became unstable; the frames before are kept.
     """
 
-    def tell(done: int, of: int) -> None:
-        report_progress(progress, f"simulate {name}", done=done, total=of)
-
     name = os.fspath(study)
     if name != SQUARES_TOGETHER and name not in SLUGS:
-        return simulate_lattice(study, out, resume=resume, device=device, tell=tell)
+        return simulate_lattice(study, out, resume=resume, device=device, progress=progress)
     if resume:
         raise InputError(f"{name} takes seconds and keeps nothing to resume from; run it without `resume`")
     if device != "cpu":

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import numpy as np
 from naibu._version import __version__
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
+from naibu.core.progress import Progress, report_progress
 from naibu.io.files.atomic import write_atomically
 from naibu.io.vtkhdf_series import SeriesFile
 from naibu.mechanics.lattices.model.contact_state import ContactState
@@ -27,7 +27,6 @@ from naibu.viewer.tables import Table
 from naibu.workflows.lattice_study import PreparedStudy, prepared_study
 from naibu.workflows.result_folder import result_folder
 
-Tell = Callable[[int, int], None]
 CONTACT_ARRAYS = ("nodes", "mode", "friction", "touched", "centres", "axes")
 PAGE_BYTES = 3_000_000
 PAGE_FRAMES, PAGE_POINTS = 200, 2_000_000
@@ -57,7 +56,12 @@ class SimulationRun:
 
 
 def simulate_lattice(
-    source: str | os.PathLike[str], out: str | os.PathLike[str], *, resume: bool = False, device: str = "cpu", tell: Tell | None = None
+    source: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    resume: bool = False,
+    device: str = "cpu",
+    progress: Progress | None = None,
 ) -> SimulationRun:
     """Run a study, and write ``NAME.html``, ``NAME.vtkhdf`` and ``NAME.json``; an interruption keeps the frames computed so far.
 
@@ -73,8 +77,8 @@ def simulate_lattice(
         Whether an interrupted run goes on; the result is the same as if it had not been interrupted.
     device : str
         ``"cpu"``, ``"cuda"`` or ``"cuda:1"`` and so on (an NVIDIA GPU), or ``"warp-cpu"`` (the GPU's kernels on the processor, for tests).
-    tell : callable
-        Told the frames that are kept, and how many there will be.
+    progress : callable, optional
+        Called with a `ProgressReport` after every frame.
 
     Returns
     -------
@@ -95,7 +99,7 @@ def simulate_lattice(
     start = _read_checkpoint(checkpoint, prepared) if resume else None
     series = SeriesFile.begun(path, prepared.mesh) if start is None else SeriesFile.continued(path, prepared.mesh, start.frame + 1)
     with series:
-        state, stopped = _computed(prepared, series, start, device, tell)
+        state, stopped = _computed(prepared, series, start, device, progress)
         if state is None:
             raise stopped or KeyboardInterrupt
         series.truncate(state.frame + 1)  # what an interruption left of the next one
@@ -112,7 +116,7 @@ def simulate_lattice(
 
 
 def _computed(
-    prepared: PreparedStudy, series: SeriesFile, start: StudyState | None, device: str, tell: Tell | None
+    prepared: PreparedStudy, series: SeriesFile, start: StudyState | None, device: str, progress: Progress | None
 ) -> tuple[StudyState | None, BaseException | None]:
     """Append frames; return the last whole one, and what stopped the run before its end."""
     state = start
@@ -120,8 +124,7 @@ def _computed(
         for frame in run_study(prepared.study, start, device=device):
             _append(series, prepared, frame)
             state = frame.state
-            if tell is not None:
-                tell(state.frame, prepared.study.frames)
+            report_progress(progress, f"simulate {prepared.name}", done=state.frame, total=prepared.study.frames)
     except (KeyboardInterrupt, ConvergenceError) as error:
         return state, error
     return state, None

@@ -30,7 +30,7 @@ WORST = 1e30  # cost of parameters whose motion cannot be computed
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Searched:
-    """What a search found.
+    """Result of an evolutionary search.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class Searched:
 
 
 def cost_of(problem: CalibrationProblem, theta: FloatArray, *, measure: Measure = "report") -> float:
-    """Return what a search makes small, for logarithms theta (p,); coarse steps.
+    """Return the objective of a search, for logarithms theta (p,); coarse steps.
 
     ``"chi-squared"`` is that of `calibrate_lattice`; ``"report"`` is S_shape in units of the sensor's error, S_force too, or their sum.
     """
@@ -97,7 +97,7 @@ def _worker_cost(theta: FloatArray) -> float:
 def evaluator(
     problem: CalibrationProblem, measure: Measure = "report", *, workers: int = 1, client: Any = None
 ) -> Iterator[Callable[[Sequence[FloatArray]], list[float]]]:
-    """Give a function from many theta to their costs, by this process, by several, or by the workers of a `dask.distributed.Client`.
+    """Provide a function from many theta to their costs, by this process, by several, or by the workers of a `dask.distributed.Client`.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def search_genetic(
     workers: int = 1,
     client: Any = None,
 ) -> Searched:
-    """Search by a genetic algorithm (pymoo), the report's way, in the logarithms of the parameters.
+    """Search by a genetic algorithm (pymoo), as in the report, in the logarithms of the parameters.
 
     Parameters
     ----------

@@ -27,7 +27,7 @@ QUICK_S = 0.06  # after a change of motion, in which long steps would smear the 
 
 @dataclass(frozen=True, slots=True)
 class PushedFace:
-    """A rigid body: at rest it touches the nodes in a box, and moves with a constant velocity while it pushes.
+    """A rigid face that touches the nodes in a box at rest, and moves with a constant velocity during the push.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class PushedFace:
 
 @dataclass(frozen=True, slots=True)
 class Pushing:
-    """An operation: push, keep, release; nodes on the floor, the lowest ones, stay where they are.
+    """A loading history of push, hold and release; the lowest nodes, on the floor, are fixed.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class Pushing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
-    """What cameras and force sensors saw of a pushing.
+    """Measurements of a loading: captured surface points and forces.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ class Capture:
     def of(
         cls, pushing: Pushing, points: Sequence[ArrayLike], force: ArrayLike, lattice: Lattice, *, point_sd_mm: float, force_sd_mn: float
     ) -> Capture:
-        """Check what was captured of an object with this lattice.
+        """Return checked measurements of an object with this lattice.
 
         Raises
         ------
@@ -157,7 +157,7 @@ class Capture:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reproduced:
-    """The computed motion of a pushing.
+    """Computed response to a loading: positions and forces.
 
     Attributes
     ----------
@@ -179,7 +179,7 @@ class Reproduced:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PushedLattice:
-    """A lattice made ready to be pushed in one way, whatever its parameters.
+    """A lattice prepared for one loading, for any parameters.
 
     Attributes
     ----------
@@ -219,7 +219,7 @@ class PushedLattice:
         long_step: float | None = None,
         force: FloatArray | None = None,
     ) -> PushedLattice:
-        """Make a lattice ready.
+        """Prepare a lattice.
 
         Parameters
         ----------

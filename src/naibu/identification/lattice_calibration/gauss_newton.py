@@ -37,7 +37,7 @@ SETTLED = 0.05  # decrease of chi-squared that is not worth another iteration
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LatticeLoadCase:
-    """A capture and the lattice that is to reproduce it, with coarse and with fine steps."""
+    """A load case: a capture and the lattice that models it, with coarse and with fine steps."""
 
     capture: Capture
     coarse: PushedLattice
@@ -46,7 +46,7 @@ class LatticeLoadCase:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationProblem:
-    """What is sought, from what.
+    """Inverse problem of lattice calibration: load cases and unknowns.
 
     Attributes
     ----------
@@ -150,7 +150,7 @@ class CalibrationProblem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LatticeEstimate:
-    """Calibrated parameters.
+    """Identified lattice parameters with their covariance.
 
     Attributes
     ----------
@@ -162,7 +162,7 @@ class LatticeEstimate:
         Of their logarithms; weak priors around the start included. The widest of those at the estimate and at the ends of the interval of
         its least determined combination, along which the data's information changes.
     information : ndarray, shape (p, p)
-        What the data alone tell.
+        Fisher information of the data alone.
     noise_factor : tuple of float
         Root mean square residual of points and of forces in units of the stated noise; NaN where they did not count.
     iterations, runs : int
@@ -190,7 +190,7 @@ class LatticeEstimate:
         return np.stack([self.values * np.exp(-half), self.values * np.exp(half)], axis=1)
 
     def sentences(self) -> tuple[str, ...]:
-        """Say in words what was found, and what the data do not determine."""
+        """Return the result in sentences, and what the data do not determine."""
         lines = []
         for name, value, (low, high) in zip(self.unknowns.names, self.values, self.intervals(), strict=True):
             lines.append(f"{name}: {value:.4g} {UNITS[name.split()[0]]} (95 % between {low:.4g} and {high:.4g})")
@@ -255,7 +255,7 @@ def calibrate_lattice(
     threads: int = 2,
     executor: Executor | None = None,
 ) -> LatticeEstimate:
-    """Return the parameters that reproduce captures best, with their covariance.
+    """Identify lattice parameters from captures by least squares, with their covariance.
 
     Iterations take steps that are long but after changes of motion; then residuals of fine steps throughout are brought to their minimum,
     by the same derivatives, or by those of fine steps where that fails. Where the law does not reproduce points or forces to within their
@@ -397,7 +397,7 @@ def _polished(problem: CalibrationProblem, point: _Point, centre: FloatArray, pr
 
 @dataclass(frozen=True, slots=True)
 class ReportIndices:
-    """The report's measures of one pushing.
+    """Misfit measures of the report for one load case.
 
     Attributes
     ----------

@@ -15,7 +15,7 @@ from naibu.mechanics.contact.triangle_tree import TriangleTree
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Closest:
-    """Where k points lie beside a surface.
+    """Closest points of a surface for k points, with signed distances.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Closest:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShapeDifference:
-    """The report's S_shape at one time.
+    """Shape misfit S_shape of the report at one time.
 
     Attributes
     ----------

@@ -111,7 +111,7 @@ def identifiability(names: tuple[str, ...], information: FloatArray, *, loose: f
     names : tuple of str
         Parameters.
     information : ndarray, shape (p, p)
-        What the data tell of their logarithms (Fisher).
+        Fisher information of their logarithms.
     loose : float
         Standard deviation of a combination, as a logarithm, from which it counts as not determined.
     """

@@ -31,7 +31,7 @@ _PRICE = 2  # how many iterations' multiplications of an element a number of the
 
 
 def coarse_space(lattice: Lattice, stiff: FloatArray, diagonal: FloatArray, smoother: AnyFloatArray, pad: int, parts: int) -> KernelTuple:
-    """Return what the kernels need of coarse functions, or arrays without numbers where they do not pay.
+    """Return the arrays of the coarse correction for the kernels; they are empty where it does not pay.
 
     Parameters
     ----------

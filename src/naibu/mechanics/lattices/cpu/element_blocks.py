@@ -19,7 +19,7 @@ _STRIDE = 4  # a neighbour along y, z or a diagonal, and the two beside it along
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Blocks:
-    """Where elements are stored: lane k of block b joins the nodes first[b] + k and second[b] + k, or none.
+    """Storage of elements in blocks: lane k of block b joins the nodes first[b] + k and second[b] + k, or none.
 
     Attributes
     ----------

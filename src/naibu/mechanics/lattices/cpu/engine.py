@@ -39,7 +39,7 @@ THREADED_FROM = 20_000  # elements; below, one thread is faster than two that wa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LatticeEngine:
-    """A lattice prepared for steps of one length by one method.
+    """Engine of a mass-spring-dashpot lattice on the processor, for steps of one length by one method.
 
     Attributes
     ----------
@@ -161,7 +161,7 @@ class LatticeEngine:
         velocity: ArrayLike = 0.0,
         external_force: ArrayLike | None = None,
     ) -> Motion:
-        """Take steps.
+        """Take steps, and return the state at their end and all reactions.
 
         Parameters
         ----------
@@ -198,7 +198,7 @@ class LatticeEngine:
         return Motion(self.state(stepper), reaction, iterations / max(steps, 1), rotation_limited)
 
     def stepper(self, state: LatticeState, external_force: ArrayLike | None = None, scratch: Scratch | None = None) -> Stepper:
-        """Return what takes steps from a state on, with scratch arrays of its own unless some are lent.
+        """Return a stepper that begins at a state, with scratch arrays of its own unless some are lent.
 
         Raises
         ------

@@ -46,7 +46,7 @@ class SteppedEngine(Protocol):
         """Return the lattice in the reference configuration."""
 
     def stepper(self, state: LatticeState, external_force: ArrayLike | None = None) -> Stepper:
-        """Return what takes steps from a state on."""
+        """Return a stepper that begins at a state."""
 
     def state(self, stepper: Stepper) -> LatticeState:
         """Return a copy of the state that a stepper has reached."""

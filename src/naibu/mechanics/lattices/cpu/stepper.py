@@ -1,4 +1,4 @@
-"""What takes the steps of a lattice, with its state as the kernels hold it; `LatticeEngine.run` and `LatticeSession` share it."""
+"""Steppers of lattices, explicit and implicit, with the state in the layout of the kernels; used by engines and sessions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MOST_ITERATIONS = 20_000
 
 @dataclass(slots=True, eq=False)
 class Stepper(ABC):
-    """A state on its way.
+    """Base of steppers: a state in the layout of the kernels, and how it is advanced.
 
     Attributes
     ----------

@@ -23,7 +23,7 @@ _CODES = 256  # different elements that a byte can number
 
 
 def warp_package() -> ModuleType:
-    """Return Warp, told to leave the standard output alone unless something is wrong.
+    """Return Warp, configured to print warnings only.
 
     Raises
     ------

@@ -41,7 +41,7 @@ _AT_ONCE = 16  # steps that the device is given at once
 
 @dataclass(slots=True, eq=False)
 class WarpLatticeSession:
-    """A lattice that moves on a device, where its state stays.
+    """A lattice in motion on a device of Warp, where its state stays between steps.
 
     Attributes
     ----------

@@ -18,7 +18,7 @@ TOUCH_MM = 1e-6  # gap below which a node counts as touching at the start
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContactState:
-    """Which nodes touch which indenter.
+    """State of the contact between a lattice and its indenters.
 
     Attributes
     ----------

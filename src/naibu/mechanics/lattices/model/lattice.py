@@ -24,7 +24,7 @@ ByClass = float | ArrayLike | Mapping[str, "float | Mapping[str, float]"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lattice:
-    """Masses and the elements between them.
+    """Mass-spring-dashpot lattice: nodes with mass, and the elements between them.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ def classic_lattice(
     origin: ArrayLike = (0.0, 0.0, 0.0),
     frame: RigidTransform | None = None,
 ) -> Lattice:
-    """Return nodes at the corners of all voxels of a mask, each joined to its up to 26 neighbours.
+    """Return the regular lattice of a voxel mask: nodes at the corners of voxels, each joined to its up to 26 neighbours.
 
     Two nodes are joined where a voxel has both as corners.
 
@@ -400,7 +400,7 @@ def voxel_parameters(lattice: Lattice, mask: BoolArray, values: ArrayLike, origi
 
 
 def general_lattice(points: ArrayLike, elements: ArrayLike, node_mass: ArrayLike) -> Lattice:
-    """Return the lattice of any nodes and elements; all elements count as short ones of the core, and no node as on the surface.
+    """Return a lattice from arrays of nodes and elements; all elements count as short ones of the core, and no node as on the surface.
 
     Parameters
     ----------

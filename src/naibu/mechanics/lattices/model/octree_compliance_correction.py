@@ -44,7 +44,7 @@ _DIRECTIONS = np.array([d for d in product((-1, 0, 1), repeat=3) if d > (0, 0, 0
 
 
 def response_factors(grid: OctreeGrid, start: FloatArray, class_stiffness: FloatArray) -> FloatArray:
-    """Return factors (m,) with which the surface of an octree lattice answers as that of the classic lattice does.
+    """Return factors (m,) with which the surface of an octree lattice responds as that of the classic lattice does.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ class _EnergyTest:
 
     @classmethod
     def of_forces(cls, elements: _Elements, constrained: BoolArray, forces: FloatArray) -> _EnergyTest:
-        """Hold some nodes (n,), and put forces (n, 3, p) on others."""
+        """Fix some nodes (n,), and put forces (n, 3, p) on others."""
         return cls(elements, ~constrained, None, forces[~constrained].reshape(3 * int((~constrained).sum()), -1))
 
     def evaluated(self, logarithms: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -200,7 +200,7 @@ def _solver(matrix: sp.bsr_matrix, points: FloatArray) -> LinearSolver:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EquilibriumPolynomials:
-    """Polynomial motions in which no inner mass of a classic lattice feels a force, orthonormal by their energy in it.
+    """Polynomial motions in which no inner node of a classic lattice feels a force, orthonormal by their energy in it.
 
     Attributes
     ----------

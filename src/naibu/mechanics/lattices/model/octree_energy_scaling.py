@@ -46,7 +46,7 @@ class OctreeGrid:
 
     @property
     def offset(self) -> IntArray:
-        """From the first to the second mass of all elements (m, 3)."""
+        """From the first to the second node of all elements (m, 3)."""
         return np.asarray(self.nodes[self.pairs[:, 1]] - self.nodes[self.pairs[:, 0]])
 
     @property

@@ -1,4 +1,4 @@
-"""The state of a lattice, what is prescribed of it, and the largest stable explicit step."""
+"""State of a lattice, its constraints, and the largest stable explicit step."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STEP_S = 2e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LatticeState:
-    """What changes while a lattice moves.
+    """State of a lattice: positions, velocities and history variables of its elements.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class LatticeState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConstrainedNodes:
-    """Components of nodes that move as rigid bodies do.
+    """Constrained components of nodes, which follow rigid bodies.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ class ConstrainedNodes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """What a run of steps gave.
+    """Result of a run of steps.
 
     Attributes
     ----------

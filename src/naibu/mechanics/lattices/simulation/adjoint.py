@@ -53,7 +53,7 @@ class RecordedPush:
 
     @property
     def memory_mb(self) -> float:
-        """What the kept states and those of one stretch take, MB."""
+        """Memory of the kept states and those of one stretch, MB."""
         states = sum(array.nbytes for array in self.kept)
         return float(states) * (1.0 + self.stretch / len(self.kept[0])) / 1e6
 

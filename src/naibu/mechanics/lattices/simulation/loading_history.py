@@ -25,7 +25,7 @@ StudyEngine = Engine[LatticeState, ConstrainedNodes]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """A force that moves a guided body.
+    """Force history that drives a guided body.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Drive:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StudyBody:
-    """A rigid body with its programme.
+    """A rigid indenter with its loading history.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class StudyBody:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LatticeStudy:
-    """What is computed.
+    """A lattice, its indenters with their loading histories, and the settings of the computation.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ class LatticeStudy:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StudyState:
-    """All that a study needs to go on behind a frame.
+    """State of a study at a frame, from which it can be resumed.
 
     Attributes
     ----------
@@ -163,7 +163,7 @@ class StudyState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StudyFrame:
-    """A frame of a study.
+    """One frame of a study: time, state, energies and forces.
 
     Attributes
     ----------

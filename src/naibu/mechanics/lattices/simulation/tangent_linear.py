@@ -73,7 +73,7 @@ class StateChange:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrivenMotion:
-    """What a run of driven steps gave.
+    """Result of driven steps, with derivatives.
 
     Attributes
     ----------
