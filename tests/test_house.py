@@ -135,6 +135,42 @@ def test_no_file_holds_what_belongs_elsewhere() -> None:
     none_of(found, "files name no machine's folders and no package index, and leave nothing open")
 
 
+# words that earlier versions used for terms of the field, as regular expressions, and the terms
+PRIVATE_WORDS = {
+    r"[Pp]usher": "indenter",
+    r"[Gg]r[ea]y[ -]values?\b|[Gg]r[ea]y[ _-]rms\b|[Gg]rey RMS": "intensity, intensity residual RMS",
+    r"\b[Ss]lopes? of (?:the )?(?:grey|gray|both)": "image intensity gradient",
+    r"(?:field|incremental|whitened|force)[ _]balance": "equilibrium gap, weighted equilibrium gap",
+    r"\b[Ss]welling": "dilatation penalty",
+    r"\b[Ll]ikeness": "normalised cross-correlation",
+    r"\b[Ww]aver": "perturb",
+    r"\b[Ss]tiff[ _]bod(?:y|ies)": "rigid inclusion",
+    r"place_voxels|scatter of place": "sub-voxel jitter SD",
+    r"\b[Ss]pec [A-Z]\d?\b": "a citation, or the chapter of the report",
+    r"\b[Gg]lued\b": "tied",
+    r"\b[Tt]eam\b": "thread pool",
+    r"HeldNodes|\b[Hh]eld (?:nodes?|mass(?:es)?|faces)\b": "constrained",
+    r"\bKnowledge\b": "known materials",
+    r"\bNearby\b|\bHint\b": "warm start",
+    r"\b[Ff]ree (?:state|shape|configuration)\b": "reference configuration, unloaded",
+    r"\b[Dd]ampers?\b": "dashpot",
+    r"\b[Dd]epartures?\b": "residual from the local affine fit",
+}
+
+
+def test_terms_are_those_of_the_field() -> None:
+    own = ("src/", "docs/", "tests/", "benchmarks/", "viewer-src/", "README.md", "CONTRIBUTING.md")
+    rules = {re.compile(word): term for word, term in PRIVATE_WORDS.items()}
+    found = []
+    for path in text_files():
+        name = path.relative_to(ROOT).as_posix()
+        if not name.startswith(own) or name == "docs/glossary.rst":  # which lists other names on purpose
+            continue
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+            found += [f"{place(path, number)} {m[0]!r}: write {term}" for rule, term in rules.items() if (m := rule.search(line))]
+    none_of(found, "terms are those of the field (docs/glossary.rst)")
+
+
 def text_files() -> list[Path]:
     kept = []
     for folder, folders, files in os.walk(ROOT):

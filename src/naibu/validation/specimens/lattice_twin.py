@@ -1,4 +1,4 @@
-"""A virtual twin of the report's dough: pushed, watched by two stereo cameras and measured by force sensors, with known truth (spec L6)."""
+"""Virtual twin of the dough of the 2008 report :cite:p:`hirai2008` (chapter 4.3): compressed, captured by two cameras and force sensors."""
 
 from __future__ import annotations
 
