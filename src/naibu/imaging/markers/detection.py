@@ -40,7 +40,7 @@ HIDDEN, UNRESOLVED, UPRIGHT = 0.6, 1.0, 0.94
 THIN = 0.11
 SAMPLED = 0.08  # bias, in slices, of the Gaussian fit to a plate that two slices show, whose profile is not Gaussian
 THINNEST = 0.3  # least width of a fitted blob, voxels
-MOST_SHARED = 50.0  # largest number of voxels with common noise; smoothing tells it, as it averages less of such noise
+MOST_SHARED = 50.0  # largest number of voxels with common noise, which is estimated from what smoothing leaves of the noise
 CONSTRAINED, FREE = 1e12, 1.0  # weight of the prior on the axes of a blob: those of the volume, or any
 # windows of the fits: half their width in diameters, and voxels besides; the first is for a quick look
 ROUNDS = ((0.55, 0.5), (0.75, 1.0))

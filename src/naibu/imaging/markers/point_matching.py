@@ -39,6 +39,7 @@ SEEDS = 8  # reference points from which guesses start
 GUESSES_AT_ONCE = 200_000  # bounds the memory of a search
 # guesses that grow before the best is taken; fraction of the points that ends the search; waves after which growth ends with fewer links
 GROWN, NEARLY_ALL, PROBATION = 30, 0.985, (5, 24)
+# bounds of the time: failed proposals of a point, waves of growth, and rounds of refinement
 MOST_TRIES, MOST_WAVES, REFINEMENTS = 4, 400, 6
 
 # links from which on their mean probability is judged; of fewer, this fraction of the markers must be linked

@@ -18,7 +18,7 @@ from naibu.imaging.markers._washer_kernels import column_sums, weigh_plates
 # Empirical values, judged by tests/imaging/markers/test_detection.py and benchmarks/sense_markers.py, unless said otherwise.
 # prior of the tilt of a plate in the gel: standard deviation and largest value of its slope, and number of slopes that are tried
 TILT_SD, STEEPEST, TILTS = 0.12, 0.32, 9
-HEIGHTS, REACH_SLICES = 45, 0.85
+HEIGHTS, REACH_SLICES = 45, 0.85  # number of heights that are tried, and largest distance from the start, slices
 # blur across the slices that is tried, slices; number of plates by which it is chosen
 BLURS, CHOOSING = (0.0, 0.2, 0.35, 0.5), 20
 # a blur is accepted if it lowers the mean squared residual below this fraction: a small gain may be due to model errors
