@@ -1,4 +1,4 @@
-"""Kernels of the coarse correction in the implicit solver of lattices: between nodes and coarse nodes, and the small dense solve.
+"""Kernels of the two-level (coarse) correction of the implicit solver :cite:p:`toselli2005`, with its small dense solve.
 
 `coarse` is the tuple that `lattice_coarse.coarse_space` makes: steps, vectors, further ones, small, weights and memory (see there); its
 arrays are empty where an engine does without.

@@ -1,4 +1,4 @@
-"""The solver of implicit steps of a lattice: preconditioned conjugate gradients in single precision, corrected in full precision.
+"""Kernels of preconditioned conjugate gradients :cite:p:`hestenes1952` for the implicit step of a lattice.
 
 The preconditioner is the diagonal, plus, where it pays, what coarse functions on a grid see of the residual (`lattice_coarse`). It decides
 how many iterations there are, not where they end: at the residual's norm in the diagonal's inverse, with either.

@@ -1,4 +1,4 @@
-"""Kernels of the implicit steps of lattices on a GPU, for NVIDIA Warp.
+"""Kernels of the linear-implicit step :cite:p:`baraff1998` of a lattice, for NVIDIA Warp.
 
 The method is that of `naibu.mechanics.lattices.cpu._implicit_kernels`. This module needs Warp. Elements are computed at both their nodes
 (see `naibu.mechanics.lattices.gpu._explicit_kernels`); their directions are computed anew from the positions in each product with the

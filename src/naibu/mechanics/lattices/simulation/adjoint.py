@@ -223,7 +223,7 @@ def _by_parameter(engine: LatticeEngine, labels: IntArray, rows: IntArray, sums:
     spots, group = place[example], labels[example]
     p = engine.parameters
     found: list[FloatArray] = []
-    tiny = 1e-30  # the derivative by a complex step is exact to rounding
+    tiny = 1e-30  # the derivative by a complex step :cite:p:`squire1998` is exact to rounding
     for shift in range(3):
         moved = [v[example].astype(complex) for v in (p.stiffness, p.voigt_damping, p.series_damping)]
         moved[shift] += 1j * tiny
