@@ -1,4 +1,4 @@
-"""Two-level preconditioner of the implicit solver of a lattice :cite:p:`toselli2005`: coarse functions that carry long-range corrections.
+"""Coarse space of a two-level preconditioner for the implicit solver of a lattice :cite:p:`toselli2005`.
 
 Neighbours pass a residual on slowly; coarse functions spread it over the lattice at once.
 Hat functions of a grid over the lattice at rest, linear in x, y and z, take the residual of the nodes to few coarse nodes, where a small
