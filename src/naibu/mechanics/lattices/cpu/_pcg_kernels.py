@@ -1,8 +1,8 @@
 """Kernels of preconditioned conjugate gradients :cite:p:`hestenes1952` for the implicit step of a lattice.
 
 Iterations are in single precision, their residual is corrected in double precision. The preconditioner is the diagonal, plus, where it
-pays, a coarse correction (`naibu.mechanics.lattices.cpu.coarse_space`). It decides how many iterations there are, not where they end: at the
-residual's norm in the diagonal's inverse, with either.
+pays, a coarse correction (`naibu.mechanics.lattices.cpu.coarse_space`). It decides how many iterations there are, not where they end:
+at the residual's norm in the diagonal's inverse, with either.
 """
 
 from __future__ import annotations
