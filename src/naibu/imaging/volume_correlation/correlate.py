@@ -24,6 +24,7 @@ from naibu.core.arrays import BoolArray, Float32Array, FloatArray, Int32Array, I
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
+from naibu.imaging.preprocessing.field_of_view import Box, fields_of_view, in_box
 from naibu.imaging.preprocessing.object_mask import object_mask
 from naibu.imaging.preprocessing.resampling import require_mask
 from naibu.imaging.preprocessing.volume_pair import intensity_pair
@@ -135,8 +136,11 @@ class _Correlation:
         self, reference: Volume, deformed: Volume, mask: ArrayLike | None, settings: CorrelationSettings, progress: Progress | None
     ) -> None:
         self.volume, self.settings, self.progress = reference, settings, progress
-        self.reference, self.deformed = _checked_pair(reference, deformed)
-        self.mask = object_mask(reference, margin=1) if mask is None else require_mask(mask, reference)
+        _check_shape(reference, deformed)
+        self.views = fields_of_view(reference, deformed)
+        self.reference, self.deformed = _filled_pair(reference, deformed, self.views)
+        self.mask = _mask_in(self.views[0], reference, margin=1) if mask is None else require_mask(mask, reference)
+        self.mask = self.mask & in_box(self.views[0], reference.shape)
         self.deformed_volume = deformed
         where = np.argwhere(self.mask)
         if not len(where):
@@ -153,7 +157,7 @@ class _Correlation:
         self.ratio, self.dilatation_factor = 1.0, 1.0
 
     def level(self, stride: tuple[int, ...], smoothing: float) -> ImageLevel:
-        return ImageLevel(self.reference, self.deformed, self.mask, self.spacing, stride, smoothing)
+        return ImageLevel(self.reference, self.deformed, self.mask, self.spacing, stride, smoothing, self.views[1])
 
     def comparison(self, level: int) -> ComparisonSettings:
         s, fine = self.settings, level > 1
@@ -183,8 +187,10 @@ class _Correlation:
         level = self.level(stride, self.settings.smoothing_voxels)
         thin = tuple(slice(None, None, s) for s in stride[::-1])
         shifts = [np.zeros(3), correlated_shift(self.reference[thin] * self.mask[thin], self.deformed[thin], level.spacing)]
-        after = np.argwhere(object_mask(self.deformed_volume))[:, ::-1] * self.spacing
-        before = np.argwhere(self.mask)[:, ::-1] * self.spacing
+        # only what both scans can show is compared: else the part that one of them lacks would shift the centroid and stretch the outline
+        both = in_box(self.views[0], self.mask.shape) & in_box(self.views[1], self.mask.shape)
+        shown = _mask_in(self.views[1], self.deformed_volume)
+        after, before = (np.argwhere(m & both if (m & both).any() else m)[:, ::-1] * self.spacing for m in (shown, self.mask))
         shifts.append(after.mean(axis=0) - before.mean(axis=0))
         start = RigidInitialization(level)
         linear, shift, correlation = start.found(shifts)
@@ -271,21 +277,41 @@ class _Correlation:
         return collected(self.volume, self.mask, fit, self.c, samples, self.bending, self.dilatation)
 
 
-def _checked_pair(reference: Volume, deformed: Volume) -> tuple[Float32Array, Float32Array]:
+def _check_shape(reference: Volume, deformed: Volume) -> None:
     for name, volume in (("reference", reference), ("deformed", deformed)):
         if min(volume.shape) < LEAST_SIZE:
             raise InputError(
                 f"the {name} volume has {' x '.join(map(str, volume.shape[::-1]))} voxels; volume correlation needs {LEAST_SIZE} or more "
                 "along every axis. For an image or a few slices use naibu.imaging.lucas_kanade"
             )
-    before, after = intensity_pair(*(v.with_values(np.asarray(v.values, dtype=np.float32)) for v in (reference, deformed)))
-    for name, values in (("reference", before), ("deformed", after)):
-        if np.isnan(values).any():
-            bad = tuple(int(i) for i in np.argwhere(np.isnan(values))[0])
-            raise InputError(
-                f"voxel {bad} (z, y, x) of the {name} volume is NaN; crop the volumes, or fill unknown voxels with the intensity of air"
-            )
+
+
+def _filled_pair(reference: Volume, deformed: Volume, views: tuple[Box, Box]) -> tuple[Float32Array, Float32Array]:
+    """Return the intensities of both volumes; those outside the fields of view, which are never compared, are the mean of those inside."""
+    filled = [_filled(*each) for each in (("reference", reference, views[0]), ("deformed", deformed, views[1]))]
+    before, after = intensity_pair(*filled)
     return before, after
+
+
+def _filled(name: str, volume: Volume, view: Box) -> Volume:
+    values = np.asarray(volume.values, dtype=np.float32)
+    inside = values[view]
+    if np.isnan(inside).any():
+        bad = tuple(int(i + (s.start or 0)) for i, s in zip(np.argwhere(np.isnan(inside))[0], view, strict=True))
+        raise InputError(
+            f"voxel {bad} (z, y, x) of the {name} volume is NaN; crop the volumes, or fill unknown voxels with the intensity of air"
+        )
+    if inside.shape != values.shape:
+        values = np.where(in_box(view, values.shape), values, inside.mean(dtype=np.float64).astype(np.float32))
+    return volume.with_values(values)
+
+
+def _mask_in(view: Box, volume: Volume, *, margin: int = 0) -> BoolArray:
+    """Return the object (nz, ny, nx) that the field of view of a volume shows."""
+    mask = np.zeros(volume.shape, dtype=bool)
+    shown = Volume.from_array(np.asarray(volume.values)[view], spacing_mm=volume.spacing_mm)
+    mask[view] = object_mask(shown, margin=margin)
+    return mask
 
 
 def _step(settings: CorrelationSettings, mask: BoolArray, spacing: FloatArray) -> FloatArray:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from scipy import linalg, ndimage
 
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray
+from naibu.imaging.preprocessing.field_of_view import Box
 from naibu.imaging.volume_correlation._warp_kernels import OUTSIDE, gain_normal_equations, gain_values, sample_spline
 
 MARGIN = 12  # voxels about the object that are kept of the reference: the prefilter's response at its edge has died out
@@ -41,13 +42,22 @@ class ImageLevel:
     gradient : ndarray, shape (n, 3), float32
         Image intensity gradient of the reference, per mm.
     deformed : ndarray, float32
-        Spline coefficients of the deformed volume, padded.
+        Spline coefficients of the field of view of the deformed volume, padded.
+    first : ndarray, shape (3,), float64
+        Index x, y, z of the first voxel of that field of view.
     runs : ndarray, shape (m, 5), int64
         Lines of voxels: z, y, first x, x after the last, all in the box, and number in the list.
     """
 
     def __init__(
-        self, reference: Float32Array, deformed: Float32Array, mask: BoolArray, spacing: FloatArray, stride: ArrayLike, sigma: float
+        self,
+        reference: Float32Array,
+        deformed: Float32Array,
+        mask: BoolArray,
+        spacing: FloatArray,
+        stride: ArrayLike,
+        sigma: float,
+        view: Box | None = None,
     ) -> None:
         every = np.asarray(stride, dtype=int)[::-1]
         thin = tuple(slice(None, None, int(s)) for s in every)
@@ -58,8 +68,12 @@ class ImageLevel:
         box = tuple(slice(int(a), int(b)) for a, b in zip(self.low, self.high, strict=True))
         near_low = np.maximum(self.low * every - MARGIN * every, 0) // every * every
         near = tuple(slice(int(a), int(b)) for a, b in zip(near_low, self.high * every + MARGIN * every, strict=True))
+        # the first voxel of the view at this resolution is one that the stride meets
+        starts = -(-np.array([s.start or 0 for s in view]) // every) if view is not None else np.zeros(3, dtype=int)
+        self.first = starts[::-1].astype(float)
+        shown = tuple(slice(int(a), s.stop) for a, s in zip(starts * every, view, strict=True)) if view is not None else ()
         with ThreadPoolExecutor(2) as pool:
-            jobs = [pool.submit(_thinned, v, sigma * every, thin) for v in (reference[near], deformed)]
+            jobs = [pool.submit(_thinned, v, sigma * every, thin) for v in (reference[near], deformed[shown])]
             (before, before_spline), (_, self.deformed) = (job.result() for job in jobs)
         shift = near_low // every
         inner = tuple(slice(int(a), int(b)) for a, b in zip(self.low - shift, self.high - shift, strict=True))
@@ -75,6 +89,10 @@ class ImageLevel:
         edges = np.diff(np.pad(self.mask.astype(np.int8), ((0, 0), (0, 0), (1, 1))), axis=2)
         first, last = np.argwhere(edges == 1), np.argwhere(edges == -1)
         self.runs = np.column_stack([first, last[:, 2], self.number[tuple(first.T)]]).astype(np.int64)
+
+    def sample(self, positions_mm: FloatArray, value: Float32Array, gradient: Float32Array) -> None:
+        """Fill value (n,) and gradient (n, 3), per voxel, of the deformed volume at positions (n, 3), mm; OUTSIDE beyond its view."""
+        sample_spline(self.deformed, (positions_mm / self.spacing - self.first).astype(np.float32), value, gradient)
 
     @property
     def axes_mm(self) -> list[FloatArray]:

@@ -118,8 +118,9 @@ class SplineSystem:
     ) -> None:
         """Fill displacement, intensity and gradients of the voxels at coefficients c (NZ, NY, NX, 3), mm: see `warp_voxels`."""
         level = self.level
+        low = (level.low[::-1] - level.first).astype(np.float32)
         warp_voxels(
-            c.astype(np.float32), level.runs, self.cell_of, self.weights, self.derivatives, level.low[::-1].astype(np.float32),
+            c.astype(np.float32), level.runs, self.cell_of, self.weights, self.derivatives, low,
             (1 / level.spacing).astype(np.float32), level.deformed, level.gradient, value, reference_gradient, gradient, displacement,
         )  # fmt: skip
 

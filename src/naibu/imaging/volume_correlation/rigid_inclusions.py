@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from naibu.core.arrays import Float32Array, FloatArray, Int32Array, IntArray
 from naibu.core.progress import Progress, report_progress
 from naibu.core.rigid_transform import RigidTransform
-from naibu.imaging.volume_correlation._warp_kernels import OUTSIDE, sample_spline
+from naibu.imaging.volume_correlation._warp_kernels import OUTSIDE
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.intensity_comparison import IntensityComparison
 
@@ -26,6 +26,7 @@ LEAST_VOXELS = 50  # too few for six unknowns and a test
 # whose displacement is so far from it, voxels; removed so many times
 WORSE, APART, PRUNED = 0.15, 0.6, 2
 OUTLIER = 9.0  # residual variances at which a residual counts half, and what a voxel outside the deformed volume counts
+UNSEEN = 1e-30  # least value there: of an inclusion that has left the field of view no voxel counts, and it does not move
 REGULAR = 1e-9  # of the trace, on the diagonal of the normal matrix: an inclusion without texture does not move
 
 
@@ -103,7 +104,7 @@ class RigidInclusion:
         level, at, x = self.level, self.voxels, self.moved
         gain, offset = comparison.gain[at], comparison.offset[at]
         value, gradient = np.empty(len(at), np.float32), np.empty((len(at), 3), np.float32)
-        sample_spline(level.deformed, (x / level.spacing).astype(np.float32), value, gradient)
+        level.sample(x, value, gradient)
         seen = value > 0.9 * OUTSIDE
         r = np.where(seen, level.intensity[at] - gain * value - offset, 0.0)
         g = 0.5 * (gain[:, None] * gradient / level.spacing + level.gradient[at] @ self.rotation.T)
@@ -116,7 +117,7 @@ class RigidInclusion:
         for _ in range(STEPS):
             r, self.derivatives, w = self.linearised(comparison)
             matrix = (self.derivatives * w[:, None]).T @ self.derivatives
-            self.normal = matrix + REGULAR * np.trace(matrix) * np.eye(6)
+            self.normal = matrix + max(REGULAR * np.trace(matrix), UNSEEN) * np.eye(6)
             d = np.linalg.solve(self.normal, self.derivatives.T @ (w * r))
             self.rotation, self.shift = Rotation.from_rotvec(d[:3]).as_matrix() @ self.rotation, self.shift + d[3:]
             if np.abs(d[3:]).max() < CONVERGED_MM:
@@ -126,7 +127,7 @@ class RigidInclusion:
     def misfits(self, comparison: IntensityComparison, positions: FloatArray) -> FloatArray:
         """Return the bounded squared residuals (n,), in residual variances, of its voxels displaced to positions (n, 3), mm."""
         value, gradient = np.empty(len(positions), np.float32), np.empty((len(positions), 3), np.float32)
-        sample_spline(self.level.deformed, (positions / self.level.spacing).astype(np.float32), value, gradient)
+        self.level.sample(positions, value, gradient)
         at = self.voxels
         residual = self.level.intensity[at] - comparison.gain[at] * value - comparison.offset[at]
         square = (residual / comparison.residual_sd).astype(float) ** 2
@@ -217,6 +218,6 @@ def rigid_inclusions_among(
         inclusion.fit(comparison)
         free = float(inclusion.misfits(comparison, inclusion.points + displacement).mean())
         rigid = float(inclusion.misfits(comparison, inclusion.moved).mean())
-        if given or rigid < RIGID * free:
+        if given or (rigid < RIGID * free and np.count_nonzero(inclusion.root_weight) >= LEAST_VOXELS):
             out.append(inclusion)
     return out

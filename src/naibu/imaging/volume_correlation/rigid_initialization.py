@@ -12,7 +12,7 @@ from scipy import fft
 from scipy.spatial.transform import Rotation
 
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray
-from naibu.imaging.volume_correlation._warp_kernels import OUTSIDE, sample_spline
+from naibu.imaging.volume_correlation._warp_kernels import OUTSIDE
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 
 # empirical: rotations about each axis of the initial guesses, rad, and longest step; steps of all guesses, and of the best so many
@@ -93,7 +93,7 @@ class RigidInitialization:
 
     def _sample(self, rotation: FloatArray, shift: FloatArray) -> FloatArray:
         arm = (self.points - self.middle) @ rotation.T
-        sample_spline(self.level.deformed, ((arm + self.middle + shift) / self.level.spacing).astype(np.float32), self.value, self.gradient)
+        self.level.sample(arm + self.middle + shift, self.value, self.gradient)
         return np.asarray(arm)
 
     def _improved(self, rotation: FloatArray, shift: FloatArray, guess: FloatArray, steps: int) -> tuple[FloatArray, FloatArray]:
