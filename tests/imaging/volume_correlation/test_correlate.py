@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from scenes import texture
+from scipy import ndimage
 
 from naibu.core.errors import InputError
 from naibu.core.rigid_transform import rotation_matrix
@@ -283,6 +284,43 @@ def test_bad_scans_are_refused() -> None:
         correlate_volumes(before, after, mask=small)
     with pytest.raises(InputError, match="gradients"):
         correlate_volumes(before, after, settings=CorrelationSettings(gradients="none"))  # type: ignore[arg-type]
+
+
+@cache
+def padded(side: int, end: int, fill: float, reference_too: bool) -> tuple[CorrelationResult, Array]:
+    """A smooth motion of which one scan lacks a fifth at an end of an axis, and where the other shows the material."""
+    grid = frame()
+    motion, back = waves()
+    pair = list(scans(grid, back))
+    n = grid.shape[side]
+    lost = slice(int(0.8 * n), n) if end else slice(0, n - int(0.8 * n))
+    which = 0 if reference_too else 1
+    values = np.array(pair[which].values)
+    values[(slice(None),) * side + (lost,)] = fill
+    pair[which] = grid.with_values(values)
+    x = positions(grid)
+    index = np.round((x + (0.0 if reference_too else 1.0) * motion(x))[..., 2 - side]).astype(int)
+    return correlate_volumes(*pair), (index < lost.start) if end else (index >= lost.stop)
+
+
+@pytest.mark.parametrize(("side", "end", "fill", "reference_too"), [(0, 1, 0.0, False), (1, 0, np.nan, False), (2, 1, -500.0, True)])
+def test_padding_is_not_compared_and_what_it_hides_is_not_answered(side: int, end: int, fill: float, reference_too: bool) -> None:
+    found, shown = padded(side, end, fill, reference_too)
+    motion, _ = waves()
+    error = errors(found, motion)
+    assert np.linalg.norm(error, axis=1).mean() < 0.12
+    assert not (found.valid & ~ndimage.binary_dilation(shown, iterations=2)).any()
+    assert (found.valid & shown).sum() > 0.97 * (shown & (depth(positions(found.volume)) > 0.0)).sum()
+    covariance = found.covariance()[found.valid & (depth(positions(found.volume)) > 0.0)]
+    assert (np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error) < CHI_SQUARED_95).mean() >= 0.9
+
+
+def test_scans_of_noise_are_refused() -> None:
+    """Also where a mask says that there is an object: a search always finds some displacement."""
+    rng, grid = np.random.default_rng(3), frame()
+    pair = [grid.with_values(100.0 + 10.0 * rng.standard_normal(grid.shape)) for _ in range(2)]
+    with pytest.raises(InputError, match="no common content"):
+        correlate_volumes(*pair, mask=depth(positions(grid)) > 0.0)
 
 
 def test_scans_that_are_known_in_different_places_do_not_overlap() -> None:

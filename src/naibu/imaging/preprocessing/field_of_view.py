@@ -8,15 +8,14 @@ from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.volume import Volume
 
 Box = tuple[slice, slice, slice]
-TOUCHING = 0.02  # fraction of a plane that the object covers where padding cuts it off; a convex surface that just touches covers less
+_Planes = list[tuple[tuple[int, float], tuple[int, float]]]  # of each axis: how many planes at both ends, and their intensity
 
 
 def fields_of_view(reference: Volume, deformed: Volume) -> tuple[Box, Box]:
     """Return the boxes (z, y, x) of two scans of one object that hold data.
 
-    Outer planes of NaN are padding. Outer planes of one intensity are padding too, unless they are the background: where both scans end in
-    planes of the same intensity, these are taken for the background, except on a side where both scans have equally many of them and the
-    object is cut off by them in both.
+    Outer planes of NaN are padding. So are outer planes of one intensity, unless the other scan has outer planes of the same intensity:
+    then it is that of a background without noise.
 
     Parameters
     ----------
@@ -29,20 +28,16 @@ def fields_of_view(reference: Volume, deformed: Volume) -> tuple[Box, Box]:
         Boxes along z, y, x; the whole scan where nothing is padded.
     """
     planes = [_outer_planes(np.asarray(v.values)) for v in (reference, deformed)]
-    boxes: list[Box] = []
-    for own, other, volume in ((planes[0], planes[1], reference), (planes[1], planes[0], deformed)):
-        sides = []
-        for axis in range(3):
-            counts = []
-            for end in range(2):
-                count, level = own[axis][end]
-                common = any(level == value for pair in other for n, value in pair if n)
-                cut = count == other[axis][end][0] and _covered(volume, axis, end, count) > TOUCHING
-                counts.append(count if np.isnan(level) or not common or cut else 0)
-            n = volume.shape[axis]
-            sides.append(slice(counts[0], n - counts[1]) if sum(counts) < n else slice(0, n))
-        boxes.append((sides[0], sides[1], sides[2]))
-    return boxes[0], boxes[1]
+    return _box(planes[0], planes[1], reference.shape), _box(planes[1], planes[0], deformed.shape)
+
+
+def _box(own: _Planes, other: _Planes, shape: tuple[int, ...]) -> Box:
+    background = {level for ends in other for count, level in ends if count}
+    slices = []
+    for ends, n in zip(own, shape, strict=True):
+        low, high = (0 if level in background else count for count, level in ends)
+        slices.append(slice(low, n - high) if low + high < n else slice(0, n))
+    return slices[0], slices[1], slices[2]
 
 
 def in_box(box: Box, shape: tuple[int, ...]) -> BoolArray:
@@ -52,15 +47,12 @@ def in_box(box: Box, shape: tuple[int, ...]) -> BoolArray:
     return inside
 
 
-def _outer_planes(values: FloatArray) -> list[tuple[tuple[int, float], tuple[int, float]]]:
+def _outer_planes(values: FloatArray) -> _Planes:
     """Return for each axis, at both ends, how many planes have one intensity or are NaN, and that intensity."""
     found = []
     for axis in range(3):
         others = tuple(a for a in range(3) if a != axis)
-        low, high = values.min(axis=others), values.max(axis=others)
-        if values.dtype.kind == "f":
-            missing = np.isnan(values).all(axis=others)
-            low, high = np.where(missing, np.nan, low), np.where(missing, np.nan, high)
+        low, high = (f.reduce(values, axis=others) for f in (np.fmin, np.fmax))  # NaN only where a plane holds nothing else
         found.append((_run(low, high), _run(low[::-1], high[::-1])))
     return found
 
@@ -69,14 +61,3 @@ def _run(low: FloatArray, high: FloatArray) -> tuple[int, float]:
     level = float(low[0])
     same = (np.isnan(low) & np.isnan(high)) if np.isnan(level) else (low == level) & (high == level)
     return (len(same) if same.all() else int(np.argmin(same))), level
-
-
-def _covered(volume: Volume, axis: int, end: int, count: int) -> float:
-    """Fraction of the first plane inside the padding that is brighter than halfway between the padding and the brightest."""
-    n = volume.shape[axis]
-    if not 0 < count < n:
-        return 0.0
-    values = np.moveaxis(np.asarray(volume.values, dtype=float), axis, 0)
-    plane, level = values[count if end == 0 else n - 1 - count], values[0 if end == 0 else n - 1].flat[0]
-    typical = np.nanpercentile(np.abs(values - level), 99)
-    return float((np.abs(plane - level) > 0.3 * typical).mean())

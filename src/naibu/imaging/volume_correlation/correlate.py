@@ -41,6 +41,9 @@ from naibu.imaging.volume_correlation.settings import REFERENCE_FRACTION, Correl
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid
 
 LEAST_SIZE = 4  # voxels along an axis: cubic B-splines have four nodes in a cell
+# correlation of the image intensity gradients of the registered volumes, below which nothing was matched: two volumes of noise or of
+# unrelated textures reach 0.00 to 0.01, the same leg under 25 times its noise 0.16
+LEAST_AGREEMENT = 0.05
 LEAST_OVERLAP = 0.05  # fraction of the object in the deformed volume after its motion, below which the volumes do not overlap
 # No derivation stands behind the numbers below: they are empirical, and benchmarks/sense_volumes.py shows the effect of a change.
 VOXELS_PER_LONG_CELL = 2.5  # least number of voxels along a cell on the axis of the largest spacing
@@ -119,7 +122,13 @@ def correlate_volumes(
     Raises
     ------
     InputError
-        Volumes on different grids, of few slices, constant or with NaN; an empty mask; volumes that do not overlap.
+        Volumes on different grids, of few slices, constant or with NaN in their field of view; an empty mask; volumes that do not overlap,
+        or have no content in common.
+
+    Notes
+    -----
+    Outer planes of NaN or of one intensity are padding: they are excluded from the comparison, and the displacement of what they hide is
+    not answered (see `naibu.imaging.preprocessing.field_of_view`).
     """
     correlation = _Correlation(reference, deformed, mask, settings, progress)
     correlation.initialize()
@@ -138,6 +147,8 @@ class _Correlation:
         self.volume, self.settings, self.progress = reference, settings, progress
         _check_shape(reference, deformed)
         self.views = fields_of_view(reference, deformed)
+        if any(max(a.start, b.start) >= min(a.stop, b.stop) for a, b in zip(*self.views, strict=True)):
+            raise InputError("reference and deformed do not overlap: no voxel is known in both; check the transform that registered them")
         self.reference, self.deformed = _filled_pair(reference, deformed, self.views)
         self.mask = _mask_in(self.views[0], reference, margin=1) if mask is None else require_mask(mask, reference)
         self.mask = self.mask & in_box(self.views[0], reference.shape)
@@ -157,7 +168,7 @@ class _Correlation:
         self.ratio, self.dilatation_factor = 1.0, 1.0
 
     def level(self, stride: tuple[int, ...], smoothing: float) -> ImageLevel:
-        return ImageLevel(self.reference, self.deformed, self.mask, self.spacing, stride, smoothing, self.views[1])
+        return ImageLevel(self.reference, self.deformed, self.mask, self.spacing, stride, smoothing, self.views)
 
     def comparison(self, level: int) -> ComparisonSettings:
         s, fine = self.settings, level > 1
@@ -269,6 +280,12 @@ class _Correlation:
             raise InputError(
                 f"only {fit.seen.mean():.1%} of the object lies in the deformed volume after its motion: the volumes do not overlap, or do "
                 "not show the same object"
+            )
+        agreement = fit.gradient_correlation
+        if agreement < LEAST_AGREEMENT:
+            raise InputError(
+                f"the volumes show no common content: after registration their intensity gradients correlate by {agreement:.2f} (1 for "
+                "identical volumes, 0 by chance); check that both show the same object, at the same positions of the grid"
             )
         for inclusion in self.inclusions:
             inclusion.draws.clear()

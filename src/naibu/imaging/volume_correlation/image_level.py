@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg, ndimage
 
-from naibu.core.arrays import BoolArray, Float32Array, FloatArray
+from naibu.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from naibu.imaging.preprocessing.field_of_view import Box
 from naibu.imaging.volume_correlation._warp_kernels import OUTSIDE, gain_normal_equations, gain_values, sample_spline
 
@@ -57,7 +57,7 @@ class ImageLevel:
         spacing: FloatArray,
         stride: ArrayLike,
         sigma: float,
-        view: Box | None = None,
+        views: tuple[Box, Box] | None = None,
     ) -> None:
         every = np.asarray(stride, dtype=int)[::-1]
         thin = tuple(slice(None, None, int(s)) for s in every)
@@ -66,12 +66,12 @@ class ImageLevel:
         self.low, self.high = where.min(axis=0), where.max(axis=0) + 1
         self.spacing = spacing * every[::-1]
         box = tuple(slice(int(a), int(b)) for a, b in zip(self.low, self.high, strict=True))
-        near_low = np.maximum(self.low * every - MARGIN * every, 0) // every * every
-        near = tuple(slice(int(a), int(b)) for a, b in zip(near_low, self.high * every + MARGIN * every, strict=True))
-        # the first voxel of the view at this resolution is one that the stride meets
-        starts = -(-np.array([s.start or 0 for s in view]) // every) if view is not None else np.zeros(3, dtype=int)
-        self.first = starts[::-1].astype(float)
-        shown = tuple(slice(int(a), s.stop) for a, s in zip(starts * every, view, strict=True)) if view is not None else ()
+        # nothing outside the fields of view is smoothed into what is compared
+        before_view, after_view = (_corners(v, reference.shape, every) for v in views or (None, None))
+        near_low = np.maximum((self.low - MARGIN) * every, before_view[0])
+        near = tuple(slice(int(a), int(b)) for a, b in zip(near_low, np.minimum((self.high + MARGIN) * every, before_view[1]), strict=True))
+        shown = tuple(slice(int(a), int(b)) for a, b in zip(*after_view, strict=True))
+        self.first = (after_view[0] // every)[::-1].astype(float)
         with ThreadPoolExecutor(2) as pool:
             jobs = [pool.submit(_thinned, v, sigma * every, thin) for v in (reference[near], deformed[shown])]
             (before, before_spline), (_, self.deformed) = (job.result() for job in jobs)
@@ -98,6 +98,13 @@ class ImageLevel:
     def axes_mm(self) -> list[FloatArray]:
         """Coordinates of the voxels of the box along x, y, z, mm."""
         return [np.arange(self.low[2 - a], self.high[2 - a]) * self.spacing[a] for a in range(3)]
+
+
+def _corners(view: Box | None, shape: tuple[int, ...], every: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the first voxel (3,) of a field of view that the strides meet, and the one after its last."""
+    low = np.array([0 if view is None else view[a].start or 0 for a in range(3)])
+    high = np.array([shape[a] if view is None or view[a].stop is None else view[a].stop for a in range(3)])
+    return -(-low // every) * every, high
 
 
 def _thinned(values: Float32Array, sigma: FloatArray, thin: tuple[slice, ...]) -> tuple[Float32Array, Float32Array]:

@@ -97,6 +97,12 @@ class IntensityComparison:
         if s.agreement_window_mm:
             self._weigh_by_agreement()
 
+    @property
+    def gradient_correlation(self) -> float:
+        """Correlation of the image intensity gradients of both volumes over all voxels that are seen."""
+        both = self.agreement[self.seen].sum(axis=0, dtype=np.float64)
+        return float(both[0] / max(float(both[1]), 1e-30))
+
     def anchor(self, first: Float32Array, fraction: float) -> None:
         """Add springs to displacements `first` (n, 3), mm, of a fraction of the mean stiffness that the intensities give."""
         diagonal = self.products[:, [0, 3, 5]]
