@@ -27,7 +27,7 @@ extensions = [
     "naibu_help",
     "public_names",
 ]
-bibtex_bibfiles = sorted(str(path.relative_to(Path(__file__).parent)) for path in Path(__file__).parent.glob("references/*.bib"))
+bibtex_bibfiles = ["references.bib"]
 bibtex_reference_style = "author_year"
 bibtex_default_style = "plain"
 default_role = "py:obj"

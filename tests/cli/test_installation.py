@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import re
 import sys
 from pathlib import Path
 
@@ -45,7 +46,7 @@ def test_this_installation_is_healthy_and_every_row_is_whole() -> None:
 
 
 def test_every_required_package_of_the_distribution_is_examined() -> None:
-    required = {r.split(">")[0].strip() for r in importlib.metadata.requires("naibu") or [] if "extra ==" not in r}
+    required = {re.split(r"[<>=!~;\[ ]", r)[0] for r in importlib.metadata.requires("naibu") or [] if "extra ==" not in r}
     if not required:
         pytest.skip("naibu runs from its sources and is not installed")
     assert required <= {r.name for r in installation.doctor_rows()}
