@@ -8,7 +8,8 @@ from cyclopts import CycloptsError
 
 from naibu.cli import experiments, imaging, studies  # noqa: F401  they bring their verbs
 from naibu.cli.cold_start import first_run
-from naibu.cli.console import BAD_INPUT, INTERRUPTED, NO_SOLUTION, app, errors, fail, print_table, progress_display, say
+from naibu.cli.console import BAD_INPUT, FAILED, INTERRUPTED, NO_SOLUTION, app, errors, fail, print_table, progress_display, say
+from naibu.cli.failures import OutputLostError, flush_output, leave_quietly, output_lost, unexpected
 from naibu.cli.installation import doctor_rows, healthy
 from naibu.cli.option_names import in_options
 from naibu.core.errors import ConvergenceError, NaibuError
@@ -48,11 +49,22 @@ def _verb() -> str:
     return next((word for word in sys.argv[1:] if not word.startswith("-")), "")
 
 
-def main() -> None:
-    """Run the command line; a user's mistake ends with one message and exit code 2."""
+def _run() -> None:
+    """Run the verb, and see that what it printed was taken."""
     try:
         with first_run(_verb(), errors):
             app(sys.argv[1:], exit_on_error=False, print_error=False)
+    except SystemExit as ended:
+        if not ended.code:
+            flush_output()
+        raise
+    flush_output()
+
+
+def main() -> None:
+    """Run the command line; a user's mistake ends with one message and exit code 2, any other error with one message and code 1."""
+    try:
+        _run()
     except CycloptsError as error:
         fail(f"{' '.join(str(error).split())} See naibu --help, or naibu VERB --help.", BAD_INPUT)
     except NaibuError as error:
@@ -60,3 +72,11 @@ def main() -> None:
     except KeyboardInterrupt:
         errors.print("Interrupted; every file written is complete. The same command resumes an identification.", soft_wrap=True)
         sys.exit(INTERRUPTED)
+    except OutputLostError as error:
+        leave_quietly(str(error))
+    except MemoryError as error:
+        fail(f"naibu {_verb()} needs more memory than there is ({error or 'no details'}); use a coarser mesh or smaller volumes", FAILED)
+    except Exception as error:
+        if output_lost(error):
+            leave_quietly(f"standard output cannot be written ({error}); results in files are complete")
+        fail(unexpected(error, _verb()), FAILED)

@@ -1,7 +1,7 @@
 """The command-line application, its output and error consoles: lines, tables, progress, failures.
 
-Exit codes: 0 done, 1 the installation is not sound (``doctor``), 2 input that cannot be used, 3 a solve that failed, 130 interrupted,
-143 terminated.
+Exit codes: 0 done, 1 failed (an error of naibu's own, too little memory, lost output, or an unsound installation that ``doctor`` found),
+2 input that cannot be used, 3 a solve that failed, 130 interrupted, 143 terminated.
 """
 
 from __future__ import annotations
@@ -35,9 +35,10 @@ app = App(
     default_parameter=Parameter(negative_iterable=()),
 )
 WIDTH_OF_FILES = 160  # where the output is no terminal
-console = Console(width=None if sys.stdout.isatty() else WIDTH_OF_FILES)
-errors = Console(stderr=True, width=None if sys.stderr.isatty() else WIDTH_OF_FILES)
-BAD_INPUT, NO_SOLUTION, INTERRUPTED = 2, 3, 130
+# a stream that was closed before the start is None
+console = Console(width=None if sys.stdout is not None and sys.stdout.isatty() else WIDTH_OF_FILES)
+errors = Console(stderr=True, width=None if sys.stderr is not None and sys.stderr.isatty() else WIDTH_OF_FILES)
+FAILED, BAD_INPUT, NO_SOLUTION, INTERRUPTED = 1, 2, 3, 130
 QUIET_S, INTERVAL_S = 1.0, 5.0  # plain progress lines: none before the first, then one in the second
 
 
