@@ -27,6 +27,7 @@ from .finite_elements.boundary_conditions import PrescribedDisplacement
 from .finite_elements.elements import Elements, elements
 from .finite_elements.hyperelasticity import Law, Material, lame_parameters, law_named, material
 from .finite_strain.problem import Problem, SolverSettings
+from .finite_strain.quasi_static_session import EquilibriumState, QuasiStaticEngine, QuasiStaticSession
 from .finite_strain.sensitivities import sensitivities
 from .finite_strain.statics import LoadState, Solution, solve
 from .finite_strain.viscoelasticity import PronySeries, ViscoelasticSolution, simulate_viscoelastic
@@ -70,6 +71,7 @@ __all__ = [
     "ContactMotion",
     "Elements",
     "Engine",
+    "EquilibriumState",
     "Factorization",
     "Friction",
     "IndenterForce",
@@ -95,6 +97,8 @@ __all__ = [
     "PrescribedMotion",
     "Problem",
     "PronySeries",
+    "QuasiStaticEngine",
+    "QuasiStaticSession",
     "RecordedPush",
     "Rheology",
     "RigidIndenter",

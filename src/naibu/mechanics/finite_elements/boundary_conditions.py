@@ -21,10 +21,17 @@ class PrescribedDisplacement:
         Which components are prescribed.
     values : ndarray, shape (n, d)
         Their values at full load, mm.
+    start : ndarray, shape (n, d), optional
+        Their values without load, mm; zero by default.
     """
 
     constrained: BoolArray
     values: FloatArray
+    start: FloatArray | None = None
+
+    def at(self, load: float) -> FloatArray:
+        """Return the values (n, d), mm, at a fraction of the load."""
+        return np.asarray(load * self.values if self.start is None else self.start + load * (self.values - self.start))
 
     @classmethod
     def none(cls, n_points: int, dimension: int = 3) -> PrescribedDisplacement:
@@ -59,4 +66,4 @@ class PrescribedDisplacement:
         for axis in range(self.constrained.shape[1]) if components is None else np.flatnonzero(components):
             constrained[index, axis] = True
             all_values[index, axis] = given[:, axis]
-        return PrescribedDisplacement(constrained, all_values)
+        return PrescribedDisplacement(constrained, all_values, self.start)

@@ -176,7 +176,7 @@ class Newton:
         Displacing the constrained nodes alone would flatten the elements next to them.
         """
         p = self.problem
-        target = np.where(p.prescribed.constrained, load * p.prescribed.values, u)
+        target = np.where(p.prescribed.constrained, p.prescribed.at(load), u)
         jump = target - u
         if np.abs(jump).max() <= 1e-9 * float(np.ptp(p.points, axis=0).max()):
             return target

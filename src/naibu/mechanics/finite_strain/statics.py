@@ -82,8 +82,9 @@ def solve(
     callback: Callable[[float], None] | None = None,
     solver: LinearSolver | None = None,
     warm_start: Sequence[WarmStart] = (),
+    start: LoadState | None = None,
 ) -> Solution:
-    """Solve for static equilibrium, following the load in steps from the reference configuration.
+    """Solve for static equilibrium, following the load in steps from the reference configuration, or from a state.
 
     Parameters
     ----------
@@ -100,6 +101,8 @@ def solve(
     warm_start : sequence of (load, displacement)
         Displacements (n, 3), mm, of a similar problem at increasing loads up to 1: load steps then end at these loads and start from these
         displacements.
+    start : LoadState, optional
+        Equilibrium without load, with the history variables of its contacts; the reference configuration by default.
 
     Raises
     ------
@@ -111,7 +114,8 @@ def solve(
     chosen = settings or SolverSettings()
     require_finite("problem.external_force", problem.external_force)
     newton = Newton(problem, chosen, solver)
-    first = LoadState(0.0, np.zeros_like(problem.points), tuple(c.anchors_at_rest() for c in problem.contacts))
+    rest = LoadState(0.0, np.zeros_like(problem.points), tuple(c.anchors_at_rest() for c in problem.contacts))
+    first = rest if start is None else LoadState(0.0, start.displacement, start.anchors)
     states, residual = [first], 0.0
     step, ceiling = 1.0 if warm_start else chosen.first_step, 1.0 if warm_start else chosen.largest_step
     while states[-1].load < 1.0 - 1e-12:

@@ -1,0 +1,343 @@
+"""Quasi-static sessions of finite elements: a loop moves rigid indenters and bodies, and each step ends in equilibrium at finite strain.
+
+They follow the protocol of `naibu.mechanics.contact.session_protocol`, as lattices do, so that a loop can drive either. There is no
+inertia: the length of a step only turns velocities into displacements, and an indenter driven by a force stands where the body balances
+it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import brentq
+
+from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.errors import ConvergenceError, InputError
+from naibu.core.rigid_transform import rotation_matrix
+from naibu.mechanics.contact.contact_surfaces import Friction, rigid_contact
+from naibu.mechanics.contact.indenter_motion import IndenterForce, IndenterMotion, indenter_velocities
+from naibu.mechanics.contact.penalty_contact import Contact
+from naibu.mechanics.contact.rigid_indenters import RigidIndenter
+from naibu.mechanics.contact.session_protocol import StepForces
+from naibu.mechanics.finite_elements.assembly import Assembler
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
+from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
+from naibu.mechanics.finite_strain.statics import LoadState, Solution, solve
+
+IN_FEW_STEPS = SolverSettings(first_step=0.5, largest_step=1.0)
+FORCE_TOLERANCE = 1e-4  # of the force of a driven indenter
+FIRST_ADVANCE = 0.005  # of the extent of the body: how far a driven indenter is moved first
+FARTHEST = 1.0  # extents of the body
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EquilibriumState:
+    """Equilibrium of a body with its indenters.
+
+    Attributes
+    ----------
+    displacement : ndarray, shape (n, 3)
+        Of the nodes, mm.
+    centres : ndarray, shape (k, 3)
+        Positions of the indenters, mm.
+    rotations : ndarray, shape (k, 3, 3)
+        Their rotations since they were made.
+    anchors : tuple of ndarray, shape (p, 3)
+        Frictional anchors of their contacts, mm.
+    """
+
+    displacement: FloatArray
+    centres: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    rotations: FloatArray = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    anchors: tuple[FloatArray, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class QuasiStaticEngine:
+    """A finite element model prepared for quasi-static steps.
+
+    Attributes
+    ----------
+    points : ndarray, shape (n, 3)
+        Nodes in the reference configuration, mm.
+    assembler : Assembler
+        Elements and materials.
+    faces : ndarray, shape (f, 3) or (f, 4), int64
+        Boundary faces that indenters may touch.
+    step : float
+        Length of a step, s.
+    normal_stiffness, tangential_stiffness : float
+        Penalties of the contact, kPa/mm.
+    settings : SolverSettings
+        Load steps within a step, and tolerances.
+    """
+
+    points: FloatArray
+    assembler: Assembler
+    faces: IntArray
+    step: float = 1.0
+    normal_stiffness: float = 1000.0
+    tangential_stiffness: float = 200.0
+    settings: SolverSettings = IN_FEW_STEPS
+
+    def rest(self) -> EquilibriumState:
+        """Return the body in the reference configuration, without any force."""
+        return EquilibriumState(np.zeros_like(self.points))
+
+    def energy(self, state: EquilibriumState) -> float:
+        """Return the strain energy, mN mm."""
+        return float(self.assembler.forces(state.displacement)[0])
+
+    def session(
+        self,
+        state: EquilibriumState | None = None,
+        constrained: Sequence[ArrayLike] | None = None,
+        external_force: ArrayLike | None = None,
+        indenters: Sequence[RigidIndenter] = (),
+    ) -> QuasiStaticSession:
+        """Begin a session at a state, by default in the reference configuration.
+
+        Parameters
+        ----------
+        state : EquilibriumState, optional
+            Of a session with the same indenters.
+        constrained : sequence of array_like
+            Nodes that move with each rigid body.
+        external_force : array_like, shape (n, 3), optional
+            Dead load, mN.
+        indenters : sequence of RigidIndenter
+            In contact, or about to be.
+
+        Raises
+        ------
+        InputError
+            As `QuasiStaticSession.constrain`, `press` and `restore`.
+        """
+        load = np.broadcast_to(np.asarray(0.0 if external_force is None else external_force, dtype=float), self.points.shape)
+        session = QuasiStaticSession(self, load, self.rest())
+        session.constrain(constrained or ())
+        session.press(indenters)
+        if state is not None:
+            session.restore(state)
+        return session
+
+
+@dataclass(slots=True, eq=False)
+class QuasiStaticSession:
+    """A body that a loop moves from equilibrium to equilibrium; made by `QuasiStaticEngine.session`.
+
+    Attributes
+    ----------
+    engine : QuasiStaticEngine
+        The model.
+    external_force : ndarray, shape (n, 3)
+        Dead load, mN.
+    reached : EquilibriumState
+        The last equilibrium.
+    bodies : tuple of ndarray
+        Nodes of each rigid body.
+    indenters : tuple of RigidIndenter
+        As they were made.
+    """
+
+    engine: QuasiStaticEngine
+    external_force: FloatArray
+    reached: EquilibriumState
+    bodies: tuple[IntArray, ...] = ()
+    indenters: tuple[RigidIndenter, ...] = ()
+    _forces: StepForces = field(default_factory=lambda: StepForces(np.zeros((0, 0, 3))))
+
+    def constrain(self, constrained: Sequence[ArrayLike], bodies: int = 0) -> None:
+        """Constrain these nodes, and no others, from the next step on.
+
+        Parameters
+        ----------
+        constrained : sequence of array_like
+            Nodes of each rigid body.
+        bodies : int
+            Number of bodies, if some have no node at present.
+
+        Raises
+        ------
+        InputError
+            A node that does not exist, or that belongs to two bodies.
+        """
+        chosen = tuple(np.unique(np.asarray(nodes, dtype=np.int64)) for nodes in constrained)
+        listed = np.concatenate([*chosen, np.zeros(0, np.int64)])
+        n = len(self.engine.points)
+        if len(listed) and (listed.min() < 0 or listed.max() >= n):
+            raise InputError(f"constrained has nodes from {listed.min()} to {listed.max()}; the mesh has nodes 0 to {n - 1}")
+        if len(np.unique(listed)) < len(listed):
+            raise InputError("constrained has a node that belongs to two bodies; each node moves with one")
+        self.bodies = chosen + tuple(np.zeros(0, np.int64) for _ in range(bodies - len(chosen)))
+
+    def press(self, indenters: Sequence[RigidIndenter]) -> None:
+        """Bring these indenters, and no others, into play from the next step on, where they were made.
+
+        Raises
+        ------
+        InputError
+            An indenter with pull-off, or with a kinetic friction below the static one: quasi-static contact has neither.
+        """
+        for k, indenter in enumerate(indenters):
+            if indenter.pull_stiffness or indenter.pull_damping:
+                raise InputError(f"indenters[{k}] has pull-off, which needs a dynamic model; use a lattice, or leave it out")
+            if indenter.kinetic_friction != indenter.static_friction:
+                raise InputError(f"indenters[{k}] has two friction coefficients; quasi-static contact has one: give both the same value")
+        self.indenters = tuple(indenters)
+        centres = np.array([i.centre for i in indenters], dtype=float).reshape(-1, 3)
+        placed = replace(self.reached, centres=centres, rotations=np.tile(np.eye(3), (len(centres), 1, 1)), anchors=())
+        contacts = self._contacts(placed, centres, np.zeros_like(centres))
+        self.reached = replace(placed, anchors=tuple(c.local(placed.displacement, 0.0) for c in contacts))
+
+    def step(self, velocity: ArrayLike = 0.0, motions: Sequence[IndenterMotion] = (), *, steps: int = 1) -> StepForces:
+        """Take steps to equilibrium.
+
+        Parameters
+        ----------
+        velocity : array_like, shape (3,), (bodies, 3) or (steps, bodies, 3)
+            Of the bodies of constrained nodes, mm/s.
+        motions : sequence of IndenterMotion
+            One for each indenter, or none: they stand still. At most one may be a force.
+        steps : int
+            Number of steps; a pose is reached at the end of the last.
+
+        Raises
+        ------
+        InputError
+            Motions for another number of indenters, or values of another shape.
+        ConvergenceError
+            There is no equilibrium, or none at which the body balances the force; the session stays at the last equilibrium.
+        """
+        if len(motions) not in (0, len(self.indenters)):
+            raise InputError(f"motions has {len(motions)} entries for {len(self.indenters)} indenters; give one for each, or none")
+        driven = [k for k, motion in enumerate(motions) if isinstance(motion, IndenterForce)]
+        if len(driven) > 1:
+            raise InputError("motions drives several indenters by forces; only one can be driven by a force in a step")
+        speeds = np.broadcast_to(np.asarray(velocity, dtype=float), (steps, len(self.bodies), 3))
+        axes = np.array([i.geometry.axes @ r.T for i, r in zip(self.indenters, self.reached.rotations, strict=True)]).reshape(-1, 3, 3)
+        duration = steps * self.engine.step
+        along, spin, _ = indenter_velocities(self.indenters, motions, self.reached.centres, axes, duration)
+        of_bodies, of_indenters = [], []
+        for moving in speeds:
+            ends = self.reached.centres + self.engine.step * along
+            if driven:
+                solution, contacts = self._driven(motions[driven[0]], driven[0], moving, ends, spin)
+            else:
+                solution, contacts = self._solved(moving, ends, spin)
+            self._accept(solution, contacts, spin)
+            of_bodies.append(self._body_forces(solution, contacts))
+            of_indenters.append(np.array([solution.reactions[c.name] for c in contacts]).reshape(-1, 3))
+        self._forces = StepForces(np.array(of_bodies).reshape(steps, -1, 3), np.array(of_indenters).reshape(steps, -1, 3))
+        return self._forces
+
+    def positions(self, nodes: ArrayLike | None = None) -> FloatArray:
+        """Return positions of nodes (k, 3), mm, by default of all."""
+        x = self.engine.points + self.reached.displacement
+        return x if nodes is None else np.asarray(x[np.asarray(nodes, dtype=np.int64)])
+
+    def forces(self) -> StepForces:
+        """Return the forces of the last call of `step`."""
+        return self._forces
+
+    def state(self) -> EquilibriumState:
+        """Return the equilibrium, contacts included."""
+        return self.reached
+
+    def restore(self, state: EquilibriumState) -> None:
+        """Go on from a state.
+
+        Raises
+        ------
+        InputError
+            A state of another mesh or of other indenters.
+        """
+        if state.displacement.shape != self.engine.points.shape or len(state.anchors) not in (0, len(self.indenters)):
+            raise InputError(
+                f"state is that of {len(state.displacement)} nodes and {len(state.anchors)} indenters; the session has "
+                f"{len(self.engine.points)} and {len(self.indenters)}"
+            )
+        self.reached = state if len(state.anchors) == len(self.indenters) else replace(self.reached, displacement=state.displacement)
+
+    def close(self) -> None:
+        """Do nothing: the session holds neither threads nor device memory."""
+
+    def __enter__(self) -> Self:
+        """Return the session."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """Close it."""
+
+    def _contacts(self, state: EquilibriumState, ends: FloatArray, spin: FloatArray) -> tuple[Contact, ...]:
+        """Contacts whose bodies move from where they are to their ends during the load."""
+        engine, out = self.engine, []
+        for k, indenter in enumerate(self.indenters):
+            contact = rigid_contact(
+                f"indenter {k}", engine.points, engine.faces, indenter.geometry, start=state.centres[k], stop=ends[k],
+                friction=Friction(indenter.static_friction, engine.tangential_stiffness), normal_stiffness=engine.normal_stiffness,
+                rotation=state.rotations[k],
+            )  # fmt: skip
+            out.append(replace(contact, tilt=engine.step * spin[k]) if spin[k].any() else contact)
+        return tuple(out)
+
+    def _solved(self, velocity: FloatArray, ends: FloatArray, spin: FloatArray) -> tuple[Solution, tuple[Contact, ...]]:
+        start = self.reached
+        prescribed = PrescribedDisplacement.none(len(self.engine.points))
+        for nodes, speed in zip(self.bodies, velocity, strict=True):
+            if len(nodes):
+                prescribed = prescribed.and_also(nodes, start.displacement[nodes] + self.engine.step * speed)
+        contacts = self._contacts(start, ends, spin)
+        prescribed = replace(prescribed, start=start.displacement)
+        problem = Problem(self.engine.points, self.engine.assembler, contacts, prescribed, self.external_force)
+        return solve(problem, settings=self.engine.settings, start=LoadState(0.0, start.displacement, start.anchors)), contacts
+
+    def _driven(
+        self, motion: IndenterMotion, index: int, velocity: FloatArray, ends: FloatArray, spin: FloatArray
+    ) -> tuple[Solution, tuple[Contact, ...]]:
+        """Move an indenter along its guide to where the body balances its force."""
+        assert isinstance(motion, IndenterForce)
+        guide, wanted = motion.guide(), float(motion.force)
+        extent = float(np.ptp(self.engine.points, axis=0).max())
+        tried: dict[float, tuple[Solution, tuple[Contact, ...]]] = {}
+
+        def excess(advance: float) -> float:
+            placed = ends.copy()
+            placed[index] += advance * guide
+            tried[advance] = self._solved(velocity, placed, spin)
+            return float(tried[advance][0].reactions[f"indenter {index}"] @ guide) - wanted
+
+        here, reach = excess(0.0), FIRST_ADVANCE * extent
+        sign, before = (1.0 if here < 0.0 else -1.0), 0.0
+        while abs(here) > FORCE_TOLERANCE * max(abs(wanted), 1e-9) and sign * excess(sign * reach) < 0.0:
+            before, reach = reach, 2.0 * reach
+            if reach > FARTHEST * extent:
+                raise ConvergenceError(f"the body does not balance {wanted:g} mN of indenter {index} within {before:.3g} mm of its guide")
+        if abs(here) <= FORCE_TOLERANCE * max(abs(wanted), 1e-9):
+            return tried[0.0]
+        low, high = sorted((sign * before, sign * reach))
+        root = float(brentq(excess, low, high, xtol=1e-6 * extent, rtol=1e-6))
+        if root not in tried:
+            excess(root)
+        return tried[root]
+
+    def _accept(self, solution: Solution, contacts: tuple[Contact, ...], spin: FloatArray) -> None:
+        last = solution.states[-1]
+        centres = np.array([c.stop for c in contacts]).reshape(-1, 3)
+        turned = [rotation_matrix(self.engine.step * w) @ r if w.any() else r for w, r in zip(spin, self.reached.rotations, strict=True)]
+        self.reached = EquilibriumState(last.displacement, centres, np.array(turned).reshape(-1, 3, 3), last.anchors)
+
+    def _body_forces(self, solution: Solution, contacts: tuple[Contact, ...]) -> FloatArray:
+        """Forces (bodies, 3), mN, of the bodies of constrained nodes on the object."""
+        last = solution.states[-1]
+        before = solution.states[-2].anchors if len(solution.states) > 1 else last.anchors
+        rest = self.engine.assembler.forces(last.displacement)[1] - self.external_force
+        for contact, anchors in zip(contacts, before, strict=True):
+            response = contact.evaluate(last.displacement, anchors, last.load)
+            rest = rest - contact.scattered(response.force, len(rest), response.orientation)
+        return np.array([rest[nodes].sum(axis=0) for nodes in self.bodies]).reshape(-1, 3)
