@@ -49,7 +49,7 @@ def refused(ended: tuple[int, str, str], *words: str) -> None:
     """A message that holds the words, and nothing written."""
     code, _, message = ended
     assert code == cli.BAD_INPUT, message
-    assert message.startswith("error ") and message.count("\n") <= 2 and "Traceback" not in message, message
+    assert message.startswith("error: ") and message.count("\n") <= 2 and "Traceback" not in message, message
     for word in words:
         assert word in message, message
     assert not [p for p in Path().rglob("*") if p.is_file()]

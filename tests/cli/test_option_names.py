@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from cyclopts import CycloptsError
 
 from naibu.cli import app
-from naibu.cli.option_names import OTHER_NAMES, in_options
+from naibu.cli.option_names import OTHER_NAMES, in_options, usage_error
 
 SAID = {
     "predict": [
@@ -49,3 +50,22 @@ def test_other_names_stand_for_options_there_are() -> None:
     for verb, names in OTHER_NAMES.items():
         options = {a.field_info.name for a in app[verb].assemble_argument_collection()}
         assert set(names.values()) <= options, verb
+
+
+@pytest.mark.parametrize(
+    ("tokens", "shown"),
+    [
+        (["sense", "a.mha"], "naibu sense needs DEFORMED. See naibu sense --help."),
+        (["track", "a.mha"], "naibu track needs --diameter-mm. See naibu track --help."),
+        (["identify", "--law"], "--law needs a value. See naibu identify --help."),
+        (["sense", "a.mha", "b.mha", "--methode"], "Unknown option: --methode. Did you mean --method? See naibu sense --help."),
+    ],
+)
+def test_usage_errors_name_operands_and_the_help_of_the_verb(tokens: list[str], shown: str) -> None:
+    with pytest.raises(CycloptsError) as refused:
+        app(tokens, exit_on_error=False, print_error=False)
+    assert usage_error(" ".join(str(refused.value).split()), app, tokens) == shown
+
+
+def test_an_unknown_verb_leads_to_the_list_of_verbs() -> None:
+    assert usage_error('Unknown command "simulte".', app, ["simulte"]) == 'Unknown command "simulte". See naibu --help.'

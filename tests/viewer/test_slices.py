@@ -55,6 +55,11 @@ def test_values_survive_within_their_steps() -> None:
     assert np.abs(arrows[1:] * data["arrows"]["quantum"] - v.displacement[1:]).max() <= 0.51 * data["arrows"]["quantum"]
 
 
+def test_positions_start_at_the_origin_of_the_grid() -> None:
+    assert payload(slices_html(view()))["first"] == [0.0, 0.0, 0.0]
+    assert payload(slices_html(view(origin_mm=(-3.0, 4.0, 10.5))))["first"] == [-3.0, 4.0, 10.5]
+
+
 def test_what_is_not_known_has_no_colour_and_two_sided_scales_are_even() -> None:
     data = payload(slices_html(view()))
     size, ratio = data["overlays"]

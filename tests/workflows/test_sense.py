@@ -22,7 +22,7 @@ from naibu.io.marker_tables import import_markers
 from naibu.io.meshes import read_mesh
 from naibu.validation.specimens.textured_sphere import squeezed_ball
 from naibu.workflows.compare_methods import compare_methods
-from naibu.workflows.sense import read_pair, sense_pair, slice_view
+from naibu.workflows.sense import Pair, read_pair, sense_pair, slice_view
 
 Array = np.ndarray
 
@@ -127,6 +127,18 @@ def test_a_field_that_folds_is_named_on_the_page(folder: Path) -> None:
     assert not any("folds" in sentence for sentence in slice_view(pair, run).sentences)
     folded = replace(run, figures=run.figures | {"folded_fraction": 0.125})
     assert any("folds at 12.50%" in sentence for sentence in slice_view(pair, folded).sentences)
+
+
+def test_the_page_states_positions_of_the_scan_and_the_part_that_was_not_measured() -> None:
+    before, after, _, mask = squeezed_ball(seed=3)
+    pair = Pair(before, after, mask, {}, ("before", "after"))
+    run = sense_pair(pair, method="rigid")
+    view = slice_view(pair, run)
+    first = np.array([at.min() for at in np.nonzero(mask)])[::-1] - 4  # voxels around the object
+    np.testing.assert_allclose(view.origin_mm, before.to_physical(np.maximum(first, 0)), atol=1e-9)
+    assert not any("not measured" in sentence for sentence in view.sentences)
+    part = replace(run, figures={**run.figures, "measured_fraction": 0.75})
+    assert any("25.0% of the object was not measured" in sentence for sentence in slice_view(pair, part).sentences)
 
 
 def test_methods_that_all_fail_say_why(folder: Path, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from naibu.cli.cold_start import first_run
 from naibu.cli.console import BAD_INPUT, FAILED, INTERRUPTED, NO_SOLUTION, app, errors, fail, print_table, progress_display, say
 from naibu.cli.failures import OutputLostError, flush_output, leave_quietly, output_lost, unexpected
 from naibu.cli.installation import doctor_rows, healthy
-from naibu.cli.option_names import in_options
+from naibu.cli.option_names import in_options, usage_error
 from naibu.core.errors import ConvergenceError, NaibuError
 
 
@@ -66,7 +66,7 @@ def main() -> None:
     try:
         _run()
     except CycloptsError as error:
-        fail(f"{' '.join(str(error).split())} See naibu --help, or naibu VERB --help.", BAD_INPUT)
+        fail(usage_error(" ".join(str(error).split()), app, sys.argv[1:]), BAD_INPUT)
     except NaibuError as error:
         fail(in_options(str(error), app, sys.argv[1:]), NO_SOLUTION if isinstance(error, ConvergenceError) else BAD_INPUT)
     except KeyboardInterrupt:

@@ -126,5 +126,5 @@ def _cell(value: object) -> str:
 
 def fail(text: str, code: int) -> NoReturn:
     """Print an error message and exit with a code."""
-    errors.print(f"[bold red]error[/bold red] {escape(text)}", soft_wrap=True, highlight=False)
+    errors.print(f"[bold red]error:[/bold red] {escape(text)}", soft_wrap=True, highlight=False)
     sys.exit(code)

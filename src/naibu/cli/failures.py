@@ -73,6 +73,6 @@ def flush_output() -> None:
 def leave_quietly(reason: str) -> NoReturn:
     """End with exit code 1, without the interpreter's second attempt to write what is buffered."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
-        sys.stderr.write(f"error {reason}\n")
+        sys.stderr.write(f"error: {reason}\n")
         sys.stderr.flush()
     os._exit(1)

@@ -35,7 +35,8 @@ def sense(
     method
         Digital volume correlation regularised by mechanics (default), or a classic method.
     out
-        Folder for displacement.mha, standard_deviation.mha, displacement.vtu, field.npz, sense.json and report.html.
+        Folder for displacement.mha, standard_deviation.mha, displacement.vtu, field.npz, initial.csv and pressed.csv (positions as
+        markers), sense.json and report.html.
     """
     from naibu.workflows.sense import read_pair, sense_pair
 

@@ -44,12 +44,39 @@ def in_options(message: str, app: App, tokens: Sequence[str]) -> str:
     return message
 
 
+def usage_error(message: str, app: App, tokens: Sequence[str]) -> str:
+    """Return a message about the form of a command, with operands by their names and the help to look at.
+
+    Parameters
+    ----------
+    message : str
+        Text of an error of the parser.
+    app : App
+        The program.
+    tokens : sequence of str
+        Arguments of the command line.
+    """
+    chain, apps, _ = app.parse_commands(list(tokens))
+    if not chain or chain[0].startswith("-"):
+        return f"{message} See naibu --help."
+    lacking = re.fullmatch(r'Command "\S+" parameter (--\S+) requires an argument\.', message)
+    if lacking:
+        operands = {a.names[0]: _operand(a.names[0]) for a in apps[-1].assemble_argument_collection() if a.index is not None}
+        given = lacking[1] in tokens
+        message = f"{lacking[1]} needs a value." if given else f"naibu {chain[0]} needs {operands.get(lacking[1], lacking[1])}."
+    return f"{message} See naibu {chain[0]} --help."
+
+
+def _operand(option: str) -> str:
+    return option[2:].replace("-", "_").upper()
+
+
 def _options(verb: App, name: str) -> dict[str, str]:
     """Spelling of every argument on the command line; the longest names come first."""
     spelled = {}
     for argument in verb.assemble_argument_collection():
         if not argument.names[0].startswith("--"):
             continue
-        spelled[argument.field_info.name] = argument.names[0] if argument.index is None else argument.names[0][2:].replace("-", "_").upper()
+        spelled[argument.field_info.name] = argument.names[0] if argument.index is None else _operand(argument.names[0])
     spelled |= {other: spelled[own] for other, own in OTHER_NAMES.get(name, {}).items()}
     return dict(sorted(spelled.items(), key=lambda item: -len(item[0])))

@@ -182,7 +182,7 @@ def write_experiment_folder(
         ("[markers]", {"nominal_spacing_mm": spacing_mm}),
         *(("[[layer]]", _layer_table(la)) for la in layers),
         ("[loading]", _loading_table(loading)),
-        ("[[state]]", {"name": "initial", "what": "free", "file": "initial.csv"}),
+        ("[[state]]", {"name": "initial", "what": "no load", "file": "initial.csv"}),
         *(("[[state]]", {"name": name, "file": f"{name}.csv", key: heights.get(name)}) for name in states),
     )
     _place_checked(target, text, {"initial": initial, **states})

@@ -58,6 +58,8 @@ class SliceView:
         Fields to choose from.
     tables : sequence of Table
         Tables below the slices.
+    origin_mm : array_like, shape (3,), optional
+        Position of the first voxel along the axes of the grid, mm.
     difference : tuple of (str, int, int), optional
         Further images to choose from, as differences: name, and the numbers of two images.
     """
@@ -69,6 +71,7 @@ class SliceView:
     displacement: AnyFloatArray
     overlays: Sequence[Overlay]
     tables: Sequence[Table] = ()
+    origin_mm: AnyFloatArray | Sequence[float] = (0.0, 0.0, 0.0)
     difference: tuple[tuple[str, int, int], ...] = ()
 
 
@@ -91,7 +94,7 @@ def slices_html(view: SliceView) -> str:
     payload = {
         "size": [len(range(s.start, n, s.step)) for s, n in zip(steps, shape, strict=True)][::-1],
         "spacing": [float(d * k) for d, k in zip(view.spacing_mm, every, strict=True)],
-        "first": [float(d * (k // 2)) for d, k in zip(view.spacing_mm, every, strict=True)],
+        "first": [float(o + d * (k // 2)) for o, d, k in zip(view.origin_mm, view.spacing_mm, every, strict=True)],
         "images": _images([(name, v[steps]) for name, v in view.images]),
         "difference": [[name, a, b] for name, a, b in view.difference],
         "overlays": [_overlay(o, o.values[steps]) for o in view.overlays],

@@ -164,15 +164,33 @@ def sense(
 
     Parameters
     ----------
-    reference, deformed, mask, truth, check_points, spacing_mm
-        See `read_pair`.
-    method, out, progress
-        See `sense_pair`.
+    reference, deformed : path-like
+        Volumes before and after the deformation, on one grid: MetaImage, NIfTI, NRRD, TIFF, HDF5, Zarr or a folder of DICOM.
+    method : str
+        ``"default"`` for digital volume correlation, or a classic method (see `naibu.imaging.measure_displacement`).
+    mask : path-like, optional
+        Volume on the grid of the reference, not zero in the object; by default the object is segmented.
+    truth : path-like, optional
+        True displacement on that grid, an image of vectors, mm, to compare with.
+    check_points : two path-like, optional
+        Tables of points in the reference and in the deformed configuration, with one number for each point, to compare with.
+    spacing_mm : sequence of float, optional
+        Voxel spacing along x, y, z, mm, for files without it.
+    out : path-like, optional
+        Folder for fields, markers, numbers and the page of slices (see `naibu.workflows.sense.sense_pair`).
+    progress : Progress, optional
+        Called at the beginning of every stage.
+
+    Returns
+    -------
+    SenseRun
+        The displacement (``measured.displacement``), figures and files.
 
     Raises
     ------
     InputError
-        As `read_pair` and `sense_pair`.
+        A file that cannot be read; volumes, mask or truth on different grids; volumes that cannot be compared; a folder that cannot be
+        written to.
     """
     pair = read_pair(reference, deformed, mask=mask, truth=truth, check_points=check_points, spacing_mm=spacing_mm)
     return sense_pair(pair, method=method, out=out, progress=progress)
@@ -349,6 +367,7 @@ def slice_view(pair: Pair, run: SenseRun) -> SliceView:
         displacement=(u @ grid.direction)[box],
         overlays=overlays,
         tables=[_table(run)],
+        origin_mm=grid.to_physical([b.start for b in box[::-1]]) @ grid.direction,
         difference=(("reference minus deformed", 0, 1), ("reference minus deformed, warped back", 0, 2)),
     )
 
@@ -371,6 +390,11 @@ def _sentences(run: SenseRun) -> list[str]:
         )
     else:
         sentences.append("This method states no uncertainty.")
+    if isinstance(f["measured_fraction"], float) and f["measured_fraction"] < 0.995:
+        sentences.append(
+            f"The displacement of {1.0 - f['measured_fraction']:.1%} of the object was not measured: that part lies outside one of the "
+            "scans, or in its padding, or the method found no match there."
+        )
     if isinstance(f["folded_fraction"], float) and f["folded_fraction"] > 0.0:
         sentences.append(f"The field folds at {f['folded_fraction']:.2%} of the voxels: it is wrong there.")
     return sentences

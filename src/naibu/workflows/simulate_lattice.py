@@ -243,7 +243,7 @@ def _sentences(prepared: PreparedStudy, state: StudyState, force: FloatArray) ->
     study = prepared.study
     lattice = study.lattice
     found = [
-        f"{lattice.n_nodes} masses, {1e3 * lattice.total_mass:.4g} g in all, joined by {lattice.n_elements} elements of a spring and "
+        f"{lattice.n_nodes} nodes, {1e3 * lattice.total_mass:.4g} g in all, joined by {lattice.n_elements} elements of a spring and "
         f"two dashpots; {study.frames * study.frame_s:g} s in steps of {1e3 * study.step_s:g} ms."
     ]
     if state.frame < study.frames:
@@ -265,7 +265,7 @@ def _tables(prepared: PreparedStudy, force: FloatArray, moved: FloatArray, times
         if len(size):
             at = prepared.study.sample_s * (int(np.argmax(size)) + 1)
             rows.append((f"largest force of {body.name}, mN", float(size.max()), float(at) if size.max() > 0.0 else None))
-    return [Table("Largest values", ("what", "value", "at, s"), tuple(rows))]
+    return [Table("Largest values", ("quantity", "value", "time, s"), tuple(rows))]
 
 
 def _packed(state: StudyState, fingerprint: str) -> bytes:

@@ -167,7 +167,7 @@ def _relative(p: Parameter, model: CalibratedModel, experiment: Experiment, note
         centre = float(np.mean([q.inner(q.value) for q in similar]))
         return Parameter(p.name, p.physical(centre), p.unit, p.scale, prior_sd=0.5 if p.scale == "incompressibility" else 0.1)
     if kind == "stiffness":
-        notes.append(f"how stiff {subject} is was not identified; it is taken to be like the others")
+        notes.append(f"the relative stiffness of {subject} was not identified; it is taken to be that of the other batches")
         return Parameter(p.name, 1.0, p.unit, p.scale, prior_sd=p.prior_sd)
     sisters = [q for q in similar if q.name.split("/")[0] == experiment.name]
     if kind.startswith("shift_of_layer") and similar:

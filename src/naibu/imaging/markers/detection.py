@@ -211,7 +211,7 @@ def detect_markers(
     found = max((_found(values, look, volume, diameter_mm, count, how) for look in looks), key=lambda f: f.energy)
     if count is not None and len(found.kept.score) < count:
         raise InputError(
-            f"{len(found.kept.score)} markers found, {count} asked for; {found.summary}. Lower count, or check diameter_mm and mask"
+            f"{len(found.kept.score)} markers found, {count} asked for; {found.summary}. Lower `count`, or check diameter_mm and `mask`"
         )
     if not len(found.kept.score):
         what = "bright or dark" if polarity == "auto" else polarity
@@ -219,7 +219,7 @@ def detect_markers(
         raise InputError(
             f"no {what} marker of about {diameter_mm:g} mm was found: the strongest peak of that size has a contrast of {strongest:.3g}, "
             f"{strongest / noise:.1f} times the noise ({how.min_contrast:g} times are needed); {found.summary}. "
-            "Check diameter_mm, polarity and mask"
+            "Check diameter_mm, `polarity` and `mask`"
         )
     report_progress(progress, "locating markers", done=2, total=3)
     centres, covariance = _located(values * np.float32(found.sign), found.kept, volume.spacing_mm, diameter_mm, thickness_mm)
