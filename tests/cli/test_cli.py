@@ -195,7 +195,7 @@ def test_a_folder_that_cannot_be_used_is_refused(naibu: Run, experiment_folder: 
 
 IDENTIFY_MISTAKES = {
     "unknown dataset": (("ct_cube_plat",), ("ct_cube_plat", "Did you mean 'ct_cube_plate'")),
-    "no experiment": ((), ("experiments",)),
+    "no experiment": ((), ("naibu identify needs EXPERIMENTS", "naibu identify --help")),
     "twice": (("PRESS", "PRESS"), ("'press'", "once")),
     "unknown material": (("PRESS", "--known", "hard=200"), ("'hard'", "firm", "soft")),
     "no modulus": (("PRESS", "--known", "firm=2oo kPa"), ("firm=2oo kPa", "kPa")),
