@@ -20,6 +20,7 @@ from naibu.viewer.result_page.payload import Box, Correlation, ParameterRow, Rep
 from naibu.viewer.tables import Cell, Table
 
 _ACCURACY_COLUMNS = ("experiment/state", "markers", "x mm", "y mm", "z mm", "3-D mm", "in noise units")
+LABELS: Mapping[str, str] = {"young_modulus": "Young's modulus", "poisson_ratio": "Poisson's ratio"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,6 +172,12 @@ def shared_names(model: CalibratedModel) -> tuple[str, ...]:
     return tuple(p.name for p in model.parameters.free if p.name.partition(":")[0].partition("/")[0] not in own)
 
 
+def parameter_label(name: str) -> str:
+    """Return the name of a parameter as a reader writes it: ``"gel: young_modulus"`` is "gel: Young's modulus"."""
+    subject, separator, kind = name.rpartition(": ")
+    return f"{subject}{separator}{LABELS.get(kind, kind.replace('_', ' '))}"
+
+
 def parameter_rows(model: CalibratedModel, names: Sequence[str]) -> tuple[ParameterRow, ...]:
     """Return estimates with 95 % intervals, given values with a note."""
     rows = []
@@ -180,7 +187,7 @@ def parameter_rows(model: CalibratedModel, names: Sequence[str]) -> tuple[Parame
             note = (
                 "" if not p.fixed else ("given" if model.known_materials.scale_is_absolute else "sets the scale: moduli are ratios to it")
             )
-            rows.append(ParameterRow(p.name, p.name.replace("_", " "), p.value, low, high, p.unit, note))
+            rows.append(ParameterRow(p.name, parameter_label(p.name), p.value, low, high, p.unit, note))
     return tuple(rows)
 
 

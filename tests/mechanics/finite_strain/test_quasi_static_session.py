@@ -63,7 +63,7 @@ def test_steps_end_where_one_solve_ends(steps: int) -> None:
     told = session.step(motions=[IndenterVelocity((0.0, 0.0, -2.0 / steps))], steps=steps)
     np.testing.assert_allclose(session.positions() - MESH.points, expected, atol=1e-6)
     np.testing.assert_allclose(told.indenters[-1, 0], force, rtol=1e-6, atol=1e-6 * np.linalg.norm(force))
-    np.testing.assert_allclose(told.bodies[-1, 0] + told.indenters[-1, 0], 0.0, atol=1e-5 * np.linalg.norm(force))  # force balance
+    np.testing.assert_allclose(told.bodies[-1, 0] + told.indenters[-1, 0], 0.0, atol=1e-5 * np.linalg.norm(force))  # action and reaction
     assert engine().energy(session.state()) > 0.0
 
 

@@ -74,7 +74,7 @@ def _parameter_row(row: ParameterRow, scale: _Scale) -> str:
     low, high = (_to_width(v, width) if math.isfinite(v) else "?" for v in (row.lower, row.upper))
     unit = f" {escape(row.unit)}" if row.unit else ""
     value = f"<strong>{_to_width(row.estimate, width)}</strong> [{low}, {high}]{unit}"
-    name = f"{escape(row.label)} <code>{escape(row.name)}</code>"
+    name = escape(row.label) if row.label == row.name else f"{escape(row.label)} <code>{escape(row.name)}</code>"
     svg = f'<svg width="100%" height="20" aria-hidden="true">{_interval(row, scale)}</svg>'
     return f'<tr><th scope="row">{name}</th><td>{value}</td><td class="plot">{svg}</td><td>{escape(row.note)}</td></tr>'
 
