@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import os
 import socket
 import zlib
@@ -76,14 +77,17 @@ def test_compressed_bombs_are_not_unpacked(tmp_path: Path) -> None:
     (tmp_path / "a.mha").write_bytes(head.encode() + bomb)
     with pytest.raises(InputError, match="unpack to more than"):
         read_volume(tmp_path / "a.mha")
-    gz = zlib.compressobj(9, zlib.DEFLATED, 31)
-    (tmp_path / "a.nrrd").write_bytes(
-        b"NRRD0004\ntype: uint8\ndimension: 3\nsizes: 10 10 10\nspacings: 1 1 1\nencoding: gzip\n\n"
-        + gz.compress(bytes(300 << 20))
-        + gz.flush()
-    )
+    packed = gzip.compress(bytes(300 << 20))
+    (tmp_path / "a.nrrd").write_bytes(b"NRRD0004\ntype: uint8\ndimension: 3\nsizes: 10 10 10\nspacings: 1 1 1\nencoding: gzip\n\n" + packed)
     with pytest.raises(InputError, match="unpack to more than"):
         read_volume(tmp_path / "a.nrrd")
+    head = "NRRD0004\ntype: uint8\ndimension: 3\nsizes: 10 10 10\nspacings: 1 1 1\nencoding: gzip\ndata file: a.raw.gz\n"
+    (tmp_path / "a.nhdr").write_text(head)
+    (tmp_path / "a.raw.gz").write_bytes(packed)
+    with pytest.raises(InputError, match="unpack to more than"):
+        read_volume(tmp_path / "a.nhdr")
+    (tmp_path / "a.raw.gz").write_bytes(gzip.compress(bytes(range(250)) * 4))
+    assert read_volume(tmp_path / "a.nhdr").values[0, 0].tolist() == list(range(10))
 
 
 @pytest.mark.parametrize("named", ["/etc/hostname", "../secret.raw", "sub/../../secret.raw"])

@@ -17,7 +17,7 @@ from naibu.core.errors import InputError
 from naibu.core.optional_packages import optional_package
 from naibu.core.volume import Volume
 from naibu.io.files.atomic import write_atomically
-from naibu.io.files.reading import file_beside, guarded_reading, inflated, require_plausible, require_regular
+from naibu.io.files.reading import file_beside, guarded_reading, inflated, read_bytes, require_plausible, require_regular
 from naibu.io.image_formats.geometry import FLIP_RAS, ReadOptions, three_axes, unit_length, volume_with_axes
 
 _TO_LPS = {
@@ -85,10 +85,11 @@ def _loaded(path: Path) -> tuple[AnyArray, dict[str, Any]]:
         method = _PACKED.get(str(header.get("encoding", "raw")).lower())
         # a value takes a byte at least, and eight at most
         require_plausible(path.name, count, holder.stat().st_size, compressed=method is not None)
-        if method is None or holder != path or header.get("line skip") or header.get("byte skip"):
+        if method is None or header.get("line skip") or header.get("byte skip"):
             return np.asarray(nrrd.read_data(header, stream, str(path))), header
-        content = inflated(stream.read(), 8 * count, method)
-        return np.asarray(nrrd.read_data(header | {"encoding": "raw"}, io.BytesIO(content))), header
+        content = inflated(stream.read() if holder == path else read_bytes(holder), 8 * count, method)
+        plain = {key: value for key, value in header.items() if key not in ("data file", "datafile")} | {"encoding": "raw"}
+        return np.asarray(nrrd.read_data(plain, io.BytesIO(content))), header
 
 
 def _data_file(path: Path, header: dict[str, Any]) -> Path:
