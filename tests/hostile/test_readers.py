@@ -3,27 +3,47 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import gzip
+import json
 import os
 import socket
+import subprocess
+import sys
 import zlib
 from pathlib import Path
 
+import fuzz
 import h5py
 import numpy as np
 import pytest
-from damaged_files import mutated
-from fuzz import outcome
+from damaged_files import NUMBERS, WORDS, mutated
+from fuzz import outcome, time_limit
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from lattice_studies import STUDY
 from valid_files import ValidFile, valid_files
 
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.io.experiment_folder.reader import read_experiment
 from naibu.io.images import read_volume, write_volume
+from naibu.io.lattice_study_schema import load_study
 from naibu.io.marker_tables import import_markers
 from naibu.io.meshes import read_mesh, read_surface
 
 EACH = 12
+# a stack whose fourth page is its own successor, found by mutation
+CIRCLE_OF_PAGES = (
+    b"c-pm;*Hcqb5XOHgG*JW<P_RU7h#`g&Kx`;Bu!}k>6A>YSD1-"
+    b"=zB4Y2NV#nTl@4fe~FZ$v*J~;jzZo*{@s1FX|&U|}z&bPbsojqr7T3QsoKub_*QHkdxP$|B*K&{fa{6K+5@m-"
+    b"voAD~jRUDn5fASJh2Ot4!_h+EB2#h)k$Q+c_3tC(=bw~L8Xay5b&soz}IGC#;r_SJ%TAuA%{^0OV5h-6)+Nv})L>k`d+T||i^JI7|v%PK5%5-"
+    b"|p&UKe8!KGtA#(nZC#Jeyr%qvM=(ywjKrCMTV1E4Jj6+KTK>x;ERW7@;$bwdERY)a{zhl{EO8DLrVToTt=gwOVZj7K5X_VW`BZB}R*vbjnBW#!s^S<@7BGkX"
+    b"s5Qh*q?gO2LE>N?Y0yMmX*1Ku0>Eqcah7p)1|g-RVIjJ&B?hdZIDV8zV8q5=T5H5=bP8J|xqZe)MO6b|5JXVlb%;VJO2G&Ir;-XC$K-"
+    b"%^1cqj`2(&LvC&ollj6FrZSC8zG7xNS<E1tndFd*CD2M9`Pi7nYzipEP7w~~P)rG>%%zNZ%%_|MRIrdr7O|KmEM*zXS;0zHv6?lkWgY9OVgno5L^Ye)!dAA)"
+    b"d)vWIYS_hY_OO?I?B@UnImBU(aFk;l=L9D?#c9rPmUEov0vEZ&Wv+0QYh33BH@U@a?r@iT+~)xgc_gp+2~T;(b6)V0SG?v8Z+XXiKJbxGaubc2mAd)(@t^bY"
+    b"S@U~7zG>>uhx<(Y)co<@QW~q++qEXCn?`Ysw!UJ2foFQ`S;eXURIKrs;;JU<ak`fW75lm?{@z52|MuVf1!Fdzg#"
+)
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +62,36 @@ def test_damaged_files_are_refused_in_words(files: list[ValidFile], seed: int) -
         rng = np.random.default_rng([seed, number])
         found = outcome(file, mutated(file.target.read_bytes(), rng))
         assert found in ("read", "refused"), f"{file.kind}: {found}"
+
+
+EDITS = st.lists(
+    st.tuples(
+        st.floats(0.0, 1.0),  # where, as a fraction of the file
+        st.integers(0, 64),  # how many bytes go
+        st.one_of(st.binary(max_size=16), st.sampled_from([*NUMBERS, *WORDS])),  # what comes instead
+    ),
+    min_size=1,
+    max_size=4,
+)
+
+
+@settings(max_examples=150, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(which=st.floats(0.0, 1.0, exclude_max=True), edits=EDITS)
+def test_any_edit_of_a_valid_file_is_read_or_refused(files: list[ValidFile], which: float, edits: list[tuple[float, int, bytes]]) -> None:
+    file = files[int(which * len(files))]
+    content = file.target.read_bytes()
+    for where, gone, new in edits:
+        at = int(where * len(content))
+        content = content[:at] + new + content[at + gone :]
+    assert outcome(file, content) in ("read", "refused"), file.kind
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_ten_thousand_mutations_end_in_words(seed: int) -> None:
+    program = [sys.executable, Path(fuzz.__file__), "--count", "250", "--seed", str(seed)]
+    done = subprocess.run(program, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
 
 
 @pytest.mark.parametrize("name", ["a.mha", "a.nii", "a.nrrd", "a.tif", "a.h5"])
@@ -114,9 +164,56 @@ def test_values_of_hdf5_outside_the_file_are_refused(tmp_path: Path) -> None:
         stored.attrs.update(attributes)
     with h5py.File(tmp_path / "linked.h5", "w") as file:
         file["values"] = h5py.ExternalLink("outside.h5", "values")
-    for name in ("outside.h5", "linked.h5"):
+    with h5py.File(tmp_path / "far.h5", "w") as file:  # a link within the file that passes through another one
+        file["elsewhere"] = h5py.ExternalLink("inside.h5", "/")
+        file["values"] = h5py.SoftLink("/elsewhere/values")
+    with h5py.File(tmp_path / "inside.h5", "w") as file:
+        file.create_dataset("values", data=np.zeros((2, 2, 2), dtype="u1")).attrs.update(attributes)
+        file["again"] = h5py.SoftLink("/values")
+    assert read_volume(tmp_path / "inside.h5").shape == (2, 2, 2)
+    for name in ("outside.h5", "linked.h5", "far.h5"):
         with pytest.raises(InputError, match="copy them into"):
             read_volume(tmp_path / name)
+
+
+HEADER = {
+    "NDims": "3", "DimSize": "2 2 2", "ElementType": "MET_UCHAR", "ElementSpacing": "1 1 1", "Offset": "0 0 0",
+    "TransformMatrix": "1 0 0 0 1 0 0 0 1", "HeaderSize": "0", "ElementNumberOfChannels": "1", "ElementDataFile": "LOCAL",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("field", [name for name in HEADER if name != "ElementDataFile"])
+@pytest.mark.parametrize(
+    "value", ["abc", "2.5 x", "", "0", "-7", "nan nan nan", "1e400 1 1", "9" * 5000, "2 2", "LIST", "\u00b2 \u00b2 \u00b2"]
+)
+def test_fields_of_a_header_that_cannot_be_are_named(tmp_path: Path, field: str, value: str) -> None:
+    text = "".join(f"{name} = {value if name == field else given}\n" for name, given in HEADER.items())
+    (tmp_path / "a.mha").write_bytes(text.encode() + bytes(8))
+    if (field, value) == ("HeaderSize", "0"):
+        assert read_volume(tmp_path / "a.mha").shape == (2, 2, 2)
+        return
+    with pytest.raises(InputError, match=r"a\.mha"):
+        read_volume(tmp_path / "a.mha")
+
+
+@pytest.mark.parametrize("names", ["", "gone.raw\n", "/etc/hostname\n", "a.mhd\na.mhd\n", "\x00\n", "a/" * 3000 + "\n"])
+def test_lists_of_files_that_are_none_are_refused(tmp_path: Path, names: str) -> None:
+    text = "".join(f"{name} = {given}\n" for name, given in (HEADER | {"DimSize": "20 20 20", "ElementDataFile": "LIST"}).items())
+    (tmp_path / "a.mhd").write_text(text + names)
+    with pytest.raises(InputError):
+        read_volume(tmp_path / "a.mhd")
+
+
+def test_every_cut_of_a_file_is_refused_or_read(files: list[ValidFile]) -> None:
+    short = [
+        f for f in files if f.kind in ("mesh binary.msh", "surface binary.ply", "surface binary.stl", "surface text.obj", "table wide.csv")
+    ]
+    assert len(short) == 5
+    for file in short:
+        content = file.target.read_bytes()
+        for end in np.unique(np.linspace(0, len(content) - 1, 60).astype(int)):
+            found = outcome(file, content[:end])
+            assert found in ("read", "refused"), f"{file.kind} of {end} bytes: {found}"
 
 
 def test_a_lost_chunk_of_a_zarr_store_is_not_taken_for_zeros(tmp_path: Path) -> None:
@@ -126,6 +223,29 @@ def test_a_lost_chunk_of_a_zarr_store_is_not_taken_for_zeros(tmp_path: Path) -> 
     (store / "values" / "c" / "1" / "0" / "0").unlink()
     with pytest.raises(InputError, match="1 of its 8 chunks are missing"):
         read_volume(store)
+
+
+def test_pages_that_follow_each_other_in_a_circle_end(tmp_path: Path) -> None:
+    (tmp_path / "a.tif").write_bytes(zlib.decompress(base64.b85decode(CIRCLE_OF_PAGES)))
+    with time_limit(), contextlib.suppress(InputError):
+        read_volume(tmp_path / "a.tif")
+
+
+def test_a_store_that_announces_endless_chunks_is_refused_quickly(tmp_path: Path) -> None:
+    store = write_volume(tmp_path / "a.zarr", Volume.from_array(np.zeros((5, 6, 7), dtype=np.int16), spacing_mm=(1.0, 1.0, 1.0)))
+    described = store / "values" / "zarr.json"
+    stated = json.loads(described.read_text())
+    described.write_text(json.dumps(stated | {"shape": [2**40, 2**20, 7]}))
+    with time_limit(), pytest.raises(InputError, match="chunks are missing"):
+        read_volume(store)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("spacing_mm = 10.0", "spacing_mm = 1e-308"), ("duration_s = 0.2", "duration_s = 0.2\nstep_s = 1e-308")]
+)
+def test_numbers_of_a_study_that_overflow_are_refused(old: str, new: str) -> None:
+    with pytest.raises(InputError, match="must lie between"):
+        load_study("mine.toml", STUDY.replace(old, new).encode())
 
 
 def test_text_nested_without_end_is_refused(tmp_path: Path) -> None:

@@ -1,0 +1,166 @@
+"""Bad inputs of every verb, as tables: each is refused with exit code 2 and one message that names what is wrong; nothing is written."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+import shutil
+import signal
+import sys
+import tomllib
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from types import FrameType
+
+import numpy as np
+import pytest
+from bad_keys import bad_descriptions, bad_studies, document
+from bad_options import bad_options
+from lattice_studies import study_file
+from virtual_press import Press
+
+from naibu import cli
+from naibu.core.volume import Volume
+from naibu.io.images import write_volume
+
+BY_HAND = tomllib.loads((Path(__file__).parent / "bad_inputs.toml").read_text(encoding="utf-8"))["input"]
+FAST = 5  # every fifth row of the generated tables; the others are slow
+PATIENCE_S = 60  # for a command that must be refused at once, on a machine with much else to do
+Files = dict[str, Path]
+Run = Callable[[list[str]], tuple[int, str]]
+
+
+@pytest.fixture(scope="module")
+def files(press: Press, tmp_path_factory: pytest.TempPathFactory) -> Files:
+    """Good inputs of every verb."""
+    root = tmp_path_factory.mktemp("good")
+    rng = np.random.default_rng(0)
+    for name, shape in (("scan", (10, 12, 14)), ("scan2", (10, 12, 14)), ("frames", (5, 20, 24))):
+        write_volume(root / f"{name}.mha", Volume.from_array(rng.random(shape).astype(np.float32), spacing_mm=(1.0, 1.0, 1.0)))
+    scans = {name: root / f"{name}.mha" for name in ("scan", "scan2", "frames")}
+    tables = {"table": press.folder / "initial.csv", "table2": press.folder / "pressed.csv"}
+    return {**scans, **tables, "press": press.folder, "model": press.results / "model.json", "study": study_file(root)}
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Run]:
+    """Run a command in this process, in a folder of its own; return the exit code and the message."""
+
+    def too_long(number: int, frame: FrameType | None) -> None:
+        raise TimeoutError("not refused, or not at once")
+
+    place = tmp_path / "place"
+    place.mkdir()
+    monkeypatch.chdir(place)
+    before = signal.signal(signal.SIGALRM, too_long)
+
+    def command(words: list[str]) -> tuple[int, str]:
+        said = io.StringIO()
+        # both consoles write to the streams of the time; a console whose file is set and "restored" keeps this test's stream for ever
+        monkeypatch.setattr(sys, "stderr", said)
+        monkeypatch.setattr(sys, "stdout", io.StringIO())
+        monkeypatch.setattr(sys, "argv", ["naibu", *words])
+        signal.alarm(PATIENCE_S)
+        try:
+            cli.main()
+            code = 0
+        except SystemExit as ended:
+            code = int(ended.code or 0)
+        finally:
+            signal.alarm(0)
+        return code, said.getvalue()
+
+    yield command
+    signal.signal(signal.SIGALRM, before)
+
+
+def faults(run: Run, words: list[str], expected: Iterable[str | set[str]]) -> list[str]:
+    """Return what is wrong with the answer to a bad input: nothing, if it was refused in words, and nothing was written."""
+    code, message = run(words)
+    found = []
+    if code != cli.BAD_INPUT or not message.startswith("error: ") or "Traceback" in message or "error of its own" in message:
+        found.append(f"exit code {code}: {message[:200]!r}")
+    for word in expected:
+        if not any(w in message for w in ({word} if isinstance(word, str) else word)):
+            found.append(f"{word!r} is not in {message[:300]!r}")
+    if left := [str(p) for p in Path("out").rglob("*") if p.is_file()]:
+        found.append(f"wrote {left}")
+    shutil.rmtree("out", ignore_errors=True)
+    return [f"{' '.join(words)[:200]}: {fault}" for fault in found]
+
+
+def ways_to_say(value: str) -> set[str]:
+    """Return the forms in which a message may quote a value, or a part of it."""
+    said = {value, repr(value), *(part for part in re.split(r"[=/]", value) if part)}
+    try:
+        number = float(value)
+    except ValueError:
+        return said
+    return said | {f"{number:g}", repr(number), *([str(int(number))] if math.isfinite(number) else [])}
+
+
+@pytest.mark.parametrize("row", BY_HAND, ids=lambda row: f"{row['kind']}: {' '.join(row['command'])}"[:60])
+def test_inputs_written_by_hand(run: Run, files: Files, tmp_path: Path, row: dict[str, object]) -> None:
+    names, folder = dict(files), tmp_path / "folder"
+    folder.mkdir()
+    names["folder"] = folder
+    if "file" in row:
+        name, content = row["file"]
+        names["file"] = folder / name
+        (folder / name).write_text(content, encoding="utf-8")
+    words = [word.format(**names) for word in row["command"]]
+    if "--out" not in words and words[0] not in ("report", "nosuch"):
+        words += ["--out", "out"]
+    assert not faults(run, words, row["expected"])
+    assert "file" not in row or (folder / row["file"][0]).read_text(encoding="utf-8") == row["file"][1]
+
+
+def check_options(run: Run, files: Files, part: slice) -> int:
+    found, rows = [], list(bad_options())[part]
+    for row in rows:
+        words = [word.format(**files) if re.fullmatch(r"\{\w+\}", word) else word for word in row.command]
+        option = {row.option, row.option.removeprefix("--"), *({"is not loaded"} if row.option == "--state" else ())}
+        values = set.union(*(ways_to_say(value) for value in row.values)) if all(row.values) else {""}
+        found += faults(run, [*words, "--out", "out"], [option, values])
+    assert not found, "\n".join(found)
+    return len(rows)
+
+
+def check_studies(run: Run, tmp_path: Path, part: slice) -> int:
+    found, rows, file = [], list(bad_studies())[part], tmp_path / "bad.toml"
+    for row in rows:
+        file.write_text(document(row.file), encoding="utf-8")
+        found += faults(run, ["simulate", str(file), "--out", "out"], [row.key])
+    assert not found, "\n".join(found)
+    return len(rows)
+
+
+def check_descriptions(run: Run, files: Files, folder: Path, part: slice) -> int:
+    file = folder / "meta.toml"
+    found, rows = [], list(bad_descriptions(file.read_text(encoding="utf-8")))[part]
+    for row in rows:
+        file.write_text(document(row.file), encoding="utf-8")
+        # the state does not exist either: a mistake that is not noticed does not start a long computation
+        found += faults(run, ["predict", str(files["model"]), str(folder), "--state", "nosuch", "--out", "out"], [row.key])
+    assert not found, "\n".join(found)
+    return len(rows)
+
+
+def test_some_bad_values_of_every_option(run: Run, files: Files) -> None:
+    assert check_options(run, files, slice(None, None, FAST)) > 150
+
+
+def test_some_bad_values_of_every_key_of_a_study(run: Run, tmp_path: Path) -> None:
+    assert check_studies(run, tmp_path, slice(None, None, FAST)) > 90
+
+
+def test_some_bad_values_of_every_key_of_an_experiment(run: Run, files: Files, experiment_folder: Path) -> None:
+    assert check_descriptions(run, files, experiment_folder, slice(None, None, FAST)) > 60
+
+
+@pytest.mark.slow
+def test_all_bad_values(run: Run, files: Files, experiment_folder: Path, tmp_path: Path) -> None:
+    count = check_options(run, files, slice(None)) + check_studies(run, tmp_path, slice(None))
+    count += check_descriptions(run, files, experiment_folder, slice(None))
+    assert count + len(BY_HAND) >= 1600
