@@ -26,6 +26,7 @@ from .finite_elements.assembly import Assembler, body_force
 from .finite_elements.boundary_conditions import PrescribedDisplacement
 from .finite_elements.elements import Elements, elements
 from .finite_elements.hyperelasticity import Law, Material, lame_parameters, law_named, material
+from .finite_strain.dynamic_session import DynamicEngine, DynamicSession, DynamicState
 from .finite_strain.problem import Problem, SolverSettings
 from .finite_strain.quasi_static_session import EquilibriumState, QuasiStaticEngine, QuasiStaticSession
 from .finite_strain.sensitivities import sensitivities
@@ -69,6 +70,9 @@ __all__ = [
     "ConstrainedNodes",
     "Contact",
     "ContactMotion",
+    "DynamicEngine",
+    "DynamicSession",
+    "DynamicState",
     "Elements",
     "Engine",
     "EquilibriumState",

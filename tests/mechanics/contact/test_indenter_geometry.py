@@ -112,6 +112,19 @@ def test_a_bar_is_a_rounded_edge() -> None:
     np.testing.assert_allclose(shape.distance(points), [2.0, 1.0, 5.0 - 1.0, -0.5], atol=1e-12)
 
 
+@pytest.mark.parametrize("name", SHAPES)
+def test_the_inradius_is_the_deepest_distance(name: str) -> None:
+    """Of a mesh it is a bound from below."""
+    shape = SHAPES[name]
+    deepest = -shape.distance(np.random.default_rng(2).uniform(-5.0, 5.0, (20000, 3))).min()
+    if name == "plane":
+        assert shape.inradius == np.inf
+    elif name == "mesh":
+        assert 0.3 * deepest < shape.inradius <= deepest
+    else:
+        assert 0.85 * shape.inradius < deepest <= shape.inradius + 1e-9
+
+
 def test_packed_meshes_keep_apart() -> None:
     """Two meshes and a sphere in one set of arrays."""
     shapes: list[IndenterGeometry] = [SHAPES["mesh"], SHAPES["sphere"], mesh_geometry(*box_mesh((1.0, 1.0, 1.0)))]

@@ -35,9 +35,10 @@ def points(y, *, surface=FLAT, mu=0.3, tied=False, rotation=None, area=1.7) -> C
         zero,
         zero,
         turn,
-        K_N,
+        np.full(p, K_N),
         np.full(p, K_T),
         np.full(p, mu),
+        np.ones(p),
         tied,
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,10 +14,10 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.rigid_transform import RigidTransform
 from naibu.mechanics.contact.contact_surfaces import Friction, rigid_contact
 from naibu.mechanics.contact.indenter_motion import IndenterForce, IndenterVelocity
-from naibu.mechanics.contact.rigid_indenters import RigidIndenter, plane_indenter, spherical_indenter
+from naibu.mechanics.contact.rigid_indenters import RigidIndenter, box_indenter, plane_indenter, spherical_indenter
 from naibu.mechanics.contact.session_protocol import Engine
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
-from naibu.mechanics.finite_strain.problem import Problem
+from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
 from naibu.mechanics.finite_strain.quasi_static_session import EquilibriumState, QuasiStaticEngine
 from naibu.mechanics.finite_strain.statics import solve
 from naibu.meshing.primitives import box
@@ -111,6 +112,27 @@ def test_bodies_of_constrained_nodes_move() -> None:
     np.testing.assert_allclose(session.positions(side_nodes(MESH, "z+")), MESH.points[side_nodes(MESH, "z+")] + (2.0, 0.0, 0.0), atol=1e-9)
     assert told.bodies[1, 1, 0] > told.bodies[0, 1, 0] > 0.0
     np.testing.assert_allclose(told.bodies.sum(axis=1), 0.0, atol=1e-4 * told.bodies[1, 1, 0])
+
+
+@pytest.mark.parametrize("thickness", [1.0, 40.0])
+def test_a_thin_plate_does_not_pass_through(thickness: float) -> None:
+    """Of 1 mm, it ends 7 mm below where it began in a single step: the force is that of a half space in its place."""
+    session = engine().session(
+        constrained=[BASE], indenters=[box_indenter((10.0, 10.0, TOP + 5.0 + 0.5 * thickness), (60.0, 60.0, thickness))]
+    )
+    forces = session.step(motions=[IndenterVelocity((0.0, 0.0, -7.0))])
+    displacement, force = reference(2.0)
+    np.testing.assert_allclose(forces.indenters[0, 0], force, rtol=1e-3, atol=1e-3 * abs(force[2]))
+    np.testing.assert_allclose(session.positions() - MESH.points, displacement, atol=1e-3)
+
+
+def test_a_way_through_the_body_is_no_equilibrium() -> None:
+    """A plate that would have to squash it flat fails, and does not appear below it."""
+    hasty = replace(engine(), settings=SolverSettings(first_step=1.0, largest_step=1.0, smallest_step=0.3))
+    session = hasty.session(constrained=[BASE], indenters=[box_indenter((10.0, 10.0, TOP + 5.5), (60.0, 60.0, 1.0))])
+    with pytest.raises(ConvergenceError):
+        session.step(motions=[IndenterVelocity((0.0, 0.0, -500.0))])
+    np.testing.assert_array_equal(session.positions(), MESH.points)
 
 
 def test_what_cannot_be_is_refused() -> None:

@@ -84,8 +84,9 @@ def rigid_contact(
     pairs = [friction] * len(faces) if isinstance(friction, Friction) else friction
     return Contact(
         name, nodes, coefficients, np.einsum("pk,pki->pi", coefficients, points[nodes]), area.ravel(), surface,
-        np.asarray(start, dtype=float), np.asarray(stop, dtype=float), np.eye(3) if rotation is None else rotation, normal_stiffness,
-        np.repeat([f.stiffness for f in pairs], n_q), np.repeat([f.coefficient for f in pairs], n_q), tied,
+        np.asarray(start, dtype=float), np.asarray(stop, dtype=float), np.eye(3) if rotation is None else rotation,
+        np.full(len(nodes), normal_stiffness), np.repeat([f.stiffness for f in pairs], n_q),
+        np.repeat([f.coefficient for f in pairs], n_q), np.repeat(np.sqrt(area.sum(axis=1)), n_q), tied,
     )  # fmt: skip
 
 
@@ -124,7 +125,7 @@ def interface(
     k = len(pairs)
     return Contact(
         name, pairs, np.tile([-1.0, 1.0], (k, 1)), np.zeros((k, 3)), area, plane_geometry(), np.zeros(3), np.zeros(3), np.eye(3),
-        normal_stiffness, np.full(k, friction.stiffness), np.full(k, friction.coefficient), tied,
+        np.full(k, normal_stiffness), np.full(k, friction.stiffness), np.full(k, friction.coefficient), np.sqrt(area), tied,
     )  # fmt: skip
 
 

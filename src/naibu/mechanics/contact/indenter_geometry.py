@@ -64,6 +64,22 @@ class IndenterGeometry:
         """Whether the surface has the same normal everywhere."""
         return self.kind == PLANE
 
+    @property
+    def inradius(self) -> float:
+        """Radius of the largest sphere inside, mm; of a mesh a bound from below, infinite for a half space."""
+        if self.kind == PLANE:
+            return np.inf
+        if self.kind == BOX:
+            return float(self.size.min())
+        if self.kind == CYLINDER:
+            return float(self.size[:2].min())
+        if self.tree is not None:
+            corners = self.vertices[self.tree.triangles]
+            area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+            volume = np.einsum("ti,ti->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
+            return float(volume / area)
+        return float(self.size[0])
+
     def distance(self, points: ArrayLike) -> FloatArray:
         """Return the signed distances (p,), mm, of points (p, 3) in the indenter's frame; positive outside."""
         return self.distance_derivatives(points)[0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -68,6 +68,44 @@ class IndenterForce:
 
 IndenterMotion = RigidTransform | IndenterVelocity | IndenterForce
 """Motion of an indenter in a step: its pose at the end of it, from the position in which it was made; a velocity; or a force."""
+
+SHARE = 0.5  # of the radius of the largest sphere in an indenter, by which it may move at once where it touches
+CAUTION = 0.9  # of a gap, by which an indenter may move at once
+
+
+def safe_fraction(
+    indenters: Sequence[RigidIndenter], points: FloatArray, centres: FloatArray, axes: FloatArray, travel: FloatArray, turn: FloatArray,
+    approach: float = 0.0,
+) -> float:  # fmt: skip
+    """Return the fraction of a motion, at most 1, in which no indenter passes through points, by conservative advancement.
+
+    Either it reaches none, or it goes so little of its own thickness into them that the nearest face is the one it came with
+    :cite:p:`ericson2005`.
+
+    Parameters
+    ----------
+    indenters : sequence of RigidIndenter
+        Their shapes.
+    points : ndarray, shape (p, 3)
+        Of the object, mm.
+    centres, axes : ndarray, shape (k, 3) and (k, 3, 3)
+        Where they are, mm, and their axes, in rows.
+    travel, turn : ndarray, shape (k, 3)
+        How far they move, mm, and turn, rad, about their reference points.
+    approach : float
+        How far the object moves meanwhile, mm.
+    """
+    fraction = 1.0
+    for indenter, centre, own, moved, turned in zip(indenters, centres, axes, travel, turn, strict=True):
+        allowed, arms = SHARE * indenter.geometry.inradius, points - centre
+        way = float(np.linalg.norm(moved)) + approach
+        if turned.any():
+            way += float(np.linalg.norm(turned)) * float(np.linalg.norm(arms, axis=1).max())
+        if way > fraction * allowed:
+            gap = float(replace(indenter.geometry, axes=own).distance(arms).min())
+            fraction = min(fraction, max(allowed, CAUTION * gap) / way)
+    return fraction
+
 
 Poses = dict[int, tuple[FloatArray, FloatArray]]
 

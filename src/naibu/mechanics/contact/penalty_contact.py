@@ -45,10 +45,12 @@ class Contact:
         Position of the body's reference point at the beginning and at the end of loading, mm.
     rotation : ndarray, shape (3, 3)
         Orientation of the body at the beginning.
-    normal_stiffness : float
+    normal_stiffness : ndarray, shape (p,)
         Penalty, kPa/mm.
     tangential_stiffness, friction_coefficient : ndarray, shape (p,)
         Stiffness before slip, kPa/mm, and Coulomb's coefficient.
+    element_size : ndarray, shape (p,)
+        Edge of the element face to which the point belongs, mm: the square root of its area.
     tied : bool
         Whether points can neither separate nor slip.
     tilt : ndarray, shape (3,), optional
@@ -65,9 +67,10 @@ class Contact:
     start: FloatArray
     stop: FloatArray
     rotation: FloatArray
-    normal_stiffness: float
+    normal_stiffness: FloatArray
     tangential_stiffness: FloatArray
     friction_coefficient: FloatArray
+    element_size: FloatArray
     tied: bool = False
     tilt: FloatArray | None = None
 
@@ -79,10 +82,17 @@ class Contact:
         """Return the contact with another path of the body."""
         return replace(self, start=np.asarray(start, dtype=float), stop=np.asarray(stop, dtype=float))
 
+    def positions(self, displacement: FloatArray) -> FloatArray:
+        """Return positions (p, 3) of the points, mm (for a pair of nodes: their difference)."""
+        return np.asarray(self.rest + np.einsum("pk,pki->pi", self.shape, displacement[self.nodes]))
+
     def local(self, displacement: FloatArray, load: float) -> FloatArray:
         """Return positions (p, 3) of the points in the body's frame, at the fraction `load` of the path."""
-        moved = self.rest + np.einsum("pk,pki->pi", self.shape, displacement[self.nodes])
-        return np.asarray((moved - (self.start + load * (self.stop - self.start))) @ self.orientation(load))
+        return np.asarray((self.positions(displacement) - (self.start + load * (self.stop - self.start))) @ self.orientation(load))
+
+    def gap(self, displacement: FloatArray, load: float) -> FloatArray:
+        """Return the distances (p,) of the points from the body, mm, negative inside."""
+        return self.surface.distance(self.local(displacement, load))
 
     def anchors_at_rest(self) -> FloatArray:
         """Return anchors (p, 3) for the beginning of loading, in the body's frame."""
@@ -186,13 +196,13 @@ def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
         g = distance_with_derivatives(geometry, axes, y[q], n, h)
         gap[q] = g
         if tied:
-            p, dp = -k_n * g, -k_n
+            p, dp = -k_n[q] * g, -k_n[q]
         elif g >= 0.0:
             continue
         elif g > -RAMP_MM:
-            p, dp = 0.5 * k_n * g * g / RAMP_MM, k_n * g / RAMP_MM
+            p, dp = 0.5 * k_n[q] * g * g / RAMP_MM, k_n[q] * g / RAMP_MM
         else:
-            p, dp = -k_n * (g + 0.5 * RAMP_MM), -k_n
+            p, dp = -k_n[q] * (g + 0.5 * RAMP_MM), -k_n[q]
         along = 0.0
         for i in range(3):
             along += n[i] * (y[q, i] - anchors[q, i])

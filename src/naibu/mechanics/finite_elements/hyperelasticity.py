@@ -90,10 +90,7 @@ class Material:
     @property
     def small_strain_shear_modulus(self) -> float:
         """Shear modulus of the linearised law, kPa."""
-        p = self.parameters
-        if self.law.code == MOONEY_RIVLIN:
-            return 2.0 * (p[0] + p[1])
-        return 2.0 * p[0] if self.law.code == YEOH else p[0]
+        return float(small_strain_shear_moduli(np.array([self.law.code]), np.array([self.parameters]))[0])
 
     @property
     def small_strain_bulk_modulus(self) -> float:
@@ -112,6 +109,12 @@ class Material:
         """Poisson's ratio of the linearised law."""
         mu, kappa = self.small_strain_shear_modulus, self.small_strain_bulk_modulus
         return (3.0 * kappa - 2.0 * mu) / (6.0 * kappa + 2.0 * mu)
+
+
+def small_strain_shear_moduli(law_codes: IntArray, parameters: FloatArray) -> FloatArray:
+    """Return the shear moduli (m,), kPa, of linearised laws (m,) with parameters (m, k), kPa."""
+    second = np.where(law_codes == MOONEY_RIVLIN, parameters[:, 1], 0.0)
+    return np.asarray(np.where((law_codes == MOONEY_RIVLIN) | (law_codes == YEOH), 2.0, 1.0) * (parameters[:, 0] + second))
 
 
 def law_named(name: str) -> Law:

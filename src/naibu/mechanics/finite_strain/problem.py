@@ -26,6 +26,8 @@ class SolverSettings:
     anchor_stiffness : float
         Stiffness of weak springs between every node and the ground, as a fraction of the mean diagonal of the tangent: they suppress
         rigid-body motions of a body that is not in contact yet.
+    penetration : float
+        Most that a rigid body may penetrate an element, as a fraction of the edge of its face; contact becomes stiffer until it holds.
     linear_solver : {"automatic", "superlu", "pardiso", "recycled_cholesky", "multigrid"}
         See `naibu.mechanics.linear_algebra.solver_selection`.
     """
@@ -36,6 +38,7 @@ class SolverSettings:
     tolerance: float = 1e-7
     max_iterations: int = 16
     anchor_stiffness: float = 1e-9
+    penetration: float = 0.01
     linear_solver: SolverName = "automatic"
 
 

@@ -18,20 +18,22 @@ from scipy.optimize import brentq
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import ConvergenceError, InputError
-from naibu.core.rigid_transform import rotation_matrix
 from naibu.mechanics.contact.contact_surfaces import Friction, rigid_contact
-from naibu.mechanics.contact.indenter_motion import IndenterForce, IndenterMotion, indenter_velocities
+from naibu.mechanics.contact.indenter_motion import IndenterForce, IndenterMotion, safe_fraction
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.contact.session_protocol import StepForces
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
+from naibu.mechanics.finite_strain.penalties import with_normal_stiffness
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
+from naibu.mechanics.finite_strain.session_checks import checked_bodies, checked_velocities, require_one_friction, require_state
 from naibu.mechanics.finite_strain.statics import LoadState, Solution, solve
 
 IN_FEW_STEPS = SolverSettings(first_step=0.5, largest_step=1.0)
 FORCE_TOLERANCE = 1e-4  # of the force of a driven indenter
 FIRST_ADVANCE = 0.005  # of the extent of the body: how far a driven indenter is moved first
+MOST_PARTS = 1000  # of a step, in which indenters that would pass through the object move little by little
 FARTHEST = 1.0  # extents of the body
 
 
@@ -49,12 +51,15 @@ class EquilibriumState:
         Their rotations since they were made.
     anchors : tuple of ndarray, shape (p, 3)
         Frictional anchors of their contacts, mm.
+    normal_stiffness : tuple of ndarray, shape (p,)
+        Penalties of the contacts, kPa/mm, as stiff as they had to be so far.
     """
 
     displacement: FloatArray
     centres: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     rotations: FloatArray = field(default_factory=lambda: np.zeros((0, 3, 3)))
     anchors: tuple[FloatArray, ...] = ()
+    normal_stiffness: tuple[FloatArray, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,14 +172,7 @@ class QuasiStaticSession:
         InputError
             A node that does not exist, or that belongs to two bodies.
         """
-        chosen = tuple(np.unique(np.asarray(nodes, dtype=np.int64)) for nodes in constrained)
-        listed = np.concatenate([*chosen, np.zeros(0, np.int64)])
-        n = len(self.engine.points)
-        if len(listed) and (listed.min() < 0 or listed.max() >= n):
-            raise InputError(f"constrained has nodes from {listed.min()} to {listed.max()}; the mesh has nodes 0 to {n - 1}")
-        if len(np.unique(listed)) < len(listed):
-            raise InputError("constrained has a node that belongs to two bodies; each node moves with one")
-        self.bodies = chosen + tuple(np.zeros(0, np.int64) for _ in range(bodies - len(chosen)))
+        self.bodies = checked_bodies(constrained, len(self.engine.points), bodies)
 
     def press(self, indenters: Sequence[RigidIndenter]) -> None:
         """Bring these indenters, and no others, into play from the next step on, where they were made.
@@ -184,14 +182,10 @@ class QuasiStaticSession:
         InputError
             An indenter with pull-off, or with a kinetic friction below the static one: quasi-static contact has neither.
         """
-        for k, indenter in enumerate(indenters):
-            if indenter.pull_stiffness or indenter.pull_damping:
-                raise InputError(f"indenters[{k}] has pull-off, which needs a dynamic model; use a lattice, or leave it out")
-            if indenter.kinetic_friction != indenter.static_friction:
-                raise InputError(f"indenters[{k}] has two friction coefficients; quasi-static contact has one: give both the same value")
+        require_one_friction(indenters)
         self.indenters = tuple(indenters)
         centres = np.array([i.centre for i in indenters], dtype=float).reshape(-1, 3)
-        placed = replace(self.reached, centres=centres, rotations=np.tile(np.eye(3), (len(centres), 1, 1)), anchors=())
+        placed = replace(self.reached, centres=centres, rotations=np.tile(np.eye(3), (len(centres), 1, 1)), anchors=(), normal_stiffness=())
         contacts = self._contacts(placed, centres, np.zeros_like(centres))
         self.reached = replace(placed, anchors=tuple(c.local(placed.displacement, 0.0) for c in contacts))
 
@@ -214,25 +208,19 @@ class QuasiStaticSession:
         ConvergenceError
             There is no equilibrium, or none at which the body balances the force; the session stays at the last equilibrium.
         """
-        if len(motions) not in (0, len(self.indenters)):
-            raise InputError(f"motions has {len(motions)} entries for {len(self.indenters)} indenters; give one for each, or none")
         driven = [k for k, motion in enumerate(motions) if isinstance(motion, IndenterForce)]
         if len(driven) > 1:
             raise InputError("motions drives several indenters by forces; only one can be driven by a force in a step")
         speeds = np.broadcast_to(np.asarray(velocity, dtype=float), (steps, len(self.bodies), 3))
-        axes = np.array([i.geometry.axes @ r.T for i, r in zip(self.indenters, self.reached.rotations, strict=True)]).reshape(-1, 3, 3)
         duration = steps * self.engine.step
-        along, spin, _ = indenter_velocities(self.indenters, motions, self.reached.centres, axes, duration)
+        along, spin = checked_velocities(self.indenters, motions, self.reached.centres, self.reached.rotations, duration)
         of_bodies, of_indenters = [], []
         for moving in speeds:
             ends = self.reached.centres + self.engine.step * along
-            if driven:
-                solution, contacts = self._driven(motions[driven[0]], driven[0], moving, ends, spin)
-            else:
-                solution, contacts = self._solved(moving, ends, spin)
-            self._accept(solution, contacts, spin)
-            of_bodies.append(self._body_forces(solution, contacts))
-            of_indenters.append(np.array([solution.reactions[c.name] for c in contacts]).reshape(-1, 3))
+            solution = self._driven(motions[driven[0]], driven[0], moving, ends, spin) if driven else self._solved(moving, ends, spin)
+            self.reached = _end_of(solution)
+            of_bodies.append(self._body_forces(solution))
+            of_indenters.append(np.array([solution.reactions[c.name] for c in solution.problem.contacts]).reshape(-1, 3))
         self._forces = StepForces(np.array(of_bodies).reshape(steps, -1, 3), np.array(of_indenters).reshape(steps, -1, 3))
         return self._forces
 
@@ -257,11 +245,7 @@ class QuasiStaticSession:
         InputError
             A state of another mesh or of other indenters.
         """
-        if state.displacement.shape != self.engine.points.shape or len(state.anchors) not in (0, len(self.indenters)):
-            raise InputError(
-                f"state is that of {len(state.displacement)} nodes and {len(state.anchors)} indenters; the session has "
-                f"{len(self.engine.points)} and {len(self.indenters)}"
-            )
+        require_state(state.displacement, state.anchors, self.engine.points, self.indenters)
         self.reached = state if len(state.anchors) == len(self.indenters) else replace(self.reached, displacement=state.displacement)
 
     def close(self) -> None:
@@ -274,8 +258,8 @@ class QuasiStaticSession:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         """Close it."""
 
-    def _contacts(self, state: EquilibriumState, ends: FloatArray, spin: FloatArray) -> tuple[Contact, ...]:
-        """Contacts whose bodies move from where they are to their ends during the load."""
+    def _contacts(self, state: EquilibriumState, ends: FloatArray, turn: FloatArray) -> tuple[Contact, ...]:
+        """Contacts whose bodies move from where they are to their ends during the load, and turn, rad."""
         engine, out = self.engine, []
         for k, indenter in enumerate(self.indenters):
             contact = rigid_contact(
@@ -283,34 +267,49 @@ class QuasiStaticSession:
                 friction=Friction(indenter.static_friction, engine.tangential_stiffness), normal_stiffness=engine.normal_stiffness,
                 rotation=state.rotations[k],
             )  # fmt: skip
-            out.append(replace(contact, tilt=engine.step * spin[k]) if spin[k].any() else contact)
+            out.append(replace(contact, tilt=turn[k]) if turn[k].any() else contact)
         return tuple(out)
 
-    def _solved(self, velocity: FloatArray, ends: FloatArray, spin: FloatArray) -> tuple[Solution, tuple[Contact, ...]]:
-        start = self.reached
-        prescribed = PrescribedDisplacement.none(len(self.engine.points))
-        for nodes, speed in zip(self.bodies, velocity, strict=True):
-            if len(nodes):
-                prescribed = prescribed.and_also(nodes, start.displacement[nodes] + self.engine.step * speed)
-        contacts = self._contacts(start, ends, spin)
-        prescribed = replace(prescribed, start=start.displacement)
-        problem = Problem(self.engine.points, self.engine.assembler, contacts, prescribed, self.external_force)
-        return solve(problem, settings=self.engine.settings, start=LoadState(0.0, start.displacement, start.anchors)), contacts
+    def _solved(self, velocity: FloatArray, ends: FloatArray, spin: FloatArray) -> Solution:
+        """Equilibrium at the ends, reached in parts in which no indenter passes through the object."""
+        at, left, duration = self.reached, 1.0, self.engine.step
+        fastest = float(np.linalg.norm(velocity, axis=1).max(initial=0.0))
+        surface = self._contacts(at, ends, spin)
+        for _ in range(MOST_PARTS):
+            points = surface[0].positions(at.displacement) if surface else np.zeros((0, 3))
+            axes = np.array([i.geometry.axes @ r.T for i, r in zip(self.indenters, at.rotations, strict=True)]).reshape(-1, 3, 3)
+            travel, turn, approach = ends - at.centres, left * duration * spin, left * duration * fastest
+            fraction = safe_fraction(self.indenters, points, at.centres, axes, travel, turn, approach)
+            solution = self._part_solved(at, fraction * left * duration * velocity, at.centres + fraction * travel, fraction * turn)
+            if fraction >= 1.0:
+                return solution
+            at, left = _end_of(solution), left * (1.0 - fraction)
+        came = 100.0 * (1.0 - left)
+        raise ConvergenceError(f"{MOST_PARTS} parts of a step bring the indenters only {came:.1f} % of their way; shorten the step")
 
-    def _driven(
-        self, motion: IndenterMotion, index: int, velocity: FloatArray, ends: FloatArray, spin: FloatArray
-    ) -> tuple[Solution, tuple[Contact, ...]]:
+    def _part_solved(self, at: EquilibriumState, moved: FloatArray, ends: FloatArray, turn: FloatArray) -> Solution:
+        """Equilibrium when bodies have `moved` (bodies, 3), mm, and indenters have come to their ends and turned, from a state."""
+        prescribed = PrescribedDisplacement.none(len(self.engine.points))
+        for nodes, way in zip(self.bodies, moved, strict=True):
+            if len(nodes):
+                prescribed = prescribed.and_also(nodes, at.displacement[nodes] + way)
+        prescribed = replace(prescribed, start=at.displacement)
+        problem = Problem(self.engine.points, self.engine.assembler, self._contacts(at, ends, turn), prescribed, self.external_force)
+        problem = with_normal_stiffness(problem, at.normal_stiffness)
+        return solve(problem, settings=self.engine.settings, start=LoadState(0.0, at.displacement, at.anchors))
+
+    def _driven(self, motion: IndenterMotion, index: int, velocity: FloatArray, ends: FloatArray, spin: FloatArray) -> Solution:
         """Move an indenter along its guide to where the body balances its force."""
         assert isinstance(motion, IndenterForce)
         guide, wanted = motion.guide(), float(motion.force)
         extent = float(np.ptp(self.engine.points, axis=0).max())
-        tried: dict[float, tuple[Solution, tuple[Contact, ...]]] = {}
+        tried: dict[float, Solution] = {}
 
         def excess(advance: float) -> float:
             placed = ends.copy()
             placed[index] += advance * guide
             tried[advance] = self._solved(velocity, placed, spin)
-            return float(tried[advance][0].reactions[f"indenter {index}"] @ guide) - wanted
+            return float(tried[advance].reactions[f"indenter {index}"] @ guide) - wanted
 
         here, reach = excess(0.0), FIRST_ADVANCE * extent
         sign, before = (1.0 if here < 0.0 else -1.0), 0.0
@@ -326,18 +325,20 @@ class QuasiStaticSession:
             excess(root)
         return tried[root]
 
-    def _accept(self, solution: Solution, contacts: tuple[Contact, ...], spin: FloatArray) -> None:
-        last = solution.states[-1]
-        centres = np.array([c.stop for c in contacts]).reshape(-1, 3)
-        turned = [rotation_matrix(self.engine.step * w) @ r if w.any() else r for w, r in zip(spin, self.reached.rotations, strict=True)]
-        self.reached = EquilibriumState(last.displacement, centres, np.array(turned).reshape(-1, 3, 3), last.anchors)
-
-    def _body_forces(self, solution: Solution, contacts: tuple[Contact, ...]) -> FloatArray:
+    def _body_forces(self, solution: Solution) -> FloatArray:
         """Forces (bodies, 3), mN, of the bodies of constrained nodes on the object."""
         last = solution.states[-1]
         before = solution.states[-2].anchors if len(solution.states) > 1 else last.anchors
         rest = self.engine.assembler.forces(last.displacement)[1] - self.external_force
-        for contact, anchors in zip(contacts, before, strict=True):
+        for contact, anchors in zip(solution.problem.contacts, before, strict=True):
             response = contact.evaluate(last.displacement, anchors, last.load)
             rest = rest - contact.scattered(response.force, len(rest), response.orientation)
         return np.array([rest[nodes].sum(axis=0) for nodes in self.bodies]).reshape(-1, 3)
+
+
+def _end_of(solution: Solution) -> EquilibriumState:
+    """Return the state at the end of a solution."""
+    last, contacts = solution.states[-1], solution.problem.contacts
+    centres = np.array([c.stop for c in contacts]).reshape(-1, 3)
+    rotations = np.array([c.orientation(1.0) for c in contacts]).reshape(-1, 3, 3)
+    return EquilibriumState(last.displacement, centres, rotations, last.anchors, last.normal_stiffness)

@@ -7,7 +7,7 @@ to step.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -17,6 +17,7 @@ from naibu.core.rigid_transform import left_jacobian, rotation_matrix
 from naibu.mechanics.contact.penalty_contact import Contact, ContactResponse
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_strain.newton import Newton
+from naibu.mechanics.finite_strain.penalties import with_normal_stiffness
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
 from naibu.mechanics.finite_strain.statics import LoadState
 
@@ -29,6 +30,8 @@ class Direction:
     ----------
     materials : ndarray, shape (cells, 4), optional
         Change of the cells' parameters, kPa.
+    law : int, optional
+        Code of the law to which `materials` belong where that is not the cells' own: a strain energy that is added to theirs.
     contact : int
         Index of the contact to which the following belong.
     friction : ndarray, shape (p,), optional
@@ -46,6 +49,7 @@ class Direction:
     """
 
     materials: FloatArray | None = None
+    law: int | None = None
     contact: int = -1
     friction: FloatArray | None = None
     tangential_stiffness: FloatArray | None = None
@@ -84,11 +88,12 @@ def sensitivities(
     moving = [_BodyDirections.gather(i, c, directions) for i, c in enumerate(problem.contacts)]
     d_anchors = [m.at_rest(c) for m, c in zip(moving, problem.contacts, strict=True)]
     for before, state in pairwise(states):
+        solver.problem = with_normal_stiffness(problem, state.normal_stiffness)
         _, _, factorization, responses = solver.linearised(state.displacement, before.anchors, state.load)
         rhs = np.zeros((*problem.points.shape, count))
         for k, direction in enumerate(directions):
             if direction.materials is not None:
-                rhs[:, :, k] = -problem.assembler.forces_of_parameter(state.displacement, direction.materials)
+                rhs[:, :, k] = -_of_law(problem.assembler, direction.law).forces_of_parameter(state.displacement, direction.materials)
             if direction.points is not None:
                 rhs[:, :, k] -= reshaped[k].forces(state.displacement)
         explicit = []
@@ -105,6 +110,11 @@ def sensitivities(
             for c, response, change in zip(problem.contacts, responses, explicit, strict=True)
         ]
     return out
+
+
+def _of_law(assembler: Assembler, law: int | None) -> Assembler:
+    """The assembler with one law in all cells; as it is where none is named."""
+    return assembler if law is None else replace(assembler, law_codes=np.full_like(assembler.law_codes, law))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,10 +11,13 @@ from naibu.core.arrays import FloatArray, require_finite
 from naibu.core.errors import ConvergenceError
 from naibu.core.status import Status
 from naibu.mechanics.finite_strain.newton import Newton
+from naibu.mechanics.finite_strain.penalties import relative_penetrations, stiffened, with_softer_sticking, with_suited_penalties
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
 
 USUAL_ITERATIONS = 5.0  # Newton iterations of a load step of suitable length
+MOST_RAISES = 8  # of the penalties of contact at a load
+PATIENCE = 2  # load steps for which Newton's method fails, before frictional points on soft elements stick more softly
 WarmStart = tuple[float, FloatArray]  # a fraction of the load, and an initial guess of the displacement there (n, 3), mm
 
 
@@ -31,11 +34,14 @@ class LoadState:
     anchors : tuple of ndarray, shape (p, 3)
         Frictional anchors of the points of every contact, in the frame of its body, mm: history variables with which the next load step
         starts.
+    normal_stiffness : tuple of ndarray, shape (p,)
+        Penalties of the points of every contact with which the state was found, kPa/mm; empty where it was not solved.
     """
 
     load: float
     displacement: FloatArray
     anchors: tuple[FloatArray, ...]
+    normal_stiffness: tuple[FloatArray, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,8 +62,12 @@ class Solution:
         Relative residual force of the last state.
     penetration_mm : float
         Deepest penetration of a rigid body at the last state.
+    relative_penetration : float
+        The same as a fraction of the edge of the element that is penetrated, where that is largest.
     linear_solver : str
         The solver that was used.
+    problem : Problem
+        What was solved: the problem given, with contact as stiff as it had to be at the last state.
     """
 
     states: tuple[LoadState, ...]
@@ -66,7 +76,9 @@ class Solution:
     iterations: int
     residual: float
     penetration_mm: float
+    relative_penetration: float
     linear_solver: str
+    problem: Problem
 
     @property
     def displacement(self) -> FloatArray:
@@ -113,40 +125,76 @@ def solve(
     """
     chosen = settings or SolverSettings()
     require_finite("problem.external_force", problem.external_force)
-    newton = Newton(problem, chosen, solver)
+    newton = Newton(with_suited_penalties(problem), chosen, solver)
     rest = LoadState(0.0, np.zeros_like(problem.points), tuple(c.anchors_at_rest() for c in problem.contacts))
     first = rest if start is None else LoadState(0.0, start.displacement, start.anchors)
-    states, residual = [first], 0.0
-    step, ceiling = 1.0 if warm_start else chosen.first_step, 1.0 if warm_start else chosen.largest_step
-    while states[-1].load < 1.0 - 1e-12:
-        last = states[-1]
-        passed = next((h for h in reversed(warm_start) if h[0] <= last.load + 1e-9), None)
-        ahead = next((h for h in warm_start if h[0] > last.load + 1e-9), None)
-        load = min(1.0 if ahead is None else ahead[0], last.load + step)
-        found = None
-        for guess in _guesses(states, load, passed, ahead):
+    path = _LoadPath(newton, [first], warm_start, *((1.0, 1.0) if warm_start else (chosen.first_step, chosen.largest_step)))
+    softer = path.follow(callback)
+    if softer is not None:
+        newton.problem, known = softer, [(state.load, state.displacement) for state in path.states[1:]]
+        path = _LoadPath(newton, [first], known, chosen.first_step, chosen.largest_step, may_soften=False)
+        path.follow(callback)
+    return finished(newton, path.states, path.residual, path.status, throw)
+
+
+@dataclass(slots=True, eq=False)
+class _LoadPath:
+    """States that follow the load; `follow` extends them."""
+
+    newton: Newton
+    states: list[LoadState]
+    warm_start: Sequence[WarmStart]
+    step: float
+    ceiling: float
+    may_soften: bool = True
+    residual: float = 0.0
+    status: Status = Status.CONVERGED
+    rejected: int = 0
+
+    def follow(self, callback: Callable[[float], None] | None) -> Problem | None:
+        """Follow the load; return the problem with softer sticking where it must be followed again with that, else None."""
+        settings, states = self.newton.settings, self.states
+        while states[-1].load < 1.0 - 1e-12:
+            last, penalties = states[-1], self.newton.problem
+            passed = next((h for h in reversed(self.warm_start) if h[0] <= last.load + 1e-9), None)
+            ahead = next((h for h in self.warm_start if h[0] > last.load + 1e-9), None)
+            load = min(1.0, last.load + min(self.step, self.ceiling)) if ahead is None else min(ahead[0], last.load + self.step)
+            found, iterations = self._solved(load, passed, ahead)
+            penetrated = found is not None and (found := without_penetration(self.newton, found, last.anchors, load)) is None
+            if found is None:
+                self.rejected += 1
+                self.newton.problem = penalties
+                if self.may_soften and self.rejected == PATIENCE and (softer := with_softer_sticking(penalties)) is not None:
+                    return softer
+                self.step = 0.5 * (load - last.load)
+                self.ceiling = 1.6 * self.step
+                if self.step < settings.smallest_step:
+                    reason = Status.PENETRATION if penetrated else Status.STEP_TOO_SMALL
+                    self.status = Status.SINGULAR if self.newton.rigid_motion else reason
+                    return None
+                continue
+            self.residual = found[1]
+            states.append(advanced(self.newton.problem, found[0], last.anchors, load))
+            if ahead is not None:
+                self.step = min(1.0, 2.0 * self.step)
+            else:
+                self.ceiling = min(settings.largest_step, 1.25 * self.ceiling)
+                self.step = min(self.ceiling, self.step * _growth(iterations))
+            if callback is not None:
+                callback(load)
+        return None
+
+    def _solved(self, load: float, passed: WarmStart | None, ahead: WarmStart | None) -> tuple[tuple[FloatArray, float] | None, int]:
+        """Return equilibrium at `load` and its residual, None where there is none, and the iterations of the last guess."""
+        newton, last, found, before = self.newton, self.states[-1], None, 0
+        for guess in _guesses(self.states, load, passed, ahead):
             before = newton.iterations
             found = newton.solve(guess, last.anchors, load)
             if found is not None:
                 break
-        if found is None and load - last.load < chosen.first_step:
+        if found is None and load - last.load < newton.settings.first_step:
             found = newton.pseudo_transient(last.displacement, last.anchors, load)
-        if found is None:
-            step = 0.5 * (load - last.load)
-            ceiling = 1.6 * step
-            if step < chosen.smallest_step:
-                return finished(newton, states, residual, Status.SINGULAR if newton.rigid_motion else Status.STEP_TOO_SMALL, throw)
-            continue
-        residual = found[1]
-        states.append(advanced(problem, found[0], last.anchors, load))
-        if warm_start:
-            step = min(1.0, 2.0 * step)
-        else:
-            ceiling = min(chosen.largest_step, 1.25 * ceiling)
-            step = min(ceiling, step * _growth(newton.iterations - before))
-        if callback is not None:
-            callback(load)
-    return finished(newton, states, residual, Status.CONVERGED, throw)
+        return found, newton.iterations - before
 
 
 def _growth(iterations: int) -> float:
@@ -171,10 +219,39 @@ def _guesses(states: list[LoadState], load: float, before: WarmStart | None, ahe
     return out
 
 
+def without_penetration(
+    newton: Newton, found: tuple[FloatArray, float], anchors: tuple[FloatArray, ...], load: float
+) -> tuple[FloatArray, float] | None:
+    """Raise the penalties of contact until no body penetrates too deeply; return equilibrium and its residual, None where there is none.
+
+    Parameters
+    ----------
+    newton : Newton
+        Solver, whose problem gets the raised penalties.
+    found : tuple
+        Equilibrium (n, 3), mm, with the present penalties, and its residual.
+    anchors : tuple of ndarray, shape (p, 3)
+        Frictional anchors of the points of every contact, mm.
+    load : float
+        Fraction of the load.
+    """
+    allowed, now = newton.settings.penetration, found
+    for _ in range(MOST_RAISES):
+        depths = relative_penetrations(newton.problem.contacts, now[0], load)
+        if max((float(d.max()) for d in depths), default=0.0) <= allowed:
+            return now
+        newton.problem = stiffened(newton.problem, depths, allowed)
+        again = newton.solve(now[0], anchors, load) or newton.pseudo_transient(now[0], anchors, load)
+        if again is None:
+            return None
+        now = again
+    return None
+
+
 def advanced(problem: Problem, u: FloatArray, anchors: tuple[FloatArray, ...], load: float) -> LoadState:
     """Return the converged state with displacement `u` (n, 3), mm, and the anchors for the next load step."""
     moved = tuple(c.next_anchors(c.evaluate(u, a, load)) for c, a in zip(problem.contacts, anchors, strict=True))
-    return LoadState(load, u, moved)
+    return LoadState(load, u, moved, tuple(c.normal_stiffness for c in problem.contacts))
 
 
 def finished(newton: Newton, states: list[LoadState], residual: float, status: Status, throw: bool) -> Solution:
@@ -189,7 +266,7 @@ def finished(newton: Newton, states: list[LoadState], residual: float, status: S
         raise ConvergenceError(f"stopped at {100 * states[-1].load:.1f} % of the load. {status.value}")
     problem, last = newton.problem, states[-1]
     reactions: dict[str, FloatArray] = {}
-    penetration = 0.0
+    penetration, relative = 0.0, 0.0
     contact = np.zeros_like(last.displacement)
     anchors = states[-2].anchors if len(states) > 1 else last.anchors
     for c, a in zip(problem.contacts, anchors, strict=True):
@@ -198,8 +275,9 @@ def finished(newton: Newton, states: list[LoadState], residual: float, status: S
         contact += nodal
         reactions[c.name] = (response.force @ response.orientation.T).sum(axis=0)
         penetration = max(penetration, float(-response.gap.min()))
+        relative = max(relative, float((-response.gap / c.element_size).max()))
     internal = problem.assembler.forces(last.displacement)[1]
     constrained = problem.prescribed.constrained
     reactions["prescribed"] = np.where(constrained, internal - contact - problem.external_force, 0.0).sum(axis=0)
     name = newton.solver.name if newton.solver is not None else "none"
-    return Solution(tuple(states), status, reactions, newton.iterations, residual, penetration, name)
+    return Solution(tuple(states), status, reactions, newton.iterations, residual, penetration, relative, name, problem)

@@ -31,8 +31,9 @@ from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.hyperelasticity import LAWS, LINEAR_ELASTIC
 from naibu.mechanics.finite_elements.stress_history import HistoryAssembler, second_piola
 from naibu.mechanics.finite_strain.newton import Newton
+from naibu.mechanics.finite_strain.penalties import with_suited_penalties
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
-from naibu.mechanics.finite_strain.statics import LoadState, Solution, advanced, finished
+from naibu.mechanics.finite_strain.statics import LoadState, Solution, advanced, finished, without_penetration
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
 
 Relaxing = Literal["isochoric", "all"]
@@ -319,7 +320,7 @@ def simulate_viscoelastic(
     """
     path = _path(times, loads, force_factors)
     body = ViscoelasticBody.of(problem.assembler, series, regions, relaxing=relaxing)
-    newton = Newton(problem, settings or SolverSettings(), solver)
+    newton = Newton(with_suited_penalties(problem), settings or SolverSettings(), solver)
     rest = LoadState(0.0, np.zeros_like(problem.points), tuple(c.anchors_at_rest() for c in problem.contacts))
     at, history = rest, body.at_rest()
     steps: list[TimeStep] = []
@@ -355,10 +356,12 @@ def _advance(
     while done < 1.0:
         now = previous + (done + part) * (target - previous) if done + part < 1.0 else target
         duration = part * float(target[0] - previous[0])
-        newton.problem = replace(problem, assembler=body.step(history, duration), external_force=now[2] * problem.external_force)
+        newton.problem = replace(newton.problem, assembler=body.step(history, duration), external_force=now[2] * problem.external_force)
         found = newton.solve(at.displacement, at.anchors, float(now[1]))
         if found is None and part <= PSEUDO_TRANSIENT_PART:
             found = newton.pseudo_transient(at.displacement, at.anchors, float(now[1]))
+        if found is not None:
+            found = without_penetration(newton, found, at.anchors, float(now[1]))
         if found is None:
             part *= 0.5
             if part < SMALLEST_PART:
@@ -366,7 +369,7 @@ def _advance(
             continue
         u, residual = found
         before = at
-        at, history = advanced(problem, u, at.anchors, float(now[1])), body.updated(history, u, duration)
+        at, history = advanced(newton.problem, u, at.anchors, float(now[1])), body.updated(history, u, duration)
         done += part
         part = min(2.0 * part, 1.0 - done)
     return before, (at, history), residual

@@ -46,6 +46,9 @@ def use_one_thread() -> None:
         library.MKL_Set_Num_Threads_Local(1)
 
 
+_NO_MEMORY = -2  # PARDISO's number of this error
+
+
 class PardisoSolver:
     """Supernodal factorization by oneMKL PARDISO; the symbolic analysis is kept between factorizations.
 
@@ -146,6 +149,8 @@ class PardisoSolver:
             pointer(self._values), pointer(self._ia), pointer(self._ja), None, integer(columns), pointer(self._parameters),
             integer(0), pointer(b), pointer(x), ctypes.byref(error),
         )  # fmt: skip
+        if error.value == _NO_MEMORY:
+            raise MemoryError(f"the factorization of {self._n} equations")
         return error.value
 
     def _release(self) -> None:

@@ -138,6 +138,26 @@ def test_momentum_balances_with_the_forces_of_constraints_and_indenters() -> Non
     assert BALL.gap(state.position - (0.8, 0.0, -6.0)).min() > -0.05
 
 
+@pytest.mark.parametrize("driven", [False, True], ids=["velocity", "force"])
+def test_a_fast_thin_plate_does_not_pass_through(driven: bool) -> None:
+    """5 m/s: in a step a plate of 2 mm moves by 10 mm. It does what it does when steps are short enough."""
+    plate = box_indenter((15.0, 15.0, 36.0), (60.0, 60.0, 2.0))
+    made, parts = engine(step=2e-3), 32
+    fine = LatticeEngine.of(LATTICE, made.parameters, tolerance=1e-6, step=made.step / parts)
+    motion = IndenterForce(-4e6 if driven else 0.0, (0.0, 0.0, 1.0), 2.0) if driven else IndenterVelocity((0.0, 0.0, -5000.0))
+    coarse, reference = (e.session(constrained=BOTTOM, indenters=[plate]) for e in (made, fine))
+    coarse.step(motions=[motion], steps=2 if driven else 1)
+    reference.step(motions=[motion], steps=2 * parts if driven else parts)
+    ends = [session.state().contact.centres[0, 2] for session in (coarse, reference)]
+    assert ends[0] < 29.0
+    for session, end in zip((coarse, reference), ends, strict=True):
+        assert session.positions(TOP)[:, 2].max() < end - 1.0 + 1e-6  # below the plate, which is at its end
+    if not driven:
+        np.testing.assert_allclose(coarse.positions(), reference.positions(), atol=1e-3)
+        mean = reference.forces().indenters.mean(axis=0)
+        np.testing.assert_allclose(coarse.forces().indenters[0], mean, rtol=0.01, atol=0.01 * np.abs(mean).max())
+
+
 def test_a_mesh_of_a_box_presses_as_the_box_does() -> None:
     corners = np.array([[x, y, z] for z in (-5, 5) for y in (-9, 9) for x in (-9, 9)], dtype=float)
     sides = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]])

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from naibu.core.arrays import AnyFloatArray, BoolArray, FloatArray, IntArray
 from naibu.mechanics.contact.indenter_geometry import GeometryArrays, packed_geometries
+from naibu.mechanics.contact.indenter_motion import SHARE, safe_fraction
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.lattices.cpu._contact_kernels import FREE, contact_steps
 from naibu.mechanics.lattices.cpu.stepper import MOST_ITERATIONS, ImplicitStepper
@@ -16,6 +17,7 @@ from naibu.mechanics.lattices.model.contact_state import ContactState
 
 PASSES = 20  # solutions in a step, at most
 SECANT_STEPS = 12  # of the speed of an indenter that a force drives
+MOST_PARTS = 4096  # of a step whose indenters are fast
 SLOW = 1e-5  # spacings a step: nodes that slide more slowly stick
 
 
@@ -39,6 +41,10 @@ class ContactStepper:
         Slip velocity, mm/s, below which nodes stick.
     passes : int
         Most solutions in a step.
+    indenters : tuple of RigidIndenter
+        As they were made.
+    divided : callable
+        Returns a stepper of the same arrays whose steps are shorter by a whole number.
     """
 
     base: ImplicitStepper
@@ -47,23 +53,29 @@ class ContactStepper:
     friction: FloatArray
     pull: FloatArray
     slow: float
-    passes: int = PASSES
+    passes: int
+    indenters: tuple[RigidIndenter, ...]
+    divided: Callable[[ImplicitStepper, int], ImplicitStepper]
+    _finer: dict[int, ImplicitStepper] = field(default_factory=dict)
 
     @classmethod
     def of(
-        cls, base: ImplicitStepper, indenters: Sequence[RigidIndenter], contact: ContactState, spacing_mm: float, passes: int = PASSES
-    ) -> ContactStepper:
+        cls, base: ImplicitStepper, indenters: Sequence[RigidIndenter], contact: ContactState, spacing_mm: float,
+        divided: Callable[[ImplicitStepper, int], ImplicitStepper], passes: int = PASSES,
+    ) -> ContactStepper:  # fmt: skip
         """Put indenters beside a lattice; the contact state is copied."""
         own = ContactState(*(getattr(contact, name).copy() for name in ("nodes", "mode", "friction", "touched", "centres", "axes")))
         friction = np.array([(p.static_friction, p.kinetic_friction) for p in indenters])
         pull = np.array([(p.pull_stiffness, p.pull_damping, p.pull_speed) for p in indenters])
         geometry = packed_geometries([p.geometry for p in indenters])
-        return cls(base, own, geometry, friction, pull, SLOW * spacing_mm / base.step, passes)
+        return cls(base, own, geometry, friction, pull, SLOW * spacing_mm / base.step, passes, tuple(indenters), divided)
 
     def advance(
         self, held_velocity: FloatArray, velocity: FloatArray, spin: FloatArray, reactions: tuple[FloatArray, FloatArray]
     ) -> tuple[int, int, int]:
         """Take len(velocity) steps; return iterations, passes and the steps whose contacts did not settle.
+
+        A step in which an indenter would pass through nodes is taken in shorter ones.
 
         Parameters
         ----------
@@ -74,7 +86,50 @@ class ContactStepper:
         reactions : tuple of ndarray
             Of the bodies and of the indenters, mN, of the shapes of their velocities; filled.
         """
-        base, contact = self.base, self.contact
+        allowed = SHARE * np.array([p.geometry.inradius for p in self.indenters])
+        ways = self.base.step * np.linalg.norm(velocity, axis=2)
+        if not spin.any() and (ways <= allowed).all():
+            return self._taken(self.base, held_velocity, velocity, spin, reactions)
+        found = np.zeros(3, dtype=np.int64)
+        for n in range(len(velocity)):
+            parts = self._parts(velocity[n], spin[n], allowed)
+            own = [np.repeat(motion[n : n + 1], parts, axis=0) for motion in (held_velocity, velocity, spin)]
+            forces = (np.empty_like(own[0]), np.empty_like(own[1]))
+            taken = self._taken(self._finer_by(parts), own[0], own[1], own[2], forces)
+            found += (taken[0], taken[1], min(taken[2], 1))
+            for whole, pieces in zip(reactions, forces, strict=True):
+                whole[n] = pieces.mean(axis=0)
+        return int(found[0]), int(found[1]), int(found[2])
+
+    def _parts(self, velocity: FloatArray, spin: FloatArray, allowed: FloatArray) -> int:
+        """Parts of a step, a power of two, in each of which no indenter passes through nodes."""
+        base, contact, duration = self.base, self.contact, self.base.step
+        points = base.position.reshape(3, -1)[:, contact.nodes].T.astype(np.float64)
+        turn = duration * spin
+        arms = np.array([np.linalg.norm(points - centre, axis=1).max() for centre in contact.centres])
+        ways = duration * np.linalg.norm(velocity, axis=1) + np.linalg.norm(turn, axis=1) * arms
+        if (ways <= allowed).all():
+            return 1
+        approach = duration * float(np.linalg.norm(base.velocity.reshape(3, -1), axis=0).max())
+        if safe_fraction(self.indenters, points, contact.centres, contact.axes, duration * velocity, turn, approach) >= 1.0:
+            return 1
+        return int(min(2 ** np.ceil(np.log2((ways / allowed).max())), MOST_PARTS))
+
+    def _finer_by(self, parts: int) -> ImplicitStepper:
+        """Return the stepper whose steps are shorter by `parts`."""
+        if parts == 1:
+            return self.base
+        if parts not in self._finer:
+            self._finer[parts] = self.divided(self.base, parts)
+        self._finer[parts].constrained = self.base.constrained
+        return self._finer[parts]
+
+    def _taken(
+        self, base: ImplicitStepper, held_velocity: FloatArray, velocity: FloatArray, spin: FloatArray,
+        reactions: tuple[FloatArray, FloatArray],
+    ) -> tuple[int, int, int]:  # fmt: skip
+        """Take steps of a stepper that shares the state."""
+        contact = self.contact
         free = ~np.isin(contact.nodes, base.constrained[0])  # constrained nodes are in no contact
         contact.mode[~free] = FREE
         contact.friction[~free] = 0.0
@@ -86,7 +141,7 @@ class ContactStepper:
         found: tuple[int, int, int] = contact_steps(
             blocks, tables, (base.position, base.velocity, base.extension, base.length), base.mass, base.external, work, inner, indenters,
             history, base.constrained, (held_velocity, velocity, spin), base.step, (base.tolerance, MOST_ITERATIONS), reactions,
-            (self.passes, self.slow),
+            (self.passes, self.slow * self.base.step / base.step),
         )  # fmt: skip
         contact.mode[free], contact.friction[free], contact.touched[free] = history
         return found

@@ -216,6 +216,11 @@ class LatticeEngine:
         own = scratch or self.scratch.made()
         return ImplicitStepper(x, v, y, self.stored_lengths(state), self.kernel, own, external, self.step, self.mass, self.tolerance)
 
+    def divided(self, stepper: ImplicitStepper, parts: int) -> ImplicitStepper:
+        """Return a stepper of the same arrays whose steps are shorter by a whole number."""
+        kernel, scratch = implicit_kernel(self.lattice, self.parameters, self.step / parts, self.blocks, self.mass)
+        return replace(stepper, kernel=kernel, scratch=scratch.made(), step=self.step / parts)
+
     def energy(self, state: LatticeState) -> float:
         """Return kinetic energy plus that of the springs, mN mm; free of supports and forces it never grows."""
         kinetic = 0.5 * float((self.lattice.node_mass * (state.velocity**2).sum(axis=1)).sum())

@@ -54,6 +54,9 @@ class SteppedEngine(Protocol):
     def check(self, stepper: Stepper, steps: int) -> None:
         """Check that explicit steps did not diverge."""
 
+    def divided(self, stepper: ImplicitStepper, parts: int) -> ImplicitStepper:
+        """Return a stepper of the same arrays whose steps are shorter by a whole number."""
+
 
 @dataclass(slots=True, eq=False, weakref_slot=True)
 class LatticeSession:
@@ -268,7 +271,7 @@ class LatticeSession:
         if not isinstance(stepper, ImplicitStepper):
             raise InputError(f"contact needs method='implicit', which is stable when nodes stop at an indenter, not {self.engine.method!r}")
         known = state.contact if state is not None and state.contact is not None else begin_contact(lattice, indenters, self.positions())
-        self._contact = ContactStepper.of(stepper, indenters, known, lattice.spacing_mm)
+        self._contact = ContactStepper.of(stepper, indenters, known, lattice.spacing_mm, self.engine.divided)
         self.indenters, self._speed, self._largest_force = tuple(indenters), np.zeros((len(indenters), 3)), 0.0
 
     def _advance(self, reaction: FloatArray) -> None:

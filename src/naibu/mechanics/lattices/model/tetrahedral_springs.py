@@ -18,9 +18,9 @@ DampingRule = Literal["ratio", "printed"]
 def mesh_edges(cells: IntArray) -> tuple[IntArray, IntArray]:
     """Return the edges (m, 2) of tetrahedra (k, 4), and the number of each of the six edges of every tetrahedron (k, 6)."""
     first, second = np.triu_indices(4, 1)
-    ends = np.sort(np.stack([cells[:, first], cells[:, second]], axis=-1).reshape(-1, 2), axis=1)
-    edges, number = np.unique(ends, axis=0, return_inverse=True)
-    return edges, number.reshape(-1, 6)
+    i, j, count = cells[:, first].ravel(), cells[:, second].ravel(), int(cells.max()) + 1
+    keys, number = np.unique(np.minimum(i, j) * count + np.maximum(i, j), return_inverse=True)  # rows would take ten times as long
+    return np.stack([keys // count, keys % count], axis=1), number.reshape(-1, 6)
 
 
 def volumetric_lattice(

@@ -171,7 +171,7 @@ def _begun(
     assert isinstance(base, ImplicitStepper)
     none = ConstrainedNodes.none()
     base.constrain((none.node, none.direction, none.weight, none.body), 0)
-    return ContactStepper.of(base, indenters, known, engine.lattice.spacing_mm, passes)
+    return ContactStepper.of(base, indenters, known, engine.lattice.spacing_mm, engine.divided, passes)
 
 
 def _motion(
