@@ -1,0 +1,1 @@
+"""Cutting of meshes along the surface that a blade sweeps."""

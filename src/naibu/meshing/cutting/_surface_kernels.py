@@ -1,0 +1,245 @@
+"""Kernels: triangles with neighbours that are bisected, swapped and separated in place, at a cost that the mesh around does not change."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from naibu._numba.compilation import njit
+from naibu.core.arrays import FloatArray, IntArray
+
+
+class SurfaceArrays(NamedTuple):
+    """Arrays with room to grow."""
+
+    rest: FloatArray  # (v, 3), mm
+    position: FloatArray  # (v, 3), mm
+    triangles: IntArray  # (t, 3)
+    neighbours: IntArray  # (t, 3) across the edge opposite to each corner; -1 where there is none, -2 where it was cut off
+    at: IntArray  # (v,) one of the triangles of a vertex
+    twin: IntArray  # (v,) next vertex in the ring of copies
+    ends: IntArray  # (v, 2) ends of the edge that a vertex halves, -1 of others
+    source: IntArray  # (v,) vertex that a vertex was copied from, itself of others
+    parent: IntArray  # (t,) triangle of the surface before that a triangle is a part of
+    stamp: IntArray  # (t,)
+    n: IntArray  # (3,) numbers of vertices and triangles, last stamp
+
+
+@njit(cache=True)
+def _length2(p, a, b):  # type: ignore[no-untyped-def]  # pragma: no cover
+    x, y, z = p[a, 0] - p[b, 0], p[a, 1] - p[b, 1], p[a, 2] - p[b, 2]
+    return x * x + y * y + z * z
+
+
+@njit(cache=True)
+def longest(s, t):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Corner opposite to the longest edge at rest; equal ones are told apart by their vertices."""
+    best, where, low, high = -1.0, 0, 0, 0
+    for i in range(3):
+        a, b = s.triangles[t, (i + 1) % 3], s.triangles[t, (i + 2) % 3]
+        l2 = _length2(s.rest, a, b)
+        p, q = min(a, b), max(a, b)
+        if l2 > best or (l2 == best and (q > high or (q == high and p > low))):
+            best, where, low, high = l2, i, p, q
+    return where
+
+
+@njit(cache=True)
+def _replace(s, t, old, new):  # type: ignore[no-untyped-def]  # pragma: no cover
+    if t >= 0:
+        for i in range(3):
+            if s.neighbours[t, i] == old:
+                s.neighbours[t, i] = new
+                return
+
+
+@njit(cache=True)
+def corner(s, t, v):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return which corner of a triangle a vertex is."""
+    return 0 if s.triangles[t, 0] == v else 1 if s.triangles[t, 1] == v else 2
+
+
+@njit(cache=True)
+def _set(s, t, a, b, c, p, q, r):  # type: ignore[no-untyped-def]  # pragma: no cover
+    s.triangles[t, 0], s.triangles[t, 1], s.triangles[t, 2] = a, b, c
+    s.neighbours[t, 0], s.neighbours[t, 1], s.neighbours[t, 2] = p, q, r
+
+
+@njit(cache=True)
+def _halve(s, t, i):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Bisect the edge opposite to corner i, and the triangles on both of its sides."""
+    a, b, c = s.triangles[t, i], s.triangles[t, (i + 1) % 3], s.triangles[t, (i + 2) % 3]
+    u, beside_b, beside_c = s.neighbours[t, i], s.neighbours[t, (i + 1) % 3], s.neighbours[t, (i + 2) % 3]
+    m, t2 = s.n[0], s.n[1]
+    u2 = t2 + 1 if u >= 0 else u
+    s.n[0] += 1
+    s.n[1] += 1 if u < 0 else 2
+    for k in range(3):
+        s.rest[m, k] = 0.5 * (s.rest[b, k] + s.rest[c, k])
+        s.position[m, k] = 0.5 * (s.position[b, k] + s.position[c, k])
+    s.twin[m], s.source[m], s.ends[m, 0], s.ends[m, 1] = m, m, b, c
+    s.stamp[t2], s.parent[t2] = 0, s.parent[t]
+    if u >= 0:
+        j = 0
+        while s.triangles[u, j] == b or s.triangles[u, j] == c:
+            j += 1
+        e, near_c, near_b = s.triangles[u, j], s.neighbours[u, (j + 1) % 3], s.neighbours[u, (j + 2) % 3]
+        s.stamp[u2], s.parent[u2] = 0, s.parent[u]
+        _set(s, u, e, m, b, t, near_c, u2)
+        _set(s, u2, e, c, m, t2, u, near_b)
+        _replace(s, near_b, u, u2)
+    _set(s, t, a, b, m, u, t2, beside_c)
+    _set(s, t2, a, m, c, u2, beside_b, t)
+    _replace(s, beside_b, t, t2)
+    s.at[m], s.at[c] = t, t2
+
+
+@njit(cache=True)
+def bisect(s, t):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Bisect a triangle and what its longest-edge propagation path makes necessary; False where there is no room."""
+    while True:
+        now = t
+        while True:
+            i = longest(s, now)
+            u = s.neighbours[now, i]
+            if u < 0 or s.neighbours[u, longest(s, u)] == now:
+                break
+            now = u
+        if s.n[0] + 1 >= len(s.at) or s.n[1] + 2 >= len(s.triangles):
+            return False
+        _halve(s, now, i)
+        if now == t or u == t:
+            return True
+
+
+@njit(cache=True)
+def size2(s, t):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Square of the longest edge where the triangle is now."""
+    a, b, c = s.triangles[t]
+    return max(_length2(s.position, a, b), max(_length2(s.position, b, c), _length2(s.position, c, a)))
+
+
+@njit(cache=True)
+def fan(s, v, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Triangles around a vertex in counterclockwise order, and whether they close; their number is negative if there are too many."""
+    first = s.at[v]
+    t, count = first, 0
+    while True:  # clockwise to the beginning
+        back = s.neighbours[t, (corner(s, t, v) + 2) % 3]
+        count += 1
+        if back < 0 or back == first or count > len(out):
+            break
+        t = back
+    closed = back == first and back >= 0
+    if closed:
+        t = first
+    count, begin = 0, t
+    while count < len(out):
+        out[count] = t
+        count += 1
+        t = s.neighbours[t, (corner(s, t, v) + 1) % 3]
+        if t < 0 or t == begin:
+            return count, closed
+    return -1, closed
+
+
+@njit(cache=True)
+def on_boundary(s, v, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Whether a vertex lies on the boundary or on a lip of a cut."""
+    return not fan(s, v, out)[1]
+
+
+@njit(cache=True)
+def swap(s, t, i):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Swap the edge opposite to corner i if it is the longest of both triangles and they are one plane convex quadrilateral."""
+    u = s.neighbours[t, i]
+    if u < 0 or longest(s, t) != i or s.neighbours[u, longest(s, u)] != t:
+        return False
+    r, b, c = s.triangles[t, i], s.triangles[t, (i + 1) % 3], s.triangles[t, (i + 2) % 3]
+    j = 0
+    while s.triangles[u, j] == b or s.triangles[u, j] == c:
+        j += 1
+    e = s.triangles[u, j]
+    p = s.rest
+    normal = np.cross(p[b] - p[r], p[c] - p[r])
+    area2 = (normal * normal).sum()
+    new, other = np.cross(p[b] - p[r], p[e] - p[r]), np.cross(p[e] - p[r], p[c] - p[r])
+    whole = np.sqrt(area2) + np.sqrt((np.cross(p[c] - p[e], p[b] - p[e]) ** 2).sum())
+    changed = abs(np.sqrt((new**2).sum()) + np.sqrt((other**2).sum()) - whole)
+    height = abs((normal * (p[e] - p[r])).sum())
+    least = 0.05 * area2
+    if (new * normal).sum() < least or (other * normal).sum() < least or changed > 1e-12 * whole or height > 1e-9 * area2**0.75:
+        return False
+    beside_b, beside_c = s.neighbours[t, (i + 1) % 3], s.neighbours[t, (i + 2) % 3]
+    near_c, near_b = s.neighbours[u, (j + 1) % 3], s.neighbours[u, (j + 2) % 3]
+    _set(s, t, r, b, e, near_c, u, beside_c)
+    _set(s, u, r, e, c, near_b, beside_b, t)
+    _replace(s, near_c, u, t)
+    _replace(s, beside_b, t, u)
+    s.at[b], s.at[c], s.at[r], s.at[e] = t, u, t, t
+    return True
+
+
+@njit(cache=True)
+def _resolve(s, v, around, count):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Give each group of triangles that still hold together around a vertex a vertex of its own."""
+    groups = 0
+    for k in range(count):
+        groups += s.neighbours[around[k], (corner(s, around[k], v) + 2) % 3] < 0
+    if groups < 2:
+        return
+    start = 0
+    while s.neighbours[around[start], (corner(s, around[start], v) + 2) % 3] >= 0:
+        start += 1
+    now = v
+    for k in range(count):
+        t = around[(start + k) % count]
+        i = corner(s, t, v)
+        if k > 0 and s.neighbours[t, (i + 2) % 3] < 0:
+            now = s.n[0]
+            s.n[0] += 1
+            s.rest[now], s.position[now], s.ends[now] = s.rest[v], s.position[v], -1
+            s.source[now], s.twin[now], s.twin[v] = v, s.twin[v], now
+        s.triangles[t, i] = now
+        s.at[now] = t
+
+
+@njit(cache=True)
+def separate(s, a, b):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Part the triangles on the two sides of an edge, and duplicate its ends where that divides the triangles around them."""
+    first, second = np.empty(512, dtype=np.int64), np.empty(512, dtype=np.int64)
+    n1, n2 = fan(s, a, first)[0], fan(s, b, second)[0]
+    if n1 < 0 or n2 < 0 or s.n[0] + 2 >= len(s.at):
+        return False
+    for k in range(n1):
+        t = first[k]
+        i = corner(s, t, a)
+        if s.triangles[t, (i + 1) % 3] == b:
+            u = s.neighbours[t, (i + 2) % 3]
+            s.neighbours[t, (i + 2) % 3] = -2
+            _replace(s, u, t, -2)
+            break
+    _resolve(s, a, first, n1)
+    _resolve(s, b, second, n2)
+    return True
+
+
+@njit(cache=True)
+def link(triangles, order, keys, neighbours):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Fill the neighbours from sorted keys of half edges; an edge of three triangles or more, or of equal direction, stays open."""
+    seams, n, k = 0, len(order), 0
+    while k < n:
+        stop = k + 1
+        while stop < n and keys[order[stop]] == keys[order[k]]:
+            stop += 1
+        if stop - k == 2:
+            t, i, u, j = order[k] // 3, order[k] % 3, order[k + 1] // 3, order[k + 1] % 3
+            if triangles[t, (i + 1) % 3] == triangles[u, (j + 2) % 3]:
+                neighbours[t, i], neighbours[u, j] = u, t
+            else:
+                seams += 1
+        elif stop - k > 2:
+            seams += 1
+        k = stop
+    return seams

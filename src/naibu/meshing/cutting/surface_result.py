@@ -1,0 +1,200 @@
+"""What a cut makes of a surface: pieces, lips, distance from the tool's path, and the groove beneath it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from naibu.core.arrays import BoolArray, FloatArray, IntArray
+from naibu.core.errors import InputError
+from naibu.meshing.cutting._surface_kernels import SurfaceArrays
+from naibu.meshing.cutting._surface_walk_kernels import on_path
+from naibu.meshing.cutting.surface_input import LinkedSurface
+
+PARTS = 8  # of an edge at whose ends its distance from the path is measured
+
+ToolPath = tuple[FloatArray, FloatArray, BoolArray]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceCut:
+    """A cut surface, and how it comes from the one before.
+
+    Attributes
+    ----------
+    points : ndarray, shape (n, 3)
+        mm; those of the surface before come first.
+    triangles : ndarray, shape (t, 3), int64
+        Counterclockwise seen from outside.
+    parents : ndarray, shape (t,), int64
+        Triangle of the surface before that each is a part of; where an edge was swapped, that of one of the two.
+    ends : ndarray, shape (n, 2), int64
+        Ends of the edge that a point halves, -1 for others.
+    source : ndarray, shape (n,), int64
+        Point that each was copied from when the cut passed it, itself for others.
+    piece : ndarray, shape (t,), int64
+        Piece that each triangle belongs to, the one of the largest area first.
+    lips : ndarray, shape (l, 2), int64
+        Edges of triangles along the cut, in the triangles' direction.
+    cut_edges : ndarray, shape (c, 2, 3)
+        Edges that were cut, in the order of the cut, mm.
+    paths : tuple
+        For each contact of the tool: its path on the surface (m, 3), mm, the tip (m, 3), mm, and whether it was over the surface (m,).
+    deviation_mm : float
+        Largest distance of the cut from the path of the tool on the surface; 0 if there is no cut.
+    missed_mm : float
+        Length of the path over the surface with no cut within the distance: nowhere did an edge lead on there; mm.
+    repairs : tuple of str
+        What was mended of the surface before.
+    """
+
+    points: FloatArray
+    triangles: IntArray
+    parents: IntArray
+    ends: IntArray
+    source: IntArray
+    piece: IntArray
+    lips: IntArray
+    cut_edges: FloatArray
+    paths: tuple[ToolPath, ...]
+    deviation_mm: float
+    missed_mm: float
+    repairs: tuple[str, ...]
+
+    @property
+    def n_pieces(self) -> int:
+        """Number of pieces."""
+        return int(self.piece.max()) + 1
+
+    @property
+    def areas_mm2(self) -> FloatArray:
+        """Areas of the pieces, mm2."""
+        return np.bincount(self.piece, triangle_areas(self.points, self.triangles)).astype(np.float64)
+
+    @property
+    def length_mm(self) -> float:
+        """Length of the cut, mm."""
+        return float(np.linalg.norm(self.cut_edges[:, 1] - self.cut_edges[:, 0], axis=1).sum())
+
+    @property
+    def on_surface(self) -> bool:
+        """Whether the tool came over the surface."""
+        return any(bool(over.any()) for _, _, over in self.paths)
+
+    @property
+    def roots(self) -> IntArray:
+        """Point (n,) that each point and its copies come from: the same for points of two lips that met."""
+        roots = self.source.copy()
+        while (roots != roots[roots]).any():
+            roots = roots[roots]
+        return roots
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Groove:
+    """Walls and floor line of a groove.
+
+    Attributes
+    ----------
+    points : ndarray, shape (n + f, 3)
+        Those of the cut surface, then the points of the floor at the tips of the tool, mm.
+    triangles : ndarray, shape (w, 3), int64
+        Walls, from the lips down to the floor.
+    area_mm2 : float
+        Of the walls.
+    """
+
+    points: FloatArray
+    triangles: IntArray
+    area_mm2: float
+
+
+def triangle_areas(points: FloatArray, triangles: IntArray) -> FloatArray:
+    """Return areas (t,), mm2."""
+    a, b, c = points[triangles].transpose(1, 0, 2)
+    return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
+
+
+def cut_result(before: LinkedSurface, s: SurfaceArrays, edges: IntArray, paths: Sequence[ToolPath], distance_mm: float) -> SurfaceCut:
+    """Return what the arrays of a cutter hold, without their room."""
+    n, t = int(s.n[0]), int(s.n[1])
+    triangles, neighbours = s.triangles[:t].copy(), s.neighbours[:t]
+    rows, corner = np.nonzero(neighbours >= 0)
+    graph = coo_array((np.ones(len(rows)), (rows, neighbours[rows, corner])), shape=(t, t))
+    count, label = connected_components(graph, directed=False)
+    points = s.rest[:n].copy()
+    order = np.argsort(-np.bincount(label, triangle_areas(points, triangles), minlength=count), kind="stable")
+    rank = np.empty(count, dtype=np.int64)
+    rank[order] = np.arange(count)
+    rows, corner = np.nonzero(neighbours == -2)
+    lips = np.stack([triangles[rows, (corner + 1) % 3], triangles[rows, (corner + 2) % 3]], axis=1)
+    cut_edges = s.position[edges]
+    return SurfaceCut(
+        points, triangles, s.parent[:t].copy(), s.ends[:n].copy(), s.source[:n].copy(), rank[label], lips, cut_edges, tuple(paths),
+        _deviation(cut_edges, paths), _missed(cut_edges, paths, distance_mm), before.repairs,
+    )  # fmt: skip
+
+
+def _deviation(edges: FloatArray, paths: Sequence[ToolPath]) -> float:
+    if not len(edges):
+        return 0.0
+    share = np.linspace(0.0, 1.0, PARTS + 1)[:, None, None]
+    places = ((1.0 - share) * edges[:, 0] + share * edges[:, 1]).reshape(-1, 3)
+    gap = np.full(len(places), np.inf)
+    for points, _, _ in paths:
+        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+        found = [on_path(points, length, len(points), np.ascontiguousarray(q), 0.0, float(length[-1]))[0] for q in places]
+        gap = np.minimum(gap, found)
+    return float(gap.max())
+
+
+def _missed(edges: FloatArray, paths: Sequence[ToolPath], distance_mm: float) -> float:
+    missed = 0.0
+    for points, _, over in paths:
+        step = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        for k in np.flatnonzero(over[1:] & over[:-1]):
+            e = edges[:, 1] - edges[:, 0]
+            f = np.clip(((points[k] - edges[:, 0]) * e).sum(axis=1) / (e * e).sum(axis=1), 0.0, 1.0)[:, None]
+            gap = np.linalg.norm(points[k] - edges[:, 0] - f * e, axis=1).min(initial=np.inf)
+            missed += float(step[k]) if gap > distance_mm else 0.0
+    return missed
+
+
+def groove(cut: SurfaceCut) -> Groove:
+    """Return the groove that the tool leaves: walls from both lips of the cut down to floor points at the tips of the tool.
+
+    Where the cut ends inside the surface, the floor rises to its end. Points on both lips that met share their floor point.
+
+    Raises
+    ------
+    InputError
+        There is no cut.
+    """
+    if not len(cut.lips):
+        raise InputError("the surface was not cut, so that there is no groove; check the path and the reach of the tool")
+    nodes, place = np.unique(cut.lips, return_inverse=True)
+    spots, spot = np.unique(np.round(cut.points[nodes], 9), axis=0, return_inverse=True)
+    spot = spot.ravel()
+    paths = [(points[over], tips[over]) for points, tips, over in cut.paths]
+    surface, tips = (np.concatenate([p[k] for p in paths]) for k in (0, 1))
+    floor = np.stack([_tip(surface, tips, q) for q in spots])
+    closed = np.bincount(spot, minlength=len(spots)) == 1
+    once = closed & (cut.ends[nodes[np.unique(spot, return_index=True)[1]], 0] < 0)
+    number = np.where(once[spot], nodes, len(cut.points) + spot)[place.reshape(-1, 2)]
+    a, b = cut.lips.T
+    walls = np.concatenate([np.stack([b, a, number[:, 0]], axis=1), np.stack([b, number[:, 0], number[:, 1]], axis=1)])
+    distinct = (walls[:, 0] != walls[:, 1]) & (walls[:, 1] != walls[:, 2]) & (walls[:, 2] != walls[:, 0])
+    points = np.concatenate([cut.points, floor])
+    return Groove(points, walls[distinct], float(triangle_areas(points, walls[distinct]).sum()))
+
+
+def _tip(surface: FloatArray, tips: FloatArray, q: FloatArray) -> FloatArray:
+    """Tip of the tool when it was nearest to a point of the surface."""
+    a, e = surface[:-1], np.diff(surface, axis=0)
+    f = np.clip(((q - a) * e).sum(axis=1) / np.maximum((e * e).sum(axis=1), 1e-300), 0.0, 1.0)[:, None]
+    k = int((((q - a - f * e) ** 2).sum(axis=1)).argmin())
+    return np.asarray((1.0 - f[k]) * tips[k] + f[k] * tips[k + 1])

@@ -1,0 +1,74 @@
+"""Cuts open as linear elastic fracture mechanics and beam theory say (plane states: Poisson's ratio 0, no displacement across)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from naibu.core.arrays import FloatArray
+from naibu.core.mesh import Mesh
+from naibu.mechanics import LinearBody, PrescribedDisplacement
+from naibu.meshing import box_from_coordinates, cut_volume, node_areas, nodes_on_plane, swept_blade
+from naibu.meshing.surface import boundary_faces
+
+E = 100.0  # kPa
+
+
+def solved(mesh: Mesh, held: np.ndarray, force: FloatArray) -> FloatArray:
+    """Displacement without any motion along y; `held` (n, 3) are further constraints."""
+    constrained = held | np.array([False, True, False])
+    zero = np.zeros(mesh.points.shape)
+    prescribed = PrescribedDisplacement(constrained, zero, zero)
+    return LinearBody.of(mesh).solve(0.0, 0.5 * E, prescribed, force)
+
+
+def straight_cut(mesh: Mesh, x: tuple[float, float], z: float) -> Mesh:
+    """Cut a plate of the x-z plane along a line of its mesh."""
+    edges = np.stack([[[v, -5.0, z], [v, 5.0, z]] for v in np.linspace(*x, 4)])
+    cut = cut_volume(mesh, swept_blade(edges), 0.4)
+    assert cut.deviation_mm < 1e-9
+    assert cut.n_pieces == 1
+    return cut.mesh
+
+
+def test_a_centre_crack_in_a_strip_under_tension_opens_as_fracture_mechanics_says() -> None:
+    half_width, half_crack, stress = 20.0, 8.0, 1.0
+    half = np.concatenate([np.arange(0.0, 2.01, 0.25), np.geomspace(2.4, 60.0, 16)])
+    across = np.concatenate([np.arange(0.0, 5.0, 1.0), np.arange(5.0, 10.51, 0.25), np.arange(11.0, 20.1, 0.75)])
+    heights, widths = (np.concatenate([-values[:0:-1], values]) for values in (half, across))
+    mesh = box_from_coordinates(widths, [-0.5, 0.5], heights, cell_type="tetra")
+    plate = straight_cut(mesh, (-half_crack, half_crack), 0.0)
+    force = np.zeros(plate.points.shape)
+    for sign in (-1.0, 1.0):
+        ends = nodes_on_plane(plate, (0.0, 0.0, sign * 60.0), (0.0, 0.0, 1.0))
+        faces = boundary_faces(plate).faces
+        on_end = faces[np.isin(faces, ends).all(axis=1)]
+        force[:, 2] += sign * stress * node_areas(plate, on_end)
+    held = np.zeros(plate.points.shape, dtype=bool)
+    corner = np.argmin(np.abs(plate.points - [-half_width, 0.0, -60.0]).sum(axis=1))
+    other = np.argmin(np.abs(plate.points - [half_width, 0.0, -60.0]).sum(axis=1))
+    held[corner, [0, 2]] = held[other, 2] = True
+    u = solved(plate, held, force)
+    middle = np.flatnonzero(np.abs(plate.points[:, [0, 2]]).max(axis=1) < 1e-9)
+    assert len(middle) == 4  # two nodes across y, on each side of the crack
+    opening = np.ptp(u[middle, 2])
+    ratio = half_crack / half_width
+    width = -0.071 - 0.535 * ratio + 0.169 * ratio**2 + 0.020 * ratio**3 - 1.071 / ratio * np.log(1.0 - ratio)  # Tada, Paris, Irwin
+    assert opening == pytest.approx(4.0 * stress * half_crack / E * width, rel=0.03)
+
+
+@pytest.mark.parametrize("length", [25.0, 40.0])
+def test_the_compliance_of_a_double_cantilever_beam_grows_with_its_crack(length: float) -> None:
+    arm, load = 4.0, 1.0
+    mesh = box_from_coordinates(np.arange(0.0, 80.1, 0.5), [-0.5, 0.5], np.arange(-arm, arm + 0.01, 0.4), cell_type="tetra")
+    beam = straight_cut(mesh, (-1.0, length), 0.0)
+    force = np.zeros(beam.points.shape)
+    for sign in (-1.0, 1.0):
+        tip = np.flatnonzero((beam.points[:, 0] < 1e-9) & (np.abs(beam.points[:, 2] - sign * arm) < 1e-9))
+        force[tip, 2] = sign * load / len(tip)
+    held = np.zeros(beam.points.shape, dtype=bool)
+    held[nodes_on_plane(beam, (80.0, 0.0, 0.0), (1.0, 0.0, 0.0))[:, None], [0, 2]] = True
+    u = solved(beam, held, force)
+    opening = 2.0 * np.abs(u[force[:, 2] != 0.0, 2]).mean()
+    chi = np.sqrt(2.0 / 11.0 * (3.0 - 2.0 * (2.36 / 3.36) ** 2))  # corrected beam theory, ISO 15024: root rotation and shear
+    assert opening / load == pytest.approx(8.0 * (length + chi * arm) ** 3 / (E * arm**3), rel=0.05)

@@ -1,0 +1,182 @@
+"""Cutting of tetrahedral meshes: volume, conformity, distance from the blade, pieces, fronts, crossing cuts, and what is kept."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import InputError
+from naibu.core.mesh import Mesh
+from naibu.core.rigid_transform import RigidTransform, rotation_matrix
+from naibu.meshing import SweptBlade, VolumeCut, blade_poses, box, cut_volume, signed_volumes, swept_blade
+from naibu.meshing.cutting.separation import face_pairs
+
+SIZE = 20.0
+
+
+def cube(divisions: int = 4) -> Mesh:
+    return box((SIZE, SIZE, SIZE), (divisions, divisions, divisions), cell_type="tetra", layers=[("low", 10.0), ("high", 10.0)])
+
+
+def plane(x: float = 0.3, *, tilt: float = 0.0, until_y: float = 15.0, from_z: float = -5.0) -> SweptBlade:
+    """A blade that stands upright from `from_z` to above the cube and moves along y from before the cube to `until_y`."""
+    y = np.linspace(-15.0, until_y, 5)
+    return swept_blade(np.stack([[[x + tilt * v, v, from_z], [x + tilt * v, v, SIZE + 5.0]] for v in y]))
+
+
+def volume(mesh: Mesh) -> float:
+    return float(signed_volumes(mesh).sum())
+
+
+def check(before: Mesh, cut: VolumeCut, distance: float) -> None:
+    """What holds for every cut."""
+    assert volume(cut.mesh) == pytest.approx(volume(before), rel=1e-12)
+    assert signed_volumes(cut.mesh).min() > 0.0
+    assert cut.deviation_mm <= 0.5 * distance
+    pairs = face_pairs(cut.mesh.cells)  # conforming: no face of more than two cells
+    neighbours = np.bincount(pairs.cells.ravel(), minlength=cut.mesh.n_cells)
+    assert neighbours.max() <= 4
+    # the cells of a piece, and no others, share nodes across faces; two pieces share none
+    for piece in range(cut.n_pieces):
+        own = np.unique(cut.mesh.cells[cut.piece == piece])
+        others = np.unique(cut.mesh.cells[cut.piece != piece])
+        assert not np.intersect1d(own, others).size
+    kept = np.zeros(before.n_cells)
+    np.add.at(kept, cut.parents, signed_volumes(cut.mesh))
+    np.testing.assert_allclose(kept, signed_volumes(before), rtol=1e-9)
+    np.testing.assert_array_equal(before.regions[cut.parents], cut.mesh.regions)
+    first, second = np.split(cut.faces, 2)
+    np.testing.assert_allclose(cut.mesh.points[first].mean(axis=1), cut.mesh.points[second].mean(axis=1), atol=1e-12)
+
+
+@pytest.mark.parametrize("distance", [8.0, 2.0])
+def test_a_whole_cut_gives_two_pieces_of_the_volumes_on_both_sides(distance: float) -> None:
+    cut = cut_volume(cube(), plane(2.0), distance)
+    check(cube(), cut, distance)
+    assert cut.n_pieces == 2
+    volumes = [signed_volumes(cut.mesh)[cut.piece == k].sum() for k in (0, 1)]
+    assert abs(volumes[0] - 12.0 * SIZE**2) < 0.5 * distance * SIZE**2
+    area = 0.5 * _area_vectors(cut.mesh.points, np.split(cut.faces, 2)[0]).sum(axis=0)
+    assert abs(area[0]) == pytest.approx(SIZE**2, rel=1e-9)  # seen along x, facets cover the section exactly once
+
+
+def _area_vectors(points: FloatArray, faces: np.ndarray) -> FloatArray:
+    a, b, c = points[faces].transpose(1, 0, 2)
+    return np.cross(b - a, c - a)
+
+
+def test_faces_of_the_two_sides_look_at_each_other() -> None:
+    cut = cut_volume(cube(), plane(0.3, tilt=0.1), 3.0)
+    first, second = np.split(cut.faces, 2)
+    np.testing.assert_allclose(_area_vectors(cut.mesh.points, first), -_area_vectors(cut.mesh.points, second), atol=1e-9)
+
+
+def test_a_cut_that_ends_inside_leaves_one_piece_with_a_front() -> None:
+    cut = cut_volume(cube(), plane(0.3, until_y=0.0), 2.0)
+    check(cube(), cut, 2.0)
+    assert cut.n_pieces == 1
+    assert len(cut.faces) > 0
+    first, second = np.split(cut.faces, 2)
+    shared = np.intersect1d(first, second)  # nodes of the front belong to both sides
+    assert len(shared) > 0
+    assert np.abs(cut.mesh.points[shared][:, 1]).max() < 4.0
+
+
+def test_crossing_cuts_give_four_pieces_and_cells_hang_on_faces_only() -> None:
+    first = cut_volume(cube(), plane(0.3), 4.0)
+    crossing = np.stack([[[v, 0.2, -5.0], [v, 0.2, SIZE + 5.0]] for v in np.linspace(-15.0, 15.0, 4)])
+    second = cut_volume(first.mesh, swept_blade(crossing), 4.0)
+    check(first.mesh, second, 4.0)
+    assert second.n_pieces == 4
+    volumes = [signed_volumes(second.mesh)[second.piece == k].sum() for k in range(4)]
+    np.testing.assert_allclose(volumes, SIZE**3 / 4.0, rtol=0.35)
+
+
+def test_a_closed_path_cuts_a_column_out() -> None:
+    around = [[5.0 * np.cos(t), 5.0 * np.sin(t)] for t in np.linspace(0.0, 2.0 * np.pi, 25)]
+    cut = cut_volume(cube(6), swept_blade(np.stack([[[x, y, -1.0], [x, y, SIZE + 1.0]] for x, y in around])), 2.0)
+    check(cube(6), cut, 2.0)
+    assert cut.n_pieces == 2
+    column = signed_volumes(cut.mesh)[cut.piece == 1].sum()
+    assert column == pytest.approx(np.pi * 25.0 * SIZE, rel=0.15)
+
+
+def test_a_blade_through_nodes_and_along_faces_cuts_all_the_same() -> None:
+    cut = cut_volume(cube(), plane(0.0), 10.0)  # x = 0 is a plane of faces of the mesh
+    check(cube(), cut, 10.0)
+    assert cut.n_pieces == 2
+    assert cut.deviation_mm < 1e-9
+    assert cut.mesh.n_cells == cube().n_cells  # nothing to refine
+    np.testing.assert_allclose([signed_volumes(cut.mesh)[cut.piece == k].sum() for k in (0, 1)], SIZE**3 / 2.0)
+
+
+def test_a_blade_outside_leaves_the_mesh_as_it_was() -> None:
+    mesh = cube()
+    cut = cut_volume(mesh, plane(100.0), 2.0)
+    assert len(cut.faces) == 0
+    assert cut.n_pieces == 1
+    np.testing.assert_array_equal(cut.mesh.points, mesh.points)
+    np.testing.assert_array_equal(np.sort(cut.mesh.cells, axis=1), np.sort(mesh.cells, axis=1))
+
+
+def test_linear_fields_momentum_and_regions_are_kept() -> None:
+    mesh = cube()
+    rng = np.random.default_rng(3)
+    gradient, velocity = rng.normal(size=(3, 3)), rng.normal(size=(mesh.n_points, 3))
+    cut = cut_volume(mesh, plane(0.4, tilt=0.2), 2.0)
+    np.testing.assert_allclose(cut.nodal(mesh.points @ gradient), cut.mesh.points @ gradient, atol=1e-12)
+
+    def momentum(m: Mesh, v: FloatArray) -> FloatArray:
+        return np.asarray((signed_volumes(m)[:, None] * v[m.cells].mean(axis=1)).sum(axis=0))
+
+    np.testing.assert_allclose(momentum(cut.mesh, cut.nodal(velocity)), momentum(mesh, velocity), rtol=1e-10)
+    np.testing.assert_array_equal(cut.cellwise(mesh.regions), cut.mesh.regions)
+
+
+def test_the_blade_passes_the_deformed_body() -> None:
+    mesh = cube()
+    moved = mesh.points + np.array([50.0, 0.0, 0.0])
+    assert len(cut_volume(mesh, plane(2.0), 4.0, positions=moved).faces) == 0
+    cut = cut_volume(mesh, plane(52.0), 4.0, positions=moved)
+    assert cut.n_pieces == 2
+    np.testing.assert_allclose(cut.positions, cut.mesh.points + np.array([50.0, 0.0, 0.0]), atol=1e-12)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.floats(-8.0, 8.0), st.floats(-0.6, 0.6), st.floats(-14.0, 14.0), st.floats(-4.0, 18.0), st.sampled_from([2.5, 5.0]))
+def test_any_cut_keeps_volume_quality_and_distance(x: float, tilt: float, until_y: float, from_z: float, distance: float) -> None:
+    mesh = cube(3)
+    cut = cut_volume(mesh, plane(x, tilt=tilt, until_y=until_y, from_z=from_z), distance)
+    check(mesh, cut, distance)
+    assert cut.smallest_angle_deg > 15.0
+
+
+def test_poses_carry_the_edge() -> None:
+    poses = [RigidTransform.of(rotation_matrix(np.array([0.0, 0.0, a])), (0.0, 0.0, 1.0)) for a in (0.0, np.pi / 2)]
+    np.testing.assert_allclose(blade_poses([[1.0, 0, 0], [2.0, 0, 0]], poses)[1], [[0, 1, 1], [0, 2, 1]], atol=1e-12)
+
+
+def test_what_cannot_be_cut_is_refused() -> None:
+    mesh = cube()
+    for distance in (0.0, -1.0, np.nan):
+        with pytest.raises(InputError, match="distance_mm"):
+            cut_volume(mesh, plane(), distance)
+    with pytest.raises(InputError, match="larger than the body"):
+        cut_volume(mesh, plane(), 100.0)
+    with pytest.raises(InputError, match="sweeps no area"):
+        swept_blade([[[0.0, 0, 0], [1.0, 0, 0]], [[2.0, 0, 0], [3.0, 0, 0]]])
+    with pytest.raises(InputError, match="not finite in pose 1"):
+        swept_blade([[[0.0, 0, 0], [1.0, 0, 0]], [[0.0, 1, np.nan], [1.0, 1, 0]]])
+    with pytest.raises(InputError, match="at least two poses"):
+        swept_blade([[[0.0, 0, 0], [1.0, 0, 0]]])
+    with pytest.raises(InputError, match="not 'hexahedron' cells"):
+        cut_volume(box((1.0, 1.0, 1.0), (1, 1, 1)), plane(), 0.5)
+    flat = mesh.points * np.array([1.0, 1.0, -1.0])
+    with pytest.raises(InputError, match="is inverted"):
+        cut_volume(mesh, plane(), 2.0, positions=flat)
+    twice = Mesh.from_arrays(mesh.points, np.concatenate([mesh.cells, mesh.cells[:1], mesh.cells[:1]]), "tetra")
+    with pytest.raises(InputError, match="share"):
+        cut_volume(twice, plane(), 10.0)
