@@ -32,6 +32,23 @@ def test_a_crop_keeps_its_place() -> None:
     assert not part.same_grid(volume) and volume.same_grid(volume.with_values(values + 1))
 
 
+def test_the_difference_of_two_grids_is_named() -> None:
+    values, turn = np.zeros((3, 4, 5)), rotation_matrix(np.array([0.0, 0.0, 0.1]))
+    volume = Volume.from_array(values, spacing_mm=(1.0, 2.0, 3.0))
+    for other, words in (
+        (volume, ""),
+        (Volume.from_array(values[:2], spacing_mm=(1.0, 2.0, 3.0)), "their sizes differ: 5 x 4 x 3 and 5 x 4 x 2 voxels"),
+        (Volume.from_array(values, spacing_mm=(1.0, 2.0, 3.1)), "their voxel spacings differ: [1.0, 2.0, 3.0] and [1.0, 2.0, 3.1] mm"),
+        (Volume.from_array(values, spacing_mm=(1.0, 2.0, 3.0), direction=turn), "their axes differ: "),
+        (
+            Volume.from_array(values, spacing_mm=(1.0, 2.0, 3.0), origin_mm=(0.0, 3.0, 4.0)),
+            "they agree in size and spacing, but their origins lie 5 mm apart: [0.0, 0.0, 0.0] and [0.0, 3.0, 4.0] mm",
+        ),
+    ):
+        assert volume.grid_difference(other).startswith(words)
+        assert volume.same_grid(other) == (not words)
+
+
 @pytest.mark.parametrize(
     ("values", "options", "message"),
     [

@@ -330,6 +330,7 @@ def test_vrml_clockwise_faces_are_turned(tmp_path):
         ("a.wrl", vrml().replace(b"V2.0", b"V1.0"), "VRML 2.0"),
         ("a.wrl", vrml(field="translation 0 5 0 "), "translation"),
         ("a.wrl", vrml(field="rotation 0 0 1 1.57 "), "rotation"),
+        ("a.wrl", vrml(field="scale 2 2 2 ").replace(b"scale 2 2 2 ", b"scale 2,2,2}Transform{"), "scale"),
         ("a.wrl", vrml()[:-40], "truncated"),
         ("a.vtu", b"", "read_mesh"),
     ],

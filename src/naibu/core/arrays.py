@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ Int16Array = NDArray[np.int16]
 Int8Array = NDArray[np.int8]
 UInt16Array = NDArray[np.uint16]
 AnyArray = NDArray[Any]
+LENGTHS_MM = 1e-6, 1e5
 
 
 def as_points(name: str, values: ArrayLike, dimension: int | None = None, *, least: int = 0) -> FloatArray:
@@ -119,3 +121,56 @@ def as_mask(name: str, values: ArrayLike, shape: tuple[int, ...]) -> BoolArray:
     if not mask.any():
         raise InputError(f"{name} is empty: no element is true")
     return mask
+
+
+def require_within(name: str, value: float, low: float, high: float, unit: str = "") -> float:
+    """Return a number between two bounds, or say that it is none, or too small or too large to be meant.
+
+    Raises
+    ------
+    InputError
+        It is not.
+    """
+    if not low <= value <= high:  # also where it is not a number
+        raise InputError(f"{name} is {value:g}; give a number from {low:g} to {high:g}{f' {unit}' if unit else ''}")
+    return float(value)
+
+
+def require_lengths(**lengths: float | Iterable[float] | None) -> None:
+    """Refuse lengths that are not between a nanometre and 100 m: no object or scan has such, so the unit, or the number, is another.
+
+    Parameters
+    ----------
+    **lengths : float, iterable of float, or None
+        Lengths by the names of arguments, mm; None is skipped.
+
+    Raises
+    ------
+    InputError
+        One is not.
+    """
+    for name, value in lengths.items():
+        for length in [] if value is None else np.ravel(np.asarray(value, dtype=float)).tolist():
+            require_within(name, length, *LENGTHS_MM, "mm")
+
+
+def require_count(name: str, value: int, least: int = 1) -> int:
+    """Return a whole number, or say that it is none, or too small.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument, for the message.
+    value : int
+        Number.
+    least : int
+        Smallest allowed value.
+
+    Raises
+    ------
+    InputError
+        It is not a whole number of at least `least`.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise InputError(f"{name} is {value}; give a whole number of at least {least}")
+    return int(value)

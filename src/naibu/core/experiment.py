@@ -119,6 +119,8 @@ class Experiment:
         Factor by which printed x, y must be multiplied according to the file (1 when nothing is known).
     xy_step_mm, z_step_mm : float
         Quantisation of the coordinates (pixel and slice pitch).
+    sd_mm : tuple of float, shape (3,), or None
+        Standard deviation of a measured coordinate along x, y, z, mm, where it was estimated with the positions.
     up_axis : str
         Axis that points away from the base.
     dimensions : int
@@ -142,6 +144,7 @@ class Experiment:
     xy_scale: float = 1.0
     xy_step_mm: float = 0.0
     z_step_mm: float = 0.0
+    sd_mm: tuple[float, float, float] | None = None
     up_axis: Axis = "z"
     dimensions: Literal[2, 3] = 3
     known_problems: tuple[str, ...] = ()

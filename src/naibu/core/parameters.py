@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -45,6 +45,8 @@ class Parameter:
     fixed: bool = False
 
     def __post_init__(self) -> None:
+        if self.scale not in get_args(Scale):
+            raise InputError(f"parameter {self.name!r} has the unknown scale {self.scale!r}; use one of {', '.join(get_args(Scale))}")
         if not np.isfinite(self.value):
             raise InputError(f"parameter {self.name!r} must be a finite number, not {self.value}")
         if self.scale == "log" and not self.value > 0.0:

@@ -15,6 +15,10 @@ class Status(Enum):
         "more steps."
     )
     SINGULAR = "The linear system is singular: the body can move freely. Constrain it by a fixed support, a tied contact, or friction."
+    PENETRATION = (
+        "A rigid body penetrates the object by more than a hundredth of an element, and no equilibrium was found with stiffer contact. "
+        "Refine the mesh near the body's edge, lower the load, or allow for more penetration."
+    )
     INTERRUPTED = "Interrupted by the user; what is returned is the best so far."
     ITERATION_LIMIT = (
         "The iteration limit was reached before the tolerance; the result may be used with care, or continued with more iterations."

@@ -9,6 +9,7 @@ import numpy as np
 from naibu.core.errors import InputError
 
 _KILOPASCALS = {"Pa": 1e-3, "kPa": 1.0, "MPa": 1e3, "GPa": 1e6, "N/m^2": 1e-3, "N/mm^2": 1e3}
+_SOFTEST_KPA, _STIFFEST_KPA = 1e-6, 1e10  # diamond: 1.2e9 kPa
 
 
 def kilopascals(text: str) -> float:
@@ -17,7 +18,7 @@ def kilopascals(text: str) -> float:
     Raises
     ------
     InputError
-        Not a number, an unknown unit, or a value that is not positive.
+        Not a number, an unknown unit, or a value that no material has.
     """
     match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*([A-Za-z/^0-9]*)\s*", text)
     try:
@@ -29,4 +30,7 @@ def kilopascals(text: str) -> float:
         raise InputError(f"{text!r} is not a modulus; write a number and one of {', '.join(_KILOPASCALS)}, such as '222 kPa'")
     if not value > 0.0:
         raise InputError(f"a modulus must be positive, not {text!r}")
-    return value * _KILOPASCALS[unit]
+    modulus = value * _KILOPASCALS[unit]
+    if not _SOFTEST_KPA <= modulus <= _STIFFEST_KPA:
+        raise InputError(f"no material has a modulus of {text!r}; it must lie between {_SOFTEST_KPA:g} and {_STIFFEST_KPA:g} kPa")
+    return modulus

@@ -37,7 +37,13 @@ class Volume:
 
     @classmethod
     def from_array(
-        cls, values: ArrayLike, *, spacing_mm: ArrayLike, origin_mm: ArrayLike = (0.0, 0.0, 0.0), direction: ArrayLike | None = None
+        cls,
+        values: ArrayLike,
+        *,
+        spacing_mm: ArrayLike,
+        origin_mm: ArrayLike = (0.0, 0.0, 0.0),
+        direction: ArrayLike | None = None,
+        missing: bool = False,
     ) -> Volume:
         """Return a volume after checking the arrays.
 
@@ -51,6 +57,8 @@ class Volume:
             Centre of the first voxel, mm.
         direction : array_like, shape (3, 3), optional
             Unit vectors along which x, y and z indices grow, as columns; by default the axes of space.
+        missing : bool
+            Whether voxels may be NaN: not measured.
 
         Raises
         ------
@@ -64,8 +72,10 @@ class Volume:
         if v.dtype.kind not in "biuf":
             raise InputError(f"intensities must be real numbers, not {v.dtype}")
         if v.dtype.kind == "f" and not np.isfinite(v).all():
-            bad = tuple(int(i) for i in np.argwhere(~np.isfinite(v))[0])
-            raise InputError(f"voxel {bad} (z, y, x) is {v[bad]}; mask or repair it")
+            wrong = np.isinf(v) if missing else ~np.isfinite(v)
+            if wrong.any():
+                bad = tuple(int(i) for i in np.argwhere(wrong)[0])
+                raise InputError(f"voxel {bad} (z, y, x) is {v[bad]}; mask or repair it")
         spacing, origin = np.array(spacing_mm, dtype=float), np.array(origin_mm, dtype=float)
         axes = np.eye(3) if direction is None else np.array(direction, dtype=float).reshape(3, 3)
         if spacing.shape != (3,) or not (np.isfinite(spacing).all() and (spacing > 0.0).all()):
@@ -104,12 +114,23 @@ class Volume:
 
     def same_grid(self, other: Volume) -> bool:
         """Whether the voxels of another volume lie at the same positions."""
-        return (
-            self.shape == other.shape
-            and bool(np.abs(self.spacing_mm - other.spacing_mm).max() < NEARLY * self.spacing_mm.min())
-            and bool(np.abs(self.origin_mm - other.origin_mm).max() < NEARLY * self.spacing_mm.min())
-            and bool(np.abs(self.direction - other.direction).max() < NEARLY)
-        )
+        return not self.grid_difference(other)
+
+    def grid_difference(self, other: Volume) -> str:
+        """Return in words what distinguishes the grid of another volume from this one: size, spacing, axes or origin; empty for none."""
+        if self.shape != other.shape:
+            sizes = (" x ".join(str(n) for n in volume.shape[::-1]) for volume in (self, other))
+            return f"their sizes differ: {' and '.join(sizes)} voxels"
+        limit = NEARLY * float(self.spacing_mm.min())
+        if np.abs(self.spacing_mm - other.spacing_mm).max() >= limit:
+            return f"their voxel spacings differ: {_rounded(self.spacing_mm)} and {_rounded(other.spacing_mm)} mm"
+        if np.abs(self.direction - other.direction).max() >= NEARLY:
+            return f"their axes differ: {_rounded(self.direction)} and {_rounded(other.direction)}"
+        apart = float(np.linalg.norm(self.origin_mm - other.origin_mm))
+        if np.abs(self.origin_mm - other.origin_mm).max() >= limit:
+            ends = f"{_rounded(self.origin_mm)} and {_rounded(other.origin_mm)} mm"
+            return f"they agree in size and spacing, but their origins lie {apart:.4g} mm apart: {ends}"
+        return ""
 
     def with_values(self, values: ArrayLike) -> Volume:
         """Return other values on the same grid."""
@@ -126,3 +147,7 @@ class Volume:
             raise InputError(f"cannot crop to {a.tolist()}..{b.tolist()}: the volume has {size.tolist()} voxels along x, y, z")
         box = tuple(slice(int(s), int(e)) for s, e in zip(a[::-1], b[::-1], strict=True))
         return replace(self, values=self.values[box], origin_mm=self.to_physical(a))
+
+
+def _rounded(values: FloatArray) -> str:
+    return str(np.round(values, 4).tolist())

@@ -1,3 +1,4 @@
+from .displacement_fields import read_field, write_field
 from .experiment_folder.reader import read_experiment
 from .images import open_volume, read_displacement, read_volume_box, write_displacement, write_volume
 from .marker_tables import import_markers, write_experiment_folder, write_markers
@@ -12,11 +13,13 @@ __all__ = [
     "open_volume",
     "read_displacement",
     "read_experiment",
+    "read_field",
     "read_mesh",
     "read_surface",
     "read_volume_box",
     "write_displacement",
     "write_experiment_folder",
+    "write_field",
     "write_markers",
     "write_volume",
     "write_vtkhdf_series",

@@ -18,6 +18,7 @@ from naibu.core.arrays import FloatArray, require_positive
 from naibu.core.chunked_volume import ChunkedVolume
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
+from naibu.io.files.paths import require_usable_path
 from naibu.io.files.reading import guarded_reading
 from naibu.io.image_formats import dicom, hdf5, metaimage, nifti, nrrd, tiff, zarr_store
 from naibu.io.image_formats.geometry import ReadOptions
@@ -58,6 +59,7 @@ def read_volume(
     spacing_mm: ArrayLike | None = None,
     unit_mm: float | None = None,
     rescaled: bool = False,
+    missing: bool = False,
 ) -> Volume:
     """Read an image volume with its geometry.
 
@@ -76,6 +78,8 @@ def read_volume(
     rescaled : bool
         Whether to apply the rescale slope and intercept of DICOM and NIfTI files (to obtain CT numbers in HU, for example). By default the
         stored values are returned.
+    missing : bool
+        Whether voxels may be NaN, as outside of a field of view.
 
     Returns
     -------
@@ -90,7 +94,7 @@ def read_volume(
     MissingDependencyError
         The package that reads the format is not installed.
     """
-    source = Path(path)
+    source = require_usable_path(path)
     reader = _reader(source)
     spacing = None if spacing_mm is None else np.asarray(spacing_mm, dtype=float)
     if spacing is not None and (spacing.shape != (3,) or not (np.isfinite(spacing).all() and (spacing > 0.0).all())):
@@ -98,7 +102,11 @@ def read_volume(
     if unit_mm is not None:
         require_positive("unit_mm, the length of the file's unit,", unit_mm, "mm (1000 for metres)")
     with guarded_reading(source):
-        return reader(source, ReadOptions(unit_mm, spacing, series, rescaled))
+        volume = reader(source, ReadOptions(unit_mm, spacing, series, rescaled))
+    if not missing and volume.values.dtype.kind == "f" and np.isnan(volume.values).any():
+        bad = tuple(int(i) for i in np.argwhere(np.isnan(volume.values))[0])
+        raise InputError(f"{source}: voxel {bad} (z, y, x) is nan; mask or repair it")
+    return volume
 
 
 def write_volume(path: str | os.PathLike[str], volume: Volume, *, compressed: bool = True) -> Path:

@@ -12,15 +12,22 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from naibu.core.errors import InputError
-from naibu.io.experiment_folder.schema import Finite, NotNegative, Positive
+from naibu.io.experiment_folder.schema import Finite, Length, Mass, NotNegative, Position, Positive, between
 from naibu.io.files.parsing import parsed_toml
 
-Three = Annotated[list[Finite], Field(min_length=3, max_length=3)]
-ThreePositive = Annotated[list[Positive], Field(min_length=3, max_length=3)]
-ThreeCells = Annotated[list[Annotated[int, Field(gt=0)]], Field(min_length=3, max_length=3)]
+# beyond these bounds the unit, or the number, is another; computations within them neither overflow nor vanish
+Duration = Annotated[Positive, between(1e-9, 1e6)]
+Large = Annotated[NotNegative, between(0.0, 1e9)]
+Friction = Annotated[NotNegative, between(0.0, 1e3)]
+Three = Annotated[list[Position], Field(min_length=3, max_length=3)]
+ThreeLengths = Annotated[list[Length], Field(min_length=3, max_length=3)]
+ThreeCells = Annotated[list[Annotated[int, Field(gt=0, le=100_000)]], Field(min_length=3, max_length=3)]
 Quantity = Literal["displacement", "velocity", "stretch"]
 
 _KEYS = ("short", "normal", "long", "core", "surface")
+_LEAST, _MOST = 1e-9, 1e9  # stiffness and damping of an element, where it is neither 0 nor infinite; forces and velocities
+_MOST_STEPS = 1e9
+_SHOWN = 60  # letters of a value in a message
 _HEAVIEST = 30.0  # g/cm^3; nothing soft is denser, so the unit must be another
 
 
@@ -41,6 +48,8 @@ def _by_class(zero: bool, infinite: bool) -> Any:
             number = np.nan
         if np.isnan(number) or (np.isinf(number) and not infinite) or number < 0.0 or (number == 0.0 and not zero):
             raise ValueError("must be positive, or inf for none" if infinite else "must be finite and not negative")
+        if number and np.isfinite(number) and not _LEAST <= number <= _MOST:
+            raise ValueError(f"must lie between {_LEAST:g} and {_MOST:g}")
         return number
 
     return Annotated[Any, AfterValidator(checked)]
@@ -56,6 +65,8 @@ def _timed(columns: int, what: str) -> Any:
         times = [row[0] for row in rows]
         if not rows or times[0] < 0.0 or any(b <= a for a, b in pairwise(times)):
             raise ValueError(f"the times {', '.join(f'{t:g}' for t in times) or '(none)'} s must grow from 0 or later; each row is {what}")
+        if max(abs(number) for row in rows for number in row) > _MOST:
+            raise ValueError(f"holds a number beyond {_MOST:g}; each row is {what}")
         return rows
 
     return Annotated[list[list[Finite]], AfterValidator(checked)]
@@ -68,14 +79,14 @@ class _Table(BaseModel):
 class ObjectTable(_Table):
     """``[object]``: shape and mass."""
 
-    size_mm: ThreePositive | None = None
+    size_mm: ThreeLengths | None = None
     cells: ThreeCells | None = None
     labels: Annotated[str, Field(min_length=1)] | None = None
     label: Annotated[list[int], Field(min_length=1), BeforeValidator(lambda v: v if isinstance(v, list) else [v])] | None = None
-    voxel_mm: Annotated[list[Positive], Field(min_length=3, max_length=3)] | None = None
+    voxel_mm: ThreeLengths | None = None
     largest_piece: bool = False
-    mass_g: Positive | None = None
-    density_g_per_cm3: Positive | None = None
+    mass_g: Mass | None = None
+    density_g_per_cm3: Annotated[Positive, between(1e-6, 1e9)] | None = None
 
     @model_validator(mode="after")
     def _one_of_each(self) -> ObjectTable:
@@ -101,7 +112,7 @@ class LatticeTable(_Table):
     """``[lattice]``: nodes and elements."""
 
     kind: Literal["classic", "octree-0", "octree-1", "octree-2"] = "classic"
-    spacing_mm: Positive
+    spacing_mm: Length
     masses: Literal["volume", "equal"] = "volume"
 
 
@@ -116,19 +127,19 @@ class ParametersTable(_Table):
 class SimulationTable(_Table):
     """``[simulation]``: steps in time."""
 
-    duration_s: Positive
-    step_s: Positive = 0.002
+    duration_s: Duration
+    step_s: Duration = 0.002
     method: Literal["implicit", "euler", "symplectic_euler"] = "implicit"
-    tolerance: Annotated[float, Field(gt=0, lt=1)] = 1e-3
-    gravity_mm_per_s2: NotNegative = 0.0
+    tolerance: Annotated[Positive, Field(lt=1), between(1e-12, 1.0)] = 1e-3
+    gravity_mm_per_s2: Large = 0.0
 
 
 class _Surface(_Table):
-    static_friction: NotNegative = 0.0
-    kinetic_friction: NotNegative | None = None
-    pull_stiffness_mN_per_mm: NotNegative = 0.0
-    pull_damping_mN_s_per_mm: NotNegative = 0.0
-    pull_speed_mm_per_s: NotNegative = 0.0
+    static_friction: Friction = 0.0
+    kinetic_friction: Friction | None = None
+    pull_stiffness_mN_per_mm: Large = 0.0
+    pull_damping_mN_s_per_mm: Large = 0.0
+    pull_speed_mm_per_s: Large = 0.0
 
     @model_validator(mode="after")
     def _friction(self) -> _Surface:
@@ -149,18 +160,18 @@ class IndenterTable(_Surface):
 
     name: Annotated[str, Field(min_length=1)] | None = None
     shape: Literal["box", "cylinder", "sphere"]
-    size_mm: ThreePositive | None = None
-    radius_mm: Positive | None = None
-    length_mm: Positive | None = None
+    size_mm: ThreeLengths | None = None
+    radius_mm: Length | None = None
+    length_mm: Length | None = None
     axis: Three = [0.0, 0.0, 1.0]
     centre_mm: Three
     contact: Literal["friction", "tied"] = "friction"
-    until_s: NotNegative | None = None
+    until_s: Annotated[NotNegative, between(0.0, 1e6)] | None = None
     path: _timed(4, "[time in s, displacement along x, y, z in mm]") | None = None  # type: ignore[valid-type]
     velocity: _timed(4, "[time in s, velocity along x, y, z in mm/s from then on]") | None = None  # type: ignore[valid-type]
     force: _timed(2, "[time in s, force in mN]") | None = None  # type: ignore[valid-type]
     direction: Three | None = None
-    mass_g: Positive | None = None
+    mass_g: Mass | None = None
 
     @model_validator(mode="after")
     def _complete(self) -> IndenterTable:
@@ -169,7 +180,7 @@ class IndenterTable(_Surface):
         spare = [n for n in ("size_mm", "radius_mm", "length_mm") if n not in wanted and getattr(self, n) is not None]
         if missing or spare:
             raise ValueError(f"a {self.shape} has {' and '.join(wanted)}; {f'add {missing[0]}' if missing else f'remove {spare[0]}'}")
-        if not any(self.axis):
+        if np.linalg.norm(self.axis) < _LEAST:
             raise ValueError("axis = [0, 0, 0] has no direction; give that of the cylinder")
         moved = [name for name in ("path", "velocity", "force") if getattr(self, name) is not None]
         if len(moved) > 1:
@@ -186,7 +197,7 @@ class IndenterTable(_Surface):
     def _driven(self) -> None:
         if self.force is None and (self.direction or self.mass_g):
             raise ValueError("direction and mass_g belong to an indenter that is moved by force; give force, or remove them")
-        if self.force is not None and (self.direction is None or not any(self.direction) or self.mass_g is None):
+        if self.force is not None and (self.direction is None or np.linalg.norm(self.direction) < _LEAST or self.mass_g is None):
             raise ValueError("an indenter that is moved by force needs direction = [x, y, z] and mass_g")
         if self.force is not None and self.contact == "tied":
             raise ValueError('a tied indenter cannot be moved by force; write contact = "friction"')
@@ -195,8 +206,8 @@ class IndenterTable(_Surface):
 class OutputTable(_Table):
     """``[output]``: what is kept."""
 
-    every_s: Positive = 0.05
-    forces_every_s: Positive | None = None
+    every_s: Duration = 0.05
+    forces_every_s: Duration | None = None
     quantities: Annotated[list[Quantity], Field(min_length=1)] = ["displacement", "velocity", "stretch"]
 
 
@@ -237,6 +248,13 @@ class StudyFile(_Table):
 
     def _times(self) -> None:
         simulation, output = self.simulation, self.output
+        if (steps := simulation.duration_s / simulation.step_s) > _MOST_STEPS:
+            raise ValueError(
+                f"[simulation] duration_s = {simulation.duration_s:g} has {steps:.3g} steps of step_s = {simulation.step_s:g}; at most "
+                f"{_MOST_STEPS:g} are computed"
+            )
+        if output.every_s < simulation.step_s:
+            raise ValueError(f"[output] every_s = {output.every_s:g} is less than [simulation] step_s = {simulation.step_s:g}; give more")
         whole = [
             ("[output] every_s", output.every_s, "[simulation] step_s", simulation.step_s),
             ("[simulation] duration_s", simulation.duration_s, "[output] every_s", output.every_s),
@@ -339,7 +357,9 @@ def _told(fault: dict[str, Any]) -> str:
     if whole:
         return f"{place} {message}"
     what = "must be a finite number" if fault["type"] == "finite_number" else message.replace("Input should", "must")
-    return f"{place} = {fault['input']!r}: {what[:1].lower()}{what[1:]}; {_MENDS.get(key, 'correct it in this file')}"
+    value = repr(fault["input"])
+    shown = value if len(value) <= _SHOWN else f"{value[:_SHOWN]}..."
+    return f"{place} = {shown}: {what[:1].lower()}{what[1:]}; {_MENDS.get(key, 'correct it in this file')}"
 
 
 def _place(loc: tuple[int | str, ...]) -> tuple[str, str, bool]:

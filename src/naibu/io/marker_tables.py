@@ -16,12 +16,14 @@ from pathlib import Path
 
 import numpy as np
 
+from naibu.core.arrays import require_lengths
 from naibu.core.errors import InputError, MissingDependencyError
 from naibu.core.experiment import Axis, Layer, Loading, Shape
 from naibu.core.markers import Markers
 from naibu.io.experiment_folder.reader import META_FILE, read_experiment
 from naibu.io.experiment_folder.state_csv import COORDINATES, OPTIONAL, REQUIRED, STATUSES, is_trusted
 from naibu.io.files.atomic import write_atomically
+from naibu.io.files.paths import require_usable_path
 from naibu.io.files.reading import guarded_reading, read_bytes, require_regular
 
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "in": 25.4, "inch": 25.4}
@@ -134,13 +136,16 @@ def write_experiment_folder(
     spacing_mm: float | None = None,
     xy_step_mm: float | None = None,
     z_step_mm: float | None = None,
+    xy_sd_mm: float | None = None,
+    z_sd_mm: float | None = None,
+    overwrite: bool = False,
 ) -> Path:
     """Write an experiment folder that `read_experiment` reads: `meta.toml` and one marker table per state.
 
     Parameters
     ----------
     folder : path-like
-        Folder to create; it must not exist, or be empty.
+        Folder to create; it must not exist or be empty, unless `overwrite` is true.
     initial : Markers
         Reference configuration (unloaded).
     states : mapping of str to Markers
@@ -153,6 +158,10 @@ def write_experiment_folder(
         Height of the plate or bar above the base, or distance of the side plates, mm, by name of the state.
     spacing_mm, xy_step_mm, z_step_mm : float, optional
         Spacing of the marker lattice and resolution of the coordinates, mm.
+    xy_sd_mm, z_sd_mm : float, optional
+        Standard deviation of a coordinate along x and y, and along z, mm, where it is known; both or neither.
+    overwrite : bool
+        Whether a folder that is not empty may be used: files of the same names are replaced, others stay.
 
     Returns
     -------
@@ -164,9 +173,12 @@ def write_experiment_folder(
     InputError
         The folder is not empty, or the arguments do not form a valid experiment; nothing is left behind then.
     """
-    target = Path(folder)
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise InputError(f"folder {target} exists and is not empty; choose a new name, or remove it first")
+    require_lengths(
+        size_mm=shape.size_mm, bar_width_mm=loading.bar_width_mm, spacing_mm=spacing_mm, xy_step_mm=xy_step_mm, z_step_mm=z_step_mm
+    )
+    target = require_usable_path(folder, written=True)
+    if target.exists() and (not target.is_dir() or (not overwrite and any(target.iterdir()))):
+        raise InputError(f"folder {target} exists and is not empty; choose a new name, or allow it to be used with `overwrite`")
     key = "width_stated_mm" if loading.kind == "side_plates" else "height_stated_mm"
     heights = dict(stated_mm or {})
     for name in heights:
@@ -177,7 +189,7 @@ def write_experiment_folder(
     size: dict[str, object] = {"shape": shape.kind, "size_mm": list(shape.size_mm)}
     text = _document(
         {"title": title, "source": source, "dimensions": 2 if np.isnan(initial.points[:, 2]).all() else 3, "units": "mm"},
-        ("[coordinates]", {"up_axis": up_axis, "xy_step_mm": xy_step_mm, "z_step_mm": z_step_mm}),
+        ("[coordinates]", {"up_axis": up_axis, "xy_step_mm": xy_step_mm, "z_step_mm": z_step_mm, "xy_sd_mm": xy_sd_mm, "z_sd_mm": z_sd_mm}),
         ("[object]", size | {"size_axes": ["x", "y", "z"], "joined_at_mm": list(joined_at_mm)}),
         ("[markers]", {"nominal_spacing_mm": spacing_mm}),
         *(("[[layer]]", _layer_table(la)) for la in layers),
@@ -222,9 +234,15 @@ def _place_checked(target: Path, meta: str, states: Mapping[str, Markers]) -> No
             write_markers(aside / f"{name}.csv", markers)
         read_experiment(aside)
         aside.chmod(0o755)
-        aside.replace(target)
+        if target.is_dir() and any(target.iterdir()):
+            for file in sorted(aside.iterdir()):
+                file.replace(target / file.name)
+        else:
+            aside.replace(target)
     except InputError as error:
         raise InputError(str(error).replace(str(aside), str(target))) from error
+    except OSError as error:
+        raise InputError(f"{target}: cannot be written ({error.strerror}); choose another folder") from error
     finally:
         shutil.rmtree(aside, ignore_errors=True)
 

@@ -22,6 +22,7 @@ from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.io.files.atomic import new_aside, put_in_place
 from naibu.io.files.hdf5_stream import Hdf5File
+from naibu.io.files.rollback_journal import roll_back
 
 VTK_TYPES = {"line": 3, "triangle": 5, "tetra": 10, "hexahedron": 12, "tetra10": 24}
 _ROWS = "naibu"  # group of our own tables beside VTK's
@@ -33,17 +34,27 @@ _CHUNK_BYTES = 16_384
 class SeriesFile:
     """A VTKHDF time series that is written under a temporary name and replaces an existing file only when finished.
 
-    As a context manager it removes an unfinished file on exit.
+    As a context manager it removes an unfinished file on exit, unless there was a checkpoint: `continued` takes that up.
     """
 
     target: Path
     aside: Path
     mesh: Mesh
     output: Hdf5File
+    recoverable: bool = False
 
     @classmethod
-    def begun(cls, path: str | os.PathLike[str], mesh: Mesh) -> SeriesFile:
+    def begun(cls, path: str | os.PathLike[str], mesh: Mesh, origin: str = "") -> SeriesFile:
         """Begin a new series on a mesh.
+
+        Parameters
+        ----------
+        path : path-like
+            The file when it is finished.
+        mesh : Mesh
+            Common to all steps.
+        origin : str
+            Mark of what the series belongs to, which `continued` compares.
 
         Raises
         ------
@@ -57,6 +68,8 @@ class SeriesFile:
             root = series.file.create_group("VTKHDF")
             _write_static(root, mesh)
             _begin_steps(root)
+            if origin:
+                series.file.create_group(_ROWS).attrs["origin"] = origin
             series._require_written()
         except BaseException:
             series.discard()
@@ -64,35 +77,64 @@ class SeriesFile:
         return series
 
     @classmethod
-    def continued(cls, path: str | os.PathLike[str], mesh: Mesh, steps: int) -> SeriesFile:
-        """Continue a finished series after its first `steps` steps; the old file stays until the new one is finished.
+    def continued(cls, path: str | os.PathLike[str], mesh: Mesh, steps: int, origin: str = "", aside: Path | None = None) -> SeriesFile:
+        """Continue a series after its first `steps` steps; the old file stays until the new one is finished.
+
+        Parameters
+        ----------
+        path : path-like
+            The file, finished or to be.
+        mesh : Mesh
+            As before.
+        steps : int
+            Number of steps to keep.
+        origin : str
+            As for `begun`.
+        aside : Path, optional
+            The unfinished file that a killed process left at its last checkpoint, if there is one.
 
         Raises
         ------
         InputError
-            There is no such file, it is damaged, has fewer steps, or contains another mesh.
+            There is no such file, it is damaged, has fewer steps, or contains another series or mesh.
         """
         target = Path(path)
-        aside = new_aside(target)
+        source = target if aside is None else aside
+        copy = new_aside(target)
         try:
-            shutil.copyfile(target, aside)
+            shutil.copyfile(source, copy)
         except OSError as error:
-            aside.unlink(missing_ok=True)
-            raise InputError(f"{target}: cannot be read ({error.strerror or error}); begin a new series") from error
+            copy.unlink(missing_ok=True)
+            raise InputError(f"{source}: cannot be read ({error.strerror or error}); begin a new series") from error
         try:
-            series = cls(target, aside, mesh, Hdf5File(aside, keep=True))
-            root = series.file["VTKHDF"]
-            known, same = int(root["Steps"].attrs["NSteps"]), np.array_equal(root["Connectivity"][:], mesh.cells.ravel())
-        except (OSError, KeyError) as error:
-            aside.unlink(missing_ok=True)
-            raise InputError(f"{target}: is damaged ({error}); begin a new series") from error
-        if known < steps or not same:
+            if aside is not None and _journal(source).exists():
+                roll_back(copy, _journal(source))
+            series = cls(target, copy, mesh, Hdf5File(copy, keep=True))
+        except (OSError, InputError) as error:
+            copy.unlink(missing_ok=True)
+            raise InputError(f"{source}: is damaged ({error}); begin a new series") from error
+        try:
+            series._require(source, steps, origin)
+            series.truncate(steps)
+        except BaseException:
             series.discard()
-            raise InputError(
-                f"{target}: contains {known} steps{'' if same else ' on another mesh'}, not the {steps} needed; begin a new series"
-            )
-        series.truncate(steps)
+            raise
         return series
+
+    def _require(self, source: Path, steps: int, origin: str) -> None:
+        """Refuse a file that is damaged, of other content or with fewer steps."""
+        try:
+            root = self.file["VTKHDF"]
+            known, same = int(root["Steps"].attrs["NSteps"]), np.array_equal(root["Connectivity"][:], self.mesh.cells.ravel())
+            marked = self.file[_ROWS].attrs.get("origin", "") if _ROWS in self.file else ""
+        except (OSError, KeyError) as error:
+            raise InputError(f"{source}: is damaged ({error}); begin a new series") from error
+        if known < steps or not same:
+            raise InputError(
+                f"{source}: contains {known} steps{'' if same else ' on another mesh'}, not the {steps} needed; begin a new series"
+            )
+        if marked != origin:
+            raise InputError(f"{source}: contains the steps of another computation; begin a new series")
 
     @property
     def file(self) -> h5py.File:
@@ -183,18 +225,40 @@ class SeriesFile:
         """
         self.output.close()
         self._require_written()
-        return put_in_place(self.aside, self.target)
+        put_in_place(self.aside, self.target)
+        _journal(self.aside).unlink(missing_ok=True)
+        return self.target
+
+    def checkpoint(self) -> Path:
+        """Make the steps so far survive the end of this process at any later moment; return the file that `continued` takes then.
+
+        Raises
+        ------
+        InputError
+            The disk is full.
+        """
+        try:
+            self.output.checkpoint(_journal(self.aside))
+        except OSError:
+            self._require_written()
+            raise
+        self.recoverable = True
+        return self.aside
 
     def discard(self) -> None:
         """Close and remove the unfinished file."""
         self.output.close()
         self.aside.unlink(missing_ok=True)
+        _journal(self.aside).unlink(missing_ok=True)
 
     def __enter__(self) -> SeriesFile:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.discard()
+        if self.recoverable:
+            self.output.close()
+        else:
+            self.discard()
 
     def _require_written(self) -> None:
         try:
@@ -221,6 +285,10 @@ class SeriesFile:
             raise InputError(f"{name!r} has shape {own.shape} in step {step}, but {(n, *known)} in step 0; shapes must not change")
         group[name].resize((step + 1) * n, axis=0)
         group[name][step * n :] = own
+
+
+def _journal(aside: Path) -> Path:
+    return aside.with_suffix(".undo")
 
 
 def numbers(name: str, values: ArrayLike, n: int, what: str) -> NDArray[np.generic]:

@@ -145,6 +145,13 @@ META_FAULTS = [
     ('title = "Small cube"', 'title = "Small cube"\nweather = "fine"', ["weather is not a known key", "remove it"]),
     ("z_step_mm = 0.5", "z_step_mm = 0.5 mm", ["line 6", "'z_step_mm = 0.5 mm'", "not valid TOML"]),
     ("z_step_mm = 0.5", "z_step_mm = 0", ["[coordinates] z_step_mm = 0", "greater than 0"]),
+    ("z_step_mm = 0.5", "xy_scale_probable = 1e-9", ["xy_scale_probable = 1e-09", "greater than or equal to 0.5", "true size of a pixel"]),
+    ("z_step_mm = 0.5", "z_step_mm = 1e-9", ["z_step_mm = 1e-09", "between 1e-06 and 100000"]),
+    ("z_step_mm = 0.5", "z_base_est_mm = 1e9", ["z_base_est_mm = 1000000000.0", "less than or equal to 100000"]),
+    ("size_mm = [30, 30, 30]", "size_mm = [30, 30, 3e5]", ["size_mm, entry 3 = 300000.0", "between 1e-06 and 100000"]),
+    ("nominal_spacing_mm = 10", "count = 0", ["[markers] count = 0", "greater than 0"]),
+    ('name = "pressed"', 'name = "pressed"\nfile = "../pressed.csv"', ["'../pressed.csv' is outside the folder"]),
+    ('name = "pressed"', 'name = "pressed"\nfile = "/etc/hostname"', ["'/etc/hostname' is outside the folder"]),
     ("from_base_mm = [15, 30]", "from_base_mm = [16, 30]", ["[[layer]] number 2", "gap above 15 mm", "0 to 30 mm"]),
     ("from_base_mm = [15, 30]", "from_base_mm = [14, 30]", ["[[layer]] number 2", "overlaps"]),
     ("from_base_mm = [15, 30]", "from_base_mm = [15, 29]", ["ends at 29 mm", "0 to 30 mm"]),
@@ -274,6 +281,16 @@ def test_centimetres_called_millimetres_are_named(folder: Path) -> None:
     (folder / "initial.csv").write_text(HEADER + rows)
     message = refusal(folder)
     assert "1 mm apart" in message and "nominal_spacing_mm = 10" in message and "unit" in message
+
+
+def test_a_scan_upside_down_is_named_where_layers_tell_their_markers(folder: Path) -> None:
+    edit(folder / "meta.toml", "from_base_mm = [0, 15]", "from_base_mm = [0, 15]\nmarkers = [1, 4]")
+    edit(folder / "meta.toml", "from_base_mm = [15, 30]", "from_base_mm = [15, 30]\nmarkers = [5, 8]")
+    read_experiment(folder)
+    upside_down = HEADER + "".join(f"{n},{x},{y},{-z},ok,\n" for n, (x, y, z) in enumerate(CORNERS, 1))
+    (folder / "initial.csv").write_text(upside_down)
+    message = refusal(folder)
+    assert "number 2 has markers 5 to 8" in message and "-20.0 and -10.0 mm" in message and "z must" in message
 
 
 def test_table_that_is_a_folder_is_named(folder: Path) -> None:

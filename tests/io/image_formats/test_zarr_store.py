@@ -85,6 +85,36 @@ def test_what_is_no_volume_is_told(tmp_path: Path) -> None:
         open_volume(tmp_path / "a.h5")
 
 
+@pytest.mark.parametrize("form", [2, 3])
+@pytest.mark.parametrize("shards", [None, (8, 8, 8)])
+def test_missing_chunks_are_values_only_where_the_store_says_so(tmp_path: Path, form: int, shards: tuple[int, int, int] | None) -> None:
+    if form == 2 and shards:
+        pytest.skip("version 2 of Zarr has no shards")
+    frame = {"spacing_mm": [1.0, 1.0, 1.0], "origin_mm": [0.0, 0.0, 0.0], "direction": np.eye(3).tolist()}
+    group = zarr.create_group(str(tmp_path / "a.zarr"), zarr_format=form)
+    group.attrs.update(frame)
+    stored = group.create_array("values", shape=(9, 8, 8), chunks=(4, 4, 4), shards=shards, dtype="i2", fill_value=7)
+    stored[:8] = 1
+    with pytest.raises(InputError, match=r"chunks are missing, or were not written yet, and would be read as 7.*every_chunk_is_stored"):
+        read_volume(tmp_path / "a.zarr")
+    group.attrs["every_chunk_is_stored"] = False
+    values = read_volume(tmp_path / "a.zarr").values
+    assert (values[:8] == 1).all() and (values[8] == 7).all()
+    stored[:] = 2
+    del group.attrs["every_chunk_is_stored"]
+    assert (read_volume(tmp_path / "a.zarr").values == 2).all()
+
+
+def test_missing_chunks_of_unknown_values_are_unknown(tmp_path: Path) -> None:
+    group = zarr.create_group(str(tmp_path / "a.zarr"))
+    group.attrs.update(spacing_mm=[1.0, 1.0, 1.0], origin_mm=[0.0, 0.0, 0.0], direction=np.eye(3).tolist())
+    stored = group.create_array("values", shape=(8, 8, 8), chunks=(4, 8, 8), dtype="f4", fill_value=np.nan)
+    stored[:4] = 1.0
+    assert np.isnan(np.asarray(open_volume(tmp_path / "a.zarr").values[4:])).all()
+    with pytest.raises(InputError, match="nan; mask or repair"):
+        read_volume(tmp_path / "a.zarr")
+
+
 def test_arrays_of_other_shapes_are_no_volumes() -> None:
     with pytest.raises(InputError, match="three axes"):
         ChunkedVolume.from_array(np.zeros((3, 3)), spacing_mm=(1, 1, 1))

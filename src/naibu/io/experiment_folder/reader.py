@@ -17,9 +17,10 @@ from naibu.core.errors import InputError
 from naibu.core.experiment import Axis, Experiment, Layer, Shape, ShapeKind, State
 from naibu.core.markers import Markers
 from naibu.io.experiment_folder.indenter_description import read_joints, read_loading, read_up_axis
-from naibu.io.experiment_folder.schema import LoadingTable, Meta, StateTable, load_meta
+from naibu.io.experiment_folder.schema import CoordinatesTable, LoadingTable, Meta, StateTable, load_meta
 from naibu.io.experiment_folder.state_csv import COORDINATES, parse_state_csv
-from naibu.io.files.reading import guarded_reading, read_bytes
+from naibu.io.files.paths import require_usable_path
+from naibu.io.files.reading import file_beside, guarded_reading, read_bytes
 
 META_FILE = "meta.toml"
 _SHAPES: dict[str, ShapeKind] = {
@@ -53,7 +54,7 @@ def read_experiment(folder: str | os.PathLike[str]) -> Experiment:
     InputError
         A file is missing, unreadable or contains an impossible value; the message names file, field, value and correction.
     """
-    root = Path(folder)
+    root = require_usable_path(folder)
     with guarded_reading(root):
         return _read(root)
 
@@ -91,12 +92,20 @@ def _experiment(root: Path, meta: Meta, hashes: dict[str, str]) -> Experiment:
         xy_scale=scan.xy_scale_probable,
         xy_step_mm=scan.pixel_mm or scan.xy_step_mm or scan.step_mm or 0.0,
         z_step_mm=scan.z_step_mm or scan.step_mm or 0.0,
+        sd_mm=_stated_sd(path, scan),
         up_axis=up,
         dimensions=meta.dimensions,
         known_problems=tuple(meta.known_problems),
         scanner=MappingProxyType(meta.scanner.model_dump(exclude_none=True)),
         input_hashes=MappingProxyType(hashes),
     )
+
+
+def _stated_sd(path: Path, scan: CoordinatesTable) -> tuple[float, float, float] | None:
+    """Return the standard deviation of a coordinate along x, y, z, mm, where the file states it."""
+    if (scan.xy_sd_mm is None) != (scan.z_sd_mm is None):
+        raise InputError(f"{path}: [coordinates] states xy_sd_mm or z_sd_mm alone; write both, or neither")
+    return None if scan.xy_sd_mm is None or scan.z_sd_mm is None else (scan.xy_sd_mm, scan.xy_sd_mm, scan.z_sd_mm)
 
 
 def _content(root: Path, file: str, hashes: dict[str, str], mend: str) -> bytes:
@@ -162,6 +171,8 @@ def _states(root: Path, meta: Meta, hashes: dict[str, str], assumed: list[str]) 
     states: list[State] = []
     for table in meta.state:
         file = table.file or f"{table.name}.csv"
+        if table.file:
+            file_beside(root / META_FILE, table.file)
         first = not states
         held_out = table.held_out and not first and not (root / file).exists()
         mend = "add it" + ("" if first else f", or set held_out = true in [[state]] {table.name!r} of {META_FILE}")
@@ -220,6 +231,7 @@ def _check_positions(root: Path, meta: Meta, experiment: Experiment) -> None:
     files = [table.file or f"{table.name}.csv" for table in meta.state]
     _refuse_outside(root / files[0], experiment.initial, scale, size + _OUTSIDE_MM, f"the object is {measures} mm (+ {_OUTSIDE_MM:g} mm)")
     _refuse_too_close(root / files[0], experiment)
+    _refuse_upside_down(root, meta, experiment)
     seen = slice(0, experiment.dimensions)
     for file, state in zip(files[1:], experiment.states[1:], strict=True):
         if state.markers is None:
@@ -247,6 +259,27 @@ def _refuse_outside(path: Path, markers: Markers, scale: FloatArray, limit: Floa
             f"{path}: {name} spans {np.nanmax(values) - np.nanmin(values):.1f} mm, but {why}; farthest off is marker {ids[worst]} "
             f"with {name} = {markers.points[markers.trusted][worst, axis]:g}. Check that value, the unit (mm) and size_mm in {META_FILE}"
         )
+
+
+def _refuse_upside_down(root: Path, meta: Meta, experiment: Experiment) -> None:
+    """Raise an error if the markers of a layer lie below those of the layer under it."""
+    axis, below = "xyz".index(experiment.up_axis), None
+    for number, layer in enumerate(meta.layer, start=1):
+        if layer.markers is None:
+            continue
+        first, last = layer.markers
+        known = experiment.initial.points[(experiment.initial.ids >= first) & (experiment.initial.ids <= last) & experiment.initial.trusted]
+        heights = known[np.isfinite(known[:, axis]), axis]
+        if len(heights) == 0:
+            continue
+        height = float(np.median(heights))
+        if below is not None and height < below:
+            raise InputError(
+                f"{root / META_FILE}: [[layer]] number {number} has markers {first} to {last}, which lie lower than those of the layer "
+                f"under it ({height:.1f} and {below:.1f} mm, medians of {experiment.up_axis}); in every table {experiment.up_axis} must "
+                "point away from the base, and layers follow each other from the base up"
+            )
+        below = height
 
 
 def _refuse_too_close(path: Path, experiment: Experiment) -> None:

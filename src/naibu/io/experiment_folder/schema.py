@@ -7,17 +7,37 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from naibu.core.errors import InputError
 from naibu.core.experiment import Axis
 from naibu.io.files.parsing import parsed_toml
 
+
+def between(low: float, high: float) -> AfterValidator:
+    """Return the check that a number lies between two bounds."""
+
+    def checked(value: float) -> float:
+        if not low <= value <= high:
+            raise ValueError(f"must lie between {low:g} and {high:g}")
+        return value
+
+    return AfterValidator(checked)
+
+
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+# beyond these the unit, or the number, is another: lengths from a nanometre to 100 m, pixel sizes that are wrong by at most a factor of two
+Length = Annotated[Positive, between(1e-6, 1e5)]
+Mass = Annotated[Positive, between(1e-9, 1e9)]
+Height = Annotated[NotNegative, between(0.0, 1e5)]
+Position = Annotated[float, Field(ge=-1e5, le=1e5, allow_inf_nan=False)]
+Scale = Annotated[float, Field(ge=0.5, le=2.0, allow_inf_nan=False)]
+Celsius = Annotated[float, Field(ge=-273.15, le=1000.0, allow_inf_nan=False)]
+Count = Annotated[int, Field(gt=0, le=10**7)]
 # a single number is accepted as a list of one
-PositiveOrList = Annotated[list[Positive], BeforeValidator(lambda v: v if isinstance(v, list) else [v])]
+LengthOrList = Annotated[list[Length], BeforeValidator(lambda v: v if isinstance(v, list) else [v])]
 
 
 class _Table(BaseModel):
@@ -37,12 +57,14 @@ class CoordinatesTable(_Table):
 
     axes: str = ""
     up_axis: Axis | None = None
-    pixel_mm: Positive | None = None
-    xy_step_mm: Positive | None = None
-    step_mm: Positive | None = None
-    z_step_mm: Positive | None = None
-    z_base_est_mm: Finite | None = None
-    xy_scale_probable: Positive = 1.0
+    pixel_mm: Length | None = None
+    xy_step_mm: Length | None = None
+    step_mm: Length | None = None
+    z_step_mm: Length | None = None
+    xy_sd_mm: Length | None = None
+    z_sd_mm: Length | None = None
+    z_base_est_mm: Position | None = None
+    xy_scale_probable: Scale = 1.0
     printed_values: str = ""
 
 
@@ -50,12 +72,12 @@ class ObjectTable(_Table):
     """``[object]``: the undeformed body."""
 
     shape: str
-    size_mm: Annotated[list[Positive], Field(min_length=3, max_length=3)]
+    size_mm: Annotated[list[Length], Field(min_length=3, max_length=3)]
     size_axes: Annotated[list[Axis], Field(min_length=3, max_length=3)] | None = None
-    joined_at_mm: list[Positive] | None = None
+    joined_at_mm: list[Length] | None = None
     material: str = "gel"
-    mass_g: Positive | None = None
-    temperature_C: Finite | None = None
+    mass_g: Mass | None = None
+    temperature_C: Celsius | None = None
 
 
 class MarkersTable(_Table):
@@ -64,12 +86,12 @@ class MarkersTable(_Table):
     kind: str = ""
     placing: str = ""
     numbering: str = ""
-    count: Annotated[int, Field(gt=0)] | None = None
-    nominal_spacing_mm: Positive | None = None
-    nominal_margin_mm: NotNegative | None = None
-    nominal_height_above_base_mm: list[Positive] = []
-    depth_below_top_mm: Positive | None = None
-    layer_z_mm: list[Finite] = []
+    count: Count | None = None
+    nominal_spacing_mm: Length | None = None
+    nominal_margin_mm: Height | None = None
+    nominal_height_above_base_mm: list[Length] = []
+    depth_below_top_mm: Length | None = None
+    layer_z_mm: list[Position] = []
     rows_of_layers: dict[str, list[int]] = {}
 
     @model_validator(mode="before")
@@ -82,7 +104,7 @@ class LayerTable(_Table):
     """``[[layer]]``: a slab of one material."""
 
     material: Annotated[str, Field(min_length=1)]
-    from_base_mm: Annotated[list[NotNegative], Field(min_length=2, max_length=2)]
+    from_base_mm: Annotated[list[Height], Field(min_length=2, max_length=2)]
     markers: Annotated[list[int], Field(min_length=2, max_length=2)] | None = None
     batch: str = ""
 
@@ -91,18 +113,18 @@ class LoadingTable(_Table):
     """``[loading]``: loading of the object, as keys or as free text."""
 
     kind: Literal["plate", "bar", "side_plates", "cylinder"] | None = None
-    bar_width_mm: Positive | None = None
+    bar_width_mm: Length | None = None
     bar_axis: Axis | None = None
     counter_material: str = "acrylic"
     base_material: str = "table"
     indenter: str = ""
     contact: str = ""
-    height_stated_mm: PositiveOrList | None = None
-    height_est_mm: PositiveOrList | None = None
-    width_stated_mm: PositiveOrList | None = None
-    width_est_mm: PositiveOrList | None = None
-    width_initial_mm: Positive | None = None
-    surface_displacement_mm: Finite | None = None
+    height_stated_mm: LengthOrList | None = None
+    height_est_mm: LengthOrList | None = None
+    width_stated_mm: LengthOrList | None = None
+    width_est_mm: LengthOrList | None = None
+    width_initial_mm: Length | None = None
+    surface_displacement_mm: Position | None = None
     deformed_after_s: NotNegative | None = None
 
 
@@ -110,14 +132,14 @@ class ScannerTable(_Table):
     """``[scanner]``: the instrument; stored with the experiment unchanged."""
 
     instrument: str | None = None
-    slice_area_mm: Positive | None = None
-    slice_thickness_mm: Positive | None = None
-    slice_pitch_mm: Positive | None = None
-    slices: int | None = None
-    coil_inner_diameter_mm: Positive | None = None
+    slice_area_mm: Length | None = None
+    slice_thickness_mm: Length | None = None
+    slice_pitch_mm: Length | None = None
+    slices: Count | None = None
+    coil_inner_diameter_mm: Length | None = None
     frequency_MHz: Positive | None = None
     frame_rate_Hz: Positive | None = None
-    image_px: list[int] | None = None
+    image_px: Annotated[list[Count], Field(min_length=2, max_length=3)] | None = None
     sound_speed_m_per_s: Positive | None = None
 
 
@@ -142,14 +164,14 @@ class StateTable(_Table):
     loaded: bool | None = None
     file: Annotated[str, Field(min_length=1)] | None = None
     held_out: bool = False
-    height_stated_mm: Positive | None = None
-    height_est_mm: Positive | None = None
-    width_stated_mm: Positive | None = None
-    width_est_mm: Positive | None = None
+    height_stated_mm: Length | None = None
+    height_est_mm: Length | None = None
+    width_stated_mm: Length | None = None
+    width_est_mm: Length | None = None
     printed_heading: str = ""
     seed_lines: str = ""
     count: dict[str, int] = {}
-    residual_from_smooth_field_mm: dict[str, NotNegative] = {}
+    residual_from_smooth_field_mm: dict[str, Height] = {}
 
 
 class Meta(_Table):
@@ -194,6 +216,7 @@ _MENDS = {
     "kind": 'write kind = "plate", "bar", "side_plates" or "cylinder"',
     "bar_axis": 'write bar_axis = "x", "y" or "z"',
     "up_axis": 'write up_axis = "x", "y" or "z"',
+    "xy_scale_probable": "write the true size of a pixel divided by that of the file, 1 where nothing is known",
     "state": 'add a [[state]] table with name = "initial" for the unloaded state, and one for each loaded state',
     "name": 'give every state a name of letters, digits, "_", "-" and ".", for example name = "initial"',
 }
@@ -223,7 +246,11 @@ def _told(fault: dict[str, Any]) -> str:
     mend = _MENDS.get(key, "correct it in this file")
     if fault["type"] == "missing":
         return f"{field} is missing; {_MENDS.get(key, 'add it')}"
-    what = "must be a finite number" if fault["type"] == "finite_number" else str(fault["msg"]).replace("Input should", "must")
+    what = (
+        "must be a finite number"
+        if fault["type"] == "finite_number"
+        else str(fault["msg"]).removeprefix("Value error, ").replace("Input should", "must")
+    )
     return f"{field} = {fault['input']!r}: {what[:1].lower()}{what[1:]}; {mend}"
 
 

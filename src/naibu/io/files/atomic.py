@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import hashlib
 import os
+import platform
+import re
 import tempfile
+import time
+from collections.abc import Collection
 from pathlib import Path
 
 from naibu.core.errors import InputError
+from naibu.io.files.paths import require_usable_path
+
+_STEM = 40  # letters of a file's name in that of its temporary file
+_PART = re.compile(r"\..*\.(?P<place>[0-9a-f]{8})-(?P<process>\d+)-\w+\.(part|undo)")
+_OLD_S = 7 * 86400.0  # what another computer left is removed when nothing was written to it for so long
 
 
 def write_atomically(path: str | os.PathLike[str], data: str | bytes) -> Path:
@@ -47,15 +59,17 @@ def write_atomically(path: str | os.PathLike[str], data: str | bytes) -> Path:
 def new_aside(path: str | os.PathLike[str]) -> Path:
     """Create an empty temporary file beside `path`, for libraries that write files themselves; `put_in_place` renames it.
 
+    Its name tells which process writes it, so that `remove_orphans` finds what killed ones left.
+
     Raises
     ------
     InputError
         The folder cannot be written.
     """
-    target = Path(path)
+    target = require_usable_path(path, written=True)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
+        handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name[:_STEM]}.{_place()}-{os.getpid()}-", suffix=".part")
         os.close(handle)
     except OSError as error:
         raise _not_writable(target, error) from error
@@ -89,3 +103,54 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
+
+
+def remove_orphans(folder: Path, keep: Collection[str] = ()) -> None:
+    """Remove the temporary files of processes that were killed from a folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Where files are written; those in folders below stay.
+    keep : collection of str
+        Names that stay.
+    """
+    with contextlib.suppress(OSError):
+        for path in folder.iterdir():
+            found = _PART.fullmatch(path.name)
+            if found is not None and path.name not in keep and not _in_use(path, found["place"], int(found["process"])):
+                path.unlink()
+
+
+def writer_of(aside: Path) -> int | None:
+    """Return the number of another process that is writing a temporary file, or None."""
+    found = _PART.fullmatch(aside.name)
+    if found is None or not aside.exists() or int(found["process"]) == os.getpid():
+        return None
+    return int(found["process"]) if _in_use(aside, found["place"], int(found["process"])) else None
+
+
+def _in_use(path: Path, place: str, process: int) -> bool:
+    if place == _place() and os.name == "posix":
+        return _alive(process)
+    # nothing can be known about a process elsewhere; a lattice that is computed is written to after every frame
+    return time.time() - path.stat().st_mtime < _OLD_S
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+@functools.cache
+def _place() -> str:
+    """Return a digest of this computer, and of the container on it, within which the number of a process is unique."""
+    space = ""
+    with contextlib.suppress(OSError):
+        space = os.readlink("/proc/self/ns/pid")
+    return hashlib.sha256(f"{platform.node()} {space}".encode()).hexdigest()[:8]

@@ -8,10 +8,13 @@ file closes; the caller asks for the failure and discards the file.
 from __future__ import annotations
 
 import io
+import os
 from pathlib import Path
 from typing import Any
 
 import h5py
+
+from naibu.io.files.rollback_journal import RollbackJournal
 
 
 class ForgivingStream(io.RawIOBase):
@@ -26,7 +29,21 @@ class ForgivingStream(io.RawIOBase):
     def __init__(self, path: Path) -> None:
         super().__init__()
         self._raw = path.open("r+b", buffering=0)
+        self._journal: RollbackJournal | None = None
         self.failure: OSError | None = None
+
+    def checkpoint(self, journal: Path) -> None:
+        """Keep what is overwritten from now on in a journal; see `naibu.io.files.rollback_journal`.
+
+        Raises
+        ------
+        InputError
+            The journal cannot be written.
+        """
+        size = os.fstat(self._raw.fileno()).st_size
+        before, self._journal = self._journal, RollbackJournal(journal, size)
+        if before is not None:
+            before.close()
 
     def readable(self) -> bool:
         """Whether it can be read: always."""
@@ -60,7 +77,8 @@ class ForgivingStream(io.RawIOBase):
     def write(self, data: Any, /) -> int:
         """Write all bytes, or remember why not."""
         view = memoryview(data).cast("B")
-        written = 0
+        written, place = 0, self._raw.tell()
+        self._keep(place, place + len(view))
         while written < len(view) and self.failure is None:
             try:
                 written += self._raw.write(view[written:]) or 0
@@ -70,11 +88,24 @@ class ForgivingStream(io.RawIOBase):
 
     def truncate(self, size: int | None = None, /) -> int:
         """Set the size, or remember why not."""
+        length = self._raw.tell() if size is None else size
+        self._keep(length, os.fstat(self._raw.fileno()).st_size)
+        if self.failure is not None:
+            return length
         try:
-            return self._raw.truncate(size)
+            return self._raw.truncate(length)
         except OSError as error:
-            self.failure = self.failure or error
-            return size or 0
+            self.failure = error
+            return length
+
+    def _keep(self, start: int, stop: int) -> None:
+        """Keep bytes in the journal before they are changed; what cannot be kept is not changed."""
+        if self._journal is None or self.failure is not None:
+            return
+        try:
+            self._journal.keep(self._raw, start, stop)
+        except OSError as error:
+            self.failure = error
 
     def flush(self) -> None:
         """Do nothing: there is no buffer."""
@@ -86,6 +117,8 @@ class ForgivingStream(io.RawIOBase):
                 self._raw.close()
             except OSError as error:
                 self.failure = self.failure or error
+            if self._journal is not None:
+                self._journal.close()
         super().close()
 
 
@@ -101,6 +134,18 @@ class Hdf5File:
     def __init__(self, path: Path, *, keep: bool = False) -> None:
         self._stream = ForgivingStream(path)
         self.file = h5py.File(self._stream, "r+" if keep else "w")
+
+    def checkpoint(self, journal: Path) -> None:
+        """Write everything out, so that `naibu.io.files.rollback_journal.roll_back` can restore this moment.
+
+        Raises
+        ------
+        OSError, InputError
+            The disk is full.
+        """
+        self.file.flush()
+        self.require_written()
+        self._stream.checkpoint(journal)
 
     def require_written(self) -> None:
         """Raise what the disk refused.

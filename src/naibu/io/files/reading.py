@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Protocol
 
 from naibu.core.errors import InputError, NaibuError
+from naibu.io.files.paths import require_usable_path
 
 LARGEST_RATIO = 1100  # no deflate stream unpacks to more than 1032 times its length (RFC 1951)
 
@@ -84,6 +85,7 @@ def require_regular(path: str | os.PathLike[str]) -> None:
     InputError
         It is not a regular file.
     """
+    require_usable_path(path)
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError) as error:
@@ -111,9 +113,9 @@ def file_beside(header: Path, name: str) -> Path:
     try:
         found = (folder / name).resolve()
     except (OSError, ValueError) as error:
-        raise InputError(f"{header.name}: names the file {name!r} for its data, which cannot be ({error})") from error
+        raise InputError(f"{header}: names the file {name!r} for its data, which cannot be ({error})") from error
     if not found.is_relative_to(folder):
-        raise InputError(f"{header.name}: its data file {name!r} is outside the folder of the header; put both files into one folder")
+        raise InputError(f"{header}: its data file {name!r} is outside the folder of the header; put both files into one folder")
     return found
 
 

@@ -67,7 +67,7 @@ def unit_length(source: str, name: str) -> float:
 
 
 def volume_with_axes(source: str, values: ArrayLike, origin: ArrayLike, axes: ArrayLike, unit_mm: float = 1.0) -> Volume:
-    """Return a volume from its values, the centre of the first voxel and the voxel axes.
+    """Return a volume from its values, of which some may be NaN, the centre of the first voxel and the voxel axes.
 
     Parameters
     ----------
@@ -101,8 +101,9 @@ def volume_with_axes(source: str, values: ArrayLike, origin: ArrayLike, axes: Ar
         )
     try:
         return Volume.from_array(
-            values, spacing_mm=spacing * unit_mm, origin_mm=np.asarray(origin, dtype=float) * unit_mm, direction=nearest_rotation(direction)
-        )
+            values, spacing_mm=spacing * unit_mm, origin_mm=np.asarray(origin, dtype=float) * unit_mm,
+            direction=nearest_rotation(direction), missing=True,
+        )  # fmt: skip
     except InputError as error:
         raise InputError(f"{source}: {error}") from error
 

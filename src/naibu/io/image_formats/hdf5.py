@@ -85,6 +85,8 @@ def _dataset(path: Path) -> Iterator[Any]:
         if not isinstance(stored, h5py.Dataset) or any(name not in stored.attrs for name in _ATTRIBUTES):
             expected = f"a dataset 'values' with the attributes {', '.join(_ATTRIBUTES)}"
             raise InputError(f"{path.name}: contains no volume: naibu expects {expected}; the file has {sorted(file)}")
+        if stored.file.filename != file.filename:
+            raise InputError(f"{path.name}: its values stand in {stored.file.filename!r}, to which a link leads; copy them into the file")
         if stored.ndim != 3:
             raise InputError(f"{path.name}: its values have {stored.ndim} axes {stored.shape}, not (z, y, x); save one of its components")
         if stored.external or stored.is_virtual:

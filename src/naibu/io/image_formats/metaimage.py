@@ -203,8 +203,8 @@ def _with_geometry(path: Path, header: dict[str, str], values: AnyArray, options
         raise InputError(f"{path.name}: does not state its voxel spacing; give spacing_mm")
     name = path.name
     spacing = _numbers_in(name, "ElementSpacing", length, n) if length is not None else np.asarray(options.spacing_mm, dtype=float)[:n]
-    origin = _numbers_in(name, "Offset", position, n) if position else np.zeros(n)
-    direction = _numbers_in(name, "TransformMatrix", orientation, n * n).reshape(n, n).T if orientation else np.eye(n)
+    origin = _numbers_in(name, "Offset", position, n) if position is not None else np.zeros(n)
+    direction = _numbers_in(name, "TransformMatrix", orientation, n * n).reshape(n, n).T if orientation is not None else np.eye(n)
     if n == 2:
         spacing, origin = np.append(spacing, 1.0), np.append(origin, 0.0)
         direction = np.block([[direction, np.zeros((2, 1))], [np.zeros((1, 2)), np.ones((1, 1))]])

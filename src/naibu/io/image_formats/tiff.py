@@ -101,6 +101,8 @@ def _loaded(tifffile: Any, path: Path) -> tuple[AnyArray, dict[str, Any]]:
     require_regular(path)
     try:
         with tifffile.TiffFile(path) as file:
+            if not len(file.pages):  # counting ends where pages refer to each other in a circle, iterating does not
+                raise InputError(f"{path.name}: contains no image; copy the file again")
             series, page = file.series[0], file.pages[0]
             samples = int(page.samplesperpixel)
             n_series, axes = len(file.series), str(series.axes)

@@ -1,11 +1,13 @@
 """Image volumes in Zarr, chunked: for volumes larger than memory, and for several processes that read and write parts of one.
 
 The store is a group with an array ``values`` (nz, ny, nx) and the attributes ``spacing_mm``, ``origin_mm`` (x, y, z) and ``direction``
-(3 x 3, columns are the axes). Needs the package zarr (extra ``naibu[cluster]``).
+(3 x 3, columns are the axes). Missing chunks are an error, unless the attribute
+``every_chunk_is_stored`` is false or the fill value is NaN. Needs the package zarr (extra ``naibu[cluster]``).
 """
 
 from __future__ import annotations
 
+import math
 import shutil
 import tempfile
 from pathlib import Path
@@ -19,6 +21,7 @@ from naibu.core.chunked_volume import ChunkedVolume
 from naibu.core.errors import InputError
 from naibu.core.optional_packages import optional_package
 from naibu.core.volume import Volume
+from naibu.io.files.paths import require_usable_path
 from naibu.io.image_formats.geometry import ReadOptions, volume_with_axes
 
 CHUNK = 64
@@ -71,14 +74,38 @@ def open_chunked(path: Path, options: ReadOptions | None = None) -> ChunkedVolum
         raise InputError(f"{path.name}: contains no volume: its group lacks the attributes {', '.join(missing) or 'of an array'}")
     if stored.ndim != 3:
         raise InputError(f"{path.name}: its values have {stored.ndim} axes {stored.shape}, not (z, y, x); save one time point or component")
-    if group.attrs.get(ALL_CHUNKS):
-        there = sum(file.is_file() for file in (path / "values" / "c").rglob("*"))
-        if there < stored.nchunks:
-            lost = f"{stored.nchunks - there} of its {stored.nchunks} chunks are missing, or were not written yet"
-            raise InputError(f"{path.name}: {lost}; copy the store again")
+    _require_all_chunks(path, group, stored)
     unit = (options.unit_mm if options else None) or 1.0
     origin, spacing = (unit * np.asarray(group.attrs[name], dtype=float) for name in ("origin_mm", "spacing_mm"))
     return ChunkedVolume.from_array(stored, spacing_mm=spacing, origin_mm=origin, direction=group.attrs["direction"])
+
+
+def _require_all_chunks(path: Path, group: Any, stored: Any) -> None:
+    """Refuse a store that lacks chunks, which would be read as its fill value, unless it says that these are meant.
+
+    Raises
+    ------
+    InputError
+        Chunks are missing; a fill value of NaN stands for unknown and is not refused.
+    """
+    meant = group.attrs.get(ALL_CHUNKS)
+    if meant is False or (meant is None and stored.dtype.kind == "f" and np.isnan(stored.fill_value)):
+        return
+    edges = stored.shards or stored.chunks
+    files = math.prod(-(-n // edge) for n, edge in zip(stored.shape, edges, strict=True))
+    most = sum(file.is_file() for file in path.rglob("*"))
+    there = most  # where even these are too few, looking for every chunk may take for ever
+    if files <= most:
+        there = stored.nchunks_initialized // math.prod(edge // inner for edge, inner in zip(edges, stored.chunks, strict=True))
+    if there >= files:
+        return
+    lost = f"{files - there} of its {files} chunks are missing, or were not written yet"
+    if meant:
+        raise InputError(f"{path.name}: {lost}; copy the store again")
+    raise InputError(
+        f"{path.name}: {lost}, and would be read as {stored.fill_value}; copy the store again, or where they are meant to be "
+        f"{stored.fill_value} set the attribute {ALL_CHUNKS} = false of its group"
+    )
 
 
 def create_chunked(
@@ -105,6 +132,7 @@ def create_chunked(
         Array to be assigned to by slices, for example by `naibu.imaging.out_of_core.stored`.
     """
     zarr = _zarr()
+    require_usable_path(path, written=True)
     try:
         if path.exists():
             shutil.rmtree(path)
@@ -126,6 +154,7 @@ def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Pa
     An existing store is replaced when the new one is complete.
     """
     _zarr()
+    require_usable_path(path, written=True)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         aside = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))

@@ -73,7 +73,7 @@ def _face_set(source: str, text: str, start: int) -> tuple[FloatArray, IntArray]
 
 def _refuse_moved(source: str, text: str) -> None:
     """Raise an error if a Transform translates, rotates or scales shapes: ignoring it would misplace the surface."""
-    for match in re.finditer(rf"\b(translation|scale|rotation)\s+((?:{_NUMBER}\s+){{3,4}})", text):
+    for match in re.finditer(rf"\b(translation|scale|rotation)((?:\s+{_NUMBER}){{3,4}})", text):
         values = [float(word) for word in match[2].split()]
         still = values[3:4] == [0.0] if match[1] == "rotation" else values[:3] == _IDENTITY[match[1]]
         if not still:
