@@ -6,7 +6,7 @@ flow, and rigid registration.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -26,7 +26,8 @@ from naibu.imaging.feature_matching.correlation_matching import candidate_matche
 from naibu.imaging.feature_matching.harris import interest_points
 from naibu.imaging.feature_matching.relaxation_labelling import PotentialMatches, relaxed
 from naibu.imaging.feature_matching.scattered_interpolation import dense_from_sparse, sparse_displacement
-from naibu.imaging.preprocessing.object_mask import object_mask
+from naibu.imaging.preprocessing.field_of_view import fields_of_view
+from naibu.imaging.preprocessing.object_mask import mask_in_view, mask_jumps
 from naibu.imaging.preprocessing.resampling import require_mask, resampled_to_grid
 from naibu.imaging.preprocessing.rigid_registration import rigid_from_points, total_displacement
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
@@ -39,6 +40,7 @@ FEWEST_MATCHES = 12  # for a rigid registration
 SEARCH_FRACTION = 0.12  # search radius, in extents of the object
 OUTLIER, REJECTIONS = 3.0, 20  # matches further off than so many medians are rejected, in so many rounds at most
 BLOCK_MM, SEARCH_MM = 8.0, 12.0  # block size and search range of block matching
+MOST_NAMED = 3  # slices in a warning
 LEAST_RANGE = 30.0 / 256.0  # of the intensity range, above which the hybrid takes block matching: as in the report
 
 # what the diagnostics of the methods mean, with their units
@@ -50,6 +52,8 @@ FACTS = {
     "cell_size_mm": "cell size of the spline grid, mm",
     "rigid_inclusions": "rigid inclusions",
     "convergence": "convergence",
+    "unconverged_cells": "cells of the spline grid that have not converged",
+    "unconverged_fraction": "the same, fraction of the cells in the object",
 }
 
 
@@ -74,6 +78,8 @@ class MeasuredDisplacement:
         Interest points matched by ``"features"``.
     facts : dict
         Diagnostics of the method, by name; see `FACTS`.
+    warnings : tuple of str
+        What makes the result doubtful, in sentences for the user.
     """
 
     method: Method
@@ -83,10 +89,17 @@ class MeasuredDisplacement:
     rigid: RigidTransform | None = None
     matches: PotentialMatches | None = None
     facts: dict[str, float | int | str] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
 
 
 def measure_displacement(
-    reference: Volume, deformed: Volume, *, method: Method = "default", mask: ArrayLike | None = None, progress: Progress | None = None
+    reference: Volume,
+    deformed: Volume,
+    *,
+    method: Method = "default",
+    mask: ArrayLike | None = None,
+    deformed_mask: ArrayLike | None = None,
+    progress: Progress | None = None,
 ) -> MeasuredDisplacement:
     """Measure the displacement field between two volumes by a named method, with settings that follow from the volumes.
 
@@ -101,24 +114,62 @@ def measure_displacement(
         matching and optical flow as the report does; ``"rigid"`` is the rigid motion of the whole object.
     mask : array_like, shape (nz, ny, nx), optional
         Voxels of the object in the reference; by default from `naibu.imaging.object_mask`.
+    deformed_mask : array_like, shape (nz, ny, nx), optional
+        Voxels of the object in the deformed volume, for digital volume correlation; the classic methods do not use it.
     progress : Progress, optional
         Called at the beginning of every stage.
 
     Raises
     ------
     InputError
-        An unknown method, volumes on different grids, a constant volume, or a mask that is empty or of another shape.
+        An unknown method, volumes on different grids, a constant volume, voxels that are NaN for another method than the default, or a mask
+        that is empty or of another shape.
     """
     if method not in METHODS:
         raise InputError(f"method must be one of {', '.join(METHODS)}, not {method!r}")
-    if not reference.same_grid(deformed):
+    if different := reference.grid_difference(deformed):
         raise InputError(
-            f"reference and deformed lie on different grids: {_grid(reference)} and {_grid(deformed)}; resample one to the grid of the "
-            "other with naibu.imaging.resampled_to_grid"
+            f"reference and deformed lie on different grids: {different}; resample one to the grid of the other with "
+            "naibu.imaging.resampled_to_grid"
         )
-    inside = object_mask(reference) if mask is None else require_mask(mask, reference)
+    if method != "default":
+        _require_measured(reference, deformed)
+    if mask is None:
+        inside = mask_in_view(reference, fields_of_view(reference, deformed)[0])
+        doubts = _mask_doubts(inside)
+    else:
+        inside, doubts = require_mask(mask, reference), ()
     if method == "default":
-        return _correlated(reference, deformed, inside, None if mask is None else inside, progress)
+        found = _correlated(reference, deformed, inside, (None if mask is None else inside, deformed_mask), progress)
+    else:
+        found = _by_classic_method(reference, deformed, method, inside, progress)
+    return replace(found, warnings=doubts + found.warnings)
+
+
+def _require_measured(reference: Volume, deformed: Volume) -> None:
+    """Refuse voxels that were not measured, which the classic methods would compare."""
+    for name, volume in (("reference", reference), ("deformed", deformed)):
+        if volume.values.dtype.kind == "f" and np.isnan(volume.values).any():
+            raise InputError(
+                f"the {name} volume has voxels that are NaN, which only digital volume correlation leaves out; choose method='default', or "
+                "crop the volumes"
+            )
+
+
+def _mask_doubts(mask: BoolArray) -> tuple[str, ...]:
+    jumps = mask_jumps(mask)
+    if not len(jumps):
+        return ()
+    where = ", ".join(f"{k - 1} and {k}" for k in jumps[:MOST_NAMED]) + (" ..." if len(jumps) > MOST_NAMED else "")
+    return (
+        f"The mask of the object that was found jumps between neighbouring slices ({where}, from 0): if the object has no such step, parts "
+        "of it are missing or too much is in it; give a `mask`.",
+    )
+
+
+def _by_classic_method(
+    reference: Volume, deformed: Volume, method: Method, inside: BoolArray, progress: Progress | None
+) -> MeasuredDisplacement:
     report_progress(progress, "rigid registration")
     matches, rigid = matched_rigidly(reference, deformed, inside)
     if method == "features":
@@ -132,10 +183,6 @@ def measure_displacement(
     return MeasuredDisplacement(
         method, whole, inside, displacement_gradient(vectors, reference), rigid=rigid, facts={"matches": len(matches)}
     )
-
-
-def _grid(volume: Volume) -> str:
-    return f"{'x'.join(str(n) for n in volume.shape[::-1])} voxels of {'x'.join(f'{d:g}' for d in volume.spacing_mm)} mm"
 
 
 def matched_rigidly(reference: Volume, deformed: Volume, mask: BoolArray) -> tuple[PotentialMatches, RigidTransform]:
@@ -210,15 +257,22 @@ def _from_features(reference: Volume, matches: PotentialMatches, rigid: RigidTra
 
 
 def _correlated(
-    reference: Volume, deformed: Volume, inside: BoolArray, given: BoolArray | None, progress: Progress | None
+    reference: Volume,
+    deformed: Volume,
+    inside: BoolArray,
+    masks: tuple[BoolArray | None, ArrayLike | None],
+    progress: Progress | None,
 ) -> MeasuredDisplacement:
     # without a mask the correlation takes one that includes the surface, which has much of the contrast
-    found = correlate_volumes(reference, deformed, mask=given, progress=progress)
+    found = correlate_volumes(reference, deformed, mask=masks[0], deformed_mask=masks[1], progress=progress)
+    unconverged, cells = int((~found.converged).sum()), int(np.isfinite(found.cell_covariance[..., 0, 0]).sum())
     facts: dict[str, float | int | str] = {
         "residual_sd": found.residual_sd,
         "cell_size_mm": float(found.grid.step_mm.mean()),
         "rigid_inclusions": int(found.inclusions.max()),
         "convergence": found.status,
+        "unconverged_cells": unconverged,
+        "unconverged_fraction": unconverged / cells,
     }
     valid = found.valid & inside
     outside = ~valid
@@ -226,4 +280,13 @@ def _correlated(
     for values in (vectors, gradient, covariance):
         values[outside] = np.nan
     field = DisplacementField.on_grid(reference, vectors, covariance=covariance, valid=valid)
-    return MeasuredDisplacement("default", field, inside, gradient, facts=facts)
+    return MeasuredDisplacement("default", field, inside, gradient, facts=facts, warnings=_convergence_doubts(unconverged, cells))
+
+
+def _convergence_doubts(unconverged: int, cells: int) -> tuple[str, ...]:
+    if not unconverged:
+        return ()
+    return (
+        f"{unconverged} of {cells} cells of the grid ({unconverged / cells:.1%}) have not converged: their displacement is less certain, "
+        "which its standard deviation includes.",
+    )

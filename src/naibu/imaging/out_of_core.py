@@ -360,11 +360,8 @@ def _sums(values: AnyArray) -> tuple[float, float, float, float, float]:
 
 def _pair(reference: ChunkedVolume, deformed: ChunkedVolume, block: ArrayLike) -> tuple[_Moments, _Moments]:
     """Check two volumes that are compared."""
-    if not reference.grid.same_grid(deformed.grid):
-        raise InputError(
-            f"reference and deformed lie on different grids ({reference.shape} voxels of {reference.spacing_mm.tolist()} mm; "
-            f"{deformed.shape} of {deformed.spacing_mm.tolist()} mm); resample deformed to the grid of reference first"
-        )
+    if different := reference.grid.grid_difference(deformed.grid):
+        raise InputError(f"reference and deformed lie on different grids: {different}; resample deformed to the grid of reference first")
     known = _moments(reference, block), _moments(deformed, block)
     for name, m in zip(("reference", "deformed"), known, strict=True):
         if not m.high > m.low:

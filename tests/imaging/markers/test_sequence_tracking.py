@@ -7,6 +7,8 @@ import pytest
 from marker_scenes import Echoes, ultrasound
 
 from naibu.core.errors import InputError
+from naibu.imaging.markers.sequence_gaps import completed
+from naibu.imaging.markers.sequence_paths import Track
 from naibu.imaging.markers.sequence_tracking import TrackedSequence, track_sequence
 from naibu.imaging.markers.settings import SequenceSettings
 
@@ -42,6 +44,28 @@ def test_positions_in_gaps_say_that_they_are_less_certain(scene: Echoes, followe
     assert np.median(followed.sd_mm[~followed.seen]) > np.median(followed.sd_mm[followed.seen])
     error = (followed.points - scene.truth)[followed.seen]
     assert 0.6 < np.sqrt(np.mean(error**2)) / np.sqrt(np.mean(followed.sd_mm[followed.seen] ** 2)) < 1.6
+
+
+@pytest.mark.parametrize(("motions", "limit"), [(1, 0.1), (2, 0.13), (3, 0.17)])
+def test_gaps_are_filled_as_well_by_more_motions_than_there_are(motions: int, limit: float) -> None:
+    """Gaps of a fifth of the sequence in every marker; the noise is 0.06 mm. Linear interpolation misses by 0.18 to 0.33 mm."""
+    off = []
+    for seed in range(4):
+        rng, n, m = np.random.default_rng(seed), 140, 5
+        t = np.arange(n) / n
+        base = np.stack([5.0 * (1.0 - np.exp(-8.0 * t)), 0.8 * np.sin(9.0 * t), 0.5 * np.cos(23.0 * t)], axis=1)[:, :motions]
+        shapes = rng.normal(size=(motions, m, 2)) * np.array([1.0, 0.6, 0.6])[:motions, None, None]
+        shapes[0, :, 1] += 1.0
+        truth = np.tensordot(base, shapes, 1) + rng.uniform(0.0, 50.0, (m, 2))
+        seen = rng.uniform(size=(n, m)) > 0.06
+        for k in range(m):
+            first = int(rng.integers(5, n - 35))
+            seen[first : first + 30, k] = False
+        measured = truth + 0.06 * rng.normal(size=truth.shape)
+        tracks = [Track(np.flatnonzero(seen[:, k]), measured[seen[:, k], k], np.ones(int(seen[:, k].sum())), 1.0) for k in range(m)]
+        filled, kept = completed(tracks, n, np.array([3.0, 2.0]), SequenceSettings(shared_motions=3))
+        off.append(np.sqrt(np.mean((filled - truth)[~kept] ** 2)))
+    assert np.mean(off) < limit
 
 
 def test_frames_become_markers_in_a_plane(followed: TrackedSequence) -> None:

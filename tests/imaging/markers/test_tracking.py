@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from marker_scenes import lattice, render_spheres
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
 
 from naibu.core.errors import InputError
 from naibu.core.experiment import Loading, Shape
@@ -101,6 +104,18 @@ def test_joint_positions_are_better_and_say_so() -> None:
     assert 0.8 < np.sqrt(np.mean(np.square(ratio))) < 1.25
 
 
+@pytest.mark.parametrize(("noise", "seed"), [(5.0, 0), (20.0, 1), (60.0, 2)])
+def test_the_stated_deviation_is_that_of_the_errors(noise: float, seed: int) -> None:
+    states = [GRID, pressed(GRID, 0.85)]
+    volumes = [render_spheres(c, shape=SHAPE, contrast=-400.0, noise=noise, seed=10 * seed + s) for s, c in enumerate(states)]
+    found = track_markers(volumes, diameter_mm=2.0)
+    material = cKDTree(GRID + ORIGIN).query(found.points[0])[1]
+    error = found.points - np.stack([c[material] + ORIGIN for c in states])
+    across, along = np.sqrt(np.mean(error[..., :2] ** 2)), np.sqrt(np.mean(error[..., 2] ** 2))
+    ratio = np.array([across, along]) / found.typical_sd_mm
+    assert (ratio > 1 / 1.5).all() and (ratio < 1.5).all(), ratio
+
+
 def test_an_outlier_is_reported_and_not_updated() -> None:
     x = lattice((4, 4, 4), 10.0, 0.5)
     states = np.stack([x, x * (1.1, 1.1, 0.85)])
@@ -108,6 +123,31 @@ def test_an_outlier_is_reported_and_not_updated() -> None:
     better = joint_positions(states, np.broadcast_to(1e-3 * np.eye(3), (2, 64, 3, 3)).copy())
     assert np.flatnonzero(better.outliers[1]).tolist() == [20]
     assert (better.points[1, 20] == states[1, 20]).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_volume_without_markers_has_none_that_are_trusted(seed: int) -> None:
+    """A textured body without markers, before and after a shift by a voxel, of which every blob could be followed."""
+    rng, shape = np.random.default_rng(seed), (32, 40, 40)
+    z, y, x = np.indices(shape)
+    inside = 1.0 / (1.0 + np.exp(15.0 * (np.sqrt(((x - 20) / 16) ** 2 + ((y - 20) / 15) ** 2 + ((z - 16) / 12) ** 2) - 1.0)))
+    texture = gaussian_filter(rng.normal(size=shape), 1.5)
+    body = 100.0 * inside * (1.0 + 0.2 * texture / texture.std())
+    volumes = [Volume.from_array(np.roll(body, k, axis=2) + 2.0 * rng.normal(size=shape), spacing_mm=(1.0, 1.0, 1.0)) for k in range(2)]
+    for diameter in (3.0, 6.0):
+        try:
+            found = track_markers(volumes, diameter_mm=diameter)
+        except InputError as error:
+            assert re.search("no bright or dark marker|are needed|no common structure", str(error))
+        else:
+            assert not (found.flags[1:] == "ok").any()
+
+
+def test_few_markers_are_trusted_only_where_their_number_is_known() -> None:
+    some = GRID[[0, 15, 21, 47]]
+    volumes = scans([some, pressed(some, 0.85)])
+    assert (track_markers(volumes, diameter_mm=2.0).flags[1] == "suspect").all()
+    assert (track_markers(volumes, diameter_mm=2.0, count=4).flags[1] == "ok").all()
 
 
 def test_what_cannot_be_followed_is_refused() -> None:

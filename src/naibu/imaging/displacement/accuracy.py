@@ -163,8 +163,8 @@ def intensity_rms(
     InputError
         Volumes on different grids, an empty region, or one outside the field.
     """
-    if not reference.same_grid(deformed):
-        raise InputError("reference and deformed lie on different grids; resample one to the grid of the other")
+    if different := reference.grid_difference(deformed):
+        raise InputError(f"reference and deformed lie on different grids: {different}; resample one to the grid of the other")
     if frame not in ("deformed", "reference"):
         raise InputError(f"frame must be 'deformed' or 'reference', not {frame!r}")
     if frame == "deformed":

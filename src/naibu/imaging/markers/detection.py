@@ -301,7 +301,11 @@ def _settled(look: _Look, diameter: float, count: int | None, how: DetectionSett
     above = fits.score[keep] / np.sqrt(shared) - np.sqrt(2.0 * np.log(look.voxels))
     by_chance = np.full(len(keep), True) if len(keep) and np.median(above) < how.above_chance else above < 0.0
     rejected += [Rejected(p, "no stronger than noise") for p in fits.centres[keep[by_chance]]]
-    kept = fits.chosen(keep[~by_chance])
+    keep = keep[~by_chance]
+    # noise alone leaves a blob that stands out less uncertain: more says that what was fitted is no blob
+    vague = np.sqrt(shared * np.linalg.eigvalsh(fits.covariance[keep])[:, 1]) > how.max_deviation * diameter
+    rejected += [Rejected(p, NO_BLOB) for p in fits.centres[keep[vague]]]
+    kept = fits.chosen(keep[~vague])
     kept.covariance[:] *= shared
     return _Found(look.sign, kept, tuple(rejected)), [Rejected(p, NO_BLOB) for p in look.starts[~good, 2:5]]
 

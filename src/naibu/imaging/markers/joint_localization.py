@@ -22,8 +22,9 @@ from naibu.core.arrays import BoolArray, FloatArray, IntArray
 FEWEST, MOST = 12, 600
 # amplitudes of the kernel that are tried, in units of the median variance, for points scaled to a unit box
 AMPLITUDES = np.logspace(-3.0, 7.0, 16)
-# range of the estimated factor of the stated variances; not below 1, as errors common to neighbours do not show
-CALIBRATION = (1.0, 9.0)
+# range of the estimated factor of the stated variances; the fit to a blob that is no Gaussian overstates its error, up to three times in
+# standard deviation, but errors common to neighbours do not show
+CALIBRATION = (0.2, 9.0)
 # a position further than so many standard deviations from its prediction is an outlier, and not updated
 APART = 4.0
 LOCAL = 14  # neighbours from which the deformation gradient at a marker is fitted

@@ -9,7 +9,7 @@ hundred markers are assigned at once instead (`naibu.imaging.markers.thin_plate_
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from naibu.core.arrays import FloatArray, IntArray, as_points, require_finite, require_shape
 from naibu.core.errors import InputError
 from naibu.imaging.markers._point_matching_kernels import fill_grid, frontier, propose, propose_few, settle, try_guesses
+from naibu.imaging.markers.motion_coherence import coherence_of_links
 from naibu.imaging.markers.settings import LinkSettings
 from naibu.imaging.markers.thin_plate_assignment import ENOUGH, assigned, exchanged, residuals
 
@@ -146,7 +147,8 @@ def link_markers(
     Raises
     ------
     InputError
-        Fewer than three points, shapes that do not match, coordinates that are not finite, or two clouds without common structure.
+        Fewer than three points, shapes that do not match, coordinates that are not finite, two clouds without common structure, or links
+        that no soft body allows: lengths in other units, or a mirror image.
     """
     how = settings if settings is not None else LinkSettings()
     reference, deformed = _checked(reference_points, "reference_points"), _checked(deformed_points, "deformed_points")
@@ -168,6 +170,8 @@ def link_markers(
         state = _best_grown(cloud, rng, stretch, how)
         link, residual = state.link, _refined(cloud, state, how) * float(np.linalg.det(stretch)) ** (1.0 / reference.shape[1])
     links = _reported(_spacing(deformed), link, residual, reference.shape[1])
+    right = coherence_of_links(reference[links.pairs[:, 0]], deformed[links.pairs[:, 1]])
+    links = replace(links, confidence=right * links.confidence)
     smaller, sure = min(len(reference), len(deformed)), float(links.confidence.mean()) if len(links) else 0.0
     if sure < how.min_mean_confidence if len(links) >= FEW_LINKS else len(links) < FEW_LINKED * smaller:
         raise InputError(

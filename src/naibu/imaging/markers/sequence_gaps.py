@@ -2,7 +2,8 @@
 
 A position is an outlier if it agrees neither with robust lines through its neighbouring frames :cite:p:`theil1950,sen1968` nor with what
 the other markers do at that time. Gaps are filled by the leading principal components of the motion of all markers, found by iterated
-singular value decompositions in which the missing positions are replaced by their reconstruction.
+singular value decompositions in which the missing positions are replaced by their reconstruction, less the part of noise in the singular
+values (regularised iterative principal component analysis) :cite:p:`josse2012`.
 """
 
 from __future__ import annotations
@@ -67,31 +68,33 @@ def _beside_line(dt: IntArray, off: FloatArray) -> FloatArray:
 def _filled(points: FloatArray, seen: BoolArray, most: int) -> FloatArray:
     """Fill gaps by at most so many principal motions of all markers, and linearly in time in what these leave."""
     n, m, _ = points.shape
-    t = np.arange(n)
-
-    def bridged(values: FloatArray) -> FloatArray:
-        out = np.empty_like(values)
-        for k in range(m):
-            for c in range(2):
-                out[:, k, c] = np.interp(t, t[seen[:, k]], values[seen[:, k], k, c])
-        return out
-
-    filled = bridged(points)
+    filled = _bridged(points, seen)
     start = np.linalg.svd((filled - filled.mean(axis=0)).reshape(n, -1), compute_uv=False)
     # the largest singular value of n x 2m noise is about its standard deviation times (sqrt(n) + sqrt(2m))
-    noise = float(np.sqrt(np.nanmean(residual_sd(points, seen) ** 2))) * (np.sqrt(n) + np.sqrt(2 * m))
-    modes = min(most, (2 * m) // 3, n - 1, int((start > ABOVE_NOISE * noise).sum()))
+    sd = float(np.sqrt(np.nanmean(residual_sd(points, seen) ** 2)))
+    modes = min(most, (2 * m) // 3, n - 1, int((start > ABOVE_NOISE * sd * (np.sqrt(n) + np.sqrt(2 * m))).sum()))
     for _ in range(FILLINGS if m > 2 and modes > 0 else 0):
         flat = filled.reshape(n, -1)
         mean = flat.mean(axis=0)
         u, s, w = np.linalg.svd(flat - mean, full_matrices=False)
-        shared = ((u[:, :modes] * s[:modes]) @ w[:modes] + mean).reshape(points.shape)
-        new = np.where(seen[:, :, None], points, shared + bridged(points - shared))
+        # without the part of noise, motions that are none would fill gaps with amplified noise
+        kept = np.maximum(s[:modes] ** 2 - n * sd**2, 0.0) / np.maximum(s[:modes], 1e-300)
+        shared = ((u[:, :modes] * kept) @ w[:modes] + mean).reshape(points.shape)
+        new = np.where(seen[:, :, None], points, shared + _bridged(points - shared, seen))
         change = float(np.abs(new - filled).max())
         filled = new
         if change < 1e-6 * float(np.ptp(points[seen])):
             break
     return filled
+
+
+def _bridged(values: FloatArray, seen: BoolArray) -> FloatArray:
+    """Interpolate linearly in time between the frames in which every marker is seen."""
+    t, out = np.arange(len(values)), np.empty_like(values)
+    for k in range(values.shape[1]):
+        for c in range(2):
+            out[:, k, c] = np.interp(t, t[seen[:, k]], values[seen[:, k], k, c])
+    return out
 
 
 def residual_sd(points: FloatArray, seen: BoolArray) -> FloatArray:

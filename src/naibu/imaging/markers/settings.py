@@ -45,6 +45,8 @@ class DetectionSettings:
     outlier_sd : float
         Standard deviations from the median in size, content and thickness together beyond which a marker among 20 or more is rejected;
         above 0.
+    max_deviation : float
+        Largest standard deviation of the centre, in diameters, along the second most uncertain axis; above 0. What is no blob fits worse.
     min_distance : float
         Distance of two fits, in diameters, below which they are one marker; 0 or more.
     above_chance : float
@@ -58,11 +60,12 @@ class DetectionSettings:
     elongation_ratio: float = 1.5
     spread_sd: float = 5.0
     outlier_sd: float = 7.5
+    max_deviation: float = 0.08
     min_distance: float = 0.45
     above_chance: float = 5.5
 
     def __post_init__(self) -> None:
-        for name in ("min_contrast", "outlier_sd"):
+        for name in ("min_contrast", "outlier_sd", "max_deviation"):
             require_positive(name, getattr(self, name))
         for name in ("size_ratio", "content_ratio", "elongation_ratio"):
             require_between(name, getattr(self, name), 1.0, np.inf)
@@ -146,8 +149,7 @@ class SequenceSettings:
     min_outlier : float
         Residual below which no position is an outlier, in diameters; 0 or more.
     shared_motions : int
-        Largest number of principal motions, shared by all markers, that fill gaps; 0 or more. 0 interpolates linearly in time; 1 suits a
-        motion that one load drives.
+        Largest number of principal motions, shared by all markers, that fill gaps; 0 or more. 0 interpolates linearly in time.
     """
 
     min_contrast: float = 2.5

@@ -18,6 +18,7 @@ from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
 from naibu.imaging.markers.detection import DetectedMarkers, Polarity, detect_markers
 from naibu.imaging.markers.joint_localization import joint_positions
+from naibu.imaging.markers.peaks import POPULATION
 from naibu.imaging.markers.point_matching import Links, link_markers
 from naibu.imaging.markers.settings import DetectionSettings, LinkSettings, require_between
 from naibu.imaging.markers.thin_plate_assignment import spline_through
@@ -73,10 +74,10 @@ class TrackedMarkers:
         return np.asarray(np.sqrt(np.einsum("snii->sni", self.covariance)))
 
     @property
-    def steps_mm(self) -> tuple[float, float]:
-        """Rounding steps across and along z, mm, of the same standard deviation as the median one: sqrt(12) times it."""
-        x, y, z = np.sqrt(12.0) * np.nanmedian(self.sd_mm, axis=(0, 1))
-        return 0.5 * float(x + y), float(z)
+    def typical_sd_mm(self) -> tuple[float, float]:
+        """Root mean square standard deviation of a trusted coordinate across and along z, mm."""
+        x, y, z = np.nanmean(np.where((self.flags == "ok")[:, :, None], self.sd_mm, np.nan) ** 2, axis=(0, 1))
+        return float(np.sqrt(0.5 * (x + y))), float(np.sqrt(z))
 
     @property
     def states(self) -> dict[str, Markers]:
@@ -108,6 +109,7 @@ def track_markers(
         The reference state first, then the others in the order in which they were reached: each is linked by way of the previous one.
     diameter_mm, thickness_mm, polarity, count
         See `naibu.imaging.markers.detection.detect_markers`. The polarity that ``"auto"`` finds in the first volume holds for all.
+        Fewer than five markers are all suspect unless `count` says how many there are.
     masks : sequence of array_like of bool or None, optional
         Where markers may lie, for every volume.
     names : sequence of str, optional
@@ -158,6 +160,8 @@ def track_markers(
         found.append(markers)
     link, confidence, residual = linked_states([m.points for m in found], names=states, seed=seed, settings=linking)
     report_progress(progress, "linking markers", done=len(volumes), total=len(volumes))
+    if count is None and min(len(markers) for markers in found) < POPULATION:
+        confidence[1:] = 0.0  # bubbles and other structures are not told from so few markers
     return _tracked(states, tuple(found), link, confidence, residual, joint=joint, min_confidence=min_confidence)
 
 

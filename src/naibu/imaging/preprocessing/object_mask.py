@@ -1,21 +1,30 @@
-"""Mask of the object: the largest connected region brighter than the air about it, by the threshold of :cite:t:`otsu1979`."""
+"""Mask of the object: what the contour of its bright region encloses, by the threshold of :cite:t:`otsu1979`."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy import ndimage
 
-from naibu.core.arrays import BoolArray
+from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.bone_mask import otsu_thresholds
+from naibu.imaging.preprocessing.field_of_view import Box
 
 # empirical: upper bound of the threshold, in fractions from the mean of the air to that of the object: skin is darker than the mean
 DIMMEST = 0.3
 CLOSING = 2  # empirical, voxels: radius of the morphological closing that bridges noise at the surface
+# empirical: radii of the throats through which cavities may be open, in fractions of the cube root of the volume of the bright region; a
+# cavity has room for a ball so much larger than its throat, or it is a gap of the outline
+THROATS = (0.02, 0.04, 0.08)
+WIDER = 1.6
+THROAT_VOXELS = 300_000  # about so many coarse voxels show the throats
+# share of a slice, of the larger of two neighbours, in which their masks differ, above which the mask jumps
+JUMP = 0.25
+LEAST_AREA = 0.02  # of the largest slice: smaller ones are the tip of an object, where slices differ much
 
 
 def object_mask(volume: Volume, *, margin: int = 0) -> BoolArray:
-    """Return the mask of the largest bright region of a volume, with the holes in its slices filled.
+    """Return the mask of the largest bright region of a volume, with all cavities that its outline encloses, such as lungs.
 
     Parameters
     ----------
@@ -33,6 +42,11 @@ def object_mask(volume: Volume, *, margin: int = 0) -> BoolArray:
     ------
     InputError
         Volume without contrast.
+
+    Notes
+    -----
+    Cavities are found in three dimensions: air is outside if it is connected to air on a face of the volume that no outline encloses within
+    that face. A cavity may be open to the outside, as lungs are by the trachea, through a throat much narrower than itself.
     """
     values = np.asarray(volume.values, dtype=np.float32)
     reach = tuple(1.0 if n > 1 else 0.0 for n in volume.shape)
@@ -44,5 +58,101 @@ def object_mask(volume: Volume, *, margin: int = 0) -> BoolArray:
     found = labels == 1 + np.argmax(np.bincount(labels.ravel())[1:])
     pad = CLOSING + 1
     found = ndimage.binary_closing(np.pad(found, pad), iterations=CLOSING)[pad:-pad, pad:-pad, pad:-pad]
-    found = np.stack([ndimage.binary_fill_holes(page) for page in found])
+    found = _with_cavities(found, volume)
     return np.asarray(ndimage.binary_dilation(found, iterations=margin) if margin else found)
+
+
+def mask_in_view(volume: Volume, view: Box, *, margin: int = 0) -> BoolArray:
+    """Return the object (nz, ny, nx) that the field of view of a volume shows.
+
+    Parameters
+    ----------
+    volume : Volume
+        Scan, which may be padded.
+    view : tuple of slice
+        Its field of view (see `naibu.imaging.preprocessing.field_of_view`).
+    margin : int
+        See `object_mask`.
+
+    Raises
+    ------
+    InputError
+        As `object_mask`.
+    """
+    mask = np.zeros(volume.shape, dtype=bool)
+    shown = Volume.from_array(np.asarray(volume.values)[view], spacing_mm=volume.spacing_mm)
+    mask[view] = object_mask(shown, margin=margin)
+    return mask
+
+
+def mask_jumps(mask: BoolArray) -> IntArray:
+    """Return the slices (n,) whose mask differs from that of the slice before by more than a quarter of the larger of both.
+
+    Parameters
+    ----------
+    mask : ndarray, shape (nz, ny, nx), bool
+        The object.
+
+    Returns
+    -------
+    ndarray, shape (n,), int64
+        Indices along z; the ends of the object are no jumps, a slice without object between others is.
+    """
+    area = mask.sum(axis=(1, 2))
+    filled = np.flatnonzero(area)
+    if not len(filled):
+        return np.zeros(0, dtype=np.int64)
+    inner = mask[filled[0] : filled[-1] + 1]
+    larger = np.maximum(inner[1:].sum(axis=(1, 2)), inner[:-1].sum(axis=(1, 2)))
+    changed = (inner[1:] != inner[:-1]).sum(axis=(1, 2))
+    jumps = (changed > JUMP * larger) & (larger > LEAST_AREA * area.max())
+    return np.asarray(filled[0] + 1 + np.flatnonzero(jumps), dtype=np.int64)
+
+
+def _with_cavities(bright: BoolArray, volume: Volume) -> BoolArray:
+    """Return the bright region with the cavities that it encloses, also those that are open through a throat."""
+    outside = _from_outside(~bright, ~bright)
+    voxel = max((bright.size * float(np.prod(volume.spacing_mm)) / THROAT_VOXELS) ** (1 / 3), float(volume.spacing_mm.min()))
+    stride = np.maximum(np.round(voxel / volume.spacing_mm[::-1]), 1).astype(int)
+    # coarse voxels are bright where any of theirs is: thin walls stay closed
+    blocked = _blocks(~outside, stride)
+    cavities = _through_throats(blocked, volume.spacing_mm[::-1] * stride)
+    if cavities.any():
+        fine = cavities.repeat(stride[0], 0).repeat(stride[1], 1).repeat(stride[2], 2)[tuple(map(slice, bright.shape))]
+        fine = ndimage.binary_dilation(fine & outside, iterations=int(stride.max()) + 1, mask=outside)
+        outside = _from_outside(outside & ~fine, outside & ~fine)
+    return ~outside
+
+
+def _through_throats(closed: BoolArray, spacing: FloatArray) -> BoolArray:
+    """Return the open voxels of cavities into which no ball of the radius of a throat fits from outside."""
+    size = (float(closed.sum()) * float(np.prod(spacing))) ** (1 / 3)
+    room = ndimage.distance_transform_edt(~closed, sampling=spacing)
+    found = np.zeros_like(closed)
+    for throat in (f * size for f in THROATS):
+        free = _from_outside(room > throat, ~closed)
+        touched = free | (ndimage.distance_transform_edt(~free, sampling=spacing) <= throat) if free.any() else free
+        labels, n = ndimage.label(~closed & ~touched)
+        if n:
+            largest = ndimage.maximum(room, labels, np.arange(1, n + 1))
+            found |= np.isin(labels, 1 + np.flatnonzero(largest > WIDER * throat))
+    return found
+
+
+def _from_outside(free: BoolArray, air: BoolArray) -> BoolArray:
+    """Return the free voxels that are connected to air on a face of the volume, where no outline encloses it within the face."""
+    seeds = np.zeros_like(free)
+    for axis in range(3):
+        if free.shape[axis] == 1:
+            continue
+        for end in (0, -1):
+            face = (slice(None),) * axis + (end,)
+            seeds[face] |= free[face] & ~ndimage.binary_fill_holes(~air[face])
+    return np.asarray(ndimage.binary_propagation(seeds, mask=free))
+
+
+def _blocks(values: BoolArray, stride: IntArray) -> BoolArray:
+    """Return which blocks of voxels hold a true one."""
+    padded = np.pad(values, [(0, int(-n % s)) for n, s in zip(values.shape, stride, strict=True)], mode="edge")
+    nz, ny, nx = (n // s for n, s in zip(padded.shape, stride, strict=True))
+    return np.asarray(padded.reshape(nz, stride[0], ny, stride[1], nx, stride[2]).any(axis=(1, 3, 5)))

@@ -27,12 +27,12 @@ def intensity_pair(reference: Volume, deformed: Volume) -> tuple[Float32Array, F
     InputError
         Grids that differ, a volume without contrast, infinite values, or no voxel that is known in both.
     """
-    if not reference.same_grid(deformed):
+    if different := reference.grid_difference(deformed):
         ratio = deformed.spacing_mm / reference.spacing_mm
         units = " Their spacings differ by a power of ten: was one stored in other units?" if _power_of_ten(ratio) else ""
         raise InputError(
-            f"reference and deformed lie on different grids ({_described(reference)}; {_described(deformed)}); resample deformed "
-            f"to the grid of the reference with naibu.imaging.resampled_to_grid.{units}"
+            f"reference and deformed lie on different grids: {different}; resample deformed to the grid of the reference with "
+            f"naibu.imaging.resampled_to_grid.{units}"
         )
     known = np.isfinite(reference.values)
     if not (known & np.isfinite(deformed.values)).any():
@@ -58,11 +58,6 @@ def shifted_intensity(values: AnyArray, shift: float, name: str) -> Float32Array
     if np.isinf(shifted).any():
         raise InputError(f"the {name} volume has infinite values; mask or repair them")
     return np.ascontiguousarray(shifted)
-
-
-def _described(volume: Volume) -> str:
-    size = " x ".join(str(n) for n in volume.shape[::-1])
-    return f"{size} voxels of {np.round(volume.spacing_mm, 4).tolist()} mm from {np.round(volume.origin_mm, 2).tolist()}"
 
 
 def _power_of_ten(ratio: FloatArray) -> bool:

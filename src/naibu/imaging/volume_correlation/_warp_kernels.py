@@ -167,8 +167,8 @@ def weighted_residuals(
 
     scalars: precision of the residual; variance of the sub-voxel jitter, mm^2; 1 / (residual, in residual SD, where the robust weight is
     1/4)^2; fraction of the gradient that is taken from the reference. gradient (n, 3) is replaced by the one that was used. agreement
-    (n, 2): product of both gradients, to which noise does not contribute on average, and mean of their squares, both times the weight. The
-    robust weight is that of :cite:t:`geman1987`.
+    (n, 12): symmetric products xx xy xz yy yz zz of both gradients, to which noise does not contribute on average, and of the one that was
+    used with itself, both times the weight. The robust weight is that of :cite:t:`geman1987`.
     """
     precision, jitter, robust, fraction = scalars[0], scalars[1], scalars[2], scalars[3]
     for p in prange(len(intensity)):
@@ -189,9 +189,29 @@ def weighted_residuals(
         q = F(1) / (F(1) + r * r * iv * robust)
         w = iv * q * q
         weight[p] = w
-        agreement[p, 0] = w * both
-        squares = gain[p] * gain[p] * (gradient[p, 0] * gradient[p, 0] + gradient[p, 1] * gradient[p, 1] + gradient[p, 2] * gradient[p, 2])
-        agreement[p, 1] = w * F(0.5) * (fx * fx + fy * fy + fz * fz + squares)
+        dx, dy, dz = w * gain[p] * gradient[p, 0], w * gain[p] * gradient[p, 1], w * gain[p] * gradient[p, 2]
+        agreement[p, 0], agreement[p, 3], agreement[p, 5] = fx * dx, fy * dy, fz * dz
+        agreement[p, 1], agreement[p, 2] = F(0.5) * (fx * dy + fy * dx), F(0.5) * (fx * dz + fz * dx)
+        agreement[p, 4] = F(0.5) * (fy * dz + fz * dy)
+        agreement[p, 6], agreement[p, 7], agreement[p, 8] = w * x * x, w * x * y, w * x * z
+        agreement[p, 9], agreement[p, 10], agreement[p, 11] = w * y * y, w * y * z, w * z * z
+        gradient[p, 0], gradient[p, 1], gradient[p, 2] = x, y, z
+        force[p, 0], force[p, 1], force[p, 2] = w * r * x, w * r * y, w * r * z
+        products[p, 0], products[p, 1], products[p, 2] = w * x * x, w * x * y, w * x * z
+        products[p, 3], products[p, 4], products[p, 5] = w * y * y, w * y * z, w * z * z
+
+
+@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
+def shrink_gradients(
+    reliability: AnyArray, cell: IntArray, weight: AnyArray, residual: AnyArray, gradient: AnyArray, products: AnyArray, force: AnyArray
+) -> None:
+    """Multiply gradients (n, 3) by the reliability (m, 3, 3) of their cell (n,), and renew weighted products (n, 6) and force (n, 3)."""
+    for p in prange(len(weight)):
+        w, r, m = weight[p], residual[p], reliability[cell[p]]
+        gx, gy, gz = gradient[p, 0], gradient[p, 1], gradient[p, 2]
+        x = m[0, 0] * gx + m[0, 1] * gy + m[0, 2] * gz
+        y = m[1, 0] * gx + m[1, 1] * gy + m[1, 2] * gz
+        z = m[2, 0] * gx + m[2, 1] * gy + m[2, 2] * gz
         gradient[p, 0], gradient[p, 1], gradient[p, 2] = x, y, z
         force[p, 0], force[p, 1], force[p, 2] = w * r * x, w * r * y, w * r * z
         products[p, 0], products[p, 1], products[p, 2] = w * x * x, w * x * y, w * x * z

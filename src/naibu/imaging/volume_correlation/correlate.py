@@ -25,25 +25,24 @@ from naibu.core.errors import InputError
 from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.field_of_view import Box, fields_of_view, in_box
-from naibu.imaging.preprocessing.object_mask import object_mask
+from naibu.imaging.preprocessing.object_mask import mask_in_view
 from naibu.imaging.preprocessing.resampling import require_mask
 from naibu.imaging.preprocessing.volume_pair import intensity_pair
+from naibu.imaging.volume_correlation.common_content import common_content, refuse_unrelated
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit, Iterations, chosen_weights
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.inclusion_candidates import LEAST_VOLUME, inclusion_candidates
 from naibu.imaging.volume_correlation.intensity_comparison import ComparisonSettings
 from naibu.imaging.volume_correlation.normal_equations import SplineSystem
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise
-from naibu.imaging.volume_correlation.result import CorrelationResult, collected
+from naibu.imaging.volume_correlation.result import CorrelationResult, collected, last_steps, still_mm
 from naibu.imaging.volume_correlation.rigid_inclusions import RigidInclusion, rigid_inclusions_among
 from naibu.imaging.volume_correlation.rigid_initialization import RigidInitialization, correlated_shift
 from naibu.imaging.volume_correlation.settings import REFERENCE_FRACTION, CorrelationSettings
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid
 
 LEAST_SIZE = 4  # voxels along an axis: cubic B-splines have four nodes in a cell
-# correlation of the image intensity gradients of the registered volumes, below which nothing was matched: two volumes of noise or of
-# unrelated textures reach 0.00 to 0.01, the same leg under 25 times its noise 0.16
-LEAST_AGREEMENT = 0.05
+MOST_MOVING = 0.33  # fraction of the cells that have not converged, above which nothing was found: 0.7 in legs of two persons
 LEAST_OVERLAP = 0.05  # fraction of the object in the deformed volume after its motion, below which the volumes do not overlap
 # No derivation stands behind the numbers below: they are empirical, and benchmarks/sense_volumes.py shows the effect of a change.
 VOXELS_PER_LONG_CELL = 2.5  # least number of voxels along a cell on the axis of the largest spacing
@@ -55,7 +54,6 @@ COARSE_JITTER = 0.15  # sub-voxel jitter SD on coarse grids, voxels
 COARSE_FRACTION = 0.5  # of the reference's gradient on coarse grids: far from registered, the mean of both gradients reaches furthest
 INCLUSION_SMOOTHING = 0.8  # of both volumes, for rigid inclusions, voxels
 WEIGHT_WINDOW = 1.9  # cells: standard deviation of the window in which cells share a weight
-AGREEMENT_WINDOW = 0.5  # cells: standard deviation of the window in which the gradients of both volumes are compared
 ADAPTATION_SAMPLES, ADAPTATIONS = 12, 4  # random fields of a round, and rounds, in which the weights are adapted
 INCLUSION_STEPS, ADAPTED_STEPS = 3, 5  # Gauss-Newton steps with rigid inclusions, and after each adaptation
 LEAST_WEIGHT = 1e-3  # of the dilatation weight of the round before
@@ -95,6 +93,7 @@ def correlate_volumes(
     deformed: Volume,
     *,
     mask: ArrayLike | None = None,
+    deformed_mask: ArrayLike | None = None,
     rigid_mask: ArrayLike | None = None,
     settings: CorrelationSettings = DEFAULT,
     progress: Progress | None = None,
@@ -106,7 +105,9 @@ def correlate_volumes(
     reference, deformed : Volume
         Volumes of the object before and after the deformation, on one grid and without NaN.
     mask : array_like, shape (nz, ny, nx), optional
-        Voxels of the object in the reference; by default the largest region brighter than the air about it, dilated by a voxel.
+        Voxels of the object in the reference; by default `naibu.imaging.object_mask`, dilated by a voxel.
+    deformed_mask : array_like, shape (nz, ny, nx), optional
+        Voxels of the object in the deformed volume, from whose position and outline the search starts; by default they are found likewise.
     rigid_mask : array_like, shape (nz, ny, nx), bool or int, optional
         Rigid inclusions: labels from 1, or true in each connected inclusion; by default they are found.
     settings : CorrelationSettings
@@ -117,20 +118,23 @@ def correlate_volumes(
     Returns
     -------
     CorrelationResult
-        Valid in the mask, where it lies in the deformed volume after its motion.
+        Valid in the mask, where it lies in the deformed volume after its motion, and where both volumes show the same texture.
 
     Raises
     ------
     InputError
         Volumes on different grids, of few slices, constant or with NaN in their field of view; an empty mask; volumes that do not overlap,
-        or have no content in common.
+        or have no content in common, or not enough to be sure that they show the same object.
 
     Notes
     -----
+    Where the inside of the object has no texture that both volumes share the displacement is not answered: a smooth field would be an
+    extrapolation from the surface, which does not show how it moves along itself.
+
     Outer planes of NaN or of one intensity are padding: they are excluded from the comparison, and the displacement of what they hide is
     not answered (see `naibu.imaging.preprocessing.field_of_view`).
     """
-    correlation = _Correlation(reference, deformed, mask, settings, progress)
+    correlation = _Correlation(reference, deformed, (mask, deformed_mask), settings, progress)
     correlation.initialize()
     correlation.refine()
     correlation.find_inclusions(rigid_mask)
@@ -142,17 +146,24 @@ class _Correlation:
     """State of a correlation that its steps hand on."""
 
     def __init__(
-        self, reference: Volume, deformed: Volume, mask: ArrayLike | None, settings: CorrelationSettings, progress: Progress | None
+        self,
+        reference: Volume,
+        deformed: Volume,
+        masks: tuple[ArrayLike | None, ArrayLike | None],
+        settings: CorrelationSettings,
+        progress: Progress | None,
     ) -> None:
+        mask, deformed_mask = masks
         self.volume, self.settings, self.progress = reference, settings, progress
         _check_shape(reference, deformed)
         self.views = fields_of_view(reference, deformed)
         if any(max(a.start, b.start) >= min(a.stop, b.stop) for a, b in zip(*self.views, strict=True)):
             raise InputError("reference and deformed do not overlap: no voxel is known in both; check the transform that registered them")
         self.reference, self.deformed = _filled_pair(reference, deformed, self.views)
-        self.mask = _mask_in(self.views[0], reference, margin=1) if mask is None else require_mask(mask, reference)
+        self.mask = mask_in_view(reference, self.views[0], margin=1) if mask is None else require_mask(mask, reference)
         self.mask = self.mask & in_box(self.views[0], reference.shape)
         self.deformed_volume = deformed
+        self.deformed_mask = None if deformed_mask is None else require_mask(deformed_mask, deformed, name="deformed_mask")
         where = np.argwhere(self.mask)
         if not len(where):
             raise InputError("mask is empty: it holds no voxel of the object")
@@ -179,7 +190,6 @@ class _Correlation:
             s.jitter_sd_voxels if fine else COARSE_JITTER,
             REFERENCE_FRACTION[s.gradients] if fine else COARSE_FRACTION,
             cell,
-            agreement_window_mm=AGREEMENT_WINDOW * float(self.step.mean()) if fine else 0.0,
             far=level == 0,
         )
 
@@ -200,7 +210,7 @@ class _Correlation:
         shifts = [np.zeros(3), correlated_shift(self.reference[thin] * self.mask[thin], self.deformed[thin], level.spacing)]
         # only what both scans can show is compared: else the part that one of them lacks would shift the centroid and stretch the outline
         both = in_box(self.views[0], self.mask.shape) & in_box(self.views[1], self.mask.shape)
-        shown = _mask_in(self.views[1], self.deformed_volume)
+        shown = mask_in_view(self.deformed_volume, self.views[1]) if self.deformed_mask is None else self.deformed_mask
         after, before = (np.argwhere(m & both if (m & both).any() else m)[:, ::-1] * self.spacing for m in (shown, self.mask))
         shifts.append(after.mean(axis=0) - before.mean(axis=0))
         start = RigidInitialization(level)
@@ -225,13 +235,14 @@ class _Correlation:
             if k == 0 or stride != self.strides[k - 1]:
                 level = self.level(stride, self.settings.smoothing_voxels)
             system = SplineSystem(level, self.grid, self.ratio)
-            self.fit = CorrelationFit(level, system, self.comparison(k))
+            self.fit = CorrelationFit(level, system, self.comparison(k), noisy=k > 1)
             self.bending, self.dilatation = self.weights(system, LEVELS[k].bending)
             iterations = Iterations(LEVELS[k].steps, anchoring=LEVELS[k].anchoring)
             self.c = self.fit.iterate(self.c, self.bending, self.dilatation * system.gauss_volume, iterations)
             report_progress(
                 self.progress, "coarse-to-fine correlation", done=k + 1, total=len(self.strides), objective=self.fit.residual_sd
             )
+        refuse_unrelated(self.fit)
 
     def find_inclusions(self, rigid_mask: ArrayLike | None) -> None:
         """Find the inclusions that move rigidly, and give each a rigid motion."""
@@ -269,11 +280,20 @@ class _Correlation:
             if self.dilatation > 0.5 * before:
                 break
 
+    def depth_mm(self, level: ImageLevel) -> Float32Array:
+        """Return the distance (n,) of the listed voxels of the finest level from the surface, mm; the ends of the volume are none."""
+        low, high = np.maximum(level.low - 1, 0), level.high + 1
+        box = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+        inner = tuple(slice(int(a), int(b)) for a, b in zip(level.low - low, level.high - low, strict=True))
+        depth = ndimage.distance_transform_edt(self.mask[box], sampling=self.spacing[::-1])
+        return np.asarray(depth[inner][level.mask], dtype=np.float32)
+
     def result(self) -> CorrelationResult:
         """Draw the covariance, and return the result."""
         report_progress(self.progress, "covariance")
         fit, system = self.fit, self.fit.system
         dilatation = self.dilatation * system.gauss_volume
+        fit.reliability = None
         fit.compare(self.c)
         fit.system.assembled(self.c, fit.products, fit.force, self.bending, dilatation)
         if fit.seen.mean() < LEAST_OVERLAP:
@@ -281,17 +301,20 @@ class _Correlation:
                 f"only {fit.seen.mean():.1%} of the object lies in the deformed volume after its motion: the volumes do not overlap, or do "
                 "not show the same object"
             )
-        agreement = fit.gradient_correlation
-        if agreement < LEAST_AGREEMENT:
+        refuse_unrelated(fit)
+        content = common_content(fit, self.depth_mm(fit.level))
+        content.refuse_chance(system.inner)
+        moving = float((last_steps(fit)[system.inner] > still_mm(fit)).mean())
+        if moving > MOST_MOVING:
             raise InputError(
-                f"the volumes show no common content: after registration their intensity gradients correlate by {agreement:.2f} (1 for "
-                "identical volumes, 0 by chance); check that both show the same object, at the same positions of the grid"
+                f"no displacement fits the volumes: {moving:.0%} of the object had not converged after the last step; check that both show "
+                "the same object, and give masks of it if there is much else in them"
             )
         for inclusion in self.inclusions:
             inclusion.draws.clear()
         noise = ResidualNoise(fit.level.mask, fit.residual * np.sqrt(fit.weight), _lost_to_robustness(fit))
         samples = fit.samples(self.c, self.bending, dilatation, self.settings.samples, noise, self.settings.seed + 1)
-        return collected(self.volume, self.mask, fit, self.c, samples, self.bending, self.dilatation)
+        return collected(self.volume, fit, self.c, samples, self.bending, self.dilatation, content.matched)
 
 
 def _check_shape(reference: Volume, deformed: Volume) -> None:
@@ -321,14 +344,6 @@ def _filled(name: str, volume: Volume, view: Box) -> Volume:
     if inside.shape != values.shape:
         values = np.where(in_box(view, values.shape), values, inside.mean(dtype=np.float64).astype(np.float32))
     return volume.with_values(values)
-
-
-def _mask_in(view: Box, volume: Volume, *, margin: int = 0) -> BoolArray:
-    """Return the object (nz, ny, nx) that the field of view of a volume shows."""
-    mask = np.zeros(volume.shape, dtype=bool)
-    shown = Volume.from_array(np.asarray(volume.values)[view], spacing_mm=volume.spacing_mm)
-    mask[view] = object_mask(shown, margin=margin)
-    return mask
 
 
 def _step(settings: CorrelationSettings, mask: BoolArray, spacing: FloatArray) -> FloatArray:

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import ndimage
 
-from naibu.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from naibu.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray, IntArray
+from naibu.imaging.volume_correlation._warp_kernels import shrink_gradients
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.intensity_comparison import ComparisonSettings, IntensityComparison
 from naibu.imaging.volume_correlation.normal_equations import SplineSystem
@@ -25,6 +27,12 @@ SAMPLES_AT_ONCE = 16  # right sides of one solve, which bounds its memory
 # empirical, fractions of the unknowns: at least so many count as determined by the data of a kind, and a cell's own weight starts from the
 # common one with the worth of so many
 LEAST_FRACTION, COMMON = 0.02, 0.05
+
+
+AGREEMENT_WINDOW = 0.5  # cells: standard deviation of the window in which the gradients of both volumes are compared
+LEAST_RELIABILITY = 0.01  # keeps the normal matrix regular where the gradients do not agree at all
+REGULAR = 1e-6  # of the trace: gradients of a cell may all have one direction
+FRESH = 2  # steps at which the reliability of the gradients is estimated anew: it varies little from step to step
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,20 +59,45 @@ class Iterations:
 
 
 class CorrelationFit(IntensityComparison):
-    """Gauss-Newton fit of a displacement field on a spline grid to the voxels of a level."""
+    """Gauss-Newton fit of a displacement field on a spline grid to the voxels of a level.
+
+    With `noisy` the gradients are multiplied by their reliability, cell by cell.
+    """
 
     def __init__(
-        self, level: ImageLevel, system: SplineSystem, settings: ComparisonSettings, inclusions: Sequence[RigidInclusion] = ()
+        self,
+        level: ImageLevel,
+        system: SplineSystem,
+        settings: ComparisonSettings,
+        inclusions: Sequence[RigidInclusion] = (),
+        *,
+        noisy: bool = False,
     ) -> None:
         super().__init__(level, settings)
-        self.system, self.inclusions = system, inclusions
+        self.system, self.inclusions, self.noisy = system, inclusions, noisy
+        self.reliability: Float32Array | None = None
         self.last_step = np.zeros((system.n, 3), np.float32)
+
+    @cached_property
+    def cell_of_voxel(self) -> IntArray:
+        """Number of the cell of every listed voxel (n,)."""
+        system, level = self.system, self.level
+        where = (level.index.astype(np.int64) - level.low[::-1]).T
+        number = np.full(tuple(int(n) for n in system.grid.cells[::-1]), -1, np.int64)
+        number[tuple(system.cells[:, 2:].T)] = np.arange(len(system.cells))
+        return np.asarray(number[tuple(system.cell_of[a][where[a]] for a in (2, 1, 0))])
+
+    def cell_sums(self, values: AnyFloatArray) -> FloatArray:
+        """Return the sums (m,) over the listed voxels (n,) of every cell."""
+        return np.bincount(self.cell_of_voxel, np.asarray(values, dtype=float), minlength=len(self.system.cells)).astype(float)
 
     def iterate(self, c: FloatArray, bending: FloatArray, dilatation: FloatArray, times: Iterations) -> FloatArray:
         """Return the coefficients after Gauss-Newton steps from c; bending (m, 3) and dilatation (m,) are weights of the cells."""
         voxel = float(np.prod(self.level.spacing) ** (1 / 3))
         first = None
-        for _ in range(times.most):
+        for k in range(times.most):
+            if k < FRESH:
+                self.reliability = None
             self.compare(c)
             if times.anchoring:
                 first = self.displacement.copy() if first is None else first
@@ -85,8 +118,35 @@ class CorrelationFit(IntensityComparison):
         """Warp, weight the residuals at coefficients c, and let rigid inclusions replace those of their voxels."""
         self.system.warped(c, self.value, self.reference_gradient, self.gradient, self.displacement)
         self.weigh()
+        if self.noisy:
+            if self.reliability is None:
+                self.reliability = self._reliability()
+            shrink_gradients(self.reliability, self.cell_of_voxel, self.weight, self.residual, self.gradient, self.products, self.force)
         for inclusion in self.inclusions:
             inclusion.follow(self)
+
+    def windowed(self, values: FloatArray, width: float) -> FloatArray:
+        """Return values (m, ...) of the cells summed in a Gaussian window of a standard deviation in cells."""
+        dense = np.zeros((*(int(n) for n in self.system.grid.cells[::-1]), *values.shape[1:]))
+        at = tuple(self.system.cells[:, 2:].T)
+        dense[at] = values
+        sigma = (width,) * 3 + (0,) * (values.ndim - 1)
+        return np.asarray(ndimage.gaussian_filter(dense, sigma, mode="constant")[at])
+
+    def _reliability(self) -> Float32Array:
+        """Return the matrix (m, 3, 3) by which a gradient in every cell is multiplied to leave out what is noise in it.
+
+        It is the local regression of the gradient of one volume on that of the other :cite:p:`fuller1987`. Noise would else count as
+        information, above all in directions in which the image varies little, such as along a surface.
+        """
+        sums = np.stack([self.cell_sums(self.agreement[:, k]) for k in range(12)], axis=-1)
+        common, own = (_symmetric(v) for v in np.split(self.windowed(sums, AGREEMENT_WINDOW), 2, axis=-1))
+        trace = np.trace(own, axis1=1, axis2=2)[:, None, None]
+        root = np.linalg.cholesky(own + (REGULAR * trace + 1e-30) * np.eye(3))
+        inverse = np.linalg.inv(root)
+        shares, axes = np.linalg.eigh(inverse @ common @ np.swapaxes(inverse, 1, 2))
+        clipped = (axes * np.clip(shares, LEAST_RELIABILITY, 1.0)[:, None, :]) @ np.swapaxes(axes, 1, 2)
+        return np.ascontiguousarray(root @ clipped @ inverse, dtype=np.float32)
 
     def samples(
         self, c: FloatArray, bending: FloatArray, dilatation: FloatArray, count: int, noise: ResidualNoise | None, seed: int
@@ -179,3 +239,8 @@ def _unknowns(system: SplineSystem, bending: FloatArray) -> FloatArray:
     for a in range(64):
         out += diagonal[a] * bending / total[z + (a >> 4), y + ((a >> 2) & 3), x + (a & 3)]
     return out
+
+
+def _symmetric(values: FloatArray) -> FloatArray:
+    """Return the symmetric matrices (m, 3, 3) of components xx, xy, xz, yy, yz, zz (m, 6)."""
+    return np.asarray(values[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]])

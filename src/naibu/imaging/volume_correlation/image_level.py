@@ -94,6 +94,11 @@ class ImageLevel:
         """Fill value (n,) and gradient (n, 3), per voxel, of the deformed volume at positions (n, 3), mm; OUTSIDE beyond its view."""
         sample_spline(self.deformed, (positions_mm / self.spacing - self.first).astype(np.float32), value, gradient)
 
+    def shows(self, positions_mm: FloatArray) -> BoolArray:
+        """Return which positions (n, 3), mm, lie in a voxel of the field of view of the deformed volume, the outer halves included."""
+        at = positions_mm / self.spacing - self.first
+        return np.asarray(((at >= -0.5) & (at <= np.array(self.deformed.shape[::-1]) - 3 - 0.5)).all(axis=1))
+
     @property
     def axes_mm(self) -> list[FloatArray]:
         """Coordinates of the voxels of the box along x, y, z, mm."""

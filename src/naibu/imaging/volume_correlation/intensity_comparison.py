@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
 
 from naibu.core.arrays import BoolArray, Float32Array
 from naibu.imaging.volume_correlation._warp_kernels import OUTSIDE, weighted_residuals
 from naibu.imaging.volume_correlation.image_level import GainMap, ImageLevel
 
 MAD = 1.4826  # standard deviation of a normal distribution, in median absolute deviations
-LEAST_AGREEMENT = 0.01  # lower bound of a weight, which keeps the normal matrix regular where the gradients do not agree at all
 ROUNDING = 1e-6  # least residual SD, of the intensity range: identical volumes would divide by zero
 
 
@@ -30,8 +28,6 @@ class ComparisonSettings:
         Fraction of the image intensity gradient that is taken from the reference; the rest from the deformed volume.
     gain_cell_mm : float
         Cell size of the lattice of local gain, mm; 0 for one gain.
-    agreement_window_mm : float
-        Standard deviation of the window in which the gradients of both volumes are compared, mm; 0 to weight no voxel by it.
     far : bool
         Whether the volumes are far from registered: the residual SD is then that of all residuals, those at edges included.
     """
@@ -40,7 +36,6 @@ class ComparisonSettings:
     jitter_sd_voxels: float
     reference_fraction: float
     gain_cell_mm: float
-    agreement_window_mm: float = 0.0
     far: bool = False
 
 
@@ -68,7 +63,7 @@ class IntensityComparison:
         n = len(level.intensity)
         self.value, self.residual, self.weight = (np.zeros(n, np.float32) for _ in range(3))
         self.reference_gradient, self.gradient, self.displacement, self.force = (np.zeros((n, 3), np.float32) for _ in range(4))
-        self.products, self.agreement = np.zeros((n, 6), np.float32), np.zeros((n, 2), np.float32)
+        self.products, self.agreement = np.zeros((n, 6), np.float32), np.zeros((n, 12), np.float32)
         self.gain, self.offset = np.ones(n, np.float32), np.zeros(n, np.float32)
         self.robust_weight, self.residual_sd = np.ones(n, np.float32), 0.0
 
@@ -94,14 +89,12 @@ class IntensityComparison:
             self.level.intensity, self.value, self.gain, self.offset, self.reference_gradient, self.gradient, scalars.astype(np.float32),
             self.products, self.force, self.weight, self.residual, self.agreement,
         )  # fmt: skip
-        if s.agreement_window_mm:
-            self._weigh_by_agreement()
 
     @property
     def gradient_correlation(self) -> float:
         """Correlation of the image intensity gradients of both volumes over all voxels that are seen."""
         both = self.agreement[self.seen].sum(axis=0, dtype=np.float64)
-        return float(both[0] / max(float(both[1]), 1e-30))
+        return float(both[[0, 3, 5]].sum() / max(float(both[[6, 9, 11]].sum()), 1e-30))
 
     def anchor(self, first: Float32Array, fraction: float) -> None:
         """Add springs to displacements `first` (n, 3), mm, of a fraction of the mean stiffness that the intensities give."""
@@ -110,19 +103,6 @@ class IntensityComparison:
         for k in (0, 3, 5):
             self.products[:, k] += strength
         self.force -= strength * (self.displacement - first)
-
-    def _weigh_by_agreement(self) -> None:
-        """Multiply weights by the local correlation of the gradients of both volumes, which is low where they are mostly noise."""
-        both = []
-        for k in range(2):
-            box = np.zeros(self.level.mask.shape, np.float32)
-            box[self.level.mask] = self.agreement[:, k]
-            wide = ndimage.gaussian_filter(box, self.settings.agreement_window_mm / self.level.spacing[::-1], mode="constant", truncate=2.5)
-            both.append(wide[self.level.mask])
-        agreement = np.clip(both[0] / np.maximum(both[1], 1e-30), LEAST_AGREEMENT, 1.0)
-        for values in (self.products, self.force):
-            values *= agreement[:, None]
-        self.weight *= agreement
 
     def _update_residual_sd(self, seen: BoolArray) -> None:
         r = np.where(seen, self.level.intensity - self.gain * self.value - self.offset, 0)

@@ -107,11 +107,13 @@ class SplineSystem:
         for o in range(REACH**3):
             self.neighbours[:, o] = wide[z + o // 49, y + (o // 7) % 7, x + o % 7]
 
-    def at_middles(self, coefficients: Float32Array) -> FloatArray:
-        """Return the field (k, 3) of coefficients (n, 3) in the middles of the cells that lie in the object."""
+    def at_middles(self, coefficients: Float32Array, *, every: bool = False) -> FloatArray:
+        """Return the field (k, 3) of coefficients (n, 3) in the middles of the cells that lie in the object, or of every cell."""
         full = np.zeros((*self.active.shape, 3))
         full[self.active] = coefficients
-        return self.grid.values(full, self.grid.origin_mm + (self.cells[self.inner][:, :1:-1] + 0.5) * self.grid.step_mm)
+        return self.grid.values(
+            full, self.grid.origin_mm + (self.cells[slice(None) if every else self.inner][:, :1:-1] + 0.5) * self.grid.step_mm
+        )
 
     def warped(
         self, c: FloatArray, value: Float32Array, reference_gradient: Float32Array, gradient: Float32Array, displacement: Float32Array

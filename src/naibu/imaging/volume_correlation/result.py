@@ -21,6 +21,7 @@ from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable
 VOXELS_PER_CELL = 6  # at which the random fields are evaluated: splines vary little within a cell
 SHARED = 0.7  # empirical, cells: SD of the window in which cells share their samples
 STILL = 0.1  # voxels: step below which a cell has converged
+REMAINING = 5.0  # empirical: last steps that a cell which has not converged may still be away from the solution
 # empirical: displacement that is not resolved, of the root mean square second derivative times the square of the resolved length
 UNRESOLVED = 0.055
 SQUARE = 151 / 315  # integral of the square of a cubic B-spline along an axis, in cells
@@ -197,14 +198,26 @@ class CorrelationResult:
 
 
 def collected(
-    volume: Volume, mask: BoolArray, fit: CorrelationFit, c: FloatArray, samples: Float32Array, bending: FloatArray, dilatation: float
+    volume: Volume,
+    fit: CorrelationFit,
+    c: FloatArray,
+    samples: Float32Array,
+    bending: FloatArray,
+    dilatation: float,
+    matched: BoolArray,
 ) -> CorrelationResult:
-    """Return the result of a fit at full resolution; `samples` (n, 3, s) are random coefficients about c."""
+    """Return the result of a fit at full resolution.
+
+    `samples` (n, 3, s) are random coefficients about c. Soft cells (m,) that are not matched are not answered.
+    """
     system, level = fit.system, fit.level
     box = tuple(slice(int(a), int(b)) for a, b in zip(level.low, level.high, strict=True))
     valid = np.zeros(volume.shape, dtype=bool)
     inside = level.mask.copy()
-    inside[level.mask] = fit.seen
+    answered = matched[fit.cell_of_voxel]
+    for inclusion in fit.inclusions:
+        answered[inclusion.voxels] = True
+    inside[level.mask] = answered & level.shows(level.index * level.spacing + fit.displacement)
     valid[box] = inside
     axes = [np.arange(n) * s for n, s in zip(volume.shape[::-1], volume.spacing_mm, strict=True)]
     vectors = separable([system.grid.matrix(a, axes[a]) for a in range(3)], c)
@@ -219,18 +232,28 @@ def collected(
     vectors[~valid] = np.nan
     maps = [np.full(volume.shape, np.nan) for _ in range(2)]
     for full, listed in zip(maps, (fit.gain, fit.offset), strict=True):
-        full[valid] = listed[fit.seen]
-    covariance = _per_cell(
-        system.grid, fit, sampled_covariance(fit, samples) + _unresolved(fit, c, samples, bending)[:, None, None] * np.eye(3)
-    )
+        full[box][level.mask] = listed
+        full[~valid] = np.nan
+    moving = last_steps(fit)
+    variance = _unresolved(fit, c, samples, bending) + np.where(moving > still_mm(fit), (REMAINING * moving) ** 2, 0.0)
+    covariance = _per_cell(system.grid, fit, sampled_covariance(fit, samples) + variance[:, None, None] * np.eye(3))
     converged = np.ones(tuple(int(n) for n in system.grid.cells[::-1]), dtype=bool)
-    still = np.linalg.norm(system.at_middles(fit.last_step), axis=1) <= STILL * np.prod(level.spacing) ** (1 / 3)
-    converged[tuple(system.cells[system.inner, 2:].T)] = still
+    converged[tuple(system.cells[:, 2:].T)] = (moving <= still_mm(fit)) | ~system.inner
     return CorrelationResult(
         DisplacementField.on_grid(volume, vectors, valid=valid), system.grid, c, volume.direction @ covariance @ volume.direction.T,
         _per_cell(system.grid, fit, bending), dilatation, fit.residual_sd, maps[0], maps[1], converged, inclusions, motions,
         _status(system.grid, volume, converged),
     )  # fmt: skip
+
+
+def last_steps(fit: CorrelationFit) -> FloatArray:
+    """Return how far the middle of every cell (m,) was moved by the last step, mm."""
+    return np.asarray(np.linalg.norm(fit.system.at_middles(fit.last_step, every=True), axis=1))
+
+
+def still_mm(fit: CorrelationFit) -> float:
+    """Return the length of a step, mm, below which a cell has converged."""
+    return STILL * float(np.prod(fit.level.spacing) ** (1 / 3))
 
 
 def sampled_covariance(fit: CorrelationFit, samples: Float32Array) -> FloatArray:
@@ -272,8 +295,7 @@ def _unresolved(fit: CorrelationFit, c: FloatArray, samples: Float32Array, bendi
     system = fit.system
     h = float(np.prod(system.grid.step_mm) ** (1 / 3))
     likely = (system.bending_energy + system.energies(samples, c)[0]).astype(float).mean(axis=1) / h**3
-    cell, _ = cells_of_voxels(fit)
-    known = np.bincount(cell, fit.products[:, [0, 3, 5]].sum(axis=1) / 3, minlength=len(system.cells))
+    known = fit.cell_sums(fit.products[:, [0, 3, 5]].sum(axis=1) / 3)
     dense = np.zeros((*(int(n) for n in system.grid.cells[::-1]), 2))
     at = tuple(system.cells[:, 2:].T)
     dense[at] = np.stack([SQUARE**3 * known, bending.mean(axis=1) * float(np.trace(system.stiffness))], axis=-1)
@@ -282,19 +304,10 @@ def _unresolved(fit: CorrelationFit, c: FloatArray, samples: Float32Array, bendi
     return np.asarray((UNRESOLVED * h**2) ** 2 * fraction ** (-4 / 3) * likely)
 
 
-def cells_of_voxels(fit: CorrelationFit) -> tuple[IntArray, IntArray]:
-    """Return the cell of every listed voxel (n,), and the number of voxels of every cell (m,)."""
-    system, level = fit.system, fit.level
-    where = (level.index.astype(np.int64) - level.low[::-1]).T
-    number = np.full(tuple(int(n) for n in system.grid.cells[::-1]), -1, np.int64)
-    number[tuple(system.cells[:, 2:].T)] = np.arange(len(system.cells))
-    of = number[tuple(system.cell_of[a][where[a]] for a in (2, 1, 0))]
-    return of, np.bincount(of, minlength=len(system.cells))
-
-
 def _some_voxels(fit: CorrelationFit) -> tuple[IntArray, IntArray]:
     """Return cells and listed voxels, a few of them spread over every cell."""
-    of, count = cells_of_voxels(fit)
+    of = fit.cell_of_voxel
+    count = np.bincount(of, minlength=len(fit.system.cells))
     order = np.argsort(of, kind="stable")
     first = np.cumsum(count) - count
     rank = np.arange(len(of)) - first[of[order]]

@@ -1,0 +1,119 @@
+"""Test of a volume correlation against chance: whether both volumes show the same content, cell by cell.
+
+Any search finds some displacement, also between volumes that have nothing in common. Two things tell it from the true one, neither of
+which needs the noise to be known: the image intensity gradients of both volumes agree, and the residual has no structure of an image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from naibu.core.arrays import BoolArray, Float32Array, FloatArray
+from naibu.core.errors import InputError
+from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
+
+# correlation of the image intensity gradients of the registered volumes, below which nothing was matched: two volumes of noise or of
+# unrelated textures reach 0.00 to 0.01, the same leg under 25 times its noise 0.16
+LEAST_AGREEMENT = 0.05
+# the same in a window of a few cells, without the surface: by chance up to 0.25, in the leg under three times its
+# noise 0.44 or more; below, a cell has no texture, or not the same in both volumes
+MATCHED, LEAST_MATCHED = 0.3, 0.75
+# autocorrelation of the residual at a distance of two voxels: -0.05 to 0.1 where it is the noise of an image that was smoothed by half a
+# voxel, 0.3 where both volumes show different things
+STRUCTURED = 0.15
+LAG = 2
+WINDOWS = (1.0, 2.0, 4.0)  # cells: SDs of the windows in which a cell is judged, the first that holds enough of the inside
+SURFACE = 1.5  # cells: depth below which a voxel may show the contrast of the surface
+LEAST_VOXELS = 40  # of the inside of the object in a window; thinner objects are judged by their surface, too
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CommonContent:
+    """What the cells of a fit have in common in both volumes.
+
+    Attributes
+    ----------
+    agreement : ndarray, shape (m,)
+        Regression of the image intensity gradients of one volume on those of the other: 1 for identical volumes, 0 by chance. The surface
+        is left out: it says how the object is bounded, and not how what is inside has moved.
+    structure : ndarray, shape (m,)
+        Autocorrelation of the residual two voxels apart.
+    """
+
+    agreement: FloatArray
+    structure: FloatArray
+
+    @property
+    def matched(self) -> BoolArray:
+        """Cells (m,) with a texture that both volumes share; the displacement of others would be an extrapolation."""
+        return self.agreement > MATCHED
+
+    def refuse_chance(self, inner: BoolArray) -> None:
+        """Refuse volumes that agree in a part of the given cells (m,) only, and differ elsewhere by more than noise.
+
+        Raises
+        ------
+        InputError
+            Such volumes.
+        """
+        share, other = float(self.matched[inner].mean()), inner & ~self.matched
+        if share < LEAST_MATCHED and float(np.median(self.structure[other])) > STRUCTURED:
+            raise InputError(
+                f"the volumes match in {share:.0%} of the object only, and what is left elsewhere after registration has the structure of "
+                f"an image (autocorrelation {np.median(self.structure[other]):.2f} at {LAG} voxels; that of noise is below "
+                f"{STRUCTURED:g}): "
+                "check that both show the same object; where it has no texture only markers can be followed (naibu.imaging.detect_markers)"
+            )
+
+
+def refuse_unrelated(fit: CorrelationFit) -> None:
+    """Refuse volumes whose gradients do not agree anywhere, such as noise.
+
+    Raises
+    ------
+    InputError
+        Such volumes.
+    """
+    agreement = fit.gradient_correlation
+    if agreement < LEAST_AGREEMENT:
+        raise InputError(
+            f"the volumes show no common content: after registration their intensity gradients correlate by {agreement:.2f} (1 for "
+            "identical volumes, 0 by chance); check that both show the same object, at the same positions of the grid"
+        )
+
+
+def common_content(fit: CorrelationFit, depth_mm: Float32Array) -> CommonContent:
+    """Return what the cells of a fit have in common.
+
+    Parameters
+    ----------
+    fit : CorrelationFit
+        After `compare`.
+    depth_mm : ndarray, shape (n,)
+        Distance of the listed voxels from the surface of the object, mm.
+    """
+    inside = depth_mm > SURFACE * float(fit.system.grid.step_mm.mean())
+    traces = np.stack([fit.agreement[:, axes].sum(axis=1) for axes in ([0, 3, 5], [6, 9, 11])], axis=1)
+    every = np.column_stack([traces, np.ones(len(traces))])
+    sums = [np.stack([fit.cell_sums(v) for v in rows.T], axis=1) for rows in (every, every * inside[:, None])]
+    judged = fit.windowed(sums[0], WINDOWS[0])
+    for width in WINDOWS[::-1]:
+        deep = fit.windowed(sums[1], width) * (2.0 * np.sqrt(np.pi) * width) ** 3
+        judged = np.where(deep[:, 2:] > LEAST_VOXELS, deep, judged)
+    residual = fit.residual * np.sqrt(fit.weight)
+    structure = [fit.windowed(fit.cell_sums(v), WINDOWS[0]) for v in (_lagged(fit, residual), residual**2)]
+    return CommonContent(judged[:, 0] / np.maximum(judged[:, 1], 1e-30), structure[0] / np.maximum(structure[1], 1e-30))
+
+
+def _lagged(fit: CorrelationFit, residual: Float32Array) -> Float32Array:
+    """Return the mean products (n,) of residuals and those of the voxels LAG further along the axes of the finest voxels."""
+    spacing = fit.level.spacing
+    axes = [2 - a for a in range(3) if spacing[a] < 1.5 * spacing.min() and fit.level.mask.shape[2 - a] > LAG]
+    box, total = np.zeros(fit.level.mask.shape, np.float32), np.zeros(fit.level.mask.shape, np.float32)
+    box[fit.level.mask] = residual
+    for axis in axes:
+        here, there = (tuple(s if a == axis else slice(None) for a in range(3)) for s in (slice(None, -LAG), slice(LAG, None)))
+        total[here] += box[here] * box[there] / len(axes)
+    return np.asarray(total[fit.level.mask])
