@@ -1,15 +1,18 @@
 from .equilibrium_gap.batch import EquilibriumGapEstimate, batch_equilibrium_gap
 from .equilibrium_gap.incremental import IncrementalEstimate, incremental_equilibrium_gap
 from .equilibrium_gap.weighted import weighted_equilibrium_gap
+from .from_fields.assumptions import Assumption
 from .from_fields.estimate import FieldEstimate, identify_field
 from .from_fields.experiment_design import Accuracy, expected_accuracy
-from .from_fields.load_cases import FieldLoadCase, Zones
-from .from_fields.uncertainty import cramer_rao_bound
+from .from_fields.load_cases import FieldLoadCase, KnownRegion, Zones
+from .from_fields.uncertainty import ErrorBudget, cramer_rao_bound
+from .from_fields.verdict import FieldVerdict
 from .from_markers.calibration import Calibration, calibrate
 from .from_markers.gauss_newton import MatchingSettings
 from .from_markers.known_materials import KnownMaterials
 from .from_markers.observations import NoiseModel
 from .from_markers.specimen_model import ModelSettings
+from .from_markers.verdict import Explanation, Verdict
 from .from_motion.rheology import MotionEstimate, MotionLoadCase, identify_motion
 from .lattice_calibration.evolutionary import search_cma_es, search_genetic
 from .lattice_calibration.forward_model import Capture, PushedFace, Pushing
@@ -25,16 +28,21 @@ from .prediction.prediction import Prediction, predict_state
 
 __all__ = [
     "Accuracy",
+    "Assumption",
     "CalibratedModel",
     "Calibration",
     "CalibrationProblem",
     "Capture",
     "CompressionTest",
     "EquilibriumGapEstimate",
+    "ErrorBudget",
+    "Explanation",
     "FieldEstimate",
     "FieldLoadCase",
+    "FieldVerdict",
     "IncrementalEstimate",
     "KnownMaterials",
+    "KnownRegion",
     "LatticeEstimate",
     "LatticeUnknowns",
     "LeftOut",
@@ -52,6 +60,7 @@ __all__ = [
     "ReportIndices",
     "Specimen",
     "SpecimenMean",
+    "Verdict",
     "Zones",
     "baselines",
     "batch_equilibrium_gap",

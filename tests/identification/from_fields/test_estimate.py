@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from other_mesh import grid_of_points, load_cases_of
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.estimate import FieldEstimate, identify_field
+from naibu.identification.from_fields.estimate import FieldEstimate
+from naibu.identification.from_fields.estimate import identify_field as identify_accurately
 from naibu.identification.from_fields.gauss_newton import Bounds, Objective, SearchSettings, exact_step, first_point, search
 from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.regularization import Laplacian, TotalVariation, ZoneGraph
@@ -26,6 +28,7 @@ from naibu.meshing.point_location import interpolation_operator
 from naibu.meshing.primitives import box
 from naibu.reproduction.chapter3.bodies import LAYERS, UNIFORM, PushedBody, cube
 
+identify_field = partial(identify_accurately, elements="as_given")  # for data that were computed with these very elements
 LAWS = ("linear", "neo_hookean")
 PRESS, SHEAR, CROSS, LEAN = (0.0, 0.0, -10.0), (7.0, 0.0, -7.0), (0.0, 7.0, -7.0), (4.0, 4.0, -8.0)
 TRUE_YOUNG, TRUE_POISSON = np.array([v[0] for v in LAYERS.values()]), np.array([v[1] for v in LAYERS.values()])
@@ -51,7 +54,7 @@ def at_some_point(law: str, *, each_cell: bool = False, seed: int = 0) -> tuple[
     """A point away from the best one, so that residuals are large, with two trials."""
     body = layered(law, (PRESS, SHEAR))
     zones = body.zones(each_cell=each_cell)
-    model = FieldModel(body.mesh, body.load_cases(sd_mm=0.1, seed=seed), zones, law)  # type: ignore[arg-type]
+    model = FieldModel(body.mesh, body.load_cases(sd_mm=0.1, seed=seed), zones, law, "as_given")  # type: ignore[arg-type]
     rng = np.random.default_rng(seed)
     point = first_point(model, true_theta(body, zones) + 0.1 * rng.standard_normal(2 * zones.count))
     return model, point
@@ -114,7 +117,7 @@ def test_concentrated_quadratic_is_the_schur_complement_of_the_explicit_jacobian
         hessian[start:stop, start:stop] += o.prior.toarray()
         start = stop
     residual = np.concatenate([o.residual(u) for o, u in zip(model.observed, point.states, strict=True)])
-    prior = np.concatenate([np.zeros(4), *(o.prior @ u.ravel()[o.loaded] for o, u in zip(model.observed, point.states, strict=True))])
+    prior = np.concatenate([np.zeros(4), *(o.prior @ o.sought(u) for o, u in zip(model.observed, point.states, strict=True))])
     gradient = explicit.T @ residual + prior
     eliminated = np.linalg.solve(hessian[4:, 4:], np.column_stack([hessian[4:, :4], gradient[4:]]))
     found = at.concentrated(np.eye(4))
@@ -164,7 +167,7 @@ def test_the_misfit_is_chi_squared_of_what_is_left() -> None:
     """250 measured components less 150 loaded ones less four moduli a trial; the mean over draws is known to a per cent or so."""
     body = layered(pushes=(PRESS, SHEAR))
     states = [body.displacement(p) for p in body.pushes]
-    values = [identify_field(body.mesh, with_noise(body, states, 0.1, seed), body.zones()) for seed in range(12)]
+    values = [identify_field(body.mesh, with_noise(body, states, 0.02, seed), body.zones()) for seed in range(12)]
     freedom = values[0].degrees_of_freedom
     assert freedom == pytest.approx(2 * (375 - 150) - 4, abs=0.5)
     assert np.mean([v.chi_squared for v in values]) == pytest.approx(freedom, abs=4.0 * np.sqrt(2.0 * freedom / len(values)))
@@ -179,7 +182,7 @@ def region_errors(law: str, draws: int) -> tuple[np.ndarray, np.ndarray]:
         found = identify_field(body.mesh, with_noise(body, states, 0.1, seed), zones, law=law)  # type: ignore[arg-type]
         errors.append(found.theta - theta)
     lame, shear = (values[[0, body.mesh.n_cells // 4]] for values in body.moduli)
-    bound = cramer_rao_bound(body.mesh, with_noise(body, states, 0.1, 0), zones, lame, shear, states, law=law)  # type: ignore[arg-type]
+    bound = cramer_rao_bound(body.mesh, with_noise(body, states, 0.1, 0), zones, lame, shear, states, law=law, elements="as_given")  # type: ignore[arg-type]
     return np.sqrt(np.mean(np.square(errors), axis=0)), bound.standard_deviations()
 
 
@@ -212,7 +215,7 @@ def test_layers_are_found_without_being_told(every_element: tuple[PushedBody, Zo
     assert np.median(np.abs(poisson - told.poisson_ratio[layer])) < 0.001
     assert found.segmentation is not None and found.weights is not None and found.uncertainty is not None
     assert len(found.steps) == len(found.weights.trials) + 3
-    assert "segment 1" in found.identifiability[0]
+    assert found.verdict is not None and found.verdict.sentence == found.identifiability[0] and "segment 1" in found.identifiability[1]
 
 
 def test_what_total_variation_shrinks_regions_restore(every_element: tuple[PushedBody, Zones, FieldEstimate]) -> None:
@@ -266,7 +269,7 @@ def test_the_preconditioner_of_loaded_components_serves_other_moduli() -> None:
     """It is made for a homogeneous body; with a ball four times as stiff inside, few iterations still suffice."""
     mesh, trials, zones, _ = ball_from_a_finer_mesh(6, 10)
     homogeneous = Zones(np.where(zones.of_cell < 0, -1, 0), ("body",), zones.known_lambda, zones.known_mu)
-    model = FieldModel(mesh, trials, homogeneous)
+    model = FieldModel(mesh, trials, homogeneous, elements="as_given")
     first_point(model, np.log([4.0, 4.0]))
     stiff = FieldModel.with_zones(model, zones)
     centres = mesh.points[mesh.cells[zones.of_cell >= 0]].mean(axis=1)

@@ -121,7 +121,7 @@ def test_without_data_a_bump_on_a_border_is_smoothed_away() -> None:
 def test_the_criterion_counts_borders_and_regions() -> None:
     body = cube(LAYERS)
     zones = body.zones(each_cell=True)
-    model = FieldModel(body.mesh, body.load_cases(sd_mm=0.1), zones)
+    model = FieldModel(body.mesh, body.load_cases(sd_mm=0.1), zones, elements="as_given")
     lame, shear = body.moduli
     unknown = zones.of_cell >= 0
     point = first_point(model, logarithms(lame[unknown], shear[unknown]))
@@ -141,7 +141,7 @@ def test_two_layers_come_out_of_a_blurred_field() -> None:
     zones = body.zones(each_cell=True)
     graph = ZoneGraph.of(body.mesh, zones)
     unknown = zones.of_cell >= 0
-    model = FieldModel(body.mesh, body.load_cases(sd_mm=0.01), zones)
+    model = FieldModel(body.mesh, body.load_cases(sd_mm=0.01), zones, elements="as_given")
     height = body.mesh.points[body.mesh.cells].mean(axis=1)[unknown, 2]
     share = np.clip((height - 6.0) / 8.0, 0.0, 1.0)
     theta = np.concatenate([np.log(0.12) + 0.25 * share, np.log(5.5) - 0.2 * share])

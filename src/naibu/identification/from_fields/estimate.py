@@ -21,7 +21,8 @@ from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress, report_progress
 from naibu.core.status import Status
-from naibu.identification.from_fields.forward_model import LawName
+from naibu.identification.from_fields.assumptions import Assumption, assumptions, covariance_of, effects
+from naibu.identification.from_fields.field_laws import FieldElements, LawName
 from naibu.identification.from_fields.gauss_newton import (
     Bounds,
     Found,
@@ -33,16 +34,28 @@ from naibu.identification.from_fields.gauss_newton import (
     search,
 )
 from naibu.identification.from_fields.load_cases import KNOWN, FieldLoadCase, Zones
+from naibu.identification.from_fields.mesh_error import COARSE, EXTRAPOLATED, changes_on_finer_mesh, doubt_of, refitted
 from naibu.identification.from_fields.regularization import Regularization, RegularizationName, ZoneGraph, regularization
 from naibu.identification.from_fields.regularization_weight import WeightChoice, WeightRule, WeightTrial, choose_weight
 from naibu.identification.from_fields.segmentation import EXPLICIT, Segmentation, segment
-from naibu.identification.from_fields.sensitivities import FieldModel, Point, logarithms, moduli_of, young_and_poisson
+from naibu.identification.from_fields.sensitivities import (
+    Concentrated,
+    FieldModel,
+    Linearised,
+    Point,
+    logarithms,
+    moduli_of,
+    young_and_poisson,
+)
 from naibu.identification.from_fields.truncated_newton import truncated_step
-from naibu.identification.from_fields.uncertainty import Uncertainty, information_at, report, resolution, resolution_report
+from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, report, resolution, resolution_report
+from naibu.identification.from_fields.verdict import FieldVerdict, inflation, verdict
 from naibu.identification.load_case import require_load_cases
 
 FEW = 12  # zones up to which no penalty is needed by default
 START_POISSON_RATIO = 0.4
+TOO_COARSE = "The elements are too coarse for extrapolation to be trusted, and intervals are wide: use smaller ones."
+MOST_UNKNOWNS = 120_000  # nodal displacements of the quadratic elements with which regions of a map are refitted
 SEARCH_AT_WEIGHT = SearchSettings(max_iterations=15, tolerance=1e-3)
 UNEXPLAINED = 3.0  # standard deviations of chi squared by which regions may fit worse than the regularised field
 
@@ -60,11 +73,11 @@ class FieldEstimate:
     theta : ndarray, shape (2 count,)
         ln mu, then ln(kappa / mu) of the zones; kPa.
     states : tuple of ndarray, shape (n, d)
-        Displacement of every load case under the result, mm.
+        Displacement of every load case in the fit on `mesh`, mm.
     chi_squared, degrees_of_freedom : float
         Misfit in units of the stated noise, and what noise alone would leave on average.
     uncertainty : Uncertainty or None
-        Of theta; None where zones are too many to invert.
+        Of theta: of the measurement, of the discretisation and of what is known; None where zones are too many to invert.
     weights : WeightChoice or None
         The weights of the penalty that were tried.
     regularized : tuple of ndarray, shape (count of the given zones,), or None
@@ -79,6 +92,14 @@ class FieldEstimate:
         What was done, a sentence a step.
     identifiability : tuple of str
         Which moduli the measurements determine, in words.
+    verdict : FieldVerdict or None
+        Whether the model explains the measurements.
+    budget : ErrorBudget or None
+        Where the uncertainty stems from.
+    mesh_shift : ndarray, shape (2 count,), or None
+        What extrapolation to vanishing element size added to the best theta on `mesh`; None where that error was not estimated.
+    assumptions : tuple of Assumption
+        What other moduli of the known regions, or another law, would do.
     """
 
     mesh: Mesh
@@ -95,6 +116,10 @@ class FieldEstimate:
     status: Status
     steps: tuple[str, ...]
     identifiability: tuple[str, ...]
+    verdict: FieldVerdict | None = None
+    budget: ErrorBudget | None = None
+    mesh_shift: FloatArray | None = None
+    assumptions: tuple[Assumption, ...] = ()
 
     @property
     def young_modulus(self) -> FloatArray:
@@ -109,6 +134,18 @@ class FieldEstimate:
     def lame_of_cells(self) -> tuple[FloatArray, FloatArray]:
         """Return lambda and mu of every cell (m,), kPa, known ones included."""
         return moduli_of(self.zones, self.theta)
+
+    def intervals(self, level: float = 0.95) -> tuple[FloatArray, FloatArray]:
+        """Return the bounds of Young's modulus (count, 2), kPa, and of Poisson's ratio (count, 2) at a level of confidence.
+
+        Raises
+        ------
+        InputError
+            The estimate has no covariance.
+        """
+        if self.uncertainty is None:
+            raise InputError("a field of many moduli under a penalty has no intervals; see its `resolution`, or use regions")
+        return intervals(self.theta, self.uncertainty, level)
 
     @property
     def noise_factor(self) -> float:
@@ -127,6 +164,7 @@ def identify_field(
     segmented: bool = True,
     bounds: Bounds | None = None,
     start: tuple[FloatArray, FloatArray] | None = None,
+    elements: FieldElements = "accurate",
     progress: Progress | None = None,
 ) -> FieldEstimate:
     """Find the moduli of zones from displacement fields measured in one or more load cases, no force being known.
@@ -134,13 +172,13 @@ def identify_field(
     Parameters
     ----------
     mesh : Mesh
-        Simplices; independent of the points of measurement.
+        Lines, triangles, linear tetrahedra or hexahedra; independent of the points of measurement.
     load_cases : sequence of FieldLoadCase
         Pushes of the body, the loaded components of its nodes, and what was measured.
     zones : Zones
         Known cells, and which cells share a pair of unknown moduli; `Zones.of(..., each_cell=True)` where nothing is known of regions.
     law : {"linear", "neo_hookean"}
-        Small strain, or compressible neo-Hookean at finite strain (linear tetrahedra).
+        Small strain, or compressible neo-Hookean at finite strain (in three dimensions).
     regularization : {"automatic", "total_variation", "laplacian"} or None
         Penalty on jumps between neighbouring zones. Automatic is total variation for more than `FEW` zones, none for fewer.
     weight : {"discrepancy", "l_curve"} or float
@@ -152,6 +190,10 @@ def identify_field(
         Of the moduli.
     start : tuple of ndarray, shape (count,), optional
         lambda and mu of the zones, kPa, to start from; by default those of a homogeneous body that fits best.
+    elements : {"accurate", "as_given"}
+        Accurate gives tetrahedra mid-edge nodes and hexahedra the mean dilatation of their points, and extrapolates moduli of regions to
+        vanishing element size from a mesh of half the element size. As given serves data computed with the very elements of `mesh`. Maps of
+        the moduli of many tetrahedra use them as given; the regions made of such a map are refitted with accurate ones.
     progress : callable, optional
         Gets a report after every step, its stage in words (`naibu.core.progress`); the same words are in `FieldEstimate.steps`.
 
@@ -165,9 +207,11 @@ def identify_field(
     require_load_cases(load_cases)
     if len(zones.of_cell) != mesh.n_cells:
         raise InputError(f"the zones are of a mesh of {len(zones.of_cell)} cells, this mesh has {mesh.n_cells}")
-    recipe = _Recipe(FieldModel(mesh, load_cases, zones, law), bounds or Bounds(), [], progress)
     automatic: RegularizationName | None = "total_variation" if zones.count > FEW else None
     name = automatic if regularization == "automatic" else regularization
+    of_map: FieldElements = "as_given" if name is not None and mesh.cell_type == "tetra" else elements
+    model = FieldModel(mesh, load_cases, zones, law, of_map)
+    recipe = _Recipe(model, tuple(load_cases), law, elements, bounds or Bounds(), [], progress)
     point = recipe.start(start)
     return recipe.free(point) if name is None else recipe.regularized(point, name, weight, segmented)
 
@@ -177,6 +221,9 @@ class _Recipe:
     """The steps of an identification, recorded and reported."""
 
     model: FieldModel
+    load_cases: tuple[FieldLoadCase, ...]
+    law: LawName
+    elements: FieldElements
     bounds: Bounds
     steps: list[str]
     progress: Progress | None
@@ -192,8 +239,8 @@ class _Recipe:
         if given is not None:
             return first_point(self.model, objective.clipped(logarithms(*(np.asarray(g, dtype=float) for g in given))))
         zones = self.model.zones
-        one = Zones(np.where(zones.of_cell == KNOWN, KNOWN, 0), ("body",), zones.known_lambda, zones.known_mu)
-        homogeneous = self.model.with_zones(one)
+        one = replace(zones, of_cell=np.where(zones.of_cell == KNOWN, KNOWN, 0), names=("body",))
+        homogeneous = self._plain().with_zones(one)
         known = zones.known_mu[zones.of_cell == KNOWN]
         shear = float(np.exp(np.log(known).mean())) if len(known) else 1.0
         ratio = 2.0 * (1.0 + START_POISSON_RATIO) / (3.0 * (1.0 - 2.0 * START_POISSON_RATIO))
@@ -204,7 +251,16 @@ class _Recipe:
             f"homogeneous start: Young's modulus {young[0]:.4g} kPa, Poisson's ratio {poisson[0]:.3f}, "
             f"misfit {found.point.misfit:.4g} (noise alone: {self.model.n_free:.4g})"
         )
-        return self.model.evaluate(np.repeat(found.point.theta, zones.count), found.point.states)
+        theta = np.repeat(found.point.theta, zones.count)
+        if homogeneous.computed is self.model.computed:
+            return self.model.evaluate(theta, found.point.states)
+        return first_point(self.model, theta)
+
+    def _plain(self) -> FieldModel:
+        """Return the model with the elements of the mesh as they are, where these cost less and lead to a start as well."""
+        if self.model.computed is self.model.mesh:
+            return self.model
+        return FieldModel(self.model.mesh, self.load_cases, self.model.zones, self.law, "as_given")
 
     def free(self, point: Point) -> FieldEstimate:
         """Fit the zones without a penalty."""
@@ -277,22 +333,65 @@ class _Recipe:
         if misfit > limit:
             self.record(f"the regions leave more unexplained than noise would ({limit:.4g}): the regularised field is the result")
             return replace(field, segmentation=regions, steps=tuple(self.steps))
-        model = self.model.with_zones(regions.zones)
-        sharp = self._estimate(model, model.evaluate(regions.point.theta, regions.point.states), Status.CONVERGED)
+        sharp = self._sharp(regions)
         return replace(
             sharp, weights=field.weights, regularized=field.regularized, resolution=field.resolution, segmentation=regions,
             identifiability=(*sharp.identifiability, *field.identifiability),
         )  # fmt: skip
 
+    def _sharp(self, regions: Segmentation) -> FieldEstimate:
+        """Return the fit of regions, with accurate elements where those of the map were not and such a body is not too large."""
+        model, point = self.model.with_zones(regions.zones), regions.point
+        if self.elements == "accurate" and not model.averaged and model.mesh.dimension == 3:
+            accurate = FieldModel(model.mesh, self.load_cases, regions.zones, self.law, "accurate")
+            if accurate.points.size <= MOST_UNKNOWNS:
+                found = search(accurate, first_point(accurate, point.theta), Objective(bounds=self.bounds))
+                self.record(f"fit of {regions.zones.count} regions with quadratic elements: misfit {found.point.misfit:.4g}")
+                return self._estimate(accurate, found.point, found.status)
+        return self._estimate(model, model.evaluate(point.theta, point.states), Status.CONVERGED)
+
     def _estimate(self, model: FieldModel, point: Point, status: Status) -> FieldEstimate:
-        """Return moduli that were fitted without a penalty, with their standard errors."""
-        information = information_at(model, point)
-        freedom = model.n_free - 2.0 * model.zones.count
-        exact = all(o.exact for o in model.observed)
-        factor = 1.0 if exact or freedom <= 0.0 else max(1.0, float(np.sqrt(point.misfit / freedom)))
-        uncertainty = Uncertainty.of(information, factor)
-        words = report(model.zones, point.theta, uncertainty)
+        """Return moduli that were fitted without a penalty, with the errors of measurement, discretisation and knowledge."""
+        at = model.linearised(point)
+        quadratic = at.concentrated(np.eye(2 * model.zones.count))
+        theta, residuals, shift = self._extrapolated(at, quadratic)
+        misfit, freedom = sum(float(r @ r) for r in residuals), model.n_free - 2.0 * model.zones.count
+        factor = 1.0 if freedom <= 0.0 else max(1.0, float(np.sqrt(misfit / freedom)))
+        of_noise = Uncertainty.of(quadratic.hessian, factor)
+        shared = inflation(model.observed, residuals, at.jacobians(quadratic), of_noise.covariance, freedom)
+        of_noise = Uncertainty(of_noise.information / shared, of_noise.covariance * shared)
+        others = assumptions(at, quadratic, self.law)
+        of_known = covariance_of(others, len(theta))
+        of_mesh, total, coarse = np.full(len(theta), np.nan), of_noise.with_added(of_known), False
+        if shift is not None:
+            of_mesh, covariance = doubt_of(shift)
+            total, coarse = total.with_added(covariance), float(np.abs(shift).max()) > COARSE
+        judged = verdict(model.observed, residuals, freedom)
+        budget = ErrorBudget(of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), shared)
+        sure = judged.explanation == "explained" and not coarse
+        how_well = report(model.zones, theta, total, budget=budget, usable=judged.ok, sure=sure)
+        words = (judged.sentence, *how_well, *effects(others, model.zones, theta))
+        if coarse:
+            words = (
+                words[0],
+                TOO_COARSE,
+                *words[1:],
+            )
+        states = tuple(u[: model.mesh.n_points] for u in point.states)
         return FieldEstimate(
-            model.mesh, model.zones, point.theta, point.states, point.misfit, freedom, uncertainty, None, None, None, None, status,
-            tuple(self.steps), words,
+            model.mesh, model.zones, theta, states, misfit, freedom, total, None, None, None, None, status, tuple(self.steps), words,
+            judged, budget, shift, others,
         )  # fmt: skip
+
+    def _extrapolated(self, at: Linearised, quadratic: Concentrated) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray | None]:
+        """Return theta and whitened residuals at vanishing element size, and the change of theta; None where it was not estimated."""
+        fitted, model = at.point.theta, at.model
+        changes = changes_on_finer_mesh(at, self.law) if self.elements == "accurate" else None
+        if changes is None:
+            return fitted, tuple(o.residual(u) for o, u in zip(model.observed, at.point.states, strict=True)), None
+        finer = refitted(at, quadratic, changes)
+        theta = Objective(bounds=self.bounds).clipped(fitted + EXTRAPOLATED * finer.theta)
+        young, before = young_and_poisson(theta)[0], young_and_poisson(fitted)[0]
+        most = 100.0 * float(np.abs(young / before - 1.0).max())
+        self.record(f"half the element size: Young's modulus changes by up to {most:.2g} % when extrapolated to vanishing size")
+        return theta, finer.residuals, theta - fitted

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.forward_model import LawName
+from naibu.identification.from_fields.field_laws import FieldElements, LawName
 from naibu.identification.from_fields.gauss_newton import Objective, SearchSettings, first_point, search
 from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.sensitivities import FieldModel, logarithms, young_and_poisson
@@ -62,6 +62,7 @@ def expected_accuracy(
     young_modulus: ArrayLike,
     poisson_ratio: ArrayLike,
     law: LawName = "linear",
+    elements: FieldElements = "accurate",
 ) -> Accuracy:
     """Return the accuracy with which FEMU will identify the moduli of the zones.
 
@@ -81,6 +82,8 @@ def expected_accuracy(
         True moduli of the zones, kPa.
     law : {"linear", "neo_hookean"}
         Law of the material.
+    elements : {"accurate", "as_given"}
+        As for `identify_field`.
 
     Raises
     ------
@@ -95,7 +98,7 @@ def expected_accuracy(
         if sd is None or not (sd[load_case.field.valid] > 0.0).all():
             raise InputError(f"load case {load_case.name!r}: a planned measurement needs the standard deviation it will have, sd_mm > 0")
     lame, shear = np.array([lame_parameters(e, nu) for e, nu in zip(young, poisson, strict=True)]).T
-    model = FieldModel(mesh, load_cases, zones, law)
+    model = FieldModel(mesh, load_cases, zones, law, elements)
     truth = logarithms(lame, shear)
     start = first_point(model, truth)
     found = Uncertainty.of(information_at(model, start))

@@ -8,7 +8,6 @@ and the measured field constrains both.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -17,140 +16,48 @@ from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
+from naibu.identification.from_fields.field_laws import FieldLaw, NeoHookean
 from naibu.identification.from_fields.load_cases import FieldLoadCase
-from naibu.mechanics.finite_elements.assembly import Assembler
+from naibu.identification.from_fields.refinement import Refinement
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
-from naibu.mechanics.finite_elements.elements import elements
-from naibu.mechanics.finite_elements.hyperelasticity import material
-from naibu.mechanics.finite_elements.linear_simplices import Simplices, parameter_forces, simplices
-from naibu.mechanics.finite_elements.modulus_derivatives import unit_forces
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
 from naibu.mechanics.finite_strain.statics import solve
 from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
 from naibu.mechanics.linear_algebra.direct import direct_solver, pardiso_library
 from naibu.mechanics.linear_algebra.protocols import Factorization, LinearSolver
-from naibu.mechanics.linear_algebra.solver_selection import DIRECT_LIMIT, choose_solver
-from naibu.mechanics.small_strain.linear_elasticity import LinearBody
+from naibu.mechanics.linear_algebra.solver_selection import DIRECT_LIMIT, SolverName, choose_solver
 from naibu.meshing.point_location import interpolation_operator
 
-LawName = Literal["linear", "neo_hookean"]
 EXACT = 1e-3  # standard deviation ascribed to data that are called exact, as a fraction of the largest displacement: models are not exact
-SURFACE_STRAIN = 1.0  # standard deviation of the strain along loaded nodes: constrains those near which nothing was measured
+SURFACE_STRAIN = 0.2  # standard deviation of the strain along loaded nodes: constrains those near which nothing was measured
 NEWTON_TOLERANCE = 1e-9  # residual force over the force on the loaded nodes
 NEWTON_ITERATIONS = 12
-
-
-class FieldLaw(Protocol):
-    """A law on the cells of a mesh, linear in lambda and mu of every cell (kPa)."""
-
-    simplices: Simplices
-    linear: bool
-
-    def forces(self, lame: FloatArray, shear: FloatArray, u: FloatArray) -> FloatArray:
-        """Return the nodal forces (n, d), mN, at a displacement (n, d), mm; not finite where a cell is inverted."""
-        ...
-
-    def stiffness(self, lame: FloatArray, shear: FloatArray, u: FloatArray) -> sp.bsr_matrix:
-        """Return the tangent stiffness (n d, n d), mN/mm."""
-        ...
-
-    def unit_forces(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the forces at the vertices of every cell for lambda = 1 kPa and for mu = 1 kPa, (m, d + 1, d) each, mN."""
-        ...
-
-
-class SmallStrain:
-    """Linear elasticity."""
-
-    linear = True
-
-    def __init__(self, mesh: Mesh) -> None:
-        self.body = LinearBody.of(mesh)
-        self.simplices = self.body.simplices
-
-    def forces(self, lame: FloatArray, shear: FloatArray, u: FloatArray) -> FloatArray:
-        """Return the nodal forces (n, d), mN, at a displacement (n, d), mm."""
-        return self.body.forces(lame, shear, u)
-
-    def stiffness(self, lame: FloatArray, shear: FloatArray, u: FloatArray) -> sp.bsr_matrix:
-        """Return the stiffness (n d, n d), mN/mm."""
-        return self.body.stiffness(lame, shear)
-
-    def unit_forces(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the forces at the vertices of every cell for lambda = 1 kPa and for mu = 1 kPa, (m, d + 1, d) each, mN."""
-        return parameter_forces(self.simplices, u)
-
-
-class NeoHookean:
-    """Compressible neo-Hookean law ``W = mu (I1 - 3) / 2 - mu ln J + lambda (ln J)^2 / 2`` at finite strain, on linear tetrahedra.
-
-    Raises
-    ------
-    InputError
-        Other cells than linear tetrahedra.
-    """
-
-    linear = False
-
-    def __init__(self, mesh: Mesh) -> None:
-        if mesh.cell_type != "tetra":
-            raise InputError(f"the neo-Hookean law needs linear tetrahedra, not {mesh.cell_type!r} cells; split them, or use law='linear'")
-        self.simplices = simplices(mesh)
-        each = np.zeros(mesh.n_cells, dtype=np.int64)
-        some = material("neo_hookean", young_modulus=1.0, poisson_ratio=0.3)
-        self._assembler = Assembler.from_materials(elements(mesh, "standard"), each, [some])
-
-    def assembler(self, lame: FloatArray, shear: FloatArray) -> Assembler:
-        """Return the assembler of the body with these moduli."""
-        table = np.zeros((len(lame), self._assembler.parameters.shape[1]))
-        table[:, 0], table[:, 1] = shear, lame
-        return self._assembler.with_parameters(table)
-
-    def forces(self, lame: FloatArray, shear: FloatArray, u: FloatArray) -> FloatArray:
-        """Return the nodal forces (n, 3), mN, at a displacement (n, 3), mm; infinite where a cell is inverted."""
-        _, force, smallest = self.assembler(lame, shear).forces(u)
-        return force if smallest > 0.0 else np.full_like(force, np.inf)
-
-    def stiffness(self, lame: FloatArray, shear: FloatArray, u: FloatArray) -> sp.bsr_matrix:
-        """Return the tangent stiffness (n d, n d), mN/mm."""
-        return self._assembler.pattern.matrix(self.assembler(lame, shear).evaluate(u)[2])
-
-    def unit_forces(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the forces at the vertices of every cell for lambda = 1 kPa and for mu = 1 kPa, (m, 4, 3) each, mN."""
-        return unit_forces(self.simplices, u, "neo_hookean")
-
-
-def field_law(mesh: Mesh, name: LawName) -> FieldLaw:
-    """Return the law of that name on a mesh.
-
-    Raises
-    ------
-    InputError
-        An unknown name, or cells that the law is not made for.
-    """
-    if name == "linear":
-        return SmallStrain(mesh)
-    if name == "neo_hookean":
-        return NeoHookean(mesh)
-    raise InputError(f"law {name!r} is not known for fields; use 'linear' or 'neo_hookean'")
+HALVINGS = 6
+ITERATIVE_FROM = 30_000  # unknowns from which a body solved only once or twice is solved by iteration
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
     """Measurements of a load case, whitened, and the components of the model's nodes that follow from equilibrium.
 
+    The displacement of the loaded components is that of the given nodes; mid-edge nodes between them lie half-way.
+
     Attributes
     ----------
     load_case : FieldLoadCase
-        The load case.
+        The load case, on the nodes on which equilibrium is computed.
     operator : csr_matrix, shape (q, n d)
         From nodal displacements to whitened data, 1/mm.
     data : ndarray, shape (q,)
         Whitened measurements.
-    loaded : ndarray, shape (n_b,), int64
-        Numbers of the loaded components among the n d.
+    loaded : ndarray, shape (n_l,), int64
+        Numbers of all loaded components among the n d.
+    unknown : ndarray, shape (n_b,), int64
+        Those of the given nodes, whose displacement is sought.
+    basis : csr_matrix, shape (n_l, n_b)
+        From the sought displacements to those of all loaded components.
     prior : csr_matrix, shape (n_b, n_b)
-        Weak prior on the displacement of the loaded components, 1/mm^2.
+        Inverse covariance of the weak prior on the sought displacements, 1/mm^2.
     noise_mm : float
         Root mean square standard deviation of a component, mm.
     exact : bool
@@ -161,13 +68,15 @@ class Observed:
     operator: sp.csr_matrix
     data: FloatArray
     loaded: IntArray
+    unknown: IntArray
+    basis: sp.csr_matrix
     prior: sp.csr_matrix
     noise_mm: float
     exact: bool
 
     @classmethod
-    def of(cls, mesh: Mesh, load_case: FieldLoadCase) -> Observed:
-        """Whiten the valid measurements of a load case.
+    def of(cls, mesh: Mesh, computed: Mesh, load_case: FieldLoadCase) -> Observed:
+        """Whiten the valid measurements of a load case of `mesh`, whose equilibrium is computed on another of the same first nodes.
 
         Raises
         ------
@@ -177,11 +86,27 @@ class Observed:
         field, d = load_case.field, mesh.dimension
         valid = field.valid
         whiten, noise, exact = _whitening(field, load_case.name)
-        where = interpolation_operator(mesh, field.points[valid]) if d == 3 else _at_nodes(mesh, field.points[valid], load_case.name)
+        where = interpolation_operator(computed, field.points[valid]) if d == 3 else _at_nodes(mesh, field.points[valid], load_case.name)
         operator = (sp.block_diag(list(whiten), format="csr") @ sp.kron(where, sp.identity(d), format="csr")).tocsr()
         data = np.einsum("nij,nj->ni", whiten, field.vectors[valid]).ravel()
-        loaded = np.flatnonzero(load_case.loaded.ravel()).astype(np.int64)
-        return cls(load_case, operator, data, loaded, _surface_prior(mesh, loaded), noise, exact)
+        unknown = np.flatnonzero(load_case.loaded.ravel()).astype(np.int64)
+        if computed is mesh:
+            loaded, basis = unknown, sp.identity(len(unknown), format="csr")
+        else:
+            finer = Refinement.of(mesh)  # the nodes of quadratic cells are those of refined ones
+            load_case = finer.load_case(load_case)
+            loaded = np.flatnonzero(load_case.loaded.ravel()).astype(np.int64)
+            basis = sp.kron(finer.parents, sp.identity(d), format="csr")[loaded][:, unknown]
+        return cls(load_case, operator, data, loaded, unknown, basis, _surface_prior(mesh, unknown), noise, exact)
+
+    def sought(self, u: FloatArray) -> FloatArray:
+        """Return the sought displacements (n_b,), mm, among the displacement (n, d) of all nodes."""
+        return u.ravel()[self.unknown]
+
+    @property
+    def points(self) -> FloatArray:
+        """Positions of the measurements (k, d), mm."""
+        return self.load_case.field.points[self.load_case.field.valid]
 
     def residual(self, u: FloatArray) -> FloatArray:
         """Return the whitened difference (q,) of a displacement (n, d), mm, from the measurements."""
@@ -235,10 +160,11 @@ def _surface_prior(mesh: Mesh, loaded: IntArray) -> sp.csr_matrix:
 
 
 class Solvers:
-    """Linear solvers, one for each set of loaded components, analysed once."""
+    """Linear solvers, one for each set of loaded components, analysed once; large systems that are solved once, by iteration."""
 
-    def __init__(self, law: FieldLaw, points: FloatArray) -> None:
+    def __init__(self, law: FieldLaw, points: FloatArray, *, iterative: bool = False) -> None:
         self._law, self._points = law, points
+        self._limit = ITERATIVE_FROM if iterative else DIRECT_LIMIT
         self._solvers: dict[bytes, LinearSolver] = {}
 
     def factorized(self, lame: FloatArray, shear: FloatArray, u: FloatArray, constrained: BoolArray, owner: bytes = b"") -> Factorization:
@@ -249,8 +175,12 @@ class Solvers:
         matrix = with_dirichlet_rows(self._law.stiffness(lame, shear, u), constrained)
         key = owner + np.packbits(constrained).tobytes()
         if key not in self._solvers:
-            direct = matrix.shape[0] <= DIRECT_LIMIT and pardiso_library() is not None
-            chosen = direct_solver(matrix, symmetric=True) if direct else choose_solver(matrix, self._points, constrained, symmetric=True)
+            small = matrix.shape[0] <= self._limit
+            if small and pardiso_library() is not None:
+                chosen = direct_solver(matrix, symmetric=True)
+            else:
+                name: SolverName = "automatic" if small else "multigrid"
+                chosen = choose_solver(matrix, self._points, constrained, symmetric=True, solver=name)
             self._solvers[key] = chosen
         return self._solvers[key].factorize(matrix)
 
@@ -267,8 +197,9 @@ def equilibrium(
     """
     u, constrained = guess, load_case.loaded
     factor, before = solvers.factorized(lame, shear, u, constrained, owner), np.inf
+    force = law.forces(lame, shear, u)
     for _ in range(NEWTON_ITERATIONS):
-        residual = law.forces(lame, shear, u) - load_case.external_force
+        residual = force - load_case.external_force
         scale = float(np.abs(residual[constrained]).sum() + np.abs(load_case.external_force).sum())
         if not np.isfinite(scale):
             raise ConvergenceError(f"load case {load_case.name!r}: a cell is inverted")
@@ -279,10 +210,21 @@ def equilibrium(
         if norm > 0.1 * before:  # the tangent of an earlier displacement serves no more
             factor = solvers.factorized(lame, shear, u, constrained, owner)
         before = norm
-        u = u - np.where(constrained, 0.0, factor.solve(residual.ravel()).reshape(u.shape))
+        step = np.where(constrained, 0.0, factor.solve(residual.ravel()).reshape(u.shape))
         if law.linear:
-            return u, factor
+            return u - step, factor
+        u, force = _stepped(law, lame, shear, u, step)
     raise ConvergenceError(f"load case {load_case.name!r}: Newton's method did not reach equilibrium within {NEWTON_ITERATIONS} iterations")
+
+
+def _stepped(law: FieldLaw, lame: FloatArray, shear: FloatArray, u: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return ``u - step`` and the forces there, the step halved until no cell is inverted."""
+    for _ in range(HALVINGS):
+        force = law.forces(lame, shear, u - step)
+        if np.isfinite(force).all():
+            break
+        step = 0.5 * step
+    return u - step, force
 
 
 def loaded_from_rest(

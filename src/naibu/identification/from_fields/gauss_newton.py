@@ -136,7 +136,7 @@ def first_point(model: FieldModel, theta: FloatArray) -> Point:
         The measured field does not fix how the loaded nodes move, or a body of finite strain cannot follow.
     """
     small = model if model.law.linear else model.with_law("linear")
-    at = small.linearised(small.evaluate(theta, [np.zeros_like(model.mesh.points)] * len(model.observed)))
+    at = small.linearised(small.evaluate(theta, [np.zeros_like(model.points)] * len(model.observed)))
     step = at.loaded_solved([-g[:, None] for g in at.gradient()[1]])
     moved = at.forward(None, step)
     states = [u + du.reshape(u.shape) for u, du in zip(at.point.states, moved, strict=True)]

@@ -71,6 +71,29 @@ class FieldLoadCase:
         return int(self.field.valid.sum() * self.field.points.shape[1])
 
 
+@dataclass(frozen=True, slots=True)
+class KnownRegion:
+    """A region of known moduli, and how well they are known.
+
+    Attributes
+    ----------
+    name : str
+        The region.
+    young_modulus, poisson_ratio : float
+        Young's modulus, kPa, and Poisson's ratio.
+    young_modulus_sd : float
+        Relative standard deviation of Young's modulus.
+    poisson_ratio_sd : float
+        Standard deviation of Poisson's ratio.
+    """
+
+    name: str
+    young_modulus: float
+    poisson_ratio: float
+    young_modulus_sd: float = 0.0
+    poisson_ratio_sd: float = 0.0
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Zones:
     """Which cells share one pair of unknown moduli, and which are known.
@@ -83,15 +106,28 @@ class Zones:
         Name of every zone.
     known_lambda, known_mu : ndarray, shape (m,)
         Lame parameters of the known cells, kPa; NaN elsewhere.
+    known : tuple of KnownRegion
+        What is known, by region.
+    region_of_cell : ndarray, shape (m,), int64, or None
+        Index into `known` for every cell, -1 elsewhere.
     """
 
     of_cell: IntArray
     names: tuple[str, ...]
     known_lambda: FloatArray
     known_mu: FloatArray
+    known: tuple[KnownRegion, ...] = ()
+    region_of_cell: IntArray | None = None
 
     @classmethod
-    def of(cls, mesh: Mesh, *, known: Mapping[str, tuple[float, float]], each_cell: bool | Sequence[str] = False) -> Zones:
+    def of(
+        cls,
+        mesh: Mesh,
+        *,
+        known: Mapping[str, tuple[float, float]],
+        each_cell: bool | Sequence[str] = False,
+        known_sd: Mapping[str, tuple[float, float]] | None = None,
+    ) -> Zones:
         """Make one zone of every region that is not known, or of every cell of it.
 
         Parameters
@@ -102,22 +138,30 @@ class Zones:
             Young's modulus, kPa, and Poisson's ratio of the known regions; empty where a known force gives the scale.
         each_cell : bool or sequence of str
             Whether every cell (of these regions) is a zone of its own.
+        known_sd : mapping, optional
+            Relative standard deviation of Young's modulus and standard deviation of Poisson's ratio of known regions; it becomes part of
+            the uncertainty of what is identified. Zero by default.
 
         Raises
         ------
         InputError
             A region that the mesh lacks, nothing unknown, or moduli that no elastic solid has.
         """
-        for name in [*known, *(each_cell if not isinstance(each_cell, bool) else ())]:
+        doubt = dict(known_sd or {})
+        for name in [*known, *doubt, *(each_cell if not isinstance(each_cell, bool) else ())]:
             if name not in mesh.region_names:
                 raise InputError(f"region {name!r} does not exist; the mesh has {', '.join(mesh.region_names)}")
         of_cell = np.full(mesh.n_cells, KNOWN, dtype=np.int64)
         lame, shear = np.full(mesh.n_cells, np.nan), np.full(mesh.n_cells, np.nan)
         names: list[str] = []
+        region_of_cell = np.full(mesh.n_cells, KNOWN, dtype=np.int64)
+        regions: list[KnownRegion] = []
         for index, region in enumerate(mesh.region_names):
             cells = np.flatnonzero(mesh.regions == index)
             if region in known:
                 lame[cells], shear[cells] = lame_parameters(*known[region])
+                region_of_cell[cells] = len(regions)
+                regions.append(KnownRegion(region, *known[region], *doubt.get(region, (0.0, 0.0))))
             elif each_cell if isinstance(each_cell, bool) else region in each_cell:
                 of_cell[cells] = len(names) + np.arange(len(cells))
                 names += [f"{region}: cell {c}" for c in cells]
@@ -126,7 +170,7 @@ class Zones:
                 names.append(region)
         if not names:
             raise InputError("every region is known: leave out of `known` what is to be identified")
-        return cls(of_cell, tuple(names), lame, shear)
+        return cls(of_cell, tuple(names), lame, shear, tuple(regions), region_of_cell)
 
     @property
     def count(self) -> int:

@@ -16,6 +16,8 @@ from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.load_cases import KNOWN, Zones
+from naibu.meshing.quality import signed_volumes
+from naibu.meshing.surface import CELL_FACES
 
 RegularizationName = Literal["total_variation", "laplacian"]
 ROUNDING = 0.02  # jumps of a logarithm below this count quadratically in total variation
@@ -75,25 +77,31 @@ class ZoneGraph:
 
 
 def cell_volumes(mesh: Mesh) -> FloatArray:
-    """Return the volume (area, length) of every simplex (m,), mm^d."""
+    """Return the volume (area, length) of every cell (m,), mm^d."""
+    if mesh.cell_type == "hexahedron":
+        return signed_volumes(mesh)
     corners = mesh.points[mesh.cells]
     d = mesh.dimension
     return np.asarray(np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / float(np.prod(np.arange(1, d + 1))))
 
 
 def inner_faces(mesh: Mesh) -> tuple[IntArray, FloatArray]:
-    """Return the two cells (f, 2) at every face inside a mesh of simplices, and its area (f,), mm^2 (length in the plane, 1 on a line)."""
+    """Return the two cells (f, 2) at every face inside a mesh, and its area (f,), mm^2 (length in the plane, 1 on a line)."""
     d = mesh.dimension
-    corners = np.array([[a for a in range(d + 1) if a != opposite] for opposite in range(d + 1)])
-    faces = np.sort(mesh.cells[:, corners].reshape(-1, d), axis=1)
+    if mesh.cell_type == "hexahedron":
+        corners = CELL_FACES["hexahedron"]
+    else:
+        corners = np.array([[a for a in range(d + 1) if a != opposite] for opposite in range(d + 1)])
+    around = mesh.cells[:, corners].reshape(-1, corners.shape[1])
+    faces = np.sort(around, axis=1)
     order = np.lexsort(faces.T)
     same = (faces[order[1:]] == faces[order[:-1]]).all(axis=1)
     first, second = order[:-1][same], order[1:][same]
-    points = mesh.points[faces[first]]
-    edges = points[:, 1:] - points[:, :1]
+    points = mesh.points[around[first]]
+    edges = points[:, 2:] - points[:, :2] if mesh.cell_type == "hexahedron" else points[:, 1:] - points[:, :1]  # diagonals, or edges
     gram = np.einsum("fia,fja->fij", edges, edges)
     area = np.sqrt(np.linalg.det(gram)) / max(d - 1, 1) if d > 1 else np.ones(len(first))
-    return np.stack([first, second], axis=1) // (d + 1), area
+    return np.stack([first, second], axis=1) // len(corners), area
 
 
 class Regularization(Protocol):

@@ -65,7 +65,7 @@ def joined(zones: Zones, of_zone: IntArray) -> Zones:
     of_cell = zones.of_cell.copy()
     of_cell[unknown] = of_zone[of_cell[unknown]]
     names = tuple(f"segment {i + 1}" for i in range(int(of_zone.max()) + 1))
-    return Zones(of_cell, names, zones.known_lambda, zones.known_mu)
+    return replace(zones, of_cell=of_cell, names=names)
 
 
 def clusters(graph: ZoneGraph, theta: FloatArray, most: int) -> IntArray:

@@ -11,24 +11,24 @@ adjoint takes one solve with the same factor.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import scipy.linalg as sl
 import scipy.sparse as sp
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.forward_model import FieldLaw, LawName, Observed, Solvers, equilibrium, field_law, loaded_from_rest
+from naibu.identification.from_fields.field_laws import FieldElements, FieldLaw, LawName, computed_mesh, field_law
+from naibu.identification.from_fields.forward_model import Observed, Solvers, equilibrium, loaded_from_rest
 from naibu.identification.from_fields.load_cases import KNOWN, FieldLoadCase, Zones
+from naibu.identification.from_fields.loaded_components import BLOCK, BoundaryPreconditioner, alike, conjugate_gradients
+from naibu.identification.from_fields.refinement import Refinement
 from naibu.mechanics.linear_algebra.protocols import Factorization
 
-BLOCK = 256  # right-hand sides solved together
 REFRESHED = 400  # loaded components up to which their Hessian is made anew at every point
-BOUNDARY_TOLERANCE = 1e-5
-BOUNDARY_ITERATIONS = 200
+Gradient = tuple[FloatArray, list[FloatArray]]  # with respect to theta, and to the sought displacements of every load case
 
 
 def moduli_of(zones: Zones, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -76,18 +76,37 @@ class Point:
 class FieldModel:
     """All load cases of a body, evaluated and linearised at points of the search."""
 
-    def __init__(self, mesh: Mesh, load_cases: Sequence[FieldLoadCase], zones: Zones, law: LawName = "linear") -> None:
+    def __init__(
+        self,
+        mesh: Mesh,
+        load_cases: Sequence[FieldLoadCase],
+        zones: Zones,
+        law: LawName = "linear",
+        elements: FieldElements = "accurate",
+    ) -> None:
         self.mesh, self.zones = mesh, zones
-        self.law: FieldLaw = field_law(mesh, law)
-        self.observed = tuple(Observed.of(mesh, load_case) for load_case in load_cases)
-        self.solvers = Solvers(self.law, mesh.points)
+        self.computed, self.averaged = computed_mesh(mesh, elements)
+        self.law: FieldLaw = field_law(self.computed, law, averaged=self.averaged)
+        self.observed = tuple(Observed.of(mesh, self.computed, load_case) for load_case in load_cases)
+        self.solvers = Solvers(self.law, self.computed.points)
         self.boundary: list[BoundaryPreconditioner | None] = [None] * len(self.observed)
         self.informed: list[float | None] = [None] * len(self.observed)
+
+    @property
+    def points(self) -> FloatArray:
+        """Nodes (n, d), mm, on which equilibrium is computed."""
+        return self.computed.points
 
     @property
     def n_data(self) -> int:
         """Number of measured components."""
         return sum(len(o.data) for o in self.observed)
+
+    def on_all_nodes(self, u: FloatArray) -> FloatArray:
+        """Return the displacement of all nodes (n, d), mm, from that of the given ones: mid-edge nodes lie half-way."""
+        if self.computed is self.mesh:
+            return u
+        return Refinement.of(self.mesh).displacement(u)
 
     def with_zones(self, zones: Zones) -> FieldModel:
         """Return the model of the same load cases with other zones; solvers and preconditioners are shared."""
@@ -100,8 +119,8 @@ class FieldModel:
         """Return the model of the same load cases under another law."""
         out = object.__new__(FieldModel)
         out.__dict__.update(self.__dict__)
-        out.law = field_law(self.mesh, law)
-        out.solvers = Solvers(out.law, self.mesh.points)
+        out.law = field_law(self.computed, law, averaged=self.averaged)
+        out.solvers = Solvers(out.law, self.points)
         out.boundary, out.informed = [None] * len(self.observed), [None] * len(self.observed)
         return out
 
@@ -111,7 +130,7 @@ class FieldModel:
 
         Before a first point was found, as if all loaded components were determined.
         """
-        return self.n_data - sum(len(o.loaded) if i is None else i for o, i in zip(self.observed, self.informed, strict=True))
+        return self.n_data - sum(len(o.unknown) if i is None else i for o, i in zip(self.observed, self.informed, strict=True))
 
     def evaluate(self, theta: FloatArray, guesses: Sequence[FloatArray]) -> Point:
         """Find the equilibrium of all load cases; `guesses` (n, d), mm, hold the displacement of the loaded components, and help elsewhere.
@@ -126,12 +145,9 @@ class FieldModel:
             raise ConvergenceError("moduli are beyond all bounds")
         states, factors = self._states(lame, shear, guesses)
         misfit = sum(float(np.sum(o.residual(u) ** 2)) for o, u in zip(self.observed, states, strict=True))
-        prior = sum(float(b @ (o.prior @ b)) for o, b in zip(self.observed, map(self._loaded, self.observed, states), strict=True))
+        loaded = [o.sought(u) for o, u in zip(self.observed, states, strict=True)]
+        prior = sum(float(b @ (o.prior @ b)) for o, b in zip(self.observed, loaded, strict=True))
         return Point(theta, tuple(states), tuple(factors), misfit, prior)
-
-    @staticmethod
-    def _loaded(observed: Observed, u: FloatArray) -> FloatArray:
-        return u.ravel()[observed.loaded]
 
     def _states(self, lame: FloatArray, shear: FloatArray, guesses: Sequence[FloatArray]) -> tuple[list[FloatArray], list[Factorization]]:
         states, factors = [], []
@@ -153,13 +169,13 @@ class FieldModel:
         """Return states (n, d), mm, reached in load steps, for displacements of the loaded components (n, d)."""
         lame, shear = moduli_of(self.zones, theta)
         pairs = zip(self.observed, moved, strict=True)
-        return [loaded_from_rest(self.law, self.mesh.points, lame, shear, o.load_case, u) for o, u in pairs]
+        return [loaded_from_rest(self.law, self.points, lame, shear, o.load_case, u) for o, u in pairs]
 
     def linearised(self, point: Point) -> Linearised:
         """Linearise all load cases at a point."""
         lame, shear = moduli_of(self.zones, point.theta)
         for t, o in enumerate(self.observed):
-            if len(o.loaded) <= REFRESHED:
+            if len(o.unknown) <= REFRESHED:
                 self.boundary[t] = None
         columns = [modulus_columns(self.law, self.zones, lame, shear, u) for u in point.states]
         stiffness: list[sp.bsr_matrix] = []
@@ -170,16 +186,15 @@ class FieldModel:
 
 def modulus_columns(law: FieldLaw, zones: Zones, lame: FloatArray, shear: FloatArray, u: FloatArray) -> sp.csr_matrix:
     """Return the nodal forces (n d, 2 count), mN, of a relative change of mu at constant kappa / mu, then of kappa, of every zone."""
-    body = law.simplices
     unit_lame, unit_shear = law.unit_forces(u)
     _, k, d = unit_lame.shape
     unknown = zones.of_cell != KNOWN
     of_bulk = (lame + 2.0 / 3.0 * shear)[unknown, None, None] * unit_lame[unknown]
     of_both = lame[unknown, None, None] * unit_lame[unknown] + shear[unknown, None, None] * unit_shear[unknown]
-    rows = ((body.cells[unknown] * d)[:, :, None] + np.arange(d)).ravel()
+    rows = ((law.cells[unknown] * d)[:, :, None] + np.arange(d)).ravel()
     columns = np.repeat(zones.of_cell[unknown], k * d)
     index = np.concatenate([rows, rows]), np.concatenate([columns, columns + zones.count])
-    return sp.csr_matrix((np.concatenate([of_both.ravel(), of_bulk.ravel()]), index), shape=(body.n_points * d, 2 * zones.count))
+    return sp.csr_matrix((np.concatenate([of_both.ravel(), of_bulk.ravel()]), index), shape=(law.n_points * d, 2 * zones.count))
 
 
 @dataclass(slots=True, eq=False)
@@ -192,7 +207,7 @@ class Linearised:
     stiffness: list[sp.bsr_matrix]
     _transposed: list[sp.csr_matrix] = field(default_factory=list)
     _border: list[sp.csr_matrix] = field(default_factory=list)
-    _gradient: tuple[FloatArray, list[FloatArray]] | None = None
+    _gradient: Gradient | None = None
 
     def __post_init__(self) -> None:
         self._transposed = [c.T.tocsr() for c in self.columns]
@@ -200,11 +215,11 @@ class Linearised:
         for o, matrix in zip(self.model.observed, self.stiffness, strict=True):
             key = id(matrix), o.loaded.tobytes()
             if key not in rows:
-                rows[key] = matrix.tocsr()[o.loaded]
+                rows[key] = (o.basis.T @ matrix.tocsr()[o.loaded]).tocsr()
             self._border.append(rows[key])
 
     def border(self, t: int) -> sp.csr_matrix:
-        """Return the rows (n_b, n d) of the stiffness of load case `t`, mN/mm, that belong to its loaded components; also its columns."""
+        """Return the forces (n_b, n d), mN/mm, of load case `t` on all nodes for a unit of each of its sought displacements."""
         return self._border[t]
 
     def solved(self, right: list[FloatArray]) -> list[FloatArray]:
@@ -234,7 +249,7 @@ class Linearised:
             right.append(force)
         moved = self.solved(right)
         for t, o in enumerate(self.model.observed):
-            moved[t][o.loaded] = 0.0 if loaded is None else loaded[t]
+            moved[t][o.loaded] = 0.0 if loaded is None else o.basis @ loaded[t]
         return moved
 
     def adjoint(self, gradients: list[FloatArray]) -> tuple[FloatArray, list[FloatArray]]:
@@ -247,18 +262,21 @@ class Linearised:
             o = self.model.observed[t]
             w[o.loaded] = 0.0
             theta -= self._transposed[t] @ w
-            loaded.append(gradients[t][o.loaded] - self._border[t] @ w)
+            loaded.append(o.basis.T @ gradients[t][o.loaded] - self._border[t] @ w)
         return theta, loaded
 
-    def gradient(self) -> tuple[FloatArray, list[FloatArray]]:
+    def gradient(self) -> Gradient:
         """Return the gradient of half the misfit and prior: (2 count,) and a list of (n_b,)."""
         if self._gradient is None:
-            model = self.model
-            pulls = [(o.operator.T @ o.residual(u))[:, None] for o, u in zip(model.observed, self.point.states, strict=True)]
-            theta, loaded = self.adjoint(pulls)
-            prior = [o.prior @ u.ravel()[o.loaded] for o, u in zip(model.observed, self.point.states, strict=True)]
-            self._gradient = theta[:, 0], [b[:, 0] + p for b, p in zip(loaded, prior, strict=True)]
+            self._gradient = self.gradient_of([o.residual(u) for o, u in zip(self.model.observed, self.point.states, strict=True)])
         return self._gradient
+
+    def gradient_of(self, residuals: Sequence[FloatArray]) -> Gradient:
+        """Return the gradient if the whitened residuals (q,) of the load cases were these."""
+        observed = self.model.observed
+        theta, loaded = self.adjoint([(o.operator.T @ r)[:, None] for o, r in zip(observed, residuals, strict=True)])
+        prior = [o.prior @ o.sought(u) for o, u in zip(observed, self.point.states, strict=True)]
+        return theta[:, 0], [b[:, 0] + p for b, p in zip(loaded, prior, strict=True)]
 
     def product(self, theta: FloatArray, loaded: Sequence[FloatArray]) -> tuple[FloatArray, list[FloatArray]]:
         """Return the Gauss-Newton Hessian of half the misfit and prior times a vector; parts (2 count, r) and (n_b, r) as in `forward`."""
@@ -284,7 +302,7 @@ class Linearised:
         made = self.model.boundary
         found = made[t]
         if found is None:
-            twin = next((s for s in range(t) if made[s] is not None and _alike(self.model.observed[s], self.model.observed[t])), None)
+            twin = next((s for s in range(t) if made[s] is not None and alike(self.model.observed[s], self.model.observed[t])), None)
             shared = None if twin is None else made[twin]
             found = BoundaryPreconditioner.of(self, t) if shared is None or twin is None else shared.scaled(self.model.observed, twin, t)
             made[t], self.model.informed[t] = found, found.informed
@@ -298,7 +316,11 @@ class Linearised:
             pulled = [o.operator.T @ (o.operator @ u) for o, u in zip(self.model.observed, moved, strict=True)]
             return [a + o.prior @ b for a, o, b in zip(self.adjoint(pulled)[1], self.model.observed, loaded, strict=True)]
 
-        return _conjugate_gradients(product, self.preconditioned, list(right))
+        try:
+            return conjugate_gradients(product, self.preconditioned, list(right))
+        except ConvergenceError:  # the preconditioner is that of other moduli, too far from these
+            self.model.boundary[:] = [None] * len(self.model.boundary)
+            return conjugate_gradients(product, self.preconditioned, list(right))
 
     def concentrated(self, basis: FloatArray) -> Concentrated:
         """Return half the misfit as a quadratic in changes of theta along `basis` (2 count, k), minimised over the loaded components."""
@@ -311,6 +333,11 @@ class Linearised:
         hessian = sum(u.T @ p - c.T @ x for u, p, c, x in zip(moved, pulls, cross, response, strict=True))
         gradient = basis.T @ theta - sum(x.T @ g for x, g in zip(response, loaded, strict=True))
         return Concentrated(np.asarray(0.5 * (hessian + hessian.T)), np.asarray(gradient), response, [x[:, -1] for x in solved])
+
+    def jacobians(self, quadratic: Concentrated) -> list[FloatArray]:
+        """Return the derivatives (q, 2 count) of the whitened residuals of every load case, the loaded components following theta."""
+        moved = self.forward(np.eye(2 * self.model.zones.count), [-x for x in quadratic.response])
+        return [np.asarray(o.operator @ u) for o, u in zip(self.model.observed, moved, strict=True)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -339,101 +366,7 @@ class Concentrated:
         return [-(x @ step) - r for x, r in zip(self.response, self.offset, strict=True)]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BoundaryPreconditioner:
-    """The Hessian of the loaded components of one load case at one point of the search, factorized; it changes little with the moduli.
-
-    Attributes
-    ----------
-    factor : tuple
-        Cholesky factor (n_b, n_b), 1/mm^2, as SciPy's.
-    informed : float
-        Number of loaded components that the measurements, rather than the prior, determine.
-    scale : float
-        Of the Hessian against the factor's.
-    """
-
-    factor: tuple[FloatArray, bool]
-    informed: float
-    scale: float = 1.0
-
-    @classmethod
-    def of(cls, at: Linearised, t: int) -> BoundaryPreconditioner:
-        """Make it from the response to every loaded component."""
-        o = at.model.observed[t]
-        factor, border, n_b = at.point.factors[t], at.border(t), len(o.loaded)
-        hessian = np.empty((n_b, n_b))
-        for start in range(0, n_b, BLOCK):
-            stop = min(start + BLOCK, n_b)
-            force = border[start:stop].T.toarray()
-            force[o.loaded] = 0.0
-            moved = -factor.solve(force)
-            moved[o.loaded[start:stop], np.arange(stop - start)] = 1.0
-            pull = np.asarray(o.operator.T @ (o.operator @ moved))
-            inner = pull.copy()
-            inner[o.loaded] = 0.0
-            answer = factor.solve(inner)
-            answer[o.loaded] = 0.0
-            hessian[:, start:stop] = pull[o.loaded] - border @ answer
-        hessian = 0.5 * (hessian + hessian.T)
-        full = hessian + o.prior.toarray()
-        try:
-            cholesky = sl.cho_factor(full, overwrite_a=False)
-        except np.linalg.LinAlgError as error:
-            raise ConvergenceError(
-                f"load case {o.load_case.name!r}: the measured field does not fix how the loaded nodes move as a whole"
-            ) from error
-        informed = n_b - float(np.sum(o.prior.multiply(sl.cho_solve(cholesky, np.eye(n_b)))))
-        return cls(cholesky, informed)
-
-    def scaled(self, observed: Sequence[Observed], source: int, target: int) -> BoundaryPreconditioner:
-        """Return the preconditioner of a load case `target` whose measurements differ from those of `source` in accuracy alone."""
-        ratio = (observed[source].noise_mm / observed[target].noise_mm) ** 2
-        return BoundaryPreconditioner(self.factor, self.informed, self.scale * ratio)
-
-    def unscaled(self, b: FloatArray) -> FloatArray:
-        """Return the solution (n_b, r) with the factor, before it is divided by `scale`."""
-        return np.asarray(sl.cho_solve(self.factor, b, check_finite=False))  # the check would cost as much as the solution
-
-
-def _alike(one: Observed, other: Observed) -> bool:
-    """Whether two load cases are measured at the same points and loaded at the same nodes, and differ in accuracy alone."""
-    same = one.operator.shape == other.operator.shape and np.array_equal(one.loaded, other.loaded)
-    if not same or not np.array_equal(one.operator.indices, other.operator.indices):
-        return False
-    return bool(np.allclose(one.operator.data * one.noise_mm, other.operator.data * other.noise_mm, rtol=1e-6, atol=0.0))
-
-
 def _in_blocks(factor: Factorization, right: FloatArray) -> FloatArray:
     if right.shape[1] <= BLOCK:
         return factor.solve(right)
     return np.concatenate([factor.solve(right[:, a : a + BLOCK]) for a in range(0, right.shape[1], BLOCK)], axis=1)
-
-
-def _conjugate_gradients(
-    product: Callable[[list[FloatArray]], list[FloatArray]],
-    precondition: Callable[[list[FloatArray]], list[FloatArray]],
-    right: list[FloatArray],
-) -> list[FloatArray]:
-    """Solve independent systems of several load cases, every column by its own iteration, all advanced together."""
-
-    def dot(a: list[FloatArray], b: list[FloatArray]) -> list[FloatArray]:
-        return [np.einsum("ij,ij->j", p, q) for p, q in zip(a, b, strict=True)]
-
-    x, r = [np.zeros_like(b) for b in right], [b.copy() for b in right]
-    target = [BOUNDARY_TOLERANCE * np.linalg.norm(b, axis=0) for b in right]
-    p, rz = [np.zeros_like(b) for b in right], [np.ones(b.shape[1]) for b in right]
-    for iteration in range(BOUNDARY_ITERATIONS):
-        if all((np.linalg.norm(a, axis=0) <= limit).all() for a, limit in zip(r, target, strict=True)):
-            return x
-        z = precondition(r)
-        new = dot(r, z)
-        for t in range(len(p)):
-            p[t] = z[t] + p[t] * (new[t] / np.maximum(rz[t], 1e-300) if iteration else 0.0)
-        q = product(p)
-        for t, curvature in enumerate(dot(p, q)):
-            alpha = new[t] / np.where(curvature > 0.0, curvature, np.inf)
-            x[t] += alpha * p[t]
-            r[t] -= alpha * q[t]
-        rz = new
-    raise ConvergenceError(f"the displacement of the loaded nodes did not converge in {BOUNDARY_ITERATIONS} conjugate gradient iterations")

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg as sl
+from scipy.special import ndtri
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.forward_model import LawName
+from naibu.identification.from_fields.field_laws import FieldElements, LawName
 from naibu.identification.from_fields.gauss_newton import Objective
 from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.sensitivities import FieldModel, Linearised, Point, logarithms, young_and_poisson
@@ -51,6 +52,10 @@ class Uncertainty:
         covariance[shared, shared] = np.inf
         return cls(information / noise_factor**2, covariance * noise_factor**2)
 
+    def with_added(self, covariance: FloatArray) -> Uncertainty:
+        """Return the uncertainty with independent errors of another covariance (2 k, 2 k) added; the information stays that of the data."""
+        return Uncertainty(self.information, self.covariance + covariance)
+
     def standard_deviations(self) -> FloatArray:
         """Return those of ln mu, then ln(kappa / mu) (2 k,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
@@ -82,20 +87,21 @@ def cramer_rao_bound(
     states: Sequence[FloatArray],
     *,
     law: LawName = "linear",
+    elements: FieldElements = "accurate",
 ) -> Uncertainty:
     """Return the Cramer-Rao bound at true moduli and displacements, the motion of loaded nodes being unknown.
 
     Parameters
     ----------
-    mesh, load_cases, zones, law
+    mesh, load_cases, zones, law, elements
         As for `identify_field`; of the load cases the points, covariances and loaded components count, not the measurements.
     lame_lambda, shear_modulus : ndarray, shape (count,)
         True moduli of the zones, kPa.
     states : sequence of ndarray, shape (n, d)
         True displacement of every load case, mm.
     """
-    model = FieldModel(mesh, load_cases, zones, law)
-    point = model.evaluate(logarithms(lame_lambda, shear_modulus), states)
+    model = FieldModel(mesh, load_cases, zones, law, elements)
+    point = model.evaluate(logarithms(lame_lambda, shear_modulus), [model.on_all_nodes(u) for u in states])
     return Uncertainty.of(information_at(model, point))
 
 
@@ -120,27 +126,83 @@ def resolution(at: Linearised, objective: Objective, *, explicit: bool, probes: 
     rng = np.random.default_rng(seed)
     signs = rng.choice([-1.0, 1.0], size=(probes, size)).T
     # (A + P)^-1 A s = s - (A + P)^-1 P s, the loaded components following
-    right = [curvature @ signs, *(np.zeros((len(o.loaded), probes)) for o in at.model.observed)]
+    right = [curvature @ signs, *(np.zeros((len(o.unknown), probes)) for o in at.model.observed)]
     lost = conjugate_gradients(system.product, system.preconditioned, right, 1e-2, 200)[0][0]
     return np.asarray((signs * (signs - lost)).mean(axis=1))
 
 
-def report(zones: Zones, theta: FloatArray, found: Uncertainty) -> tuple[str, ...]:
-    """Say in words how well every zone's moduli are determined, and which combination is determined worst."""
+@dataclass(frozen=True, slots=True, eq=False)
+class ErrorBudget:
+    """Where the uncertainty of moduli stems from.
+
+    Attributes
+    ----------
+    noise, mesh, known : ndarray, shape (2 k,)
+        Standard deviations of ln mu, then ln(kappa / mu), from the measurement, from what extrapolation to vanishing element size leaves
+        in doubt, and from the stated uncertainty of known regions. NaN for the mesh where its error was not estimated.
+    shared : float
+        By how much errors that neighbours share raised the variance from the measurement, 1 or more.
+    """
+
+    noise: FloatArray
+    mesh: FloatArray
+    known: FloatArray
+    shared: float
+
+
+def intervals(theta: FloatArray, found: Uncertainty, level: float = 0.95) -> tuple[FloatArray, FloatArray]:
+    """Return the bounds of Young's modulus (k, 2), kPa, and of Poisson's ratio (k, 2) that hold the truth with a probability `level`.
+
+    Both are normal in a logarithm: of E, and of kappa / mu, so that no bound of Poisson's ratio exceeds 0.5.
+    """
+    k, quantile = len(theta) // 2, float(ndtri(0.5 + 0.5 * level))
+    of_young, _ = found.of_young_and_poisson(theta)
+    young = young_and_poisson(theta)[0][:, None] * np.exp(quantile * of_young[:, None] * np.array([-1.0, 1.0]))
+    sd = found.standard_deviations()[k:, None]
+    with np.errstate(over="ignore"):
+        ratio = np.exp(theta[k:, None] + quantile * np.where(np.isfinite(sd), sd, 1e3) * np.array([-1.0, 1.0]))
+    return young, 0.5 - 1.5 / (3.0 * ratio + 1.0)
+
+
+def report(
+    zones: Zones, theta: FloatArray, found: Uncertainty, *, budget: ErrorBudget | None = None, usable: bool = True, sure: bool = True
+) -> tuple[str, ...]:
+    """Say in words how well every zone's moduli are determined, from what the uncertainty stems, and what is determined worst.
+
+    Nothing is called well determined unless the model explains the data and its elements are fine enough (`sure`); nor anything determined
+    where the result is not `usable`.
+    """
     young, poisson = young_and_poisson(theta)
     of_young, of_poisson = found.of_young_and_poisson(theta)
-    lines = [_sentence(*row) for row in zip(zones.names, young, of_young, poisson, of_poisson, strict=True)]
+    within = intervals(theta, found)
+    lines = []
+    for i, name in enumerate(zones.names):
+        line = _sentence(name, young[i], of_young[i], within[0][i], poisson[i], of_poisson[i], within[1][i], usable=usable, sure=sure)
+        lines.append(line + ("" if budget is None or not np.isfinite(of_young[i]) else _parts(budget, i, zones.count)))
     return (*lines, _worst(zones, found))
 
 
-def _sentence(name: str, young: float, of_young: float, poisson: float, of_poisson: float) -> str:
+def _sentence(
+    name: str, young: float, of_young: float, e: FloatArray, poisson: float, of_poisson: float, nu: FloatArray, *, usable: bool, sure: bool
+) -> str:
     if not np.isfinite(of_young):
         return f"{name}: the measurements do not determine its moduli."
-    how = "well" if of_young < WELL else "roughly" if of_young < POORLY else "poorly"
-    text = f"{name}: Young's modulus {young:.4g} kPa is {how} determined (standard error {100 * of_young:.2g} %)"
+    best = "well" if sure else "within the model"
+    how = f"{best if of_young < WELL else 'roughly' if of_young < POORLY else 'poorly'} determined"
+    text = f"{name}: Young's modulus {young:.4g} kPa is {how if usable else 'not to be used'} (standard error {100 * of_young:.2g} %, "
+    text += f"95 % interval {e[0]:.4g} to {e[1]:.4g} kPa)"
     if of_poisson > POISSON_POORLY:
         return text + f"; Poisson's ratio {poisson:.3f} is not (standard error {of_poisson:.2g}): take it from elsewhere."
-    return text + f", Poisson's ratio {poisson:.3f} within {of_poisson:.2g}."
+    return text + f", Poisson's ratio {poisson:.3f} ({nu[0]:.3f} to {nu[1]:.3f})."
+
+
+def _parts(budget: ErrorBudget, zone: int, count: int) -> str:
+    noise, mesh, known = (100.0 * float(values[zone]) for values in (budget.noise, budget.mesh, budget.known))
+    parts = [f"measurement {noise:.2g} %", f"elements {mesh:.2g} %" if np.isfinite(mesh) else "elements not estimated"]
+    if known > 0.0:
+        parts.append(f"known values {known:.2g} %")
+    shared = f" Errors that neighbours share raised the first {np.sqrt(budget.shared):.2g} times." if budget.shared > 1.0 else ""
+    return f" Of its shear modulus: {', '.join(parts)}.{shared}"
 
 
 def _worst(zones: Zones, found: Uncertainty) -> str:

@@ -41,13 +41,14 @@ TRUSTED_RATIO = (0.05, 20.0)  # of an unknown modulus to the known ones; the equ
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """Load cases of a calibration and their fit."""
+    """Load cases of a calibration and their fit; `priors` holds the parameters as they were before the search."""
 
     load_cases: tuple[MarkerLoadCase, ...]
     match: Match
     settings: ModelSettings
     noise: NoiseModel
     known_materials: KnownMaterials
+    priors: ParameterSet
 
     @property
     def warm_starts(self) -> dict[str, SolvedLoadCase]:
@@ -115,7 +116,7 @@ def calibrate(
     match = Matcher(load_cases, parameters, search or MatchingSettings()).run(
         progress=progress, checkpoint=checkpoint, start=begin, warm_starts=warm_starts
     )
-    return Calibration(load_cases, match, chosen, measured, known)
+    return Calibration(load_cases, match, chosen, measured, known, parameters)
 
 
 def _first_material(experiments: Sequence[Experiment]) -> KnownMaterials:

@@ -25,6 +25,7 @@ from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLo
 from naibu.identification.from_markers.parameter_names import pixel_scale
 from naibu.identification.from_markers.specimen_model import Specimen
 from naibu.mechanics.finite_strain.newton import Newton
+from naibu.mechanics.finite_strain.penalties import with_normal_stiffness
 from naibu.mechanics.finite_strain.problem import SolverSettings
 from naibu.mechanics.finite_strain.sensitivities import sensitivities
 from naibu.mechanics.finite_strain.statics import Solution, WarmStart, solve
@@ -127,6 +128,7 @@ class Matcher:
     parameters: ParameterSet
     settings: MatchingSettings = field(default_factory=MatchingSettings)
     _solvers: dict[int, LinearSolver | None] = field(default_factory=dict)
+    _penalties: dict[int, tuple[FloatArray, ...]] = field(default_factory=dict)
 
     def evaluate(
         self, values: Mapping[str, float], warm_starts: Sequence[SolvedLoadCase | None] = (), poses: Sequence[RigidTransform | None] = ()
@@ -152,15 +154,25 @@ class Matcher:
         self, index: int, values: Mapping[str, float], warm_start: Sequence[WarmStart], pose: RigidTransform | None
     ) -> LoadCaseFit:
         load_case = self.load_cases[index]
-        problem = load_case.specimen.problem(values, load_case.state)
+        # as stiff as contact had to be before: the objective does not jump, and no evaluation finds it anew
+        problem = with_normal_stiffness(load_case.specimen.problem(values, load_case.state), self._penalties.get(index, ()))
         try:
             solution = solve(problem, settings=_PATH, solver=self._solvers.get(index), warm_start=warm_start)
         except ConvergenceError as error:
             raise ConvergenceError(f"{load_case.name}: {error}") from error
-        newton = Newton(problem, _PATH, self._solvers.get(index))
+        newton = Newton(solution.problem, _PATH, self._solvers.get(index))
         path = self._path_derivatives(load_case, values, solution, newton)
-        self._solvers[index] = newton.solver
+        self._solvers[index], self._penalties[index] = newton.solver, solution.states[-1].normal_stiffness
         return self._observed(load_case, values, solution, path, pose)
+
+    def differentiated(self, fits: Sequence[LoadCaseFit], values: Mapping[str, float]) -> list[LoadCaseFit]:
+        """Return fits at `values` with derivatives with respect to the free parameters of this matcher; nothing is solved anew."""
+        out = []
+        for load_case, fit in zip(self.load_cases, fits, strict=True):
+            newton = Newton(fit.solution.problem, _PATH)
+            path = self._path_derivatives(load_case, values, fit.solution, newton)
+            out.append(self._observed(load_case, values, fit.solution, path, fit.pose))
+        return out
 
     def _path_derivatives(
         self, load_case: MarkerLoadCase, values: Mapping[str, float], solution: Solution, newton: Newton
@@ -191,7 +203,8 @@ class Matcher:
         moved = specimen.marker_points + u
         enlargement = specimen.enlargement(values)
         if pose is None:
-            pose = _first_pose(specimen, moved, load_case.measured * enlargement)
+            lifted = specimen.marker_points.mean(axis=0) - (load_case.specimen.marker_points * enlargement).mean(axis=0)
+            pose = _first_pose(specimen, moved, load_case.measured * enlargement, lifted)
         placed = pose.applied(moved)
         predicted = placed / enlargement  # residuals stay in the file's millimetres: a smaller scale must not make them smaller
         turned = np.einsum("ij,kjl->kil", pose.rotation, gradient)
@@ -371,9 +384,9 @@ def _bounded_step(hessian: FloatArray, gradient: FloatArray, limits: FloatArray)
     return step
 
 
-def _first_pose(specimen: Specimen, points: FloatArray, measured: FloatArray) -> RigidTransform:
-    """Pose that brings `points` to the `measured` ones; without data that of the reference scan."""
+def _first_pose(specimen: Specimen, points: FloatArray, measured: FloatArray, lifted: FloatArray) -> RigidTransform:
+    """Pose that brings `points` to the `measured` ones; without data that of the reference scan, whose markers the model has `lifted`."""
     if np.isfinite(measured).all(axis=1).sum() >= 4:
         return registration(points, measured)
     pose, centre = specimen.placement.pose, points.mean(axis=0)
-    return RigidTransform(pose.rotation, centre, pose.applied(centre))
+    return RigidTransform(pose.rotation, centre, pose.applied(centre - lifted))

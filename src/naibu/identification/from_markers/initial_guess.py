@@ -141,7 +141,7 @@ def equilibrium_gap(
     for e in experiments:
         for state in (states or {}).get(e.name, [s.name for s in e.loaded_states]):
             meshes.append(marker_mesh(e, state))
-            spreads.append(np.sqrt(2.0) * measured.standard_deviation(e.xy_step_mm, e.z_step_mm))
+            spreads.append(np.sqrt(2.0) * measured.of_experiment(e))
     if not meshes:
         raise InputError(f"no loaded state with measured positions in {', '.join(e.name for e in experiments) or 'no experiment'}")
     return equilibrium_gap_of_meshes(meshes, spreads, known_materials.young_moduli, poisson_ratios=poisson_ratios, sweeps=sweeps)

@@ -9,6 +9,7 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
+from naibu.core.experiment import Experiment
 from naibu.core.parameters import ParameterSet
 from naibu.core.rigid_transform import RigidTransform
 from naibu.identification.from_markers.marker_grid import FILLED_SD_MM
@@ -21,9 +22,20 @@ FAR_MM = 1.0
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """Standard deviation of a measured coordinate, mm: localisation of the marker's centre, and quantisation to pixels and slices."""
+    """Standard deviation of a measured coordinate, mm: localisation of the marker's centre, and quantisation to pixels and slices.
+
+    Where an experiment states the standard deviation of its coordinates, as tracked markers do, that replaces `placing_mm` and the
+    quantisation, and `model_mm` is added: what a model with elements of a tenth of the object leaves unexplained at the true parameters.
+    """
 
     placing_mm: float = 0.1
+    model_mm: float = 0.05
+
+    def of_experiment(self, experiment: Experiment) -> FloatArray:
+        """Return the standard deviation (3,) along x, y, z, mm, of the coordinates of an experiment."""
+        if experiment.sd_mm is not None:
+            return np.asarray(np.hypot(experiment.sd_mm, self.model_mm))
+        return self.standard_deviation(experiment.xy_step_mm, experiment.z_step_mm)
 
     def standard_deviation(self, xy_step_mm: float, z_step_mm: float) -> FloatArray:
         """Return the standard deviation (3,) along x, y, z, mm."""
@@ -81,7 +93,7 @@ class MarkerLoadCase:
         measured = markers.aligned(specimen.marker_ids) * specimen.placement.scale
         if np.isfinite(measured).any(axis=1).sum() < 4:
             raise InputError(f"{experiment.name}/{state} shares fewer than 4 trusted markers with the reference configuration")
-        sd = noise.standard_deviation(experiment.xy_step_mm, experiment.z_step_mm)
+        sd = noise.of_experiment(experiment)
         return cls(specimen, state, measured, sd, np.where(specimen.marker_filled, FILLED_SD_MM, sd))
 
 

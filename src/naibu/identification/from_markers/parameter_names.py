@@ -22,6 +22,12 @@ def shape_parameter(material: str, name: str) -> str:
     return f"{material}: {name}"
 
 
+def law_of_shape(kind: str, own: str) -> str | None:
+    """Return the name of the law that has the shape parameter `kind`: `own` where it does; None where no law has it."""
+    laws = [law for law, kinds in SHAPE_NAMES.items() if kind in kinds]
+    return own if own in laws else next(iter(laws), None)
+
+
 def batch_stiffness(batch: str) -> str:
     """Name of the factor by which all moduli of a batch differ from those of their materials."""
     return f"batch {batch}: stiffness"

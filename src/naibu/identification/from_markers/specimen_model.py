@@ -22,6 +22,7 @@ from naibu.identification.from_markers.parameter_names import (
     batch_stiffness,
     friction,
     joint_friction,
+    law_of_shape,
     layer_shift,
     pixel_scale,
     platen_position,
@@ -240,10 +241,12 @@ class Specimen:
     def direction(self, name: str, values: Mapping[str, float], state: str) -> list[Direction]:
         """Return how the problem of a state depends on the physical value of a parameter; empty where it does not.
 
-        The change is the sum of the directions returned.
+        The change is the sum of the directions returned. A parameter of the shape of another law (`SHAPE_NAMES`) adds to the specimen's
+        law what distinguishes the other one from a neo-Hookean law.
         """
         if (materials := self._material_direction(name, values)) is not None:
-            return [Direction(materials=materials)]
+            other = law_of_shape(name.rpartition(": ")[2], self.law.name)
+            return [Direction(materials=materials, law=None if other in (None, self.law.name) else law_named(str(other)).code)]
         out = []
         for i, (pairs, pair_of_point) in enumerate(zip(self._pairs, self._pair_of_points, strict=True)):
             if name in pairs:
@@ -285,11 +288,12 @@ class Specimen:
             return parameter_vector(self.law, mu / factor, kappa / factor, shape)
         if name == poisson_ratio(material):
             return parameter_vector(self.law, -mu / (1.0 + nu), 2.0 * kappa / (1.0 - 2.0 * nu), shape)
-        for k, shape_name in enumerate(SHAPE_NAMES.get(self.law.name, ())):
-            if name == shape_parameter(material, shape_name):
-                one = tuple(1.0 if k == j else 0.0 for j in range(len(shape)))
-                zero = parameter_vector(self.law, mu, 0.0, tuple(0.0 for _ in shape))
-                return tuple(a - b for a, b in zip(parameter_vector(self.law, mu, 0.0, one), zero, strict=True))
+        kind = name.rpartition(": ")[2]
+        law_name = law_of_shape(kind, self.law.name)
+        if law_name is not None and name == shape_parameter(material, kind):
+            law = law_named(law_name)
+            one = tuple(float(kind == other) for other in SHAPE_NAMES[law_name])
+            return tuple(a - b for a, b in zip(parameter_vector(law, mu, 0.0, one), parameter_vector(law, mu, 0.0), strict=True))
         return None
 
     def _is_spring(self, index: int) -> bool:

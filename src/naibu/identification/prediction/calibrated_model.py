@@ -15,8 +15,12 @@ from naibu.identification.from_markers.calibration import Calibration
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
 from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.prediction.predictive_uncertainty import PredictiveUncertainty, predictive_uncertainty
+from naibu.identification.prediction.stored_model import check_stored_model
 
 FORMAT = "naibu model 1"
+LARGEST_EXPONENT = 700.0
+UNBOUNDED = 1e3  # a factor between estimate and bound beyond which the data give no bound
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +45,10 @@ class CalibratedModel:
         ``experiment/state`` of the data used.
     provenance : mapping
         Version, settings, input hashes.
+    predictive : PredictiveUncertainty, optional
+        What the calibration leaves uncertain about other load cases.
+    reservation : str
+        What speaks against using the model, from the verdict on its identification; empty where nothing does.
     """
 
     settings: ModelSettings
@@ -51,6 +59,15 @@ class CalibratedModel:
     known_materials: KnownMaterials
     load_cases: tuple[str, ...]
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    predictive: PredictiveUncertainty | None = None
+    reservation: str = ""
+
+    @property
+    def uncertainty(self) -> PredictiveUncertainty:
+        """What the calibration leaves uncertain about other load cases; no more than the covariance where the model does not say."""
+        if self.predictive is not None:
+            return self.predictive
+        return PredictiveUncertainty(tuple(p.name for p in self.parameters.free), self.covariance, 0.0, max(1.0, self.noise_factor), {})
 
     @classmethod
     def of(cls, calibration: Calibration, provenance: Mapping[str, Any] | None = None) -> CalibratedModel:
@@ -58,8 +75,9 @@ class CalibratedModel:
         c = calibration
         labels = tuple(t.name for t in c.load_cases)
         return cls(
-            c.settings, c.match.parameters, c.match.covariance, c.noise, c.match.noise_factor, c.known_materials, labels, provenance or {}
-        )
+            c.settings, c.match.parameters, c.match.covariance, c.noise, c.match.noise_factor, c.known_materials, labels, provenance or {},
+            predictive_uncertainty(c),
+        )  # fmt: skip
 
     def standard_deviation(self, name: str) -> float:
         """Standard deviation of a parameter on the optimiser's scale; 0 where it was given.
@@ -77,11 +95,16 @@ class CalibratedModel:
         raise InputError(f"the model has no parameter {name!r}; it has {', '.join(self.parameters.values())}")
 
     def interval(self, name: str, width: float = 1.959964) -> tuple[float, float]:
-        """Return the bounds of a parameter, `width` standard deviations about its estimate on the optimiser's scale (95 % by default)."""
+        """Return the bounds of a parameter, `width` standard deviations about its estimate on the optimiser's scale (95 % by default).
+
+        They respect physics: a Poisson's ratio is at least -1, and a positive parameter known to no power of `UNBOUNDED` has no bounds.
+        """
         parameter = next(p for p in self.parameters if p.name == name)
-        centre, half = parameter.inner(parameter.value), width * self.standard_deviation(name)
+        centre, half = parameter.inner(parameter.value), min(width * self.standard_deviation(name), LARGEST_EXPONENT)
+        if parameter.scale == "log" and half > np.log(UNBOUNDED):
+            return 0.0, np.inf
         low, high = sorted((parameter.physical(centre - half), parameter.physical(centre + half)))
-        return low, high
+        return (max(low, -1.0), high) if parameter.scale == "incompressibility" else (low, high)
 
     def correlation(self, names: Sequence[str]) -> FloatArray:
         """Return the correlation matrix of some free parameters."""
@@ -96,6 +119,7 @@ class CalibratedModel:
         rows = [asdict(p) | {"prior_sd": p.prior_sd if np.isfinite(p.prior_sd) else None} for p in self.parameters]
         return {
             "format": FORMAT,
+            "reservation": self.reservation,
             "units": "mm, kg, s, mN, kPa",
             "settings": asdict(self.settings),
             "noise": asdict(self.noise),
@@ -104,6 +128,7 @@ class CalibratedModel:
             "load_cases": list(self.load_cases),
             "parameters": rows,
             "covariance": self.covariance.tolist(),
+            "predictive": None if self.predictive is None else self.predictive.to_dict(),
             "provenance": dict(self.provenance),
         }
 
@@ -118,13 +143,16 @@ class CalibratedModel:
         """
         if data.get("format") != FORMAT:
             raise InputError(f"this is not a naibu model: its format is {data.get('format')!r}, not {FORMAT!r}")
+        check_stored_model(data)
         try:
             parameters = ParameterSet.of(Parameter(**(row | {"prior_sd": row["prior_sd"] or np.inf})) for row in data["parameters"])
             covariance = np.array(data["covariance"], dtype=float).reshape(len(parameters.free), len(parameters.free))
-            known = data["known"]
+            known, predictive = data["known"], data.get("predictive")
             return cls(
                 ModelSettings(**data["settings"]), parameters, covariance, NoiseModel(**data["noise"]), float(data["noise_factor"]),
                 KnownMaterials(known["young_moduli"], known["scale_is_absolute"]), tuple(data["load_cases"]), data.get("provenance", {}),
+                None if predictive is None else PredictiveUncertainty.from_dict(predictive),
+                str(data.get("reservation", "")),
             )  # fmt: skip
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"the model file is damaged or was written by another version ({error}); identify the model again") from error

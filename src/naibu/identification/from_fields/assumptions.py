@@ -1,0 +1,115 @@
+"""Sensitivity of identified moduli to what was assumed: the moduli of known regions, and the law.
+
+As for the discretisation (`mesh_error`), the states under another assumption change the residuals, and the best moduli follow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import ConvergenceError
+from naibu.identification.from_fields.field_laws import FieldLaw, LawName, field_law
+from naibu.identification.from_fields.forward_model import Solvers, equilibrium
+from naibu.identification.from_fields.load_cases import KnownRegion, Zones
+from naibu.identification.from_fields.mesh_error import refitted
+from naibu.identification.from_fields.sensitivities import Concentrated, Linearised, moduli_of, young_and_poisson
+from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
+
+OTHER_YOUNG, OTHER_POISSON = 0.1, 0.02  # changes whose effect is stated: relative, of Young's modulus; absolute, of Poisson's ratio
+MOST_POISSON = 0.499
+OTHER_LAW: dict[LawName, LawName] = {"linear": "neo_hookean", "neo_hookean": "linear"}
+LAW_NAMES = {"linear": "small strain", "neo_hookean": "a neo-Hookean law at finite strain"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Assumption:
+    """Another assumption, and what it would do to the moduli.
+
+    Attributes
+    ----------
+    text : str
+        The other assumption in words.
+    theta : ndarray, shape (2 count,)
+        By how much it would change ln mu and ln(kappa / mu) of the zones.
+    standard_deviations : float
+        How many standard deviations it is away from what was assumed; zero where it is a question of the model.
+    """
+
+    text: str
+    theta: FloatArray
+    standard_deviations: float
+
+
+def assumptions(at: Linearised, quadratic: Concentrated, law: LawName) -> tuple[Assumption, ...]:
+    """Return what other moduli of the known regions, and the other law, would do to the result."""
+    model, out = at.model, []
+    for number, region in enumerate(model.zones.known):
+        cells = model.zones.region_of_cell == number
+        for text, young, poisson, sd in _others(region):
+            lame, shear = moduli_of(model.zones, at.point.theta)
+            lame[cells], shear[cells] = lame_parameters(young, poisson)
+            changed = _refitted(at, quadratic, model.law, lame, shear)
+            if changed is not None:
+                out.append(Assumption(text, changed, sd))
+    if model.mesh.dimension == 3:
+        lame, shear = moduli_of(model.zones, at.point.theta)
+        other = OTHER_LAW[law]
+        changed = _refitted(at, quadratic, field_law(model.computed, other, averaged=model.averaged), lame, shear)
+        if changed is not None:
+            out.append(Assumption(f"with {LAW_NAMES[other]}", changed, 0.0))
+    return tuple(out)
+
+
+def covariance_of(found: tuple[Assumption, ...], size: int) -> FloatArray:
+    """Return the covariance (size, size) of theta that stems from the stated uncertainty of known regions."""
+    out = np.zeros((size, size))
+    for one in found:
+        if one.standard_deviations > 0.0:
+            per_sd = one.theta / one.standard_deviations
+            out += np.outer(per_sd, per_sd)
+    return out
+
+
+def effects(found: tuple[Assumption, ...], zones: Zones, theta: FloatArray) -> tuple[str, ...]:
+    """Say what other assumptions would do to Young's modulus and Poisson's ratio of the zones, at most three zones each."""
+    young, poisson = young_and_poisson(theta)
+    lines = []
+    for one in found:
+        other, ratio = young_and_poisson(theta + one.theta)
+        rows = [
+            f"{name} {100 * (a / b - 1):+.2g} %, Poisson's ratio {c - d:+.2g}"
+            for name, a, b, c, d in zip(zones.names[:3], other, young, ratio, poisson, strict=False)
+        ]
+        lines.append(f"{one.text[0].upper()}{one.text[1:]}, Young's modulus would change: {'; '.join(rows)}.")
+    return tuple(lines)
+
+
+def _others(region: KnownRegion) -> list[tuple[str, float, float, float]]:
+    """Return text, Young's modulus, Poisson's ratio and distance in standard deviations of other moduli of a region."""
+    young, poisson = region.young_modulus, region.poisson_ratio
+    near = min(poisson + OTHER_POISSON, 0.5 * (poisson + 0.5), MOST_POISSON)
+    if near - poisson < 1e-3:
+        near = poisson - OTHER_POISSON
+    of_young = OTHER_YOUNG / region.young_modulus_sd if region.young_modulus_sd > 0.0 else 0.0
+    of_poisson = abs(near - poisson) / region.poisson_ratio_sd if region.poisson_ratio_sd > 0.0 else 0.0
+    stiffer = (1.0 + OTHER_YOUNG) * young
+    return [
+        (f"with {stiffer:.4g} kPa for {young:.4g} kPa of {region.name!r}", stiffer, poisson, of_young),
+        (f"with Poisson's ratio {near:.3g} for {poisson:.3g} of {region.name!r}", young, near, of_poisson),
+    ]
+
+
+def _refitted(at: Linearised, quadratic: Concentrated, law: FieldLaw, lame: FloatArray, shear: FloatArray) -> FloatArray | None:
+    """Return the change (2 count,) of theta when equilibrium is that of other moduli or another law; None where there is none."""
+    model = at.model
+    solvers, changes = Solvers(law, model.points), []
+    try:
+        for o, u in zip(model.observed, at.point.states, strict=True):
+            state, _ = equilibrium(law, solvers, lame, shear, o.load_case, u, b"")
+            changes.append(np.asarray(o.operator @ (state - u).ravel()))
+        return refitted(at, quadratic, changes).theta
+    except ConvergenceError:
+        return None

@@ -1,0 +1,115 @@
+"""The unknown displacement of loaded nodes: its Hessian at one point of the search, and conjugate gradients preconditioned by it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.linalg as sl
+
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import ConvergenceError
+from naibu.identification.from_fields.forward_model import Observed
+
+if TYPE_CHECKING:
+    from naibu.identification.from_fields.sensitivities import Linearised
+
+BLOCK = 256  # right-hand sides solved together
+BOUNDARY_TOLERANCE = 1e-5
+BOUNDARY_ITERATIONS = 200
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoundaryPreconditioner:
+    """The Hessian of the loaded components of one load case at one point of the search, factorized; it changes little with the moduli.
+
+    Attributes
+    ----------
+    factor : tuple
+        Cholesky factor (n_b, n_b), 1/mm^2, as SciPy's.
+    informed : float
+        Number of loaded components that the measurements, rather than the prior, determine.
+    scale : float
+        Of the Hessian against the factor's.
+    """
+
+    factor: tuple[FloatArray, bool]
+    informed: float
+    scale: float = 1.0
+
+    @classmethod
+    def of(cls, at: Linearised, t: int) -> BoundaryPreconditioner:
+        """Make it from the response to every loaded component."""
+        o = at.model.observed[t]
+        factor, border, n_b = at.point.factors[t], at.border(t), len(o.unknown)
+        hessian = np.empty((n_b, n_b))
+        for start in range(0, n_b, BLOCK):
+            stop = min(start + BLOCK, n_b)
+            force = border[start:stop].T.toarray()
+            force[o.loaded] = 0.0
+            moved = -factor.solve(force)
+            moved[o.loaded] = o.basis[:, start:stop].toarray()
+            pull = np.asarray(o.operator.T @ (o.operator @ moved))
+            inner = pull.copy()
+            inner[o.loaded] = 0.0
+            answer = factor.solve(inner)
+            answer[o.loaded] = 0.0
+            hessian[:, start:stop] = o.basis.T @ pull[o.loaded] - border @ answer
+        hessian = 0.5 * (hessian + hessian.T)
+        full = hessian + o.prior.toarray()
+        try:
+            cholesky = sl.cho_factor(full, overwrite_a=False)
+        except np.linalg.LinAlgError as error:
+            raise ConvergenceError(
+                f"load case {o.load_case.name!r}: the measured field does not fix how the loaded nodes move as a whole"
+            ) from error
+        informed = n_b - float(np.sum(o.prior.multiply(sl.cho_solve(cholesky, np.eye(n_b)))))
+        return cls(cholesky, informed)
+
+    def scaled(self, observed: Sequence[Observed], source: int, target: int) -> BoundaryPreconditioner:
+        """Return the preconditioner of a load case `target` whose measurements differ from those of `source` in accuracy alone."""
+        ratio = (observed[source].noise_mm / observed[target].noise_mm) ** 2
+        return BoundaryPreconditioner(self.factor, self.informed, self.scale * ratio)
+
+    def unscaled(self, b: FloatArray) -> FloatArray:
+        """Return the solution (n_b, r) with the factor, before it is divided by `scale`."""
+        return np.asarray(sl.cho_solve(self.factor, b, check_finite=False))  # the check would cost as much as the solution
+
+
+def alike(one: Observed, other: Observed) -> bool:
+    """Whether two load cases are measured at the same points and loaded at the same nodes, and differ in accuracy alone."""
+    same = one.operator.shape == other.operator.shape and np.array_equal(one.loaded, other.loaded)
+    if not same or not np.array_equal(one.operator.indices, other.operator.indices):
+        return False
+    return bool(np.allclose(one.operator.data * one.noise_mm, other.operator.data * other.noise_mm, rtol=1e-6, atol=0.0))
+
+
+def conjugate_gradients(
+    product: Callable[[list[FloatArray]], list[FloatArray]],
+    precondition: Callable[[list[FloatArray]], list[FloatArray]],
+    right: list[FloatArray],
+) -> list[FloatArray]:
+    """Solve independent systems of several load cases, every column by its own iteration, all advanced together."""
+
+    def dot(a: list[FloatArray], b: list[FloatArray]) -> list[FloatArray]:
+        return [np.einsum("ij,ij->j", p, q) for p, q in zip(a, b, strict=True)]
+
+    x, r = [np.zeros_like(b) for b in right], [b.copy() for b in right]
+    target = [BOUNDARY_TOLERANCE * np.linalg.norm(b, axis=0) for b in right]
+    p, rz = [np.zeros_like(b) for b in right], [np.ones(b.shape[1]) for b in right]
+    for iteration in range(BOUNDARY_ITERATIONS):
+        if all((np.linalg.norm(a, axis=0) <= limit).all() for a, limit in zip(r, target, strict=True)):
+            return x
+        z = precondition(r)
+        new = dot(r, z)
+        for t in range(len(p)):
+            p[t] = z[t] + p[t] * (new[t] / np.maximum(rz[t], 1e-300) if iteration else 0.0)
+        q = product(p)
+        for t, curvature in enumerate(dot(p, q)):
+            alpha = new[t] / np.where(curvature > 0.0, curvature, np.inf)
+            x[t] += alpha * p[t]
+            r[t] -= alpha * q[t]
+        rz = new
+    raise ConvergenceError(f"the displacement of the loaded nodes did not converge in {BOUNDARY_ITERATIONS} conjugate gradient iterations")

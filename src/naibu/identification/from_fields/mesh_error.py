@@ -1,0 +1,116 @@
+"""Discretisation error of identified moduli: the same load cases on a mesh of half the element size, and extrapolation from the two.
+
+The state on the finer mesh, under the same moduli and the same displacement of the loaded nodes, changes the residuals; the moduli that fit
+best then change by a Gauss-Newton step. Corners, edges and interfaces make solutions singular, so that the order of convergence lies
+between 1 and 2 whatever the elements; on bodies like those of the benchmark it is about 1.8. What
+extrapolation adds is doubted accordingly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import ConvergenceError
+from naibu.identification.from_fields.field_laws import LawName, computed_mesh, field_law
+from naibu.identification.from_fields.forward_model import Observed, Solvers, equilibrium
+from naibu.identification.from_fields.refinement import Refinement
+from naibu.identification.from_fields.sensitivities import Concentrated, Linearised, moduli_of
+from naibu.meshing.point_location import interpolation_operator
+
+EXTRAPOLATED = 1.4  # whole error over the change to half the element size: 1 / (1 - 2^-1.8)
+DOUBT = 0.4  # standard deviation of that error over the change: orders from 1 to 2.5 give 2 to 1.2 for it
+COARSE = 0.25  # change of a logarithm from which extrapolation is not trusted: then every modulus gets the doubt of the worst
+MOST_UNKNOWNS = 600_000  # of the finer mesh
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refit:
+    """Best fit after a change of the model, by one Gauss-Newton step.
+
+    Attributes
+    ----------
+    theta : ndarray, shape (2 count,)
+        Change of the logarithms of the moduli.
+    residuals : tuple of ndarray, shape (q,)
+        Whitened residuals of every load case.
+    """
+
+    theta: FloatArray
+    residuals: tuple[FloatArray, ...]
+
+    @property
+    def misfit(self) -> float:
+        """Sum of squares of the residuals."""
+        return sum(float(r @ r) for r in self.residuals)
+
+
+def doubt_of(shift: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return standard deviations (2 count,) and covariance (2 count, 2 count) of extrapolated logarithms that changed by `shift`.
+
+    The error of all moduli has one cause and one sign, unless elements are so coarse that changes say little of what is left.
+    """
+    worst = float(np.abs(shift).max(initial=0.0))
+    if worst > COARSE:
+        sd = np.full_like(shift, DOUBT / EXTRAPOLATED * worst)
+        return sd, np.diag(sd**2)
+    return DOUBT / EXTRAPOLATED * np.abs(shift), (DOUBT / EXTRAPOLATED) ** 2 * np.outer(shift, shift)
+
+
+def refitted(at: Linearised, quadratic: Concentrated, changes: list[FloatArray]) -> Refit:
+    """Return the best fit when the whitened residuals of the load cases change by `changes` (q,); `quadratic` is in all of theta."""
+    observed = at.model.observed
+    residuals = [o.residual(u) + c for o, u, c in zip(observed, at.point.states, changes, strict=True)]
+    theta, loaded = at.gradient_of(residuals)
+    offset = at.loaded_solved([g[:, None] for g in loaded])
+    gradient = theta - sum(x.T @ g for x, g in zip(quadratic.response, loaded, strict=True))
+    step: FloatArray = -np.linalg.lstsq(quadratic.hessian, np.asarray(gradient), rcond=1e-12)[0].astype(np.float64)
+    moved = at.forward(step[:, None], [-(x @ step)[:, None] - b for x, b in zip(quadratic.response, offset, strict=True)])
+    return Refit(step, tuple(r + (o.operator @ u)[:, 0] for o, r, u in zip(observed, residuals, moved, strict=True)))
+
+
+def changes_on_finer_mesh(at: Linearised, law: LawName) -> list[FloatArray] | None:
+    """Return by how much the whitened residuals (q,) of every load case change on a mesh of half the element size.
+
+    Where no equilibrium at finite strain is found on it, because the displacement of the loaded nodes is too rough for small cells, the
+    change is that of small strain. None where the elements are used as given, or the finer mesh is too large.
+    """
+    model = at.model
+    if not model.averaged or 8 * model.points.size > MOST_UNKNOWNS:
+        return None
+    names: tuple[LawName, ...] = ("linear",) if law == "linear" else (law, "linear")
+    for name in names:
+        try:
+            return _changes(at, name, at.point.states if name == law else _small_strain(at))
+        except ConvergenceError:
+            continue
+    return None
+
+
+def _small_strain(at: Linearised) -> tuple[FloatArray, ...]:
+    """Return the states (n, d), mm, of small strain with the same moduli and the same displacement of the loaded nodes."""
+    model, law = at.model, field_law(at.model.computed, "linear", averaged=at.model.averaged)
+    lame, shear = moduli_of(model.zones, at.point.theta)
+    solvers = Solvers(law, model.points)
+    pairs = zip(model.observed, at.point.states, strict=True)
+    return tuple(equilibrium(law, solvers, lame, shear, o.load_case, u, b"")[0] for o, u in pairs)
+
+
+def _changes(at: Linearised, law: LawName, states: tuple[FloatArray, ...]) -> list[FloatArray]:
+    model, finer = at.model, Refinement.of(at.model.mesh)
+    computed, averaged = computed_mesh(finer.mesh, "accurate")
+    body = field_law(computed, law, averaged=averaged)
+    lame, shear = moduli_of(finer.zones(model.zones), at.point.theta)
+    solvers, between = Solvers(body, computed.points, iterative=True), interpolation_operator(model.computed, computed.points)
+    out = []
+    for o, u in zip(model.observed, states, strict=True):
+        of_nodes = o.load_case if finer.mesh.n_points == len(u) else finer.load_case(o.load_case)
+        on = Observed.of(finer.mesh, computed, of_nodes)
+        guess = np.asarray(between @ u)
+        nodes = guess[: finer.mesh.n_points].ravel()
+        guess.ravel()[on.loaded] = on.basis @ nodes[on.unknown]
+        state, _ = equilibrium(body, solvers, lame, shear, on.load_case, guess, b"")
+        out.append(on.residual(state) - o.residual(u))
+    return out

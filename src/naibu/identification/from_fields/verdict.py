@@ -1,0 +1,157 @@
+"""Verdict on moduli from a displacement field: whether the model explains the measurements, and noise that neighbours share.
+
+The verdict weighs the residuals in units of the stated noise, what they leave unexplained of the deformation, and the part of them that
+neighbours share (noise of independent points is not shared; compare Moran's I). Errors that neighbours share, of the
+measurement or of the model, weigh more than independent ones; the covariance of the moduli is then taken from the scatter of the scores of
+spatial blocks, the cluster-robust estimator of :cite:t:`liang1986`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.rigid_transform import registration
+from naibu.identification.from_fields.forward_model import Observed
+
+Explanation = Literal["explained", "explained in part", "not explained"]
+WITHIN_NOISE = 1.25  # residuals over the noise that need no explanation even if neighbours share them
+NOISE_UNDERSTATED = 2.0  # residuals over the stated noise that may still be noise, if neighbours do not share them
+SMALL, LARGE = 0.02, 0.25  # of the deformation: so little needs no explanation, so much must not be left
+SHARED = 0.15
+NEIGHBOURS = 6
+BLOCKS, POINTS_PER_BLOCK, FEWEST_BLOCKS = 64, 6, 16
+
+
+@dataclass(frozen=True, slots=True)
+class FieldVerdict:
+    """Whether the model explains the measured fields.
+
+    Attributes
+    ----------
+    explanation : {"explained", "explained in part", "not explained"}
+        The verdict.
+    sentence : str
+        The same with its reasons.
+    noise_factor : float
+        Root mean square residual in units of the stated noise.
+    unexplained : float
+        Residual beyond noise over the deformation (displacement less its rigid motion), root mean squares.
+    shared : float
+        Correlation of the residual of a point with the mean of its neighbours'.
+    """
+
+    explanation: Explanation
+    sentence: str
+    noise_factor: float
+    unexplained: float
+    shared: float
+
+    @property
+    def ok(self) -> bool:
+        """Whether the moduli can be used."""
+        return self.explanation != "not explained"
+
+
+def verdict(observed: Sequence[Observed], residuals: Sequence[FloatArray], degrees_of_freedom: float) -> FieldVerdict:
+    """Return the verdict on whitened residuals (q,) of the load cases."""
+    misfit = sum(float(r @ r) for r in residuals)
+    factor = float(np.sqrt(misfit / max(degrees_of_freedom, 1.0)))
+    noise_stated = not any(o.exact for o in observed)
+    left = deformed = 0.0
+    for o, r in zip(observed, residuals, strict=True):
+        beyond = max(float(r @ r) - (len(r) if noise_stated else 0.0), 0.0) * o.noise_mm**2
+        left, deformed = left + beyond, deformed + _deformation(o)
+    unexplained = float(np.sqrt(left / max(deformed, 1e-300)))
+    shared = _shared(observed, residuals)
+    how = _explanation(factor, unexplained, shared, noise_stated=noise_stated)
+    noise = f"residuals are {factor:.2g} times the stated noise, " if noise_stated else ""
+    sentence = f"{how.capitalize()}: {noise}{100 * unexplained:.2g} % of the deformation is left unexplained"
+    if shared > SHARED and how != "explained":
+        sentence += ", and neighbouring points share it"
+    advice = {"explained": "", "explained in part": ": question law, zones and known values", "not explained": "; do not use these moduli"}
+    return FieldVerdict(how, f"{sentence}{advice[how]}.", factor, unexplained, shared)
+
+
+def _explanation(factor: float, unexplained: float, shared: float, *, noise_stated: bool) -> Explanation:
+    if unexplained > LARGE and (factor > NOISE_UNDERSTATED or not noise_stated):
+        return "not explained"
+    if not noise_stated:
+        return "explained" if unexplained <= SMALL else "explained in part"
+    unshared = factor <= NOISE_UNDERSTATED and shared <= SHARED
+    return "explained" if factor <= WITHIN_NOISE or unshared else "explained in part"
+
+
+def _deformation(o: Observed) -> float:
+    """Return the sum of squares (mm^2) of the measured displacement less its best rigid motion."""
+    points, vectors = o.points, o.load_case.field.vectors[o.load_case.field.valid]
+    if points.shape[1] < 3 or len(points) < 4:
+        return float(((vectors - vectors.mean(axis=0)) ** 2).sum())
+    return float(((points + vectors - registration(points, points + vectors).applied(points)) ** 2).sum())
+
+
+def _shared(observed: Sequence[Observed], residuals: Sequence[FloatArray]) -> float:
+    """Return the correlation of residuals with the mean of their neighbours', in [-1, 1]."""
+    products = own = of_means = 0.0
+    for o, r in zip(observed, residuals, strict=True):
+        at = r.reshape(len(o.points), -1)
+        count = min(NEIGHBOURS, len(at) - 1)
+        if count < 1:
+            continue
+        near = np.asarray(cKDTree(o.points).query(o.points, k=count + 1)[1])
+        means = at[near[:, 1:]].mean(axis=1)
+        products, own, of_means = products + float((at * means).sum()), own + float((at**2).sum()), of_means + float((means**2).sum())
+    return products / max(float(np.sqrt(own * of_means)), 1e-300)
+
+
+def inflation(
+    observed: Sequence[Observed], residuals: Sequence[FloatArray], jacobians: Sequence[FloatArray], covariance: FloatArray, freedom: float
+) -> float:
+    """Return by how much errors that neighbours share raise the variance of the moduli, 1 where they do not by more than chance.
+
+    Parameters
+    ----------
+    observed : sequence of Observed
+        Load cases.
+    residuals : sequence of ndarray, shape (q,)
+        Whitened residuals.
+    jacobians : sequence of ndarray, shape (q, 2 count)
+        Their derivatives, loaded components following.
+    covariance : ndarray, shape (2 count, 2 count)
+        Of theta, for independent errors.
+    freedom : float
+        Degrees of freedom.
+    """
+    points = np.concatenate([o.points for o in observed])
+    blocks = _blocks(points, min(BLOCKS, len(points) // POINTS_PER_BLOCK))
+    count, size = int(blocks.max()) + 1, covariance.shape[0]
+    if count < FEWEST_BLOCKS or not np.isfinite(covariance).all() or freedom <= 0.0:
+        return 1.0
+    misfit = sum(float(r @ r) for r in residuals)
+    scores = np.concatenate(
+        [(r[:, None] * j).reshape(-1, points.shape[1], size).sum(axis=1) for r, j in zip(residuals, jacobians, strict=True)]
+    )
+    of_blocks = np.stack([np.bincount(blocks, s, minlength=count) for s in scores.T], axis=1)
+    information = sum(j.T @ j for j in jacobians)
+    bread = np.linalg.pinv(information)
+    robust = bread @ (of_blocks.T @ of_blocks) @ bread * count / (count - 1.0) * sum(len(r) for r in residuals) / freedom
+    independent = bread * misfit / freedom
+    ratio = float(np.max(np.diag(robust) / np.maximum(np.diag(independent), 1e-300)))
+    return ratio if ratio > 1.0 + 2.5 * np.sqrt(2.0 / count) else 1.0
+
+
+def _blocks(points: FloatArray, most: int) -> IntArray:
+    """Return the spatial block (n,) of every point: halves of halves along the longest axis, as many of like numbers as a power of two."""
+    label = np.zeros(len(points), dtype=np.int64)
+    for level in range(int(np.log2(max(most, 1)))):
+        for block in range(2**level):
+            inside = np.flatnonzero(label == block)
+            axis = int(np.argmax(np.ptp(points[inside], axis=0)))
+            order = np.argsort(points[inside, axis], kind="stable")
+            label[inside[order[len(order) // 2 :]]] = block + 2**level
+    return label

@@ -1,0 +1,80 @@
+"""Platen positions from the outermost markers, on gels whose plates stand elsewhere than stated."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from naibu.core.errors import InputError
+from naibu.core.experiment import Experiment, Loading
+from naibu.core.markers import Markers
+from naibu.identification.from_markers.calibration import initial_parameters
+from naibu.identification.from_markers.known_materials import KnownMaterials
+from naibu.identification.from_markers.observations import NoiseModel
+from naibu.identification.from_markers.parameter_names import friction, poisson_ratio, young_modulus
+from naibu.identification.from_markers.specimen_model import ModelSettings, specimen
+from naibu.identification.prediction.calibrated_model import CalibratedModel
+from naibu.identification.prediction.platen_position import Gauge, outermost_markers
+from naibu.identification.prediction.prediction import predict_state
+from naibu.validation.specimens.marker_phantoms import Scanner, box_experiment, virtual_specimen
+
+TRUTH = {young_modulus("gel"): 200.0, poisson_ratio("gel"): 0.48, friction("gel", "table"): 0.2, friction("gel", "acrylic"): 0.3}
+WIDTH_MM, STATED_MM = 54.0, 52.0
+COARSE = ModelSettings(element_size_mm=12.0)
+
+
+@pytest.fixture(scope="module")
+def squeezed() -> Experiment:
+    """A gel between side plates, on a mesh of its own, turned and moved in either scan; the stated distance is 2 mm too small."""
+    template = box_experiment("pair", (40.0, 70.0, 40.0), [("gel", 40.0)], Loading("side_plates"), {"pressed": WIDTH_MM}, margin_mm=5.0)
+    virtual = virtual_specimen(template, TRUTH, settings=ModelSettings(element_size_mm=9.0))
+    seen = virtual.scanned(seed=4, scanner=Scanner(placing_mm=0.05, xy_step_mm=0.0, z_step_mm=0.0, turn_deg=8.0)).experiment
+    return replace(seen, states=(seen.states[0], replace(seen.states[1], stated_mm=STATED_MM)))
+
+
+def model_of(experiment: Experiment) -> CalibratedModel:
+    """A model that knows the materials exactly, and nothing of this experiment."""
+    known = KnownMaterials({"gel": 200.0})
+    wanted = initial_parameters([specimen(experiment, COARSE)], {experiment.name: ["pressed"]}, known)
+    own = wanted.with_values({name: v for name, v in TRUTH.items() if name in wanted.values()}, fixed=True)
+    kept = type(own)(tuple(p for p in own if p.name in TRUTH))
+    return CalibratedModel(COARSE, kept, np.zeros((0, 0)), NoiseModel(0.05), 1.0, known, ("other/pressed",))
+
+
+def test_the_distance_of_side_plates_follows_from_the_outermost_columns(squeezed: Experiment) -> None:
+    found = predict_state(model_of(squeezed), squeezed, "pressed", heights_from_markers=True)
+    assert found.platen_position_mm == pytest.approx(WIDTH_MM, abs=0.25)  # stated 2 mm off
+    assert any("outermost marker columns" in note for note in found.notes)
+    stated = predict_state(model_of(squeezed), squeezed, "pressed")
+    assert stated.platen_position_mm == STATED_MM
+    assert np.nanmean(found.residual**2) < 0.2 * np.nanmean(stated.residual**2)
+    # a distance from markers is known better than a stated one, and the error of the stated one is within its interval
+    assert np.median(found.sd_model_mm) < 0.5 * np.median(stated.sd_model_mm)
+    assert np.nanmean(np.abs(stated.residual) < 1.96 * stated.sd_mm) > 0.95
+
+
+def test_columns_without_known_markers_give_way_to_the_next_ones(squeezed: Experiment) -> None:
+    body, state = specimen(squeezed, COARSE), squeezed.states[1]
+    assert state.markers is not None
+    whole = outermost_markers(body, state, np.full((len(body.marker_ids), 3), 0.1))
+    lost = state.markers.points.copy()
+    lost[np.flatnonzero(whole.low)[2:]] = np.nan  # two markers of the column are left
+    gauge = outermost_markers(body, replace(state, markers=Markers.from_arrays(state.markers.ids, lost)), np.full(lost.shape, 0.1))
+    assert body.marker_points[whole.low, 1].mean() == pytest.approx(-30.0, abs=0.5)
+    assert body.marker_points[gauge.low, 1].mean() == pytest.approx(-20.0, abs=0.5)
+    n = whole.low.sum()
+    assert whole.sd_mm == pytest.approx(0.1 * np.sqrt(2.0 / n))
+    with pytest.raises(InputError, match="no two marker columns"):
+        outermost_markers(body, replace(state, markers=Markers.from_arrays(state.markers.ids[:4], lost[-4:])), np.full(lost.shape, 0.1))
+    with pytest.raises(InputError, match="no measured markers"):
+        outermost_markers(body, replace(state, markers=None), np.full(lost.shape, 0.1))
+
+
+@pytest.mark.parametrize("axis", [None, 2])
+def test_the_derivative_of_a_distance_is_its_finite_difference(axis: int | None) -> None:
+    rng = np.random.default_rng(0)
+    points, direction = rng.normal(size=(9, 3)) * 10.0, rng.normal(size=(9, 3))
+    gauge = Gauge(np.arange(9) < 3, np.arange(9) > 5, axis, 10.0, 0.1)
+    step = 1e-5
+    difference = (gauge.distance(points + step * direction) - gauge.distance(points - step * direction)) / (2.0 * step)
+    assert gauge.derivatives(points, direction[:, :, None])[0] == pytest.approx(difference, rel=1e-6)
