@@ -7,6 +7,7 @@ from collections.abc import Callable
 from naibu.reproduction.chapter1.tables import chapter1
 from naibu.reproduction.chapter2.tables import chapter2
 from naibu.reproduction.chapter3.tables import chapter3
+from naibu.reproduction.chapter4.adaptive import chapter4_adaptive
 from naibu.reproduction.chapter4.cube import chapter4_cube
 from naibu.reproduction.chapter4.lattice import chapter4_lattice
 from naibu.reproduction.chapter4.octree import chapter4_octree
@@ -16,6 +17,7 @@ CHAPTERS: dict[str, Callable[[int], Chapter]] = {
     "ch1": chapter1,
     "ch2": chapter2,
     "ch3": chapter3,
+    "ch4-adaptive": chapter4_adaptive,
     "ch4-lattice": chapter4_lattice,
     "ch4-cube": chapter4_cube,
     "ch4-octree": chapter4_octree,

@@ -54,7 +54,7 @@ def known_stiffness(ratio: float) -> Accuracy:
     body = cube_with_known(ratio)
     young, poisson = np.array(list(LAYERS.values())).T
     trials = planned_trials(body, body.mesh.points, body.displacement(PUSH))
-    return expected_accuracy(body.mesh, trials, body.zones(), young_modulus=young, poisson_ratio=poisson)
+    return expected_accuracy(body.mesh, trials, body.zones(), young_modulus=young, poisson_ratio=poisson, elements="as_given")
 
 
 def density(cells: int, markers: int, truth: PushedBody, displacement: FloatArray) -> Accuracy:
@@ -64,7 +64,7 @@ def density(cells: int, markers: int, truth: PushedBody, displacement: FloatArra
     body = cube_with_known(1.0, cells)
     young, poisson = np.array(list(LAYERS.values())).T
     trials = planned_trials(body, points, interpolation_operator(truth.mesh, points) @ displacement)
-    return expected_accuracy(body.mesh, trials, body.zones(), young_modulus=young, poisson_ratio=poisson)
+    return expected_accuracy(body.mesh, trials, body.zones(), young_modulus=young, poisson_ratio=poisson, elements="as_given")
 
 
 def monte_carlo_errors(ratio: float, draws: int, seed: int) -> MonteCarloErrors:
@@ -77,7 +77,7 @@ def monte_carlo_errors(ratio: float, draws: int, seed: int) -> MonteCarloErrors:
     errors = []
     for _ in range(draws):
         noisy = planned_trials(body, body.mesh.points, exact + NOISE_MM * rng.standard_normal(exact.shape))
-        model = FieldModel(body.mesh, noisy, body.zones())
+        model = FieldModel(body.mesh, noisy, body.zones(), elements="as_given")
         e, nu = young_and_poisson(search(model, first_point(model, truth), Objective()).point.theta)
         errors.append([np.log(e / young), nu - poisson])
     rms = np.sqrt(np.mean(np.square(errors), axis=0))

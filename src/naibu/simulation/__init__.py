@@ -1,0 +1,5 @@
+"""Bodies whose mesh changes or that are touched while they are simulated."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,53 @@
+from .adaptive.body import AdaptiveBody
+from .adaptive.conditions import Conditions, face_force, weight
+from .adaptive.error_criterion import StressError
+from .adaptive.error_estimator import recovery_indicators, residual_indicators
+from .adaptive.hyperelastic_dynamics import HyperelasticDynamics
+from .adaptive.lattice import AdaptiveLattice, SpringMaterial
+from .adaptive.linear_dynamics import LinearDynamics
+from .adaptive.spring_levels import level_spring
+from .adaptive.statics import AdaptiveSolution, StaticResult, hyperelastic_static, linear_static, solve_adaptively
+from .force_limits import ForceLimits
+from .haptic_loop import DeviceChannel, DeviceForce, DevicePose, HapticHand
+from .interactive_bodies import FiniteElementBody, InteractiveBody, LatticeBody
+from .interactive_simulation import Frame, InteractiveSimulation
+from .real_time_loop import RealTimeLoop
+from .simulated_device import SimulatedDevice
+from .surface_springs import SurfaceSprings, opened, surface_springs
+from .virtual_coupling import VirtualCoupling
+
+__all__ = [
+    "AdaptiveBody",
+    "AdaptiveLattice",
+    "AdaptiveSolution",
+    "Conditions",
+    "DeviceChannel",
+    "DeviceForce",
+    "DevicePose",
+    "FiniteElementBody",
+    "ForceLimits",
+    "Frame",
+    "HapticHand",
+    "HyperelasticDynamics",
+    "InteractiveBody",
+    "InteractiveSimulation",
+    "LatticeBody",
+    "LinearDynamics",
+    "RealTimeLoop",
+    "SimulatedDevice",
+    "SpringMaterial",
+    "StaticResult",
+    "StressError",
+    "SurfaceSprings",
+    "VirtualCoupling",
+    "face_force",
+    "hyperelastic_static",
+    "level_spring",
+    "linear_static",
+    "opened",
+    "recovery_indicators",
+    "residual_indicators",
+    "solve_adaptively",
+    "surface_springs",
+    "weight",
+]

@@ -1,0 +1,125 @@
+"""A mesh that follows the deformation of what moves on it, and the transfer of the state from one mesh to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.errors import InputError
+from naibu.core.mesh import Mesh
+from naibu.meshing.refinement.forest import BisectionForest, LeafMesh, MeshChange
+from naibu.meshing.refinement.marking import Criterion
+from naibu.meshing.refinement.transfer import transferred_cells, transferred_motion, transferred_nodes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeshState:
+    """What is carried from one mesh to the next.
+
+    Attributes
+    ----------
+    displacement, velocity : ndarray, shape (n, d)
+        Of the vertices, mm and mm/s.
+    mass : ndarray, shape (n,)
+        Lumped masses, kg.
+    cell_mass : ndarray, shape (m,)
+        Masses of the cells, kg.
+    history : ndarray, shape (m, h)
+        History variables of the cells.
+    """
+
+    displacement: FloatArray
+    velocity: FloatArray
+    mass: FloatArray
+    cell_mass: FloatArray
+    history: FloatArray
+
+
+@dataclass(slots=True, eq=False)
+class AdaptiveMesh:
+    """A bisection forest with the criterion by which it is refined and coarsened.
+
+    Attributes
+    ----------
+    forest : BisectionForest
+        The mesh, and all meshes that it was made of.
+    criterion : Criterion or None
+        Where to refine and to coarsen; None: nowhere.
+    max_level : int
+        Cells of this level are not refined; three bisections make an eighth of the volume.
+    bisections : int
+        Bisections of a marked cell in one adaptation.
+    leaf : LeafMesh
+        The present mesh.
+    """
+
+    forest: BisectionForest
+    criterion: Criterion | None
+    max_level: int
+    bisections: int
+    leaf: LeafMesh
+
+    @classmethod
+    def of(cls, mesh: Mesh, criterion: Criterion | None, *, max_level: int = 3, bisections: int = 3) -> AdaptiveMesh:
+        """Begin with a mesh, as the coarsest one.
+
+        Raises
+        ------
+        InputError
+            Cells that cannot be bisected, a negative level, or no bisection.
+        """
+        if max_level < 0 or bisections < 1:
+            raise InputError(f"max_level must not be negative, and bisections must be at least 1, not {max_level} and {bisections}")
+        forest = BisectionForest.of(mesh)
+        return cls(forest, criterion, max_level, bisections, forest.leaf_mesh())
+
+    def adapted(self, state: MeshState) -> MeshState | None:
+        """Refine and coarsen by the criterion; return the state on the new mesh, or None where nothing changed."""
+        if self.criterion is None:
+            return None
+        marks = self.criterion.marks(self.forest, self.leaf, state.displacement)
+        cells = self.leaf.cells
+        return self.changed(state, cells[marks.refine & (self.forest.levels[cells] < self.max_level)], cells[marks.coarsen & ~marks.refine])
+
+    def changed(self, state: MeshState, refine: IntArray, coarsen: IntArray) -> MeshState | None:
+        """Refine and coarsen given leaves; return the state on the new mesh, or None where nothing changed."""
+        forest, leaf = self.forest, self.leaf
+        nodal, velocity = (_scattered(v, leaf.nodes, forest.node_rows) for v in (state.displacement, state.velocity))
+        mass = _scattered(state.mass, leaf.nodes, forest.node_rows)
+        cell_mass, history = (_scattered(v, leaf.cells, forest.cell_rows) for v in (state.cell_mass, state.history))
+        anything = False
+        for change in self._changes(refine, coarsen):
+            anything = True
+            nodal = transferred_nodes(forest, change, nodal)
+            history = transferred_cells(forest, change, history)
+            cell_mass = transferred_cells(forest, change, cell_mass, extensive=True)
+            mass, velocity = transferred_motion(forest, change, mass, velocity, cell_mass)
+        if not anything:
+            return None
+        self.leaf = forest.leaf_mesh()
+        nodes, cells = self.leaf.nodes, self.leaf.cells
+        return MeshState(nodal[nodes], velocity[nodes], mass[nodes], cell_mass[cells], history[cells])
+
+    def _changes(self, refine: IntArray, coarsen: IntArray) -> Iterator[MeshChange]:
+        """Refine, then coarsen what is still a leaf, and yield each change when it has happened."""
+        for _ in range(self.bisections if len(refine) else 0):
+            if change := self.forest.refine(refine, max_level=self.max_level):
+                yield change
+            first = self.forest.children[refine]
+            first = first[first >= 0].astype(np.int64)
+            refine = np.concatenate([first, first + 1])
+        for _ in range(self.bisections if len(coarsen) else 0):
+            change = self.forest.coarsen(coarsen)
+            if not change:
+                return
+            yield change
+            coarsen = np.concatenate([coarsen, change.parents])
+
+
+def _scattered(values: FloatArray, rows: IntArray, count: int) -> FloatArray:
+    out = np.zeros((count, *values.shape[1:]))
+    out[rows] = values
+    return out

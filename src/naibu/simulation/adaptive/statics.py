@@ -1,0 +1,228 @@
+"""Adaptive statics: solve, estimate the error, mark by Doerfler's rule, refine, and again :cite:p:`doerfler1996`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import InputError
+from naibu.core.mesh import Mesh
+from naibu.mechanics.contact.penalty_contact import Contact
+from naibu.mechanics.finite_elements.assembly import Assembler
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
+from naibu.mechanics.finite_elements.elements import elements
+from naibu.mechanics.finite_elements.hyperelasticity import Material, lame_parameters
+from naibu.mechanics.finite_elements.linear_simplices import lumped_mass, simplices
+from naibu.mechanics.finite_elements.stress_history import second_piola
+from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
+from naibu.mechanics.finite_strain.statics import solve
+from naibu.mechanics.linear_algebra.block_matrix import block_pattern
+from naibu.mechanics.small_strain.linear_elasticity import LinearBody
+from naibu.meshing.refinement.forest import BisectionForest, LeafMesh
+from naibu.meshing.refinement.marking import doerfler_marks
+from naibu.meshing.refinement.transfer import transferred_nodes
+from naibu.simulation.adaptive.conditions import Conditions
+from naibu.simulation.adaptive.error_estimator import recovery_indicators
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StaticResult:
+    """Equilibrium on one mesh.
+
+    Attributes
+    ----------
+    displacement : ndarray, shape (n, d)
+        mm.
+    indicators : ndarray, shape (m,)
+        Errors of the cells, ``(mN mm)^(1/2)``.
+    energy : float
+        Strain energy, mN mm.
+    reactions : dict
+        Forces (3,), mN, of rigid bodies on the body, by their names.
+    """
+
+    displacement: FloatArray
+    indicators: FloatArray
+    energy: float
+    reactions: dict[str, FloatArray] = field(default_factory=dict)
+
+    @property
+    def relative_error(self) -> float:
+        """Estimated error in the energy norm, as a fraction of the norm of the displacement."""
+        return float(np.linalg.norm(self.indicators) / np.sqrt(max(2.0 * self.energy, 1e-300)))
+
+
+StaticSolve = Callable[[Mesh, FloatArray | None], StaticResult]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AdaptiveSolution:
+    """Equilibria on a sequence of meshes, each refined where the one before was estimated to be wrong.
+
+    Attributes
+    ----------
+    forest : BisectionForest
+        Its leaves are the last mesh.
+    leaf : LeafMesh
+        The last mesh.
+    rounds : tuple of StaticResult
+        On all meshes, the last one last.
+    unknowns : tuple of int
+        Displacement components on all meshes.
+    """
+
+    forest: BisectionForest
+    leaf: LeafMesh
+    rounds: tuple[StaticResult, ...]
+    unknowns: tuple[int, ...]
+
+    @property
+    def result(self) -> StaticResult:
+        """On the last mesh."""
+        return self.rounds[-1]
+
+
+def solve_adaptively(
+    mesh: Mesh,
+    solve_on: StaticSolve,
+    *,
+    tolerance: float = 0.05,
+    max_unknowns: int = 100_000,
+    fraction: float = 0.5,
+    bisections: int = 1,
+    max_level: int = 60,
+) -> AdaptiveSolution:
+    """Refine a mesh until the estimated error of an equilibrium is small.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        The coarsest one: triangles or linear tetrahedra.
+    solve_on : callable
+        Solves on a mesh, from a displacement (n, d), mm, of the mesh before or None: `linear_static`, `hyperelastic_static`, or one's own.
+    tolerance : float
+        Estimated error in the energy norm, as a fraction.
+    max_unknowns : int
+        No finer mesh is solved when this number of displacement components is reached.
+    fraction : float
+        Part of the squared error that lies in the cells that are refined.
+    bisections : int
+        Bisections of every marked cell: d halve its edges.
+    max_level : int
+        Cells of this level are not refined.
+
+    Raises
+    ------
+    InputError
+        Cells that cannot be bisected, or settings out of range.
+    ConvergenceError
+        An equilibrium was not found.
+    """
+    if not tolerance >= 0.0 or bisections < 1:
+        raise InputError(f"tolerance must not be negative and bisections must be at least 1, not {tolerance:g} and {bisections}")
+    forest = BisectionForest.of(mesh)
+    leaf, start = forest.leaf_mesh(), None
+    rounds: list[StaticResult] = []
+    unknowns: list[int] = []
+    while True:
+        found = solve_on(leaf.mesh, start)
+        rounds.append(found)
+        unknowns.append(found.displacement.size)
+        if found.relative_error <= tolerance or unknowns[-1] >= max_unknowns:
+            return AdaptiveSolution(forest, leaf, tuple(rounds), tuple(unknowns))
+        nodal = np.zeros((forest.node_rows, mesh.dimension))
+        nodal[leaf.nodes] = found.displacement
+        marked = leaf.cells[doerfler_marks(found.indicators, fraction)]
+        anything = False
+        for _ in range(bisections):
+            change = forest.refine(marked, max_level=max_level)
+            nodal, anything = transferred_nodes(forest, change, nodal), anything or bool(change)
+            first = forest.children[marked]
+            marked = np.concatenate([first[first >= 0], first[first >= 0] + 1]).astype(np.int64)
+        if not anything:
+            return AdaptiveSolution(forest, leaf, tuple(rounds), tuple(unknowns))
+        leaf = forest.leaf_mesh()
+        start = nodal[leaf.nodes]
+
+
+def linear_static(
+    conditions: Conditions, *, young_modulus: float | Sequence[float], poisson_ratio: float | Sequence[float], density: float = 0.0
+) -> StaticSolve:
+    """Return what solves small-strain linear elasticity on any mesh of triangles (plane strain) or tetrahedra, for `solve_adaptively`.
+
+    Parameters
+    ----------
+    conditions : Conditions
+        Fixed nodes and loads.
+    young_modulus, poisson_ratio : float or sequence of float
+        kPa and dimensionless, of all cells or one for each region.
+    density : float
+        kg/mm^3, for loads that depend on the mass.
+
+    Raises
+    ------
+    InputError
+        Moduli out of range.
+    """
+    moduli, ratios = np.broadcast_arrays(np.atleast_1d(young_modulus), np.atleast_1d(poisson_ratio))
+    lame = np.array([lame_parameters(float(e), float(nu)) for e, nu in zip(moduli, ratios, strict=True)])
+
+    def solve_on(mesh: Mesh, start: FloatArray | None) -> StaticResult:
+        lam, mu = lame[np.minimum(mesh.regions, len(lame) - 1)].T
+        body = LinearBody.of(mesh)
+        force = conditions.force(mesh, lumped_mass(body.simplices, density))
+        held = PrescribedDisplacement(conditions.constrained(mesh.points), np.zeros_like(mesh.points))
+        u = body.solve(lam, mu, held, force)
+        gradient = body.simplices.displacement_gradients(u)
+        strain = 0.5 * (gradient + np.swapaxes(gradient, 1, 2))
+        trace = np.einsum("mii->m", strain)
+        stress = 2.0 * mu[:, None, None] * strain + (lam * trace)[:, None, None] * np.eye(mesh.dimension)
+        energy = 0.5 * float((body.simplices.measures * (stress * strain).sum(axis=(1, 2))).sum())
+        return StaticResult(u, recovery_indicators(mesh, stress, mu), energy)
+
+    return solve_on
+
+
+def hyperelastic_static(
+    conditions: Conditions,
+    materials: Sequence[Material],
+    *,
+    contacts: Callable[[Mesh], tuple[Contact, ...]] = lambda mesh: (),
+    density: float = 0.0,
+    settings: SolverSettings | None = None,
+) -> StaticSolve:
+    """Return what solves for equilibrium at finite strain, in contact or not, on any mesh of tetrahedra, for `solve_adaptively`.
+
+    Parameters
+    ----------
+    conditions : Conditions
+        Fixed nodes and loads.
+    materials : sequence of Material
+        One for each region.
+    contacts : callable
+        From a mesh to its contacts with rigid bodies; see `naibu.mechanics.rigid_contact`.
+    density : float
+        kg/mm^3, for loads that depend on the mass.
+    settings : SolverSettings, optional
+        Load steps and tolerances; the equilibrium of the mesh before is the initial guess.
+    """
+
+    def solve_on(mesh: Mesh, start: FloatArray | None) -> StaticResult:
+        bodies = contacts(mesh)
+        parts = elements(mesh, "standard")
+        pattern = block_pattern(mesh.n_points, parts.connectivity, *(c.nodes for c in bodies))
+        assembler = Assembler.from_materials(parts, mesh.regions, list(materials), pattern)
+        held = PrescribedDisplacement(conditions.constrained(mesh.points), np.zeros_like(mesh.points))
+        geometry = simplices(mesh)
+        problem = Problem(mesh.points, assembler, bodies, held, conditions.force(mesh, lumped_mass(geometry, density)))
+        found = solve(problem, settings=settings, warm_start=() if start is None else [(1.0, start)])
+        u = found.displacement
+        gradient = geometry.displacement_gradients(u) + np.eye(3)
+        stress = gradient @ second_piola(assembler, assembler.parameters, u)[:, 0]
+        shear = np.array([m.small_strain_shear_modulus for m in materials])[mesh.regions]
+        return StaticResult(u, recovery_indicators(mesh, stress, shear), assembler.forces(u)[0], found.reactions)
+
+    return solve_on

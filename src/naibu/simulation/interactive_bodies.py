@@ -1,0 +1,308 @@
+"""Bodies that a person pushes and pulls: lattices and finite elements behind one interface, with their supports and surface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from naibu.core.arrays import FloatArray, IntArray, as_vector, require_positive
+from naibu.core.errors import InputError
+from naibu.core.mesh import Mesh
+from naibu.mechanics.contact.rigid_indenters import RigidIndenter
+from naibu.mechanics.contact.session_protocol import Session
+from naibu.mechanics.finite_elements.assembly import Assembler, body_force
+from naibu.mechanics.finite_elements.elements import elements
+from naibu.mechanics.finite_elements.hyperelasticity import material
+from naibu.mechanics.finite_strain.dynamic_session import DynamicEngine, DynamicState
+from naibu.mechanics.lattices.cpu.engine import LatticeEngine
+from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState
+from naibu.meshing.cutting.swept_blade import SweptBlade
+from naibu.meshing.cutting.volume import VolumeCut, cut_volume
+from naibu.meshing.element_conversion import to_tetra
+from naibu.meshing.surface import boundary_faces, triangles_of_faces
+
+NO_NODES: IntArray = np.zeros(0, dtype=np.int64)
+
+AnySession = Session[Any, Any]
+
+
+class InteractiveBody(Protocol):
+    """A deformable body on its supports, and what is shown of it."""
+
+    @property
+    def points(self) -> FloatArray:
+        """Nodes in the reference configuration (n, 3), mm."""
+
+    @property
+    def faces(self) -> IntArray:
+        """Triangles of the surface (f, 3), counterclockwise seen from outside."""
+
+    @property
+    def cells(self) -> IntArray:
+        """Tetrahedra (m, 4) of which sections are drawn."""
+
+    @property
+    def step_s(self) -> float:
+        """Length of a step, s."""
+
+    @property
+    def fixtures(self) -> tuple[RigidIndenter, ...]:
+        """Rigid bodies in contact that never move, such as a table."""
+
+    def session(self) -> AnySession:
+        """Begin at rest on the supports, with the fixtures in contact."""
+
+    def grip(self, session: AnySession, nodes: IntArray) -> None:
+        """Tie these nodes to a body that the loop moves, besides those of the supports; none releases them."""
+
+    def grip_velocity(self, velocity: FloatArray) -> FloatArray:
+        """Return the velocities of all bodies of constrained nodes (b, 3) if the gripped nodes move at a velocity (3,), mm/s."""
+
+    def without_contact(self, state: Any) -> Any:
+        """Return a copy of a state that no indenter touches."""
+
+    def strain(self, positions: FloatArray) -> FloatArray:
+        """Return a scalar strain at the nodes (n,), %, at positions (n, 3), mm."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LatticeBody:
+    """A mass-spring-dashpot lattice that is touched.
+
+    Attributes
+    ----------
+    engine : LatticeEngine
+        Lattice, parameters and step; contact needs the implicit method.
+    faces : ndarray, shape (f, 3), int64
+        Triangles of the surface.
+    cells : ndarray, shape (m, 4), int64
+        Tetrahedra for sections.
+    supported : ndarray, shape (s,), int64
+        Nodes that never move.
+    fixtures : tuple of RigidIndenter
+        Rigid bodies in contact that never move.
+    external_force : ndarray, shape (n, 3), optional
+        Such as weight, mN.
+    """
+
+    engine: LatticeEngine
+    faces: IntArray
+    cells: IntArray
+    supported: IntArray = field(default_factory=lambda: NO_NODES)
+    fixtures: tuple[RigidIndenter, ...] = ()
+    external_force: FloatArray | None = None
+
+    @property
+    def points(self) -> FloatArray:
+        """Nodes in the reference configuration (n, 3), mm."""
+        return self.engine.lattice.points
+
+    @property
+    def step_s(self) -> float:
+        """Length of a step, s."""
+        return self.engine.step
+
+    def session(self) -> AnySession:
+        """Begin at rest on the supports."""
+        session = self.engine.session(external_force=self.external_force, indenters=self.fixtures)
+        self.grip(session, NO_NODES)
+        return session
+
+    def grip(self, session: AnySession, nodes: IntArray) -> None:
+        """Tie nodes to a body that the loop moves; those of the supports stay where they are."""
+        free = np.setdiff1d(nodes, self.supported)
+        session.constrain(ConstrainedNodes.of(self.supported, body=0) + ConstrainedNodes.of(free, body=1), 2)
+
+    def grip_velocity(self, velocity: FloatArray) -> FloatArray:
+        """Return the velocities of the support and of the gripped nodes (2, 3), mm/s."""
+        return np.stack([np.zeros(3), velocity])
+
+    def without_contact(self, state: LatticeState) -> LatticeState:
+        """Return a copy of a state that no indenter touches."""
+        return replace(state, contact=None)
+
+    def strain(self, positions: FloatArray) -> FloatArray:
+        """Return the mean elongation of the elements at every node (n,), % of their length at rest."""
+        lattice = self.engine.lattice
+        i, j = lattice.elements.T
+        stretch = np.linalg.norm(positions[j] - positions[i], axis=1) / lattice.lengths - 1.0
+        ends = np.concatenate([i, j])
+        sums = np.bincount(ends, np.concatenate([stretch, stretch]), minlength=lattice.n_nodes)
+        return np.asarray(100.0 * sums / np.maximum(np.bincount(ends, minlength=lattice.n_nodes), 1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FiniteElementBody:
+    """A finite element model at finite strain that is touched; made by `FiniteElementBody.of`.
+
+    Attributes
+    ----------
+    engine : DynamicEngine
+        Elements, materials, masses and step.
+    mesh : Mesh
+        Linear tetrahedra or hexahedra.
+    density : float
+        kg/mm3.
+    gravity : ndarray, shape (3,)
+        Acceleration, mm/s2.
+    faces : ndarray, shape (f, 3), int64
+        Triangles of the surface.
+    cells : ndarray, shape (m, 4), int64
+        Tetrahedra for sections, and for the strain.
+    supported : ndarray, shape (s,), int64
+        Nodes that never move.
+    fixtures : tuple of RigidIndenter
+        Rigid bodies in contact that never move.
+    """
+
+    engine: DynamicEngine
+    mesh: Mesh
+    density: float
+    gravity: FloatArray
+    faces: IntArray
+    cells: IntArray
+    supported: IntArray
+    fixtures: tuple[RigidIndenter, ...]
+
+    @classmethod
+    def of(
+        cls,
+        mesh: Mesh,
+        assembler: Assembler,
+        *,
+        supported: IntArray = NO_NODES,
+        fixtures: Sequence[RigidIndenter] = (),
+        density: float = 1e-6,
+        gravity: ArrayLike = (0.0, 0.0, 0.0),
+        step_s: float = 1.0 / 60.0,
+        normal_stiffness: float = 1000.0,
+        tangential_stiffness: float = 200.0,
+    ) -> FiniteElementBody:
+        """Return the body of a mesh.
+
+        Parameters
+        ----------
+        mesh : Mesh
+            Linear tetrahedra or hexahedra.
+        assembler : Assembler
+            Its elements and materials.
+        supported : ndarray, shape (s,), int64
+            Nodes that never move.
+        fixtures : sequence of RigidIndenter
+            Rigid bodies in contact that never move.
+        density : float
+            kg/mm3; that of water by default.
+        gravity : array_like, shape (3,)
+            Acceleration, mm/s2.
+        step_s : float
+            Length of a step, s.
+        normal_stiffness, tangential_stiffness : float
+            Penalties of the contact, kPa/mm.
+
+        Raises
+        ------
+        InputError
+            Quadratic cells, or a density, step or penalty that is not positive.
+        """
+        if mesh.cell_type not in ("tetra", "hexahedron"):
+            raise InputError(f"mesh has {mesh.cell_type!r} cells; contact needs linear tetrahedra or hexahedra")
+        require_positive("density", density, "kg/mm3")
+        faces = boundary_faces(mesh).faces
+        mass = body_force(assembler.elements, np.full(mesh.n_cells, density), np.array([1.0, 0.0, 0.0]))[:, 0]
+        engine = DynamicEngine(mesh.points, assembler, mass, faces, step_s, normal_stiffness, tangential_stiffness)
+        triangles, cells = triangles_of_faces(faces), to_tetra(mesh).cells
+        return cls(engine, mesh, density, as_vector("gravity", gravity), triangles, cells, supported, tuple(fixtures))
+
+    @property
+    def points(self) -> FloatArray:
+        """Nodes in the reference configuration (n, 3), mm."""
+        return self.engine.points
+
+    @property
+    def step_s(self) -> float:
+        """Length of a step, s."""
+        return self.engine.step
+
+    def session(self) -> AnySession:
+        """Begin at rest on the supports."""
+        weight = self.engine.mass[:, None] * self.gravity
+        session = self.engine.session(external_force=weight, indenters=self.fixtures)
+        self.grip(session, NO_NODES)
+        return session
+
+    def grip(self, session: AnySession, nodes: IntArray) -> None:
+        """Tie nodes to a body that the loop moves; those of the supports stay where they are."""
+        session.constrain([self.supported, np.setdiff1d(nodes, self.supported)])
+
+    def grip_velocity(self, velocity: FloatArray) -> FloatArray:
+        """Return the velocities of the support and of the gripped nodes (2, 3), mm/s."""
+        return np.stack([np.zeros(3), velocity])
+
+    def without_contact(self, state: DynamicState) -> DynamicState:
+        """Return a copy of a state that no indenter touches."""
+        return DynamicState(state.displacement, state.velocity)
+
+    def cut(self, state: DynamicState, blade: SweptBlade, distance_mm: float) -> tuple[FiniteElementBody, DynamicState, VolumeCut]:
+        """Return the body and its state behind a cut; hexahedra are split into tetrahedra first.
+
+        Displacements, velocities, materials and supports are kept, and with them momentum and energy.
+
+        Parameters
+        ----------
+        state : DynamicState
+            Of the body as the blade passes.
+        blade : SweptBlade
+            The surface that it sweeps.
+        distance_mm : float
+            See `naibu.meshing.cut_volume`.
+
+        Raises
+        ------
+        InputError
+            What `naibu.meshing.cut_volume` refuses.
+        """
+        mesh, assembler = to_tetra(self.mesh), self.engine.assembler
+        split = np.repeat(np.arange(self.mesh.n_cells), mesh.n_cells // self.mesh.n_cells)
+        found = cut_volume(mesh, blade, distance_mm, positions=mesh.points + state.displacement)
+        before = split[found.parents]
+        placeholder = [material(young_modulus=1.0, poisson_ratio=0.3)] * len(mesh.region_names)
+        made = Assembler.from_materials(elements(found.mesh, "mean_dilatation"), found.mesh.regions, placeholder)
+        made = replace(made, law_codes=assembler.law_codes[before], parameters=assembler.parameters[before])
+        held = np.zeros(mesh.n_points)
+        held[self.supported] = 1.0
+        body = FiniteElementBody.of(
+            found.mesh, made, supported=np.flatnonzero(found.nodal(held) > 1.0 - 1e-9).astype(np.int64), fixtures=self.fixtures,
+            density=self.density, gravity=self.gravity, step_s=self.engine.step, normal_stiffness=self.engine.normal_stiffness,
+            tangential_stiffness=self.engine.tangential_stiffness,
+        )  # fmt: skip
+        return body, DynamicState(found.nodal(state.displacement), found.nodal(state.velocity)), found
+
+    def strain(self, positions: FloatArray) -> FloatArray:
+        """Return the von Mises equivalent of the Green-Lagrange strain at the nodes (n,), %, averaged over the tetrahedra around them."""
+        rest, moved = (p[self.cells[:, 1:]] - p[self.cells[:, :1]] for p in (self.points, positions))
+        gradient = np.linalg.solve(rest, moved)  # transposed
+        green = 0.5 * (gradient @ gradient.transpose(0, 2, 1) - np.eye(3))
+        deviator = green - np.trace(green, axis1=1, axis2=2)[:, None, None] / 3.0 * np.eye(3)
+        equivalent = np.sqrt(2.0 / 3.0 * (deviator**2).sum(axis=(1, 2)))
+        sums = np.bincount(self.cells.ravel(), np.repeat(equivalent, 4), minlength=len(self.points))
+        return np.asarray(100.0 * sums / np.maximum(np.bincount(self.cells.ravel(), minlength=len(self.points)), 1))
+
+
+def nodes_touching(points: FloatArray, indenters: Sequence[RigidIndenter], tolerance_mm: float = 1e-6) -> IntArray:
+    """Return the nodes (k,) of points (n, 3), mm, that lie on or in any of the indenters where they were made.
+
+    Raises
+    ------
+    InputError
+        A tolerance that is negative.
+    """
+    if tolerance_mm < 0.0:
+        raise InputError(f"tolerance_mm must not be negative, not {tolerance_mm:g} mm")
+    near = np.zeros(len(points), dtype=bool)
+    for indenter in indenters:
+        near |= indenter.gap(points) < tolerance_mm
+    return np.flatnonzero(near).astype(np.int64)

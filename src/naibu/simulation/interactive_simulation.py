@@ -1,0 +1,347 @@
+"""Interactive simulation: a tool that follows a person's hand, gripping and pulling, undo, and recording, one frame at a time.
+
+A frame is a fixed number of steps of the body's session. The tool never moves faster than a limit, so that a jump of the hand, or a pause
+of the connection, does not carry it through the body; where a step fails, the simulation returns to the frame before, and the tool stays.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from naibu.core.arrays import BoolArray, FloatArray, IntArray, as_vector, require_positive
+from naibu.core.errors import ConvergenceError, InputError
+from naibu.mechanics.contact.indenter_motion import IndenterVelocity
+from naibu.mechanics.contact.rigid_indenters import RigidIndenter
+from naibu.meshing.cutting.swept_blade import swept_blade
+from naibu.meshing.cutting.volume import VolumeCut
+from naibu.meshing.quality import mean_edge_length
+from naibu.simulation.interactive_bodies import NO_NODES, AnySession, FiniteElementBody, InteractiveBody
+
+FRAME_S = 1.0 / 60.0
+REACH = 2.0  # extents of the body around its centre in which the tool stays
+SPEED = 3.0  # extents of the body a second that tool and grip move at most
+UNDO = 20  # states kept
+THROUGH = 0.5  # of the thinnest half extent of a tool: how far it moves in a step at most, so that nothing passes through its middle
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """What a frame shows.
+
+    Attributes
+    ----------
+    body : InteractiveBody
+        The body, whose nodes the positions are those of.
+    number : int
+        Frames since the beginning.
+    time_s : float
+        Simulated time, s.
+    positions : ndarray, shape (n, 3)
+        Nodes, mm.
+    tool : str
+        Name of the tool in play, or an empty string.
+    tool_centre : ndarray, shape (3,)
+        Its position, mm.
+    force : ndarray, shape (3,)
+        Mean force of the tool on the body during the frame, mN.
+    pull : ndarray, shape (3,)
+        Mean force of the grip on the body, mN.
+    penetration_mm : float
+        How deep the surface nodes lie in the tool at most.
+    gripped : int
+        Node that is gripped, or -1.
+    failed : str
+        Why the last step was taken back; empty where none was.
+    topology : int
+        Counts the cuts, undone ones included.
+    """
+
+    body: InteractiveBody
+    number: int
+    time_s: float
+    positions: FloatArray
+    tool: str
+    tool_centre: FloatArray
+    force: FloatArray
+    pull: FloatArray
+    penetration_mm: float
+    gripped: int = -1
+    failed: str = ""
+    topology: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Kept:
+    """A state to return to."""
+
+    body: InteractiveBody
+    state: Any
+    time_s: float
+
+
+@dataclass(slots=True, eq=False)
+class InteractiveSimulation:
+    """A body that is touched, frame by frame; commands take effect in the next frame.
+
+    Attributes
+    ----------
+    body : InteractiveBody
+        What is touched.
+    tools : mapping of str to RigidIndenter
+        Tools by name, each made outside of the body: where it was made is where it waits.
+    frame_s : float
+        Simulated time of a frame, s.
+    """
+
+    body: InteractiveBody
+    tools: Mapping[str, RigidIndenter]
+    frame_s: float = FRAME_S
+    _session: AnySession = field(init=False)
+    _tool: str = field(init=False, default="")
+    _centre: FloatArray = field(init=False)
+    _target: FloatArray = field(init=False)
+    _nodes: IntArray = field(init=False, default_factory=lambda: NO_NODES)
+    _gripped: int = field(init=False, default=-1)
+    _pull_target: FloatArray = field(init=False)
+    _kept: deque[_Kept] = field(init=False)
+    _last: Frame = field(init=False)
+    _topology: int = field(init=False, default=0)
+    _surface: IntArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        require_positive("frame_s", self.frame_s, "s")
+        if self.frame_s < self.body.step_s:
+            raise InputError(f"frame_s is {self.frame_s:g} s, less than a step of the body, {self.body.step_s:g} s; make it longer")
+        for name, tool in self.tools.items():
+            if tool.gap(self.body.points).min() < 0.0:
+                raise InputError(f"tool {name!r} begins inside the body; make it outside, where it waits")
+        self._kept = deque(maxlen=UNDO)
+        self._begin(self.body)
+        self._centre = self._target = self._pull_target = np.zeros(3)
+        self._last = self._frame(0, 0.0, np.zeros(3), np.zeros(3), "")
+
+    @property
+    def steps(self) -> int:
+        """Steps of a frame."""
+        return max(1, round(self.frame_s / self.body.step_s))
+
+    @property
+    def extent_mm(self) -> float:
+        """Largest edge of the box around the body at rest, mm."""
+        return float(np.ptp(self.body.points, axis=0).max())
+
+    @property
+    def last(self) -> Frame:
+        """The last frame."""
+        return self._last
+
+    def take(self, tool: str) -> None:
+        """Bring a tool into play, where it waits; an empty name puts the one in play away.
+
+        Raises
+        ------
+        InputError
+            There is no such tool.
+        """
+        if tool and tool not in self.tools:
+            raise InputError(f"there is no tool {tool!r}; choose one of {', '.join(self.tools)}")
+        self._keep()
+        self._press(tool)
+
+    def move(self, centre: ArrayLike) -> None:
+        """Lead the tool to a position (3,), mm, which is kept within two extents of the body.
+
+        Raises
+        ------
+        InputError
+            A position that is no vector of finite numbers.
+        """
+        self._target = self._within(as_vector("centre", centre))
+
+    def grip(self, node: int, radius_mm: float = 0.0) -> None:
+        """Grip a node of the surface, and those around it within a radius at rest, mm, to pull them.
+
+        Raises
+        ------
+        InputError
+            There is no such node.
+        """
+        if not 0 <= node < len(self.body.points):
+            raise InputError(f"node is {node}; the body has nodes 0 to {len(self.body.points) - 1}")
+        self._keep()
+        near = np.linalg.norm(self.body.points - self.body.points[node], axis=1) <= max(radius_mm, 0.0)
+        near[node] = True
+        self._nodes, self._gripped = np.flatnonzero(near & self._on_surface()).astype(np.int64), node
+        self._pull_target = self._session.positions([node])[0]
+        self.body.grip(self._session, self._nodes)
+
+    def pull(self, position: ArrayLike) -> None:
+        """Lead the gripped node to a position (3,), mm.
+
+        Raises
+        ------
+        InputError
+            A position that is no vector of finite numbers.
+        """
+        self._pull_target = self._within(as_vector("position", position))
+
+    def release(self) -> None:
+        """Let go of gripped nodes."""
+        if self._gripped >= 0:
+            self._nodes, self._gripped = NO_NODES, -1
+            self.body.grip(self._session, NO_NODES)
+
+    def reset(self) -> None:
+        """Put the body at rest, and the tool where it waits."""
+        self._keep()
+        self._begin(self.body)
+        self._press(self._tool)
+        self._last = self._frame(self._last.number + 1, 0.0, np.zeros(3), np.zeros(3), "")
+
+    def cut(self, edges: ArrayLike, distance_mm: float | None = None) -> VolumeCut:
+        """Cut the body along the surface between successive positions of a blade's edge.
+
+        Parameters
+        ----------
+        edges : array_like, shape (p, e, 3)
+            See `naibu.meshing.swept_blade`, mm.
+        distance_mm : float, optional
+            See `naibu.meshing.cut_volume`; the mean edge of the mesh by default.
+
+        Raises
+        ------
+        InputError
+            A body that cannot be cut, or what `swept_blade` and `cut_volume` refuse; the body is then as it was.
+        """
+        if not isinstance(self.body, FiniteElementBody):
+            raise InputError("this body is a lattice, which is not cut; touch a mesh or an identified model to cut it")
+        fine = mean_edge_length(self.body.mesh) if distance_mm is None else distance_mm
+        body, state, found = self.body.cut(self.body.without_contact(self._session.state()), swept_blade(edges), fine)
+        self._keep()
+        self._topology += 1
+        self._begin(body, state)
+        self._press(self._tool)
+        self._last = self._frame(self._last.number + 1, self._last.time_s, np.zeros(3), np.zeros(3), "")
+        return found
+
+    def undo(self) -> bool:
+        """Return to the state before the last grip, cut, change of tool or reset; False where there is none left."""
+        if not self._kept:
+            return False
+        kept = self._kept.pop()
+        self._topology += kept.body is not self.body
+        self._begin(kept.body, kept.state)
+        self._press(self._tool)
+        self._last = self._frame(self._last.number + 1, kept.time_s, np.zeros(3), np.zeros(3), "")
+        return True
+
+    def advance(self) -> Frame:
+        """Take the steps of one frame, and return it; a step that fails is taken back, and the frame says why."""
+        before = self._session.state()
+        duration = self.steps * self.body.step_s
+        reach = SPEED * self.extent_mm * duration
+        centre = _towards(self._centre, self._target, min(reach, self._thin() * self.steps))
+        motions = self._motions((centre - self._centre) / duration)
+        gripped = _towards(self._grip_position(), self._pull_target, reach) - self._grip_position()
+        try:
+            forces = self._session.step(self.body.grip_velocity(gripped / duration), motions, steps=self.steps)
+        except ConvergenceError as error:
+            self._session.restore(before)
+            self._target = self._centre
+            self._pull_target = self._grip_position()
+            self._last = self._frame(self._last.number + 1, self._last.time_s, self._last.force, self._last.pull, str(error))
+            return self._last
+        self._centre = centre
+        force = forces.indenters[:, -1].mean(axis=0) if self._tool else np.zeros(3)
+        pull = forces.bodies[:, 1].mean(axis=0) if self._gripped >= 0 else np.zeros(3)
+        self._last = self._frame(self._last.number + 1, self._last.time_s + duration, force, pull, "")
+        return self._last
+
+    def close(self) -> None:
+        """Release what the session holds."""
+        self._session.close()
+
+    def _begin(self, body: InteractiveBody, state: Any = None) -> None:
+        """Begin a session of a body, at rest or at a state without contact, with nothing gripped and no tool."""
+        if self._topology or self._kept:
+            self._session.close()
+        self.body, self._surface = body, np.unique(body.faces)
+        self._nodes, self._gripped = NO_NODES, -1
+        self._session = body.session()
+        if state is not None:
+            self._session.press(())
+            self._session.restore(state)
+
+    def _motions(self, velocity: FloatArray) -> list[IndenterVelocity]:
+        still = [IndenterVelocity() for _ in self.body.fixtures]
+        return [*still, IndenterVelocity(velocity)] if self._tool else still
+
+    def _press(self, tool: str) -> None:
+        """Bring the fixtures and a tool, where it waits, into play."""
+        state = self._session.state()
+        self._session.press(())
+        self._session.restore(self.body.without_contact(state))
+        self._tool = tool
+        if tool:
+            self._centre = self._target = self._outside(self.tools[tool])
+        placed = [] if not tool else [_at(self.tools[tool], self._centre)]
+        self._session.press((*self.body.fixtures, *placed))
+
+    def _outside(self, tool: RigidIndenter) -> FloatArray:
+        """Where a tool waits, mm; raised until it is clear of the deformed body."""
+        centre = np.array(tool.centre, dtype=float)
+        positions = self._session.positions(self._surface)
+        for _ in range(40):
+            if _at(tool, centre).gap(positions).min() > 0.0:
+                break
+            centre[2] += 0.1 * self.extent_mm
+        return centre
+
+    def _thin(self) -> float:
+        """How far the tool may move in a step, mm."""
+        size = np.asarray(self.tools[self._tool].geometry.size) if self._tool else np.zeros(0)
+        return THROUGH * float(size[size > 0.0].min(initial=np.inf))
+
+    def _grip_position(self) -> FloatArray:
+        return self._pull_target if self._gripped < 0 else self._session.positions([self._gripped])[0]
+
+    def _on_surface(self) -> BoolArray:
+        marked = np.zeros(len(self.body.points), dtype=bool)
+        marked[self._surface] = True
+        return marked
+
+    def _within(self, position: FloatArray) -> FloatArray:
+        middle = 0.5 * (self.body.points.min(axis=0) + self.body.points.max(axis=0))
+        reach = REACH * self.extent_mm
+        return np.asarray(np.clip(position, middle - reach, middle + reach))
+
+    def _keep(self) -> None:
+        self._kept.append(_Kept(self.body, self.body.without_contact(self._session.state()), self._last.time_s))
+
+    def _frame(self, number: int, time_s: float, force: FloatArray, pull: FloatArray, failed: str) -> Frame:
+        positions = self._session.positions()
+        depth = 0.0
+        if self._tool:
+            depth = max(0.0, -float(_at(self.tools[self._tool], self._centre).gap(positions[self._surface]).min()))
+        return Frame(
+            self.body, number, time_s, positions, self._tool, self._centre, force, pull, depth, self._gripped, failed, self._topology
+        )
+
+
+def _at(tool: RigidIndenter, centre: FloatArray) -> RigidIndenter:
+    return RigidIndenter(
+        tool.geometry, centre, tool.static_friction, tool.kinetic_friction, tool.pull_stiffness, tool.pull_damping, tool.pull_speed
+    )
+
+
+def _towards(start: FloatArray, target: FloatArray, reach: float) -> FloatArray:
+    """Return the point on the way to a target that is at most `reach` away from the start."""
+    way = target - start
+    length = float(np.linalg.norm(way))
+    return np.asarray(target if length <= reach else start + way * (reach / length), dtype=float)

@@ -1,0 +1,82 @@
+"""A simulated haptic device: a hand that moves a handle along a path, pushed back by the forces that come."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray
+from naibu.simulation.haptic_loop import DeviceForce, DevicePose
+
+SILENCE_S = 0.1  # without an answer for so long, the device applies no force
+
+
+@dataclass(slots=True, eq=False)
+class SimulatedDevice:
+    """A handle of some mass, led by a hand: a spring and a dashpot to where the hand wants it.
+
+    It does what a program for a real device does: it counts its packets, tells which answer it applies, drops answers that were overtaken,
+    and lets go when none comes. Beside that it keeps account of the energy that it gets.
+
+    Attributes
+    ----------
+    path : callable
+        Returns where the hand wants the handle (3,), mm, at a time, s.
+    mass_kg, stiffness, damping : float
+        Of the handle, kg, and of the hand, mN/mm and mN s/mm.
+    position, velocity : ndarray, shape (3,)
+        Of the handle, mm and mm/s.
+    buttons : int
+        That are held; see `DevicePose`.
+    applied : DeviceForce, optional
+        Answer whose force is applied.
+    work : float
+        Energy that the forces have handed out to the handle so far, mN mm.
+    time_s : float
+        Its clock, s.
+    """
+
+    path: Callable[[float], FloatArray]
+    mass_kg: float = 0.2
+    stiffness: float = 300.0
+    damping: float = 5.0
+    position: FloatArray = field(init=False)
+    velocity: FloatArray = field(init=False, default_factory=lambda: np.zeros(3))
+    buttons: int = 0
+    applied: DeviceForce | None = None
+    work: float = 0.0
+    time_s: float = 0.0
+    _sequence: int = 0
+    _heard: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.position = np.array(self.path(0.0), dtype=float)
+
+    @property
+    def force(self) -> FloatArray:
+        """Force that is applied (3,), mN."""
+        return np.zeros(3) if self.applied is None else self.applied.force_mn
+
+    def hear(self, answer: DeviceForce) -> bool:
+        """Apply an answer from now on, unless it was overtaken; False in that case."""
+        if self.applied is not None and answer.number <= self.applied.number:
+            return False
+        self.applied, self._heard = answer, self.time_s
+        return True
+
+    def advance(self, step_s: float) -> DevicePose:
+        """Move for a step, and return what the device then sends."""
+        if self.time_s - self._heard > SILENCE_S:
+            self.applied = None
+        self.time_s += step_s
+        goal = self.path(self.time_s)
+        pull = self.stiffness * (goal - self.position) + self.force + self.mass_kg / step_s * self.velocity
+        self.velocity = pull / (self.mass_kg / step_s + self.damping + self.stiffness * step_s)
+        moved = step_s * self.velocity
+        self.work += float(self.force @ moved)
+        self.position = self.position + moved
+        self._sequence += 1
+        number = 0 if self.applied is None else self.applied.number
+        return DevicePose(self._sequence, self.time_s, self.position, buttons=self.buttons, applied=number)

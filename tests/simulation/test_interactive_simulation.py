@@ -1,0 +1,195 @@
+"""Interactive simulation: tools, gripping, undo, and the loop that keeps time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from touched_lattice import SPACING, TOP, touched_lattice
+
+from naibu.core.errors import ConvergenceError, InputError
+from naibu.mechanics import Assembler, elements, material, spherical_indenter
+from naibu.meshing import box
+from naibu.simulation import FiniteElementBody, InteractiveSimulation, RealTimeLoop
+
+
+def simulation() -> InteractiveSimulation:
+    return InteractiveSimulation(
+        touched_lattice(), {"sphere": spherical_indenter((20.0, 20.0, 60.0), 8.0), "far": spherical_indenter((0, 0, 90.0), 5.0)}
+    )
+
+
+def test_the_tool_pushes_and_the_body_springs_back() -> None:
+    touched = simulation()
+    touched.take("sphere")
+    touched.move((20.0, 20.0, TOP + 4.0))
+    for _ in range(30):
+        frame = touched.advance()
+    assert frame.force[2] < 0.0
+    assert np.abs(frame.force[:2]).max() < 0.02 * abs(frame.force[2])
+    assert frame.penetration_mm < 0.01 * SPACING
+    touched.move((20.0, 20.0, 80.0))
+    for _ in range(30):
+        frame = touched.advance()
+    np.testing.assert_array_equal(frame.force, 0.0)
+
+
+def test_the_tool_is_never_faster_than_its_limit() -> None:
+    touched = simulation()
+    touched.take("sphere")
+    touched.move((20.0, 20.0, -1e5))
+    centres = np.array([touched.advance().tool_centre for _ in range(12)])
+    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    assert steps.max() <= 3.0 * touched.extent_mm * touched.steps * touched.body.step_s * (1 + 1e-9)
+
+
+def test_a_gripped_node_follows_the_hand() -> None:
+    touched = simulation()
+    corner = int(np.argmax(touched.body.points.sum(axis=1)))
+    touched.grip(corner, 12.0)
+    goal = touched.body.points[corner] + [3.0, 4.0, 5.0]
+    touched.pull(goal)
+    for _ in range(10):
+        frame = touched.advance()
+    np.testing.assert_allclose(frame.positions[corner], goal, atol=1e-9)
+    assert frame.pull @ [3.0, 4.0, 5.0] > 0.0
+    assert frame.gripped == corner
+    touched.release()
+    assert touched.advance().gripped == -1
+
+
+def test_undo_returns_to_the_state_before() -> None:
+    touched = simulation()
+    touched.take("sphere")
+    before = touched.advance().positions
+    touched.grip(124)
+    touched.pull(touched.body.points[124] + [0.0, 0.0, 8.0])
+    for _ in range(5):
+        touched.advance()
+    assert np.abs(touched.last.positions - before).max() > 1.0
+    assert touched.undo()
+    np.testing.assert_allclose(touched.last.positions, before, atol=1e-12)
+    assert touched.undo()
+    assert not touched.undo()
+
+
+def test_reset_brings_the_body_to_rest() -> None:
+    touched = simulation()
+    touched.take("sphere")
+    touched.move((20.0, 20.0, TOP))
+    for _ in range(10):
+        touched.advance()
+    touched.reset()
+    np.testing.assert_array_equal(touched.last.positions, touched.body.points)
+    assert touched.advance().time_s == pytest.approx(touched.steps * touched.body.step_s)
+
+
+def test_a_step_that_fails_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    touched = simulation()
+    touched.take("sphere")
+    good = touched.advance()
+
+    def fails(*_: object, **__: object) -> None:
+        raise ConvergenceError("an element is inverted")
+
+    monkeypatch.setattr(type(touched._session), "step", fails)
+    frame = touched.advance()
+    assert frame.failed == "an element is inverted"
+    np.testing.assert_array_equal(frame.positions, good.positions)
+
+
+def test_the_same_commands_give_the_same_frames() -> None:
+    def run() -> np.ndarray:
+        touched = simulation()
+        touched.take("sphere")
+        for k in range(12):
+            touched.move((20.0 + k, 20.0, 56.0 - 2 * k))
+            frame = touched.advance()
+        return frame.positions
+
+    np.testing.assert_array_equal(run(), run())
+
+
+def test_a_cut_keeps_momentum_and_the_halves_part_under_tension() -> None:
+    mesh = box((20.0, 20.0, 20.0), (4, 4, 4), cell_type="tetra")
+    law = material(young_modulus=20.0, poisson_ratio=0.45)
+    assembler = Assembler.from_materials(elements(mesh, "mean_dilatation"), mesh.regions, [law])
+    lowest = np.flatnonzero(mesh.points[:, 2] < 1e-9)
+    touched = InteractiveSimulation(FiniteElementBody.of(mesh, assembler, supported=lowest), {})
+    corner = int(np.argmax(mesh.points @ [1.0, 0.2, 1.0]))
+    touched.grip(corner, 30.0)
+    touched.pull(mesh.points[corner] + [0.0, 0.0, 4.0])
+    for _ in range(8):
+        touched.advance()
+    engine, state = touched.body.engine, touched._session.state()  # type: ignore[attr-defined]
+    momentum = (engine.mass[:, None] * state.velocity).sum(axis=0)
+    found = touched.cut([[[x, -20.0, 12.0], [x, 20.0, 12.0]] for x in (-20.0, 20.0)], 4.0)
+    assert found.n_pieces == 2
+    engine, state = touched.body.engine, touched._session.state()  # type: ignore[attr-defined]
+    np.testing.assert_allclose((engine.mass[:, None] * state.velocity).sum(axis=0), momentum, atol=1e-12)
+    lower = np.unique(found.mesh.cells[found.piece == found.piece[np.argmin(found.mesh.points[found.mesh.cells][:, :, 2].mean(axis=1))]])
+    for _ in range(40):
+        frame = touched.advance()
+    assert not frame.failed
+    assert np.abs(frame.positions[lower] - found.mesh.points[lower]).max() < 0.1  # what is held goes back
+    assert touched.undo()
+    assert len(touched.last.positions) == mesh.n_points
+
+
+def test_what_cannot_be_is_refused() -> None:
+    touched = simulation()
+    with pytest.raises(InputError, match="there is no tool 'hammer'; choose one of sphere, far"):
+        touched.take("hammer")
+    with pytest.raises(InputError, match="is a lattice, which is not cut"):
+        touched.cut([[[0.0, 0, 0], [1.0, 0, 0]], [[0.0, 1, 0], [1.0, 1, 0]]])
+    with pytest.raises(InputError, match="node is 125"):
+        touched.grip(125)
+    with pytest.raises(InputError, match="begins inside the body"):
+        InteractiveSimulation(touched_lattice(), {"sphere": spherical_indenter((20.0, 20.0, 20.0), 8.0)})
+    with pytest.raises(InputError, match="less than a step"):
+        InteractiveSimulation(touched_lattice(), {}, frame_s=1e-4)
+
+
+class _Clock:
+    """A clock that only sleeping moves."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+
+def test_the_loop_keeps_real_time_and_records_thirty_frames_a_second() -> None:
+    clock = _Clock()
+    loop = RealTimeLoop(simulation(), clock, clock.sleep)
+    loop.record(True)
+    due = 0.0
+    for _ in range(90):
+        loop._obey()
+        due = loop._once(due)
+    frame, pace = loop.latest()
+    assert pace.real_time == pytest.approx(1.0, abs=0.06)
+    assert frame.time_s == pytest.approx(90 * 8 * 2e-3)
+    assert len(loop.recorded()) == pytest.approx(0.5 * 90, abs=2)
+    loop.record(False)
+    loop.replay()
+    due = loop._once(due)
+    assert loop.latest()[1].replaying
+    assert loop.latest()[0] is loop.recorded()[0]
+
+
+def test_commands_are_carried_out_by_the_thread_and_their_trouble_is_told_once() -> None:
+    import time
+
+    with RealTimeLoop(simulation()) as loop:
+        loop.submit(lambda s: s.take("hammer"))
+        loop.submit(lambda s: s.take("sphere"))
+        end = time.monotonic() + 20.0
+        while loop.latest()[0].tool != "sphere" and time.monotonic() < end:
+            time.sleep(0.01)
+        assert loop.latest()[0].tool == "sphere"
+        assert "there is no tool 'hammer'" in loop.trouble()
+        assert loop.trouble() == ""
