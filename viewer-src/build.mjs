@@ -1,4 +1,5 @@
-// Writes the bundle that the Python package ships: ../src/naibu/viewer/assets/report.js and report.css.
+// Writes the bundles that the Python package ships into ../src/naibu/viewer/assets: report.js and report.css of the pages that load
+// nothing, and live.js of the live page, the only one that talks to a server.
 import { build } from "esbuild";
 import { readFileSync, mkdirSync, statSync } from "node:fs";
 import { fileURLToPath } from "node:url";
@@ -10,7 +11,7 @@ const LIMIT_BYTES = 700_000;
 const licence = readFileSync(here("node_modules/three/LICENSE"), "utf8").trim();
 mkdirSync(outdir, { recursive: true });
 await build({
-  entryPoints: { report: here("src/main.js") },
+  entryPoints: { report: here("src/main.js"), live: here("src/live-page.js") },
   bundle: true,
   minify: true,
   format: "iife",
@@ -21,7 +22,7 @@ await build({
 });
 await build({ entryPoints: { report: here("src/report.css") }, bundle: true, minify: true, outdir });
 
-for (const name of ["report.js", "report.css"]) {
+for (const name of ["report.js", "live.js", "report.css"]) {
   const { size } = statSync(`${outdir}/${name}`);
   console.log(`${name}: ${(size / 1000).toFixed(0)} kB`);
   if (size > LIMIT_BYTES) throw new Error(`${name} has ${size} bytes; at most ${LIMIT_BYTES} are allowed`);

@@ -23,7 +23,7 @@ def test_what_the_page_holds_is_what_was_given() -> None:
     body = MovingBody("a </script> body", POINTS, TRIANGLES, u, values, marks)
     page = animation_html("A <title>", np.arange(4.0), (body,), "u, mm")
     assert "</script> body" not in page and "A &lt;title&gt;" in page and "https:" not in page
-    data = json.loads(re.search(r"const data = (.*);\n", page)[1])
+    data = json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', page)[1])
     stored = data["bodies"][0]
     moved = np.frombuffer(base64.b64decode(stored["displacement"]), "<i2").reshape(u.shape) * stored["quantum"]
     coloured = np.frombuffer(base64.b64decode(stored["values"]), "<i2").reshape(values.shape) / stored["steps"]

@@ -33,7 +33,7 @@ def view(shape: tuple[int, int, int] = (5, 8, 6), **changed: object) -> SliceVie
 
 
 def payload(page: str) -> dict:
-    found = re.search(r"^const data = (.*);$", page, re.MULTILINE)
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page)
     assert found
     return json.loads(found[1])
 

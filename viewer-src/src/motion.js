@@ -1,6 +1,6 @@
 // The 3-D view of a simulated motion: the coloured surface of a deforming object, rigid indenters, and time.
 import {
-  Box3, BoxGeometry, BufferAttribute, BufferGeometry, CylinderGeometry, DataTexture, DirectionalLight, DoubleSide, EdgesGeometry, Group,
+  Box3, BoxGeometry, BufferAttribute, BufferGeometry, CapsuleGeometry, CylinderGeometry, DataTexture, DirectionalLight, DoubleSide, EdgesGeometry, Group,
   HemisphereLight, LineBasicMaterial, LineDashedMaterial, LineSegments, LinearFilter, Matrix4, Mesh, MeshLambertMaterial, Scene,
   ShaderMaterial, Sphere, SphereGeometry,
 } from "three";
@@ -8,7 +8,7 @@ import { gridLines, lines, sharpEdges } from "./body.js";
 import { colourTable, niceCeiling } from "./colormap.js";
 import { readTheme, View } from "./view.js";
 
-const VERTEX = `
+export const VERTEX = `
 attribute float level;
 varying vec3 seen;
 varying float shade;
@@ -20,7 +20,7 @@ void main() {
 }`;
 
 // Lit gently from the camera, so that the colours keep their meaning.
-const FRAGMENT = `
+export const FRAGMENT = `
 uniform sampler2D colours;
 varying vec3 seen;
 varying float shade;
@@ -50,18 +50,31 @@ function squareEdges(points, faces) {
 function shapeOf({ kind, size }) {
   if (kind === "box") return new BoxGeometry(2 * size[0], 2 * size[1], 2 * size[2]);
   if (kind === "sphere") return new SphereGeometry(size[0], 32, 20);
+  if (kind === "capsule") return new CapsuleGeometry(size[0], 2 * size[1], 12, 32).rotateX(Math.PI / 2);
   return new CylinderGeometry(size[0], size[0], 2 * size[1], 40).rotateX(Math.PI / 2);
 }
 
 /** Corners of a box around a rigid body at a position, as a flat list. */
 function cornersOf({ kind, size, axes }, position) {
-  const half = { box: size, sphere: [size[0], size[0], size[0]], cylinder: [size[0], size[0], size[1]] }[kind];
+  const half = { box: size, sphere: [size[0], size[0], size[0]], cylinder: [size[0], size[0], size[1]], capsule: [size[0], size[0], size[0] + size[1]] }[kind];
   const out = [];
   for (let corner = 0; corner < 8; corner += 1) {
     const signs = [0, 1, 2].map((k) => ((corner >> k) & 1 ? half[k] : -half[k]));
     for (let a = 0; a < 3; a += 1) out.push(position[a] + signs[0] * axes[a] + signs[1] * axes[3 + a] + signs[2] * axes[6 + a]);
   }
   return out;
+}
+
+/** A rigid body as a translucent shape with its edges, turned as its axes say. */
+export function rigidBody(body) {
+  const group = new Group();
+  const shape = shapeOf(body);
+  const fill = new Mesh(shape, new MeshLambertMaterial({ transparent: true, opacity: 0.45, depthWrite: false, side: DoubleSide }));
+  fill.renderOrder = 3;
+  group.add(fill, new LineSegments(new EdgesGeometry(shape, 20), new LineBasicMaterial()));
+  const [a, b, c] = [0, 3, 6].map((k) => body.axes.slice(k, k + 3));
+  group.quaternion.setFromRotationMatrix(new Matrix4().set(a[0], b[0], c[0], 0, a[1], b[1], c[1], 0, a[2], b[2], c[2], 0, 0, 0, 0, 1));
+  return group;
 }
 
 export class MotionView extends View {
@@ -81,7 +94,7 @@ export class MotionView extends View {
     this.reference.computeLineDistances();
     this.grid = gridLines(data.reference, niceCeiling(this.extent.radius / 6.5));
     this.frameful.push(this.grid.geometry.attributes.position.array);
-    this.bodies = data.bodies.map((body) => (body.kind === "plane" ? null : this.#body(body)));
+    this.bodies = data.bodies.map((body) => (body.kind === "plane" ? null : rigidBody(body)));
     this.world.add(this.grid, this.reference, this.skin, this.mesh, ...this.bodies.filter(Boolean), new HemisphereLight(0xffffff, 0x8a8a8a, 2.0), this.sun);
     this.applyTheme();
     this.colourBy(0);
@@ -123,17 +136,6 @@ export class MotionView extends View {
     const mesh = new Mesh(geometry, material);
     mesh.frustumCulled = false;
     return mesh;
-  }
-
-  #body(body) {
-    const group = new Group();
-    const shape = shapeOf(body);
-    const fill = new Mesh(shape, new MeshLambertMaterial({ transparent: true, opacity: 0.45, depthWrite: false, side: DoubleSide }));
-    fill.renderOrder = 3;
-    group.add(fill, new LineSegments(new EdgesGeometry(shape, 20), new LineBasicMaterial()));
-    const [a, b, c] = [0, 3, 6].map((k) => body.axes.slice(k, k + 3));
-    group.quaternion.setFromRotationMatrix(new Matrix4().set(a[0], b[0], c[0], 0, a[1], b[1], c[1], 0, a[2], b[2], c[2], 0, 0, 0, 0, 1));
-    return group;
   }
 
   /** @param {number} frame 0 to number of frames - 1; fractions are interpolated */

@@ -20,6 +20,7 @@ export class Overlay {
   constructor(host) {
     this.svg = make("svg", { class: "overlay", "aria-hidden": "true" }, host);
     this.ring = make("circle", { class: "ring", r: 11, visibility: "hidden" }, this.svg);
+    this.stroke = make("polyline", { class: "stroke", points: "" }, this.svg);
     this.triad = make("g", { class: "triad" }, this.svg);
     this.axes = ["x", "y", "z"].map((label) => {
       const group = make("g", { class: `axis axis-${label}` }, this.triad);
@@ -57,6 +58,11 @@ export class Overlay {
       return { axis, depth: v.z };
     });
     ends.sort((p, q) => p.depth - q.depth).forEach(({ axis }) => this.triad.append(axis.group));
+  }
+
+  /** Draw a line through points [[x, y], ...] in px; none removes it. */
+  draw(points) {
+    this.stroke.setAttribute("points", points.map((p) => p.join()).join(" "));
   }
 
   /** Show the ring at `at` ({x, y} in px), or hide it with null. */

@@ -5,13 +5,13 @@ from __future__ import annotations
 import base64
 from dataclasses import dataclass
 from html import escape
-from importlib.resources import files
 
 import numpy as np
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.viewer.embedding import embedded_json
+from naibu.viewer.page_frame import filled_template
 
 STEPS = 32_000  # quantisation levels of the 16-bit numbers that the page stores
 
@@ -79,9 +79,7 @@ def animation_html(title: str, times_s: FloatArray, bodies: tuple[MovingBody, ..
         "high": high if high > low else low + 1.0,
         "bodies": [_packed(body, low, high) for body in bodies],
     }
-    template = files("naibu.viewer").joinpath("assets/animation.html").read_text(encoding="utf-8")
-    data = embedded_json(payload)
-    return template.replace("$TITLE", escape(title)).replace("$NOTE", escape(note)).replace("$DATA", data)
+    return filled_template("animation.html", {"TITLE": escape(title), "NOTE": escape(note), "DATA": embedded_json(payload)})
 
 
 def _packed(body: MovingBody, low: float, high: float) -> dict[str, object]:

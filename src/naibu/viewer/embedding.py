@@ -22,4 +22,5 @@ def embedded_bytes(data: bytes, *, level: int = 9) -> str:
 
 def embedded_json(payload: object) -> str:
     """Return JSON text that is safe inside a script element; NaN and infinities are errors (ValueError)."""
-    return json.dumps(payload, separators=(",", ":"), allow_nan=False).replace("</", "<\\/")
+    # a "<" stands in strings only; escaped, none of "</script>", "<!--" and "<script" can occur
+    return json.dumps(payload, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")

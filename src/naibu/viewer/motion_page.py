@@ -11,7 +11,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray, Int16Array, IntArray, require_shape
 from naibu.core.errors import InputError
 from naibu.viewer.embedding import embedded_bytes, embedded_json
-from naibu.viewer.page_frame import asset, page_html
+from naibu.viewer.page_frame import page_html
 from naibu.viewer.tables import Table, provenance_section, table_html
 from naibu.viewer.ticks import ticks_between
 
@@ -163,8 +163,8 @@ def _html(page: MotionPage) -> str:
         f"{curves}</section>{f'<section>{tables}</section>' if tables else ''}{provenance}"
     )
     footer = "Lengths in mm, forces in mN. This page is self-contained: it loads nothing from the network."
-    scripts = f'<script type="application/json" id="naibu-frames">{data}</script><script>{asset("report.js")}</script>'
-    return page_html(page.title, lead, main, footer, scripts=scripts)
+    frames = f'<script type="application/json" id="naibu-frames">{data}</script>'
+    return page_html(page.title, lead, main, footer, data=frames, script="report.js")
 
 
 def _packed(page: MotionPage) -> dict[str, object]:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from importlib.resources import files
 
 import numpy as np
 
 from naibu.core.arrays import AnyFloatArray
 from naibu.core.errors import InputError
 from naibu.viewer.embedding import embedded_bytes, embedded_json
+from naibu.viewer.page_frame import filled_template
 from naibu.viewer.tables import Table, table_html
 
 GREY_LEVELS = 255
@@ -100,11 +100,9 @@ def slices_html(view: SliceView) -> str:
         "overlays": [_overlay(o, o.values[steps]) for o in view.overlays],
         "arrows": _arrows(view.displacement[steps]),
     }
-    template = (files("naibu.viewer") / "assets" / "slices.html").read_text(encoding="utf-8")
-    data = embedded_json(payload)
     words = "".join(f"<p>{escape(s)}</p>" for s in view.sentences)
     tables = "".join(table_html(t) for t in view.tables)
-    return template.replace("$TITLE", escape(view.title)).replace("$WORDS", words).replace("$TABLES", tables).replace("$DATA", data)
+    return filled_template("slices.html", {"TITLE": escape(view.title), "WORDS": words, "TABLES": tables, "DATA": embedded_json(payload)})
 
 
 def _stride(shape: tuple[int, ...], spacing: AnyFloatArray) -> list[int]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
-from naibu.viewer.page_frame import asset, page_html
+from naibu.viewer.page_frame import page_html
 from naibu.viewer.result_page.estimates import correlation_table, parameter_table
 from naibu.viewer.result_page.figures import residual_panels, rms_bars
 from naibu.viewer.result_page.packing import packed_scenes
-from naibu.viewer.result_page.payload import Report, ResidualSet, Scene
+from naibu.viewer.result_page.payload import Report, ResidualSet, Scene, VerdictNote
 from naibu.viewer.tables import provenance_section, table_html
 
 
@@ -23,17 +23,24 @@ def document(report: Report, scenes: Sequence[Scene]) -> str:
         body += provenance_section(report.provenance)
     header = f'{_headline(report)}<nav aria-label="Contents"><ul>{links}</ul></nav>'
     footer = "Lengths in mm, pressures and moduli in kPa, forces in mN. This page is self-contained: it loads nothing from the network."
-    return page_html(report.title, header, body, footer, scripts=_scene_data(scenes) if scenes else "")
+    return page_html(report.title, header, body, footer, data=_scene_data(scenes) if scenes else "", script="report.js" if scenes else "")
 
 
 def _scene_data(scenes: Sequence[Scene]) -> str:
-    data = f'<script type="application/gzip+base64" id="naibu-scenes">{packed_scenes(scenes)}</script>'
-    return f"{data}<script>{asset('report.js')}</script>"
+    return f'<script type="application/gzip+base64" id="naibu-scenes">{packed_scenes(scenes)}</script>'
 
 
 def _headline(report: Report) -> str:
     sentences = "".join(f"<p{' class=lead' if i == 0 else ''}>{escape(s)}</p>" for i, s in enumerate(report.headline))
-    return sentences + rms_bars(report.scenes)
+    return _verdict(report.verdict) + sentences + rms_bars(report.scenes)
+
+
+def _verdict(verdict: VerdictNote | None) -> str:
+    if verdict is None:
+        return ""
+    details = f"<ul>{''.join(f'<li>{escape(s)}</li>' for s in verdict.details)}</ul>" if verdict.details else ""
+    kind = "" if verdict.sound else ' class="limits"'
+    return f'<div id="verdict"{kind}><p class="lead"><strong>{escape(verdict.sentence)}</strong></p>{details}</div>'
 
 
 def _section(key: str, title: str, inner: str) -> str:

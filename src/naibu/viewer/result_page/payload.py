@@ -192,6 +192,25 @@ class ResidualSet:
         return cls(title, scene.residual_mm, scene.sd_mm, scene.layer)
 
 
+@dataclass(frozen=True, slots=True)
+class VerdictNote:
+    """Whether the model explains the data.
+
+    Attributes
+    ----------
+    sentence : str
+        The verdict.
+    sound : bool
+        Whether nothing speaks against an explanation; the page sets other verdicts off as a warning.
+    details : tuple of str
+        Reasons, markers that were left out, and what else to know, one sentence each.
+    """
+
+    sentence: str
+    sound: bool
+    details: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Report:
     """Content of one result page, in reading order.
@@ -202,6 +221,8 @@ class Report:
         Heading of the page.
     headline : tuple of str
         The main results in sentences; the first is set larger.
+    verdict : VerdictNote or None
+        Set above the headline.
     scenes : tuple of Scene
         States for the 3-D view and for the RMS bars below the headline.
     accuracy : Table or None
@@ -222,6 +243,7 @@ class Report:
 
     title: str
     headline: tuple[str, ...]
+    verdict: VerdictNote | None = None
     scenes: tuple[Scene, ...] = ()
     accuracy: Table | None = None
     residuals: tuple[ResidualSet, ...] = ()

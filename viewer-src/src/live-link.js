@@ -1,0 +1,57 @@
+// The connection to the simulation: asks for one frame after the other, sends commands, and comes back after an interruption.
+import { decodeFrame } from "./live-decode.js";
+
+const FINAL = new Set([1007, 1008]); // malformed or not allowed: trying again would not help
+const REPLACED = 1013;
+
+export class LiveLink {
+  /**
+   * @param {string} token secret part of the address
+   * @param {{onFrame: Function, onTrouble: Function, onState: Function}} listener
+   */
+  constructor(token, listener) {
+    this.address = `${window.location.protocol === "https:" ? "wss" : "ws"}://${window.location.host}/session?token=${encodeURIComponent(token)}`;
+    this.listener = listener;
+    this.delay = 500;
+    this.arrivals = [];
+    this.connect();
+  }
+
+  connect() {
+    this.socket = new WebSocket(this.address);
+    this.socket.binaryType = "arraybuffer";
+    this.socket.onopen = () => {
+      this.delay = 500;
+      this.listener.onState("connected");
+      this.send({ type: "next" });
+    };
+    this.socket.onmessage = ({ data }) => {
+      if (typeof data === "string") this.listener.onTrouble(JSON.parse(data).trouble);
+      else this.#received(decodeFrame(data));
+    };
+    this.socket.onclose = ({ code, reason }) => {
+      if (FINAL.has(code)) this.listener.onState("refused", reason || "the server refused this page; open the address that naibu live printed");
+      else {
+        this.listener.onState("lost", code === REPLACED ? "too many pages are open" : "the simulation does not answer; trying again");
+        this.timer = setTimeout(() => this.connect(), this.delay);
+        this.delay = Math.min(2 * this.delay, 5000);
+      }
+    };
+  }
+
+  #received(frame) {
+    const now = performance.now();
+    this.arrivals = [...this.arrivals.filter((t) => now - t < 1000), now];
+    this.listener.onFrame(frame);
+    requestAnimationFrame(() => this.send({ type: "next" }));
+  }
+
+  /** Frames received in the last second. */
+  get framesPerSecond() {
+    return this.arrivals.length;
+  }
+
+  send(command) {
+    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(command));
+  }
+}

@@ -1,0 +1,290 @@
+// The live page: builds view and controls in #naibu-live, and leads the tools by mouse, touch, keyboard and gamepad.
+import { Vector3 } from "three";
+import { niceCeiling, tableGradient } from "./colormap.js";
+import { canDrawOr, h } from "./elements.js";
+import { ForceCurve } from "./force-curve.js";
+import { decodeScene } from "./live-decode.js";
+import { LiveLink } from "./live-link.js";
+import { LiveView } from "./live-view.js";
+
+const MODES = { push: "Push", pull: "Pull", cut: "Cut", probe: "Probe" };
+const STROKE_PX = 6; // between two positions of the blade
+const HINTS = {
+  push: "Drag the tool, or use the keys W A S D (up, left, down, right) and Q E (away, towards). Drag elsewhere to rotate.",
+  pull: "Drag a point of the surface; it is released when you let go. Drag elsewhere to rotate.",
+  cut: "Draw a line across the object: the blade cuts through it, away from you. Begin beside it to cut in from its rim.",
+  probe: "Click a point of the surface to follow its displacement.",
+};
+const AXES = ["x", "y", "z"];
+const DEAD_ZONE = 0.15;
+const digits = (value) => String(Number(value.toPrecision(3))).replace("-", "−");
+const newtons = (force) => Math.hypot(...force) / 1000;
+
+class LivePage {
+  constructor(root, scene, token) {
+    this.scene = scene;
+    this.mode = "push";
+    this.probed = -1;
+    this.tool = scene.tools.length ? scene.tools[0].name : "";
+    this.#build(root);
+    this.view = new LiveView(this.stage);
+    this.view.show(scene);
+    this.view.listenToKeys(this.#keys());
+    this.curve = new ForceCurve(this.canvas);
+    this.#listen();
+    window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.view.applyTheme());
+    this.setMode("push");
+    this.link = new LiveLink(token, {
+      onFrame: (frame) => this.#show(frame),
+      onTrouble: (text) => this.#say(text),
+      onState: (state, text) => this.#connected(state, text),
+    });
+  }
+
+  #button(text, action, attributes = {}) {
+    return h("button", { type: "button", onclick: action, ...attributes }, text);
+  }
+
+  #build(root) {
+    this.stage = h("div", { class: "stage", tabindex: 0, role: "application", "aria-label": "3-D view of the simulation. Arrow keys rotate, plus and minus zoom, W A S D Q E move the tool." });
+    this.modes = Object.entries(MODES).filter(([mode]) => mode !== "cut" || this.scene.cuttable).map(([mode, text]) => this.#button(text, () => this.setMode(mode), { "data-mode": mode, "aria-pressed": "false" }));
+    this.toolChoice = h("select", { id: "naibu-tool", onchange: () => this.take(this.toolChoice.value) },
+      ...this.scene.tools.map((t) => h("option", { value: t.name }, t.name)), h("option", { value: "" }, "no tool"));
+    this.pause = this.#button("❚❚ Pause", () => this.command("pause", { on: !this.frame?.paused }));
+    this.record = this.#button("● Record", () => this.command("record", { on: !this.frame?.recording }));
+    this.hint = h("p", { class: "hint" });
+    this.gradient = h("div", { class: "gradient" });
+    this.gradient.style.background = tableGradient(false);
+    this.ticks = h("div", { class: "ticks" });
+    this.colour = h("select", { id: "naibu-colour", onchange: () => this.command("colour", { name: this.colour.value }, true) },
+      h("option", { value: "displacement" }, "displacement, mm"), h("option", { value: "strain" }, this.scene.strain));
+    this.badge = h("p", { class: "badge", role: "status" }, "connecting");
+    this.message = h("p", { class: "note trouble", role: "alert" });
+    this.canvas = h("canvas", { class: "force-curve", role: "img", "aria-label": "Force of the last ten seconds" });
+    this.numbers = Object.fromEntries(["force", "pull", "penetration", "time", "rate", "probe"].map((name) => [name, h("dd", {}, "–")]));
+    const labels = { force: "force of the tool", pull: "force of the pull", penetration: "penetration", time: "simulated time", rate: "rate", probe: "probed point" };
+    const list = h("dl", { class: "numbers" }, ...Object.entries(labels).flatMap(([name, text]) => [h("dt", {}, text), this.numbers[name]]));
+    root.replaceChildren(
+      h("div", { class: "bar" }, h("div", { class: "modes", role: "group", "aria-label": "What dragging does" }, ...this.modes),
+        h("label", { for: "naibu-tool" }, "Tool"), this.toolChoice, this.pause, this.#button("↺ Undo", () => this.command("undo")),
+        this.#button("Reset", () => this.command("reset"))),
+      h("div", { class: "live-grid" },
+        h("div", {}, this.stage, this.hint, h("div", { class: "motion-scale" }, this.gradient, this.ticks), this.#viewControls()),
+        h("div", { class: "live-side" }, this.badge, this.message, list, this.canvas,
+          h("div", { class: "bar" }, this.record, this.#button("▶ Replay", () => this.command("replay")),
+            this.#button("Save as a page", () => { window.location.href = `/recording${window.location.search}`; }),
+            this.#button("Screenshot", () => this.#screenshot())))));
+  }
+
+  #viewControls() {
+    const slider = h("input", { type: "range", min: 0, max: 1, step: 0.01, value: 0.5, "aria-label": "Position of the section", disabled: true,
+      oninput: () => this.view.setClip(Number(axis.value), Number(slider.value)) });
+    const axis = h("select", { id: "naibu-clip", onchange: () => {
+      slider.disabled = axis.value === "";
+      this.view.setClip(axis.value === "" ? null : Number(axis.value), Number(slider.value));
+    } }, h("option", { value: "" }, "none"), ...AXES.map((name, k) => h("option", { value: k }, `across ${name}`)));
+    const toggle = (text, action) => {
+      const box = h("input", { type: "checkbox", onchange: () => action(box.checked) });
+      return h("label", { class: "toggle" }, box, text);
+    };
+    const markers = this.scene.markers.nodes.length ? [toggle("markers", (on) => this.view.setMarkers(on))] : [];
+    return h("div", { class: "bar" }, h("label", { for: "naibu-clip" }, "Section"), axis, slider,
+      h("label", { for: "naibu-colour" }, "Colour by"), this.colour, toggle("mesh", (on) => this.view.setEdges(on)), ...markers);
+  }
+
+  #keys() {
+    const moves = { w: ["up", 1], s: ["up", -1], d: ["right", 1], a: ["right", -1], q: ["away", 1], e: ["away", -1] };
+    const keys = Object.fromEntries(Object.entries(moves).map(([key, [axis, sign]]) => [key, () => this.nudge(axis, sign * 0.02)]));
+    return { ...keys, " ": () => this.command("pause", { on: !this.frame?.paused }), u: () => this.command("undo") };
+  }
+
+  /** Send a command; those that steer are not sent by a page that only watches. */
+  command(type, values = {}, always = false) {
+    if (this.frame?.driving || always) this.link.send({ type, ...values });
+    else this.#say("Another page drives this simulation; this one watches.");
+  }
+
+  take(name) {
+    this.tool = name;
+    this.lead = null;
+    this.toolChoice.value = name;
+    this.command("tool", { name });
+  }
+
+  setMode(mode) {
+    this.mode = mode;
+    this.modes.forEach((b) => b.setAttribute("aria-pressed", String(b.dataset.mode === mode)));
+    this.hint.textContent = HINTS[mode];
+  }
+
+  /** Move the tool along an axis of the screen by a fraction of the object's size. */
+  nudge(axis, fraction) {
+    if (!this.frame || this.frame.tool < 0) return;
+    const way = this.view.screenAxes()[axis];
+    const step = fraction * 2 * this.view.extent.radius;
+    const from = this.lead ?? this.frame.centre;
+    this.lead = from.map((v, k) => v + step * way[k]);
+    this.command("move", { at: this.lead });
+  }
+
+  #listen() {
+    const { stage, view } = this;
+    stage.addEventListener("pointerdown", (e) => {
+      if (!this.frame || e.button !== 0) return;
+      if (this.mode === "push" && (view.onTool(e.clientX, e.clientY) || e.shiftKey)) this.#drag(e, "move", this.frame.centre);
+      else if (this.mode === "cut") this.#stroke(e);
+      else if (this.mode !== "push") this.#touched(e);
+    }, { capture: true });
+  }
+
+  #touched(e) {
+    const hit = this.view.pick(e.clientX, e.clientY);
+    if (!hit) return;
+    if (this.mode === "probe") {
+      this.probed = hit.node;
+      this.#probe();
+      return;
+    }
+    this.command("grip", { node: hit.node });
+    this.#drag(e, "pull", hit.point.toArray());
+  }
+
+  /** Follow the pointer until it is released, then call `done`. */
+  #followed(follow, done) {
+    this.view.controls.enabled = false;
+    const end = () => {
+      this.view.controls.enabled = true;
+      window.removeEventListener("pointermove", follow);
+      ["pointerup", "pointercancel"].forEach((name) => window.removeEventListener(name, end));
+      done();
+    };
+    window.addEventListener("pointermove", follow);
+    ["pointerup", "pointercancel"].forEach((name) => window.addEventListener(name, end));
+  }
+
+  /** Draw the path of a blade, and cut when the pointer is released. */
+  #stroke(e) {
+    const path = [[e.clientX, e.clientY]];
+    const box = this.stage.getBoundingClientRect();
+    const follow = (event) => {
+      const [x, y] = path[path.length - 1];
+      if (Math.hypot(event.clientX - x, event.clientY - y) < STROKE_PX || path.length >= 200) return;
+      path.push([event.clientX, event.clientY]);
+      this.view.overlay.draw(path.map(([a, b]) => [a - box.left, b - box.top]));
+    };
+    this.#followed(follow, () => {
+      this.view.overlay.draw([]);
+      if (path.length > 1) this.command("cut", { edges: path.map(([x, y]) => this.view.edgeThrough(x, y)) });
+    });
+  }
+
+  /** Lead the tool or the gripped point with the pointer, in the plane through `from` that faces the viewer. */
+  #drag(e, kind, from) {
+    const { view } = this;
+    const start = view.inViewPlane(e.clientX, e.clientY, from);
+    const follow = (event) => {
+      const at = view.inViewPlane(event.clientX, event.clientY, from);
+      if (!at || !start) return;
+      const target = from.map((v, k) => v + at[k] - start[k]);
+      if (kind === "move") this.lead = target;
+      this.command(kind, { at: target });
+    };
+    this.#followed(follow, () => { if (kind === "pull") this.command("release"); });
+  }
+
+  #gamepad() {
+    const pad = navigator.getGamepads?.().find(Boolean);
+    if (!pad) return;
+    const axes = [["right", pad.axes[0]], ["up", -pad.axes[1]], ["away", -(pad.axes[3] ?? 0)]];
+    axes.filter(([, value]) => Math.abs(value) > DEAD_ZONE).forEach(([axis, value]) => this.nudge(axis, 0.01 * value));
+  }
+
+  #show(frame) {
+    if (frame.topology !== this.scene.topology) {
+      this.#renew();
+      return;
+    }
+    const first = !this.frame;
+    this.frame = frame;
+    if (first && frame.driving && this.tool && frame.tool < 0) this.take(this.tool);
+    this.view.setFrame(frame);
+    this.#gamepad();
+    this.curve.add(frame.time, newtons(frame.gripped >= 0 ? frame.pull : frame.force));
+    this.curve.draw(niceCeiling);
+    this.ticks.replaceChildren(...[0, 1, 2, 3, 4].map((k) => h("span", {}, digits((k / 4) * this.view.top))));
+    const { numbers } = this;
+    numbers.force.textContent = frame.tool < 0 ? "–" : `${newtons(frame.force).toFixed(2)} N`;
+    numbers.pull.textContent = frame.gripped < 0 ? "–" : `${newtons(frame.pull).toFixed(2)} N`;
+    numbers.penetration.textContent = `${frame.penetration.toFixed(2)} mm`;
+    numbers.time.textContent = `${frame.time.toFixed(2)} s`;
+    numbers.rate.textContent = `${Math.round(frame.stepsPerSecond)} steps/s, ${this.link.framesPerSecond} frames/s`;
+    this.#probe();
+    this.#badge(frame);
+    this.stage.setAttribute("data-ready", "1");
+  }
+
+  /** Fetch the scene of a body that was cut, or whose cut was undone. */
+  async #renew() {
+    if (this.renewing) return;
+    this.renewing = true;
+    const answer = await fetch(`/scene${window.location.search}`);
+    this.scene = decodeScene(await answer.json());
+    this.view.show(this.scene);
+    this.probed = -1;
+    this.view.overlay.mark(null);
+    this.renewing = false;
+  }
+
+  #badge(frame) {
+    const real = Math.round(100 * frame.realTime);
+    let text = real >= 97 ? "real time" : `slower than real time: ${real} %`;
+    if (frame.paused) text = "paused";
+    if (frame.replaying) text = "replay";
+    if (frame.failed) text = "the last step failed and was taken back";
+    if (!frame.driving) text += " (watching)";
+    this.badge.textContent = text;
+    this.badge.dataset.held = String(real >= 97 || frame.paused || frame.replaying);
+    this.pause.textContent = frame.paused ? "▶ Go on" : "❚❚ Pause";
+    this.record.textContent = frame.recording ? "■ Stop" : "● Record";
+  }
+
+  #probe() {
+    if (this.probed < 0 || !this.frame) return;
+    const [points, moved] = [this.scene.points, this.frame.positions];
+    const d = [0, 1, 2].map((a) => moved[3 * this.probed + a] - points[3 * this.probed + a]);
+    const signed = d.map((v) => v.toFixed(2).replace("-", "−"));
+    this.numbers.probe.textContent = `moved (${signed.join(", ")}) mm, ${Math.hypot(...d).toFixed(2)} mm in all`;
+    const at = new Vector3().fromArray(moved, 3 * this.probed).project(this.view.camera);
+    const { clientWidth: w, clientHeight: t } = this.stage;
+    this.view.overlay.mark({ x: ((at.x + 1) / 2) * w, y: ((1 - at.y) / 2) * t });
+  }
+
+  #connected(state, text = "") {
+    this.#say(text);
+    if (state !== "connected") this.badge.textContent = "not connected";
+    this.badge.dataset.held = String(state === "connected");
+  }
+
+  #say(text) {
+    this.message.textContent = text;
+  }
+
+  #screenshot() {
+    this.view.render();
+    this.view.canvas.toBlob((blob) => {
+      const link = h("a", { href: URL.createObjectURL(blob), download: "naibu-live.png" });
+      link.click();
+      URL.revokeObjectURL(link.href);
+    });
+  }
+}
+
+async function begin() {
+  const root = document.getElementById("naibu-live");
+  if (!root || !canDrawOr(root)) return;
+  const answer = await fetch(`/scene${window.location.search}`);
+  const token = new URLSearchParams(window.location.search).get("token") ?? "";
+  window.naibuLive = new LivePage(root, decodeScene(await answer.json()), token);
+}
+
+begin();

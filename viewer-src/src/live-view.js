@@ -1,0 +1,239 @@
+// The 3-D view of a running simulation: coloured surface, section, markers, tool, fixtures, and picking.
+import {
+  BufferAttribute, BufferGeometry, DataTexture, DirectionalLight, DoubleSide, DynamicDrawUsage, HemisphereLight, InstancedMesh,
+  LinearFilter, Matrix4, Mesh, MeshBasicMaterial, Plane, Raycaster, Scene, ShaderMaterial, Sphere, SphereGeometry,
+  Vector2, Vector3,
+} from "three";
+import { gridLines } from "./body.js";
+import { colourTable, niceCeiling } from "./colormap.js";
+import { FRAGMENT, rigidBody, VERTEX } from "./motion.js";
+import { section } from "./section.js";
+import { readTheme, View } from "./view.js";
+
+const MARKER_FRACTION = 0.012; // radius of a marker, in radii of the object
+
+export class LiveView extends View {
+  /** Show a decoded scene at rest; one that replaces another, as after a cut, is seen as the other was. */
+  show(scene) {
+    const [first, clip, marked, mesh] = [!this.scene, this.clip, this.markers?.visible, this.skin?.material.wireframe];
+    this.scene = scene;
+    this.clear();
+    this.world = new Scene();
+    this.sun = new DirectionalLight(0xffffff, 1.4);
+    this.position = new BufferAttribute(scene.points.slice(), 3).setUsage(DynamicDrawUsage);
+    this.level = new BufferAttribute(new Float32Array(scene.points.length / 3), 1).setUsage(DynamicDrawUsage);
+    this.top ??= 1;
+    this.skin = this.#coloured(this.position, this.level);
+    this.skin.geometry.setIndex(new BufferAttribute(scene.faces, 1));
+    this.cap = this.#coloured(new BufferAttribute(new Float32Array(0), 3), new BufferAttribute(new Float32Array(0), 1));
+    this.cap.visible = false;
+    this.#measure();
+    this.markers = this.#spheres();
+    this.grid = gridLines(scene.points, niceCeiling(this.extent.radius / 6.5));
+    this.fixtures = scene.fixtures.filter((f) => f.kind !== "plane").map((f) => this.#fixture(f));
+    this.tools = scene.tools.map((t) => rigidBody(t));
+    this.tools.forEach((t) => { t.visible = false; });
+    this.world.add(this.grid, this.skin, this.cap, this.markers, ...this.fixtures, ...this.tools, new HemisphereLight(0xffffff, 0x8a8a8a, 2.0), this.sun);
+    this.applyTheme();
+    this.#colours();
+    this.#clipBy(clip ?? null);
+    this.setMarkers(Boolean(marked) && this.markers.count > 0);
+    this.setEdges(Boolean(mesh));
+    if (first) this.look("oblique");
+  }
+
+  #measure() {
+    const { points } = this.scene;
+    this.low = [0, 1, 2].map((a) => { let v = Infinity; for (let i = a; i < points.length; i += 3) v = Math.min(v, points[i]); return v; });
+    this.high = [0, 1, 2].map((a) => { let v = -Infinity; for (let i = a; i < points.length; i += 3) v = Math.max(v, points[i]); return v; });
+    const centre = new Vector3(...this.low).add(new Vector3(...this.high)).multiplyScalar(0.5);
+    this.extent = new Sphere(centre, 0.62 * new Vector3(...this.high).distanceTo(new Vector3(...this.low)));
+    const above = [...this.high];
+    above[2] += 0.35 * (this.high[2] - this.low[2]); // room for the tool
+    this.frameful = [[0, 1, 2, 3, 4, 5, 6, 7].flatMap((k) => [0, 1, 2].map((a) => ((k >> a) & 1 ? above[a] : this.low[a])))];
+  }
+
+  #coloured(position, level) {
+    const geometry = new BufferGeometry();
+    geometry.setAttribute("position", position);
+    geometry.setAttribute("level", level);
+    const material = new ShaderMaterial({
+      vertexShader: `#include <clipping_planes_pars_vertex>\n${VERTEX.replace("gl_Position =", "vec4 mvPosition = p;\n  #include <clipping_planes_vertex>\n  gl_Position =")}`,
+      fragmentShader: `#include <clipping_planes_pars_fragment>\n${FRAGMENT.replace("void main() {", "void main() {\n  #include <clipping_planes_fragment>")}`,
+      uniforms: { colours: { value: null } },
+      side: DoubleSide,
+      clipping: true,
+    });
+    const mesh = new Mesh(geometry, material);
+    mesh.frustumCulled = false;
+    return mesh;
+  }
+
+  #spheres() {
+    const { nodes, each } = this.scene.markers;
+    const count = nodes.length / each;
+    const ball = new SphereGeometry(MARKER_FRACTION * this.extent.radius, 10, 8);
+    const mesh = new InstancedMesh(ball, new MeshBasicMaterial(), Math.max(count, 1));
+    mesh.count = count;
+    mesh.frustumCulled = false;
+    mesh.visible = false;
+    return mesh;
+  }
+
+  #fixture(fixture) {
+    const group = rigidBody(fixture);
+    group.position.set(...fixture.centre);
+    return group;
+  }
+
+  #colours() {
+    const texture = new DataTexture(colourTable(false), 256, 1);
+    texture.minFilter = texture.magFilter = LinearFilter;
+    texture.needsUpdate = true;
+    for (const mesh of [this.skin, this.cap]) mesh.material.uniforms.colours.value = texture;
+  }
+
+  /** Show a frame; the surface is coloured by displacement, or by the values of the frame if it has some. */
+  setFrame(frame) {
+    this.frame = frame;
+    const { points } = this.scene;
+    const moved = frame.positions;
+    this.position.array.set(moved);
+    this.position.needsUpdate = true;
+    const out = this.level.array;
+    let largest = 0;
+    for (let i = 0; i < out.length; i += 1) {
+      const value = frame.values ? frame.values[i] : Math.hypot(moved[3 * i] - points[3 * i], moved[3 * i + 1] - points[3 * i + 1], moved[3 * i + 2] - points[3 * i + 2]);
+      out[i] = value;
+      if (value > largest) largest = value;
+    }
+    // the scale grows at once and shrinks only when it is three times too long, so that colours do not flicker
+    if (largest > this.top || largest < this.top / 3) this.top = niceCeiling(Math.max(1.1 * largest, 0.01));
+    for (let i = 0; i < out.length; i += 1) out[i] /= this.top;
+    this.level.needsUpdate = true;
+    this.tools.forEach((tool, k) => {
+      tool.visible = k === frame.tool;
+      if (tool.visible) tool.position.set(...frame.centre);
+    });
+    this.#placeMarkers();
+    this.#cut();
+    this.requestRender();
+  }
+
+  /** Value of the colours at a node: mm of displacement, or what the frame carries. */
+  valueAt(node) {
+    return this.level.array[node] * this.top;
+  }
+
+  #placeMarkers() {
+    if (!this.markers.visible) return;
+    const { nodes, weights, each } = this.scene.markers;
+    const at = this.position.array;
+    const matrix = new Matrix4();
+    for (let q = 0; q < this.markers.count; q += 1) {
+      const p = [0, 0, 0];
+      for (let k = q * each; k < (q + 1) * each; k += 1) for (let a = 0; a < 3; a += 1) p[a] += weights[k] * at[3 * nodes[k] + a];
+      const hidden = this.clip && this.clip.normal.x * p[0] + this.clip.normal.y * p[1] + this.clip.normal.z * p[2] + this.clip.constant < 0;
+      this.markers.setMatrixAt(q, hidden ? matrix.makeScale(0, 0, 0) : matrix.makeTranslation(...p));
+    }
+    this.markers.instanceMatrix.needsUpdate = true;
+  }
+
+  /** Cut the view by a plane across axis 0, 1 or 2 at a fraction of the object's extent; null shows everything. */
+  setClip(axis, fraction = 0.5) {
+    if (axis === null) {
+      this.#clipBy(null);
+      return;
+    }
+    const normal = [0, 0, 0];
+    normal[axis] = axis === 1 ? 1 : -1; // the half that faces the usual view is taken away
+    const at = this.low[axis] + fraction * (this.high[axis] - this.low[axis]);
+    this.#clipBy(new Plane(new Vector3(...normal), -normal[axis] * at));
+  }
+
+  #clipBy(plane) {
+    this.clip = plane;
+    this.renderer.localClippingEnabled = Boolean(this.clip);
+    this.skin.material.clippingPlanes = this.clip ? [this.clip] : [];
+    this.cap.visible = Boolean(this.clip);
+    this.#cut();
+    this.#placeMarkers();
+    this.requestRender();
+  }
+
+  #cut() {
+    if (!this.clip) return;
+    const { normal, constant } = this.clip;
+    const found = section(this.position.array, this.level.array, this.scene.cells, [normal.x, normal.y, normal.z], -constant);
+    const { geometry } = this.cap;
+    geometry.setAttribute("position", new BufferAttribute(found.positions, 3));
+    geometry.setAttribute("level", new BufferAttribute(found.values, 1));
+  }
+
+  setMarkers(on) {
+    this.markers.visible = on;
+    this.#placeMarkers();
+    this.requestRender();
+  }
+
+  setEdges(on) {
+    this.skin.material.wireframe = on;
+    this.requestRender();
+  }
+
+  #ray(x, y) {
+    const box = this.canvas.getBoundingClientRect();
+    const ray = new Raycaster();
+    ray.setFromCamera(new Vector2((2 * (x - box.left)) / box.width - 1, 1 - (2 * (y - box.top)) / box.height), this.camera);
+    return ray;
+  }
+
+  /** Node of the surface under the pointer, and the point that was hit; null beside the object. */
+  pick(x, y) {
+    this.skin.geometry.computeBoundingSphere();
+    const hits = this.#ray(x, y).intersectObject(this.skin);
+    const hit = hits.find(({ point }) => !this.clip || this.clip.distanceToPoint(point) >= 0);
+    if (!hit) return null;
+    const corners = [hit.face.a, hit.face.b, hit.face.c];
+    const at = new Vector3();
+    const distances = corners.map((k) => at.fromBufferAttribute(this.position, k).distanceTo(hit.point));
+    return { node: corners[distances.indexOf(Math.min(...distances))], point: hit.point };
+  }
+
+  /** Whether the pointer is on the tool in play. */
+  onTool(x, y) {
+    const tool = this.tools[this.frame?.tool ?? -1];
+    return Boolean(tool) && this.#ray(x, y).intersectObject(tool, true).length > 0;
+  }
+
+  /** The point under the pointer on the plane through `through` that faces the camera. */
+  inViewPlane(x, y, through) {
+    const facing = new Plane().setFromNormalAndCoplanarPoint(this.camera.getWorldDirection(new Vector3()), new Vector3(...through));
+    const point = this.#ray(x, y).ray.intersectPlane(facing, new Vector3());
+    return point ? [point.x, point.y, point.z] : null;
+  }
+
+  /** The edge of a blade that reaches through the object under the pointer: a point before it and one behind. */
+  edgeThrough(x, y) {
+    const { origin, direction } = this.#ray(x, y).ray;
+    const depth = this.extent.center.clone().sub(origin).dot(direction);
+    return [-1, 1].map((sign) => origin.clone().addScaledVector(direction, depth + sign * 1.5 * this.extent.radius).toArray());
+  }
+
+  /** Unit vectors of the screen: to the right, upwards, and away from the viewer. */
+  screenAxes() {
+    const [right, up] = [0, 1].map((k) => new Vector3().setFromMatrixColumn(this.camera.matrixWorld, k).toArray());
+    return { right, up, away: this.camera.getWorldDirection(new Vector3()).toArray() };
+  }
+
+  applyTheme() {
+    const colours = readTheme(this.host);
+    this.world.background = null;
+    this.renderer.setClearColor(colours.background);
+    this.grid.material.color.set(colours.grid);
+    this.markers.material.color.set(colours.predicted);
+    for (const group of [...this.tools, ...this.fixtures]) group.children.forEach((part) => part.material.color.set(colours.box));
+    this.requestRender();
+  }
+}
+
