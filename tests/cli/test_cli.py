@@ -12,14 +12,17 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from virtual_press import KNOWN, Press, stop_at
 
 from naibu import cli
+from naibu.identification.from_markers.marker_checks import Doubt
 from naibu.identification.from_markers.specimen_model import ModelSettings
 from naibu.io.experiment_folder.reader import read_experiment
 from naibu.mechanics.finite_strain.newton import Newton
 from naibu.workflows import compare as comparison
+from naibu.workflows import identify as workflow
 
 Run = Callable[..., tuple[int, str, str]]
 COARSE = ("--element-size-mm", "20", "--known", KNOWN[0])
@@ -67,6 +70,20 @@ def test_identify_predict_report(naibu: Run, press: Press) -> None:
         Path(f"here/{page}.html").unlink()
     code, out, _ = naibu("report", "here")
     assert code == 0 and Path("here/report.html").is_file() and Path("here/predicted.html").is_file()
+
+
+def test_the_verdict_comes_first_and_decides_the_exit_code(naibu: Run, press: Press, monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = ("identify", press.folder, "--state", "press/pressed", *COARSE)
+    code, out, _ = naibu(*arguments, "--out", "good")
+    assert code == 0 and out.startswith("Explained: residuals of 0.3")
+    doubt = Doubt("z seems to point towards the base", grave=True)
+    monkeypatch.setattr(workflow, "check_markers", lambda *_: (doubt,))
+    code, out, _ = naibu(*arguments, "--out", "bad")
+    assert code == 3 and out.startswith(f"Not explained, do not use: {doubt.text}.")
+    assert "do not" in out.splitlines()[0] and "not to be used" in out.splitlines()[-1] and "Converged." not in out
+    assert {"model.json", "identification.json", "report.html"} <= set(os.listdir("bad"))
+    code, out, _ = naibu("predict", "bad", press.folder, "--state", "pressed_more", "--height-mm", 46, "--out", "bad")
+    assert code == 0 and "the model is doubtful: Not explained" in out
 
 
 def test_compare_keeps_what_it_has_found(naibu: Run, press: Press, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -117,6 +134,27 @@ def test_tables_become_an_experiment(naibu: Run, press: Press) -> None:
     assert sorted(os.listdir("mine")) == ["initial.csv", "meta.toml", "pressed.csv"]
     shutil.rmtree("mine")
     refused(naibu("import", *tables, tables[1], "--out", "mine", "--size-mm", 60, 60, 60), "'pressed'", "rename")
+
+
+def test_tables_whose_labels_do_not_correspond_are_refused(naibu: Run, press: Press, tmp_path_factory: pytest.TempPathFactory) -> None:
+    initial, pressed = (press.folder / f"{name}.csv" for name in ("initial", "pressed"))
+    head, *rows = pressed.read_text().splitlines()
+    cells = [row.split(",", 1) for row in rows]
+    order = np.random.default_rng(0).permutation(len(rows))
+    for name, shown in (
+        ("shuffled", [f"{cells[i][0]},{cells[j][1]}" for i, j in enumerate(order)]),
+        ("other", [f"{n},{cells[j][1]}" for n, j in enumerate(np.argsort([float(c[1].split(",")[0]) for c in cells]), start=1)]),
+    ):
+        table = tmp_path_factory.mktemp("tables") / f"{name}.csv"
+        table.write_text("\n".join([head, *shown]) + "\n")
+        done = naibu("import", initial, table, "--out", "mine", "--size-mm", 60, 60, 60)
+        refused(done, name, "do not correspond", "row numbers")
+    assert not Path("mine").exists()
+    exchanged = [*rows]
+    exchanged[3], exchanged[40] = f"{cells[3][0]},{cells[40][1]}", f"{cells[40][0]},{cells[3][1]}"
+    Path("exchanged.csv").write_text("\n".join([head, *exchanged]) + "\n")
+    code, out, _ = naibu("import", initial, "exchanged.csv", "--out", "mine", "--size-mm", 60, 60, 60)
+    assert code == 0 and f"marker {cells[3][0]}, {cells[40][0]} moved unlike its neighbours" in out
 
 
 def test_layers_and_heights_are_told_with_the_tables(naibu: Run, press: Press) -> None:
@@ -251,7 +289,7 @@ def test_predict_refuses(naibu: Run, press: Press, mistake: str) -> None:
         ('"naibu model 1"', '"naibu model 0"', "naibu model 0"),
         ('"covariance"', '"variance"', "covariance"),
         ('"law"', '"Law"', "Law"),
-        ('"unit"', '"units"', "units"),
+        ('"unit"', '"units"', "unit"),
         ('"prior_sd": 2.0', '"prior_sd": -2.0', "prior"),
     ],
 )
@@ -293,7 +331,7 @@ def test_a_solve_that_diverges_says_so(naibu: Run, press: Press, monkeypatch: py
         monkeypatch.setattr(Newton, way, lambda self, u, anchors, load, way=found: None if load > 0.1 else way(self, u, anchors, load))
     inputs = (press.folder, *COARSE) if verb == "identify" else (press.results, press.folder, "--state", "pressed")
     code, _, message = naibu(verb, *inputs, "--out", "here")
-    assert code == cli.NO_SOLUTION and "Traceback" not in message
+    assert code == cli.FAILED and "Traceback" not in message
     assert "of the load" in message and "Refine the mesh" in message and "press/pressed" in message
     assert not [p for p in Path().rglob("*") if p.is_file()]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,11 @@ import pytest
 from virtual_press import COARSE, KNOWN, PLATEN_POSITIONS_MM, TRUTH, Press, stop_at
 
 import naibu
+from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.status import Status
+from naibu.identification.from_markers.verdict import Explanation
+from naibu.io.experiment_folder.state_csv import parse_state_csv
 from naibu.io.files import atomic
 from naibu.viewer.result_page.payload import report_json
 from naibu.viewer.result_page.reading import report_from_json
@@ -95,7 +99,7 @@ def test_every_marker_is_predicted(press: Press, tmp_path: Path) -> None:
     prediction = predict.predict(press.results / MODEL_FILE, press.folder, state="pressed_more", heights_from_markers=True, out=tmp_path)
     assert names(tmp_path) == {"predicted.csv", "summary.json", "predicted.html", "predicted.json", "predicted.vtu", "predicted.vtkhdf"}
     table = rows(tmp_path / "predicted.csv")
-    assert list(table[0]) == ["marker", "x_mm", "y_mm", "z_mm", "sd_mm"]
+    assert list(table[0]) == ["marker", "x_mm", "y_mm", "z_mm", "sd_model_mm", "sd_mm", "sd_x_mm", "sd_y_mm", "sd_z_mm"]
     assert [int(r["marker"]) for r in table] == rows_of(press.folder / "initial.csv")
     assert prediction.platen_position_mm == pytest.approx(PLATEN_POSITIONS_MM["pressed_more"], abs=0.5)
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
@@ -104,6 +108,12 @@ def test_every_marker_is_predicted(press: Press, tmp_path: Path) -> None:
     error = np.array([[float(r[f"{a}_mm"]) for a in "xyz"] for r in table]) - np.array([measured[int(r["marker"])] for r in table])
     assert summary["rms_3d_mm"] == pytest.approx(np.sqrt((error**2).sum(axis=1).mean()), abs=2e-3)
     assert summary["rms_3d_mm"] < 0.6
+    sd = {name: np.array([float(r[name]) for r in table]) for name in table[0] if name.startswith("sd_")}
+    along = np.stack([sd[f"sd_{a}_mm"] for a in "xyz"], axis=1)
+    assert ((along.min(axis=1) <= sd["sd_mm"]) & (sd["sd_mm"] <= along.max(axis=1))).all()
+    assert (sd["sd_model_mm"] < sd["sd_mm"]).all()
+    assert np.mean(np.abs(error) < 1.96 * sd["sd_mm"][:, None]) > 0.9
+    assert summary["interval"] == prediction.interval and summary["strain_ratio_to_calibration"] == pytest.approx(prediction.strain_ratio)
     scene = prediction_scene(prediction)
     np.testing.assert_allclose(np.linalg.norm(scene.residual_mm, axis=1), np.linalg.norm(error, axis=1), atol=2e-3)
 
@@ -125,6 +135,19 @@ def test_a_prediction_needs_no_measured_state(press: Press, experiment_folder: P
     for points in (blind.points, seen.points):
         points -= points.mean(axis=0)
     np.testing.assert_allclose(np.linalg.svd(blind.points)[1], np.linalg.svd(seen.points)[1], rtol=1e-6)
+
+
+def test_results_are_not_replaced_unasked(press: Press, tmp_path: Path) -> None:
+    (tmp_path / "press_pressed.vtkhdf").write_text("mine")
+    with pytest.raises(InputError, match=r"holds press_pressed\.vtkhdf, an earlier result or a file of your own.*`overwrite`"):
+        identified(press.folder, tmp_path)
+    with pytest.raises(InputError, match=r"holds model\.json, residuals\.csv, identification\.json and 3 more"):
+        identified(press.folder, press.results)
+    (tmp_path / "summary.json").write_text("mine")
+    with pytest.raises(InputError, match=r"holds summary\.json"):
+        predict.predict(press.results, press.folder, state="pressed_more", out=tmp_path)
+    predict.predict(press.results, press.folder, state="pressed_more", out=tmp_path, overwrite=True)
+    assert (tmp_path / "summary.json").read_text() != "mine" and (tmp_path / "press_pressed.vtkhdf").read_text() == "mine"
 
 
 def test_a_prediction_may_share_the_folder_of_its_model(press: Press, tmp_path: Path) -> None:
@@ -196,7 +219,11 @@ def test_a_checkpoint_of_something_else_is_not_used(press: Press, tmp_path: Path
         file.write_text(file.read_text(encoding="utf-8").replace('"tied"', '"sliding"'), encoding="utf-8")
     elif changed == "damaged":
         file.write_text("{", encoding="utf-8")
-    again = identified(press.folder, tmp_path, resume=changed != "refused")
+    before = {name: (tmp_path / name).read_bytes() for name in names(tmp_path)}
+    with pytest.raises(InputError, match=r"holds model\.json.*a search with other inputs or settings that can be resumed.*`overwrite`"):
+        identified(press.folder, tmp_path, resume=changed != "refused")
+    assert {name: (tmp_path / name).read_bytes() for name in names(tmp_path)} == before
+    again = identified(press.folder, tmp_path, resume=changed != "refused", overwrite=True)
     assert again.calibration.match.history == press.identification.calibration.match.history
 
 
@@ -239,3 +266,101 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, monkeypatch: p
 def test_the_verbs_are_functions_of_the_package() -> None:
     assert naibu.identify is identify.identify and naibu.predict is predict.predict and naibu.report is report.report
     assert naibu.datasets.load("ct_cube_plate").name == "ct_cube_plate" and "ct_cube_plate" in naibu.datasets.names()
+
+
+def rewritten(file: Path, change: Callable[[FloatArray], FloatArray]) -> None:
+    """Change the positions of a marker table."""
+    read = parse_state_csv(file, file.read_bytes(), 3)
+    lines = ["marker,x_mm,y_mm,z_mm", *(f"{i},{x},{y},{z}" for i, (x, y, z) in zip(read.ids, change(read.points).tolist(), strict=True))]
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def test_good_data_are_explained(press: Press) -> None:
+    verdict = press.identification.verdict
+    assert verdict.explanation is Explanation.EXPLAINED and verdict.reasons == () and verdict.outliers == ()
+    summary = json.loads((press.results / "identification.json").read_text(encoding="utf-8"))
+    assert next(iter(summary)) == "verdict"
+    assert summary["verdict"]["explanation"] == "explained" and summary["verdict"]["sentence"] == verdict.sentence
+    page = (press.results / "report.html").read_text(encoding="utf-8")
+    assert page.index(verdict.sentence) < page.index("One set of parameters fits the markers of one loaded state")
+    assert press.identification.model.reservation == ""
+
+
+def test_a_misplaced_marker_is_named_in_every_result(press: Press, experiment_folder: Path, tmp_path: Path) -> None:
+    def changed(points: FloatArray) -> FloatArray:
+        points[59, 0] += 4.0  # too little to be seen before the model is there
+        return points
+
+    rewritten(experiment_folder / "pressed.csv", changed)
+    out = tmp_path / "out"
+    found = identified(experiment_folder, out)
+    (sentence,) = found.verdict.outliers
+    assert found.verdict.explanation is Explanation.EXPLAINED
+    assert sentence.startswith("Marker 60 of press/pressed is 4") and "off along x: left out; 0.3" in sentence
+    summary = json.loads((out / "identification.json").read_text(encoding="utf-8"))
+    assert summary["verdict"]["left_out_markers"] == [sentence] and summary["load_cases"]["press/pressed"]["markers"] == 124
+    assert sentence in (out / "report.html").read_text(encoding="utf-8")
+    assert_same_result(found, press, out)
+
+
+def test_two_tables_upside_down_are_not_explained(experiment_folder: Path, tmp_path: Path) -> None:
+    """The fit is as good as with the true direction, and takes the soft gel for the firm one: 403 kPa for 99."""
+    for name in ("initial", "pressed", "pressed_more"):
+        rewritten(experiment_folder / f"{name}.csv", lambda points: points * [1.0, 1.0, -1.0])
+    out = tmp_path / "out"
+    found = identified(experiment_folder, out)
+    assert found.model.noise_factor < 1.1
+    assert found.verdict.explanation is Explanation.NOT_EXPLAINED and "z seems to point towards the base" in found.verdict.sentence
+    assert read_model(out).reservation == found.verdict.sentence
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert '<div id="verdict" class="limits">' in page and "One set of parameters" not in page
+    prediction = predict.predict(out, experiment_folder, state="pressed", height_mm=50.0)
+    assert "the model is doubtful: Not explained, do not use" in prediction.notes[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda p: p + np.random.default_rng(1).normal(size=p.shape) * 4.0,
+        lambda p: np.roll(p, 1, axis=0),
+        lambda p: p + np.column_stack([0.3 * p[:, 2], 0.0 * p[:, :2]]),
+    ],
+)
+def test_motions_of_no_pressed_body_are_not_explained(
+    experiment_folder: Path, tmp_path: Path, change: Callable[[FloatArray], FloatArray]
+) -> None:
+    rewritten(experiment_folder / "pressed.csv", change)
+    found = identified(experiment_folder, tmp_path / "out")
+    assert found.verdict.explanation is Explanation.NOT_EXPLAINED and "of its deformation" in found.verdict.sentence
+
+
+@pytest.mark.slow
+def test_overstated_noise_is_said_and_the_intervals_hold_the_truth(experiment_folder: Path, tmp_path: Path) -> None:
+    meta = experiment_folder / "meta.toml"
+    coarse = meta.read_text(encoding="utf-8").replace("xy_step_mm = 0.29", "xy_step_mm = 4.0").replace("z_step_mm = 0.5", "z_step_mm = 4.0")
+    meta.write_text(coarse, encoding="utf-8")
+    found = identified(experiment_folder, tmp_path / "out")
+    assert found.model.noise_factor < 0.25 and "overstated about" in found.verdict.notes[0]
+    for p in found.model.parameters.free:
+        if p.name in TRUTH:
+            low, high = found.model.interval(p.name)
+            assert low <= TRUTH[p.name] <= high, p.name
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"pressed": lambda p: p[np.random.default_rng(1).permutation(len(p))]}, "same label"),
+        ({"pressed": lambda p: p * [-1.0, 1.0, 1.0]}, "mirror image"),
+        ({"initial": lambda p: p[:, [2, 1, 0]], "pressed": lambda p: p[:, [2, 1, 0]]}, "axes exchanged"),
+    ],
+)
+def test_tables_that_cannot_belong_together_are_refused_before_anything_is_written(
+    experiment_folder: Path, tmp_path: Path, changes: dict[str, Callable[[FloatArray], FloatArray]], words: str
+) -> None:
+    for name, change in changes.items():
+        rewritten(experiment_folder / f"{name}.csv", change)
+    with pytest.raises(InputError, match=words):
+        identified(experiment_folder, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -117,6 +118,26 @@ def test_an_object_of_labels(tmp_path: Path, ending: str) -> None:
     np.testing.assert_allclose(np.ptp(prepared.study.lattice.points, axis=0), [30.0, 30.0, 20.0])
     assert prepared.study.lattice.points.min() == 0.0 and prepared.study.lattice.total_mass == pytest.approx(0.012)
     assert set(prepared.inputs) == {"mine.toml", f"scan{ending}"} and all(len(digest) == 64 for digest in prepared.inputs.values())
+
+
+def test_labels_that_are_no_array_or_lie_elsewhere_are_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "study"
+    folder.mkdir()
+    np.save(tmp_path / "scan.npy", np.ones((4, 4, 4), dtype=np.uint8))
+    whole = (tmp_path / "scan.npy").read_bytes()
+    (folder / "cut.npy").write_bytes(whole[:-9])
+    (folder / "huge.npy").write_bytes(whole.replace(b"(4, 4, 4), ", b"(9999999999, 4, 4), ")[: len(whole)])
+    os.mkfifo(folder / "pipe.npy")
+    for labels, words in (
+        ("../scan.npy", "outside the folder"),
+        (str(tmp_path / "scan.npy"), "outside the folder"),
+        ("cut.npy", "save the labels by numpy.save"),
+        ("huge.npy", "save the labels by numpy.save"),
+        ("pipe.npy", "device or a pipe"),
+    ):
+        text = STUDY.replace("size_mm = [30, 20, 20]", f'labels = "{labels}"\nvoxel_mm = [5, 5, 5]')
+        with pytest.raises(InputError, match=words):
+            prepared_study(study_file(folder, text))
 
 
 def test_the_density_makes_the_mass(tmp_path: Path) -> None:

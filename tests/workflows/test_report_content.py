@@ -1,10 +1,17 @@
-"""Names of parameters as readers of a report see them."""
+"""Names of parameters as readers of a report see them, and sentences that do not contradict the numbers."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from naibu.workflows.report_content import parameter_label
+from naibu.core.parameters import Parameter, ParameterSet
+from naibu.core.status import Status
+from naibu.identification.from_markers.known_materials import KnownMaterials
+from naibu.identification.from_markers.observations import NoiseModel
+from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.prediction.calibrated_model import CalibratedModel
+from naibu.workflows.report_content import parameter_label, parameter_rows, search_sentence, undetermined
 
 
 @pytest.mark.parametrize(
@@ -20,3 +27,51 @@ from naibu.workflows.report_content import parameter_label
 )
 def test_labels_are_the_terms_of_the_field(name: str, label: str) -> None:
     assert parameter_label(name) == label
+
+
+def model_of(parameter: Parameter, sd: float) -> CalibratedModel:
+    known = KnownMaterials({"other": 1.0})
+    return CalibratedModel(ModelSettings(), ParameterSet.of([parameter]), np.array([[sd**2]]), NoiseModel(), 1.0, known, ())
+
+
+MODULUS = Parameter("gel: young_modulus", 12.6, "kPa", "log", prior_sd=2.0)
+RATIO = Parameter("gel: poisson_ratio", 0.48, "", "incompressibility", prior_sd=1.0)
+FRICTION = Parameter("gel on table: friction", 0.4, "", "log", prior_sd=10.0)
+
+
+@pytest.mark.parametrize(
+    ("parameter", "sd", "told"),
+    [
+        (MODULUS, 1.5, "the data hardly determine it; 12.6 kPa was found; 200 kPa was assumed beforehand."),
+        (MODULUS, 0.1, ""),
+        (RATIO, 0.5, ""),
+        (RATIO, 1.6, "the data hardly determine it; 0.48 was found."),
+        (RATIO, 1.9, "the data leave it open between -0.31 and 0.5."),
+        (RATIO, 70.0, "the data leave it open between -1.00 and 0.5."),
+        (FRICTION, 1.0, "known only to lie between 0.056 and 2.8"),
+        (FRICTION, 0.5, ""),
+    ],
+)
+def test_what_is_said_of_a_parameter_agrees_with_its_interval(parameter: Parameter, sd: float, told: str) -> None:
+    priors = ParameterSet.of([Parameter(MODULUS.name, 200.0, "kPa", "log", prior_sd=2.0)])
+    model = model_of(parameter, sd)
+    said = undetermined(model, [parameter.name], priors)
+    assert ("".join(said).find(told) >= 0) and bool(said) == bool(told), said
+    low, high = model.interval(parameter.name)
+    assert low <= parameter.value <= high
+
+
+def test_bounds_are_physical_however_little_is_known() -> None:
+    for sd in (5.0, 70.0, 1e6):
+        low, high = model_of(RATIO, sd).interval(RATIO.name)
+        assert low == -1.0 and 0.499 < high <= 0.4995
+        assert model_of(MODULUS, sd).interval(MODULUS.name) == (0.0, np.inf)
+        (row,) = parameter_rows(model_of(MODULUS, sd), [MODULUS.name])
+        assert row.estimate == 12.6 and row.lower == -np.inf and row.upper == np.inf  # the page and the terminal show no bound
+    low, high = model_of(MODULUS, 1.0).interval(MODULUS.name)
+    assert (low, high) == pytest.approx((12.6 * np.exp(-1.959964), 12.6 * np.exp(1.959964)))
+
+
+def test_an_early_end_is_not_called_a_result() -> None:
+    assert search_sentence(Status.CONVERGED) == "The search converged."
+    assert "may be used" not in search_sentence(Status.ITERATION_LIMIT)

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from naibu.cli import main
-from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError, NaibuError
 from naibu.core.volume import Volume
 from naibu.imaging.measure_displacement import METHODS, matched_rigidly, measure_displacement
+from naibu.io.displacement_fields import read_field
 from naibu.io.images import read_displacement, read_volume, write_displacement, write_volume
 from naibu.io.marker_tables import import_markers
 from naibu.io.meshes import read_mesh
@@ -79,9 +79,8 @@ def test_files_are_what_other_programs_read(folder: Path, tmp_path: Path) -> Non
     assert grid.same_grid(pair.reference)
     assert np.allclose(vectors, run.measured.displacement.vectors, atol=1e-5, equal_nan=True)
     assert read_mesh(tmp_path / "displacement.vtu").n_cells > 1000
-    stored = np.load(tmp_path / "field.npz")
-    field = DisplacementField.from_arrays(stored["points"], stored["vectors"], covariance=stored["covariance"], valid=stored["valid"])
-    assert len(field.points) > 1000
+    field = read_field(tmp_path / "field.h5")
+    assert len(field.points) > 1000 and field.covariance is not None
     before, after = (import_markers(tmp_path / f"{name}.csv") for name in ("initial", "pressed"))
     assert 100 < len(before) < 400
     assert np.abs(after.points - before.points - run.measured.displacement.vectors[at(pair.reference, before.points)]).max() < 1e-6
@@ -98,7 +97,7 @@ def test_the_same_scans_give_the_same_files(folder: Path, tmp_path: Path) -> Non
     pair = read_pair(folder / "before.mha", folder / "after.nrrd")
     for name in ("a", "b"):
         sense_pair(pair, out=tmp_path / name)
-    for file in ("displacement.mha", "field.npz"):
+    for file in ("displacement.mha", "field.h5"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
 
@@ -117,7 +116,7 @@ def test_a_single_slice_has_all_files_but_the_mesh(folder: Path, tmp_path: Path)
         write_volume(tmp_path / name, middle)
     run = sense_pair(read_pair(tmp_path / "before.mha", tmp_path / "after.nrrd"), method="horn-schunck", out=tmp_path / "out")
     assert {p.name for p in run.files} == {p.name for p in (tmp_path / "out").iterdir()}
-    assert {"report.html", "displacement.mha", "field.npz", "sense.json"} <= {p.name for p in run.files}
+    assert {"report.html", "displacement.mha", "field.h5", "sense.json"} <= {p.name for p in run.files}
     assert not (tmp_path / "out" / "displacement.vtu").exists()
 
 
@@ -141,6 +140,31 @@ def test_the_page_states_positions_of_the_scan_and_the_part_that_was_not_measure
     assert any("25.0% of the object was not measured" in sentence for sentence in slice_view(pair, part).sentences)
 
 
+def test_both_scans_may_have_a_mask_and_doubts_are_on_every_page(folder: Path, tmp_path: Path) -> None:
+    volume = read_volume(folder / "mask.nii.gz")
+    stepped = np.array(volume.values)
+    write_volume(tmp_path / "late.mha", volume.with_values(np.roll(stepped, 1, 2)))
+    pair = read_pair(folder / "before.mha", folder / "after.nrrd", mask=folder / "mask.nii.gz", deformed_mask=tmp_path / "late.mha")
+    assert np.array_equal(pair.deformed_mask, np.roll(stepped, 1, 2) != 0)
+    assert set(pair.inputs) == {"reference", "deformed", "mask", "deformed_mask"}
+    run = sense_pair(pair, method="rigid")
+    doubtful = replace(run, measured=replace(run.measured, warnings=("The `mask` jumps.",)))
+    assert "The mask jumps." in slice_view(pair, doubtful).sentences
+
+
+def test_a_mask_that_jumps_is_named_and_padding_is_not_in_it() -> None:
+    before, after, _, _ = squeezed_ball(seed=3)
+    lost = np.array(before.values)
+    lost[7:17] = lost.min()
+    lost[7:17, 16:26, 18:28] = before.values[7:17, 16:26, 18:28]
+    found = measure_displacement(before.with_values(lost), after, method="rigid")
+    assert any("jumps between neighbouring slices" in text for text in found.warnings)
+    padded = np.array(before.values, dtype=np.float32)
+    padded[:, :, :20] = -3000.0
+    found = measure_displacement(before.with_values(padded), after, method="rigid")
+    assert not found.mask[:, :, :20].any() and found.mask[:, :, 20:].any()
+
+
 def test_methods_that_all_fail_say_why(folder: Path, tmp_path: Path) -> None:
     tiny = write_volume(tmp_path / "tiny.mha", Volume.from_array(np.zeros((6, 6, 6)), spacing_mm=(1, 1, 1)))
     with pytest.raises(NaibuError):
@@ -150,16 +174,41 @@ def test_methods_that_all_fail_say_why(folder: Path, tmp_path: Path) -> None:
 def test_scans_on_different_grids_are_refused(folder: Path) -> None:
     before, after, *_ = squeezed_ball(seed=3)
     other = Volume.from_array(after.values, spacing_mm=(1.5, 1.5, 1.9))
-    with pytest.raises(InputError, match=r"different grids: 44x40x24 voxels of 1\.5x1\.5x2 mm and"):
+    with pytest.raises(InputError, match=r"different grids: their voxel spacings differ: \[1\.5, 1\.5, 2\.0\] and"):
         measure_displacement(before, other)
+    elsewhere = Volume.from_array(after.values, spacing_mm=before.spacing_mm, origin_mm=before.origin_mm + np.array([3.0, 0.0, 4.0]))
+    with pytest.raises(InputError, match=r"agree in size and spacing, but their origins lie 5 mm apart"):
+        measure_displacement(before, elsewhere)
     with pytest.raises(InputError, match="not 'best'"):
         measure_displacement(before, after, method="best")  # type: ignore[arg-type]
 
 
 def test_a_mask_of_another_scan_is_refused(folder: Path, tmp_path: Path) -> None:
     write_volume(tmp_path / "mask.mha", Volume.from_array(np.ones((3, 3, 3), np.uint8), spacing_mm=(1, 1, 1)))
-    with pytest.raises(InputError, match=r"mask\.mha has \(3, 3, 3\) voxels"):
+    with pytest.raises(InputError, match=r"mask\.mha does not lie on the grid of before\.mha: their sizes differ"):
         read_pair(folder / "before.mha", folder / "after.nrrd", mask=tmp_path / "mask.mha")
+
+
+def test_a_scan_that_was_not_measured_everywhere_is_read_and_left_out_there(tmp_path: Path) -> None:
+    before, after, truth, mask = squeezed_ball(seed=3)
+    lost = after.values.astype(np.float32)
+    lost[:, :, : lost.shape[2] // 4] = np.nan
+    write_volume(tmp_path / "before.mha", before)
+    write_volume(tmp_path / "after.nrrd", after.with_values(lost))
+    pair = read_pair(tmp_path / "before.mha", tmp_path / "after.nrrd")
+    assert np.isnan(pair.deformed.values).sum() == np.isnan(lost).sum()
+    found = measure_displacement(pair.reference, pair.deformed, mask=mask).displacement
+    answered = mask & found.valid
+    nz, ny, nx = lost.shape
+    index = np.stack(np.meshgrid(np.arange(nx), np.arange(ny), np.arange(nz), indexing="ij"), axis=-1).transpose(2, 1, 0, 3)
+    goes_to = index[..., 0] + truth[..., 0] / before.spacing_mm[0]  # voxel of the deformed scan along x
+    assert not answered[goes_to < nx // 4 - 2].any()
+    assert answered[mask & (goes_to > nx // 4 + 4)].mean() > 0.95
+    assert np.median(np.linalg.norm(found.vectors - truth, axis=-1)[answered]) < 0.15
+    with pytest.raises(InputError, match="NaN, which only digital volume correlation leaves out"):
+        measure_displacement(pair.reference, pair.deformed, method="ncc-blocks", mask=mask)
+    with pytest.raises(InputError, match="is nan; mask or repair it"):
+        read_volume(tmp_path / "after.nrrd")
 
 
 def test_the_verbs(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

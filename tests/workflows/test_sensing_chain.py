@@ -57,7 +57,7 @@ def chain(folder: Path, side: float, apart: float, made_mm: float, sought_mm: fl
         volumes, diameter_mm=STEEL_WASHER.diameter_mm, thickness_mm=STEEL_WASHER.thickness_mm, names=list(scans), polarity="bright"
     )
     described = specimen.experiment
-    xy_step, z_step = tracked.steps_mm
+    xy_sd, z_sd = tracked.typical_sd_mm
     write_experiment_folder(
         folder / "press",
         tracked.markers[0],
@@ -68,8 +68,8 @@ def chain(folder: Path, side: float, apart: float, made_mm: float, sought_mm: fl
         layers=described.layers,
         stated_mm=platen_positions,
         spacing_mm=described.nominal_spacing_mm,
-        xy_step_mm=xy_step,
-        z_step_mm=z_step,
+        xy_sd_mm=xy_sd,
+        z_sd_mm=z_sd,
     )
     settings = ModelSettings(element_size_mm=sought_mm)
     found = identify.identify(folder / "press", known=["firm=200 kPa"], settings=settings, states={"press": ["pressed"]})

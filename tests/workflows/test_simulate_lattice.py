@@ -152,6 +152,95 @@ def test_an_interruption_amid_writing_a_frame_keeps_those_before(whole: Path, tm
     assert found.keys() == full.keys() and all(np.array_equal(found[name], full[name]) for name in full)
 
 
+class PowerCut(Exception):
+    """What no part of naibu expects."""
+
+
+def assert_resumed(whole: Path, out: Path) -> None:
+    """Resume, and find what an undisturbed run found, and nothing else."""
+    assert run_until(whole / "mine.toml", out, resume=True).finished
+    found, full = series_of(out / "mine.vtkhdf"), series_of(whole / "out" / "mine.vtkhdf")
+    assert found.keys() == full.keys() and all(np.array_equal(found[name], full[name]) for name in full)
+    assert sorted(p.name for p in out.iterdir()) == ["mine.html", "mine.json", "mine.vtkhdf"]
+    assert (out / "mine.json").read_text(encoding="utf-8") == (whole / "out" / "mine.json").read_text(encoding="utf-8")
+
+
+KILLED = """
+import os, sys
+from naibu.workflows.simulate_lattice import simulate_lattice
+last = int(sys.argv[3])
+simulate_lattice(sys.argv[1], sys.argv[2], checkpoint_every=3, progress=lambda r: os.kill(os.getpid(), 9) if r.done == last else None)
+"""
+
+
+def test_a_killed_run_goes_on_from_its_last_checkpoint(whole: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = subprocess.run([sys.executable, "-c", KILLED, str(whole / "mine.toml"), str(out), "8"], capture_output=True, check=False)
+    assert done.returncode == -signal.SIGKILL
+    left = sorted(p.name for p in out.iterdir())
+    assert [name for name in left if not name.startswith(".")] == ["mine.checkpoint.npz"] and len(left) == 3
+    with pytest.raises(InputError, match=r"can be resumed from; continue it with `resume`"):
+        simulate_lattice(whole / "mine.toml", out)
+    seen: list[float | None] = []
+    with pytest.raises(PowerCut):  # and again, in the same process, before the next checkpoint
+
+        def progress(report: ProgressReport) -> None:
+            seen.append(report.done)
+            if report.done == 8:
+                raise PowerCut
+
+        simulate_lattice(whole / "mine.toml", out, resume=True, checkpoint_every=5, progress=progress)
+    assert seen == [7, 8]  # frames 1 to 6 were kept
+    assert_resumed(whole, out)
+
+
+def test_any_failure_keeps_the_frames_of_the_last_checkpoint(whole: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+
+    def progress(report: ProgressReport) -> None:
+        if report.done == 5:
+            raise PowerCut
+
+    with pytest.raises(PowerCut):
+        simulate_lattice(whole / "mine.toml", out, checkpoint_every=2, progress=progress)
+    assert_resumed(whole, out)
+
+
+@pytest.mark.parametrize("error", [InputError("the page is too large"), PowerCut("amid the page")])
+def test_frames_survive_a_failure_of_the_page(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+    def fails(*_: object) -> str:
+        raise error
+
+    out = tmp_path / "out"
+    monkeypatch.setattr(workflow, "motion_html", fails)
+    with pytest.raises(type(error)):
+        simulate_lattice(whole / "mine.toml", out)
+    assert series_of(out / "mine.vtkhdf")["steps"] == FRAMES + 1
+    monkeypatch.undo()
+    monkeypatch.setattr(workflow, "_append", None)  # no frame is computed again
+    assert_resumed(whole, out)
+
+
+def test_results_are_not_replaced_unasked(whole: Path, tmp_path: Path) -> None:
+    path, out = whole / "mine.toml", tmp_path / "out"
+    out.mkdir()
+    (out / "mine.json").write_text("mine")
+    with pytest.raises(InputError, match=r"already holds mine\.json.*`overwrite`"):
+        simulate_lattice(path, out)
+    assert (out / "mine.json").read_text() == "mine"
+    run_until(path, out, 3, overwrite=True)
+    assert run_until(path, out, overwrite=True).finished  # anew, though it could be resumed
+    assert not (out / "mine.checkpoint.npz").exists()
+    with pytest.raises(InputError, match=r"already holds mine\.html, mine\.vtkhdf, mine\.json"):
+        simulate_lattice(path, out)
+
+
+@pytest.mark.parametrize("every", [0, -3, 2.5, True])
+def test_checkpoints_are_counted_in_frames(whole: Path, tmp_path: Path, every: object) -> None:
+    with pytest.raises(InputError, match=r"checkpoint_every is .*whole number of at least 1"):
+        simulate_lattice(whole / "mine.toml", tmp_path, checkpoint_every=every)  # type: ignore[arg-type]
+
+
 def test_other_settings_are_not_resumed(tmp_path: Path) -> None:
     path, out = study_file(tmp_path), tmp_path / "out"
     with pytest.raises(InputError, match="nothing to resume"):

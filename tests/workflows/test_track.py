@@ -13,6 +13,7 @@ from naibu.cli import main
 from naibu.core.errors import InputError
 from naibu.core.experiment import Layer, Loading, Shape
 from naibu.core.volume import Volume
+from naibu.identification.from_markers.observations import NoiseModel
 from naibu.imaging.preprocessing.resampling import positions
 from naibu.io.experiment_folder.reader import read_experiment
 from naibu.io.images import write_volume
@@ -65,14 +66,26 @@ def test_an_experiment_folder_comes_out(scans: list[Path], tmp_path: Path) -> No
     assert "SHA-256" in summary["settings"]["scan of pressed"]
     assert run.page.read_text().startswith("<!DOCTYPE html>")
     # the identification learns how certain the positions are
-    assert (experiment.xy_step_mm, experiment.z_step_mm) == pytest.approx(run.tracked.steps_mm)
-    sd = np.nanmedian(run.tracked.sd_mm[..., 2])
-    assert experiment.z_step_mm == pytest.approx(np.sqrt(12.0) * sd, rel=1e-6)
+    assert experiment.sd_mm is not None
+    assert (experiment.sd_mm[0], experiment.sd_mm[2]) == pytest.approx(run.tracked.typical_sd_mm)
+    error = np.stack([before - truth[nearest.argmin(axis=1)], after - truth[nearest.argmin(axis=1)] @ SQUEEZE])
+    ratio = np.sqrt(np.mean(error**2, axis=(0, 1))) / experiment.sd_mm
+    assert (ratio > 1 / 1.5).all() and (ratio < 1.5).all(), ratio
+    np.testing.assert_allclose(NoiseModel(model_mm=0.0).of_experiment(experiment), experiment.sd_mm)
 
 
 def test_tables_alone_where_the_object_is_not_described(scans: list[Path], tmp_path: Path) -> None:
     track(scans, out=tmp_path / "tables", diameter_mm=DIAMETER)
     assert {p.name for p in (tmp_path / "tables").iterdir()} == {"initial.csv", "pressed.csv", "tracking.html", "tracking.json"}
+
+
+def test_blobs_that_may_be_bubbles_are_not_taken_for_markers(tmp_path: Path) -> None:
+    four = LATTICE[[0, 13, 30, 47]]
+    files = [write_volume(tmp_path / f"{n}.mha", beads(where, n)) for n, where in enumerate((four, four @ SQUEEZE))]
+    with pytest.raises(InputError, match="4 markers were followed, but only 0 of them are trusted, 4 are needed"):
+        track(files, out=tmp_path / "out", diameter_mm=DIAMETER)
+    assert not (tmp_path / "out").exists()
+    assert (track(files, out=tmp_path / "out", diameter_mm=DIAMETER, count=4).tracked.flags == "ok").all()
 
 
 def test_mistakes_are_named(scans: list[Path], tmp_path: Path) -> None:

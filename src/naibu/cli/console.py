@@ -1,16 +1,18 @@
 """The command-line application, its output and error consoles: lines, tables, progress, failures.
 
-Exit codes: 0 done, 1 failed (an error of naibu's own, too little memory, lost output, or an unsound installation that ``doctor`` found),
-2 input that cannot be used, 3 a solve that failed, 130 interrupted, 143 terminated.
+Exit codes: 0 done, 1 failed (a state that cannot be solved, an error of naibu's own, too little memory, lost output, or an unsound
+installation that ``doctor`` found), 2 input that cannot be used, 3 data that the model does not explain (results are written, and marked),
+130 interrupted, 143 terminated.
 """
 
 from __future__ import annotations
 
+import contextlib
+import io
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from typing import NoReturn
+from typing import IO, NoReturn, cast
 
 from cyclopts import App, Parameter
 from rich.console import Console
@@ -31,14 +33,43 @@ from naibu.core.progress import Progress, ProgressReport
 app = App(
     name="naibu",
     help="Identify the mechanical parameters of soft objects from CT, MR or ultrasound images of their inside.",
+    help_epilogue="Exit codes: 0 done, 1 failed, 2 bad input, 3 not explained by the model, 130 interrupted. What naibu promises and "
+    "refuses: docs/reliability.rst.",
     version=__version__,
     default_parameter=Parameter(negative_iterable=()),
 )
+
+
+class Messages(io.TextIOBase):
+    """Standard error, whatever it is at the time; what it does not take is lost, for messages must not end a computation."""
+
+    def write(self, text: str, /) -> int:
+        """Write, if possible."""
+        with contextlib.suppress(OSError, ValueError, AttributeError):  # full, closed, or None
+            sys.stderr.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush, if possible."""
+        with contextlib.suppress(OSError, ValueError, AttributeError):
+            sys.stderr.flush()
+
+    def isatty(self) -> bool:
+        """Whether it is a terminal."""
+        return sys.stderr is not None and sys.stderr.isatty()
+
+    def fileno(self) -> int:
+        """Return its number, as rich asks for the size of a terminal."""
+        if sys.stderr is None:
+            raise OSError("standard error is closed")
+        return sys.stderr.fileno()
+
+
 WIDTH_OF_FILES = 160  # where the output is no terminal
 # a stream that was closed before the start is None
 console = Console(width=None if sys.stdout is not None and sys.stdout.isatty() else WIDTH_OF_FILES)
-errors = Console(stderr=True, width=None if sys.stderr is not None and sys.stderr.isatty() else WIDTH_OF_FILES)
-FAILED, BAD_INPUT, NO_SOLUTION, INTERRUPTED = 1, 2, 3, 130
+errors = Console(file=cast(IO[str], Messages()), width=None if sys.stderr is not None and sys.stderr.isatty() else WIDTH_OF_FILES)
+FAILED, BAD_INPUT, NOT_EXPLAINED, INTERRUPTED = 1, 2, 3, 130
 QUIET_S, INTERVAL_S = 1.0, 5.0  # plain progress lines: none before the first, then one in the second
 
 
@@ -61,7 +92,7 @@ class _PlainProgress:
         errors.print(", ".join(part for part in parts if part), soft_wrap=True, highlight=False, markup=False)
 
 
-@contextmanager
+@contextlib.contextmanager
 def progress_display(clock: Callable[[], float] = time.monotonic) -> Iterator[Progress]:
     """Show progress on stderr: a bar for each stage on a terminal, plain lines elsewhere.
 

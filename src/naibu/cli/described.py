@@ -5,15 +5,28 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from cyclopts import Parameter
+from cyclopts import Parameter, Token
 
 from naibu.core.errors import InputError
 
 # what needs numpy is imported where it is used: --help answers at once, and doctor also runs where numpy itself is broken
 if TYPE_CHECKING:
     from naibu.core.experiment import Layer
+
+Flag = Annotated[bool, Parameter(negative=())]
+
+
+def _whole(hint: object, tokens: Sequence[Token]) -> int:
+    # the parser's own conversion takes 2.5 for 2
+    try:
+        return int(tokens[0].value)
+    except ValueError:
+        raise ValueError(f"{tokens[0].value!r} is not a whole number.") from None
+
+
+Whole = Annotated[int, Parameter(converter=_whole)]
 
 
 @Parameter(name="*")
@@ -25,6 +38,8 @@ class PairOptions:
     ----------
     mask
         Volume on the grid of the reference scan, nonzero inside the object; by default it is segmented.
+    deformed_mask
+        The same on the grid of the deformed scan; the search of volume correlation starts from it.
     spacing_mm
         Voxel spacing along x, y, z, mm, for files that do not state it.
     truth
@@ -34,6 +49,7 @@ class PairOptions:
     """
 
     mask: Path | None = None
+    deformed_mask: Path | None = None
     spacing_mm: tuple[float, float, float] | None = None
     truth: Path | None = None
     check_points: tuple[Path, Path] | None = None
@@ -41,7 +57,13 @@ class PairOptions:
     @property
     def arguments(self) -> dict[str, Any]:
         """As `naibu.workflows.sense.read_pair` takes them."""
-        return {"mask": self.mask, "spacing_mm": self.spacing_mm, "truth": self.truth, "check_points": self.check_points}
+        return {
+            "mask": self.mask,
+            "deformed_mask": self.deformed_mask,
+            "spacing_mm": self.spacing_mm,
+            "truth": self.truth,
+            "check_points": self.check_points,
+        }
 
 
 @Parameter(name="*")
@@ -95,6 +117,7 @@ def layers_of(texts: Sequence[str]) -> tuple[Layer, ...]:
     InputError
         A text of another form.
     """
+    from naibu.core.arrays import LENGTHS_MM
     from naibu.core.experiment import Layer
 
     layers = []
@@ -104,11 +127,14 @@ def layers_of(texts: Sequence[str]) -> tuple[Layer, ...]:
         try:
             if not (material.strip() and dots):
                 raise ValueError
-            layers.append(Layer(material.strip(), float(low), float(high)))
+            slab = Layer(material.strip(), float(low), float(high))
+            if not 0.0 <= slab.from_base_mm < slab.to_base_mm <= LENGTHS_MM[1]:
+                raise ValueError
         except ValueError:
             raise InputError(
-                f"--layer {text!r} must be NAME=FROM..TO with heights from the base in mm, such as 'hardness 0=0..30'"
+                f"--layer {text!r} must be NAME=FROM..TO with growing heights from the base in mm, such as 'hardness 0=0..30'"
             ) from None
+        layers.append(slab)
     return tuple(layers)
 
 
@@ -120,13 +146,16 @@ def heights_of(texts: Sequence[str]) -> dict[str, float]:
     InputError
         A text of another form.
     """
+    from naibu.core.arrays import LENGTHS_MM, require_within
+
     heights = {}
     for text in texts:
         state, _, height = text.rpartition("=")
         try:
             if not state.strip():
                 raise ValueError
-            heights[state.strip()] = float(height)
+            value = float(height)
         except ValueError:
             raise InputError(f"--stated-mm {text!r} must be STATE=HEIGHT in mm, such as 'pressed=45'") from None
+        heights[state.strip()] = require_within(f"--stated-mm {text!r}: the height", value, *LENGTHS_MM, "mm")
     return heights

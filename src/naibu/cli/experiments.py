@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Sequence
@@ -11,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from naibu.cli.console import INTERRUPTED, app, print_table, progress_display, say
-from naibu.cli.described import ObjectOptions
+from naibu.cli.console import INTERRUPTED, NOT_EXPLAINED, app, print_table, progress_display, say
+from naibu.cli.described import Flag, ObjectOptions
 from naibu.core.errors import InputError
 
 # imported where used, so that --help is immediate and doctor runs even if numpy is broken
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 DEMO = ("ct_two_material_1", "ct_two_material_2", "ct_two_material_3")
 DEMO_KNOWN = "hardness 5=222 kPa"  # mean of the report's compression tests, Table 3.4
+FIELD_FILES = (".h5", ".hdf5")  # operands of identify that can only be displacement fields
 ContactModel = Literal["coulomb", "stick", "springs"]
 PixelScale = Literal["given", "sought"]
 Joined = Literal["tied", "sliding"]
@@ -29,16 +31,18 @@ Law = Literal["neo_hookean", "neo_hookean_isochoric", "mooney_rivlin", "yeoh", "
 
 
 @app.command
-def demo(*, out: Path = Path("naibu-demo")) -> None:
+def demo(*, out: Path = Path("naibu-demo"), overwrite: Flag = False) -> None:
     """Calibrate both gels of the bundled two-material experiments, predict each experiment from the others, and write a report.
 
     Parameters
     ----------
     out
         Folder for the results.
+    overwrite
+        Replace results, or files of your own, that the folder already holds.
     """
     say(f"Identifying both gels from {', '.join(DEMO)} (bundled CT measurements) ...")
-    _identify(DEMO, known=(DEMO_KNOWN,), out=out, cross_validate=True)
+    _identify(DEMO, known=(DEMO_KNOWN,), out=out, cross_validate=True, overwrite=overwrite)
 
 
 @app.command
@@ -55,8 +59,18 @@ def identify(
     element_size_mm: float = 0.0,
     cross_validate: bool = False,
     resume: bool = True,
+    mask: Path | None = None,
+    zones: Path | None = None,
+    zone_name: list[str] | None = None,
+    cell_map: Annotated[bool, Parameter(name="--map", negative=())] = False,
+    overwrite: Flag = False,
 ) -> None:
     """Identify material parameters, friction and boundary conditions by finite element model updating (FEMU).
+
+    Operands are experiments with markers, or files of displacement fields, such as the field.h5 of naibu sense, which need a mask or zones.
+
+    The first line says whether the model explains the markers: explained, explained in part (what and where), or not explained. In the last
+    case the results are written, marked as not to be used, and the exit code is 3.
 
     Parameters
     ----------
@@ -82,12 +96,72 @@ def identify(
         Also predict every experiment from the others.
     resume
         Resume an interrupted identification in the same folder.
+    mask
+        With fields: volume that is not zero in the object.
+    zones
+        With fields: volume of labels, one for each material, 0 outside.
+    zone_name
+        With fields: name of a label, 'gel=1'. May be repeated.
+    cell_map
+        With fields: map the unknown moduli cell by cell, and make regions of the map.
+    overwrite
+        Replace results, or files of your own, that the folder already holds.
     """
+    if mask is not None or zones is not None or all(Path(name).suffix.lower() in FIELD_FILES for name in experiments):
+        _identify_fields(
+            experiments, mask=mask, zones=zones, zone_name=zone_name or [], known=known or (), law=law, each_cell=cell_map,
+            element_size_mm=element_size_mm, out=out, overwrite=overwrite,
+        )  # fmt: skip
+        return
     from naibu.identification.from_markers.specimen_model import ModelSettings
 
     settings = ModelSettings(law=law, contact=contact, joined=joined, element_size_mm=element_size_mm, pixel_scale=pixel_scale)
     states = _states(experiments, state or [])
-    _identify(experiments, known=known or (), states=states, settings=settings, out=out, cross_validate=cross_validate, resume=resume)
+    _identify(
+        experiments, known=known or (), states=states, settings=settings, out=out, cross_validate=cross_validate, resume=resume,
+        overwrite=overwrite,
+    )  # fmt: skip
+
+
+def _identify_fields(
+    fields: Sequence[str],
+    *,
+    mask: Path | None,
+    zones: Path | None,
+    zone_name: Sequence[str],
+    known: Sequence[str],
+    law: Law,
+    each_cell: bool,
+    element_size_mm: float,
+    out: Path,
+    overwrite: bool,
+) -> None:
+    from naibu.workflows.identify_fields import identify_fields, table_of_zones
+
+    if law != "neo_hookean":
+        raise InputError(f"law={law!r} is not known for fields; use 'neo_hookean'")
+    names: dict[int, str] = {}
+    for text in zone_name:
+        name, _, label = text.rpartition("=")
+        if not name or not label.strip().isdigit():
+            raise InputError(f"zone_name {text!r} must give a name and a label, such as 'gel=1'")
+        names[int(label)] = name.strip()
+    began = time.perf_counter()
+    with progress_display() as progress:
+        result = identify_fields(
+            fields, mask=mask, zones=zones, zone_names=names, known=known, each_cell=each_cell, element_size_mm=element_size_mm, out=out,
+            overwrite=overwrite, progress=progress,
+        )  # fmt: skip
+    usable = result.estimate.verdict is None or result.estimate.verdict.ok
+    for number, line in enumerate(result.notes):
+        say(line, "dim" if number else "bold" if usable else "bold red")
+    table = table_of_zones(result)
+    if table.rows:
+        print_table(table.title, table.columns, [tuple(_figure(v) if isinstance(v, float) else v for v in row) for row in table.rows])
+    say(f"{time.perf_counter() - began:.0f} s. Results in {out}: open report.html.")
+    if not usable:
+        say("The model does not explain the data: the results are marked as not to be used.", "bold red")
+        sys.exit(NOT_EXPLAINED)
 
 
 def _states(experiments: Sequence[str], chosen: Sequence[str]) -> dict[str, list[str]] | None:
@@ -112,6 +186,7 @@ def _identify(
     settings: ModelSettings | None = None,
     cross_validate: bool = False,
     resume: bool = True,
+    overwrite: bool = False,
 ) -> None:
     from naibu.workflows import identify
 
@@ -119,20 +194,27 @@ def _identify(
     with progress_display() as progress:
         result = identify.identify(
             list(experiments), known=known, states=states, settings=settings, out=out, cross_validate=cross_validate, resume=resume,
-            progress=progress,
+            overwrite=overwrite, progress=progress,
         )  # fmt: skip
     _show(result)
     say(f"{time.perf_counter() - began:.0f} s. Results in {out}: open report.html; naibu predict takes model.json.")
     if result.interrupted:
         say("Interrupted: these are the results so far. The same command continues from here.")
         sys.exit(INTERRUPTED)
+    if result.verdict.explanation.name == "NOT_EXPLAINED":
+        say("The model does not explain the data: the results are marked as not to be used.", "bold red")
+        sys.exit(NOT_EXPLAINED)
 
 
 def _show(result: Identification) -> None:
-    """Print assumptions, residuals of the markers, and the parameters."""
-    from naibu.workflows.report_content import accuracy_table, parameter_rows, shared_names, undetermined
+    """Print the verdict, assumptions, residuals of the markers, and the parameters."""
+    from naibu.workflows.report_content import accuracy_table, parameter_rows, search_sentence, shared_names, undetermined, verdict_note
 
     calibration, model = result.calibration, result.model
+    note = verdict_note(result.verdict)
+    say(note.sentence, "bold" if note.sound else "bold red")
+    for line in note.details:
+        say(f"- {line}")
     experiments = {t.specimen.experiment.name: t.specimen.experiment for t in calibration.load_cases}
     for experiment in experiments.values():
         for line in experiment.loading.assumed:
@@ -140,11 +222,16 @@ def _show(result: Identification) -> None:
     table = accuracy_table(calibration, result.baselines, result.left_out)
     print_table(table.title, table.columns, table.rows)
     names = shared_names(model)
-    rows = [(r.name, f"{r.estimate:.4g}", f"{r.lower:.4g}", f"{r.upper:.4g}", r.unit, r.note) for r in parameter_rows(model, names)]
+    rows = [(r.name, *(_figure(v) for v in (r.estimate, r.lower, r.upper)), r.unit, r.note) for r in parameter_rows(model, names)]
     print_table("Parameters", ("parameter", "estimate", "95 % from", "to", "unit", ""), rows)
-    for line in undetermined(model, names):
+    for line in undetermined(model, names, calibration.priors):
         say(line, "dim")
-    say(f"{calibration.match.status.value} Residuals are {model.noise_factor:.2f} times the stated noise.")
+    say(f"{search_sentence(calibration.match.status)} Residuals are {model.noise_factor:.2f} times the stated noise.")
+
+
+def _figure(value: float) -> str:
+    """Four significant digits; nothing for a bound that the data do not give."""
+    return f"{value:.4g}" if math.isfinite(value) else "-"
 
 
 @app.command
@@ -154,8 +241,9 @@ def predict(
     *,
     state: str | None = None,
     height_mm: float | None = None,
-    heights_from_markers: Annotated[bool, Parameter(negative=())] = False,
+    heights_from_markers: Flag = False,
     out: Path = Path("naibu-prediction"),
+    overwrite: Flag = False,
 ) -> None:
     """Predict the markers of a state with a calibrated model.
 
@@ -170,15 +258,18 @@ def predict(
     height_mm
         Height of the plate or bar above the base, or distance between the side plates.
     heights_from_markers
-        Take the height from the mean z of the lowest and the highest marker layer of the measured state, the only data used of it.
+        Take the height from the mean z of the lowest and the highest marker layer of the measured state, or the distance of side
+        plates from that of its outermost marker columns: the only data used of it.
     out
         Folder for predicted.csv, summary.json, predicted.html and files for ParaView; may be that of the model.
+    overwrite
+        Replace results, or files of your own, that the folder already holds.
     """
     from naibu.workflows import predict as predict_workflow
     from naibu.workflows.report_content import accuracy
 
     result = predict_workflow.predict(
-        model, experiment, state=state, height_mm=height_mm, heights_from_markers=heights_from_markers, out=out
+        model, experiment, state=state, height_mm=height_mm, heights_from_markers=heights_from_markers, out=out, overwrite=overwrite
     )
     for note in (*result.specimen.experiment.loading.assumed, *result.notes):
         say(note, "dim")
@@ -186,6 +277,7 @@ def predict(
         a = accuracy(result.specimen, result.fit, result.residual)
         rms = f"RMS x {a.x:.3f}, y {a.y:.3f}, z {a.z:.3f}, 3-D {a.total:.3f} mm"
         say(f"{a.markers} markers: {rms} ({a.noise_units:.2f} times the noise)")
+    say(result.interval)
     say(f"Predicted at {result.platen_position_mm:.2f} mm: {out / 'predicted.csv'}   page: {out / 'predicted.html'}")
 
 
@@ -199,6 +291,7 @@ def compare(
     joined: list[Joined] | None = None,
     element_size_mm: float = 0.0,
     out: Path = Path("naibu-comparison"),
+    overwrite: Flag = False,
 ) -> None:
     """Compare material laws and contact models: calibrate each combination, and predict each experiment from the others.
 
@@ -218,6 +311,8 @@ def compare(
         Edge length of the elements; 0 selects it automatically.
     out
         Folder for comparison.json; models that it already contains are not repeated.
+    overwrite
+        Discard what the folder already contains, and compute everything anew.
     """
     from naibu.identification.from_markers.specimen_model import ModelSettings
     from naibu.workflows import compare as compare_workflow
@@ -231,7 +326,9 @@ def compare(
         for one, two, three in product(laws, contacts, joints)
     ]
     with progress_display() as progress:
-        rows = compare_workflow.compare(experiments, candidates=candidates, known=known or (), out=out, progress=progress)
+        rows = compare_workflow.compare(
+            experiments, candidates=candidates, known=known or (), out=out, overwrite=overwrite, progress=progress
+        )
     table = comparison_table(rows)
     print_table(table.title, table.columns, table.rows)
     say(table.note, "dim")
@@ -265,6 +362,7 @@ def import_tables(
     spacing_mm: float | None = None,
     xy_step_mm: float | None = None,
     z_step_mm: float | None = None,
+    overwrite: Flag = False,
 ) -> None:
     """Make an experiment folder from tables of marker positions (CSV, TSV or Excel).
 
@@ -288,16 +386,17 @@ def import_tables(
         Resolution of the in-plane coordinates, such as the pixel size, from which their uncertainty is computed.
     z_step_mm
         Resolution of the heights, such as the slice spacing.
+    overwrite
+        Use the folder even if it is not empty, and replace files of the same names.
     """
-    from naibu.io.marker_tables import import_markers, write_experiment_folder
+    from naibu.workflows import import_tables as import_workflow
 
     about = (described or ObjectOptions()).described(size_mm)
-    names = [path.stem for path in loaded]
-    if len(set(names)) < len(names):
-        raise InputError(f"two tables would both be the state {max(names, key=names.count)!r}; rename one file")
-    write_experiment_folder(
-        out, import_markers(initial, unit=unit), {path.stem: import_markers(path, unit=unit) for path in loaded}, title=title,
-        spacing_mm=spacing_mm, xy_step_mm=xy_step_mm, z_step_mm=z_step_mm, **about,
+    notes = import_workflow.import_tables(
+        initial, loaded, out=out, unit=unit, title=title, spacing_mm=spacing_mm, xy_step_mm=xy_step_mm, z_step_mm=z_step_mm,
+        overwrite=overwrite, **about,
     )  # fmt: skip
+    for note in notes:
+        say(f"Warning: {note}", "yellow")
     before = "" if about["layers"] else "Describe layers and materials in its meta.toml, then run"
     say(f"Wrote {out}. {before or 'Run'}: naibu identify {out}")

@@ -49,6 +49,15 @@ def _kept(text: str) -> Path | None:
     return Path(name)
 
 
+def occupy_closed_streams() -> None:
+    """Open what stands for nothing where a standard stream was closed: a result must not get its number, and with it stray messages."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest number that is free
+
+
 def output_lost(error: Exception) -> bool:
     """Tell whether an error is that of a stream that takes no more output; files are written by functions that raise naibu's errors."""
     return isinstance(error, OSError) and error.filename is None and error.errno in _LOST

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from naibu.cli.console import app, print_table, progress_display, say
-from naibu.cli.described import ObjectOptions, PairOptions
+from naibu.cli.described import Flag, ObjectOptions, PairOptions, Whole
 from naibu.core.errors import InputError
 
 # other parts are imported where they are used: --help answers at once
@@ -23,6 +23,7 @@ def sense(
     method: Method = "default",
     pair: PairOptions | None = None,
     out: Path = Path("naibu-sense"),
+    overwrite: Flag = False,
 ) -> None:
     """Measure the displacement inside an object between two scans by digital volume correlation (DVC), with its uncertainty.
 
@@ -35,15 +36,19 @@ def sense(
     method
         Digital volume correlation regularised by mechanics (default), or a classic method.
     out
-        Folder for displacement.mha, standard_deviation.mha, displacement.vtu, field.npz, initial.csv and pressed.csv (positions as
+        Folder for displacement.mha, standard_deviation.mha, displacement.vtu, field.h5, initial.csv and pressed.csv (positions as
         markers), sense.json and report.html.
+    overwrite
+        Replace results, or files of your own, that the folder already holds.
     """
     from naibu.workflows.sense import read_pair, sense_pair
 
     with progress_display() as progress:
         scans = read_pair(reference, deformed, **(pair or PairOptions()).arguments)
-        run = sense_pair(scans, method=method, out=out, progress=progress)
+        run = sense_pair(scans, method=method, out=out, overwrite=overwrite, progress=progress)
     print_table(f"{reference.name} -> {deformed.name}, {run.measured.method}", ("quantity", "value"), run.rows())
+    for warning in run.measured.warnings:
+        say(warning.replace("`mask`", "--mask"), "yellow")
     say(f"{run.seconds:.1f} s. Page: {run.files[0]}   fields: {', '.join(str(p.name) for p in run.files[1:])}")
 
 
@@ -55,6 +60,7 @@ def compare_methods(
     method: list[Method] | None = None,
     pair: PairOptions | None = None,
     out: Path = Path("naibu-methods"),
+    overwrite: Flag = False,
 ) -> None:
     """Measure the displacement between two scans by every method, and compare errors, times and images.
 
@@ -68,6 +74,8 @@ def compare_methods(
         Use only this method. May be repeated.
     out
         Folder for methods.html and methods.json.
+    overwrite
+        Replace results, or files of your own, that the folder already holds.
     """
     from naibu.imaging.measure_displacement import METHODS
     from naibu.workflows.compare_methods import compare_methods as compared
@@ -75,7 +83,7 @@ def compare_methods(
 
     with progress_display() as progress:
         scans = read_pair(reference, deformed, **(pair or PairOptions()).arguments)
-        result = compared(scans, method or METHODS, out=out, progress=progress)
+        result = compared(scans, method or METHODS, out=out, overwrite=overwrite, progress=progress)
     print_table(f"{reference.name} -> {deformed.name}", result.columns, result.rows)
     say(f"Page: {result.page}   numbers: {result.numbers}")
 
@@ -87,13 +95,14 @@ def track(
     diameter_mm: float,
     thickness_mm: float | None = None,
     polarity: Polarity = "auto",
-    count: int | None = None,
+    count: Whole | None = None,
     mask: Path | None = None,
     spacing_mm: Spacing | None = None,
     size_mm: tuple[float, float, float] | None = None,
     described: ObjectOptions | None = None,
     title: str = "Markers followed through scans",
     out: Path = Path("naibu-markers"),
+    overwrite: Flag = False,
 ) -> None:
     """Detect markers in scans of several states, match them between the states, and make an experiment folder for 'naibu identify'.
 
@@ -119,6 +128,8 @@ def track(
         Title of the experiment.
     out
         Folder to make: the experiment, with tracking.html and tracking.json beside its tables.
+    overwrite
+        Use the folder even if it is not empty, and replace files of the same names.
     """
     from naibu.workflows import track as tracking
 
@@ -131,7 +142,7 @@ def track(
     with progress_display() as progress:
         run = tracking.track(
             scans, out=out, diameter_mm=diameter_mm, thickness_mm=thickness_mm, polarity=polarity, count=count, mask=mask,
-            spacing_mm=spacing_mm, description=description, progress=progress,
+            spacing_mm=spacing_mm, description=description, overwrite=overwrite, progress=progress,
         )  # fmt: skip
     print_table("Markers", run.columns, run.rows)
     say(f"Wrote {out}. Page: {run.page}")
@@ -149,9 +160,10 @@ def track_sequence(
     diameter_mm: float,
     frame_rate_hz: float = 1.0,
     region_mm: tuple[float, float, float, float] | None = None,
-    count: int | None = None,
+    count: Whole | None = None,
     polarity: Literal["bright", "dark"] = "bright",
     out: Path = Path("naibu-tracks"),
+    overwrite: Flag = False,
 ) -> None:
     """Track markers through a sequence of images, such as B-mode ultrasound.
 
@@ -173,13 +185,15 @@ def track_sequence(
         Whether markers are brighter or darker than their surroundings.
     out
         Folder for tracks.csv, tracks.html and tracks.json.
+    overwrite
+        Replace results, or files of your own, that the folder already holds.
     """
     from naibu.workflows.track_sequence import track_sequence_file
 
     with progress_display() as progress:
         run = track_sequence_file(
             frames, out=out, pixel_mm=pixel_mm, diameter_mm=diameter_mm, frame_rate_hz=frame_rate_hz, region_mm=region_mm, count=count,
-            polarity=polarity, progress=progress,
+            polarity=polarity, overwrite=overwrite, progress=progress,
         )  # fmt: skip
     print_table("Markers", run.columns, run.rows)
     say(f"Table: {run.table}   page: {run.page}")

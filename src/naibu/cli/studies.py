@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Literal
 
 from naibu.cli.console import INTERRUPTED, app, errors, print_table, progress_display, say
+from naibu.cli.described import Flag, Whole
 from naibu.core.progress import ProgressReport
 
-ChapterName = Literal["ch1", "ch2", "ch3", "ch4-lattice", "ch4-cube", "ch4-octree"]
+ChapterName = Literal["ch1", "ch2", "ch3", "ch4-adaptive", "ch4-lattice", "ch4-cube", "ch4-octree"]
 
 
 @app.command
-def reproduce(chapter: ChapterName, *, out: Path = Path("naibu-reproduction"), seed: int = 0) -> None:
+def reproduce(chapter: ChapterName, *, out: Path = Path("naibu-reproduction"), seed: Whole = 0, overwrite: Flag = False) -> None:
     """Recompute the tables and figures of a chapter of the 2008 report, and compare them with the printed ones.
 
     Parameters
@@ -28,10 +29,16 @@ def reproduce(chapter: ChapterName, *, out: Path = Path("naibu-reproduction"), s
         Folder for the page (ch3.html) and the numbers (ch3.json).
     seed
         Seed of the random numbers.
+    overwrite
+        Replace results, or files of your own, that the folder already holds.
     """
+    from naibu.core.arrays import require_count
     from naibu.reproduction.chapters import CHAPTERS
     from naibu.viewer.chapter_page import write_chapter
+    from naibu.workflows.output_folder import output_folder
 
+    require_count("seed", seed, 0)
+    output_folder(out, (f"{chapter}.html", f"{chapter}.json"), overwrite=overwrite)
     began = time.perf_counter()
     with errors.status("starting"):
         done = CHAPTERS[chapter](seed)
@@ -46,7 +53,14 @@ def reproduce(chapter: ChapterName, *, out: Path = Path("naibu-reproduction"), s
 
 @app.command
 def simulate(
-    study: str = "", *, out: Path = Path("naibu-simulation"), resume: bool = False, device: str = "cpu", example: bool = False
+    study: str = "",
+    *,
+    out: Path = Path("naibu-simulation"),
+    resume: Flag = False,
+    overwrite: Flag = False,
+    checkpoint_every: Whole = 10,
+    device: str = "cpu",
+    example: Flag = False,
 ) -> None:
     """Simulate a study, and write its motion for ParaView, an animated page and the numbers.
 
@@ -59,7 +73,11 @@ def simulate(
     out
         Folder for the files.
     resume
-        Resume an interrupted run of a lattice.
+        Resume an interrupted or killed run of a lattice.
+    overwrite
+        Replace results, or files of your own, that the folder already holds.
+    checkpoint_every
+        Number of frames of a lattice between checkpoints: a run that is killed loses at most so many.
     device
         Where a lattice is computed: cpu, cuda (an NVIDIA GPU; needs naibu[gpu]), or warp-cpu (the GPU's kernels on the CPU, for tests).
     example
@@ -83,7 +101,9 @@ def simulate(
             if stopping():
                 raise KeyboardInterrupt
 
-        run = simulated(study, out=out, resume=resume, device=device, progress=progress)
+        run = simulated(
+            study, out=out, resume=resume, overwrite=overwrite, checkpoint_every=checkpoint_every, device=device, progress=progress
+        )
     say(f"{time.perf_counter() - began:.0f} s. {', '.join(str(path) for path in run.files)}")
     if not run.finished:
         errors.print(f"Interrupted: {run.frames} of {run.of} frames are kept. The same command with --resume goes on.", soft_wrap=True)

@@ -1,13 +1,22 @@
 from .compare_methods import MethodComparison, compare_methods
+from .cut import CutRun, cut
+from .haptics.device import DeviceRecord, drive_live_simulation
 from .identify import Identification
+from .identify_fields import FieldIdentification, identify_fields
+from .live import live, touched_loop
 from .sense import Pair, SenseRun, read_pair, sense_pair
 from .simulate import NamedStudy, named_studies
 from .simulate_lattice import SimulationRun
+from .touchable_models import MeshMaterial, TouchableModel, tools_for, touchable
 from .track import ObjectDescription, TrackRun
 from .track_sequence import SequenceRun, track_sequence_file
 
 __all__ = [
+    "CutRun",
+    "DeviceRecord",
+    "FieldIdentification",
     "Identification",
+    "MeshMaterial",
     "MethodComparison",
     "NamedStudy",
     "ObjectDescription",
@@ -15,10 +24,18 @@ __all__ = [
     "SenseRun",
     "SequenceRun",
     "SimulationRun",
+    "TouchableModel",
     "TrackRun",
     "compare_methods",
+    "cut",
+    "drive_live_simulation",
+    "identify_fields",
+    "live",
     "named_studies",
     "read_pair",
     "sense_pair",
+    "tools_for",
+    "touchable",
+    "touched_loop",
     "track_sequence_file",
 ]

@@ -8,10 +8,13 @@ from dataclasses import replace
 
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress, ProgressReport
+from naibu.identification.from_markers.marker_checks import check_markers
+from naibu.identification.from_markers.marker_outliers import without_outliers
 from naibu.identification.from_markers.specimen_model import ModelSettings
 from naibu.identification.prediction.cross_validation import ModelRow, compare_models
-from naibu.workflows.experiments import Source, load_experiments, parse_known, provenance_of
-from naibu.workflows.result_folder import read_comparison, result_folder, write_comparison
+from naibu.workflows.experiments import Source, load_experiments, parse_known, provenance_of, require_element_size
+from naibu.workflows.output_folder import output_folder
+from naibu.workflows.result_folder import COMPARISON_FILE, read_comparison, write_comparison
 
 
 def compare(
@@ -20,6 +23,7 @@ def compare(
     candidates: Sequence[ModelSettings],
     known: Sequence[str] = (),
     out: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
     progress: Progress | None = None,
 ) -> list[ModelRow]:
     """Calibrate several models on the same experiments, and predict each experiment from the others with each of them.
@@ -35,6 +39,8 @@ def compare(
     out : path, optional
         Folder for ``comparison.json``, written anew after every candidate; candidates that it holds already, of the same inputs, are not
         repeated.
+    overwrite : bool
+        Whether what `out` holds is discarded and all is computed anew.
     progress : callable, optional
         Gets reports whose stages name the candidate, and the experiment left out (`naibu.core.progress`).
 
@@ -51,8 +57,14 @@ def compare(
     if not candidates:
         raise InputError("candidates is empty; give at least one model to compare")
     loaded = load_experiments(experiments)
+    check_markers(loaded)
+    loaded = without_outliers(loaded)[0]
     known_materials = parse_known(known)
-    folder = None if out is None else result_folder(out)
+    for settings in candidates:
+        require_element_size(loaded, settings.element_size_mm)
+    folder = None if out is None else output_folder(out)
+    if folder is not None and overwrite:
+        (folder / COMPARISON_FILE).unlink(missing_ok=True)
     rows: list[ModelRow] = []
     for settings in candidates:
         provenance = provenance_of(loaded, known, {}, settings)

@@ -19,7 +19,7 @@ from naibu.imaging.preprocessing.resampling import warped
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.result_folder import result_folder
+from naibu.workflows.output_folder import output_folder
 from naibu.workflows.sense import FIGURES, Pair, SenseRun, sense_pair
 
 if TYPE_CHECKING:
@@ -39,7 +39,12 @@ class MethodComparison:
 
 
 def compare_methods(
-    pair: Pair, methods: Sequence[Method], *, out: str | os.PathLike[str], progress: Progress | None = None
+    pair: Pair,
+    methods: Sequence[Method],
+    *,
+    out: str | os.PathLike[str],
+    overwrite: bool = False,
+    progress: Progress | None = None,
 ) -> MethodComparison:
     """Measure the displacement of one pair by several methods, one after the other, and write ``methods.html`` and ``methods.json``.
 
@@ -53,6 +58,8 @@ def compare_methods(
         Among `naibu.imaging.measure_displacement.METHODS`.
     out : path-like
         Folder for the page and the numbers.
+    overwrite : bool
+        Whether results, or other files of these names, that `out` holds already are replaced.
     progress : Progress, optional
         Called at the beginning of every method.
 
@@ -61,7 +68,7 @@ def compare_methods(
     InputError
         A folder that cannot be written to, or no method that could be used.
     """
-    folder = result_folder(out)
+    folder = output_folder(out, ("methods.html", "methods.json"), overwrite=overwrite)
     runs: dict[Method, SenseRun] = {}
     failures: dict[Method, str] = {}
     wanted = tuple(dict.fromkeys(methods))

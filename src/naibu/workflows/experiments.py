@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from naibu import datasets
@@ -17,8 +17,10 @@ from naibu.core.units import kilopascals
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.specimen_model import ModelSettings
 from naibu.io.experiment_folder.reader import META_FILE, read_experiment
+from naibu.io.files.paths import require_usable_path
 
 Source = str | os.PathLike[str] | Experiment
+MOST_ELEMENTS = 100_000
 RATIO_REFERENCE_KPA = 200.0  # stands for 1 where only ratios of moduli are sought
 
 
@@ -32,7 +34,7 @@ def load_experiment(source: Source) -> Experiment:
     """
     if isinstance(source, Experiment):
         return source
-    path, name = Path(source), str(source)
+    path, name = require_usable_path(source), str(source)
     if path.exists():
         return read_experiment(path)
     if name in datasets.names():
@@ -71,6 +73,30 @@ def require_loaded(experiment: Experiment, state: str) -> None:
     """
     if not experiment.state(state).loaded:
         raise InputError(f"{experiment.name}/{state} is not loaded; loaded are {loaded_names(experiment)}")
+
+
+def require_element_size(experiments: Sequence[Experiment], edge_mm: float) -> None:
+    """Refuse elements of no size, elements larger than an object, and so many that no memory holds them; 0 stands for the default.
+
+    Raises
+    ------
+    InputError
+        Such a size.
+    """
+    if not (math.isfinite(edge_mm) and edge_mm >= 0.0):
+        raise InputError(f"element_size_mm is {edge_mm:g} mm; give a positive length, or 0 for an eighth of the object's height")
+    for e in experiments:
+        if edge_mm > max(e.shape.size_mm):
+            raise InputError(
+                f"element_size_mm is {edge_mm:g} mm, but {e.name} measures {max(e.shape.size_mm):g} mm at most; give less, or 0 for an "
+                "eighth of its height"
+            )
+        # one length after the other: the cube of a tiny edge is 0
+        count = math.prod(size / edge_mm for size in e.shape.size_mm) if edge_mm > 0.0 else 0.0
+        if count > MOST_ELEMENTS:
+            raise InputError(
+                f"element_size_mm of {edge_mm:g} mm makes {count:.3g} elements of {e.name}; at most {MOST_ELEMENTS} are solved"
+            )
 
 
 def loaded_names(experiment: Experiment) -> str:

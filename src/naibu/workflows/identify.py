@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 
 from naibu.core.errors import ConvergenceError, InputError, NaibuError
 from naibu.core.experiment import Experiment
@@ -13,16 +14,25 @@ from naibu.core.progress import Progress
 from naibu.core.rigid_transform import registration
 from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration, calibrate
+from naibu.identification.from_markers.marker_checks import check_markers
+from naibu.identification.from_markers.marker_outliers import Outlier, distrusted, outliers_of_fit, without_outliers
 from naibu.identification.from_markers.observations import MarkerLoadCase
 from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.from_markers.verdict import Verdict, verdict_of
 from naibu.identification.prediction.baselines import affine, baselines, equilibrium_gap_baseline
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.cross_validation import LeftOut, leave_one_out
 from naibu.identification.prediction.prediction import rms
-from naibu.workflows.experiments import Source, load_experiments, parse_known, provenance_of, require_loaded
-from naibu.workflows.result_folder import CHECKPOINT_FILE, read_checkpoint, result_folder, write_checkpoint, write_identification
-
-MOST_ELEMENTS = 100_000
+from naibu.workflows.experiments import Source, load_experiments, parse_known, provenance_of, require_element_size, require_loaded
+from naibu.workflows.output_folder import output_folder
+from naibu.workflows.result_folder import (
+    CHECKPOINT_FILE,
+    IDENTIFICATION_FILES,
+    read_checkpoint,
+    series_file,
+    write_checkpoint,
+    write_identification,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +51,8 @@ class Identification:
         Experiments predicted from the others; empty when that was not asked for.
     interrupted : bool
         Whether the user stopped it; the model is then the best so far, and the same call continues from there.
+    verdict : Verdict
+        Whether the model explains the markers.
     """
 
     model: CalibratedModel
@@ -48,6 +60,7 @@ class Identification:
     baselines: Mapping[str, Mapping[str, float]]
     left_out: tuple[LeftOut, ...]
     interrupted: bool
+    verdict: Verdict
 
 
 def identify(
@@ -59,9 +72,13 @@ def identify(
     out: str | os.PathLike[str] | None = None,
     cross_validate: bool = False,
     resume: bool = True,
+    overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Identification:
     """Identify materials, friction and boundary conditions from experiments, and write model, tables and report.
+
+    Data that cannot belong together are refused; markers that are grossly misplaced are left out and listed; and whether the model explains
+    the rest is said in a verdict (`naibu.identification.Verdict`), at the top of every result.
 
     Ctrl-C (KeyboardInterrupt) ends the search: what is returned and written is the best so far, and the same call goes on from it.
 
@@ -82,6 +99,8 @@ def identify(
         Also predict every experiment from the others.
     resume : bool
         Continue from the checkpoint of an interrupted search with the same inputs and settings in `out`.
+    overwrite : bool
+        Whether results, or other files of these names, that `out` holds already are replaced.
     progress : callable, optional
         Gets reports of the stages "calibration" and, with `cross_validate`, "without EXPERIMENT" (`naibu.core.progress`).
 
@@ -93,36 +112,41 @@ def identify(
     Raises
     ------
     InputError
-        Unusable input.
+        Unusable input, or markers that cannot be those of the object in the states described.
     ConvergenceError
         A state cannot be solved at the starting values, or, with `cross_validate`, with an experiment left out; in the latter case the
         model has been written.
     """
     loaded = load_experiments(experiments)
     known_materials, chosen = parse_known(known), settings or ModelSettings()
-    _check_size(loaded, chosen.element_size_mm)
+    require_element_size(loaded, chosen.element_size_mm)
     _check_states(loaded, states or {})
-    folder = None if out is None else result_folder(out)
     provenance = provenance_of(loaded, known, states or {}, chosen)
+    doubts = check_markers(loaded, states)
+    loaded, outliers = without_outliers(loaded, states)
+    start = read_checkpoint(Path(out), provenance) if out is not None and resume else None
+    folder = None if out is None else _folder(out, loaded, states or {}, start is not None, overwrite)
 
     def checkpoint(values: Mapping[str, float]) -> None:
         if folder is not None:
             write_checkpoint(folder, provenance, values)
 
-    start = read_checkpoint(folder, provenance) if folder is not None and resume else None
+    search = partial(calibrate, known_materials=known_materials, states=states, settings=chosen, progress=progress, checkpoint=checkpoint)
     try:
-        calibration = calibrate(
-            loaded, known_materials=known_materials, states=states, settings=chosen, start=start, progress=progress, checkpoint=checkpoint
-        )
+        calibration = search(loaded, start=start)
+        if misfits := _outliers(calibration):
+            loaded, outliers = distrusted(loaded, misfits), (*outliers, *misfits)
+            calibration = search(loaded, start=calibration.match.parameters.values())
     except ConvergenceError as error:
         labels = [f"{e.name}/{s.name}" for e in loaded for s in _with_states(e, states or {}).loaded_states]
         one_of = "one of " * (len(labels) > 1) + ", ".join(labels)
         raise ConvergenceError(f"{one_of} cannot be solved with the starting values: {error}") from error
-    model = CalibratedModel.of(calibration, provenance)
+    verdict = verdict_of(calibration, doubts, outliers)
+    model = replace(CalibratedModel.of(calibration, provenance), reservation=verdict.reservation)
     left_in_turn = [_with_states(e, states or {}) for e in loaded] if cross_validate else []
-    result, trouble = _compared(calibration, model, left_in_turn, progress)
+    result, trouble = _compared(calibration, model, verdict, left_in_turn, progress)
     if folder is not None:
-        write_identification(folder, calibration, model, result.baselines, result.left_out)
+        write_identification(folder, calibration, model, verdict, result.baselines, result.left_out)
         if result.interrupted:
             write_checkpoint(folder, provenance, model.parameters.values())
         else:
@@ -132,16 +156,21 @@ def identify(
     return result
 
 
-def _check_size(loaded: Sequence[Experiment], edge_mm: float) -> None:
-    """Refuse elements of no size, and so many that no memory holds them."""
-    if not (math.isfinite(edge_mm) and edge_mm >= 0.0):
-        raise InputError(f"element_size_mm is {edge_mm:g} mm; give a positive length, or 0 for an eighth of the object's height")
-    for e in loaded:
-        count = math.prod(e.shape.size_mm) / edge_mm**3 if edge_mm > 0.0 else 0.0
-        if count > MOST_ELEMENTS:
-            raise InputError(
-                f"element_size_mm of {edge_mm:g} mm makes {count:.3g} elements of {e.name}; at most {MOST_ELEMENTS} are solved"
-            )
+def _folder(
+    out: str | os.PathLike[str], loaded: Sequence[Experiment], states: Mapping[str, Sequence[str]], resumes: bool, overwrite: bool
+) -> Path:
+    """Return the folder of the results, which holds none yet, or those of the search that goes on."""
+    series = [series_file(f"{e.name}/{s.name}") for e in loaded for s in _with_states(e, states).loaded_states]
+    kept = "a search with other inputs or settings that can be resumed" if (Path(out) / CHECKPOINT_FILE).is_file() else ""
+    return output_folder(out, () if resumes else (*IDENTIFICATION_FILES, *series), overwrite=overwrite, what=kept)
+
+
+def _outliers(calibration: Calibration) -> tuple[Outlier, ...]:
+    """Markers that the solved load cases leave far from the model and from their neighbours; none of an interrupted search."""
+    if calibration.match.status is Status.INTERRUPTED:
+        return ()
+    pairs = zip(calibration.load_cases, calibration.match.fits, strict=True)
+    return tuple(o for load_case, fit in pairs for o in outliers_of_fit(load_case, fit))
 
 
 def _check_states(loaded: Sequence[Experiment], states: Mapping[str, Sequence[str]]) -> None:
@@ -163,7 +192,7 @@ def _with_states(experiment: Experiment, states: Mapping[str, Sequence[str]]) ->
 
 
 def _compared(
-    calibration: Calibration, model: CalibratedModel, left_in_turn: Sequence[Experiment], progress: Progress | None
+    calibration: Calibration, model: CalibratedModel, verdict: Verdict, left_in_turn: Sequence[Experiment], progress: Progress | None
 ) -> tuple[Identification, NaibuError | None]:
     """Compute what the calibration is compared with; what goes wrong here is returned, so that the model is written first."""
     compared: dict[str, dict[str, float]] = {}
@@ -189,7 +218,7 @@ def _compared(
         interrupted = True
     except NaibuError as error:
         trouble = error
-    return Identification(model, calibration, compared, left_out, interrupted), trouble
+    return Identification(model, calibration, compared, left_out, interrupted, verdict), trouble
 
 
 def _baselines(load_case: MarkerLoadCase, values: Mapping[str, float]) -> dict[str, float]:

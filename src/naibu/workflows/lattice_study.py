@@ -22,7 +22,7 @@ from naibu.core.mesh import Mesh
 from naibu.core.rigid_transform import RigidTransform
 from naibu.core.volume import Volume
 from naibu.io.files.provenance import sha256
-from naibu.io.files.reading import read_bytes
+from naibu.io.files.reading import file_beside, guarded_reading, read_bytes, require_regular
 from naibu.io.images import read_volume
 from naibu.io.lattice_study_schema import FloorTable, IndenterTable, ObjectTable, StudyFile, load_study
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter, box_indenter, cylindrical_indenter, plane_indenter, spherical_indenter
@@ -136,7 +136,7 @@ def _mask(path: Path, folder: Path, settings: StudyFile) -> tuple[BoolArray, Rig
             raise InputError(f"{path}: [object] {x} x {y} x {z} voxels are more than {_MOST_CELLS}; choose a larger spacing_mm")
         return box_mask((x, y, z)), RigidTransform.identity(), {}
     assert table.labels is not None
-    file = folder / table.labels
+    file = file_beside(folder / path.name, table.labels)
     volume = _label_volume(path, file, table)
     chosen = np.isin(volume.values, table.label) if table.label else volume.values != 0
     if not chosen.any():
@@ -172,9 +172,12 @@ def _label_volume(path: Path, file: Path, table: ObjectTable) -> Volume:
     if table.voxel_mm is None:
         raise InputError(f"{place}: an array does not state its voxel size; add voxel_mm = [1.0, 1.0, 1.0]")
     try:
-        values = np.load(file, allow_pickle=False)
-        return Volume.from_array(np.asarray(values).T, spacing_mm=table.voxel_mm)
-    except (OSError, ValueError) as error:
+        require_regular(file)
+        with guarded_reading(file, "an array of NumPy"):
+            # of a memory map the announced size is checked against that of the file
+            values = np.load(file, mmap_mode="r", allow_pickle=False)
+            return Volume.from_array(np.array(values).T, spacing_mm=table.voxel_mm)
+    except InputError as error:
         raise InputError(f"{place}: {error}; save the labels by numpy.save, with the axes x, y, z") from error
 
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.experiment import Experiment
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.prediction import Prediction, predict_state
 from naibu.workflows.experiments import Source, load_experiment, loaded_names, require_loaded
-from naibu.workflows.result_folder import read_model, result_folder, write_prediction
+from naibu.workflows.output_folder import output_folder
+from naibu.workflows.result_folder import PREDICTION_FILES, read_model, write_prediction
 
 
 def predict(
@@ -20,6 +22,7 @@ def predict(
     height_mm: float | None = None,
     heights_from_markers: bool = False,
     out: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
 ) -> Prediction:
     """Predict the markers of one state with a calibrated model, and write them.
 
@@ -34,10 +37,13 @@ def predict(
     height_mm : float, optional
         Height of the plate or bar, or distance of the side plates, mm.
     heights_from_markers : bool
-        Take the height from the lowest and highest marker layer of the measured state.
+        Take the height from the lowest and highest marker layer of the measured state, or the distance of side plates from its outermost
+        marker columns.
     out : path, optional
         Folder for ``predicted.csv``, ``summary.json``, ``predicted.html`` with ``predicted.json`` behind it, and ``predicted.vtu`` and
         ``predicted.vtkhdf`` for ParaView.
+    overwrite : bool
+        Whether results, or other files of these names, that `out` holds already are replaced.
 
     Returns
     -------
@@ -57,11 +63,13 @@ def predict(
     require_loaded(loaded, name)
     if height_mm is not None and heights_from_markers:
         raise InputError("height_mm and heights_from_markers exclude each other; give one of them")
-    folder = None if out is None else result_folder(out)
+    folder = None if out is None else output_folder(out, PREDICTION_FILES, overwrite=overwrite)
     try:
         prediction = predict_state(calibrated, loaded, name, platen_position_mm=height_mm, heights_from_markers=heights_from_markers)
     except ConvergenceError as error:
         raise ConvergenceError(f"{loaded.name}/{name} cannot be solved: {error}") from error
+    if calibrated.reservation:
+        prediction = replace(prediction, notes=(f"the model is doubtful: {calibrated.reservation}", *prediction.notes))
     if folder is not None:
         write_prediction(folder, calibrated, prediction)
     return prediction

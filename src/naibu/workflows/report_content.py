@@ -8,18 +8,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from naibu.core.arrays import FloatArray
-from naibu.core.parameters import Parameter
+from naibu.core.parameters import Parameter, ParameterSet
+from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase
 from naibu.identification.from_markers.specimen_model import Specimen
+from naibu.identification.from_markers.verdict import Explanation, Verdict
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.cross_validation import LeftOut, ModelRow
-from naibu.identification.prediction.prediction import Prediction, marker_layers
+from naibu.identification.prediction.platen_position import marker_layers
+from naibu.identification.prediction.prediction import Prediction
 from naibu.meshing.surface import boundary_faces, triangles_of_faces
-from naibu.viewer.result_page.payload import Box, Correlation, ParameterRow, Report, ResidualSet, Scene, Step
+from naibu.viewer.result_page.payload import Box, Correlation, ParameterRow, Report, ResidualSet, Scene, Step, VerdictNote
 from naibu.viewer.tables import Cell, Table
 
 _ACCURACY_COLUMNS = ("experiment/state", "markers", "x mm", "y mm", "z mm", "3-D mm", "in noise units")
+INCOMPRESSIBLE, NOT_VERY_COMPRESSIBLE = 0.499, 0.3  # Poisson's ratios
+WEAK = 0.6  # of the width of the prior: an interval as wide as that owes little to the data
 LABELS: Mapping[str, str] = {"young_modulus": "Young's modulus", "poisson_ratio": "Poisson's ratio"}
 
 
@@ -184,6 +189,7 @@ def parameter_rows(model: CalibratedModel, names: Sequence[str]) -> tuple[Parame
     for p in model.parameters:
         if p.name in names or (p.fixed and p.name.endswith("young_modulus")):
             low, high = model.interval(p.name)
+            low = -np.inf if np.isinf(high) else low
             note = (
                 "" if not p.fixed else ("given" if model.known_materials.scale_is_absolute else "sets the scale: moduli are ratios to it")
             )
@@ -191,21 +197,16 @@ def parameter_rows(model: CalibratedModel, names: Sequence[str]) -> tuple[Parame
     return tuple(rows)
 
 
-def undetermined(model: CalibratedModel, names: Sequence[str]) -> tuple[str, ...]:
-    """Return, in words, what the data do not determine about the parameters `names`."""
+def undetermined(model: CalibratedModel, names: Sequence[str], priors: ParameterSet | None = None) -> tuple[str, ...]:
+    """Return, in words, what the data do not determine about the parameters `names`; `priors` tells what was assumed of them."""
     out = []
     if not model.known_materials.scale_is_absolute:
         out.append("Displacements alone do not give the absolute stiffness: the moduli are ratios to the material that sets the scale.")
     by_name: dict[str, Parameter] = {p.name: p for p in model.parameters}
+    assumed = {p.name: p for p in priors or ()}
     for name in names:
-        p, sd = by_name[name], model.standard_deviation(name)
-        low, high = model.interval(name)
-        if name.endswith("poisson_ratio") and high > 0.499:
-            out.append(f"{name}: at least {low:.3f}; the data do not distinguish it from incompressible.")
-        elif np.isfinite(p.prior_sd) and sd > 0.6 * p.prior_sd:
-            out.append(f"{name}: the data hardly determine it; {p.value:.3g} {p.unit}".rstrip() + " is close to the prior.")
-        elif name.endswith("friction") and high > 4.0 * p.value:
-            out.append(f"{name}: anything above {low:.2g} looks the same, because the surfaces do not slip.")
+        if sentence := _undetermined(by_name[name], model, assumed.get(name)):
+            out.append(f"{name}: {sentence}")
     if len(names) > 1:
         correlation = model.correlation(names)
         for i, j in zip(*np.where(np.triu(np.abs(correlation), 1) > 0.9), strict=True):
@@ -213,8 +214,27 @@ def undetermined(model: CalibratedModel, names: Sequence[str]) -> tuple[str, ...
     return tuple(out)
 
 
+def _undetermined(p: Parameter, model: CalibratedModel, assumed: Parameter | None) -> str:
+    """What the data leave open about one parameter; empty where they determine it."""
+    sd, (low, high) = model.standard_deviation(p.name), model.interval(p.name)
+    if p.scale == "incompressibility" and high > INCOMPRESSIBLE:
+        if low > NOT_VERY_COMPRESSIBLE:
+            return f"at least {low:.3f}; the data do not distinguish it from incompressible."
+        return f"the data leave it open between {low:.2f} and 0.5."
+    if np.isfinite(p.prior_sd) and sd > WEAK * p.prior_sd:
+        before = "" if assumed is None else f"; {assumed.value:.3g} {p.unit}".rstrip() + " was assumed beforehand"
+        return f"the data hardly determine it; {p.value:.3g} {p.unit}".rstrip() + f" was found{before}."
+    if p.name.endswith("friction") and high > 4.0 * p.value:
+        return f"known only to lie between {low:.2g} and {high:.2g}; where surfaces do not slip, a larger friction looks the same."
+    return ""
+
+
 def build_report(
-    calibration: Calibration, model: CalibratedModel, baselines: Mapping[str, Mapping[str, float]], left_out: Sequence[LeftOut] = ()
+    calibration: Calibration,
+    model: CalibratedModel,
+    verdict: Verdict,
+    baselines: Mapping[str, Mapping[str, float]],
+    left_out: Sequence[LeftOut] = (),
 ) -> Report:
     """Gather everything that a calibration's page shows."""
     names, values = shared_names(model), model.parameters.values()
@@ -224,28 +244,47 @@ def build_report(
     )
     return Report(
         title="Calibration of " + ", ".join(dict.fromkeys(t.specimen.experiment.name for t in calibration.load_cases)),
-        headline=_calibration_headline(calibration, model, left_out),
+        headline=_calibration_headline(calibration, model, verdict, left_out),
+        verdict=verdict_note(verdict),
         scenes=scenes,
         accuracy=accuracy_table(calibration, baselines, left_out),
         residuals=tuple(ResidualSet.from_scene(s) for s in scenes),
         parameters=parameter_rows(model, names),
         correlation=_correlation(model, names),
-        undetermined=undetermined(model, names),
+        undetermined=undetermined(model, names, calibration.priors),
         tables=(_boundary_table(model, names), *_assumptions(tuple(assumed))),
         provenance=model.provenance,
     )
 
 
-def _calibration_headline(calibration: Calibration, model: CalibratedModel, left_out: Sequence[LeftOut]) -> tuple[str, ...]:
+def verdict_note(verdict: Verdict) -> VerdictNote:
+    """Return the verdict for the page, with its details."""
+    reasons = tuple(f"{r[0].upper()}{r[1:]}." for r in verdict.reasons[3:])
+    return VerdictNote(verdict.sentence, verdict.explanation is Explanation.EXPLAINED, (*reasons, *verdict.outliers, *verdict.notes))
+
+
+def _calibration_headline(
+    calibration: Calibration, model: CalibratedModel, verdict: Verdict, left_out: Sequence[LeftOut]
+) -> tuple[str, ...]:
     found = [accuracy(t.specimen, f).total for t, f in zip(calibration.load_cases, calibration.match.fits, strict=True)]
     states = f"{len(found)} loaded states" if len(found) > 1 else "one loaded state"
-    out = [
-        f"One set of parameters predicts the markers of {states} to {np.nanmax(found):.2f} mm{' or better' * (len(found) > 1)} (RMS, 3-D)."
-    ]
+    worst = f"{np.nanmax(found):.2f} mm" if np.isfinite(found).any() else ""
+    out = []
+    if worst and verdict.explanation is Explanation.NOT_EXPLAINED:
+        out.append(f"The best fit of the model to the markers of {states} leaves {'up to ' * (len(found) > 1)}{worst} (RMS, 3-D).")
+    elif worst:
+        out.append(f"One set of parameters fits the markers of {states} to {worst}{' or better' * (len(found) > 1)} (RMS, 3-D).")
     if left_out:
-        out.append(f"Predicted from the other experiments, they lie within {max(r.rms_mm for r in left_out):.2f} mm.")
-    out.append(f"Residuals are {model.noise_factor:.2f} times the stated measurement noise. {calibration.match.status.value}")
+        out.append(f"Predicted from the other experiments, they are met to {max(r.rms_mm for r in left_out):.2f} mm or better (RMS, 3-D).")
+    out.append(f"Residuals are {model.noise_factor:.2f} times the stated measurement noise. {search_sentence(calibration.match.status)}")
     return tuple(out)
+
+
+def search_sentence(status: Status) -> str:
+    """How the search ended, which says nothing about how well the model fits."""
+    return {Status.CONVERGED: "The search converged.", Status.ITERATION_LIMIT: "The search reached its iteration limit."}.get(
+        status, status.value
+    )
 
 
 def _correlation(model: CalibratedModel, names: Sequence[str]) -> Correlation | None:
@@ -279,6 +318,7 @@ def prediction_report(model: CalibratedModel, prediction: Prediction) -> Report:
     return Report(
         title=f"Prediction of {label}",
         headline=_prediction_headline(p),
+        verdict=VerdictNote(f"The model is doubtful. {model.reservation}", sound=False) if model.reservation else None,
         scenes=(view,),
         accuracy=table if p.registered else None,
         residuals=(ResidualSet.from_scene(view),) if p.registered else (),
@@ -295,12 +335,15 @@ def _prediction_headline(p: Prediction) -> tuple[str, ...]:
         p.specimen.experiment.loading.kind, "the plate {} mm above the base"
     )
     place, label = what.format(f"{p.platen_position_mm:.2f}"), f"{p.specimen.experiment.name}/{p.state}"
-    spread = f"The stated standard deviation of a predicted coordinate is {np.median(p.sd_mm):.2f} mm (median over the markers)."
     if not p.registered:
-        return (f"{len(p.points)} markers of {label} are predicted, with {place}; no measured positions are there to compare.", spread)
+        return (f"{len(p.points)} markers of {label} are predicted, with {place}; no measured positions are there to compare.", p.interval)
     a = accuracy(p.specimen, p.fit, p.residual)
     lead = f"The markers of {label} are predicted to {a.total:.2f} mm (RMS, 3-D), with {place}."
-    return (lead, f"Residuals are {a.noise_units:.2f} times the stated measurement noise, after a rigid registration of the scan.", spread)
+    return (
+        lead,
+        f"Residuals are {a.noise_units:.2f} times the stated measurement noise, after a rigid registration of the scan.",
+        p.interval,
+    )
 
 
 def _used_table(model: CalibratedModel, p: Prediction) -> Table:

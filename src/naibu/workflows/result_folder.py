@@ -7,7 +7,6 @@ import io
 import json
 import math
 import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -18,8 +17,10 @@ import numpy as np
 from naibu.core.errors import InputError
 from naibu.identification.from_markers.calibration import Calibration
 from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.from_markers.verdict import Verdict
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.cross_validation import LeftOut, ModelRow
+from naibu.identification.prediction.interval import per_axis
 from naibu.identification.prediction.prediction import Prediction, rms
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.parsing import read_json
@@ -30,32 +31,15 @@ from naibu.viewer.json_values import jsonable
 from naibu.viewer.result_page.page import report_html
 from naibu.viewer.result_page.payload import Report, report_json
 from naibu.viewer.result_page.reading import report_from_json
-from naibu.workflows.report_content import Accuracy, accuracy, build_report, prediction_report
+from naibu.workflows.report_content import Accuracy, accuracy, build_report, prediction_report, search_sentence
 
 MODEL_FILE, CHECKPOINT_FILE, RESIDUALS_FILE = "model.json", "checkpoint.json", "residuals.csv"
 IDENTIFICATION_FILE, COMPARISON_FILE, REPORT_STEM = "identification.json", "comparison.json", "report"
 # a prediction may share the folder of the model it was made with, so nothing but its own files bears these names
 PREDICTED_FILE, SUMMARY_FILE, PREDICTED_STEM = "predicted.csv", "summary.json", "predicted"
+IDENTIFICATION_FILES = (MODEL_FILE, RESIDUALS_FILE, IDENTIFICATION_FILE, f"{REPORT_STEM}.json", f"{REPORT_STEM}.html", CHECKPOINT_FILE)
+PREDICTION_FILES = (PREDICTED_FILE, SUMMARY_FILE, *(f"{PREDICTED_STEM}.{ending}" for ending in ("json", "html", "vtu", "vtkhdf")))
 Baselines = Mapping[str, Mapping[str, float]]
-
-
-def result_folder(out: str | os.PathLike[str]) -> Path:
-    """Make a folder for results where it is not there, and see that it can be written to before anything is computed.
-
-    Raises
-    ------
-    InputError
-        It cannot be made, or not be written to.
-    """
-    folder = Path(out)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        reason = "a file stands in its way" if isinstance(error, FileExistsError | NotADirectoryError) else error.strerror
-        raise InputError(f"{folder}: cannot be used as a folder for results ({reason}); choose another as `out`") from error
-    return folder
 
 
 def read_model(path: str | os.PathLike[str]) -> CalibratedModel:
@@ -128,24 +112,34 @@ def _compared(folder: Path) -> list[dict[str, Any]]:
     return data
 
 
+def series_file(load_case: str) -> str:
+    """Return the name of the file for ParaView of ``experiment/state``."""
+    return f"{load_case.replace('/', '_')}.vtkhdf"
+
+
 def write_identification(
-    folder: Path, calibration: Calibration, model: CalibratedModel, baselines: Baselines, left_out: Sequence[LeftOut]
+    folder: Path,
+    calibration: Calibration,
+    model: CalibratedModel,
+    verdict: Verdict,
+    baselines: Baselines,
+    left_out: Sequence[LeftOut],
 ) -> None:
     """Write model, summary, residuals, report and one file for ParaView for each state, the model first."""
     write_atomically(folder / MODEL_FILE, _text(model.to_dict()))
     write_atomically(folder / RESIDUALS_FILE, _residual_csv(calibration))
-    write_atomically(folder / IDENTIFICATION_FILE, _text(_identification_summary(calibration, model, baselines, left_out)))
+    write_atomically(folder / IDENTIFICATION_FILE, _text(_identification_summary(calibration, model, verdict, baselines, left_out)))
     values = model.parameters.values()
     for load_case, fit in zip(calibration.load_cases, calibration.match.fits, strict=True):
-        series = folder / f"{load_case.name.replace('/', '_')}.vtkhdf"
+        series = folder / series_file(load_case.name)
         states = fit.solution.states
         mesh = load_case.specimen.reshaped(values).mesh
         write_vtkhdf_series(series, mesh, [s.load for s in states], {"displacement_mm": [s.displacement for s in states]})
-    _write_report(folder, REPORT_STEM, build_report(calibration, model, baselines, left_out))
+    _write_report(folder, REPORT_STEM, build_report(calibration, model, verdict, baselines, left_out))
 
 
 def _identification_summary(
-    calibration: Calibration, model: CalibratedModel, baselines: Baselines, left_out: Sequence[LeftOut]
+    calibration: Calibration, model: CalibratedModel, verdict: Verdict, baselines: Baselines, left_out: Sequence[LeftOut]
 ) -> dict[str, Any]:
     load_cases = {}
     for load_case, fit in zip(calibration.load_cases, calibration.match.fits, strict=True):
@@ -157,8 +151,15 @@ def _identification_summary(
     rows = {f"{r.experiment}/{r.state}": {"rms_3d_mm": r.rms_mm, "markers": r.marker_count} for r in left_out}
     found = {p.name: {"estimate": p.value, "from": low, "to": high, "unit": p.unit} for p, low, high in _intervals(model)}
     return {
+        "verdict": {
+            "explanation": verdict.explanation.name.lower(),
+            "sentence": verdict.sentence,
+            "reasons": list(verdict.reasons),
+            "notes": list(verdict.notes),
+            "left_out_markers": list(verdict.outliers),
+        },
         "status": calibration.match.status.name,
-        "message": calibration.match.status.value,
+        "message": search_sentence(calibration.match.status),
         "noise_factor": model.noise_factor,
         "load_cases": load_cases,
         "left_out": rows,
@@ -222,7 +223,10 @@ def write_prediction(folder: Path, model: CalibratedModel, prediction: Predictio
         "registered_to_measured": p.registered,
         **_figures(accuracy(p.specimen, p.fit, p.residual)),
         "rms_3d_mm_with_completed": rms(p.residual) if p.registered else None,
-        "median_sd_mm": float(np.median(p.sd_mm)),
+        "median_sd_model_mm": float(np.median(per_axis(p.sd_model_mm))),
+        "median_sd_mm": float(np.median(per_axis(p.sd_mm))),
+        "strain_ratio_to_calibration": p.strain_ratio,
+        "interval": p.interval,
         "notes": [*p.specimen.experiment.loading.assumed, *p.notes],
         "linear_solver": p.fit.solution.linear_solver,
         "reactions_mN": _reactions(p.fit.solution),
@@ -239,12 +243,13 @@ def write_prediction(folder: Path, model: CalibratedModel, prediction: Predictio
 
 def _predicted_csv(p: Prediction) -> str:
     """A row for every marker of the reference configuration; NaN where its position there is not known, or not trusted."""
-    rows = {int(i): (*point, sd) for i, point, sd in zip(p.specimen.marker_ids, p.points, p.sd_mm, strict=True)}
+    columns = np.column_stack([p.points, per_axis(p.sd_model_mm), per_axis(p.sd_mm), p.sd_mm])
+    rows = dict(zip(p.specimen.marker_ids.tolist(), columns, strict=True))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["marker", "x_mm", "y_mm", "z_mm", "sd_mm"])
+    writer.writerow(["marker", "x_mm", "y_mm", "z_mm", "sd_model_mm", "sd_mm", "sd_x_mm", "sd_y_mm", "sd_z_mm"])
     for marker in p.specimen.experiment.initial.ids:
-        writer.writerow([int(marker), *(_number(v, 3) for v in rows.get(int(marker), [np.nan] * 4))])
+        writer.writerow([int(marker), *(_number(v, 3) for v in rows.get(int(marker), np.full(8, np.nan)))])
     return text.getvalue()
 
 

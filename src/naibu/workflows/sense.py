@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import time
@@ -14,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from naibu._version import __version__
-from naibu.core.arrays import BoolArray, FloatArray
+from naibu.core.arrays import BoolArray, FloatArray, require_lengths
 from naibu.core.errors import InputError
 from naibu.core.markers import Markers
 from naibu.core.mesh import Mesh
@@ -24,6 +23,7 @@ from naibu.imaging.displacement.accuracy import check_point_errors, end_point_er
 from naibu.imaging.displacement.strain import folded_fraction, green_lagrange_strain_of
 from naibu.imaging.measure_displacement import FACTS, MeasuredDisplacement, Method, measure_displacement
 from naibu.imaging.preprocessing.resampling import warped
+from naibu.io.displacement_fields import write_field
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
 from naibu.io.images import read_displacement, read_volume, write_displacement, write_volume
@@ -32,11 +32,15 @@ from naibu.io.vtk_files import write_vtu
 from naibu.meshing.primitives import grid_cells
 from naibu.viewer.slices import Overlay, SliceView, slices_html
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.result_folder import result_folder
+from naibu.workflows.output_folder import output_folder
 
 # bounds of the size of files: hexahedra for ParaView, and points of the field for the identification
 MESH_CELLS, FIELD_POINTS = 60_000, 40_000
 MARKER_TABLES, MARKERS = ("initial", "pressed"), 250
+FILES = (
+    *("report.html", "displacement.mha", "standard_deviation.mha", "displacement.vtu", "field.h5", "sense.json"),
+    *(f"{table}.csv" for table in MARKER_TABLES),
+)
 LEAST_CERTAIN = 4.0  # median standard deviations; positions of a larger one make no markers; empirical
 # what the figures of a run mean, with their units
 FIGURES = {
@@ -66,6 +70,7 @@ class Pair:
     names: tuple[str, str]
     truth: FloatArray | None = None
     check_points: tuple[FloatArray, FloatArray] | None = None
+    deformed_mask: BoolArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,6 +93,7 @@ def read_pair(
     deformed: str | os.PathLike[str],
     *,
     mask: str | os.PathLike[str] | None = None,
+    deformed_mask: str | os.PathLike[str] | None = None,
     truth: str | os.PathLike[str] | None = None,
     check_points: tuple[str | os.PathLike[str], str | os.PathLike[str]] | None = None,
     spacing_mm: Sequence[float] | None = None,
@@ -97,9 +103,11 @@ def read_pair(
     Parameters
     ----------
     reference, deformed : path-like
-        Volumes before and after the deformation (see `naibu.io.images.read_volume`).
+        Volumes before and after the deformation (see `naibu.io.images.read_volume`); NaN where they were not measured.
     mask : path-like, optional
         Volume on the grid of the reference, not zero in the object.
+    deformed_mask : path-like, optional
+        The same for the deformed scan: digital volume correlation starts from its position and outline.
     truth : path-like, optional
         True displacement on that grid, an image of vectors, mm.
     check_points : two path-like, optional
@@ -113,20 +121,23 @@ def read_pair(
     InputError
         A file that cannot be read, or a mask or truth on another grid.
     """
-    a, b = (read_volume(p, spacing_mm=spacing_mm) for p in (reference, deformed))
-    inside = None
-    if mask is not None:
-        m = read_volume(mask, spacing_mm=spacing_mm)
-        _same(m, a, Path(mask), Path(reference))
-        inside = np.asarray(m.values != 0)
+    require_lengths(spacing_mm=spacing_mm)
+    a, b = (read_volume(p, spacing_mm=spacing_mm, missing=True) for p in (reference, deformed))
+    masks: list[BoolArray | None] = [None, None]
+    for k, (path, grid, scan) in enumerate(((mask, a, reference), (deformed_mask, b, deformed))):
+        if path is not None:
+            m = read_volume(path, spacing_mm=spacing_mm)
+            _same(m, grid, Path(path), Path(scan))
+            masks[k] = np.asarray(m.values != 0)
     known = None
     if truth is not None:
         known, grid = read_displacement(truth)
         _same(grid, a, Path(truth), Path(reference))
     points = None if check_points is None else _common_points(*check_points)
-    files = {"reference": reference, "deformed": deformed, "mask": mask, "truth": truth}
+    files = {"reference": reference, "deformed": deformed, "mask": mask, "deformed_mask": deformed_mask, "truth": truth}
     tables = dict(zip(("reference_check_points", "deformed_check_points"), check_points or (), strict=False))
-    return Pair(a, b, inside, input_record(files | tables), (Path(reference).name, Path(deformed).name), known, points)
+    names = (Path(reference).name, Path(deformed).name)
+    return Pair(a, b, masks[0], input_record(files | tables), names, known, points, masks[1])
 
 
 def _common_points(reference: str | os.PathLike[str], deformed: str | os.PathLike[str]) -> tuple[FloatArray, FloatArray]:
@@ -141,11 +152,8 @@ def _common_points(reference: str | os.PathLike[str], deformed: str | os.PathLik
 
 
 def _same(grid: Volume, other: Volume, file: Path, reference: Path) -> None:
-    if not grid.same_grid(other):
-        raise InputError(
-            f"{file.name} has {grid.shape[::-1]} voxels of {grid.spacing_mm.tolist()} mm, {reference.name} {other.shape[::-1]} of "
-            f"{other.spacing_mm.tolist()} mm from {other.origin_mm.tolist()}; both must lie on one grid"
-        )
+    if different := grid.grid_difference(other):
+        raise InputError(f"{file.name} does not lie on the grid of {reference.name}: {different}; resample it to that grid")
 
 
 def sense(
@@ -154,10 +162,12 @@ def sense(
     *,
     method: Method = "default",
     mask: str | os.PathLike[str] | None = None,
+    deformed_mask: str | os.PathLike[str] | None = None,
     truth: str | os.PathLike[str] | None = None,
     check_points: tuple[str | os.PathLike[str], str | os.PathLike[str]] | None = None,
     spacing_mm: Sequence[float] | None = None,
     out: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
     progress: Progress | None = None,
 ) -> SenseRun:
     """Measure the displacement between two scans, by digital volume correlation or a classic method, and write it.
@@ -170,6 +180,8 @@ def sense(
         ``"default"`` for digital volume correlation, or a classic method (see `naibu.imaging.measure_displacement`).
     mask : path-like, optional
         Volume on the grid of the reference, not zero in the object; by default the object is segmented.
+    deformed_mask : path-like, optional
+        The same for the deformed scan: digital volume correlation starts from its position and outline.
     truth : path-like, optional
         True displacement on that grid, an image of vectors, mm, to compare with.
     check_points : two path-like, optional
@@ -178,6 +190,8 @@ def sense(
         Voxel spacing along x, y, z, mm, for files without it.
     out : path-like, optional
         Folder for fields, markers, numbers and the page of slices (see `naibu.workflows.sense.sense_pair`).
+    overwrite : bool
+        Whether results, or other files of these names, that `out` holds already are replaced.
     progress : Progress, optional
         Called at the beginning of every stage.
 
@@ -192,12 +206,19 @@ def sense(
         A file that cannot be read; volumes, mask or truth on different grids; volumes that cannot be compared; a folder that cannot be
         written to.
     """
-    pair = read_pair(reference, deformed, mask=mask, truth=truth, check_points=check_points, spacing_mm=spacing_mm)
-    return sense_pair(pair, method=method, out=out, progress=progress)
+    pair = read_pair(
+        reference, deformed, mask=mask, deformed_mask=deformed_mask, truth=truth, check_points=check_points, spacing_mm=spacing_mm
+    )
+    return sense_pair(pair, method=method, out=out, overwrite=overwrite, progress=progress)
 
 
 def sense_pair(
-    pair: Pair, *, method: Method = "default", out: str | os.PathLike[str] | None = None, progress: Progress | None = None
+    pair: Pair,
+    *,
+    method: Method = "default",
+    out: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
 ) -> SenseRun:
     """Measure the displacement of a pair, and write it.
 
@@ -209,7 +230,9 @@ def sense_pair(
         See `naibu.imaging.measure_displacement.measure_displacement`.
     out : path-like, optional
         Folder for ``displacement.mha``, ``standard_deviation.mha`` (where the method states one), ``displacement.vtu`` (of volumes),
-        ``field.npz``, ``initial.csv`` and ``pressed.csv`` (positions in the object as markers), ``sense.json``, ``report.html``.
+        ``field.h5``, ``initial.csv`` and ``pressed.csv`` (positions in the object as markers), ``sense.json``, ``report.html``.
+    overwrite : bool
+        Whether results, or other files of these names, that `out` holds already are replaced.
     progress : Progress, optional
         Called at the beginning of every stage.
 
@@ -218,9 +241,11 @@ def sense_pair(
     InputError
         As `naibu.imaging.measure_displacement.measure_displacement`; also a folder that cannot be written to.
     """
-    folder = None if out is None else result_folder(out)
+    folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
     began = time.perf_counter()
-    measured = measure_displacement(pair.reference, pair.deformed, method=method, mask=pair.mask, progress=progress)
+    measured = measure_displacement(
+        pair.reference, pair.deformed, method=method, mask=pair.mask, deformed_mask=pair.deformed_mask, progress=progress
+    )
     run = SenseRun(measured, time.perf_counter() - began, figures(pair, measured))
     return run if folder is None else SenseRun(measured, run.seconds, run.figures, tuple(_written(pair, run, folder)))
 
@@ -258,7 +283,7 @@ def _written(pair: Pair, run: SenseRun, folder: Path) -> list[Path]:
         files.append(write_volume(folder / "standard_deviation.mha", grid.with_values(np.nan_to_num(sd).astype(np.float32))))
     if min(grid.shape) > 1:  # between the voxels of a single slice there are no cells
         files.append(_vtu(folder / "displacement.vtu", grid, measured))
-    files.append(_npz(folder / "field.npz", measured))
+    files.append(_field(folder / "field.h5", pair, measured))
     files += [
         write_markers(folder / f"{name}.csv", markers) for name, markers in zip(MARKER_TABLES, _as_markers(measured, grid), strict=True)
     ]
@@ -272,6 +297,7 @@ def _written(pair: Pair, run: SenseRun, folder: Path) -> list[Path]:
         "units": "mm; displacement u of the reference configuration: the material at x is found at x + u(x)",
         "figures": run.figures,
         "diagnostics": measured.facts,
+        "warnings": list(measured.warnings),
     }
     text = json.dumps(_plain(numbers), indent=1, ensure_ascii=False) + "\n"
     return [*files, write_atomically(folder / "sense.json", text)]
@@ -310,18 +336,13 @@ def _vtu(path: Path, grid: Volume, measured: MeasuredDisplacement) -> Path:
     return path
 
 
-def _npz(path: Path, measured: MeasuredDisplacement) -> Path:
-    """Write the field as the identification takes it: the arguments of `naibu.DisplacementField.from_arrays`."""
+def _field(path: Path, pair: Pair, measured: MeasuredDisplacement) -> Path:
+    """Write the field as the identification takes it (`naibu.io.read_field`)."""
     step = 1
     while (measured.mask & measured.displacement.valid)[::step, ::step, ::step].sum() > FIELD_POINTS:
         step += 1
-    field = measured.displacement.at_points(step=step)
-    stream = io.BytesIO()
-    arrays: dict[str, Any] = {"points": field.points, "vectors": field.vectors, "valid": field.valid}
-    if field.covariance is not None:
-        arrays["covariance"] = field.covariance
-    np.savez_compressed(stream, **arrays)
-    return write_atomically(path, stream.getvalue())
+    provenance = {"naibu": __version__, "method": measured.method, "inputs": pair.inputs, "every_voxel": step}
+    return write_field(path, measured.displacement.at_points(step=step), provenance=provenance)
 
 
 def _as_markers(measured: MeasuredDisplacement, grid: Volume) -> tuple[Markers, Markers]:
@@ -393,11 +414,11 @@ def _sentences(run: SenseRun) -> list[str]:
     if isinstance(f["measured_fraction"], float) and f["measured_fraction"] < 0.995:
         sentences.append(
             f"The displacement of {1.0 - f['measured_fraction']:.1%} of the object was not measured: that part lies outside one of the "
-            "scans, or in its padding, or the method found no match there."
+            "scans, or in its padding, or the scans show no common texture there."
         )
     if isinstance(f["folded_fraction"], float) and f["folded_fraction"] > 0.0:
         sentences.append(f"The field folds at {f['folded_fraction']:.2%} of the voxels: it is wrong there.")
-    return sentences
+    return sentences + [text.replace("`", "") for text in run.measured.warnings]
 
 
 def _table(run: SenseRun) -> Table:

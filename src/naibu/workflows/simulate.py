@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress
 from naibu.workflows.lattice_study import NAMED, study_text
-from naibu.workflows.simulate_lattice import SimulationRun, simulate_lattice
+from naibu.workflows.simulate_lattice import CHECKPOINT_EVERY, SimulationRun, simulate_lattice
 from naibu.workflows.simulate_study import SLUGS, SQUARES_TOGETHER, simulate_study
 
 
@@ -47,6 +47,8 @@ def simulate(
     *,
     out: str | os.PathLike[str],
     resume: bool = False,
+    overwrite: bool = False,
+    checkpoint_every: int = CHECKPOINT_EVERY,
     device: str = "cpu",
     progress: Progress | None = None,
 ) -> SimulationRun:
@@ -61,7 +63,11 @@ def simulate(
     out : path-like
         Folder for the files.
     resume : bool
-        Whether an interrupted run of a lattice is resumed; the result is the same as without an interruption.
+        Whether an interrupted or killed run of a lattice is resumed; the result is the same as without an interruption.
+    overwrite : bool
+        Whether results that the folder holds are replaced.
+    checkpoint_every : int
+        Number of frames of a lattice between checkpoints, from which a run that was killed can be resumed.
     device : str
         Where a lattice is computed: ``"cpu"``, ``"cuda"`` (an NVIDIA GPU; ``"cuda:1"`` for the second), or ``"warp-cpu"`` (the kernels of
         the GPU on the processor, for tests). Contact with friction is computed on the CPU only.
@@ -76,18 +82,20 @@ def simulate(
     Raises
     ------
     InputError
-        A study that cannot be used, a folder that cannot be written to, or nothing to resume.
+        A study that cannot be used, a folder that cannot be written to or holds results, or nothing to resume.
     ConvergenceError
         An explicit method became unstable; the frames before are kept.
     """
 
     name = os.fspath(study)
     if name != SQUARES_TOGETHER and name not in SLUGS:
-        return simulate_lattice(study, out, resume=resume, device=device, progress=progress)
+        return simulate_lattice(
+            study, out, resume=resume, overwrite=overwrite, checkpoint_every=checkpoint_every, device=device, progress=progress
+        )
     if resume:
         raise InputError(f"{name} takes seconds and keeps nothing to resume from; run it without `resume`")
     if device != "cpu":
         raise InputError(f"device is {device!r}, and {name} is a study of finite elements, which run on 'cpu'; choose that, or a lattice")
-    files = simulate_study(name, out, progress=progress)
+    files = simulate_study(name, out, overwrite=overwrite, progress=progress)
     count = sum(path.suffix == ".vtkhdf" for path in files)
     return SimulationRun(tuple(files), count, count)

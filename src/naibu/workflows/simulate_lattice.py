@@ -2,32 +2,29 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
 from naibu._version import __version__
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import FloatArray, require_count
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.progress import Progress, report_progress
 from naibu.io.files.atomic import write_atomically
 from naibu.io.vtkhdf_series import SeriesFile
-from naibu.mechanics.lattices.model.contact_state import ContactState
-from naibu.mechanics.lattices.model.state import LatticeState
 from naibu.mechanics.lattices.model.surface import surface_of
 from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy, StudyFrame, StudyState, run_study
 from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, motion_html
 from naibu.viewer.tables import Table
 from naibu.workflows.lattice_study import PreparedStudy, prepared_study
-from naibu.workflows.result_folder import result_folder
+from naibu.workflows.output_folder import output_folder
+from naibu.workflows.simulate_checkpoint import Checkpoint
 
-CONTACT_ARRAYS = ("nodes", "mode", "friction", "touched", "centres", "axes")
+CHECKPOINT_EVERY = 10  # frames
 PAGE_BYTES = 3_000_000
 PAGE_FRAMES, PAGE_POINTS = 200, 2_000_000
 ARRAYS = {"displacement": "displacement_mm", "velocity": "velocity_mm_per_s", "stretch": "stretch"}
@@ -60,6 +57,8 @@ def simulate_lattice(
     out: str | os.PathLike[str],
     *,
     resume: bool = False,
+    overwrite: bool = False,
+    checkpoint_every: int = CHECKPOINT_EVERY,
     device: str = "cpu",
     progress: Progress | None = None,
 ) -> SimulationRun:
@@ -74,7 +73,11 @@ def simulate_lattice(
     out : path-like
         Folder for the files.
     resume : bool
-        Whether an interrupted run goes on; the result is the same as if it had not been interrupted.
+        Whether an interrupted or killed run goes on; the result is the same as if it had not been interrupted.
+    overwrite : bool
+        Whether results that the folder holds are replaced.
+    checkpoint_every : int
+        Number of frames between checkpoints, from which a run that was killed can be resumed.
     device : str
         ``"cpu"``, ``"cuda"`` or ``"cuda:1"`` and so on (an NVIDIA GPU), or ``"warp-cpu"`` (the GPU's kernels on the processor, for tests).
     progress : callable, optional
@@ -88,35 +91,67 @@ def simulate_lattice(
     Raises
     ------
     InputError
-        What `naibu.workflows.lattice_study.prepared_study` refuses, a folder that cannot be written, or nothing to resume.
+        What `naibu.workflows.lattice_study.prepared_study` refuses, a folder that cannot be written or holds results, or nothing to resume.
     ConvergenceError
         An explicit method diverged; the frames before are kept.
     """
+    every = require_count("checkpoint_every", checkpoint_every)
     prepared = prepared_study(source)
-    folder = result_folder(out)
-    checkpoint = folder / f"{prepared.name}.checkpoint.npz"
-    path = folder / f"{prepared.name}.vtkhdf"
-    start = _read_checkpoint(checkpoint, prepared) if resume else None
-    series = SeriesFile.begun(path, prepared.mesh) if start is None else SeriesFile.continued(path, prepared.mesh, start.frame + 1)
-    with series:
-        state, stopped = _computed(prepared, series, start, device, progress)
+    checkpoint = Checkpoint.of(Path(out), prepared)
+    if resume:
+        start = checkpoint.read()
+    elif not overwrite and checkpoint.path.exists():
+        raise InputError(
+            f"{checkpoint.path}: is what an interrupted run can be resumed from; continue it with `resume`, begin anew with `overwrite`, "
+            "or choose another folder as `out`"
+        )
+    else:
+        start = None
+    names = () if resume else [f"{prepared.name}.{ending}" for ending in ("html", "vtkhdf", "json")]
+    before = checkpoint.needed()
+    folder = output_folder(out, names, overwrite=overwrite, keep=before)
+    with _series(folder, prepared, start, checkpoint) as series:
+        state, stopped = _computed(prepared, series, start, checkpoint, every, device, progress)
         if state is None:
             raise stopped or KeyboardInterrupt
         series.truncate(state.frame + 1)  # what an interruption left of the next one
-        files = _written(prepared, series, state, folder)
-        series.finish()
+        try:
+            files = _written(prepared, series, state, folder)
+        except InputError as error:
+            kept = f"The first {state.frame} frames are kept; free what is in the way and run again with `resume`"
+            raise InputError(f"{error}. {kept}") from error
+        finally:
+            series.finish()
+            checkpoint.write(state, series.target.name)
     if state.frame == prepared.study.frames:
-        checkpoint.unlink(missing_ok=True)
+        checkpoint.path.unlink(missing_ok=True)
     else:
-        write_atomically(checkpoint, _packed(state, prepared.fingerprint))
-        files = (*files, checkpoint)
+        files = (*files, checkpoint.path)
+    for name in before:
+        (folder / name).unlink(missing_ok=True)
     if stopped is not None and not isinstance(stopped, KeyboardInterrupt):
-        raise type(stopped)(f"{stopped} The first {state.frame * prepared.study.frame_s:g} s are kept in {path}.") from stopped
+        kept = f"The first {state.frame * prepared.study.frame_s:g} s are kept in {series.target}."
+        raise type(stopped)(f"{stopped} {kept}") from stopped
     return SimulationRun(files, state.frame, prepared.study.frames)
 
 
+def _series(folder: Path, prepared: PreparedStudy, start: StudyState | None, checkpoint: Checkpoint) -> SeriesFile:
+    """Begin the series, or take up what a checkpoint belongs to."""
+    path = folder / f"{prepared.name}.vtkhdf"
+    if start is None:
+        return SeriesFile.begun(path, prepared.mesh, prepared.fingerprint)
+    aside = next((folder / name for name in checkpoint.needed()[:1] if (folder / name).exists()), None)
+    return SeriesFile.continued(path, prepared.mesh, start.frame + 1, prepared.fingerprint, aside)
+
+
 def _computed(
-    prepared: PreparedStudy, series: SeriesFile, start: StudyState | None, device: str, progress: Progress | None
+    prepared: PreparedStudy,
+    series: SeriesFile,
+    start: StudyState | None,
+    checkpoint: Checkpoint,
+    every: int,
+    device: str,
+    progress: Progress | None,
 ) -> tuple[StudyState | None, BaseException | None]:
     """Append frames; return the last whole one, and what stopped the run before its end."""
     state = start
@@ -124,6 +159,8 @@ def _computed(
         for frame in run_study(prepared.study, start, device=device):
             _append(series, prepared, frame)
             state = frame.state
+            if state.frame and (state.frame % every == 0 or state.frame == prepared.study.frames):
+                checkpoint.write(state, series.checkpoint().name)
             report_progress(progress, f"simulate {prepared.name}", done=state.frame, total=prepared.study.frames)
     except (KeyboardInterrupt, ConvergenceError) as error:
         return state, error
@@ -266,48 +303,3 @@ def _tables(prepared: PreparedStudy, force: FloatArray, moved: FloatArray, times
             at = prepared.study.sample_s * (int(np.argmax(size)) + 1)
             rows.append((f"largest force of {body.name}, mN", float(size.max()), float(at) if size.max() > 0.0 else None))
     return [Table("Largest values", ("quantity", "value", "time, s"), tuple(rows))]
-
-
-def _packed(state: StudyState, fingerprint: str) -> bytes:
-    """Return a state as an .npz file."""
-    lattice, contact = state.lattice, state.lattice.contact
-    arrays: dict[str, Any] = {
-        "fingerprint": np.array(fingerprint),
-        "frame": np.array(state.frame),
-        "position": lattice.position,
-        "velocity": lattice.velocity,
-        "extension": lattice.extension,
-        "positions": state.positions,
-        "work": state.work,
-        "numbers": np.array([state.speed, state.external_work, float(state.unsettled)]),
-    }
-    if lattice.length is not None:
-        arrays["length"] = lattice.length
-    if contact is not None:
-        arrays |= {f"contact_{name}": getattr(contact, name) for name in CONTACT_ARRAYS}
-    stream = io.BytesIO()
-    np.savez(stream, **arrays)
-    return stream.getvalue()
-
-
-def _read_checkpoint(path: Path, prepared: PreparedStudy) -> StudyState:
-    if not path.is_file():
-        raise InputError(f"{path}: does not exist, so there is nothing to resume; run without `resume`")
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            data = {name: file[name] for name in file.files}
-        same = str(data["fingerprint"]) == prepared.fingerprint
-        contact = None
-        if "contact_nodes" in data:
-            contact = ContactState(*(data[f"contact_{name}"] for name in CONTACT_ARRAYS))
-        lattice = LatticeState(data["position"], data["velocity"], data["extension"], data.get("length"), contact)
-        speed, external_work, unsettled = data["numbers"].tolist()
-        state = StudyState(int(data["frame"]), lattice, speed, data["positions"], data["work"], external_work, int(unsettled))
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
-        raise InputError(f"{path}: is damaged ({error}); run without `resume`") from error
-    if not same:
-        raise InputError(
-            f"{path}: was kept with other settings, inputs or another version of naibu than {prepared.source} now; put them back, or run "
-            "without `resume`"
-        )
-    return state

@@ -16,12 +16,13 @@ from naibu.io.files.atomic import write_atomically
 from naibu.io.vtk_files import write_vtkhdf_series
 from naibu.reproduction.chapter2.simulations import NAMES, SQUARES, Study, run
 from naibu.viewer.animation import MovingBody, animation_html
+from naibu.workflows.output_folder import output_folder
 
 SLUGS = {name.replace(",", "").replace(" ", "-").lower(): name for name in NAMES}
 SQUARES_TOGETHER = "squares"
 
 
-def simulate_study(name: str, out: str | os.PathLike[str], *, progress: Progress | None = None) -> list[Path]:
+def simulate_study(name: str, out: str | os.PathLike[str], *, overwrite: bool = False, progress: Progress | None = None) -> list[Path]:
     """Run a named study; write ``STUDY.vtkhdf``, ``STUDY.json`` and, for plane studies, the animation ``STUDY.html``.
 
     Parameters
@@ -30,6 +31,8 @@ def simulate_study(name: str, out: str | os.PathLike[str], *, progress: Progress
         ``"elastic-square"``, ``"agar-block"``, ...; ``"squares"`` runs the three squares and animates them side by side.
     out : path-like
         Folder of the files.
+    overwrite : bool
+        Whether results that the folder holds are replaced.
     progress : callable, optional
         Called with a `ProgressReport` before every study.
 
@@ -41,12 +44,14 @@ def simulate_study(name: str, out: str | os.PathLike[str], *, progress: Progress
     Raises
     ------
     InputError
-        There is no study of this name, or the folder cannot be written.
+        There is no study of this name, or the folder cannot be written, or holds results.
     """
     if name != SQUARES_TOGETHER and name not in SLUGS:
         raise InputError(f"there is no study {name!r}; choose one of {', '.join([SQUARES_TOGETHER, *SLUGS])}")
-    folder = Path(out)
     names = SQUARES if name == SQUARES_TOGETHER else (SLUGS[name],)
+    slugs = [slug for slug, title in SLUGS.items() if title in names]
+    written = [f"{name}.html", *(f"{slug}.{ending}" for slug in slugs for ending in ("vtkhdf", "json"))]
+    folder = output_folder(out, written, overwrite=overwrite)
     studies: list[Study] = []
     files: list[Path] = []
     for each in names:

@@ -11,18 +11,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from naibu.core.arrays import require_count, require_lengths
 from naibu.core.errors import InputError
 from naibu.core.experiment import Layer, Loading, Shape
 from naibu.core.progress import Progress, report_progress
 from naibu.imaging.markers.detection import Polarity
-from naibu.imaging.markers.tracking import TrackedMarkers, track_markers
+from naibu.imaging.markers.tracking import FEWEST_COMMON, TrackedMarkers, track_markers
+from naibu.io.files.paths import require_usable_path
 from naibu.io.files.provenance import input_record
 from naibu.io.images import read_volume
 from naibu.io.marker_tables import write_experiment_folder, write_markers
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.result_folder import result_folder
+from naibu.workflows.output_folder import output_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -92,6 +94,7 @@ def track(
     mask: str | os.PathLike[str] | None = None,
     spacing_mm: Sequence[float] | None = None,
     description: ObjectDescription | None = None,
+    overwrite: bool = False,
     progress: Progress | None = None,
 ) -> TrackRun:
     """Track equal markers through scans of several states, and write an experiment folder.
@@ -111,6 +114,8 @@ def track(
         Voxel spacing along x, y, z, mm, for files without it.
     description : ObjectDescription, optional
         Shape, loading and layers.
+    overwrite : bool
+        Whether `out` may be a folder that is not empty: files of the same names are replaced, others stay.
     progress : callable, optional
         Called with a `naibu.core.progress.ProgressReport` at every stage.
 
@@ -122,11 +127,18 @@ def track(
     Raises
     ------
     InputError
-        Scans that cannot be read, two of one name, markers that cannot be found or linked, or a folder that is not empty.
+        Scans that cannot be read, two of one name, markers that cannot be found, linked or trusted, or a folder that is not empty.
     """
-    target = Path(out)
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise InputError(f"{target}: exists and is not an empty folder; choose a new folder as `out`, or remove this one first")
+    require_lengths(diameter_mm=diameter_mm, thickness_mm=thickness_mm, spacing_mm=spacing_mm)
+    if description is not None:
+        require_lengths(size_mm=description.shape.size_mm, bar_width_mm=description.loading.bar_width_mm)
+    if count is not None:
+        require_count("count", count)
+    target = require_usable_path(out, written=True)
+    if not overwrite and target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise InputError(
+            f"{target}: exists and is not an empty folder; choose a new folder as `out`, or allow this one to be used with `overwrite`"
+        )
     names = _states(scans)
     report_progress(progress, "reading")
     volumes = [read_volume(path, spacing_mm=spacing_mm) for path in scans]
@@ -134,15 +146,17 @@ def track(
     if mask is not None:
         where = read_volume(mask, spacing_mm=spacing_mm)
         for path, volume in zip(scans, volumes, strict=True):
-            if not where.same_grid(volume):
-                raise InputError(f"{Path(mask).name} does not lie on the grid of {Path(path).name}; resample the mask, or leave it out")
+            if different := where.grid_difference(volume):
+                place = f"{Path(mask).name} does not lie on the grid of {Path(path).name}"
+                raise InputError(f"{place}: {different}; resample the mask, or leave it out")
         masks = [where.values != 0] * len(volumes)
     tracked = track_markers(
         volumes, diameter_mm=diameter_mm, thickness_mm=thickness_mm, polarity=polarity, count=count, masks=masks, names=names,
         progress=progress,
     )  # fmt: skip
+    _require_trusted(tracked)
     report_progress(progress, "writing")
-    files = _written(target, tracked, description)
+    files = _written(target, tracked, description, overwrite)
     columns, rows = _table(tracked)
     settings: dict[str, Cell] = {"diameter, mm": diameter_mm, "thickness, mm": thickness_mm, "polarity": tracked.found[0].polarity}
     settings |= input_record({**{f"scan of {name}": scan for name, scan in zip(names, scans, strict=True)}, "mask": mask})
@@ -150,6 +164,18 @@ def track(
         Chapter("tracking", "Markers tracked through scans", (_section(tracked, columns, rows),), settings), target
     )
     return TrackRun(tracked, columns, rows, page, (*files, numbers))
+
+
+def _require_trusted(tracked: TrackedMarkers) -> None:
+    """Refuse tracks of which nothing can be used."""
+    for name, flags in zip(tracked.names[1:], tracked.flags[1:], strict=True):
+        trusted, linked = int((flags == "ok").sum()), int((flags != "missing").sum())
+        if trusted < FEWEST_COMMON:
+            raise InputError(
+                f"state {name!r}: {linked} markers were followed, but only {trusted} of them are trusted, {FEWEST_COMMON} are needed; "
+                "fewer than five cannot be told from bubbles or texture: where there are no more, give their number as `count`, otherwise "
+                "check diameter_mm and `polarity`"
+            )
 
 
 def _states(scans: Sequence[str | os.PathLike[str]]) -> list[str]:
@@ -164,14 +190,14 @@ def _states(scans: Sequence[str | os.PathLike[str]]) -> list[str]:
     return names
 
 
-def _written(target: Path, tracked: TrackedMarkers, description: ObjectDescription | None) -> list[Path]:
+def _written(target: Path, tracked: TrackedMarkers, description: ObjectDescription | None, overwrite: bool) -> list[Path]:
     if description is None:
-        result_folder(target)
+        output_folder(target)
         return [write_markers(target / f"{n}.csv", m) for n, m in zip(tracked.names, tracked.markers, strict=True)]
-    d, (xy_step, z_step) = description, tracked.steps_mm
+    d, (xy_sd, z_sd) = description, tracked.typical_sd_mm
     write_experiment_folder(
         target, tracked.markers[0], tracked.states, title=d.title, shape=d.shape, loading=d.loading, layers=d.layers, stated_mm=d.stated_mm,
-        xy_step_mm=xy_step, z_step_mm=z_step,
+        xy_sd_mm=xy_sd, z_sd_mm=z_sd, overwrite=overwrite,
     )  # fmt: skip
     return [target / "meta.toml", *(target / f"{n}.csv" for n in tracked.names)]
 

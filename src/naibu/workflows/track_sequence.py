@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from naibu.core.arrays import AnyArray, FloatArray, require_positive
+from naibu.core.arrays import AnyArray, FloatArray, require_lengths, require_within
 from naibu.core.progress import Progress, report_progress
 from naibu.imaging.markers.sequence_tracking import EchoPolarity, TrackedSequence, lengths_mm, track_sequence
 from naibu.imaging.markers.settings import SequenceSettings
@@ -23,11 +23,12 @@ from naibu.io.images import read_volume
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.result_folder import result_folder
+from naibu.workflows.output_folder import output_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
+FRAME_RATES_HZ = 1e-6, 1e9
 COLUMNS = ("frame", "time_s", "marker", "x_mm", "y_mm", "sd_mm", "seen")
 
 
@@ -65,6 +66,7 @@ def track_sequence_file(
     count: int | None = None,
     polarity: EchoPolarity = "bright",
     settings: SequenceSettings | None = None,
+    overwrite: bool = False,
     progress: Progress | None = None,
 ) -> SequenceRun:
     """Track markers through a stack of images, and write ``tracks.csv``, ``tracks.html`` and ``tracks.json``.
@@ -76,7 +78,9 @@ def track_sequence_file(
     out : path-like
         Folder for the files.
     frame_rate_hz : float
-        Frames per second; above 0.
+        Frames per second, from 1e-6 to 1e9.
+    overwrite : bool
+        Whether results, or other files of these names, that `out` holds already are replaced.
     pixel_mm, diameter_mm, region_mm, count, polarity, settings, progress
         See `naibu.imaging.markers.sequence_tracking.track_sequence`.
 
@@ -91,9 +95,10 @@ def track_sequence_file(
         A stack that cannot be read, an argument out of range, markers that cannot be found, or a folder that cannot be written to. No
         file is then written.
     """
-    rate = require_positive("frame_rate_hz", frame_rate_hz, "frames per second")
+    rate = require_within("frame_rate_hz", frame_rate_hz, *FRAME_RATES_HZ, "frames per second")
+    require_lengths(pixel_mm=pixel_mm, diameter_mm=diameter_mm)
     dx, dy = (float(v) for v in lengths_mm("pixel_mm", pixel_mm))
-    folder = result_folder(out)
+    folder = output_folder(out, ("tracks.csv", "tracks.html", "tracks.json"), overwrite=overwrite)
     report_progress(progress, "reading")
     stack = read_volume(frames, spacing_mm=(dx, dy, 1.0)).values
     tracked = track_sequence(

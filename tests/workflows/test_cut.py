@@ -1,0 +1,79 @@
+"""Cutting from files: what is written, that the cut opens, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from naibu.core.errors import InputError
+from naibu.io.meshes import read_mesh
+from naibu.io.vtk_files import write_vtu
+from naibu.meshing import box, signed_volumes
+from naibu.workflows import cut
+
+SIZE = 20.0
+
+
+def mesh_file(folder: Path) -> Path:
+    path = folder / "gel.vtu"
+    write_vtu(path, box((SIZE, SIZE, SIZE), (4, 4, 4), cell_type="tetra"))
+    return path
+
+
+def path_file(folder: Path, lowest: float, text: str = "") -> Path:
+    path = folder / "blade.csv"
+    rows = [f"1,{y},{lowest},1,{y},{SIZE + 5}" for y in (-15, 0, 15)]
+    path.write_text(text or "x1,y1,z1,x2,y2,z2\n" + "\n".join(rows) + "\n")
+    return path
+
+
+def test_a_notch_opens_when_the_body_is_pulled_apart(tmp_path: Path) -> None:
+    done = cut(mesh_file(tmp_path), path_file(tmp_path, 10.0), out=tmp_path / "out", pull_percent=10.0)
+    assert [file.name for file in done.files] == ["cut.html", "cut.vtu", "cut.vtkhdf", "cut.json"]
+    numbers = json.loads((tmp_path / "out" / "cut.json").read_text())
+    assert numbers["pieces"] == 1
+    assert numbers["pulled_along"] == "x"
+    assert numbers["relative_change_of_volume"] < 1e-12
+    assert 0.3 * 2.0 < done.opening_mm < 2.0 * 2.0  # the notch takes up much of the 2 mm that the ends part
+    written = read_mesh(tmp_path / "out" / "cut.vtu")
+    assert signed_volumes(written).sum() == pytest.approx(SIZE**3, rel=1e-6)
+    assert "opens by" in (tmp_path / "out" / "cut.html").read_text()
+
+
+def test_a_whole_cut_parts_the_pieces_by_the_pull(tmp_path: Path) -> None:
+    done = cut(mesh_file(tmp_path), path_file(tmp_path, -5.0), out=tmp_path / "out", pull_percent=10.0)
+    np.testing.assert_allclose(done.volumes_mm3.sum(), SIZE**3, rtol=1e-12)
+    assert len(done.volumes_mm3) == 2
+    assert done.opening_mm == pytest.approx(2.0, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("1,2,3\n4,5,6\n", "at least two vertices"),
+        ("1,2,3,4,5,6\n", "at least two poses"),
+        ("1,2,3,4,5,6\n1,2,3,4,5\n", "row 2 has 5 numbers"),
+        ("1,2,3,4,5,6\n1,2,3,4,5,x\n", "row 2 has 'x'"),
+        ("1,2,3,4,5,nan\n1,2,3,4,5,6\n", "row 1 has 'nan'"),
+        ("100,0,0,100,0,9\n100,9,0,100,9,9\n", "passes beside the body"),
+        ("1,0,0,1,0,9\n1,0,0,1,0,9\n", "sweeps no area"),
+    ],
+)
+def test_paths_that_cannot_be_used_are_refused(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        cut(mesh_file(tmp_path), path_file(tmp_path, 0.0, text), out=tmp_path / "out")
+    assert list((tmp_path / "out").glob("*")) == []
+
+
+def test_what_cannot_be_cut_is_refused(tmp_path: Path) -> None:
+    path = path_file(tmp_path, 0.0)
+    with pytest.raises(InputError, match="is a lattice, which is not cut"):
+        cut("cube-pushing", path, out=tmp_path / "out")
+    with pytest.raises(InputError, match="pull_percent"):
+        cut(mesh_file(tmp_path), path, out=tmp_path / "out", pull_percent=80.0)
+    with pytest.raises(InputError, match=r"blade\.csv: is not UTF-8"):
+        path.write_bytes(b"1,2,3,4,5,\xff")
+        cut(mesh_file(tmp_path), path, out=tmp_path / "out")

@@ -1,0 +1,138 @@
+"""From files of a field and of zones to volumes of moduli, on data of other code, by function and by command line."""
+
+from __future__ import annotations
+
+import json
+import sys
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from naibu.cli import main
+from naibu.core.displacement_field import DisplacementField
+from naibu.core.errors import InputError
+from naibu.core.volume import Volume
+from naibu.io.displacement_fields import write_field
+from naibu.io.images import read_volume, write_volume
+from naibu.validation.specimens.quadratic_body import QuadraticBody, Solved
+from naibu.workflows.identify_fields import block_mesh, blurred, identify_fields, parse_known_zones
+
+SD_MM = 0.04
+
+
+@cache
+def solved() -> Solved:
+    return QuadraticBody("cube").solved((0.0, 0.0, -4.0), divisions=4)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A cube of two gels in a scan whose axes are those of the table, turned and shifted: labels 1 below and 2 above."""
+    turned = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    labels = np.zeros((24, 24, 24), dtype=np.uint8)
+    labels[2:12, 2:22, 2:22], labels[12:22, 2:22, 2:22] = 1, 2
+    volume = Volume.from_array(labels, spacing_mm=(2.0, 2.0, 2.0), origin_mm=(100.0, 50.0, 20.0), direction=turned)
+    write_volume(tmp_path / "labels.mha", volume)
+    rng = np.random.default_rng(0)
+    points, u = solved().at(rng.uniform(0.02, 0.98, (1500, 3)))
+    u = u + SD_MM * rng.standard_normal(u.shape)
+    corner = volume.to_physical(np.array([1.5, 1.5, 1.5]))
+    write_field(tmp_path / "field.h5", DisplacementField.from_arrays(corner + points @ turned.T, u @ turned.T, sd_mm=SD_MM))
+    return tmp_path
+
+
+def test_a_zone_is_identified_on_the_grid_of_the_scan(folder: Path) -> None:
+    names = {1: "gel", 2: "pad"}
+    run = identify_fields(
+        folder / "field.h5", zones=folder / "labels.mha", zone_names=names, known=["pad=10 kPa, 0.4"], law="linear", element_size_mm=6.7,
+        out=folder / "out",
+    )  # fmt: skip
+    (young,), (poisson,) = run.estimate.intervals()
+    assert young[0] < 5.0 < young[1] and poisson[0] < 0.45 < poisson[1]
+    assert {p.name for p in run.files} == {p.name for p in (folder / "out").iterdir()}
+    labels, modulus, sd = (read_volume(folder / p) for p in ("labels.mha", "out/young_modulus.mha", "out/young_modulus_sd.mha"))
+    assert modulus.same_grid(labels)
+    assert np.unique(modulus.values[labels.values == 2]) == pytest.approx(10.0, rel=1e-5)
+    assert np.unique(modulus.values[labels.values == 1]) == pytest.approx(run.estimate.young_modulus[0], rel=1e-5)
+    assert (sd.values[labels.values == 1] > 0.0).all() and not modulus.values[labels.values == 0].any()
+    numbers = json.loads((folder / "out" / "identification.json").read_text())
+    assert numbers["verdict"]["explanation"] == "explained" and numbers["zones"][0]["zone"] == "gel"
+    assert "Young&#x27;s modulus" in (folder / "out" / "report.html").read_text()
+
+
+def test_the_command_line_takes_fields(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def run(*more: str) -> int:
+        options = ["--zones", str(folder / "labels.mha"), "--zone-name", "gel=1", "--element-size-mm", "10", "--out", str(folder / "out")]
+        monkeypatch.setattr(sys, "argv", ["naibu", "identify", str(folder / "field.h5"), *options, *more])
+        try:
+            main()
+        except SystemExit as end:
+            return int(end.code or 0)
+        return 0
+
+    assert run("--zone-name", "pad=2", "--known", "pad=10 kPa, 0.4") == 0
+    said = capsys.readouterr().out
+    assert "Explained" in said and "gel: Young's modulus" in " ".join(said.split())
+    assert (folder / "out" / "report.html").exists()
+    assert run("--zone-name", "pad=7", "--known", "pad=10 kPa", "--overwrite") == 2
+    assert "--zone-name names label 7" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_map_finds_one_gel_where_there_is_one(folder: Path) -> None:
+    run = identify_fields(
+        folder / "field.h5", zones=folder / "labels.mha", known=["label 2=10 kPa, 0.4"], each_cell=True, law="linear", element_size_mm=10.0,
+        out=folder / "map",
+    )  # fmt: skip
+    assert run.estimate.weights is not None and run.estimate.zones.count == 1
+    (young,), _ = run.estimate.intervals()
+    assert young[0] < 5.0 < young[1]
+    assert "too coarse" in " ".join(run.notes)  # four cells a side
+
+
+def test_zones_that_end_inside_of_cubes_are_told(folder: Path) -> None:
+    """Five cubes a side: the border between the gels halves the middle ones."""
+    labels = read_volume(folder / "labels.mha")
+    inside, numbers, names = labels.with_values((labels.values > 0).astype(np.uint8)), labels.values.astype(np.int64), {1: "gel", 2: "pad"}
+    for size, told in ((8.0, True), (10.0, False)):
+        mesh, cells = block_mesh(inside, numbers, names, size)
+        assert bool(blurred(mesh, cells, inside, numbers, names)) == told
+
+
+def test_blocks_fill_the_object_along_its_own_axes() -> None:
+    rng = np.random.default_rng(1)
+    direction = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    for axes in (direction, -direction):
+        inside = np.zeros((12, 14, 16))
+        inside[2:10, 3:11, 4:12] = 1
+        volume = Volume.from_array(inside, spacing_mm=(1.0, 1.5, 2.0), direction=axes)
+        mesh, of_voxel = block_mesh(volume, np.ones(inside.shape, dtype=np.int64), {1: "body"}, 3.0)
+        assert (of_voxel >= 0).sum() == inside.sum() and np.unique(of_voxel[of_voxel >= 0]).tolist() == list(range(mesh.n_cells))
+        box = volume.to_index(mesh.points)
+        assert box.min(axis=0) == pytest.approx([3.5, 2.5, 1.5]) and box.max(axis=0) == pytest.approx([11.5, 10.5, 9.5])
+
+
+def test_known_values_and_what_is_wrong_with_them() -> None:
+    names = ["gel", "bone", "pad"]
+    read = parse_known_zones(["gel=12 kPa", "bone=rigid"], names)
+    assert read.values["gel"] == (12.0, 0.45) and read.doubts["gel"][1] > 0.0 and read.values["bone"][0] > 1000.0 and not read.relative
+    assert parse_known_zones(["pad"], names).relative
+    for known, message in (
+        (["skin=3 kPa"], "no zone 'skin'"),
+        (["bone=rigid"], "nothing sets the scale"),
+        ([], "nothing sets the scale"),
+        (["gel=soft"], "write 'gel=12 kPa'"),
+        (["gel=12 kPa", "pad"], "state all, or name one"),
+    ):
+        with pytest.raises(InputError, match=message):
+            parse_known_zones(known, names)
+
+
+def test_files_that_do_not_belong_together_are_told(folder: Path) -> None:
+    far = DisplacementField.from_arrays(np.random.default_rng(0).random((100, 3)), np.ones((100, 3)), sd_mm=0.1)
+    write_field(folder / "far.h5", far)
+    with pytest.raises(InputError, match="from one reference scan"):
+        identify_fields(folder / "far.h5", zones=folder / "labels.mha", known=["label 2=10 kPa"])
+    with pytest.raises(InputError, match="give `mask`"):
+        identify_fields(folder / "field.h5", known=["body=10 kPa"])
