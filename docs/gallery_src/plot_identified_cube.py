@@ -21,14 +21,16 @@ for parameter in found.model.parameters.free:
     print(f"{parameter.name}: {parameter.value:.4g}, 95 % from {low:.4g} to {high:.4g} {parameter.unit}")
 
 # %%
-# Prediction error against displacement of the markers. The size of a symbol is the predicted standard deviation.
+# Prediction error against displacement of the markers. The size of a symbol is the predicted standard deviation of a
+# coordinate.
 
 free, measured = unseen.specimen.marker_points, unseen.measured_in_object
 moved = np.linalg.norm(measured - free, axis=1)
 missed = np.linalg.norm(unseen.residual, axis=1)
+spread = np.sqrt((unseen.sd_mm**2).mean(axis=1))
 
 figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
-drawn = axes.scatter(moved, missed, s=200.0 * unseen.sd_mm, c=free[:, 2], cmap="viridis")
+drawn = axes.scatter(moved, missed, s=200.0 * spread, c=free[:, 2], cmap="viridis")
 axes.set_xlabel("displacement of the marker, mm")
 axes.set_ylabel("prediction error, mm")
 axes.set_ylim(bottom=0.0)

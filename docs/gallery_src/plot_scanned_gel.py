@@ -64,7 +64,7 @@ for scan, name, markers in zip(scans.values(), tracked.names, tracked.markers, s
 # %%
 # The markers are written to a folder, and treated as measured ones from here on. The moduli of the firm gel are known.
 
-xy_step, z_step = tracked.steps_mm  # rounding steps of the same standard deviation as the positions
+xy_sd, z_sd = tracked.typical_sd_mm
 with tempfile.TemporaryDirectory() as aside:
     folder = write_experiment_folder(
         Path(aside) / "gel",
@@ -76,8 +76,8 @@ with tempfile.TemporaryDirectory() as aside:
         layers=described.layers,
         stated_mm=HEIGHTS,
         spacing_mm=described.nominal_spacing_mm,
-        xy_step_mm=xy_step,
-        z_step_mm=z_step,
+        xy_sd_mm=xy_sd,
+        z_sd_mm=z_sd,
     )
     settings = ModelSettings(element_size_mm=10.0)
     found = naibu.identify(folder, known=["firm=200 kPa"], settings=settings, states={"gel": ["pressed"]})

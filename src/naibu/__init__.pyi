@@ -1,4 +1,4 @@
-from . import core, datasets, identification, imaging, io, mechanics, meshing, validation, workflows
+from . import core, datasets, identification, imaging, io, mechanics, meshing, simulation, validation, workflows
 from .core.displacement_field import DisplacementField
 from .core.experiment import Experiment
 from .core.markers import Markers
@@ -33,6 +33,7 @@ __all__ = [
     "report",
     "sense",
     "simulate",
+    "simulation",
     "track",
     "validation",
     "workflows",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import json
 import shutil
@@ -50,7 +51,15 @@ class ValidFile:
 
 def valid_files(folder: Path) -> list[ValidFile]:
     """Write every input into a folder of its own below `folder`."""
-    return [*_volumes(folder), *_dicom(folder), *_meshes(folder), *_surfaces(folder), *_tables(folder), *_texts(folder)]
+    return [
+        *_volumes(folder),
+        *_other_volumes(folder),
+        *_dicom(folder),
+        *_meshes(folder),
+        *_surfaces(folder),
+        *_tables(folder),
+        *_texts(folder),
+    ]
 
 
 def _volume() -> Volume:
@@ -88,6 +97,33 @@ def _volumes(folder: Path) -> list[ValidFile]:
         if file.is_file()
     ]
     return out
+
+
+def _other_volumes(folder: Path) -> list[ValidFile]:
+    """Volumes in several files: headers with their values beside them, and slices in a folder."""
+    import nibabel
+    import tifffile
+
+    values = _volume().values
+    out = []
+    for name, encoding, content in (("raw", "raw", values.tobytes()), ("gz", "gzip", gzip.compress(values.tobytes()))):
+        head = f"NRRD0004\ntype: int16\ndimension: 3\nsizes: 7 6 5\nspacings: 1 1.5 2\nendian: little\nencoding: {encoding}\n"
+        header = _written(folder / f"volume-nhdr-{name}" / "apart.nhdr", f"{head}data file: apart.{name}\n".encode())
+        beside = _written(header.with_name(f"apart.{name}"), content)
+        read = lambda header=header: read_volume(header)  # noqa: E731  of this header
+        out += [
+            ValidFile(f"volume apart.nhdr ({name})", header, read),
+            ValidFile(f"volume values beside apart.nhdr ({name})", beside, read),
+        ]
+    pair = folder / "volume-pair" / "pair.hdr"
+    pair.parent.mkdir(parents=True)
+    nibabel.save(nibabel.Nifti1Pair(values.T, np.diag([1.0, 1.5, 2.0, 1.0])), pair)
+    out += [ValidFile(f"volume {p.name}", p, lambda: read_volume(pair)) for p in (pair, pair.with_suffix(".img"))]
+    stack = folder / "volume-stack"
+    stack.mkdir()
+    for k, plane in enumerate(values):
+        tifffile.imwrite(stack / f"{k}.tif", plane)
+    return [*out, ValidFile("volume slices of a stack", stack / "2.tif", lambda: read_volume(stack, spacing_mm=(1.0, 1.5, 2.0)))]
 
 
 def _dicom(folder: Path) -> list[ValidFile]:
@@ -190,9 +226,10 @@ def _surfaces(folder: Path) -> list[ValidFile]:
             + "".join(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in faces.tolist())
         ).encode(),
         "text.wrl": (
-            "#VRML V2.0 utf8\nShape { geometry IndexedFaceSet { coord Coordinate { point [ "
+            "#VRML V2.0 utf8\nTransform { scale 1 1 1 rotation 0 0 1 0 children [\n"
+            "Shape { geometry IndexedFaceSet { coord Coordinate { point [ "
             + ", ".join(f"{x} {y} {z}" for x, y, z in points.tolist())
-            + f" ] }} coordIndex [ {indices} ] }} }}\n"
+            + f" ] }} coordIndex [ {indices} ] }} }} ] }}\n"
         ).encode(),
     }
     out = []

@@ -1,0 +1,175 @@
+"""Bisection and adaptive models: cells a second, unknowns and time for an indentation force, and a motion, beside uniform meshes.
+
+``rate``: 1000 marked tetrahedra, near each other or scattered, of meshes of Kuhn's cubes of growing size; new cells, and cells that are
+joined again, a second (best of some repeats, wall time).
+
+``indentation``: a block of 100 x 100 x 50 mm, fixed below, under a sphere of radius 20 mm that is pushed 2 mm into it without friction; a
+quarter of it, linear elastic, Poisson's ratio 0.3. Its force on meshes refined by the recovered error of the stress, and on uniform ones.
+The reference is extrapolated from the last four adaptive meshes. Processor time, that of all coarser meshes included, whose equilibria are
+initial guesses.
+
+``dynamics``: the cuboid of the report's chapter 4.2 with neo-Hookean elements, bent by a force for 40 ms and released; implicit steps. Its
+corner path on 1000 nodes (9 x 9 x 9 cubes), and on a mesh that begins with 125 and follows the error of the stress.
+
+Run: ``MKL_NUM_THREADS=1 OMP_NUM_THREADS=1 python benchmarks/mesh_refinement.py [rate] [indentation] [dynamics]``.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import numpy as np
+
+from naibu.core.mesh import Mesh
+from naibu.mechanics.contact.contact_surfaces import Friction, rigid_contact
+from naibu.mechanics.contact.indenter_geometry import sphere_geometry
+from naibu.mechanics.contact.penalty_contact import Contact
+from naibu.mechanics.finite_elements.hyperelasticity import material
+from naibu.meshing.primitives import box
+from naibu.meshing.refinement.forest import BisectionForest
+from naibu.meshing.surface import boundary_faces
+from naibu.simulation.adaptive.body import AdaptiveBody
+from naibu.simulation.adaptive.conditions import Conditions, face_force
+from naibu.simulation.adaptive.error_criterion import StressError
+from naibu.simulation.adaptive.hyperelastic_dynamics import HyperelasticDynamics
+from naibu.simulation.adaptive.statics import StaticResult, StaticSolve, hyperelastic_static, solve_adaptively
+
+MARKED, REPEATS = 1000, 7
+RADIUS_MM, DEPTH_MM, HEIGHT_MM = 20.0, 2.0, 50.0
+SIDE_MM, FORCE_MN, DENSITY, STEP_S, STEPS, TRIAL_STEPS = 100.0, 6e3, 1e-7, 2e-3, 40, 2
+
+
+def rate() -> None:
+    print(f"{MARKED} marked tetrahedra: million cells a second")
+    print(f"{'mesh':>10s} {'marked':>10s} {'new':>7s} {'bisected':>9s} {'joined':>9s}")
+    for n in (12, 26, 56):
+        mesh = box((1, 1, 1), (n, n, n), cell_type="tetra", centred=False)
+        forest = BisectionForest.of(mesh)
+        centres = mesh.points[mesh.cells].mean(axis=1)
+        near = np.argsort(np.linalg.norm(centres - 0.3, axis=1))[:MARKED]
+        scattered = np.random.default_rng(0).choice(mesh.n_cells, MARKED, replace=False)
+        for name, marked in (("near", near), ("scattered", scattered)):
+            new, refining, coarsening = timed(forest, marked)
+            print(f"{mesh.n_cells:10d} {name:>10s} {new:7d} {new / refining / 1e6:9.1f} {new / coarsening / 1e6:9.1f}", flush=True)
+
+
+def timed(forest: BisectionForest, marked: np.ndarray) -> tuple[int, float, float]:
+    """Return the number of new cells, and the least times in which they are made and joined again, s."""
+    refining = coarsening = np.inf
+    for _ in range(REPEATS):
+        began = time.perf_counter()
+        change = forest.refine(marked)
+        refining = min(refining, time.perf_counter() - began)
+        new = change.children.ravel()
+        spent, count = 0.0, 0
+        while True:  # the closure bisects some cells twice
+            began = time.perf_counter()
+            back = forest.coarsen(new)
+            spent += time.perf_counter() - began
+            if not back:
+                break
+            count += back.children.size
+        assert count == len(new) and forest.n_cells == forest.n_roots
+        coarsening = min(coarsening, spent)
+    return len(new), refining, coarsening
+
+
+def pressed(mesh: Mesh) -> tuple[Contact, ...]:
+    """Return the contact of the sphere with the upper face."""
+    faces = boundary_faces(mesh).faces
+    top = faces[(mesh.points[faces][:, :, 2] > HEIGHT_MM - 1e-9).all(axis=1)]
+    start = np.array([0.0, 0.0, HEIGHT_MM + RADIUS_MM])
+    stop = start - [0.0, 0.0, DEPTH_MM]
+    surface = sphere_geometry(RADIUS_MM)
+    return (rigid_contact("sphere", mesh.points, top, surface, start=start, stop=stop, friction=Friction(0.0), normal_stiffness=1000.0),)
+
+
+def block(n: int) -> Mesh:
+    """Return a quarter of the block, of n cubes along a side, below the middle of its upper face."""
+    return box((50.0, 50.0, HEIGHT_MM), (n, n, n), cell_type="tetra", centred=False)
+
+
+def forces(solve_on: StaticSolve, n: int, limit: int, **settings: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return unknowns, forces, N, and times up to each of a sequence of meshes, s; each equilibrium is the initial guess of the next."""
+    began, times = time.process_time(), []
+
+    def clocked(mesh: Mesh, start: np.ndarray | None) -> StaticResult:
+        found = solve_on(mesh, start)
+        times.append(time.process_time() - began)
+        return found
+
+    found = solve_adaptively(block(n), clocked, tolerance=0.0, max_unknowns=limit, **settings)  # type: ignore[arg-type]
+    return np.array(found.unknowns, dtype=float), np.array([-4.0 * r.reactions["sphere"][2] / 1e3 for r in found.rounds]), np.array(times)
+
+
+def indentation(limit: int = 20_000, uniform_limit: int = 40_000) -> None:
+    law = material("linear_elastic", young_modulus=10.0, poisson_ratio=0.3)
+    planes = tuple((lambda p, axis=axis: p[:, axis] < 1e-9, axis) for axis in range(2))
+    solve_on = hyperelastic_static(Conditions(lambda p: p[:, 2] < 1e-9, rollers=planes), [law], contacts=pressed)
+    solve_on(block(4), None)
+    adaptive = forces(solve_on, 4, limit, fraction=0.6)
+    uniform = forces(solve_on, 6, uniform_limit, fraction=1.0, bisections=3)
+    slope = np.polyfit(adaptive[0][-4:] ** (-2.0 / 3.0), adaptive[1][-4:], 1)
+    print(f"force of the sphere, reference {slope[1]:.4f} N")
+    print(f"{'mesh':>10s} {'unknowns':>9s} {'force, N':>9s} {'error, %':>9s} {'time, s':>8s}")
+    for name, rows in (("adaptive", adaptive), ("uniform", uniform)):
+        for unknowns, force, spent in zip(*rows, strict=True):
+            print(f"{name:>10s} {unknowns:9.0f} {force:9.4f} {100 * (force / slope[1] - 1):9.2f} {spent:8.2f}")
+    for unknowns, force, spent in list(zip(*uniform, strict=True))[1:]:
+        first = int(np.argmax(adaptive[1] <= force))  # forces fall towards the reference
+        print(
+            f"as good as {unknowns:.0f} uniform unknowns: adaptive {adaptive[0][first]:.0f}, 1/{unknowns / adaptive[0][first]:.0f}, "
+            f"in 1/{spent / adaptive[2][first]:.0f} of the time"
+        )
+
+
+def path(n: int, criterion: StressError | None) -> tuple[np.ndarray, list[int], float]:
+    """Return the path of the corners of the free end (steps, 3), mm, the numbers of nodes, and the time, s."""
+
+    def fixed(p: np.ndarray) -> np.ndarray:
+        return p[:, 0] < 1e-6
+
+    def end(p: np.ndarray) -> np.ndarray:
+        return p[:, 0] > SIDE_MM - 1e-6
+
+    def corners(p: np.ndarray) -> np.ndarray:
+        return end(p) & ~((p[:, 1:] > 1e-6) & (p[:, 1:] < SIDE_MM - 1e-6)).any(axis=1)
+
+    law = material("neo_hookean", young_modulus=50.0, poisson_ratio=0.3)
+    dynamics = HyperelasticDynamics((law,), DENSITY, STEP_S, retardation_s=2e-3)
+    loaded = Conditions(fixed, loads=(face_force(end, (0.0, 0.0, -FORCE_MN)),))
+    mesh = box((SIDE_MM,) * 3, (n, n, n), cell_type="tetra", centred=False)
+    body = AdaptiveBody.of(mesh, dynamics, loaded, criterion, max_level=6, bisections=2, interval=1)
+    places, nodes, began = [], [], time.process_time()
+    if criterion is not None:  # the first steps are taken again, on the mesh that they call for
+        body.step(TRIAL_STEPS)
+        body.state = body.prepared.at_rest()
+    for k in range(STEPS):
+        if k == STEPS // 2:
+            body.constrain(Conditions(fixed))
+        body.step(1)
+        points = body.mesh.leaf.mesh.points
+        places.append(body.state.displacement[corners(points)].mean(axis=0))
+        nodes.append(len(points))
+    return np.array(places), nodes, time.process_time() - began
+
+
+def dynamics() -> None:
+    criterion = StressError(50.0, 0.3, 0.016, 0.2 * 0.016, least=80.0)
+    path(4, criterion)  # compiles
+    reference, nodes, time_9 = path(9, None)
+    largest = np.abs(reference).max()
+    print(f"corner path, largest deflection {largest:.2f} mm")
+    print(f"{'mesh':>22s} {'nodes, mean (most)':>20s} {'difference, %':>14s} {'of the time':>12s}")
+    print(f"{'uniform, 9 cubes':>22s} {nodes[0]:20d} {0:14.2f} {1:12.2f}")
+    for name, n, rule in (("uniform, 4 cubes", 4, None), ("adaptive", 4, criterion)):
+        found, nodes, spent = path(n, rule)
+        told = f"{np.mean(nodes):.0f} ({max(nodes)})"
+        print(f"{name:>22s} {told:>20s} {100 * np.abs(found - reference).max() / largest:14.2f} {spent / time_9:12.2f}", flush=True)
+
+
+if __name__ == "__main__":
+    parts = {"rate": rate, "indentation": indentation, "dynamics": dynamics}
+    for chosen in sys.argv[1:] or parts:
+        parts[chosen]()

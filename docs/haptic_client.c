@@ -1,0 +1,63 @@
+/* A haptic device for naibu live --haptics-port 8766. Build: cc -O2 haptic_client.c -o haptic_client -lm (POSIX, little-endian).
+   read_device and set_force stand for the device's own library. */
+#include <arpa/inet.h>
+#include <errno.h>
+#include <math.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/socket.h>
+#include <time.h>
+#include <unistd.h>
+
+struct pose {
+    char magic[4]; uint16_t version, buttons; uint32_t sequence, applied;
+    double time_s, position_mm[3], quaternion[4];
+};
+struct force {
+    char magic[4]; uint16_t version, flags; uint32_t number, sequence;
+    double time_s, force_mn[3], torque_mn_mm[3];
+};
+_Static_assert(sizeof(struct pose) == 80 && sizeof(struct force) == 72, "the packets have no padding");
+
+static double now(void)
+{
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+}
+
+static void read_device(double t, struct pose *p) { p->position_mm[2] = -25.0 * fmin(t / 2.0, 1.0); p->quaternion[0] = 1.0; }
+static void set_force(const double f[3]) { (void)f; }
+
+int main(int argc, char **argv)
+{
+    struct sockaddr_in to = {.sin_family = AF_INET, .sin_port = htons((uint16_t)(argc > 1 ? atoi(argv[1]) : 8766))};
+    double seconds = argc > 2 ? atof(argv[2]) : 10.0, began = now(), due = began, heard = began;
+    struct pose out = {.magic = "NHP1", .version = 1};
+    struct force in, last = {.number = 0};
+    int line = socket(AF_INET, SOCK_DGRAM, 0), answers = 0;
+    to.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+    if (line < 0 || connect(line, (struct sockaddr *)&to, sizeof to)) { perror("naibu"); return 1; }
+    while (due - began < seconds) {
+        while (recv(line, &in, sizeof in, MSG_DONTWAIT) == (ssize_t)sizeof in)
+            if (!memcmp(in.magic, "NHF1", 4) && in.version == 1 && (last.number == 0 || (int32_t)(in.number - last.number) > 0)) {
+                last = in; heard = now(); answers++;                         /* answers that were overtaken are dropped */
+            }
+        if (now() - heard > 0.1) memset(&last, 0, sizeof last);             /* no answer: let go */
+        set_force(last.force_mn);
+        out.sequence++;
+        out.applied = last.number;                                          /* the answer whose force acts */
+        out.time_s = now() - began;
+        read_device(out.time_s, &out);
+        if (send(line, &out, sizeof out, 0) < 0 && errno != ECONNREFUSED) { perror("naibu"); return 1; }
+        due += 1e-3;
+        struct timespec rest = {0, (long)(1e9 * fmax(0.0, due - now()))};
+        nanosleep(&rest, NULL);
+    }
+    printf("%u poses, %d answers, last force %.1f %.1f %.1f mN, flags %u\n", out.sequence, answers, last.force_mn[0],
+           last.force_mn[1], last.force_mn[2], (unsigned)last.flags);
+    close(line);
+    return 0;
+}
