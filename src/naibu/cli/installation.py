@@ -37,6 +37,9 @@ _REQUIRED = {
     "pynrrd": "volumes in NRRD files",
     "tifffile": "volumes in TIFF stacks",
     "lazy-loader": "public names, loaded when first used",
+    "starlette": "the page of naibu live",
+    "uvicorn": "the server of naibu live",
+    "websockets": "the connection between naibu live and its page",
 }
 _OPTIONAL = {
     "openpyxl": "importing marker tables from Excel files",
