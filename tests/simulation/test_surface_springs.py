@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from naibu.core.errors import InputError
-from naibu.meshing import cut_surface
-from naibu.simulation import opened, surface_springs
+from naibu.meshing import SurfaceCutter, cut_surface
+from naibu.simulation import CutSprings, opened, surface_springs
 
 LENGTH, WIDTH, TENSION = 40.0, 20.0, 0.1
 
@@ -72,3 +72,42 @@ def test_pieces_that_nothing_holds_are_refused():
         opened(cut, springs_of(cut), TENSION, cut.points[:, 0] < 1e-9)
     with pytest.raises(InputError, match="membrane_modulus"):
         surface_springs(points, triangles, membrane_modulus=0.0, area_density=1.0)
+
+
+@pytest.mark.parametrize("damping", ["ratio", "printed"])
+def test_springs_updated_during_a_cut_are_those_of_the_cut_surface(damping):
+    points, triangles = strip()
+    points[:, 2] = 2.0 * np.sin(0.2 * points[:, 0])
+    material = {"membrane_modulus": 50.0, "area_density": 1e-6, "damping": damping, "damping_ratio": 0.7}
+    kept = CutSprings(SurfaceCutter(points, triangles, 1.0), **material)
+    for x in np.linspace(3.0, 42.0, 200):  # leaves over an edge
+        kept.move([x, 10.0 + 5.0 * np.sin(0.3 * x), 2.0 * np.sin(0.2 * x)])
+    kept.lift()
+    for y in (-2.0, 22.0):  # crosses the first cut
+        kept.move([20.0, y, 2.0 * np.sin(4.0)])
+    cut = kept.cutter.result()
+    kept.update()
+    found, batch = kept.springs(), surface_springs(cut.points, cut.triangles, **material)
+    order = np.lexsort(found.edges.T[::-1])
+    assert len(cut.triangles) > 300
+    np.testing.assert_array_equal(found.edges[order], batch.edges)
+    for name in ("length", "stiffness", "damping"):
+        np.testing.assert_allclose(getattr(found, name)[order], getattr(batch, name), rtol=1e-12)
+    np.testing.assert_allclose(found.mass, batch.mass, rtol=1e-12)
+
+
+def test_arrays_that_grow_during_a_cut_lose_nothing():
+    points, triangles = strip()
+    kept = CutSprings(SurfaceCutter(points, triangles, 0.04), membrane_modulus=50.0, area_density=1e-6)
+    rows = len(kept.cutter.arrays.triangles)
+    turn = np.linspace(0.0, 3.0 * np.pi, 40)
+    for x, y in np.stack([20.0 + turn * np.cos(turn), 10.0 + turn * np.sin(turn)], axis=1):
+        kept.move([x, y, 0.0])
+    cut = kept.cutter.result()
+    kept.update()
+    assert len(cut.triangles) > rows
+    assert cut.deviation_mm <= 0.02 and cut.missed_mm == 0.0
+    assert cut.areas_mm2.sum() == pytest.approx(LENGTH * WIDTH, rel=1e-12)
+    found, batch = kept.springs(), springs_of(cut)
+    np.testing.assert_allclose(found.mass, batch.mass, rtol=1e-12)
+    np.testing.assert_allclose(found.stiffness[np.lexsort(found.edges.T[::-1])], batch.stiffness, rtol=1e-9)

@@ -13,7 +13,7 @@ from .interactive_bodies import FiniteElementBody, InteractiveBody, LatticeBody
 from .interactive_simulation import Frame, InteractiveSimulation
 from .real_time_loop import RealTimeLoop
 from .simulated_device import SimulatedDevice
-from .surface_springs import SurfaceSprings, opened, surface_springs
+from .surface_springs import CutSprings, SurfaceSprings, opened, surface_springs
 from .virtual_coupling import VirtualCoupling
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "AdaptiveLattice",
     "AdaptiveSolution",
     "Conditions",
+    "CutSprings",
     "DeviceChannel",
     "DeviceForce",
     "DevicePose",

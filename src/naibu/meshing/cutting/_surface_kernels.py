@@ -9,6 +9,8 @@ import numpy as np
 from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray, IntArray
 
+MOST_AROUND = 512  # triangles at a vertex
+
 
 class SurfaceArrays(NamedTuple):
     """Arrays with room to grow."""
@@ -22,8 +24,11 @@ class SurfaceArrays(NamedTuple):
     ends: IntArray  # (v, 2) ends of the edge that a vertex halves, -1 of others
     source: IntArray  # (v,) vertex that a vertex was copied from, itself of others
     parent: IntArray  # (t,) triangle of the surface before that a triangle is a part of
+    sides: IntArray  # (t, 3) number of the edge opposite to each corner; the two lips of a cut have edges of their own
     stamp: IntArray  # (t,)
-    n: IntArray  # (3,) numbers of vertices and triangles, last stamp
+    marked: IntArray  # (t,) 1 for triangles in `touched`
+    touched: IntArray  # (t,) triangles that have changed since this list was emptied
+    n: IntArray  # (5,) numbers of vertices and triangles, last stamp, numbers of edges and of touched triangles
 
 
 @njit(cache=True)
@@ -61,9 +66,17 @@ def corner(s, t, v):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 
 @njit(cache=True)
-def _set(s, t, a, b, c, p, q, r):  # type: ignore[no-untyped-def]  # pragma: no cover
-    s.triangles[t, 0], s.triangles[t, 1], s.triangles[t, 2] = a, b, c
-    s.neighbours[t, 0], s.neighbours[t, 1], s.neighbours[t, 2] = p, q, r
+def _touch(s, t):  # type: ignore[no-untyped-def]  # pragma: no cover
+    if not s.marked[t]:
+        s.marked[t], s.touched[s.n[4]] = 1, t
+        s.n[4] += 1
+
+
+@njit(cache=True)
+def _set(s, t, vertices, neighbours, sides):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for i in range(3):
+        s.triangles[t, i], s.neighbours[t, i], s.sides[t, i] = vertices[i], neighbours[i], sides[i]
+    _touch(s, t)
 
 
 @njit(cache=True)
@@ -79,18 +92,22 @@ def _halve(s, t, i):  # type: ignore[no-untyped-def]  # pragma: no cover
         s.rest[m, k] = 0.5 * (s.rest[b, k] + s.rest[c, k])
         s.position[m, k] = 0.5 * (s.position[b, k] + s.position[c, k])
     s.twin[m], s.source[m], s.ends[m, 0], s.ends[m, 1] = m, m, b, c
-    s.stamp[t2], s.parent[t2] = 0, s.parent[t]
+    s.stamp[t2], s.parent[t2], s.marked[t2] = 0, s.parent[t], 0
+    e0, at_b, at_c = s.sides[t, i], s.sides[t, (i + 1) % 3], s.sides[t, (i + 2) % 3]
+    e1, e2 = s.n[3], s.n[3] + 1  # the second half of the edge, and the edge to the opposite corner
+    s.n[3] += 2 if u < 0 else 3
     if u >= 0:
         j = 0
         while s.triangles[u, j] == b or s.triangles[u, j] == c:
             j += 1
         e, near_c, near_b = s.triangles[u, j], s.neighbours[u, (j + 1) % 3], s.neighbours[u, (j + 2) % 3]
-        s.stamp[u2], s.parent[u2] = 0, s.parent[u]
-        _set(s, u, e, m, b, t, near_c, u2)
-        _set(s, u2, e, c, m, t2, u, near_b)
+        side_c, side_b = s.sides[u, (j + 1) % 3], s.sides[u, (j + 2) % 3]
+        s.stamp[u2], s.parent[u2], s.marked[u2] = 0, s.parent[u], 0
+        _set(s, u, (e, m, b), (t, near_c, u2), (e0, side_c, e2 + 1))
+        _set(s, u2, (e, c, m), (t2, u, near_b), (e1, e2 + 1, side_b))
         _replace(s, near_b, u, u2)
-    _set(s, t, a, b, m, u, t2, beside_c)
-    _set(s, t2, a, m, c, u2, beside_b, t)
+    _set(s, t, (a, b, m), (u, t2, beside_c), (e0, e2, at_c))
+    _set(s, t2, (a, m, c), (u2, beside_b, t), (e1, at_b, e2))
     _replace(s, beside_b, t, t2)
     s.at[m], s.at[c] = t, t2
 
@@ -173,8 +190,10 @@ def swap(s, t, i):  # type: ignore[no-untyped-def]  # pragma: no cover
         return False
     beside_b, beside_c = s.neighbours[t, (i + 1) % 3], s.neighbours[t, (i + 2) % 3]
     near_c, near_b = s.neighbours[u, (j + 1) % 3], s.neighbours[u, (j + 2) % 3]
-    _set(s, t, r, b, e, near_c, u, beside_c)
-    _set(s, u, r, e, c, near_b, beside_b, t)
+    middle, at_b, at_c = s.sides[t, i], s.sides[t, (i + 1) % 3], s.sides[t, (i + 2) % 3]
+    side_c, side_b = s.sides[u, (j + 1) % 3], s.sides[u, (j + 2) % 3]
+    _set(s, t, (r, b, e), (near_c, u, beside_c), (side_c, middle, at_c))
+    _set(s, u, (r, e, c), (near_b, beside_b, t), (side_b, at_b, middle))
     _replace(s, near_c, u, t)
     _replace(s, beside_b, t, u)
     s.at[b], s.at[c], s.at[r], s.at[e] = t, u, t, t
@@ -186,6 +205,7 @@ def _resolve(s, v, around, count):  # type: ignore[no-untyped-def]  # pragma: no
     """Give each group of triangles that still hold together around a vertex a vertex of its own."""
     groups = 0
     for k in range(count):
+        _touch(s, around[k])
         groups += s.neighbours[around[k], (corner(s, around[k], v) + 2) % 3] < 0
     if groups < 2:
         return
@@ -208,7 +228,7 @@ def _resolve(s, v, around, count):  # type: ignore[no-untyped-def]  # pragma: no
 @njit(cache=True)
 def separate(s, a, b):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Part the triangles on the two sides of an edge, and duplicate its ends where that divides the triangles around them."""
-    first, second = np.empty(512, dtype=np.int64), np.empty(512, dtype=np.int64)
+    first, second = np.empty(MOST_AROUND, dtype=np.int64), np.empty(MOST_AROUND, dtype=np.int64)
     n1, n2 = fan(s, a, first)[0], fan(s, b, second)[0]
     if n1 < 0 or n2 < 0 or s.n[0] + 2 >= len(s.at):
         return False
@@ -219,10 +239,30 @@ def separate(s, a, b):  # type: ignore[no-untyped-def]  # pragma: no cover
             u = s.neighbours[t, (i + 2) % 3]
             s.neighbours[t, (i + 2) % 3] = -2
             _replace(s, u, t, -2)
+            s.sides[t, (i + 2) % 3] = s.n[3]
+            s.n[3] += 1
             break
     _resolve(s, a, first, n1)
     _resolve(s, b, second, n2)
     return True
+
+
+@njit(cache=True)
+def number_edges(neighbours, sides):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Fill the numbers of the edges; returns how many there are."""
+    count = 0
+    for t in range(len(neighbours)):
+        for i in range(3):
+            u = neighbours[t, i]
+            if u > t or u < 0:
+                sides[t, i] = count
+                count += 1
+            else:
+                j = 0
+                while neighbours[u, j] != t:
+                    j += 1
+                sides[t, i] = sides[u, j]
+    return count
 
 
 @njit(cache=True)

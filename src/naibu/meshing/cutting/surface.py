@@ -9,7 +9,6 @@ distance of the tool's path; where no edge does, triangles are bisected further.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,45 +16,15 @@ from numpy.typing import ArrayLike
 
 from naibu.core.arrays import FloatArray, IntArray, as_points, as_vector, require_positive
 from naibu.core.errors import InputError
+from naibu.meshing.cutting import _surface_tool_kernels as tool_kernels
 from naibu.meshing.cutting import _surface_walk_kernels as walk
-from naibu.meshing.cutting._surface_kernels import SurfaceArrays
-from naibu.meshing.cutting.surface_input import linked_surface
-from naibu.meshing.cutting.surface_result import SurfaceCut, cut_result
+from naibu.meshing.cutting._surface_kernels import MOST_AROUND, SurfaceArrays, number_edges
+from naibu.meshing.cutting._surface_walk_kernels import ToolArrays
+from naibu.meshing.cutting.surface_input import LinkedSurface, linked_surface
+from naibu.meshing.cutting.surface_result import SurfaceCut, ToolPath, cut_result
 
-SAMPLES = 4  # of the tool's path in one distance
-BESIDE = 1e-6  # of the distance: how far beside its boundary the tool has left the surface
 MOST_TRIANGLES = 5_000_000
-QUEUE = 4096
-
-
-@dataclass(slots=True, eq=False)
-class _Path:
-    """The tool's path on the surface: points, lengths, tips, triangles beneath, and whether the tool is over the surface."""
-
-    points: FloatArray
-    length: FloatArray
-    tips: FloatArray
-    triangle: IntArray
-    over: IntArray  # 1 over the surface, 2 on its boundary, 0 beside
-    count: int = 0
-
-    @classmethod
-    def empty(cls, room: int = 1024) -> _Path:
-        return cls(np.zeros((room, 3)), np.zeros(room), np.zeros((room, 3)), np.zeros(room, dtype=np.int64), np.zeros(room, dtype=np.int64))
-
-    def append(self, point: FloatArray, tip: FloatArray, triangle: int, over: int) -> None:
-        if self.count == len(self.length):
-            for name in ("points", "length", "tips", "triangle", "over"):
-                old = getattr(self, name)
-                setattr(self, name, np.concatenate([old, np.zeros_like(old)]))
-        k = self.count
-        if k:
-            step = float(np.linalg.norm(point - self.points[k - 1]))
-            if step < 1e-9 * max(1.0, float(self.length[k - 1])):
-                return
-            self.length[k] = self.length[k - 1] + step
-        self.points[k], self.tips[k], self.triangle[k], self.over[k] = point, tip, triangle, over
-        self.count += 1
+QUEUE, ROOM = 4096, 4096
 
 
 class SurfaceCutter:
@@ -93,18 +62,14 @@ class SurfaceCutter:
         self.distance_mm, self.refined, self.repairs = float(distance_mm), refined, start.repairs
         self.reach_mm = 2.0 * self.distance_mm if reach_mm is None else require_positive("reach_mm", reach_mm, "mm")
         self._start = start
-        self.arrays = _arrays(start.points, start.triangles, start.neighbours)
-        self._path, self._paths = _Path.empty(), list[_Path]()
-        self._queue = np.zeros(QUEUE, dtype=np.int64)
-        self._now, self._at, self._began = np.array([-1, 0]), np.zeros(1), False
-        self._edges: list[tuple[int, int]] = []
-        self._last, self._left, self._height, self._closing = np.zeros(3), False, 0.0, np.inf
-        self._searched: FloatArray | None = None
+        self.arrays = _arrays(start)
+        self._tool = _tool(self.distance_mm, self.reach_mm, refined)
+        self._paths: list[ToolPath] = []
 
     @property
     def n_steps(self) -> int:
         """Number of edges that were cut."""
-        return len(self._edges)
+        return int(self._tool.whole[walk.EDGES])
 
     def move(self, tip: ArrayLike) -> None:
         """Move the tip of the tool to a position (3,), mm, along a straight line; the cut follows about two distances behind.
@@ -115,149 +80,49 @@ class SurfaceCutter:
             NaN, or a surface that has grown beyond 5 million triangles.
         """
         goal = as_vector("tip", tip)
-        path = self._path
-        if not path.count:
-            self._sample(goal, None)
-            return
-        last = path.tips[path.count - 1].copy()
-        pieces = max(1, int(np.ceil(SAMPLES * float(np.linalg.norm(goal - last)) / self.distance_mm)))
-        for k in range(1, pieces + 1):
-            self._sample(last + k / pieces * (goal - last), int(path.triangle[path.count - 1]) if path.count else None)
-            self._walk(final=False)
+        if tool_kernels.follow(self.arrays, self._tool, goal, False) == walk.FULL:
+            self._with_room(lambda: int(tool_kernels.follow(self.arrays, self._tool, goal, True)))
 
     def lift(self) -> None:
         """Take the tool off: the cut is finished up to where it was."""
-        if self._path.count > 1:
-            self._close()
-            self._walk(final=True)
-            self._paths.append(self._path)
-        self._path, self._began, self._left = _Path.empty(), False, False
-        self._now[:] = (-1, 0)
-        self._at[0], self._searched, self._closing = 0.0, None, np.inf
-
-    def _close(self) -> None:
-        """Where the path ends at its beginning, follow it a little further, so that the cut meets its own beginning."""
-        path, d = self._path, self.distance_mm
-        last = path.count - 1
-        if path.length[last] < 4.0 * d or np.linalg.norm(path.points[last] - path.points[0]) > 0.5 * d:
-            return
-        self._closing = float(path.length[last]) - 2.0 * d
-        for k in range(1, int(np.searchsorted(path.length[: last + 1], 2.0 * d))):
-            path.append(path.points[k].copy(), path.tips[k].copy(), int(path.triangle[k]), int(path.over[k]))
+        whole, count = self._tool.whole, int(self._tool.whole[walk.COUNT])
+        if count > 1:
+            self._grow_tool(2 * count)
+            tool_kernels.close(self._tool)
+            self._with_room(lambda: int(tool_kernels.walk(self.arrays, self._tool, True)))
+            k, count = self._tool, int(whole[walk.COUNT])
+            self._paths.append((k.points[:count].copy(), k.tips[:count].copy(), k.over[:count] > 0))
+        _put_down(self._tool)
 
     def result(self) -> SurfaceCut:
         """Return the surface as it is cut, with the tool lifted."""
         self.lift()
-        paths = [(p.points[: p.count], p.tips[: p.count], p.over[: p.count] > 0) for p in self._paths]
-        edges = np.array(self._edges, dtype=np.int64).reshape(-1, 2)
-        return cut_result(self._start, self.arrays, edges, paths, self.distance_mm)
+        edges = self._tool.edges[: self.n_steps].copy()
+        return cut_result(self._start, self.arrays, edges, self._paths, self.distance_mm)
 
-    def _sample(self, tip: FloatArray, near: int | None) -> None:
-        """Append a position of the tip and the point of the surface beneath it."""
-        s, point, radius = self.arrays, np.zeros(3), 2.0 * self.distance_mm + self._height
-        found: tuple[int, float, float] = (0, 0.0, np.inf)
-        for start in (near, None):  # far from where the tool was, the whole surface is searched
-            if found[2] > self.reach_mm**2 and (start is not None or self._lost(tip)):
-                first = int(walk.nearest_of_all(s, tip)) if start is None else start
-                found = walk.nearest(s, first, tip, radius, True, self._queue, point)
-        beside = found[1] > BESIDE * self.distance_mm or found[2] > self.reach_mm**2
-        self._height = 0.0 if beside else float(np.sqrt(found[2]))
-        at_edge = 2 if found[1] >= 0.0 else 1
-        self._path.append(tip if beside else point, tip, found[0], 0 if beside else at_edge)
-
-    def _lost(self, tip: FloatArray) -> bool:
-        """Whether the whole surface is to be searched: not more often than every distance in which nothing was found."""
-        path = self._path
-        beyond = self._searched is None or float(np.linalg.norm(tip - self._searched)) >= self.distance_mm
-        if beyond or not path.count:
-            self._searched = tip.copy()
-        return beyond or not path.count
-
-    def _walk(self, *, final: bool) -> None:
-        path = self._path
-        if path.count < 2:
-            return
-        while self._now[0] >= 0 or self._enter(final):
-            before = int(self._now[0])
-
-            def step() -> int:
-                s, free = self.arrays, not self.refined
-                return int(walk.advance(s, self._now, self._at, path.points, path.length, path.count, self.distance_mm, final, free))
-
-            code = self._with_room(step, walk.FULL)
-            if code == walk.STEPPED:
-                self._edges.append((before, int(self._now[0])))
-            elif code in (walk.LEFT, walk.STUCK):
-                self._last = self.arrays.position[self._now[0]].copy()
-                self._at[0] += 0.25 * self.distance_mm if code == walk.STUCK else 0.0
-                self._left = code == walk.LEFT
-                self._now[0] = -1
-                if self._at[0] >= self._closing:
-                    return  # the loop is closed
-            else:
-                self._now[0] = -1 if code == walk.ENDED else self._now[0]
-                return
-
-    def _enter(self, final: bool) -> bool:
-        """Find the vertex at which the cut begins, or goes on behind an edge or an earlier cut."""
-        path, d = self._path, self.distance_mm
-        over, length = path.over[: path.count] > 0, path.length[: path.count]
-        while True:
-            ahead = np.flatnonzero(over & (length >= (self._at[0] + 0.5 * d if self._began else 0.0)))
-            if not len(ahead) or (not final and length[-1] - length[ahead[0]] < 2.0 * d):
-                return False
-            k, edge = int(ahead[0]), self._left or bool(path.over[ahead[0]] == 2)
-            target = self._last if self._left else path.points[k]
-            outside = np.flatnonzero(~over[:k] & (length[:k] >= self._at[0] - d))
-            if len(outside):
-                k, edge = int(outside[-1]) + 1, True
-                target = self._crossing(k)
-            low, high = max(float(self._at[0]), float(length[k]) - 2.0 * d), float(length[k]) + d
-            found = self._begin(int(path.triangle[k]), target, low, high, edge)
-            again, self._began = self._began, True
-            least = float(self._at[0]) + 0.1 * d if again else 0.0  # it never goes on behind where it was, so that it comes to an end
-            if found >= 0:
-                self._now[:] = (found, 0)
-                beside = walk.on_path(path.points, path.length, path.count, self.arrays.position[found], low, high)[1]
-                self._at[0] = max(least, beside)
-                return True
-            self._at[0] = max(least, float(self._at[0]) + 0.1 * d, float(length[k]))
-            self._left = False  # the next try begins inside
-
-    def _begin(self, triangle: int, target: FloatArray, low: float, high: float, edge: bool) -> int:
-        path, d = self._path, self.distance_mm
-
-        def begin() -> int:
-            found = walk.begin(
-                self.arrays, triangle, target, path.points, path.length, path.count, low, high, d, edge, not self.refined, self._queue
-            )
-            return int(found)
-
-        return self._with_room(begin, walk.NO_ROOM)
-
-    def _crossing(self, k: int) -> FloatArray:
-        """Where the path comes over the surface between its points k - 1 and k, by bisection."""
-        path, point = self._path, np.zeros(3)
-        outside, inside = path.points[k - 1].copy(), path.points[k].copy()
-        for _ in range(20):
-            middle = 0.5 * (outside + inside)
-            _, beside, _ = walk.nearest(self.arrays, int(path.triangle[k]), middle, self.reach_mm, False, self._queue, point)
-            if beside > BESIDE * self.distance_mm:
-                outside = middle
-            else:
-                inside = middle
-        return np.asarray(inside)
-
-    def _with_room(self, attempt: Callable[[], int], full: int) -> int:
-        while (code := attempt()) == full:
+    def _with_room(self, attempt: Callable[[], int]) -> None:
+        """Repeat what stopped because the arrays are full, with longer ones."""
+        while attempt() == walk.FULL:
             if 2 * len(self.arrays.triangles) > MOST_TRIANGLES:
                 raise InputError(
                     f"distance_mm is {self.distance_mm:g} mm, for which the surface would need more than {MOST_TRIANGLES} triangles; "
                     "choose a larger one"
                 )
-            room: list[Any] = [*(_grown(a, len(a)) for a in self.arrays[:-1]), self.arrays.n]
-            self.arrays = SurfaceArrays(*room)
-        return code
+            s, k = self.arrays, self._tool
+            full = min(len(s.at) - int(s.n[0]), len(s.parent) - int(s.n[1])) < ROOM
+            if full:
+                self.arrays = SurfaceArrays(*[*(_grown(a, len(a)) for a in s[:-1]), s.n])
+            self._grow_tool(int(k.whole[walk.COUNT]) + 1)
+            if not full and self._tool.edges is k.edges and self._tool.length is k.length:
+                raise InputError(f"the surface has a vertex with more than {MOST_AROUND} triangles; remesh it")
+
+    def _grow_tool(self, points: int) -> None:
+        """Make room for so many points of the path, and for further edges."""
+        k = self._tool
+        more = max(0, points - len(k.length), len(k.length) if points > len(k.length) else 0)
+        path: list[Any] = [_grown(a, more) if more else a for a in k[:5]]
+        edges = _grown(k.edges, len(k.edges)) if 2 * self.n_steps > len(k.edges) else k.edges
+        self._tool = ToolArrays(*[*path, edges, *k[6:]])
 
 
 def cut_surface(
@@ -304,11 +169,33 @@ def _grown(array: IntArray | FloatArray, more: int) -> Any:
     return np.concatenate([array, np.zeros((more, *array.shape[1:]), dtype=array.dtype)])
 
 
-def _arrays(points: FloatArray, triangles: IntArray, neighbours: IntArray) -> SurfaceArrays:
+def _tool(distance_mm: float, reach_mm: float, refined: bool) -> ToolArrays:
+    def whole(*shape: int) -> IntArray:
+        return np.zeros(shape, dtype=np.int64)
+
+    numbers, real = whole(walk.SAMPLED + 1), np.zeros(walk.BEGIN + 3)
+    numbers[walk.FREE], real[walk.DISTANCE], real[walk.REACH] = not refined, distance_mm, reach_mm
+    tool = ToolArrays(
+        np.zeros((ROOM, 3)), np.zeros(ROOM), np.zeros((ROOM, 3)), whole(ROOM), whole(ROOM), whole(ROOM, 2), whole(QUEUE),
+        whole(MOST_AROUND), numbers, real,
+    )  # fmt: skip
+    _put_down(tool)
+    return tool
+
+
+def _put_down(tool: ToolArrays) -> None:
+    """Set the state of a tool that begins another cut."""
+    tool.whole[[walk.COUNT, walk.AT_BOUNDARY, walk.BEGAN, walk.LEFT_BEFORE, walk.SEARCHED]] = 0
+    tool.whole[walk.NOW], tool.real[walk.AT], tool.real[walk.CLOSING] = -1, 0.0, np.inf
+
+
+def _arrays(start: LinkedSurface) -> SurfaceArrays:
+    points, triangles, neighbours, _ = start
     n, t = len(points), len(triangles)
-    at = np.zeros(n, dtype=np.int64)
+    at, sides = np.zeros(n, dtype=np.int64), np.full((t, 3), -1, dtype=np.int64)
     at[triangles.ravel()] = np.repeat(np.arange(t), 3)
-    own, none = np.arange(n), np.full((n, 2), -1, dtype=np.int64)
-    rows = [points, points, triangles, neighbours, at, own, none, own, np.arange(t), np.zeros(t, dtype=np.int64)]
+    own, none, zero = np.arange(n), np.full((n, 2), -1, dtype=np.int64), np.zeros(t, dtype=np.int64)
+    edges = int(number_edges(neighbours, sides))
+    rows = [points, points, triangles, neighbours, at, own, none, own, np.arange(t), sides, zero, zero, zero]
     room: list[Any] = [_grown(np.ascontiguousarray(a), len(a) // 2 + 20_000) for a in rows]
-    return SurfaceArrays(*[*room, np.array([n, t, 0])])
+    return SurfaceArrays(*[*room, np.array([n, t, 0, edges, 0])])

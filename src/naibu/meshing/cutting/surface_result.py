@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.meshing.cutting._surface_kernels import SurfaceArrays
-from naibu.meshing.cutting._surface_walk_kernels import on_path
+from naibu.meshing.cutting._surface_search_kernels import distances_from_edges, distances_from_path
 from naibu.meshing.cutting.surface_input import LinkedSurface
 
 PARTS = 8  # of an edge at whose ends its distance from the path is measured
@@ -46,6 +46,8 @@ class SurfaceCut:
         For each contact of the tool: its path on the surface (m, 3), mm, the tip (m, 3), mm, and whether it was over the surface (m,).
     deviation_mm : float
         Largest distance of the cut from the path of the tool on the surface; 0 if there is no cut.
+    mean_deviation_mm : float
+        Mean distance of the cut from the path, mm.
     missed_mm : float
         Length of the path over the surface with no cut within the distance: nowhere did an edge lead on there; mm.
     repairs : tuple of str
@@ -62,6 +64,7 @@ class SurfaceCut:
     cut_edges: FloatArray
     paths: tuple[ToolPath, ...]
     deviation_mm: float
+    mean_deviation_mm: float
     missed_mm: float
     repairs: tuple[str, ...]
 
@@ -135,32 +138,34 @@ def cut_result(before: LinkedSurface, s: SurfaceArrays, edges: IntArray, paths: 
     cut_edges = s.position[edges]
     return SurfaceCut(
         points, triangles, s.parent[:t].copy(), s.ends[:n].copy(), s.source[:n].copy(), rank[label], lips, cut_edges, tuple(paths),
-        _deviation(cut_edges, paths), _missed(cut_edges, paths, distance_mm), before.repairs,
+        *_deviations(cut_edges, paths), _missed(cut_edges, paths, distance_mm), before.repairs,
     )  # fmt: skip
 
 
-def _deviation(edges: FloatArray, paths: Sequence[ToolPath]) -> float:
+def _deviations(edges: FloatArray, paths: Sequence[ToolPath]) -> tuple[float, float]:
+    """Largest and mean distance (over its length) of the cut from the path, mm."""
     if not len(edges):
-        return 0.0
+        return 0.0, 0.0
     share = np.linspace(0.0, 1.0, PARTS + 1)[:, None, None]
     places = ((1.0 - share) * edges[:, 0] + share * edges[:, 1]).reshape(-1, 3)
     gap = np.full(len(places), np.inf)
     for points, _, _ in paths:
         length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-        found = [on_path(points, length, len(points), np.ascontiguousarray(q), 0.0, float(length[-1]))[0] for q in places]
-        gap = np.minimum(gap, found)
-    return float(gap.max())
+        gap = np.minimum(gap, distances_from_path(np.ascontiguousarray(points), length, places))
+    weights = np.full(PARTS + 1, 1.0 / PARTS)
+    weights[[0, -1]] *= 0.5  # the trapezoidal rule
+    mean = weights @ gap.reshape(PARTS + 1, -1)
+    return float(gap.max()), float(np.average(mean, weights=np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)))
 
 
 def _missed(edges: FloatArray, paths: Sequence[ToolPath], distance_mm: float) -> float:
     missed = 0.0
+    numbers = np.arange(2 * len(edges)).reshape(-1, 2)
     for points, _, over in paths:
         step = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        for k in np.flatnonzero(over[1:] & over[:-1]):
-            e = edges[:, 1] - edges[:, 0]
-            f = np.clip(((points[k] - edges[:, 0]) * e).sum(axis=1) / (e * e).sum(axis=1), 0.0, 1.0)[:, None]
-            gap = np.linalg.norm(points[k] - edges[:, 0] - f * e, axis=1).min(initial=np.inf)
-            missed += float(step[k]) if gap > distance_mm else 0.0
+        inside = np.flatnonzero(over[1:] & over[:-1])
+        gap = distances_from_edges(np.ascontiguousarray(edges.reshape(-1, 3)), numbers, np.ascontiguousarray(points[inside]))
+        missed += float(step[inside][gap > distance_mm].sum())
     return missed
 
 
