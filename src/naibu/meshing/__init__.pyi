@@ -1,3 +1,4 @@
+from .cutting.forest_cut import ForestCut, cut_forest, forest_pieces
 from .cutting.surface import SurfaceCutter, cut_surface
 from .cutting.surface_result import Groove, SurfaceCut, groove
 from .cutting.swept_blade import SweptBlade, blade_poses, swept_blade
@@ -19,6 +20,7 @@ __all__ = [
     "BisectionForest",
     "Boundary",
     "EdgeStretch",
+    "ForestCut",
     "Groove",
     "LeafMesh",
     "Location",
@@ -37,12 +39,14 @@ __all__ = [
     "boundary_nodes",
     "box",
     "box_from_coordinates",
+    "cut_forest",
     "cut_surface",
     "cut_volume",
     "cylinder",
     "doerfler_marks",
     "face_normals",
     "faces_towards",
+    "forest_pieces",
     "groove",
     "half_ellipsoid",
     "hemisphere",

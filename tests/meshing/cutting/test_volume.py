@@ -12,7 +12,7 @@ from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.rigid_transform import RigidTransform, rotation_matrix
 from naibu.meshing import SweptBlade, VolumeCut, blade_poses, box, cut_volume, signed_volumes, swept_blade
-from naibu.meshing.cutting.separation import face_pairs
+from naibu.meshing.quality import smallest_dihedral_angle
 
 SIZE = 20.0
 
@@ -36,9 +36,8 @@ def check(before: Mesh, cut: VolumeCut, distance: float) -> None:
     assert volume(cut.mesh) == pytest.approx(volume(before), rel=1e-12)
     assert signed_volumes(cut.mesh).min() > 0.0
     assert cut.deviation_mm <= 0.5 * distance
-    pairs = face_pairs(cut.mesh.cells)  # conforming: no face of more than two cells
-    neighbours = np.bincount(pairs.cells.ravel(), minlength=cut.mesh.n_cells)
-    assert neighbours.max() <= 4
+    faces = np.sort(cut.mesh.cells[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
+    assert np.unique(faces, axis=0, return_counts=True)[1].max() <= 2  # conforming: no face of more than two cells
     # the cells of a piece, and no others, share nodes across faces; two pieces share none
     for piece in range(cut.n_pieces):
         own = np.unique(cut.mesh.cells[cut.piece == piece])
@@ -154,6 +153,88 @@ def test_any_cut_keeps_volume_quality_and_distance(x: float, tilt: float, until_
     assert cut.smallest_angle_deg > 15.0
 
 
+@st.composite
+def blades(draw: st.DrawFn) -> SweptBlade:
+    """A straight edge that moves and turns at random, through the cube or not, in two to four poses."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    poses = draw(st.integers(2, 4))
+    start, way = np.array([0.0, 0.0, 10.0]) + rng.uniform(-12.0, 12.0, 3), rng.normal(size=3)
+    edge = np.cross(way, rng.normal(size=3))
+    edge /= np.linalg.norm(edge)
+    length, turns = rng.uniform(5.0, 40.0), rng.normal(scale=0.3, size=(poses, 3))
+    centres = start + np.cumsum(rng.uniform(2.0, 10.0, poses))[:, None] * way / np.linalg.norm(way)
+    edges = edge + turns * np.arange(poses)[:, None]
+    return swept_blade(centres[:, None] + 0.5 * length * np.array([-1.0, 1.0])[:, None] * edges[:, None])
+
+
+@settings(max_examples=15, deadline=None)
+@given(blades(), blades(), st.sampled_from([2.5, 4.0]))
+def test_two_random_blades_that_may_cross(first: SweptBlade, second: SweptBlade, distance: float) -> None:
+    mesh = cube(3)
+    once = cut_volume(mesh, first, distance)
+    check(mesh, once, distance)
+    twice = cut_volume(once.mesh, second, distance)
+    check(once.mesh, twice, distance)
+    assert min(once.smallest_angle_deg, twice.smallest_angle_deg) > 15.0
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([2.0, 4.0, 6.0]))
+def test_a_plane_through_a_cube_leaves_two_pieces_and_no_splinter(seed: int, distance: float) -> None:
+    rng = np.random.default_rng(seed)
+    (u, v, normal), centre = np.linalg.qr(rng.normal(size=(3, 3)))[0].T, np.array([0.0, 0.0, 10.0]) + rng.uniform(-6.0, 6.0, 3)
+    cut = cut_volume(cube(), swept_blade(centre + 60.0 * np.array([[-u - v, v - u], [u - v, u + v]])), distance)
+    check(cube(), cut, distance)
+    assert cut.n_pieces == 2
+    side = (cut.mesh.points[cut.mesh.cells].mean(axis=1) - centre) @ normal
+    for piece in (0, 1):  # cells of a piece that lie wholly beyond the tolerance are on one side of the plane
+        signs = np.sign(side[(cut.piece == piece) & (np.abs(side) > distance)])
+        assert len(np.unique(signs)) <= 1
+
+
+@pytest.mark.parametrize("thickness", [2.4, 1.2])
+def test_slices_that_are_thinner_than_a_cell_are_cut_off(thickness: float) -> None:
+    mesh = box((SIZE, SIZE, SIZE), (2, 2, 2), cell_type="tetra")  # centres of cells lie 2.5 mm and more inside
+    cut = cut_volume(mesh, plane(10.0 - thickness), 1.5)
+    check(mesh, cut, 1.5)
+    assert cut.n_pieces == 2
+    assert abs(signed_volumes(cut.mesh)[cut.piece == 1].sum() / SIZE**2 - thickness) < 0.75
+
+
+def test_a_blade_that_goes_back_along_its_cut_has_cut() -> None:
+    there = [[[1.0, y, -5.0], [1.0, y, 25.0]] for y in (-15.0, 15.0)]
+    assert cut_volume(cube(), swept_blade(there + there[::-1]), 3.0).n_pieces == 2
+    assert cut_volume(cube(), swept_blade(there + there[::-1] + there), 3.0).n_pieces == 2
+
+
+def test_the_smallest_dihedral_angle_on_cubes_is_45_degrees_however_fine_the_cut() -> None:
+    # of Kuhn's tetrahedra and of both other classes of similar cells that bisection makes of them (Maubach 1995)
+    for divisions, distance in ((2, 6.0), (4, 3.0), (4, 1.2)):
+        mesh = box((SIZE, SIZE, SIZE), (divisions, divisions, divisions), cell_type="tetra")
+        assert cut_volume(mesh, plane(0.3, tilt=0.3), distance).smallest_angle_deg == pytest.approx(45.0, abs=1e-6)
+
+
+@settings(max_examples=5, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_angles_on_irregular_meshes_stay_above_a_tenth_of_those_before(seed: int) -> None:
+    mesh = cube()
+    inside = (np.abs(mesh.points - [0.0, 0.0, 10.0]) < 9.0).all(axis=1)
+    points = mesh.points + np.where(inside[:, None], np.random.default_rng(seed).uniform(-1.2, 1.2, mesh.points.shape), 0.0)
+    moved = Mesh(points, mesh.cells, "tetra", mesh.regions, mesh.region_names)
+    cut = cut_volume(moved, plane(0.3, tilt=0.3), 2.0)
+    check(moved, cut, 2.0)
+    assert cut.smallest_angle_deg >= 0.1 * smallest_dihedral_angle(points, mesh.cells)
+
+
+def test_a_cut_that_would_lose_quality_is_refused() -> None:
+    mesh = cube()
+    points, cells = mesh.points.copy(), mesh.cells.copy()
+    with pytest.raises(InputError, match=r"45 degrees would be made, less than 46; choose a larger distance.*The mesh is as it was"):
+        cut_volume(mesh, plane(0.3, tilt=0.3), 1.5, least_angle_deg=46.0)
+    np.testing.assert_array_equal(mesh.points, points)
+    np.testing.assert_array_equal(mesh.cells, cells)
+
+
 def test_poses_carry_the_edge() -> None:
     poses = [RigidTransform.of(rotation_matrix(np.array([0.0, 0.0, a])), (0.0, 0.0, 1.0)) for a in (0.0, np.pi / 2)]
     np.testing.assert_allclose(blade_poses([[1.0, 0, 0], [2.0, 0, 0]], poses)[1], [[0, 1, 1], [0, 2, 1]], atol=1e-12)
@@ -180,3 +261,10 @@ def test_what_cannot_be_cut_is_refused() -> None:
     twice = Mesh.from_arrays(mesh.points, np.concatenate([mesh.cells, mesh.cells[:1], mesh.cells[:1]]), "tetra")
     with pytest.raises(InputError, match="share"):
         cut_volume(twice, plane(), 10.0)
+    alone = Mesh.from_arrays(mesh.points[mesh.cells[0]], [[0, 1, 2, 3], [0, 1, 2, 3]], "tetra")
+    with pytest.raises(InputError, match="cells 0 and 1 have the same nodes"):
+        cut_volume(alone, plane(), 1.0)
+    lost = mesh.points.copy()
+    lost[3] = np.nan
+    with pytest.raises(InputError, match="1 of 125 nodes are not finite"):
+        cut_volume(mesh, plane(), 2.0, positions=lost)

@@ -1,4 +1,4 @@
-"""Kernels: crossings of segments and triangles that are counted consistently at shared edges, and distances from triangles."""
+"""Kernels: crossings of segments and triangles, consistent at shared edges, and distances from triangles."""
 
 from __future__ import annotations
 
@@ -25,37 +25,35 @@ def _beside(p, q, points, i, j):  # type: ignore[no-untyped-def]  # pragma: no c
 
 
 @njit(cache=True)
-def crossings(starts, ends, points, triangles, low, high, count, above):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Count the triangles that every segment crosses; `low` and `high` are the boxes of the triangles.
+def crosses(p, q, points, triangles, low, high):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return 0 where the segment from p to q crosses no triangle, else which end sees the last one counterclockwise: 1 if p, -1 if q does.
 
-    A segment through an edge or a vertex of a surface crosses one of its triangles, as the signs of zero volumes are agreed on. `above`
-    says whether a segment starts on the side from which the last triangle that it crosses is seen counterclockwise.
+    `low` and `high` are the boxes of the triangles.
+    A segment through an edge or a vertex of a surface crosses one of its triangles, as the signs of zero volumes are agreed on.
     """
-    lowest, highest = np.empty(3), np.empty(3)
-    for k in range(3):
-        lowest[k], highest[k] = low[:, k].min(), high[:, k].max()
-    for s in range(len(starts)):
-        p, q = starts[s], ends[s]
-        out = False
+    side = 0
+    for t in range(len(triangles)):
+        apart = False
         for k in range(3):
-            out |= min(p[k], q[k]) > highest[k] or max(p[k], q[k]) < lowest[k]
-        if out:
+            apart |= min(p[k], q[k]) > high[t, k] or max(p[k], q[k]) < low[t, k]
+        if apart:
             continue
-        for t in range(len(triangles)):
-            apart = False
-            for k in range(3):
-                apart |= min(p[k], q[k]) > high[t, k] or max(p[k], q[k]) < low[t, k]
-            if apart:
-                continue
-            a, b, c = triangles[t]
-            before = _volume(points[a], points[b], points[c], p) >= 0.0
-            behind = _volume(points[a], points[b], points[c], q) >= 0.0
-            if before == behind:
-                continue
-            first = _beside(p, q, points, a, b)
-            if first == _beside(p, q, points, b, c) and first == _beside(p, q, points, c, a):
-                count[s] += 1
-                above[s] = not before
+        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        before = _volume(points[a], points[b], points[c], p) >= 0.0
+        behind = _volume(points[a], points[b], points[c], q) >= 0.0
+        if before == behind:
+            continue
+        first = _beside(p, q, points, a, b)
+        if first == _beside(p, q, points, b, c) and first == _beside(p, q, points, c, a):
+            side = -1 if before else 1
+    return side
+
+
+@njit(cache=True)
+def crossed_segments(starts, ends, points, triangles, low, high, side):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """What `crosses` says of every segment."""
+    for s in range(len(starts)):
+        side[s] = crosses(starts[s], ends[s], points, triangles, low, high)
 
 
 @njit(cache=True)
@@ -91,19 +89,25 @@ def _square_distance(p, a, b, c):  # type: ignore[no-untyped-def]  # pragma: no 
 
 
 @njit(cache=True)
+def distance(p, points, triangles, low, high):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Distance of a point from the nearest triangle."""
+    best = np.inf
+    for t in range(len(triangles)):
+        gap = 0.0
+        for k in range(3):
+            beyond = max(low[t, k] - p[k], p[k] - high[t, k], 0.0)
+            gap += beyond * beyond
+        if gap < best:
+            a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+            best = min(best, _square_distance(p, points[a], points[b], points[c]))
+    return np.sqrt(best)
+
+
+@njit(cache=True)
 def distances(queries, points, triangles, low, high, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Distance of every query point from the nearest triangle."""
     for i in range(len(queries)):
-        p, best = queries[i], np.inf
-        for t in range(len(triangles)):
-            gap = 0.0
-            for k in range(3):
-                beyond = max(low[t, k] - p[k], p[k] - high[t, k], 0.0)
-                gap += beyond * beyond
-            if gap < best:
-                a, b, c = triangles[t]
-                best = min(best, _square_distance(p, points[a], points[b], points[c]))
-        out[i] = np.sqrt(best)
+        out[i] = distance(queries[i], points, triangles, low, high)
 
 
 @njit(cache=True)

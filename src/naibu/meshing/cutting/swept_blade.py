@@ -32,6 +32,12 @@ class SweptBlade:
     triangles: IntArray
 
     @property
+    def arrays(self) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
+        """What the kernels read: points, triangles, and the lowest and highest corners (t, 3) of the boxes of the triangles."""
+        corners = self.points[self.triangles]
+        return self.points, self.triangles, corners.min(axis=1), corners.max(axis=1)
+
+    @property
     def extent_mm(self) -> float:
         """Largest edge of the box around the surface, mm."""
         return float(np.ptp(self.points, axis=0).max())

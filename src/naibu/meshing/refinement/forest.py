@@ -370,6 +370,14 @@ class BisectionForest:
         ends = self._arrays[2][nodes, :2].astype(np.int64)
         return MeshChange(refined, nodes, ends, parents, patches, np.stack([first, first + 1], axis=1))
 
+    def copied(self) -> BisectionForest:
+        """Return a copy."""
+        return BisectionForest(self.dimension, self.region_names, self.n_roots, _copied(self._arrays))
+
+    def become(self, other: BisectionForest) -> None:
+        """Take over the cells and vertices of a copy, which is not used any more."""
+        self._arrays = other._arrays
+
     @property
     def arrays(self) -> _Arrays:
         """What the kernels change; see `naibu.meshing.refinement._forest_kernels`."""
@@ -394,6 +402,11 @@ def _grown(array: AnyArray, more: int) -> AnyArray:
     out = np.empty((len(array) + max(more, len(array)), *array.shape[1:]), dtype=array.dtype)
     out[: len(array)] = array
     return out
+
+
+def _copied(arrays: _Arrays) -> _Arrays:
+    cells, points, nodes, table, leaves, counters = arrays
+    return cells.copy(), points.copy(), nodes.copy(), table.copy(), leaves.copy(), counters.copy()
 
 
 def _table_size(n_nodes: int) -> int:

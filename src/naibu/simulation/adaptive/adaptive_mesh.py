@@ -10,6 +10,8 @@ import numpy as np
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
+from naibu.meshing.cutting.forest_cut import ForestCut, cut_forest
+from naibu.meshing.cutting.swept_blade import SweptBlade
 from naibu.meshing.refinement.forest import BisectionForest, LeafMesh, MeshChange
 from naibu.meshing.refinement.marking import Criterion
 from naibu.meshing.refinement.transfer import transferred_cells, transferred_motion, transferred_nodes
@@ -102,6 +104,32 @@ class AdaptiveMesh:
         self.leaf = forest.leaf_mesh()
         nodes, cells = self.leaf.nodes, self.leaf.cells
         return MeshState(nodal[nodes], velocity[nodes], mass[nodes], cell_mass[cells], history[cells])
+
+    def cut(self, state: MeshState, blade: SweptBlade, distance_mm: float) -> tuple[MeshState, ForestCut]:
+        """Cut the deformed mesh along the surface that a blade has swept; return the state behind the cut, and the cut.
+
+        Vertices are doubled with displacement and velocity, masses follow from the cells on each side.
+
+        Raises
+        ------
+        InputError
+            What `naibu.meshing.cut_forest` refuses; the mesh is then as it was.
+        """
+        forest, leaf = self.forest, self.leaf
+        displacement = _scattered(state.displacement, leaf.nodes, forest.node_rows)
+        velocity = _scattered(state.velocity, leaf.nodes, forest.node_rows)
+        cell_mass, history = (_scattered(v, leaf.cells, forest.cell_rows) for v in (state.cell_mass, state.history))
+        found = cut_forest(forest, blade, distance_mm, positions=forest.points + displacement)
+        nodal = [found.nodal(forest, values) for values in (displacement, velocity)]
+        self.leaf = forest.leaf_mesh()
+        nodes, cells = self.leaf.nodes, self.leaf.cells
+        of_cell = found.cellwise(forest, cell_mass, extensive=True)[cells]
+        corners = self.leaf.mesh.cells
+        mass = np.bincount(corners.ravel(), np.repeat(of_cell / corners.shape[1], corners.shape[1]), minlength=len(nodes)).astype(
+            np.float64
+        )
+        behind = MeshState(nodal[0][nodes], nodal[1][nodes], mass, of_cell, found.cellwise(forest, history)[cells])
+        return behind, found
 
     def _changes(self, refine: IntArray, coarsen: IntArray) -> Iterator[MeshChange]:
         """Refine, then coarsen what is still a leaf, and yield each change when it has happened."""

@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
+from naibu.meshing.cutting.forest_cut import ForestCut
+from naibu.meshing.cutting.swept_blade import SweptBlade
 from naibu.meshing.refinement.marking import Criterion
 from naibu.simulation.adaptive.adaptive_mesh import AdaptiveMesh, MeshState
 from naibu.simulation.adaptive.conditions import Conditions
@@ -170,6 +172,28 @@ class AdaptiveBody:
         """Refine and coarsen cells of given numbers in the forest, whatever the criterion; return whether the mesh changed."""
         wanted = (np.asarray(cells, dtype=np.int64) for cells in (refine, coarsen))
         return self._follow(self.mesh.changed(self._mesh_state(), *wanted))
+
+    def cut(self, blade: SweptBlade, distance_mm: float) -> ForestCut:
+        """Cut the body, as it is deformed now, along the surface that a blade has swept; the next step is that of the cut body.
+
+        Displacements, velocities, history variables and regions are kept, and with them momentum; pieces that come loose move on as bodies
+        of their own, and the mesh is refined and coarsened further.
+
+        Parameters
+        ----------
+        blade : SweptBlade
+            The surface; it may end inside the body.
+        distance_mm : float
+            See `naibu.meshing.cut_forest`.
+
+        Raises
+        ------
+        InputError
+            Triangles, or what `naibu.meshing.cut_forest` refuses; the body is then as it was.
+        """
+        state, found = self.mesh.cut(self._mesh_state(), blade, distance_mm)
+        self._follow(state)
+        return found
 
     def constrain(self, conditions: Conditions) -> None:
         """Replace supports and loads from the next step on.

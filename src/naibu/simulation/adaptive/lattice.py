@@ -16,6 +16,8 @@ from naibu.mechanics.lattices.cpu.session import LatticeSession
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
 from naibu.mechanics.lattices.model.state import STEP_S, ConstrainedNodes, LatticeState, Method
 from naibu.mechanics.lattices.model.tetrahedral_springs import DampingRule, edge_damping, mesh_edges
+from naibu.meshing.cutting.forest_cut import ForestCut
+from naibu.meshing.cutting.swept_blade import SweptBlade
 from naibu.meshing.refinement.marking import Criterion
 from naibu.simulation.adaptive.adaptive_mesh import AdaptiveMesh, MeshState
 from naibu.simulation.adaptive.conditions import Conditions
@@ -240,6 +242,28 @@ class AdaptiveLattice:
         """Refine and coarsen cells of given numbers in the forest, whatever the criterion; return whether the mesh changed."""
         wanted = (np.asarray(cells, dtype=np.int64) for cells in (refine, coarsen))
         return self._follow(self.mesh.changed(self._mesh_state(), *wanted))
+
+    def cut(self, blade: SweptBlade, distance_mm: float) -> ForestCut:
+        """Cut the lattice, as it is deformed now, along the surface that a blade has swept; the next step is that of the cut lattice.
+
+        Springs, masses and dampings of each side follow from its tetrahedra, so that mass and momentum are conserved; pieces that come
+        loose move on as bodies of their own, and the mesh is refined and coarsened further.
+
+        Parameters
+        ----------
+        blade : SweptBlade
+            The surface; it may end inside the lattice.
+        distance_mm : float
+            See `naibu.meshing.cut_forest`.
+
+        Raises
+        ------
+        InputError
+            What `naibu.meshing.cut_forest` refuses; the lattice is then as it was.
+        """
+        state, found = self.mesh.cut(self._mesh_state(), blade, distance_mm)
+        self._follow(state)
+        return found
 
     def constrain(self, conditions: Conditions) -> None:
         """Replace supports and loads from the next step on.

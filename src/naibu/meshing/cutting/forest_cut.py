@@ -1,0 +1,282 @@
+"""Cutting of bisection forests by the swept surface of a blade: refine near the surface, then separate cells along their faces.
+
+Two neighbours are separated where the segment between their centres crosses the surface. Cells beside such faces are bisected first, until
+the faces lie within half of a given distance of the surface; so are cells in which the surface parts the centre from a vertex that is on no
+such face and farther from it, so that slices which are thinner than a cell are cut off. Around every vertex of these faces, cells that are
+joined by other faces keep one vertex; each other group of cells gets a copy. So no cell hangs on another by a mere edge or vertex, a cut
+may end inside the body, where the vertices of its front have one group, and cuts may cross. The forest is kept: leaves keep number, parent,
+level and tag, so that it can be refined and coarsened further; bisections that the cut runs through are not undone any more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from naibu.core.arrays import AnyArray, FloatArray, IntArray, require_positive, require_shape
+from naibu.core.errors import InputError
+from naibu.meshing.cutting import _separation_kernels as kernels
+from naibu.meshing.cutting._crossing_kernels import distances
+from naibu.meshing.cutting.swept_blade import SweptBlade
+from naibu.meshing.quality import smallest_dihedral_angle
+from naibu.meshing.refinement._forest_kernels import COUNT, FLIPPED, LEAF, NODES
+from naibu.meshing.refinement.forest import BisectionForest, MeshChange
+from naibu.meshing.refinement.transfer import transferred_cells, transferred_nodes
+
+KernelBlade = tuple[FloatArray, IntArray, FloatArray, FloatArray]
+_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])  # face k is opposite to vertex k, counterclockwise from outside
+ROUNDS = 60  # of bisection at most
+MOST_CELLS = 20_000_000
+LEAST_ANGLE = 0.1  # of the smallest dihedral angle of the cells that are bisected; bisection keeps about a fifth of it
+SPLINTER = 4  # cells of a piece that is not cut off where all of it lies as near to the blade as its cut faces may
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ForestCut:
+    """A cut of a bisection forest, and how the forest comes from that before.
+
+    Attributes
+    ----------
+    changes : tuple of MeshChange
+        Refinements near the blade, in their order.
+    copies : ndarray, shape (k, 2), int64
+        Vertices that were doubled, and their copies.
+    faces : ndarray, shape (f, 4), int64
+        New surface: cell above the blade, place in it of the vertex opposite to the face, and the same of the cell below.
+    deviation_mm : float
+        Largest distance of a vertex of the new surface from the blade.
+    smallest_angle_deg : float
+        Smallest dihedral angle of the cells that are new; of all cells, where none is.
+    """
+
+    changes: tuple[MeshChange, ...]
+    copies: IntArray
+    faces: IntArray
+    deviation_mm: float
+    smallest_angle_deg: float
+
+    def nodal(self, forest: BisectionForest, values: FloatArray) -> FloatArray:
+        """Return nodal values (rows, ...) from those before the cut, by numbers in the forest; new nodes have the mean of their edge."""
+        values = values.copy()
+        for change in self.changes:
+            values = transferred_nodes(forest, change, values)
+        return np.asarray(_extended(values, forest.node_rows, self.copies))
+
+    def cellwise(self, forest: BisectionForest, values: FloatArray, *, extensive: bool = False) -> FloatArray:
+        """Return values of cells (rows, ...) from those before the cut, by numbers in the forest; see `naibu.meshing.transferred_cells`."""
+        values = values.copy()
+        for change in self.changes:
+            values = transferred_cells(forest, change, values, extensive=extensive)
+        return values
+
+
+def cut_forest(
+    forest: BisectionForest,
+    blade: SweptBlade,
+    distance_mm: float,
+    *,
+    positions: FloatArray | None = None,
+    least_angle_deg: float | None = None,
+) -> ForestCut:
+    """Cut the leaves of a forest of tetrahedra along the surface that a blade has swept.
+
+    Parameters
+    ----------
+    forest : BisectionForest
+        Of tetrahedra; changed.
+    blade : SweptBlade
+        The surface; it may end inside the body.
+    distance_mm : float
+        Twice the largest distance that the new surface may have from the blade: near it, cells are bisected until it has.
+    positions : ndarray, shape (node_rows, 3), optional
+        Where the vertices are while the blade passes, mm; by default in the reference configuration.
+    least_angle_deg : float, optional
+        The cut is refused where it would make cells with a smaller dihedral angle; by default a tenth of the smallest one of the cells that
+        are bisected.
+
+    Raises
+    ------
+    InputError
+        Triangles, inverted cells, positions that are not finite, a distance that is not positive or larger than the body, or so small that
+        the mesh would grow beyond 20 million cells or would need cells of lower quality. The forest is then as it was.
+    """
+    where = forest.points.copy() if positions is None else np.array(positions, dtype=float)
+    _require_cuttable(forest, where, distance_mm)
+    before = forest.copied()
+    try:
+        return _cut(forest, blade, distance_mm, where, least_angle_deg)
+    except BaseException:
+        forest.become(before)
+        raise
+
+
+def _cut(forest: BisectionForest, blade: SweptBlade, distance_mm: float, where: FloatArray, least_angle_deg: float | None) -> ForestCut:
+    changes: list[MeshChange] = []
+    gap = np.full(forest.node_rows, -1.0)
+    surface, centres = blade.arrays, np.empty((0, 3))
+    for _ in range(ROUNDS):
+        if len(centres) < forest.cell_rows:
+            centres = np.empty((2 * forest.cell_rows, 3))
+        faces = _crossed(forest, surface, where, centres)
+        coarse = _too_coarse(forest, faces, where, surface, centres, 0.5 * distance_mm, gap)
+        if not len(coarse):
+            break
+        if forest.n_cells + 2 * len(coarse) > MOST_CELLS:
+            raise _too_fine(distance_mm)
+        changes.append(forest.refine(coarse))
+        where = transferred_nodes(forest, changes[-1], where)
+        gap = np.concatenate([gap, np.full(forest.node_rows - len(gap), -1.0)])
+        gap[changes[-1].nodes] = -1.0
+    else:
+        raise _too_fine(distance_mm)
+    angle = _quality(forest, changes, distance_mm, least_angle_deg)
+    faces = _opened(forest, faces, centres, blade, 0.5 * distance_mm)
+    _, deviation = kernels.too_coarse(forest.arrays[0], faces, where, surface, np.inf, gap, np.empty(0, dtype=np.int64))
+    return ForestCut(tuple(changes), _separated(forest, faces), faces, float(deviation), angle)
+
+
+def _extended(values: AnyArray, rows: int, copies: IntArray) -> AnyArray:
+    """Return nodal values (rows, ...) in which copies (k, 2) have the values of what they are copies of."""
+    if len(values) < rows:
+        values = np.concatenate([values, np.zeros((rows - len(values), *values.shape[1:]), values.dtype)])
+    values[copies[:, 1]] = values[copies[:, 0]]
+    return values
+
+
+def forest_pieces(forest: BisectionForest) -> IntArray:
+    """Return the number of the piece of every leaf (n_cells,), in the order of `BisectionForest.leaf_mesh`, the largest volume first."""
+    label = np.full(forest.cell_rows, -1, dtype=np.int64)
+    count = int(kernels.components(forest.arrays[0], forest.arrays[4], forest.n_cells, label, np.empty(forest.n_cells, dtype=np.int64)))
+    cells = np.sort(forest.leaves())
+    rank = np.empty(count, dtype=np.int64)
+    rank[np.argsort(-np.bincount(label[cells], forest.volumes(cells)), kind="stable")] = np.arange(count)
+    return np.asarray(rank[label[cells]])
+
+
+def _crossed(forest: BisectionForest, surface: KernelBlade, where: FloatArray, centres: FloatArray) -> IntArray:
+    """Faces (f, 4) of leaves that the blade crosses; fills in the centres of all leaves."""
+    found = np.empty((4096, 4), dtype=np.int64)
+    while (size := kernels.crossed_faces(forest.arrays[0], forest.arrays[4], forest.n_cells, where, surface, centres, found)) > len(found):
+        found = np.empty((2 * size, 4), dtype=np.int64)
+    return found[:size]
+
+
+def _too_coarse(
+    forest: BisectionForest,
+    faces: IntArray,
+    where: FloatArray,
+    surface: KernelBlade,
+    centres: FloatArray,
+    tolerance: float,
+    gap: FloatArray,
+) -> IntArray:
+    """Leaves to bisect: beside faces too far from the blade, or with vertices that the blade parts from them where no face does."""
+    cells, leaves, beside = forest.arrays[0], forest.arrays[4], np.empty(2 * len(faces), dtype=np.int64)
+    size, _ = kernels.too_coarse(cells, faces, where, surface, tolerance, gap, beside)
+    within = np.empty(1024, dtype=np.int64)
+    while True:
+        touched = np.zeros(forest.node_rows, dtype=np.int8)
+        count = kernels.unresolved(cells, leaves, forest.n_cells, faces, where, surface, centres, tolerance, gap, touched, within)
+        if count <= len(within):
+            return np.concatenate([beside[:size], within[:count]])
+        within = np.empty(count, dtype=np.int64)
+
+
+def _opened(forest: BisectionForest, faces: IntArray, centres: FloatArray, blade: SweptBlade, near_mm: float) -> IntArray:
+    """Open faces, but not those around splinters: few cells that would be cut off though the blade only grazes them."""
+    cells = forest.arrays[0]
+    kernels.set_open(cells, faces, -1)
+    small = kernels.small_pieces(cells, faces, SPLINTER)
+    if not small.any():
+        return faces
+    label = np.full(forest.cell_rows, -1, dtype=np.int64)
+    kernels.components(cells, forest.arrays[4], forest.n_cells, label, np.empty(forest.n_cells, dtype=np.int64))
+    leaves = forest.leaves()
+    closed = np.zeros(len(faces), dtype=bool)
+    for piece in np.unique(label[faces[:, ::2]][small]):
+        own = leaves[label[leaves] == piece]
+        gap = np.empty(len(own))
+        distances(centres[own], *blade.arrays, gap)
+        if gap.max() > near_mm:
+            continue
+        of_piece = label[faces[:, ::2]] == piece
+        beside = of_piece.any(axis=1) & ~small.all(axis=1)  # not those towards other splinters
+        if not beside.any():
+            continue
+        across = np.where(of_piece[:, 0], label[faces[:, 2]], label[faces[:, 0]])
+        area = np.bincount(across[beside], _areas(forest, faces[beside]))
+        closed |= beside & (across == int(area.argmax()))
+    kernels.set_open(cells, faces[closed], 0)
+    return faces[~closed]
+
+
+def _areas(forest: BisectionForest, faces: IntArray) -> FloatArray:
+    corners = forest.points[face_vertices(forest, faces[:, 0], faces[:, 1])]
+    return np.asarray(0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1))
+
+
+def face_vertices(forest: BisectionForest, cells: IntArray, places: IntArray) -> IntArray:
+    """Return the vertices (f, 3) of faces of cells opposite to their vertices at places, counterclockwise seen from outside the cell."""
+    corners: IntArray = forest.simplices[cells].astype(np.int64)[np.arange(len(cells))[:, None], _FACES[places]]
+    turned = forest.arrays[0][cells, FLIPPED] == 1
+    corners[turned] = corners[turned][:, ::-1]
+    return corners
+
+
+def _separated(forest: BisectionForest, faces: IntArray) -> IntArray:
+    """Double the vertices of open faces, and return them with their copies (k, 2)."""
+    touched, slot = np.zeros(forest.node_rows, dtype=np.int8), np.full(forest.cell_rows, -1, dtype=np.int64)
+    around, group, count = kernels.corner_groups(forest.arrays[0], forest.arrays[4], forest.n_cells, faces, touched, slot)
+    first, source = forest.node_rows, np.empty(int(count), dtype=np.int64)
+    forest.reserve(int(count))
+    cells, points, nodes, _, _, counters = forest.arrays
+    counters[[NODES, COUNT]] += int(count)
+    kernels.double_vertices(cells, points, nodes, around, group, touched, first, source)
+    return np.stack([source, first + np.arange(len(source))], axis=1)
+
+
+def _quality(forest: BisectionForest, changes: list[MeshChange], distance_mm: float, least_angle_deg: float | None) -> float:
+    """Smallest dihedral angle of the leaves that refinement made, of all leaves where it made none.
+
+    Raises
+    ------
+    InputError
+        It is smaller than it may be.
+    """
+    if not changes:
+        return smallest_dihedral_angle(forest.points, forest.simplices[forest.leaves()])
+    split, made = (np.concatenate(parts) for parts in zip(*((c.parents, c.children.ravel()) for c in changes), strict=True))
+    angle = smallest_dihedral_angle(forest.points, forest.simplices[made[forest.children[made] == LEAF]])
+    least = least_angle_deg
+    if least is None:
+        least = LEAST_ANGLE * smallest_dihedral_angle(forest.points, forest.simplices[np.setdiff1d(split, made)])
+    if angle < least:
+        raise InputError(
+            f"distance_mm is {distance_mm:g} mm, for which cells with a dihedral angle of {angle:.3g} degrees would be made, less than "
+            f"{least:.3g}; choose a larger distance, or mend the mesh near the blade. The mesh is as it was"
+        )
+    return angle
+
+
+def _too_fine(distance_mm: float) -> InputError:
+    return InputError(
+        f"distance_mm is {distance_mm:g} mm, for which the mesh would need more than {MOST_CELLS} cells or {ROUNDS} bisections; choose a "
+        "larger one. The mesh is as it was"
+    )
+
+
+def _require_cuttable(forest: BisectionForest, where: FloatArray, distance_mm: float) -> None:
+    if forest.dimension != 3:
+        raise InputError("cutting needs a forest of tetrahedra, not of triangles")
+    require_shape("positions", where, (forest.node_rows, 3))
+    require_positive("distance_mm", distance_mm, "mm")
+    used = where[forest.node_used]
+    if not np.isfinite(used).all():
+        raise InputError(f"positions of {int((~np.isfinite(used)).any(axis=1).sum())} of {len(used)} nodes are not finite")
+    extent = float(np.ptp(used, axis=0).max())
+    if distance_mm > extent:
+        raise InputError(f"distance_mm is {distance_mm:g} mm, larger than the body of {extent:.4g} mm; choose a fraction of an element")
+    bad = int(kernels.inverted(forest.arrays[0], forest.arrays[4], forest.n_cells, where))
+    if bad >= 0:
+        raise InputError(f"cell {bad} is inverted or has no volume where the blade passes; mend the mesh, or cut a state with less strain")
