@@ -1,4 +1,4 @@
-from . import core, datasets, identification, imaging, io, mechanics, meshing, simulation, validation, workflows
+from . import applications, core, datasets, identification, imaging, io, mechanics, meshing, simulation, validation, workflows
 from .core.displacement_field import DisplacementField
 from .core.experiment import Experiment
 from .core.markers import Markers
@@ -19,6 +19,7 @@ __all__ = [
     "Markers",
     "Mesh",
     "Volume",
+    "applications",
     "compare",
     "core",
     "datasets",

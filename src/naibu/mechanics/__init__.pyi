@@ -57,6 +57,8 @@ from .linear_algebra.multigrid import MultigridSolver, rigid_body_modes
 from .linear_algebra.protocols import Factorization, LinearSolver
 from .linear_algebra.solver_selection import choose_solver
 from .prescribed_motion import PrescribedMotion
+from .small_strain.anisotropic_body import AnisotropicBody
+from .small_strain.cubic_elasticity import CubicCrystal, crystal_frame, miller_indices, silicon
 from .small_strain.dynamics import Series, simulate_motion
 from .small_strain.implicit_integrators import MotionState
 from .small_strain.linear_elasticity import LinearBody
@@ -65,11 +67,13 @@ from .small_strain.sensitivities import MaterialChange, SeriesDerivatives, simul
 from .small_strain.supports import Support
 
 __all__ = [
+    "AnisotropicBody",
     "Assembler",
     "BlockPattern",
     "ConstrainedNodes",
     "Contact",
     "ContactMotion",
+    "CubicCrystal",
     "DynamicEngine",
     "DynamicSession",
     "DynamicState",
@@ -129,6 +133,7 @@ __all__ = [
     "capsule_indenter",
     "choose_solver",
     "classic_lattice",
+    "crystal_frame",
     "cylinder_geometry",
     "cylindrical_indenter",
     "direct_solver",
@@ -144,6 +149,7 @@ __all__ = [
     "maxwell",
     "mesh_geometry",
     "mesh_indenter",
+    "miller_indices",
     "octree_lattice",
     "per_region",
     "plane_geometry",
@@ -156,6 +162,7 @@ __all__ = [
     "rigid_contact",
     "run_study",
     "sensitivities",
+    "silicon",
     "simulate_motion",
     "simulate_motion_with_derivatives",
     "simulate_viscoelastic",

@@ -1,0 +1,5 @@
+"""Uses of mechanics and imaging: the silicon chip that senses force and moment."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,43 @@
+from .sensing_chip.bridge import closed_form_sensitivities, crosstalk, decoupled, half_bridge, sensitivity_matrix
+from .sensing_chip.chip_mesh import ChipMesh, ChipResolution, chip_mesh
+from .sensing_chip.closed_forms import CrossBeam, orthotropic_torsion_stiffness
+from .sensing_chip.design import ChipDesign, assumed_chip
+from .sensing_chip.design_study import DesignStudy, pareto_front, study_designs
+from .sensing_chip.electronics import Readout, report_readout
+from .sensing_chip.filters import RampKalman, first_order_filter, forward_backward_filter
+from .sensing_chip.finite_elements import ChipResponse, solve_chip
+from .sensing_chip.load_envelope import largest_stress, load_envelope, load_limits, require_bearable
+from .sensing_chip.piezoresistance import Piezoresistance, doping_factor, n_type_silicon, p_type_silicon
+
+__all__ = [
+    "ChipDesign",
+    "ChipMesh",
+    "ChipResolution",
+    "ChipResponse",
+    "CrossBeam",
+    "DesignStudy",
+    "Piezoresistance",
+    "RampKalman",
+    "Readout",
+    "assumed_chip",
+    "chip_mesh",
+    "closed_form_sensitivities",
+    "crosstalk",
+    "decoupled",
+    "doping_factor",
+    "first_order_filter",
+    "forward_backward_filter",
+    "half_bridge",
+    "largest_stress",
+    "load_envelope",
+    "load_limits",
+    "n_type_silicon",
+    "orthotropic_torsion_stiffness",
+    "p_type_silicon",
+    "pareto_front",
+    "report_readout",
+    "require_bearable",
+    "sensitivity_matrix",
+    "solve_chip",
+    "study_designs",
+]

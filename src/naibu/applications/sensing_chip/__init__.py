@@ -1,0 +1,1 @@
+"""Cross-beam silicon chip that senses a force and two moments: mechanics, piezoresistance, electronics, load limits and design."""
