@@ -294,6 +294,18 @@ def test_fehlberg_keeps_its_tolerance() -> None:
     assert errors[0] < 1e-3 and errors[1] < 1e-6 and found[0].steps < found[1].steps
 
 
+def test_rejected_steps_do_not_loosen_the_error_control_of_a_stiff_body() -> None:
+    # the first attempt is a hundred times too long; its end was once the measure of the errors of all later steps
+    body, free, floor = small_block()
+    stiff = three_element(30.0, 20.0, 200.0, 0.3)
+    plate = Support("plate", free[:1], motion=PrescribedMotion.through([0.0, 0.05], [[0.0, 0.0], [0.0, -0.5]]))
+    implicit, explicit = (
+        simulate_motion(body, stiff, 1e-3, [floor, plate], [0.0, 0.05], step=step, method=method)
+        for method, step in (("sdirk2", 2.5e-4), ("rkf45", None))
+    )
+    np.testing.assert_allclose(explicit.final.displacement, implicit.final.displacement, atol=1e-4)
+
+
 def push(**changes: object) -> Series:
     body, _, floor = small_block()
     options: dict[str, object] = {"density": 1.0, "supports": [floor], "times": [0.0, 1.0]}

@@ -117,9 +117,12 @@ class RungeKuttaFehlberg(Explicit):
             h = min(self._length, until - t)
             last = t + h >= until - 1e-12 * span
             with np.errstate(over="ignore", invalid="ignore"):
-                end, error = self._attempt(phase, state, t, h, y, last)
+                end, error, largest = self._attempt(phase, state, t, h, y, last)
             if not error > 1.0:  # also where nothing moves; an overflow makes it infinite
                 t, y = (until if last else t + h), end
+                self._largest = (
+                    largest  # of accepted steps only: a rejected one may be far too large, and would loosen the tolerance for good
+                )
                 self.steps += 1
             else:
                 self.rejected += 1
@@ -130,7 +133,10 @@ class RungeKuttaFehlberg(Explicit):
                 raise ConvergenceError(f"Runge-Kutta-Fehlberg needs steps below {self._length:.2g} s at {t:g} s; use 'sdirk2'")
         return self._state(phase, until, y)
 
-    def _attempt(self, phase: Phase, state: MotionState, t: float, h: float, y: FloatArray, last: bool) -> tuple[FloatArray, float]:
+    def _attempt(
+        self, phase: Phase, state: MotionState, t: float, h: float, y: FloatArray, last: bool
+    ) -> tuple[FloatArray, float, FloatArray]:
+        """Return the state after a step of length `h`, its error in units of the tolerance, and the largest magnitudes up to there."""
         stages: list[FloatArray] = []
         for c, row in zip(_FEHLBERG_TIMES, _FEHLBERG, strict=True):
             at = y + h * sum((w * k for w, k in zip(row, stages, strict=True)), np.zeros_like(y))
@@ -138,13 +144,14 @@ class RungeKuttaFehlberg(Explicit):
         k = np.array(stages)
         end, error = y + h * (_FOURTH @ k), np.abs(h * ((_FIFTH - _FOURTH) @ k))
         if not np.isfinite(end).all():
-            return y, np.inf
+            return y, np.inf, self._largest
         n, m = state.displacement.size, len(state.trace)
         blocks = [slice(0, n), slice(n, 2 * n), slice(2 * n, 2 * n + m), slice(2 * n + m, -1)]
         size = np.array([max(np.abs(y[b]).max(), np.abs(end[b]).max()) for b in blocks])
-        self._largest = size if len(self._largest) == 0 else np.maximum(size, self._largest)
-        worst = [error[b].max() / largest for b, largest in zip(blocks, self._largest, strict=True) if largest > 0.0]
-        return end, max(worst, default=0.0) / self.tolerance
+        if len(self._largest):
+            size = np.maximum(size, self._largest)
+        worst = [error[b].max() / largest for b, largest in zip(blocks, size, strict=True) if largest > 0.0]
+        return end, max(worst, default=0.0) / self.tolerance, size
 
 
 def _packed(state: MotionState) -> FloatArray:
