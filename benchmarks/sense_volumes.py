@@ -34,6 +34,7 @@ Array = NDArray[Any]
 TISSUES = {
     "limb": {"skin+fat": (1, 2), "muscle": (3, 6), "bone": (4, 5)},
     "gel": {"soft": (1,), "hard": (2,)},
+    "thorax": {"soft": (1,), "lung": (2,), "bone": (3,)},
 }
 CHI_SQUARED_95 = 7.815  # three degrees of freedom
 ABLATION = {
@@ -92,6 +93,23 @@ def second_body(case: dict[str, Array]) -> dict[str, Array]:
     return case | {key: np.maximum(case[key], np.roll(body, shift, 0)) for key, shift in (("ref", 0), ("deformed", 4))}
 
 
+def dark_background(case: dict[str, Array]) -> dict[str, Array]:
+    """A fifth of z zero, as the air about the object in both scans is, without noise."""
+    air = {key: np.where(ndimage.gaussian_filter(case[key].astype(np.float32), 1.0) < 80.0, 0.0, case[key]) for key in ("ref", "deformed")}
+    return cropped(2, 0.0)(case | air)
+
+
+def blurred_noise(case: dict[str, Array]) -> dict[str, Array]:
+    """Two textures that have nothing to do with each other, in the outline of the object."""
+    rng = np.random.default_rng(4)
+
+    def texture() -> Array:
+        values = ndimage.gaussian_filter(rng.standard_normal(case["ref"].shape), 1.5)
+        return np.where(case["mask"], 500.0 + 80.0 * values / values.std(), 0.0) + 12.0 * rng.standard_normal(values.shape)
+
+    return case | {key: texture().astype(np.float32) for key in ("ref", "deformed")}
+
+
 def noise_alone(case: dict[str, Array]) -> dict[str, Array]:
     """Two volumes of noise."""
     rng = np.random.default_rng(3)
@@ -103,12 +121,17 @@ CONDITIONS: dict[str, Callable[[dict[str, Array]], dict[str, Array]]] = {
     "as it is": dict,
     "3x noise": noisier,
     "bias 30 %": biased,
-    "20 % of x zero": cropped(0, 0.0),
-    "20 % of y NaN": cropped(1, np.nan),
-    "20 % of z zero, 1st scan": cropped(2, 0.0, "ref", 0),
+    **{
+        f"20 % of {axis} {fill}, {scan} scan": cropped("xyz".index(axis), value, key, end)
+        for scan, key, ends in (("2nd", "deformed", (1, 0, 1)), ("1st", "ref", (0, 1, 0)))
+        for axis, end in zip("xyz", ends, strict=True)
+        for fill, value in (("zero", 0.0), ("NaN", np.nan))
+    },
+    "20 % of z zero, as the air is": dark_background,
     "thick slices": thick,
     "second body": second_body,
     "noise alone": noise_alone,
+    "unrelated textures": blurred_noise,
 }
 
 
@@ -155,7 +178,7 @@ def show(name: str, case: dict[str, Array], settings: CorrelationSettings, progr
             reference, deformed, settings=settings, progress=(lambda report: print("   ", report, flush=True)) if progress else None
         )
     except InputError as error:
-        print(f"{name:26s} refused: {error}", flush=True)
+        print(f"{name:30s} refused: {error}", flush=True)
         return
     wall, busy = time.perf_counter() - wall, time.process_time() - busy
     s = score(case, found)
@@ -163,7 +186,7 @@ def show(name: str, case: dict[str, Array], settings: CorrelationSettings, progr
     tissues = "  ".join(f"{tissue} {v:.3f}" for tissue, v in s["tissues"].items())
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(
-        f"{name:26s} {shown}   {tissues}   {s['gradient']:.4f}   {s['covered']:6.1%}   {s['measured']:6.1%}   {wall:6.1f} ({busy:.1f}) s"
+        f"{name:30s} {shown}   {tissues}   {s['gradient']:.4f}   {s['covered']:6.1%}   {s['measured']:6.1%}   {wall:6.1f} ({busy:.1f}) s"
         f"   {peak:.0f} MB",
         flush=True,
     )
@@ -178,7 +201,7 @@ def main() -> None:
     arguments = parser.parse_args()
     compile_all()
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
-    print("                           mean / median / 95 %, mm   tissues, mm   gradient   covered   measured   wall (processor)   peak")
+    print("                               mean / median / 95 %, mm   tissues, mm   gradient   covered   measured   wall (processor)   peak")
     cases = [dict(np.load(path)) for path in arguments.cases]
     for k, case in enumerate(cases):
         meta = json.loads(str(case["meta"]))
@@ -186,8 +209,9 @@ def main() -> None:
         if arguments.conditions is not None:
             for name in arguments.conditions or CONDITIONS:
                 show(name, CONDITIONS[name](case), ABLATION["default"], arguments.progress)
-            if len(cases) > 1:
-                show("another object", case | {"deformed": cases[(k + 1) % len(cases)]["deformed"]}, ABLATION["default"], False)
+            other = cases[(k + 1) % len(cases)]["deformed"]
+            if len(cases) > 1 and other.shape == case["ref"].shape:
+                show("another object", case | {"deformed": other}, ABLATION["default"], False)
             continue
         for name, settings in (ABLATION if arguments.ablation else {"default": ABLATION["default"]}).items():
             show(name, case, settings, arguments.progress)

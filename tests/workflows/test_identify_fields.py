@@ -17,7 +17,7 @@ from naibu.core.volume import Volume
 from naibu.io.displacement_fields import write_field
 from naibu.io.images import read_volume, write_volume
 from naibu.validation.specimens.quadratic_body import QuadraticBody, Solved
-from naibu.workflows.identify_fields import block_mesh, blurred, identify_fields, parse_known_zones
+from naibu.workflows.identify_fields import block_mesh, blurred, identify_fields, parse_known_zones, table_of_assumptions
 
 SD_MM = 0.04
 
@@ -59,7 +59,23 @@ def test_a_zone_is_identified_on_the_grid_of_the_scan(folder: Path) -> None:
     assert (sd.values[labels.values == 1] > 0.0).all() and not modulus.values[labels.values == 0].any()
     numbers = json.loads((folder / "out" / "identification.json").read_text())
     assert numbers["verdict"]["explanation"] == "explained" and numbers["zones"][0]["zone"] == "gel"
-    assert "Young&#x27;s modulus" in (folder / "out" / "report.html").read_text()
+    page = (folder / "out" / "report.html").read_text()
+    assert "Young&#x27;s modulus" in page and "Moduli under other assumptions" in page
+
+
+def test_what_the_other_law_would_give_stands_next_to_the_moduli(folder: Path) -> None:
+    """To first order what the other law gives when it is used: within four tenths of the difference."""
+    options = {"zones": folder / "labels.mha", "known": ["label 2=10 kPa, 0.4"], "element_size_mm": 10.0}
+    linear = identify_fields(folder / "field.h5", law="linear", **options)  # type: ignore[arg-type]
+    finite = identify_fields(folder / "field.h5", law="neo_hookean", **options)  # type: ignore[arg-type]
+    told = {row[0]: row for row in table_of_assumptions(linear).rows}["with a neo-Hookean law at finite strain"]
+    young, other = float(linear.estimate.young_modulus[0]), float(finite.estimate.young_modulus[0])
+    assert told[2] == pytest.approx(other, abs=0.4 * abs(other - young))
+    low, high = linear.estimate.intervals()[0][0]
+    assert told[4] == ("yes" if low <= float(str(told[2])) <= high else "no")
+    assert ("label 1 would leave the interval" in " ".join(linear.notes)) == any(
+        row[4] == "no" for row in table_of_assumptions(linear).rows
+    )
 
 
 def test_the_command_line_takes_fields(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -74,7 +90,7 @@ def test_the_command_line_takes_fields(folder: Path, monkeypatch: pytest.MonkeyP
 
     assert run("--zone-name", "pad=2", "--known", "pad=10 kPa, 0.4") == 0
     said = capsys.readouterr().out
-    assert "Explained" in said and "gel: Young's modulus" in " ".join(said.split())
+    assert "other assumptions" in said and "Explained" in said and "gel: Young's modulus" in " ".join(said.split())
     assert (folder / "out" / "report.html").exists()
     assert run("--zone-name", "pad=7", "--known", "pad=10 kPa", "--overwrite") == 2
     assert "--zone-name names label 7" in " ".join(capsys.readouterr().err.split())

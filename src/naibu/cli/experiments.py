@@ -136,7 +136,7 @@ def _identify_fields(
     out: Path,
     overwrite: bool,
 ) -> None:
-    from naibu.workflows.identify_fields import identify_fields, table_of_zones
+    from naibu.workflows.identify_fields import identify_fields, table_of_assumptions, table_of_zones
 
     if law != "neo_hookean":
         raise InputError(f"law={law!r} is not known for fields; use 'neo_hookean'")
@@ -155,9 +155,9 @@ def _identify_fields(
     usable = result.estimate.verdict is None or result.estimate.verdict.ok
     for number, line in enumerate(result.notes):
         say(line, "dim" if number else "bold" if usable else "bold red")
-    table = table_of_zones(result)
-    if table.rows:
-        print_table(table.title, table.columns, [tuple(_figure(v) if isinstance(v, float) else v for v in row) for row in table.rows])
+    for table in (table_of_zones(result), table_of_assumptions(result)):
+        if table.rows:
+            print_table(table.title, table.columns, [tuple(_figure(v) if isinstance(v, float) else v for v in row) for row in table.rows])
     say(f"{time.perf_counter() - began:.0f} s. Results in {out}: open report.html.")
     if not usable:
         say("The model does not explain the data: the results are marked as not to be used.", "bold red")

@@ -11,6 +11,7 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import ndimage
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.displacement_field import DisplacementField
@@ -26,7 +27,7 @@ from naibu.imaging.feature_matching.correlation_matching import candidate_matche
 from naibu.imaging.feature_matching.harris import interest_points
 from naibu.imaging.feature_matching.relaxation_labelling import PotentialMatches, relaxed
 from naibu.imaging.feature_matching.scattered_interpolation import dense_from_sparse, sparse_displacement
-from naibu.imaging.preprocessing.field_of_view import fields_of_view
+from naibu.imaging.preprocessing.field_of_view import fields_of_view, in_box
 from naibu.imaging.preprocessing.object_mask import mask_in_view, mask_jumps
 from naibu.imaging.preprocessing.resampling import require_mask, resampled_to_grid
 from naibu.imaging.preprocessing.rigid_registration import rigid_from_points, total_displacement
@@ -135,12 +136,16 @@ def measure_displacement(
     if method != "default":
         _require_measured(reference, deformed)
     if mask is None:
-        inside = mask_in_view(reference, fields_of_view(reference, deformed)[0])
+        view = fields_of_view(reference, deformed)[0]
+        inside = mask_in_view(reference, view)
         doubts = _mask_doubts(inside)
+        # the surface has much of the contrast
+        compared = ndimage.binary_dilation(inside, mask=in_box(view, reference.shape))
     else:
         inside, doubts = require_mask(mask, reference), ()
+        compared = inside
     if method == "default":
-        found = _correlated(reference, deformed, inside, (None if mask is None else inside, deformed_mask), progress)
+        found = _correlated(reference, deformed, inside, (compared, deformed_mask), progress)
     else:
         found = _by_classic_method(reference, deformed, method, inside, progress)
     return replace(found, warnings=doubts + found.warnings)
@@ -260,10 +265,9 @@ def _correlated(
     reference: Volume,
     deformed: Volume,
     inside: BoolArray,
-    masks: tuple[BoolArray | None, ArrayLike | None],
+    masks: tuple[BoolArray, ArrayLike | None],
     progress: Progress | None,
 ) -> MeasuredDisplacement:
-    # without a mask the correlation takes one that includes the surface, which has much of the contrast
     found = correlate_volumes(reference, deformed, mask=masks[0], deformed_mask=masks[1], progress=progress)
     unconverged, cells = int((~found.converged).sum()), int(np.isfinite(found.cell_covariance[..., 0, 0]).sum())
     facts: dict[str, float | int | str] = {

@@ -22,6 +22,7 @@ from naibu.core.volume import Volume
 from naibu.identification.from_fields.estimate import FieldEstimate, identify_field
 from naibu.identification.from_fields.field_laws import LawName
 from naibu.identification.from_fields.load_cases import KNOWN, FieldLoadCase, Zones
+from naibu.identification.from_fields.sensitivities import young_and_poisson
 from naibu.io.displacement_fields import read_field
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
@@ -301,7 +302,7 @@ def moduli_of_cells(found: FieldEstimate) -> tuple[FloatArray, FloatArray, Float
 
 
 def table_of_zones(result: FieldIdentification) -> Table:
-    """Return the table of moduli with their intervals."""
+    """Return the table of moduli with their intervals, which take the law as given."""
     found = result.estimate
     rows: list[tuple[Cell, ...]] = []
     unit = "multiples of the known zone" if result.relative else "kPa"
@@ -312,6 +313,25 @@ def table_of_zones(result: FieldIdentification) -> Table:
             rows.append((name, e, *map(float, young[i]), nu, *map(float, poisson[i])))
     columns = ("zone", f"Young's modulus, {unit}", "95 % from", "to", "Poisson's ratio", "of which 95 % from", "up to")
     return Table("Moduli", columns, tuple(rows))
+
+
+def table_of_assumptions(result: FieldIdentification) -> Table:
+    """Return what Young's modulus and Poisson's ratio would be under other assumptions: other known values, the other law."""
+    found = result.estimate
+    rows: list[tuple[Cell, ...]] = []
+    if found.uncertainty is not None:
+        inside = found.intervals()[0]
+        for one in found.assumptions:
+            young, poisson = young_and_poisson(found.theta + one.theta)
+            for name, e, nu, (low, high) in zip(found.zones.names, young, poisson, inside, strict=True):
+                rows.append((one.text, name, float(e), float(nu), "yes" if low <= e <= high else "no"))
+    unit = "multiples of the known zone" if result.relative else "kPa"
+    columns = ("other assumption", "zone", f"Young's modulus, {unit}", "Poisson's ratio", "modulus within the interval above")
+    return Table("Moduli under other assumptions", columns, tuple(rows))
+
+
+def _as_records(table: Table) -> list[dict[str, Cell]]:
+    return [dict(zip(table.columns, row, strict=True)) for row in table.rows]
 
 
 def _written(
@@ -334,14 +354,15 @@ def _written(
             Overlay(f"standard deviation of Young's modulus, {unit}", np.where(sd > 0.0, sd, np.nan) + outside),
             Overlay("Poisson's ratio", poisson + outside),
         ],
-        tables=[table_of_zones(result)],
+        tables=[t for t in (table_of_zones(result), table_of_assumptions(result)) if t.rows],
         origin_mm=inside.origin_mm @ inside.direction,
     )
     verdict = found.verdict
     numbers = {
         "naibu": __version__,
         "verdict": None if verdict is None else {"explanation": verdict.explanation, "sentence": verdict.sentence},
-        "zones": [dict(zip(table_of_zones(result).columns, row, strict=True)) for row in table_of_zones(result).rows],
+        "zones": _as_records(table_of_zones(result)),
+        "other_assumptions": _as_records(table_of_assumptions(result)),
         "noise_factor": found.noise_factor,
         "in_words": list(result.notes),
         "steps": list(found.steps),

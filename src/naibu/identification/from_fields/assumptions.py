@@ -73,8 +73,20 @@ def covariance_of(found: tuple[Assumption, ...], size: int) -> FloatArray:
     return out
 
 
-def effects(found: tuple[Assumption, ...], zones: Zones, theta: FloatArray) -> tuple[str, ...]:
-    """Say what other assumptions would do to Young's modulus and Poisson's ratio of the zones, at most three zones each."""
+def effects(found: tuple[Assumption, ...], zones: Zones, theta: FloatArray, within: FloatArray) -> tuple[str, ...]:
+    """Say what other assumptions would do to the moduli of the zones, at most three zones each, and where that leaves their intervals.
+
+    Parameters
+    ----------
+    found : tuple of Assumption
+        From `assumptions`.
+    zones : Zones
+        Their names.
+    theta : ndarray, shape (2 count,)
+        Logarithms of the moduli.
+    within : ndarray, shape (count, 2)
+        Intervals of Young's modulus, kPa.
+    """
     young, poisson = young_and_poisson(theta)
     lines = []
     for one in found:
@@ -83,8 +95,14 @@ def effects(found: tuple[Assumption, ...], zones: Zones, theta: FloatArray) -> t
             f"{name} {100 * (a / b - 1):+.2g} %, Poisson's ratio {c - d:+.2g}"
             for name, a, b, c, d in zip(zones.names[:3], other, young, ratio, poisson, strict=False)
         ]
-        lines.append(f"{one.text[0].upper()}{one.text[1:]}, Young's modulus would change: {'; '.join(rows)}.")
+        out = [name for name, e, (low, high) in zip(zones.names, other, within, strict=True) if not low <= e <= high]
+        left = f" {_named(out)} would leave the interval, which takes this assumption as given." if out else ""
+        lines.append(f"{one.text[0].upper()}{one.text[1:]}, Young's modulus would change: {'; '.join(rows)}.{left}")
     return tuple(lines)
+
+
+def _named(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} other zone{'s' if len(names) > 2 else ''}"
 
 
 def _others(region: KnownRegion) -> list[tuple[str, float, float, float]]:

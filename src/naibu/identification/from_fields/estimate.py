@@ -370,7 +370,7 @@ class _Recipe:
         budget = ErrorBudget(of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), shared)
         sure = judged.explanation == "explained" and not coarse
         how_well = report(model.zones, theta, total, budget=budget, usable=judged.ok, sure=sure)
-        words = (judged.sentence, *how_well, *effects(others, model.zones, theta))
+        words = (judged.sentence, *how_well, *effects(others, model.zones, theta, intervals(theta, total)[0]))
         if coarse:
             words = (
                 words[0],

@@ -8,7 +8,7 @@ from scipy import ndimage
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.bone_mask import otsu_thresholds
-from naibu.imaging.preprocessing.field_of_view import Box
+from naibu.imaging.preprocessing.field_of_view import Box, in_box
 
 # empirical: upper bound of the threshold, in fractions from the mean of the air to that of the object: skin is darker than the mean
 DIMMEST = 0.3
@@ -20,6 +20,7 @@ WIDER = 1.6
 THROAT_VOXELS = 300_000  # about so many coarse voxels show the throats
 # share of a slice, of the larger of two neighbours, in which their masks differ, above which the mask jumps
 JUMP = 0.25
+AIR = 0.01  # share of the field of view with exactly the intensity of the padding, above which that is the intensity of air
 LEAST_AREA = 0.02  # of the largest slice: smaller ones are the tip of an object, where slices differ much
 
 
@@ -79,9 +80,14 @@ def mask_in_view(volume: Volume, view: Box, *, margin: int = 0) -> BoolArray:
     InputError
         As `object_mask`.
     """
+    values = np.asarray(volume.values)
+    inside = in_box(view, volume.shape)
+    filled = values[~inside]
+    if filled.size and (filled == filled[0]).all() and np.mean(values[view] == filled[0]) > AIR:
+        # filled with the intensity of air: an object that ends there is then told from air as elsewhere
+        return object_mask(volume, margin=margin) & inside
     mask = np.zeros(volume.shape, dtype=bool)
-    shown = Volume.from_array(np.asarray(volume.values)[view], spacing_mm=volume.spacing_mm)
-    mask[view] = object_mask(shown, margin=margin)
+    mask[view] = object_mask(Volume.from_array(values[view], spacing_mm=volume.spacing_mm), margin=margin)
     return mask
 
 
@@ -129,13 +135,16 @@ def _through_throats(closed: BoolArray, spacing: FloatArray) -> BoolArray:
     size = (float(closed.sum()) * float(np.prod(spacing))) ** (1 / 3)
     room = ndimage.distance_transform_edt(~closed, sampling=spacing)
     found = np.zeros_like(closed)
-    for throat in (f * size for f in THROATS):
+    for throat in (f * size for f in reversed(THROATS)):
         free = _from_outside(room > throat, ~closed)
         touched = free | (ndimage.distance_transform_edt(~free, sampling=spacing) <= throat) if free.any() else free
-        labels, n = ndimage.label(~closed & ~touched)
-        if n:
-            largest = ndimage.maximum(room, labels, np.arange(1, n + 1))
-            found |= np.isin(labels, 1 + np.flatnonzero(largest > WIDER * throat))
+        shut = ~closed & ~touched
+        # what a large ball can touch a smaller one can, too
+        if not (room[shut] > WIDER * THROATS[0] * size).any():
+            break
+        labels, n = ndimage.label(shut)
+        largest = ndimage.maximum(room, labels, np.arange(1, n + 1))
+        found |= np.isin(labels, 1 + np.flatnonzero(largest > WIDER * throat))
     return found
 
 
@@ -148,7 +157,10 @@ def _from_outside(free: BoolArray, air: BoolArray) -> BoolArray:
         for end in (0, -1):
             face = (slice(None),) * axis + (end,)
             seeds[face] |= free[face] & ~ndimage.binary_fill_holes(~air[face])
-    return np.asarray(ndimage.binary_propagation(seeds, mask=free))
+    labels, n = ndimage.label(free)
+    reached = np.zeros(n + 1, dtype=bool)
+    reached[labels[seeds]] = True
+    return np.asarray(reached[labels])
 
 
 def _blocks(values: BoolArray, stride: IntArray) -> BoolArray:

@@ -35,7 +35,11 @@ def _moments(
     f2: AnyArray,
     load: AnyArray,
 ) -> bool:
-    """Fill m3 (10, 10, 10, 6) with the sums over voxels of a cell of pairs of weights times products; add forces to load (64, 3)."""
+    """Fill m3 (10, 600) with the sums over voxels of a cell of pairs of weights times products; add forces to load (64, 3).
+
+    m1 (60,), m2 (600,) and f1 (12,), f2 (48,) are work space. Pairs are numbered along z, y, x, and products last; arrays are flat, so that
+    inner loops are long.
+    """
     found = False
     m3[:] = F(0)
     for z in range(box[4], box[5]):
@@ -50,13 +54,11 @@ def _moments(
             for a in range(4):
                 for b in range(a, 4):
                     w = wy[y, a] * wy[y, b]
-                    for q in range(10):
-                        for k in range(6):
-                            m2[m, q, k] += w * m1[q, k]
-                    m += 1
-                for q in range(4):
-                    for k in range(3):
-                        f2[a, q, k] += wy[y, a] * f1[q, k]
+                    for k in range(60):
+                        m2[m + k] += w * m1[k]
+                    m += 60
+                for k in range(12):
+                    f2[12 * a + k] += wy[y, a] * f1[k]
         if not in_slice:
             continue
         found = True
@@ -64,14 +66,12 @@ def _moments(
         for a in range(4):
             for b in range(a, 4):
                 w = wz[z, a] * wz[z, b]
-                for p in range(10):
-                    for q in range(10):
-                        for k in range(6):
-                            m3[m, p, q, k] += w * m2[p, q, k]
+                for k in range(600):
+                    m3[m, k] += w * m2[k]
                 m += 1
             for q in range(16):
                 for k in range(3):
-                    load[16 * a + q, k] += wz[z, a] * f2[q >> 2, q & 3, k]
+                    load[16 * a + q, k] += wz[z, a] * f2[3 * q + k]
     return found
 
 
@@ -93,10 +93,10 @@ def _line(
             for b in range(a, 4):
                 w = wx[x, a] * wx[x, b]
                 for k in range(6):
-                    m1[m, k] += w * products[p, k]
-                m += 1
+                    m1[m + k] += w * products[p, k]
+                m += 6
             for k in range(3):
-                f1[a, k] += wx[x, a] * force[p, k]
+                f1[3 * a + k] += wx[x, a] * force[p, k]
     return found
 
 
@@ -173,10 +173,10 @@ def _row(
         k0, k1, k2 = weight[0] * k, weight[1] * k, weight[2] * k
         if with_data:
             q = pairs[a, b]
-            m = m3[q // 100, (q // 10) % 10, q % 10]
-            row[0, 3 * b], row[0, 3 * b + 1], row[0, 3 * b + 2] = k0 + m[0], m[1], m[2]
-            row[1, 3 * b], row[1, 3 * b + 1], row[1, 3 * b + 2] = m[1], k1 + m[3], m[4]
-            row[2, 3 * b], row[2, 3 * b + 1], row[2, 3 * b + 2] = m[2], m[4], k2 + m[5]
+            xx, xy, xz, yy, yz, zz = m3[q, 0], m3[q, 1], m3[q, 2], m3[q, 3], m3[q, 4], m3[q, 5]
+            row[0, 3 * b], row[0, 3 * b + 1], row[0, 3 * b + 2] = k0 + xx, xy, xz
+            row[1, 3 * b], row[1, 3 * b + 1], row[1, 3 * b + 2] = xy, k1 + yy, yz
+            row[2, 3 * b], row[2, 3 * b + 1], row[2, 3 * b + 2] = xz, yz, k2 + zz
         else:
             row[0, 3 * b], row[0, 3 * b + 1], row[0, 3 * b + 2] = k0, F(0), F(0)
             row[1, 3 * b], row[1, 3 * b + 1], row[1, 3 * b + 2] = F(0), k1, F(0)
@@ -224,8 +224,8 @@ def assemble(
     """Add intensity data, bending and dilatation of all cells to big and right; fill bending_energy (m, 3) and dilatation_energy (m,)."""
     for colour in range(len(tasks) - 1):
         for task in prange(tasks[colour], tasks[colour + 1]):
-            m1, m2, m3 = np.empty((10, 6), F), np.empty((10, 10, 6), F), np.empty((10, 10, 10, 6), F)
-            f1, f2, load, local = np.empty((4, 3), F), np.empty((4, 4, 3), F), np.empty((64, 3), F), np.empty((64, 3), F)
+            m1, m2, m3 = np.empty(60, F), np.empty(600, F), np.empty((10, 600), F)
+            f1, f2, load, local = np.empty(12, F), np.empty(48, F), np.empty((64, 3), F), np.empty((64, 3), F)
             row, v, cof, box = np.empty((3, 192), F), np.empty((8, 192), F), np.empty((3, 3), F), np.empty(6, np.int64)
             for m in range(cells[task, 0], cells[task, 1]):
                 cell = cells[m]
@@ -238,7 +238,7 @@ def assemble(
                 if dilatation[m] > 0:
                     dilatation_energy[m] = _dilatation_gradients(local, gradients, F(ratio), dilatation[m], load, v, cof)
                 for a in range(64):
-                    _row(a, stiffness, bending[m], m3, pairs, found, v, dilatation[m] > 0, row)
+                    _row(a, stiffness, bending[m], m3.reshape(1000, 6), pairs, found, v, dilatation[m] > 0, row)
                     az, ay, ax = a >> 4, (a >> 2) & 3, a & 3
                     n = slot[cell[2] + az, cell[3] + ay, cell[4] + ax]
                     for i in range(3):

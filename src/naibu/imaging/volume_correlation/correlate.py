@@ -249,7 +249,7 @@ class _Correlation:
         if not self.settings.rigid_inclusions:
             return
         size = float(self.step.mean())
-        found = inclusion_candidates(self.volume, self.mask, size) if rigid_mask is None else _labelled(rigid_mask, self.volume)
+        found = self._candidates(size) if rigid_mask is None else _labelled(rigid_mask, self.volume)
         labels = np.where(self.mask, found, 0).astype(np.int32)
         if not labels.any():
             return
@@ -257,6 +257,13 @@ class _Correlation:
         least = LEAST_VOLUME * size**3
         self.inclusions = rigid_inclusions_among(self.fit, labels, level, given=given, least_mm3=least, progress=self.progress)
         self.fit.inclusions = self.inclusions
+
+    def _candidates(self, size: float) -> Int32Array:
+        """Return labels (nz, ny, nx) of candidates for rigid inclusions in the field of view of the reference."""
+        view, labels = self.views[0], np.zeros(self.mask.shape, np.int32)
+        shown = Volume.from_array(self.reference[view], spacing_mm=self.spacing)
+        labels[view] = inclusion_candidates(shown, self.mask[view], size)
+        return labels
 
     def adapt(self) -> None:
         """Choose the weights of the penalties by the data, and fit once more."""

@@ -87,11 +87,13 @@ def _filled(found: BoolArray, spacing: FloatArray, largest: float) -> BoolArray:
         for page, solid in zip(np.moveaxis(out, axis, 0), np.moveaxis(found, axis, 0), strict=True):
             if not solid.any():
                 continue
-            holes, n = ndimage.label(ndimage.binary_fill_holes(solid) & ~solid)
-            if n:
-                small = np.bincount(holes.ravel()) * area <= largest
-                small[0] = False
-                page |= small[holes]
+            open_parts, n = ndimage.label(~solid)
+            enclosed = np.bincount(open_parts.ravel(), minlength=n + 1) * area <= largest
+            enclosed[0] = False
+            for edge in (open_parts[0], open_parts[-1], open_parts[:, 0], open_parts[:, -1]):
+                enclosed[edge] = False
+            if enclosed.any():
+                page |= enclosed[open_parts]
     return out
 
 

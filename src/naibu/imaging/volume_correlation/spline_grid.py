@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import sparse
 
 from naibu.core.arrays import AnyFloatArray, FloatArray, IntArray
 
@@ -87,15 +88,14 @@ class SplineGrid:
     def values(self, coefficients: FloatArray, points_mm: ArrayLike) -> FloatArray:
         """Return the field (n, ...) at points (n, 3), mm along the axes of the volume from its first voxel."""
         x = np.asarray(points_mm, dtype=float)
-        tables = [self.table(a, x[:, a]) for a in range(3)]
-        out = np.zeros((len(x), *coefficients.shape[3:]))
-        extra = (slice(None),) + (None,) * (coefficients.ndim - 3)
-        for a in range(4):
-            for b in range(4):
-                for c in range(4):
-                    w = tables[2][1][:, a] * tables[1][1][:, b] * tables[0][1][:, c]
-                    out += w[extra] * coefficients[tables[2][0] + a, tables[1][0] + b, tables[0][0] + c]
-        return out
+        (cx, wx), (cy, wy), (cz, wz) = (self.table(a, x[:, a]) for a in range(3))
+        _, ny, nx = self.shape
+        first = (cz * ny + cy) * nx + cx
+        weights = wz[:, :, None, None] * wy[:, None, :, None] * wx[:, None, None, :]
+        near = first[:, None, None, None] + (np.arange(4)[:, None, None] * ny + np.arange(4)[:, None]) * nx + np.arange(4)
+        size = (len(x), int(np.prod(self.shape)))
+        operator = sparse.csr_array((weights.ravel(), near.ravel(), np.arange(0, 64 * len(x) + 1, 64)), shape=size)
+        return np.asarray(operator @ coefficients.reshape(size[1], -1)).reshape(len(x), *coefficients.shape[3:])
 
     def bending(self) -> FloatArray:
         """Return the matrix (64, 64) of the integral of all squared second derivatives over a cell, mm^-1 for fields in mm."""
