@@ -2,10 +2,10 @@
 
 Run: python benchmarks/thorax_case.py OUT.npz [--slice-mm 3] [--closed] [--seed 1]
 
-OUT.npz is a case of sense_volumes.py of 120 x 90 voxels of 3 mm: fat, muscle, spine, ribs, and lungs (-850 HU) with vessels. A trachea joins
-them to the air at the top of the scan and, unless --closed, a slit 16 mm wide and 100 mm high in front of each opens it. A table lies below.
-Intensities are functions of the material point, read at where a voxel came from, so that no interpolation couples the scans. Printed are the
-shares of lungs and body that `naibu.imaging.object_mask` keeps, and between which slices it jumps.
+OUT.npz is a case of sense_volumes.py of 120 x 90 voxels of 3 mm: fat, muscle, spine, ribs, and lungs (-850 HU) with vessels. A trachea
+joins them to the air at the top of the scan and, unless --closed, a slit 16 mm wide and 100 mm high in front of each opens it. A table
+lies below. Intensities are functions of the material point, read at where a voxel came from, so that no interpolation couples the
+scans. Printed are the shares of lungs and body that `naibu.imaging.object_mask` keeps, and between which slices it jumps.
 """
 
 from __future__ import annotations
