@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from naibu.cli.console import app, errors, progress_display, say
+from naibu.core.errors import InputError
 
 if TYPE_CHECKING:
     from naibu.workflows.touchable_models import MeshMaterial
@@ -68,45 +69,101 @@ def cut(
     path: Path,
     out: Path = Path("naibu-cut"),
     distance_mm: float | None = None,
-    pull_percent: float = 5.0,
+    pull_percent: float | None = None,
     experiment: str | None = None,
     young_modulus_kpa: float | None = None,
     poisson_ratio: float | None = None,
+    tension_percent: float | None = None,
+    groove_depth_mm: float | None = None,
+    reach_mm: float | None = None,
+    refine: bool | None = None,
+    unit_mm: float | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Cut a mesh or an identified model along the path of a blade, pull the cut open, and write mesh, motion, page and numbers.
+    """Cut a mesh, an identified model or a scanned surface, let the cut open, and write mesh, motion, page and numbers.
+
+    A solid is cut along the path of a blade, and pulled apart. A surface is cut along the path of a tool's tip, and opens under tension.
 
     Parameters
     ----------
     source
-        demo, model.json of an identification or its folder, or a mesh (.vtu, .msh).
+        demo, model.json of an identification or its folder, a mesh (.vtu, .msh), or a surface (.stl, .ply, .obj, .wrl), which may be open.
     path
-        CSV table of the blade's edge: each row a pose, x, y, z in mm of the edge's first vertex, then of the second, and so on.
+        CSV table. Of a blade: each row a pose, x, y, z in mm of the edge's first vertex, then of the second, and so on. Of the tip of a
+        tool over a surface: each row x, y, z in mm.
     out
         Folder for cut.html, cut.vtu (mesh with its pieces), cut.vtkhdf (motion) and cut.json.
     distance_mm
-        Twice the largest distance of the cut from the blade; half of the mean edge of the mesh by default.
+        Twice the largest distance of the cut from the path; half of the mean edge of the mesh or surface by default.
     pull_percent
-        How far the ends along the axis that the cut crosses most are pulled apart, in per cent of their distance, so that the cut opens.
+        Solids: how far the ends along the axis that the cut crosses most are pulled apart, in per cent of their distance; 5 by default.
     experiment
         Experiment whose body an identified model is made for, if not the first one that it was identified from.
     young_modulus_kpa
         Young's modulus of a mesh, kPa; 10 by default.
     poisson_ratio
         Poisson's ratio of a mesh; 0.45 by default.
+    tension_percent
+        Surfaces: strain under which they are, %; 5 by default.
+    groove_depth_mm
+        Surfaces: depth of a groove, 0 for none; by default down to the tips that lie below the surface.
+    reach_mm
+        Surfaces: how far from the surface the tip still cuts; twice the distance by default.
+    refine
+        Surfaces: refine the triangles at the cut. Without it the cut follows the edges that there are.
+    unit_mm
+        Surfaces: length of the file's unit in mm, 1000 for metres; 1 by default.
     overwrite
         Replace results that the folder holds.
     """
     from naibu.workflows.cut import cut as run
+    from naibu.workflows.cut_surface import is_surface
 
+    solid = {
+        "pull_percent": pull_percent, "experiment": experiment, "young_modulus_kpa": young_modulus_kpa, "poisson_ratio": poisson_ratio,
+    }  # fmt: skip
+    sheet = {
+        "tension_percent": tension_percent, "groove_depth_mm": groove_depth_mm, "reach_mm": reach_mm, "refine": refine, "unit_mm": unit_mm,
+    }  # fmt: skip
+    if is_surface(source):
+        _require_unset(solid, f"goes with solids, and {source} is a surface")
+        _cut_surface(source, path, out, distance_mm, overwrite, sheet)
+        return
+    _require_unset(sheet, f"goes with surfaces (.stl, .ply, .obj, .wrl), and {source} is none")
     with progress_display() as progress:
         done = run(
-            source, path, out=out, distance_mm=distance_mm, pull_percent=pull_percent, experiment=experiment,
+            source, path, out=out, distance_mm=distance_mm, experiment=experiment,
             material=_material(young_modulus_kpa, poisson_ratio), overwrite=overwrite, progress=progress,
+            **({} if pull_percent is None else {"pull_percent": pull_percent}),
         )  # fmt: skip
     sizes = ", ".join(f"{volume:.4g}" for volume in done.volumes_mm3[:6])
     say(f"{done.cut.n_pieces} piece(s) of {sizes} mm3; the cut deviates from the blade by {done.cut.deviation_mm:.2g} mm at most.")
     say(f"Page: {done.files[0]}   {', '.join(str(file) for file in done.files[1:])}")
+
+
+def _cut_surface(source: str, path: Path, out: Path, distance_mm: float | None, overwrite: bool, options: dict[str, Any]) -> None:
+    from naibu.workflows.cut_surface import areas_text
+    from naibu.workflows.cut_surface import cut_surface as run
+
+    stated = {name: value for name, value in options.items() if value is not None}
+    with progress_display() as progress:
+        done = run(source, path, out=out, distance_mm=distance_mm, overwrite=overwrite, progress=progress, **stated)
+    say(
+        f"{done.cut.n_pieces} piece(s) of {areas_text(done.cut)} mm2; the cut deviates from the path by {done.cut.deviation_mm:.2g} mm at "
+        f"most, {done.cut.mean_deviation_mm:.2g} mm on average."
+    )
+    for repair in done.cut.repairs:
+        say(f"Before the cut: {repair}.")
+    if done.cut.missed_mm:
+        say(f"No cut was found for {done.cut.missed_mm:.3g} mm of the path.")
+    say(f"Page: {done.files[0]}   {', '.join(str(file) for file in done.files[1:])}")
+
+
+def _require_unset(options: dict[str, Any], reason: str) -> None:
+    """Refuse an option that does not belong to what is cut."""
+    for name, value in options.items():
+        if value is not None:
+            raise InputError(f"{name} {reason}; leave it out")
 
 
 def _material(young_modulus_kpa: float | None, poisson_ratio: float | None) -> MeshMaterial | None:

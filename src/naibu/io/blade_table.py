@@ -1,4 +1,4 @@
-"""Read the path of a blade: a table with one pose a row, and the vertices of the blade's edge in its columns."""
+"""Read the path of a blade or of a tool's tip: a table with one pose a row, and x, y, z of the vertices of its edge in the columns."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MOST_ROWS = 100_000
 
 
 def read_blade_path(path: str | os.PathLike[str]) -> FloatArray:
-    """Read a table of comma-separated numbers.
+    """Read the path of a blade, from a table of comma-separated numbers.
 
     Parameters
     ----------
@@ -35,6 +35,52 @@ def read_blade_path(path: str | os.PathLike[str]) -> FloatArray:
     InputError
         Not a readable text, a cell that is no finite number, rows of different length, fewer than two poses or two vertices.
     """
+    rows = _rows(path)
+    if len(rows) < 2 or rows.shape[1] < 6 or rows.shape[1] % 3:
+        tip = "; one vertex is the path of a tip, which cuts surfaces, not solids" if rows.shape[1] == 3 else ""
+        raise InputError(
+            f"{path}: has {_size(rows)}; a path needs at least two poses, each with x, y, z of at least two vertices of the edge{tip}"
+        )
+    return rows.reshape(len(rows), -1, 3)
+
+
+def read_tip_path(path: str | os.PathLike[str]) -> FloatArray:
+    """Read the path of a tool's tip, from a table of comma-separated numbers.
+
+    Parameters
+    ----------
+    path : path-like
+        Each row has x, y and z of the tip, mm. Rows that begin with ``#``, and a first row of names, are passed over.
+
+    Returns
+    -------
+    ndarray, shape (p, 3)
+        Tips, mm.
+
+    Raises
+    ------
+    InputError
+        Not a readable text, a cell that is no finite number, rows of different length, fewer than two rows, or other than three columns.
+    """
+    rows = _rows(path)
+    if len(rows) < 2 or rows.shape[1] != 3:
+        blade = (
+            "; rows of several vertices are the path of a blade, which cuts solids: name a mesh of tetrahedra (.vtu, .msh), or keep the "
+            "vertex that touches the surface"
+        )
+        raise InputError(
+            f"{path}: has {_size(rows)}; the path of a tip over a surface needs at least two rows of x, y, z"
+            f"{blade if rows.shape[1] >= 6 and rows.shape[1] % 3 == 0 else ''}"
+        )
+    return rows
+
+
+def _size(rows: FloatArray) -> str:
+    return f"{len(rows)} rows of {rows.shape[1]} numbers"
+
+
+def _rows(path: str | os.PathLike[str]) -> FloatArray:
+    """Read rows (p, c) of numbers."""
     file = Path(path)
     try:
         text = read_bytes(file).decode("utf-8-sig")
@@ -52,10 +98,7 @@ def read_blade_path(path: str | os.PathLike[str]) -> FloatArray:
                 raise InputError(f"{file}: has more than {MOST_ROWS} poses; keep every tenth or so")
     except csv.Error as error:
         raise InputError(f"{file}: is no table of comma-separated values ({error}); save it as CSV") from error
-    if len(rows) < 2 or len(rows[0]) < 6 or len(rows[0]) % 3:
-        found = f"{len(rows)} rows of {len(rows[0]) if rows else 0} numbers"
-        raise InputError(f"{file}: has {found}; a path needs at least two poses, each with x, y, z of at least two vertices of the edge")
-    return np.array(rows).reshape(len(rows), -1, 3)
+    return np.array(rows).reshape(len(rows), -1 if rows else 0)
 
 
 def _names(cells: list[str]) -> bool:

@@ -13,7 +13,8 @@ from .interactive_bodies import FiniteElementBody, InteractiveBody, LatticeBody
 from .interactive_simulation import Frame, InteractiveSimulation
 from .real_time_loop import RealTimeLoop
 from .simulated_device import SimulatedDevice
-from .surface_springs import CutSprings, SurfaceSprings, opened, surface_springs
+from .surface_opening import opened, opening
+from .surface_springs import CutSprings, SurfaceSprings, surface_springs
 from .virtual_coupling import VirtualCoupling
 
 __all__ = [
@@ -46,6 +47,7 @@ __all__ = [
     "level_spring",
     "linear_static",
     "opened",
+    "opening",
     "recovery_indicators",
     "residual_indicators",
     "solve_adaptively",

@@ -1,4 +1,4 @@
-"""Mass-spring model of a triangulated surface, weighted by areas, and the opening of a cut under tension :cite:p:`hirai2008`."""
+"""Mass-spring model of a triangulated surface, weighted by areas :cite:p:`hirai2008`, also while it is cut."""
 
 from __future__ import annotations
 
@@ -7,18 +7,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import minimize
 
-from naibu.core.arrays import FloatArray, IntArray, require_positive, require_within
-from naibu.core.errors import ConvergenceError, InputError
+from naibu.core.arrays import FloatArray, IntArray, require_positive
 from naibu.mechanics.lattices.model.tetrahedral_springs import DampingRule, edge_damping
 from naibu.meshing.cutting._surface_kernels import MOST_AROUND
 from naibu.meshing.cutting.surface import SurfaceCutter
-from naibu.meshing.cutting.surface_result import SurfaceCut, triangle_areas
+from naibu.meshing.cutting.surface_result import triangle_areas
 from naibu.simulation._surface_spring_kernels import SpringArrays, update
-
-ITERATIONS = 20_000
-BALANCED = 1e-5  # of the largest force of a spring at the start
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,56 +156,3 @@ class CutSprings:
 
 def _grown(array: Any, more: int) -> Any:
     return np.concatenate([array, np.zeros((more, *array.shape[1:]), dtype=array.dtype)])
-
-
-def opened(cut: SurfaceCut, springs: SurfaceSprings, tension: float, held: ArrayLike) -> FloatArray:
-    """Return where the points (n, 3), mm, of a cut surface under tension come to rest.
-
-    Parameters
-    ----------
-    cut : SurfaceCut
-        The surface, which the tension held as it is until it was cut.
-    springs : SurfaceSprings
-        Of its points and triangles.
-    tension : float
-        Strain by which all springs are stretched before the cut: their length at rest is shorter by this share.
-    held : array_like of bool, shape (n,) or (n, 3)
-        Points, or single coordinates of them, that do not move. There is no bending stiffness and no inside that resists.
-
-    Raises
-    ------
-    InputError
-        A tension outside 0 to 0.9, a mask of another shape, or a piece with nothing held.
-    ConvergenceError
-        The springs do not come to balance.
-    """
-    require_within("tension", tension, 0.0, 0.9)
-    mask = np.asarray(held, dtype=bool)
-    if mask.shape not in ((len(cut.points),), cut.points.shape):
-        raise InputError(f"held must have shape {(len(cut.points),)} or {cut.points.shape}, not {mask.shape}")
-    fixed = np.broadcast_to(mask if mask.ndim == 2 else mask[:, None], cut.points.shape)
-    loose = set(range(cut.n_pieces)) - set(cut.piece[np.isin(cut.triangles, np.flatnonzero(np.sum(fixed, axis=1))).any(axis=1)].tolist())
-    if loose:
-        raise InputError(f"held leaves piece {min(loose)} free to drift; hold one of its points")
-    i, j = springs.edges.T
-    rest, free = (1.0 - tension) * springs.length, ~fixed
-    scale = float(springs.stiffness.mean() * springs.length.mean() ** 2)
-
-    def energy(unknown: FloatArray) -> tuple[float, FloatArray]:
-        x = cut.points.copy()
-        x[free] = unknown
-        gap = x[j] - x[i]
-        now = np.maximum(np.linalg.norm(gap, axis=1), 1e-300)
-        pull = (springs.stiffness * (now - rest) / now)[:, None] * gap
-        gradient = np.stack([np.bincount(j, pull[:, k], len(x)) - np.bincount(i, pull[:, k], len(x)) for k in range(3)], axis=1)
-        return 0.5 * float((springs.stiffness * (now - rest) ** 2).sum()) / scale, gradient[free] / scale
-
-    least = BALANCED * max(float((springs.stiffness * springs.length).max()) * tension, 1e-300) / scale
-    options: Any = {"maxiter": ITERATIONS, "maxfun": 2 * ITERATIONS, "gtol": least, "ftol": 0.0, "maxcor": 30}
-    found = minimize(energy, cut.points[free], jac=True, method="L-BFGS-B", options=options)
-    left = float(np.abs(found.jac).max(initial=0.0))
-    if left > 100.0 * least:
-        raise ConvergenceError(f"the springs are out of balance by {left * scale:.2g} mN after {found.nit} iterations; hold more points")
-    out = cut.points.copy()
-    out[free] = found.x
-    return out

@@ -6,6 +6,7 @@ from .scanners.imaging_artifacts import CTDevice, MRDevice
 from .scanners.motions import FormulaMotion, MatchedMotion, MeshMotion, PosedMotion, Still
 from .scanners.textures import Texture, layered_block
 from .scanners.ultrasound import Scatterers, UltrasoundDevice, ultrasound, ultrasound_sequence
+from .specimens.hand import hand_surface
 from .specimens.lattice_twin import Twin, dough_lattice, dough_parameters, dough_twin, virtual_capture
 from .specimens.marker_phantoms import Phantom, Scanner, VirtualSpecimen, box_experiment, phantom, two_gels, virtual_specimen
 from .specimens.specimen_matching import BlockMatch, block_match
@@ -43,6 +44,7 @@ __all__ = [
     "dough_twin",
     "equibiaxial",
     "free_motion",
+    "hand_surface",
     "layered_block",
     "phantom",
     "ramp_stress",

@@ -1,5 +1,6 @@
 from .compare_methods import MethodComparison, compare_methods
 from .cut import CutRun, cut
+from .cut_surface import SurfaceCutRun, cut_surface
 from .haptics.device import DeviceRecord, drive_live_simulation
 from .identify import Identification
 from .identify_fields import FieldIdentification, identify_fields
@@ -24,10 +25,12 @@ __all__ = [
     "SenseRun",
     "SequenceRun",
     "SimulationRun",
+    "SurfaceCutRun",
     "TouchableModel",
     "TrackRun",
     "compare_methods",
     "cut",
+    "cut_surface",
     "drive_live_simulation",
     "identify_fields",
     "live",

@@ -60,7 +60,8 @@ def volume_mesh(source: str, points: FloatArray, blocks: Sequence[Block], names:
     if not volume:
         kinds = sorted({block.kind for block in blocks})
         raise InputError(
-            f"{source}: contains no volume cells (only {kinds or 'points'}); mesh it with volume cells, or use read_surface for a surface"
+            f"{source}: contains no volume cells (only {kinds or 'points'}); mesh it with volume cells, or save a surface as .stl, .ply, "
+            ".obj or .wrl"
         )
     for block in volume:
         if block.kind not in NODES_PER_CELL:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from naibu.core.arrays import BoolArray, FloatArray, IntArray
+from naibu.core.arrays import BoolArray, FloatArray, IntArray, require_positive
 from naibu.core.errors import InputError
 from naibu.meshing.cutting._surface_kernels import SurfaceArrays
 from naibu.meshing.cutting._surface_search_kernels import distances_from_edges, distances_from_path
@@ -96,6 +96,17 @@ class SurfaceCut:
             roots = roots[roots]
         return roots
 
+    @property
+    def normals(self) -> FloatArray:
+        """Unit normals (n, 3) weighted by areas, the same for points of two lips that met; zero where they cancel."""
+        a, b, c = self.points[self.triangles].transpose(1, 0, 2)
+        vector, roots = np.cross(b - a, c - a), self.roots
+        out = np.zeros_like(self.points)
+        for k in range(3):
+            np.add.at(out, roots[self.triangles[:, k]], vector)
+        size = np.linalg.norm(out, axis=1, keepdims=True)
+        return np.asarray(np.divide(out, size, out=np.zeros_like(out), where=size > 1e-300)[roots])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Groove:
@@ -169,27 +180,36 @@ def _missed(edges: FloatArray, paths: Sequence[ToolPath], distance_mm: float) ->
     return missed
 
 
-def groove(cut: SurfaceCut) -> Groove:
+def groove(cut: SurfaceCut, depth_mm: float | None = None) -> Groove:
     """Return the groove that the tool leaves: walls from both lips of the cut down to floor points at the tips of the tool.
 
     Where the cut ends inside the surface, the floor rises to its end. Points on both lips that met share their floor point.
 
+    Parameters
+    ----------
+    cut : SurfaceCut
+        The surface.
+    depth_mm : float, optional
+        Depth of the floor below the surface, mm, in place of the tips.
+
     Raises
     ------
     InputError
-        There is no cut.
+        There is no cut, or the depth is not positive.
     """
     if not len(cut.lips):
         raise InputError("the surface was not cut, so that there is no groove; check the path and the reach of the tool")
     nodes, place = np.unique(cut.lips, return_inverse=True)
-    spots, spot = np.unique(np.round(cut.points[nodes], 9), axis=0, return_inverse=True)
+    spots, first, spot = np.unique(np.round(cut.points[nodes], 9), axis=0, return_index=True, return_inverse=True)
     spot = spot.ravel()
-    paths = [(points[over], tips[over]) for points, tips, over in cut.paths]
-    surface, tips = (np.concatenate([p[k] for p in paths]) for k in (0, 1))
-    floor = np.stack([_tip(surface, tips, q) for q in spots])
-    closed = np.bincount(spot, minlength=len(spots)) == 1
-    once = closed & (cut.ends[nodes[np.unique(spot, return_index=True)[1]], 0] < 0)
-    number = np.where(once[spot], nodes, len(cut.points) + spot)[place.reshape(-1, 2)]
+    if depth_mm is None:
+        paths = [(points[over], tips[over]) for points, tips, over in cut.paths]
+        surface, tips = (np.concatenate([p[k] for p in paths]) for k in (0, 1))
+        floor = np.stack([_tip(surface, tips, q) for q in spots])
+    else:
+        floor = spots - require_positive("depth_mm", depth_mm, "mm") * cut.normals[nodes[first]]
+    ending = np.bincount(spot, minlength=len(spots)) == 1  # both lips meet in one point
+    number = np.where(ending[spot], nodes, len(cut.points) + spot)[place.reshape(-1, 2)]
     a, b = cut.lips.T
     walls = np.concatenate([np.stack([b, a, number[:, 0]], axis=1), np.stack([b, number[:, 0], number[:, 1]], axis=1)])
     distinct = (walls[:, 0] != walls[:, 1]) & (walls[:, 1] != walls[:, 2]) & (walls[:, 2] != walls[:, 0])

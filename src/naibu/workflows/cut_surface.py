@@ -1,0 +1,245 @@
+"""Cut a scanned surface along the path of a tool's tip, let tension open the cut, and write series, page and numbers."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from naibu._version import __version__
+from naibu.core.arrays import FloatArray, IntArray, require_positive, require_within
+from naibu.core.errors import InputError
+from naibu.core.mesh import Mesh
+from naibu.core.progress import Progress, report_progress
+from naibu.io.blade_table import read_tip_path
+from naibu.io.files.atomic import write_atomically
+from naibu.io.files.provenance import sha256
+from naibu.io.meshes import SURFACE_READERS, Surface, read_surface
+from naibu.io.vtk_files import write_vtkhdf_series, write_vtu
+from naibu.meshing.cutting.surface import cut_surface as cut_along
+from naibu.meshing.cutting.surface_result import SurfaceCut, groove, triangle_areas
+from naibu.simulation.surface_opening import LARGEST_TENSION, opening
+from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, motion_html
+from naibu.viewer.tables import Table
+from naibu.workflows.output_folder import output_folder
+
+FILES = ("cut.html", "cut.vtu", "cut.vtkhdf", "cut.json")
+FRAMES = 24
+FRAME_S = 0.1
+PAGE_BYTES = 24_000_000
+INSIDE = 0.5  # of the distance: tips deeper than this below the surface cut a groove
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceCutRun:
+    """A cut surface and what was written of it.
+
+    Attributes
+    ----------
+    files : tuple of Path
+        The page first.
+    cut : SurfaceCut
+        The surface behind the cut.
+    numbers : dict
+        What ``cut.json`` holds.
+    displacement : ndarray, shape (s, n, 3)
+        Of the points of the surface while the tool passes and at the end, mm.
+    """
+
+    files: tuple[Path, ...]
+    cut: SurfaceCut
+    numbers: dict[str, Any]
+    displacement: FloatArray
+
+
+def is_surface(source: str | os.PathLike[str]) -> bool:
+    """Whether the ending of a file's name is one of triangulated surfaces."""
+    return Path(source).suffix.lower() in SURFACE_READERS
+
+
+def cut_surface(
+    source: str | os.PathLike[str],
+    path: str | os.PathLike[str],
+    *,
+    out: str | os.PathLike[str],
+    distance_mm: float | None = None,
+    tension_percent: float = 5.0,
+    groove_depth_mm: float | None = None,
+    reach_mm: float | None = None,
+    refine: bool = True,
+    unit_mm: float = 1.0,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> SurfaceCutRun:
+    """Cut a scanned surface along the path of a tool's tip, and let its tension open the cut.
+
+    Parameters
+    ----------
+    source : path-like
+        Surface (``.stl``, ``.ply``, ``.obj``, ``.wrl``, ``.vrml``), which may be open.
+    path : path-like
+        Table of the tips; see `naibu.io.blade_table.read_tip_path`.
+    out : path-like
+        Folder for ``cut.html``, ``cut.vtu`` (the cut surface with its pieces), ``cut.vtkhdf`` (the cut opens behind the tool) and
+        ``cut.json``.
+    distance_mm : float, optional
+        Triangles at the cut are refined until their longest edge is shorter, and the cut stays within half of it of the path; half of
+        the mean edge of the surface by default, mm.
+    tension_percent : float
+        Strain that the surface is under, %; 0 leaves the cut closed.
+    groove_depth_mm : float, optional
+        Depth of a groove below the surface, mm; 0 for none. By default the floor lies at the tips
+        if these are deeper than half the distance somewhere.
+    reach_mm : float, optional
+        How far from the surface the tip still cuts, mm; by default two distances.
+    refine : bool
+        Without it the cut follows the edges that there are, and may stray from the path.
+    unit_mm : float
+        Length of the surface file's unit, mm; the path is in mm.
+    overwrite : bool
+        Whether results that the folder holds are replaced.
+    progress : callable, optional
+        Called with a `ProgressReport` after every state of the opening.
+
+    Raises
+    ------
+    InputError
+        A surface that cannot be cut, a path that cannot be used or misses it, or a folder that cannot be written or holds results.
+    ConvergenceError
+        The opening cannot be computed.
+    """
+    require_within("tension_percent", tension_percent, 0.0, 100.0 * LARGEST_TENSION)
+    if groove_depth_mm:
+        require_positive("groove_depth_mm", groove_depth_mm, "mm")
+    surface, tips = read_surface(source, unit_mm=unit_mm), read_tip_path(path)
+    folder = output_folder(out, FILES, overwrite=overwrite)
+    distance = 0.5 * mean_edge_mm(surface) if distance_mm is None else distance_mm
+    try:
+        found = cut_along(surface.points, surface.triangles, tips, distance, reach_mm=reach_mm, refined=refine)
+    except InputError as error:
+        raise InputError(f"{path}: {error}" if "the tip stays" in str(error) else str(error)) from error
+    if not len(found.cut_edges):
+        raise InputError(
+            f"{path}: is too short to cut anything at a distance of {distance:.3g} mm; give a longer path or a smaller distance_mm"
+        )
+    points, walls, wall_area = _grooved(found, groove_depth_mm, distance)
+    frames = FRAMES if tension_percent else 1
+    moved = np.zeros((frames + 1, len(points), 3))
+    for k, displacement in enumerate(opening(found, 0.01 * tension_percent, frames=frames)):
+        moved[k, : len(found.points)] = displacement
+        report_progress(progress, "open the cut", done=k + 1, total=frames + 1)
+    copies = np.flatnonzero(found.source != np.arange(len(found.points)))
+    gaps = np.linalg.norm(moved[-1, copies] - moved[-1, found.roots[copies]], axis=1)
+    numbers = _numbers(surface, found, distance, wall_area, float(gaps.max(initial=0.0))) | {
+        "tension_percent": tension_percent, "refined": refine, "repairs": list(found.repairs), "source": str(source), "naibu": __version__,
+        "inputs_sha256": {Path(name).name: sha256(name) for name in (source, path)},
+    }  # fmt: skip
+    files = _written(folder, found, points, walls, numbers, moved)
+    return SurfaceCutRun(files, found, numbers, moved[:, : len(found.points)])
+
+
+def areas_text(found: SurfaceCut) -> str:
+    """Return the areas of the largest pieces, mm2, as text."""
+    return ", ".join(f"{v:.4g}" if v < 1e4 else f"{v:.0f}" for v in found.areas_mm2[:6])
+
+
+def mean_edge_mm(surface: Surface) -> float:
+    """Return the mean length of the edges of the triangles, mm."""
+    corners = surface.points[surface.triangles]
+    return float(np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).mean())
+
+
+def _grooved(found: SurfaceCut, depth_mm: float | None, distance: float) -> tuple[FloatArray, IntArray, float]:
+    """Return the points of the surface and of the floor of a groove, its walls and their area, without any where there is none."""
+    if depth_mm is None and _deepest(found) < INSIDE * distance:
+        depth_mm = 0.0
+    if depth_mm == 0.0:
+        return found.points, np.zeros((0, 3), dtype=np.int64), 0.0
+    made = groove(found, depth_mm)
+    return made.points, made.triangles, made.area_mm2
+
+
+def _deepest(found: SurfaceCut) -> float:
+    """How deep the tips lie below the surface at most, mm, where the outward normals of its triangles tell what is below."""
+    nodes = np.unique(found.lips)
+    normals, deepest = found.normals[nodes], 0.0
+    for points, tips, over in found.paths:
+        gaps = found.points[nodes][None] - points[over][::8][:, None]
+        nearest = (gaps**2).sum(axis=2).argmin(axis=1)
+        deepest = max(deepest, float(-((tips[over][::8] - points[over][::8]) * normals[nearest]).sum(axis=1).min(initial=0.0)))
+    return deepest
+
+
+def _numbers(surface: Surface, found: SurfaceCut, distance: float, wall_area: float, opening_mm: float) -> dict[str, Any]:
+    before = float(triangle_areas(surface.points, surface.triangles).sum())
+    return {
+        "units": "mm",
+        "pieces": found.n_pieces,
+        "areas_mm2": found.areas_mm2.tolist(),
+        "area_before_mm2": before,
+        "relative_change_of_area": abs(float(found.areas_mm2.sum()) - before) / before,
+        "triangles_before": len(surface.triangles),
+        "triangles": len(found.triangles),
+        "length_of_the_cut_mm": found.length_mm,
+        "largest_distance_from_the_path_mm": found.deviation_mm,
+        "mean_distance_from_the_path_mm": found.mean_deviation_mm,
+        "allowed_distance_mm": 0.5 * distance,
+        "length_of_the_path_without_cut_mm": found.missed_mm,
+        "area_of_the_groove_mm2": wall_area,
+        "largest_opening_mm": opening_mm,
+    }
+
+
+def _written(
+    folder: Path, found: SurfaceCut, points: FloatArray, walls: IntArray, numbers: Mapping[str, Any], moved: FloatArray
+) -> tuple[Path, ...]:
+    triangles = np.concatenate([found.triangles, walls])
+    regions = np.repeat([0, 1], [len(found.triangles), len(walls)])
+    mesh = Mesh(points, triangles, "triangle", regions, ("surface", "groove"))
+    lips = np.zeros(len(points))
+    lips[found.lips.ravel()] = 1.0
+    none = np.full(len(walls), -1)
+    cells = {"piece": np.concatenate([found.piece, none]), "parent": np.concatenate([found.parents, none])}
+    write_vtu(folder / "cut.vtu", mesh, {"cut": lips, "displacement_mm": moved[-1]}, cells)
+    times = np.asarray(FRAME_S * np.arange(len(moved)), dtype=np.float64)
+    write_vtkhdf_series(folder / "cut.vtkhdf", mesh, times, {"displacement_mm": moved})
+    write_atomically(folder / "cut.json", json.dumps(dict(numbers), indent=1) + "\n")
+    text = motion_html(_page(found, points, triangles, numbers, times, moved), PAGE_BYTES)
+    return (write_atomically(folder / "cut.html", text), *(folder / name for name in FILES[1:]))
+
+
+def _page(
+    found: SurfaceCut, points: FloatArray, triangles: IntArray, numbers: Mapping[str, Any], times: FloatArray, moved: FloatArray
+) -> MotionPage:
+    sizes = areas_text(found)
+    said = [
+        f"The cut leaves {found.n_pieces} {'piece' if found.n_pieces == 1 else 'pieces'} of {sizes} mm². It deviates from the path of the "
+        f"tool by {found.deviation_mm:.2g} mm at most, {found.mean_deviation_mm:.2g} mm on average, where "
+        f"{numbers['allowed_distance_mm']:.2g} mm are allowed{'' if numbers['refined'] else ' with refinement'}.",
+        f"Under a tension of {numbers['tension_percent']:g} % it opens by {numbers['largest_opening_mm']:.3g} mm. The points of this "
+        "mass-spring model slide on what is beneath; those farther from the cut than it is long, and the rim, stay.",
+    ]
+    if found.missed_mm:
+        said.append(f"No cut was found for {found.missed_mm:.3g} mm of the path.")
+    if found.repairs:
+        said.append(f"Before the cut: {'; '.join(found.repairs)}.")
+    rows = [(name.replace("_", " "), v) for name, v in numbers.items() if isinstance(v, int | float) and not isinstance(v, bool)]
+    fields = [ColourField("displacement, mm", np.linalg.norm(moved, axis=2))]
+    if found.n_pieces > 1:
+        piece = np.zeros(len(points))
+        piece[found.triangles] = found.piece[:, None]
+        fields.append(ColourField("piece, 0 the largest", np.tile(piece, (len(times), 1))))
+    way = np.concatenate([tips for _, tips, _ in found.paths])
+    at = way[np.rint(np.linspace(0.0, len(way) - 1, len(times))).astype(int)][:, None]
+    radius = 0.01 * float(np.ptp(points, axis=0).max())
+    tool = RigidShape("tip of the tool", "sphere", np.full(3, radius), np.eye(3))
+    provenance = {"source": numbers["source"], "naibu": numbers["naibu"], "SHA-256": numbers["inputs_sha256"]}
+    return MotionPage(
+        f"{Path(numbers['source']).name}, cut", said, times, triangles, points, moved, fields, [tool], at, np.zeros(0),
+        np.zeros((0, 1, 3)), [Table("Numbers", ("quantity", "value"), tuple(rows))], provenance,
+    )  # fmt: skip
