@@ -41,7 +41,7 @@ def test_a_crack_opens_as_linear_elasticity_says():
     infinite = gaps[1] + (gaps[1] - gaps[0]) / 3.0  # the effect of the hold falls with the square of its radius
     ellipse = 6.0 * tension * np.sqrt(half**2 - cut.points[copies, 0] ** 2)
     assert infinite.max() == pytest.approx(ellipse.max(), rel=0.04)
-    np.testing.assert_allclose(infinite, ellipse, atol=0.06 * ellipse.max())
+    np.testing.assert_allclose(infinite, ellipse, atol=0.075 * ellipse.max())
 
 
 def test_the_cut_opens_behind_the_tool_and_ends_as_it_rests():

@@ -15,7 +15,7 @@ from naibu import cli
 from naibu.core.errors import InputError
 from naibu.io.blade_table import read_tip_path
 from naibu.meshing import boundary_faces, box
-from naibu.workflows import cut_surface
+from naibu.workflows import cut_surface_file
 
 SIZE = 40.0
 
@@ -76,7 +76,7 @@ def path_file(folder: Path, below: float = 0.0, text: str = "") -> Path:
 
 @pytest.mark.parametrize("ending", FORMATS)
 def test_a_scan_of_any_format_is_cut_and_opens(tmp_path: Path, ending: str) -> None:
-    done = cut_surface(surface_file(tmp_path, ending), path_file(tmp_path), out=tmp_path / "out", distance_mm=2.0)
+    done = cut_surface_file(surface_file(tmp_path, ending), path_file(tmp_path), out=tmp_path / "out", distance_mm=2.0)
     assert [file.name for file in done.files] == ["cut.html", "cut.vtu", "cut.vtkhdf", "cut.json"]
     numbers = json.loads((tmp_path / "out" / "cut.json").read_text())
     assert numbers["pieces"] == 1
@@ -93,27 +93,27 @@ def test_a_scan_of_any_format_is_cut_and_opens(tmp_path: Path, ending: str) -> N
 
 def test_without_tension_nothing_moves_and_without_refinement_nothing_is_refined(tmp_path: Path) -> None:
     scan, path = surface_file(tmp_path), path_file(tmp_path)
-    done = cut_surface(scan, path, out=tmp_path / "out", distance_mm=1.0, tension_percent=0.0, refine=False)
+    done = cut_surface_file(scan, path, out=tmp_path / "out", distance_mm=1.0, tension_percent=0.0, refine=False)
     assert not done.displacement.any() and done.numbers["largest_opening_mm"] == 0.0
     assert done.numbers["triangles"] == done.numbers["triangles_before"]
-    fine = cut_surface(scan, path, out=tmp_path / "fine", distance_mm=1.0, tension_percent=0.0)
+    fine = cut_surface_file(scan, path, out=tmp_path / "fine", distance_mm=1.0, tension_percent=0.0)
     assert fine.cut.deviation_mm <= 0.5 < done.cut.deviation_mm
 
 
 def test_a_groove_is_as_deep_as_the_tips_or_as_stated(tmp_path: Path) -> None:
     scan, settings = surface_file(tmp_path), {"distance_mm": 2.0, "tension_percent": 0.0}
-    deep = cut_surface(scan, path_file(tmp_path, below=2.5), out=tmp_path / "a", **settings)
+    deep = cut_surface_file(scan, path_file(tmp_path, below=2.5), out=tmp_path / "a", **settings)
     assert deep.numbers["area_of_the_groove_mm2"] == pytest.approx(2 * 2.5 * 20.4, rel=0.2)
-    stated = cut_surface(scan, path_file(tmp_path), out=tmp_path / "b", groove_depth_mm=1.0, **settings)
+    stated = cut_surface_file(scan, path_file(tmp_path), out=tmp_path / "b", groove_depth_mm=1.0, **settings)
     assert stated.numbers["area_of_the_groove_mm2"] == pytest.approx(2 * 1.0 * 20.4, rel=0.2)
-    none = cut_surface(scan, path_file(tmp_path, below=2.5), out=tmp_path / "c", groove_depth_mm=0.0, **settings)
+    none = cut_surface_file(scan, path_file(tmp_path, below=2.5), out=tmp_path / "c", groove_depth_mm=0.0, **settings)
     assert none.numbers["area_of_the_groove_mm2"] == 0.0
 
 
 def test_a_loop_falls_out_and_contracts_to_the_length_of_its_springs(tmp_path: Path) -> None:
     angle = np.linspace(0.0, 2.0 * np.pi, 41)
     rows = [f"{20 + 8 * np.cos(a)},{20 + 8 * np.sin(a)},{2.0 * np.sin(0.15 * (20 + 8 * np.cos(a)))}" for a in angle]
-    done = cut_surface(surface_file(tmp_path), path_file(tmp_path, text="\n".join(rows)), out=tmp_path / "out", distance_mm=1.5)
+    done = cut_surface_file(surface_file(tmp_path), path_file(tmp_path, text="\n".join(rows)), out=tmp_path / "out", distance_mm=1.5)
     assert done.cut.n_pieces == 2
     assert done.cut.areas_mm2[1] == pytest.approx(np.pi * 64.0, rel=0.1)
     own = done.cut.triangles[done.cut.piece == 1]
@@ -140,14 +140,14 @@ def test_a_loop_falls_out_and_contracts_to_the_length_of_its_springs(tmp_path: P
 )
 def test_what_cannot_be_cut_is_refused(tmp_path: Path, text: str, options: dict[str, float], said: str) -> None:
     with pytest.raises(InputError, match=said):
-        cut_surface(surface_file(tmp_path), path_file(tmp_path, text=text), out=tmp_path / "out", **options)
+        cut_surface_file(surface_file(tmp_path), path_file(tmp_path, text=text), out=tmp_path / "out", **options)
     assert list((tmp_path / "out").glob("*")) == []
 
 
 def test_edges_of_three_triangles_are_opened_and_said(tmp_path: Path) -> None:
     points, triangles = sheet()
     fin = np.concatenate([points, [[20.0, 20.0, 30.0]]]), np.concatenate([triangles, [[20, 21, len(points)]]])
-    done = cut_surface(surface_file(tmp_path, "obj", fin), path_file(tmp_path), out=tmp_path / "out", distance_mm=2.0)
+    done = cut_surface_file(surface_file(tmp_path, "obj", fin), path_file(tmp_path), out=tmp_path / "out", distance_mm=2.0)
     assert "more than two triangles share" in done.numbers["repairs"][0]
     assert "more than two triangles share" in (tmp_path / "out" / "cut.html").read_text()
 

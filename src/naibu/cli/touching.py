@@ -143,7 +143,7 @@ def cut(
 
 def _cut_surface(source: str, path: Path, out: Path, distance_mm: float | None, overwrite: bool, options: dict[str, Any]) -> None:
     from naibu.workflows.cut_surface import areas_text
-    from naibu.workflows.cut_surface import cut_surface as run
+    from naibu.workflows.cut_surface import cut_surface_file as run
 
     stated = {name: value for name, value in options.items() if value is not None}
     with progress_display() as progress:

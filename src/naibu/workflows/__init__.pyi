@@ -1,6 +1,6 @@
 from .compare_methods import MethodComparison, compare_methods
 from .cut import CutRun, cut
-from .cut_surface import SurfaceCutRun, cut_surface
+from .cut_surface import SurfaceCutRun, cut_surface_file
 from .haptics.device import DeviceRecord, drive_live_simulation
 from .identify import Identification
 from .identify_fields import FieldIdentification, identify_fields
@@ -30,7 +30,7 @@ __all__ = [
     "TrackRun",
     "compare_methods",
     "cut",
-    "cut_surface",
+    "cut_surface_file",
     "drive_live_simulation",
     "identify_fields",
     "live",

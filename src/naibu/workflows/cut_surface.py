@@ -62,7 +62,7 @@ def is_surface(source: str | os.PathLike[str]) -> bool:
     return Path(source).suffix.lower() in SURFACE_READERS
 
 
-def cut_surface(
+def cut_surface_file(
     source: str | os.PathLike[str],
     path: str | os.PathLike[str],
     *,
