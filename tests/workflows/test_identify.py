@@ -16,7 +16,7 @@ import naibu
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.status import Status
-from naibu.identification.from_markers.verdict import Explanation
+from naibu.identification.verdict import Explanation
 from naibu.io.experiment_folder.state_csv import parse_state_csv
 from naibu.io.files import atomic
 from naibu.viewer.result_page.payload import report_json
@@ -351,7 +351,7 @@ def test_overstated_noise_is_said_and_the_intervals_hold_the_truth(experiment_fo
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"pressed": lambda p: p[np.random.default_rng(1).permutation(len(p))]}, "same label"),
+        ({"pressed": lambda p: p[np.random.default_rng(1).permutation(len(p))]}, "labels of the two states do not"),
         ({"pressed": lambda p: p * [-1.0, 1.0, 1.0]}, "mirror image"),
         ({"initial": lambda p: p[:, [2, 1, 0]], "pressed": lambda p: p[:, [2, 1, 0]]}, "axes exchanged"),
     ],

@@ -201,7 +201,7 @@ def _identify(
     if result.interrupted:
         say("Interrupted: these are the results so far. The same command continues from here.")
         sys.exit(INTERRUPTED)
-    if result.verdict.explanation.name == "NOT_EXPLAINED":
+    if not result.verdict.ok:
         say("The model does not explain the data: the results are marked as not to be used.", "bold red")
         sys.exit(NOT_EXPLAINED)
 

@@ -6,13 +6,11 @@ from .from_fields.estimate import FieldEstimate, identify_field
 from .from_fields.experiment_design import Accuracy, expected_accuracy
 from .from_fields.load_cases import FieldLoadCase, KnownRegion, Zones
 from .from_fields.uncertainty import ErrorBudget, cramer_rao_bound
-from .from_fields.verdict import FieldVerdict
 from .from_markers.calibration import Calibration, calibrate
 from .from_markers.gauss_newton import MatchingSettings
 from .from_markers.known_materials import KnownMaterials
 from .from_markers.observations import NoiseModel
 from .from_markers.specimen_model import ModelSettings
-from .from_markers.verdict import Explanation, Verdict
 from .from_motion.rheology import MotionEstimate, MotionLoadCase, identify_motion
 from .lattice_calibration.evolutionary import search_cma_es, search_genetic
 from .lattice_calibration.forward_model import Capture, PushedFace, Pushing
@@ -25,6 +23,7 @@ from .prediction.baselines import baselines
 from .prediction.calibrated_model import CalibratedModel
 from .prediction.cross_validation import LeftOut, ModelRow, compare_models, leave_one_out
 from .prediction.prediction import Prediction, predict_state
+from .verdict import Explanation, Verdict
 
 __all__ = [
     "Accuracy",
@@ -39,7 +38,6 @@ __all__ = [
     "Explanation",
     "FieldEstimate",
     "FieldLoadCase",
-    "FieldVerdict",
     "IncrementalEstimate",
     "KnownMaterials",
     "KnownRegion",

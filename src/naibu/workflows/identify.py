@@ -18,11 +18,12 @@ from naibu.identification.from_markers.marker_checks import check_markers
 from naibu.identification.from_markers.marker_outliers import Outlier, distrusted, outliers_of_fit, without_outliers
 from naibu.identification.from_markers.observations import MarkerLoadCase
 from naibu.identification.from_markers.specimen_model import ModelSettings
-from naibu.identification.from_markers.verdict import Verdict, verdict_of
+from naibu.identification.from_markers.verdict import verdict_of
 from naibu.identification.prediction.baselines import affine, baselines, equilibrium_gap_baseline
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.cross_validation import LeftOut, leave_one_out
 from naibu.identification.prediction.prediction import rms
+from naibu.identification.verdict import Verdict
 from naibu.workflows.experiments import Source, load_experiments, parse_known, provenance_of, require_element_size, require_loaded
 from naibu.workflows.output_folder import output_folder
 from naibu.workflows.result_folder import (

@@ -360,7 +360,7 @@ def _written(
     verdict = found.verdict
     numbers = {
         "naibu": __version__,
-        "verdict": None if verdict is None else {"explanation": verdict.explanation, "sentence": verdict.sentence},
+        "verdict": None if verdict is None else verdict.to_dict(),
         "zones": _as_records(table_of_zones(result)),
         "other_assumptions": _as_records(table_of_assumptions(result)),
         "noise_factor": found.noise_factor,

@@ -13,11 +13,11 @@ from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase
 from naibu.identification.from_markers.specimen_model import Specimen
-from naibu.identification.from_markers.verdict import Explanation, Verdict
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.cross_validation import LeftOut, ModelRow
 from naibu.identification.prediction.platen_position import marker_layers
 from naibu.identification.prediction.prediction import Prediction
+from naibu.identification.verdict import Explanation, Verdict
 from naibu.meshing.surface import boundary_faces, triangles_of_faces
 from naibu.viewer.result_page.payload import Box, Correlation, ParameterRow, Report, ResidualSet, Scene, Step, VerdictNote
 from naibu.viewer.tables import Cell, Table

@@ -17,11 +17,11 @@ import numpy as np
 from naibu.core.errors import InputError
 from naibu.identification.from_markers.calibration import Calibration
 from naibu.identification.from_markers.specimen_model import ModelSettings
-from naibu.identification.from_markers.verdict import Verdict
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.cross_validation import LeftOut, ModelRow
 from naibu.identification.prediction.interval import per_axis
 from naibu.identification.prediction.prediction import Prediction, rms
+from naibu.identification.verdict import Verdict
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.parsing import read_json
 from naibu.io.files.reading import guarded_reading, read_bytes
@@ -151,13 +151,7 @@ def _identification_summary(
     rows = {f"{r.experiment}/{r.state}": {"rms_3d_mm": r.rms_mm, "markers": r.marker_count} for r in left_out}
     found = {p.name: {"estimate": p.value, "from": low, "to": high, "unit": p.unit} for p, low, high in _intervals(model)}
     return {
-        "verdict": {
-            "explanation": verdict.explanation.name.lower(),
-            "sentence": verdict.sentence,
-            "reasons": list(verdict.reasons),
-            "notes": list(verdict.notes),
-            "left_out_markers": list(verdict.outliers),
-        },
+        "verdict": verdict.to_dict() | {"left_out_markers": list(verdict.outliers)},
         "status": calibration.match.status.name,
         "message": search_sentence(calibration.match.status),
         "noise_factor": model.noise_factor,

@@ -10,6 +10,7 @@ import pytest
 from naibu.core.displacement_field import DisplacementField
 from naibu.identification.from_fields.estimate import FieldEstimate, identify_field
 from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
+from naibu.identification.verdict import Explanation
 from naibu.validation.specimens.quadratic_body import QuadraticBody, Solved
 
 PUSH = (0.0, 0.0, -4.0)
@@ -45,7 +46,7 @@ def test_the_modulus_is_found_on_coarse_hexahedra_and_the_elements_are_in_the_in
     assert poisson[0] < 0.45 < poisson[1] and np.ptp(poisson) < 0.02
     assert found.mesh_shift is not None and found.budget is not None and found.verdict is not None
     assert 0.02 < found.mesh_shift[0] < 0.10 and found.budget.mesh[0] > 0.2 * found.mesh_shift[0]
-    assert found.verdict.explanation == "explained" and found.budget.shared == 1.0
+    assert found.verdict.explanation is Explanation.EXPLAINED and found.budget.shared == 1.0
 
 
 def test_tetrahedra_are_made_quadratic() -> None:
@@ -63,7 +64,7 @@ def test_tetrahedra_are_made_quadratic() -> None:
 
 def test_an_understated_noise_widens_the_interval_and_is_no_fault_of_the_model() -> None:
     honest, bold = measured(seed=3), measured(seed=3, sd_mm=SD_MM / 1.8)
-    assert bold.verdict is not None and bold.verdict.explanation == "explained"
+    assert bold.verdict is not None and bold.verdict.explanation is Explanation.EXPLAINED
     assert bold.verdict.noise_factor == pytest.approx(1.8, rel=0.15)
     assert np.ptp(bold.intervals()[0]) == pytest.approx(np.ptp(honest.intervals()[0]), rel=0.15)
 
@@ -75,7 +76,7 @@ def test_errors_that_neighbours_share_widen_the_interval() -> None:
         return 1.5 * SD_MM * np.sin(2.0 * np.pi * points[:, [1, 2, 0]] / 12.0)
 
     found = measured(extra=waves)
-    assert found.verdict is not None and found.verdict.shared > 0.15 and found.verdict.explanation == "explained in part"
+    assert found.verdict is not None and found.verdict.shared > 0.15 and found.verdict.explanation is Explanation.IN_PART
     assert "well determined" not in " ".join(found.identifiability)
     assert found.budget is not None and found.budget.noise[0] > 1.3 * measured().budget.noise[0]  # type: ignore[union-attr]
 

@@ -55,13 +55,13 @@ def swapped_states() -> Experiment:
 
 
 IMPOSSIBLE = {
-    "labels shuffled": (lambda: squeezed_box(loaded=shuffled), ("box/pressed", "same label")),
-    "loaded mirrored": (lambda: squeezed_box(loaded=mirrored), ("box/pressed", "mirror image", "determinant")),
+    "labels shuffled": (lambda: squeezed_box(loaded=shuffled), ("box/pressed against initial", "labels of the two states do not")),
+    "loaded mirrored": (lambda: squeezed_box(loaded=mirrored), ("box/pressed", "mirror image")),
     "initial mirrored": (lambda: squeezed_box(initial=mirrored), ("mirror image",)),
-    "axes of one exchanged": (lambda: squeezed_box(loaded=exchanged), ("mirror image", "axes are exchanged")),
+    "axes of one exchanged": (lambda: squeezed_box(loaded=exchanged), ("mirror image", "order of its axes")),
     "axes of both turned": (lambda: squeezed_box(initial=turned, loaded=turned), ("along z", "shortened along y", "axes exchanged")),
-    "loaded in cm": (lambda: squeezed_box(loaded=lambda p: 0.1 * p), ("0.103 times as large", "mm")),
-    "loaded in inches": (lambda: squeezed_box(loaded=lambda p: p / 25.4), ("0.0406 times as large",)),
+    "loaded in cm": (lambda: squeezed_box(loaded=lambda p: 0.1 * p), ("by a factor of 0.108", "other units (cm")),
+    "loaded in inches": (lambda: squeezed_box(loaded=lambda p: p / 25.4), ("by a factor of 0.0424", "check the units")),
     "initial in m": (lambda: squeezed_box(initial=lambda p: 1e-3 * p), ("size_mm", "60 x 60 x 60")),
     "states exchanged": (swapped_states, ("stretched", "loaded state exchanged")),
     "height of 600": (lambda: squeezed_box(stated_mm={"pressed": 600.0}), ("height_stated_mm = 600", "60 mm")),

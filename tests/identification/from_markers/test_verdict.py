@@ -12,7 +12,8 @@ from naibu.core.parameters import Parameter, ParameterSet
 from naibu.core.status import Status
 from naibu.identification.from_markers.marker_checks import Doubt
 from naibu.identification.from_markers.marker_outliers import Outlier
-from naibu.identification.from_markers.verdict import CaseEvidence, Explanation, Verdict, prior_deviations, verdict
+from naibu.identification.from_markers.verdict import CaseEvidence, prior_deviations, verdict
+from naibu.identification.verdict import Explanation, Verdict
 
 SD = 0.2
 LATTICE = np.array(list(product(*[np.linspace(-20.0, 20.0, 5)] * 3))) + np.array([0.0, 0.0, 30.0])

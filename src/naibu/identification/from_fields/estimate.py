@@ -49,8 +49,9 @@ from naibu.identification.from_fields.sensitivities import (
 )
 from naibu.identification.from_fields.truncated_newton import truncated_step
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, report, resolution, resolution_report
-from naibu.identification.from_fields.verdict import FieldVerdict, inflation, verdict
+from naibu.identification.from_fields.verdict import inflation, verdict
 from naibu.identification.load_case import require_load_cases
+from naibu.identification.verdict import Explanation, Verdict
 
 FEW = 12  # zones up to which no penalty is needed by default
 START_POISSON_RATIO = 0.4
@@ -92,7 +93,7 @@ class FieldEstimate:
         What was done, a sentence a step.
     identifiability : tuple of str
         Which moduli the measurements determine, in words.
-    verdict : FieldVerdict or None
+    verdict : Verdict or None
         Whether the model explains the measurements.
     budget : ErrorBudget or None
         Where the uncertainty stems from.
@@ -116,7 +117,7 @@ class FieldEstimate:
     status: Status
     steps: tuple[str, ...]
     identifiability: tuple[str, ...]
-    verdict: FieldVerdict | None = None
+    verdict: Verdict | None = None
     budget: ErrorBudget | None = None
     mesh_shift: FloatArray | None = None
     assumptions: tuple[Assumption, ...] = ()
@@ -368,7 +369,7 @@ class _Recipe:
             total, coarse = total.with_added(covariance), float(np.abs(shift).max()) > COARSE
         judged = verdict(model.observed, residuals, freedom)
         budget = ErrorBudget(of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), shared)
-        sure = judged.explanation == "explained" and not coarse
+        sure = judged.explanation is Explanation.EXPLAINED and not coarse
         how_well = report(model.zones, theta, total, budget=budget, usable=judged.ok, sure=sure)
         words = (judged.sentence, *how_well, *effects(others, model.zones, theta, intervals(theta, total)[0]))
         if coarse:

@@ -9,56 +9,22 @@ spatial blocks, the cluster-robust estimator of :cite:t:`liang1986`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.rigid_transform import registration
 from naibu.identification.from_fields.forward_model import Observed
+from naibu.identification.verdict import Explanation, Verdict, shared_part
 
-Explanation = Literal["explained", "explained in part", "not explained"]
 WITHIN_NOISE = 1.25  # residuals over the noise that need no explanation even if neighbours share them
 NOISE_UNDERSTATED = 2.0  # residuals over the stated noise that may still be noise, if neighbours do not share them
 SMALL, LARGE = 0.02, 0.25  # of the deformation: so little needs no explanation, so much must not be left
 SHARED = 0.15
-NEIGHBOURS = 6
 BLOCKS, POINTS_PER_BLOCK, FEWEST_BLOCKS = 64, 6, 16
 
 
-@dataclass(frozen=True, slots=True)
-class FieldVerdict:
-    """Whether the model explains the measured fields.
-
-    Attributes
-    ----------
-    explanation : {"explained", "explained in part", "not explained"}
-        The verdict.
-    sentence : str
-        The same with its reasons.
-    noise_factor : float
-        Root mean square residual in units of the stated noise.
-    unexplained : float
-        Residual beyond noise over the deformation (displacement less its rigid motion), root mean squares.
-    shared : float
-        Correlation of the residual of a point with the mean of its neighbours'.
-    """
-
-    explanation: Explanation
-    sentence: str
-    noise_factor: float
-    unexplained: float
-    shared: float
-
-    @property
-    def ok(self) -> bool:
-        """Whether the moduli can be used."""
-        return self.explanation != "not explained"
-
-
-def verdict(observed: Sequence[Observed], residuals: Sequence[FloatArray], degrees_of_freedom: float) -> FieldVerdict:
+def verdict(observed: Sequence[Observed], residuals: Sequence[FloatArray], degrees_of_freedom: float) -> Verdict:
     """Return the verdict on whitened residuals (q,) of the load cases."""
     misfit = sum(float(r @ r) for r in residuals)
     factor = float(np.sqrt(misfit / max(degrees_of_freedom, 1.0)))
@@ -68,23 +34,24 @@ def verdict(observed: Sequence[Observed], residuals: Sequence[FloatArray], degre
         beyond = max(float(r @ r) - (len(r) if noise_stated else 0.0), 0.0) * o.noise_mm**2
         left, deformed = left + beyond, deformed + _deformation(o)
     unexplained = float(np.sqrt(left / max(deformed, 1e-300)))
-    shared = _shared(observed, residuals)
+    shared = shared_part([(o.points, r.reshape(len(o.points), -1)) for o, r in zip(observed, residuals, strict=True)]).correlation
     how = _explanation(factor, unexplained, shared, noise_stated=noise_stated)
     noise = f"residuals are {factor:.2g} times the stated noise, " if noise_stated else ""
-    sentence = f"{how.capitalize()}: {noise}{100 * unexplained:.2g} % of the deformation is left unexplained"
-    if shared > SHARED and how != "explained":
-        sentence += ", and neighbouring points share it"
-    advice = {"explained": "", "explained in part": ": question law, zones and known values", "not explained": "; do not use these moduli"}
-    return FieldVerdict(how, f"{sentence}{advice[how]}.", factor, unexplained, shared)
+    lead = f"{noise}{100 * unexplained:.2g} % of the deformation is left unexplained"
+    reasons: tuple[str, ...] = ()
+    if how is not Explanation.EXPLAINED:
+        alike = ", and neighbouring points share it" * (shared > SHARED)
+        reasons = (f"{lead}{alike}" + ": question law, zones and known values" * (how is Explanation.IN_PART),)
+    return Verdict(how, reasons, lead, factor, unexplained, shared)
 
 
 def _explanation(factor: float, unexplained: float, shared: float, *, noise_stated: bool) -> Explanation:
     if unexplained > LARGE and (factor > NOISE_UNDERSTATED or not noise_stated):
-        return "not explained"
+        return Explanation.NOT_EXPLAINED
     if not noise_stated:
-        return "explained" if unexplained <= SMALL else "explained in part"
+        return Explanation.EXPLAINED if unexplained <= SMALL else Explanation.IN_PART
     unshared = factor <= NOISE_UNDERSTATED and shared <= SHARED
-    return "explained" if factor <= WITHIN_NOISE or unshared else "explained in part"
+    return Explanation.EXPLAINED if factor <= WITHIN_NOISE or unshared else Explanation.IN_PART
 
 
 def _deformation(o: Observed) -> float:
@@ -93,20 +60,6 @@ def _deformation(o: Observed) -> float:
     if points.shape[1] < 3 or len(points) < 4:
         return float(((vectors - vectors.mean(axis=0)) ** 2).sum())
     return float(((points + vectors - registration(points, points + vectors).applied(points)) ** 2).sum())
-
-
-def _shared(observed: Sequence[Observed], residuals: Sequence[FloatArray]) -> float:
-    """Return the correlation of residuals with the mean of their neighbours', in [-1, 1]."""
-    products = own = of_means = 0.0
-    for o, r in zip(observed, residuals, strict=True):
-        at = r.reshape(len(o.points), -1)
-        count = min(NEIGHBOURS, len(at) - 1)
-        if count < 1:
-            continue
-        near = np.asarray(cKDTree(o.points).query(o.points, k=count + 1)[1])
-        means = at[near[:, 1:]].mean(axis=1)
-        products, own, of_means = products + float((at * means).sum()), own + float((at**2).sum()), of_means + float((means**2).sum())
-    return products / max(float(np.sqrt(own * of_means)), 1e-300)
 
 
 def inflation(

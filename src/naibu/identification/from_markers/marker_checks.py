@@ -1,8 +1,9 @@
 """Can the markers belong together? Size, orientation, order and motion of marker clouds are compared before anything is solved.
 
-What no loading can do to a body is refused: a mirror image, a thousandfold volume, labels without order. What is only unlikely is returned
-as doubts, which the verdict on the result takes up. The measure is the best affine map from the reference configuration to a loaded state:
-its determinant is the ratio of volumes, its right stretch tensor tells along which axis the body was shortened (:cite:p:`bonet2008`).
+What no loading can do to a body is refused: a mirror image, other units, labels without order (`naibu.imaging.markers.motion_coherence`),
+and what contradicts the loading. What is only unlikely is returned as doubts, which the verdict on the result takes up. They are judged by
+the best affine map from the reference configuration to a loaded state: its determinant is the ratio of volumes, its right stretch tensor
+tells along which axis the body was shortened (:cite:p:`bonet2008`).
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, State
 from naibu.core.rigid_transform import RigidTransform, registration
-from naibu.identification.from_markers.marker_grid import neighbours
 from naibu.identification.from_markers.observations import NoiseModel
+from naibu.identification.neighbours import neighbours
+from naibu.imaging.markers.motion_coherence import require_coherent
 
 FEWEST = 8  # markers of which an affine map says something about the rest
 COINCIDENT_MM = 1e-3
@@ -26,8 +28,7 @@ FLAT = 0.02  # a cloud is flat where its thickness is below this fraction of its
 SMALLEST_SPAN, SMALL_SPAN = 0.2, 0.33  # of the markers over the size of the object; refused, doubtful
 SMALLEST_SPAN_ALONG, THICK = 0.1, 0.2  # the same along the axis of loading alone, of a cloud that is no layer
 HIGHEST = 1.05  # of a stated height over the height at which the indenter touches the object
-INCOHERENT = 0.35  # median distance from the affine map over that from the centre: 0.02 to 0.12 in measured gels, about 1 without order
-IMPOSSIBLE_VOLUME, UNLIKELY_VOLUME = (0.05, 3.0), (0.3, 1.35)
+UNLIKELY_VOLUME = 0.3, 1.35
 GROWN = 1.02  # stretch along the axis of loading beyond which a body was not pressed there
 MOVED_PERCENTILE, STILL = 90.0, 1.8  # of the distances from the rigid motion; below so many times the noise (noise alone: 1.44)
 FLATTENED = 0.4  # of the stretch of the markers: a plate at a lower height would have flattened what they do not see to nothing
@@ -87,7 +88,7 @@ def check_markers(experiments: Sequence[Experiment], states: Mapping[str, Sequen
             _check_stated(e, state)
             _refuse_coincident(f"{e.name}/{name}", state.markers.ids[state.markers.trusted], state.markers.points[state.markers.trusted])
             if (motion := _motion(e, state)) is not None:
-                _refuse_impossible_maps(motion)
+                require_coherent(motion.free, motion.loaded, f"{motion.label} against {e.states[0].name}")
                 doubts += _motion_doubts(e, state, motion)
                 motions.append(motion)
         doubts += _upside_down(e, motions)
@@ -178,29 +179,6 @@ def robust_affine(points: FloatArray, measured: FloatArray) -> tuple[FloatArray,
         found = np.linalg.lstsq(design * weight[:, None], measured * weight[:, None], rcond=None)[0]
         weight = 1.0 / np.sqrt(np.maximum(np.linalg.norm(measured - design @ found, axis=1), smallest))
     return np.asarray(found[:3].T), np.asarray(design @ found)
-
-
-def _refuse_impossible_maps(m: _Motion) -> None:
-    """Refuse labels without order, mirror images and other units."""
-    from_map = float(np.median(np.linalg.norm(m.loaded - m.affine, axis=1)))
-    from_centre = float(np.median(np.linalg.norm(m.loaded - np.median(m.loaded, axis=0), axis=1)))
-    if from_map > INCOHERENT * from_centre:
-        raise InputError(
-            f"{m.label}: neighbouring markers do not move together (their median distance from the best affine map is {from_map:.1f} mm, "
-            f"from their centre {from_centre:.1f} mm); the same marker must have the same label in both states"
-        )
-    volume = float(np.linalg.det(m.matrix))
-    if volume < 0.0:
-        raise InputError(
-            f"{m.label}: it shows the mirror image of the reference configuration (the best affine map has the determinant {volume:.2f}); "
-            "an axis is reversed, or two axes are exchanged, in one of the two tables"
-        )
-    low, high = IMPOSSIBLE_VOLUME
-    if not low < volume < high:
-        raise InputError(
-            f"{m.label}: the markers enclose {volume:.3g} times the volume of the reference configuration, lengths are "
-            f"{np.cbrt(volume):.3g} times as large; check that both tables are in mm"
-        )
 
 
 def _motion_doubts(e: Experiment, state: State, m: _Motion) -> list[Doubt]:

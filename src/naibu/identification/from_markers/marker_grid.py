@@ -3,17 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 
 FILLED_SD_MM = 0.35  # how far a marker lies from its lattice position (threads give way while the gel cures)
-
-
-def neighbours(points: FloatArray, count: int) -> tuple[FloatArray, IntArray]:
-    """Return distances (k, n), mm, and indices (k, n) of the nearest others of points (k, 3), `count` of them where there are as many."""
-    distance, index = cKDTree(points).query(points, k=min(count + 1, len(points)))
-    return np.asarray(distance)[:, 1:], np.asarray(index, dtype=np.int64)[:, 1:]
 
 
 def lattice_indices(ids: IntArray, points: FloatArray) -> IntArray | None:

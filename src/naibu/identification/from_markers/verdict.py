@@ -2,7 +2,7 @@
 
 A search that converged has found a minimum, which says nothing about how low it is. The verdict weighs what tells data apart that the model
 cannot explain: the residuals in units of the noise, how much of the deformation they leave unexplained, whether an affine map does as well,
-the part of the residuals that neighbours share (noise is not shared; compare Moran's I, :cite:p:`moran1950`), estimates far from what was
+the part of the residuals that neighbours share (noise is not shared), estimates far from what was
 known beforehand, and heights that contradict the stated ones.
 """
 
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 
@@ -20,10 +19,10 @@ from naibu.core.rigid_transform import registration
 from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration
 from naibu.identification.from_markers.marker_checks import Doubt, robust_affine
-from naibu.identification.from_markers.marker_grid import neighbours
 from naibu.identification.from_markers.marker_outliers import Outlier
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase
 from naibu.identification.from_markers.parameter_names import platen_position
+from naibu.identification.verdict import NEIGHBOURS, Explanation, Verdict, shared_part
 
 NOISE_EXPLAINED = 2.0  # residuals below this many times the stated noise need no explanation
 NOISE_OVERSTATED = 0.5
@@ -32,19 +31,10 @@ NO_GAIN, WORSE = 0.95, 1.5  # residual over that of an affine map: nothing is ga
 SHARED, SHARED_NOISE = 0.1, 1.5  # the part of the residual that neighbours share, over the deformation and over the noise
 FAR_PRIOR, VERY_FAR_PRIOR = 5.0, 10.0  # standard deviations of a prior
 FAR_HEIGHT, VERY_FAR_HEIGHT = 0.5, 1.5  # difference of found and stated height over the stated compression
-NEIGHBOURS = 6
 WHITE = 0.3  # shared part of a residual that is like noise
 MANY = 0.04  # of the markers left out, which is no longer a few
 LISTED = 8  # outliers that get a sentence each
 FEWEST = 4  # markers of a zone that is named
-
-
-class Explanation(Enum):
-    """How far the model explains the data."""
-
-    EXPLAINED = "explained"
-    IN_PART = "explained in part"
-    NOT_EXPLAINED = "not explained, do not use"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,44 +90,7 @@ class CaseEvidence:
         """Root mean square of the part of the residual that neighbouring markers share, mm: noise has no such part."""
         if len(self.points) <= NEIGHBOURS:
             return 0.0
-        _, near = neighbours(self.points, NEIGHBOURS)
-        products = (self.residual[:, None, :] * self.residual[near]).sum(axis=2)
-        return float(np.sqrt(max(products.mean(), 0.0)))
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """Whether the model explains the data.
-
-    Attributes
-    ----------
-    explanation : Explanation
-    reasons : tuple of str
-        What speaks against an explanation, the gravest first; empty where nothing does.
-    notes : tuple of str
-        What else to know.
-    outliers : tuple of str
-        Markers that were left out, one sentence each.
-    lead : str
-        The figures behind it, in words.
-    """
-
-    explanation: Explanation
-    reasons: tuple[str, ...]
-    notes: tuple[str, ...]
-    outliers: tuple[str, ...]
-    lead: str
-
-    @property
-    def sentence(self) -> str:
-        """The verdict in one sentence."""
-        what = self.explanation.value
-        return f"{what[0].upper()}{what[1:]}: {'; '.join(self.reasons[:3]) or self.lead}."
-
-    @property
-    def reservation(self) -> str:
-        """The sentence where something speaks against the model, else nothing."""
-        return "" if self.explanation is Explanation.EXPLAINED else self.sentence
+        return float(np.sqrt(max(shared_part([(self.points, self.residual)]).square, 0.0)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,9 +168,11 @@ def verdict(
     explanation = Explanation.IN_PART if flaws else Explanation.EXPLAINED
     if any(f.grave for f in flaws):
         explanation = Explanation.NOT_EXPLAINED
+    left = float(np.sqrt(sum(c.rms_mm**2 for c in cases) / max(sum(c.rigid_mm**2 for c in cases), 1e-12)))
+    shared = shared_part([(c.points, c.residual) for c in cases]).correlation
     return Verdict(
-        explanation, tuple(f.text for f in flaws), _notes(cases, noise_factor), _left_out(outliers, cases),
-        _lead(cases, noise_factor),
+        explanation, tuple(f.text for f in flaws), _lead(cases, noise_factor, left), noise_factor, left, shared,
+        _notes(cases, noise_factor), _left_out(outliers, cases),
     )  # fmt: skip
 
 
@@ -301,11 +256,10 @@ def _left_out(outliers: Sequence[Outlier], cases: Sequence[CaseEvidence]) -> tup
     return tuple(told)
 
 
-def _lead(cases: Sequence[CaseEvidence], noise_factor: float) -> str:
+def _lead(cases: Sequence[CaseEvidence], noise_factor: float, left: float) -> str:
     worst = max((c.rms_mm for c in cases), default=0.0)
-    share = 1.0 - np.sqrt(sum(c.rms_mm**2 for c in cases) / max(sum(c.rigid_mm**2 for c in cases), 1e-12))
     figures = f"residuals of {worst:.2g} mm RMS at most, {noise_factor:.2f} times the noise"
-    return f"{figures}; {100 * share:.0f} % of the deformation is explained"
+    return f"{figures}; {100 * (1.0 - left):.0f} % of the deformation is explained"
 
 
 def _evidence(t: MarkerLoadCase, f: LoadCaseFit, values: dict[str, float]) -> CaseEvidence:
