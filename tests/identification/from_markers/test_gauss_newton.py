@@ -46,7 +46,7 @@ KNOWN = KnownMaterials({"hardness 5": 222.0})
 def test_derivatives_of_predicted_markers(
     name: str, state: str, size: float, law: str, tolerance: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(gauss_newton, "_PATH", SolverSettings(first_step=0.1, largest_step=0.1, tolerance=1e-11))
+    monkeypatch.setattr(gauss_newton, "PATH", SolverSettings(first_step=0.1, largest_step=0.1, tolerance=1e-11))
     monkeypatch.setattr(observations, "WARM_START_SPACING", 0.0)  # all on the same path
     experiment = datasets.load(name)
     body = specimen(experiment, ModelSettings(element_size_mm=size, law=law, pixel_scale="sought"))

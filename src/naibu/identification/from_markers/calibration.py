@@ -7,13 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, Layer, State
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.core.progress import Progress
+from naibu.core.status import Status
 from naibu.identification.from_markers.gauss_newton import Checkpoint, Match, Matcher, MatchingSettings
 from naibu.identification.from_markers.initial_guess import equilibrium_gap
 from naibu.identification.from_markers.known_materials import KnownMaterials
+from naibu.identification.from_markers.mesh_error import MeshError, mesh_error
 from naibu.identification.from_markers.observations import MarkerLoadCase, NoiseModel, SolvedLoadCase
 from naibu.identification.from_markers.parameter_names import (
     SHAPE_NAMES,
@@ -41,7 +44,25 @@ TRUSTED_RATIO = (0.05, 20.0)  # of an unknown modulus to the known ones; the equ
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """Load cases of a calibration and their fit; `priors` holds the parameters as they were before the search."""
+    """Load cases of a calibration and their fit.
+
+    Attributes
+    ----------
+    load_cases : tuple of MarkerLoadCase
+        What was fitted.
+    match : Match
+        The fit.
+    settings : ModelSettings
+        Law, contact, mesh.
+    noise : NoiseModel
+        Of the measurement.
+    known_materials : KnownMaterials
+        What set the scale.
+    priors : ParameterSet
+        The parameters as they were before the search.
+    mesh : MeshError, optional
+        What the size of the elements did to the parameters; None where that was not estimated.
+    """
 
     load_cases: tuple[MarkerLoadCase, ...]
     match: Match
@@ -49,6 +70,12 @@ class Calibration:
     noise: NoiseModel
     known_materials: KnownMaterials
     priors: ParameterSet
+    mesh: MeshError | None = None
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Second moment (p, p) of the errors of the free parameters on the optimiser's scale, from noise, misfit and elements."""
+        return self.match.covariance if self.mesh is None else self.match.covariance + self.mesh.covariance
 
     @property
     def warm_starts(self) -> dict[str, SolvedLoadCase]:
@@ -67,6 +94,7 @@ def calibrate(
     search: MatchingSettings | None = None,
     start: Mapping[str, float] | None = None,
     warm_starts: Mapping[str, SolvedLoadCase] | None = None,
+    with_mesh_error: bool = True,
     progress: Progress | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Calibration:
@@ -90,6 +118,8 @@ def calibrate(
         Physical values to start from, by name; priors keep their centres.
     warm_starts : mapping, optional
         Solutions near the start, by the labels of their load cases (`Calibration.warm_starts`); they save time.
+    with_mesh_error : bool
+        Whether to estimate what the size of the elements did to the parameters, on a finer mesh.
     progress : callable, optional
         Gets a report after every step (`naibu.core.progress`).
     checkpoint : callable, optional
@@ -116,7 +146,9 @@ def calibrate(
     match = Matcher(load_cases, parameters, search or MatchingSettings()).run(
         progress=progress, checkpoint=checkpoint, start=begin, warm_starts=warm_starts
     )
-    return Calibration(load_cases, match, chosen, measured, known, parameters)
+    ended = match.status is not Status.INTERRUPTED
+    mesh = mesh_error(load_cases, match, parameters) if with_mesh_error and ended else None
+    return Calibration(load_cases, match, chosen, measured, known, parameters, mesh)
 
 
 def _first_material(experiments: Sequence[Experiment]) -> KnownMaterials:

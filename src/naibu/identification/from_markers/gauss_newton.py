@@ -36,7 +36,7 @@ Checkpoint = Callable[[Mapping[str, float]], None]
 WIDEST_STEP = 3.0  # of an unknown on a linear scale: mm for positions
 UNEVEN = 0.01  # points that slip over an edge make the objective uneven; a step that promises less than this and fails ends the search
 ROUGH = 0.1  # a search is rough while a step may lower the objective by more than this fraction
-_PATH = SolverSettings(first_step=0.02, largest_step=0.15, tolerance=1e-6)
+PATH = SolverSettings(first_step=0.02, largest_step=0.15, tolerance=1e-6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,10 +157,10 @@ class Matcher:
         # as stiff as contact had to be before: the objective does not jump, and no evaluation finds it anew
         problem = with_normal_stiffness(load_case.specimen.problem(values, load_case.state), self._penalties.get(index, ()))
         try:
-            solution = solve(problem, settings=_PATH, solver=self._solvers.get(index), warm_start=warm_start)
+            solution = solve(problem, settings=PATH, solver=self._solvers.get(index), warm_start=warm_start)
         except ConvergenceError as error:
             raise ConvergenceError(f"{load_case.name}: {error}") from error
-        newton = Newton(solution.problem, _PATH, self._solvers.get(index))
+        newton = Newton(solution.problem, PATH, self._solvers.get(index))
         path = self._path_derivatives(load_case, values, solution, newton)
         self._solvers[index], self._penalties[index] = newton.solver, solution.states[-1].normal_stiffness
         return self._observed(load_case, values, solution, path, pose)
@@ -169,7 +169,7 @@ class Matcher:
         """Return fits at `values` with derivatives with respect to the free parameters of this matcher; nothing is solved anew."""
         out = []
         for load_case, fit in zip(self.load_cases, fits, strict=True):
-            newton = Newton(fit.solution.problem, _PATH)
+            newton = Newton(fit.solution.problem, PATH)
             path = self._path_derivatives(load_case, values, fit.solution, newton)
             out.append(self._observed(load_case, values, fit.solution, path, fit.pose))
         return out

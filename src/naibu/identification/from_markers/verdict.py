@@ -3,7 +3,7 @@
 A search that converged has found a minimum, which says nothing about how low it is. The verdict weighs what tells data apart that the model
 cannot explain: the residuals in units of the noise, how much of the deformation they leave unexplained, whether an affine map does as well,
 the part of the residuals that neighbours share (noise is not shared), estimates far from what was
-known beforehand, and heights that contradict the stated ones.
+known beforehand, and heights of indenters and layers that contradict the stated ones.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ from naibu.core.parameters import ParameterSet
 from naibu.core.rigid_transform import registration
 from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration
+from naibu.identification.from_markers.layer_heights import LAYER, contradicted_layers
 from naibu.identification.from_markers.marker_checks import Doubt, robust_affine
 from naibu.identification.from_markers.marker_outliers import Outlier
+from naibu.identification.from_markers.mesh_error import RATIO, STIFFNESSES
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase
 from naibu.identification.from_markers.parameter_names import platen_position
 from naibu.identification.verdict import NEIGHBOURS, Explanation, Verdict, shared_part
@@ -34,6 +36,7 @@ FAR_HEIGHT, VERY_FAR_HEIGHT = 0.5, 1.5  # difference of found and stated height 
 WHITE = 0.3  # shared part of a residual that is like noise
 MANY = 0.04  # of the markers left out, which is no longer a few
 LISTED = 8  # outliers that get a sentence each
+COARSE, COARSE_SD = 0.15, 2.0  # change of a modulus on smaller elements: of its logarithm, and in standard deviations
 FEWEST = 4  # markers of a zone that is named
 
 
@@ -114,7 +117,29 @@ def verdict_of(calibration: Calibration, doubts: Sequence[Doubt] = (), outliers:
     match = calibration.match
     values = match.parameters.values()
     cases = [_evidence(t, f, values) for t, f in zip(calibration.load_cases, match.fits, strict=True)]
-    return verdict(cases, prior_deviations(match.parameters, calibration.priors), match.noise_factor, match.status, doubts, outliers)
+    doubts = (*doubts, *coarse_elements(calibration), *contradicted_layers(calibration))
+    deviations = prior_deviations(match.parameters, calibration.priors)
+    others = {name: d for name, d in deviations.items() if LAYER not in name}
+    return verdict(cases, others, match.noise_factor, match.status, doubts, outliers)
+
+
+def coarse_elements(calibration: Calibration) -> tuple[Doubt, ...]:
+    """Doubt moduli that smaller elements would change by much, and by much more than noise."""
+    match, mesh = calibration.match, calibration.mesh
+    if mesh is None:
+        return ()
+    sd = np.sqrt(np.diag(match.covariance))
+    relative = np.array([abs(s) if p.name.endswith(STIFFNESSES) else 0.0 for p, s in zip(match.parameters.free, mesh.step, strict=True)])
+    worst = int(np.argmax(relative)) if len(relative) else 0
+    if not len(relative) or relative[worst] < max(COARSE, COARSE_SD * sd[worst]):
+        return ()
+    p = match.parameters.free[worst]
+    finer = p.physical(p.inner(p.value) + mesh.step[worst])
+    text = (
+        f"elements of {mesh.element_size_mm:.3g} mm are too coarse: on smaller ones {p.name} would be about {finer:.3g} rather than "
+        f"{p.value:.3g} {p.unit}".rstrip()
+    )
+    return (Doubt(f"{text}; identify with an element_size_mm of {mesh.element_size_mm / RATIO:.2g} or less"),)
 
 
 def prior_deviations(found: ParameterSet, priors: ParameterSet) -> dict[str, float]:

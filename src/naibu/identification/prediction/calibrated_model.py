@@ -75,7 +75,7 @@ class CalibratedModel:
         c = calibration
         labels = tuple(t.name for t in c.load_cases)
         return cls(
-            c.settings, c.match.parameters, c.match.covariance, c.noise, c.match.noise_factor, c.known_materials, labels, provenance or {},
+            c.settings, c.match.parameters, c.covariance, c.noise, c.match.noise_factor, c.known_materials, labels, provenance or {},
             predictive_uncertainty(c),
         )  # fmt: skip
 

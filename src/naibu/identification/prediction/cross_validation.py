@@ -129,6 +129,7 @@ def leave_one_out(
             noise=noise,
             search=search,
             start=start,
+            with_mesh_error=False,
             warm_starts=warm_starts,
             progress=_under_stage(progress, f"without {left.name}", stop),
         )
@@ -210,7 +211,7 @@ def compare_models(
         try:
             found = calibrate(
                 experiments, known_materials=known_materials, settings=settings, noise=noise, search=search,
-                progress=progress,
+                with_mesh_error=False, progress=progress,
             )  # fmt: skip
         except ConvergenceError as error:
             rows.append(ModelRow(settings, np.nan, np.nan, 0, np.nan, np.nan, str(error)))
