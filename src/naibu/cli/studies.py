@@ -14,7 +14,7 @@ from naibu.cli.console import INTERRUPTED, app, errors, print_table, progress_di
 from naibu.cli.described import Flag, Whole
 from naibu.core.progress import ProgressReport
 
-ChapterName = Literal["ch1", "ch2", "ch3", "ch4-adaptive", "ch4-lattice", "ch4-cube", "ch4-octree"]
+ChapterName = Literal["ch1", "ch2", "ch3", "ch4-adaptive", "ch4-cut", "ch4-lattice", "ch4-cube", "ch4-octree"]
 
 
 @app.command

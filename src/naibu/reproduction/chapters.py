@@ -9,6 +9,7 @@ from naibu.reproduction.chapter2.tables import chapter2
 from naibu.reproduction.chapter3.tables import chapter3
 from naibu.reproduction.chapter4.adaptive import chapter4_adaptive
 from naibu.reproduction.chapter4.cube import chapter4_cube
+from naibu.reproduction.chapter4.cutting import chapter4_cut
 from naibu.reproduction.chapter4.lattice import chapter4_lattice
 from naibu.reproduction.chapter4.octree import chapter4_octree
 from naibu.viewer.chapter import Chapter
@@ -18,6 +19,7 @@ CHAPTERS: dict[str, Callable[[int], Chapter]] = {
     "ch2": chapter2,
     "ch3": chapter3,
     "ch4-adaptive": chapter4_adaptive,
+    "ch4-cut": chapter4_cut,
     "ch4-lattice": chapter4_lattice,
     "ch4-cube": chapter4_cube,
     "ch4-octree": chapter4_octree,
