@@ -10,10 +10,20 @@ from naibu.cli import experiments, imaging, studies, touching  # noqa: F401  the
 from naibu.cli.cold_start import first_run
 from naibu.cli.console import BAD_INPUT, FAILED, INTERRUPTED, app, errors, fail, print_table, progress_display, say
 from naibu.cli.described import Flag
-from naibu.cli.failures import OutputLostError, flush_output, leave_quietly, occupy_closed_streams, output_lost, unexpected
+from naibu.cli.failures import (
+    OutputLostError,
+    flush_output,
+    leave_quietly,
+    occupy_closed_streams,
+    out_of_memory,
+    output_lost,
+    require_room,
+    unexpected,
+)
 from naibu.cli.installation import doctor_rows, healthy
 from naibu.cli.option_names import in_options, usage_error
 from naibu.core.errors import ConvergenceError, NaibuError
+from naibu.core.memory import is_out_of_memory
 
 
 @app.command
@@ -87,6 +97,7 @@ def main() -> None:
     """Run the command line; a user's mistake ends with one message and exit code 2, any other error with one message and code 1."""
     occupy_closed_streams()
     try:
+        require_room(_verb())
         _run()
     except CycloptsError as error:
         fail(usage_error(" ".join(str(error).split()), app, sys.argv[1:]), BAD_INPUT)
@@ -97,9 +108,9 @@ def main() -> None:
         sys.exit(INTERRUPTED)
     except OutputLostError as error:
         leave_quietly(str(error))
-    except MemoryError as error:
-        fail(f"naibu {_verb()} needs more memory than there is ({error or 'no details'}); use a coarser mesh or smaller volumes", FAILED)
     except Exception as error:
+        if is_out_of_memory(error):
+            fail(out_of_memory(error, _verb()), FAILED)
         if output_lost(error):
             leave_quietly(f"standard output cannot be written ({error}); results in files are complete")
         fail(unexpected(error, _verb()), FAILED)

@@ -13,8 +13,16 @@ from pathlib import Path
 from typing import NoReturn
 
 from naibu._version import __version__
+from naibu.core.memory import LIBRARIES_MB, require_address_space
 
 _LOST = (errno.EPIPE, errno.ENOSPC, errno.EFBIG, errno.EBADF, errno.EIO)
+
+_REMEDIES = {
+    **dict.fromkeys(("identify", "predict", "compare"), "larger elements (--element-size-mm) or fewer experiments and states"),
+    **dict.fromkeys(("sense", "compare-methods"), "smaller volumes (crop them or take larger voxels), or Zarr (read block by block)"),
+    **dict.fromkeys(("track", "track-sequence"), "smaller volumes (crop them or take larger voxels)"),
+    **dict.fromkeys(("simulate", "live", "cut"), "a coarser mesh or lattice"),
+}
 
 
 class OutputLostError(Exception):
@@ -37,6 +45,32 @@ def unexpected(error: Exception, verb: str) -> str:
     log = _kept(text)
     where = f"the details are in {log}" if log is not None else "its details could not be written to a file"
     return f"{reason}; {where}. Please report it with the command that you gave; results that were written are complete"
+
+
+def require_room(verb: str) -> None:
+    """Raise an error unless the libraries of a verb fit into the address space that the process may take.
+
+    Raises
+    ------
+    MemoryError
+        They do not; loading them would end in messages that are not naibu's, or never.
+    """
+    require_address_space(LIBRARIES_MB, f"the libraries of naibu {verb}".rstrip())
+
+
+def out_of_memory(error: BaseException, verb: str) -> str:
+    """Return the message for an error of too little memory.
+
+    Parameters
+    ----------
+    error : BaseException
+        What was raised.
+    verb : str
+        The verb that was running.
+    """
+    reason = " ".join(str(error).split())[:300].rstrip(".") or "no details"
+    remedy = _REMEDIES.get(verb, "a coarser mesh or smaller volumes")
+    return f"naibu {verb} needs more memory than there is ({reason}); use {remedy}, or a computer with more memory"
 
 
 def _kept(text: str) -> Path | None:

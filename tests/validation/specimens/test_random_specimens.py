@@ -18,6 +18,16 @@ def test_a_specimen_converges(seed):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seed", [25, 50])
+def test_a_specimen_that_snaps_through_converges(seed):
+    """The surface of 25 slips around the corner of the bar, 50 rises between the side plates: equilibrium is several mm away."""
+    drawn = random_specimen(seed)
+    solution = virtual_specimen(drawn.experiment, drawn.truth, settings=drawn.settings).solutions["pressed"]
+    assert solution.status is Status.CONVERGED
+    assert solution.relative_penetration <= 0.01
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(100, 140))
 def test_specimens_converge_or_tell(seed):
     drawn = random_specimen(seed)

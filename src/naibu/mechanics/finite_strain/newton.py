@@ -1,7 +1,8 @@
 """Equilibrium at one load: Newton's method with line search, and pseudo-transient continuation where it does not converge.
 
 Linear systems far from convergence are solved coarsely by iterative solvers, with the forcing terms of :cite:t:`eisenstat1996`; the line
-search looks for a zero of the work of the residual on the step; pseudo-transient continuation is that of :cite:t:`kelley1998`.
+search looks for a zero of the work of the residual on the step; pseudo-transient continuation is that of :cite:t:`kelley1998`, with
+steps of implicit Euler that are solved for, not only linearised.
 """
 
 from __future__ import annotations
@@ -20,10 +21,33 @@ from naibu.mechanics.linear_algebra.iterative import ApproximateFactorization
 from naibu.mechanics.linear_algebra.protocols import Factorization, LinearSolver
 from naibu.mechanics.linear_algebra.solver_selection import choose_solver
 
-PSEUDO_TRANSIENT_ITERATIONS = 40
+PSEUDO_TRANSIENT_ITERATIONS = 200  # in all; a body that snaps through takes 60 to 200
+STEP_ITERATIONS = 10  # of Newton's method within a step in pseudo-time
 RIGID_MOTION = 100.0  # extents of the body: a longer Newton step is a rigid-body motion that nothing constrains
-PSEUDO_STIFFNESS = 0.01  # initial mass over pseudo-time step, as a fraction of the mean diagonal of the tangent
+FIRST_DRAG = 0.02  # viscosity over the first step in pseudo-time, as a fraction of the mean diagonal of the tangent
+MOST_DRAG = 1e3  # likewise; a step so short hardly moves the body
+CALM = 2  # steps in pseudo-time after a failed one that do not grow
 _COARSE = 0.01  # relative tolerance of linear solves far from equilibrium, for solvers that can make use of it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drag:
+    """Viscous force of a step of implicit Euler in pseudo-time.
+
+    Attributes
+    ----------
+    start : ndarray, shape (n, 3)
+        Displacement where the step begins, mm.
+    stiffness : float
+        Viscosity over the length of the step, mN/mm.
+    """
+
+    start: FloatArray
+    stiffness: float
+
+    def force(self, u: FloatArray) -> FloatArray:
+        """Return the force (n, 3), mN, against the way to the displacement `u` (n, 3), mm."""
+        return self.stiffness * (u - self.start)
 
 
 @dataclass(slots=True, eq=False)
@@ -42,13 +66,16 @@ class Newton:
         Iterations so far.
     rigid_motion : bool
         Whether the last Newton step was so long that a rigid-body motion must be unconstrained.
+    restless : ndarray, shape (n, 3), or None
+        By how much the body moved, mm, in the last pseudo-transient continuation, if it came to no rest.
     """
 
     problem: Problem
     settings: SolverSettings
     solver: LinearSolver | None = None
     iterations: int = 0
-    rigid_motion: bool = False  # whether the last step was as long as an unconstrained rigid-body motion
+    rigid_motion: bool = False
+    restless: FloatArray | None = None
 
     def residual(self, u: FloatArray, anchors: tuple[FloatArray, ...], load: float) -> tuple[FloatArray, float, float]:
         """Return the out-of-balance force (n, 3) mN, a force scale mN, and the smallest det F."""
@@ -126,7 +153,7 @@ class Newton:
                 self.iterations += 1
                 step = -solved(self._factorized(matrix), residual, self._forcing(norm, previous, scale))
                 self.rigid_motion = float(np.abs(step).max()) > RIGID_MOTION * extent
-                found = self._line_search(u, step, anchors, load, residual)
+                found = self.line_search(u, step, anchors, load, residual)
                 poor += found is None or found[1] < 0.15
                 if found is None or poor > 2 or np.abs(step).max() > extent:
                     return None  # a shorter load step costs less than many poor iterations
@@ -140,29 +167,50 @@ class Newton:
     def pseudo_transient(self, u: FloatArray, anchors: tuple[FloatArray, ...], load: float) -> tuple[FloatArray, float] | None:
         """Return displacement (n, 3) mm and relative residual in equilibrium by pseudo-transient continuation; None where it fails.
 
-        A contact point that slips over an edge snaps through to another equilibrium, where Newton's method may cycle. An implicit step in
-        pseudo-time adds a multiple of the identity to the tangent, which falls with the residual :cite:p:`kelley1998`.
+        A body that slips off a plate, folds at an edge or buckles snaps through to another equilibrium, on the way to which Newton's method
+        cycles. Slowed down by a viscous drag it follows a path of which every step of implicit Euler has a solution if it is short enough;
+        the steps grow with success until the drag vanishes :cite:p:`kelley1998`.
         """
-        norms: list[float] = []
+        drag, calm, budget = FIRST_DRAG, 0, self.iterations + PSEUDO_TRANSIENT_ITERATIONS
+        before, self.restless = u, None
         try:
             u = self._predicted(u, anchors, load)
-            for _ in range(PSEUDO_TRANSIENT_ITERATIONS):
-                residual, scale, matrix, _ = self._tangent(u, anchors, load, curvature=False)
-                norm = float(np.abs(residual).sum())
-                if norm <= self.settings.tolerance * scale:
-                    return u, norm / scale
-                norms.append(norm)
-                self.iterations += 1
-                step = -solved(self._factorized(matrix, PSEUDO_STIFFNESS * min(norm / norms[0], 1.0)), residual, _COARSE)
-                if len(norms) > 2 and norm > 0.8 * norms[-3]:
-                    step *= 0.5  # points alternate between stick and slip
-                for _ in range(6):
-                    if self.residual(u + step, anchors, load)[2] > 0.0:
-                        break
-                    step *= 0.5
-                u = u + step
+            while self.iterations < budget and drag < MOST_DRAG:
+                begun = self.iterations
+                found = self._pseudo_step(u, anchors, load, drag)
+                if found is None:
+                    drag, calm = 4.0 * drag, CALM
+                    continue
+                u, residual = found
+                if residual <= self.settings.tolerance:
+                    return u, residual
+                calm -= 1
+                if calm <= 0:
+                    taken = self.iterations - begun
+                    drag *= 0.25 if taken <= 4 else 0.5 if taken < 7 else 1.0
         except ConvergenceError:
             return None
+        self.restless = u - before
+        return None
+
+    def _pseudo_step(self, start: FloatArray, anchors: tuple[FloatArray, ...], load: float, drag: float) -> tuple[FloatArray, float] | None:
+        """Return displacement (n, 3) mm and relative residual (without the drag) after a step in pseudo-time; None where it is too long."""
+        u, viscous = start, None
+        for _ in range(STEP_ITERATIONS):
+            residual, scale, matrix, _ = self._tangent(u, anchors, load)
+            mean = float(matrix.diagonal().mean())  # contact changes it
+            if viscous is None:
+                viscous = Drag(start, drag * mean)
+            unbalanced = residual + viscous.force(u)
+            norm, static = float(np.abs(unbalanced).sum()), float(np.abs(residual).sum())
+            if norm <= max(self.settings.tolerance * scale, _COARSE * static):
+                return u, static / scale
+            self.iterations += 1
+            step = -solved(self._factorized(matrix, viscous.stiffness / mean), unbalanced, _COARSE)
+            found = self.line_search(u, step, anchors, load, unbalanced, viscous)
+            if found is None:
+                return None
+            u = found[0]
         return None
 
     def _forcing(self, norm: float, previous: float, scale: float) -> float:
@@ -186,8 +234,8 @@ class Newton:
         self.iterations += 1
         return np.asarray(target - solved(self._factorized(matrix), residual, _COARSE))
 
-    def _line_search(
-        self, u: FloatArray, step: FloatArray, anchors: tuple[FloatArray, ...], load: float, residual: FloatArray
+    def line_search(
+        self, u: FloatArray, step: FloatArray, anchors: tuple[FloatArray, ...], load: float, residual: FloatArray, drag: Drag | None = None
     ) -> tuple[FloatArray, float, float] | None:
         """Return ``u + a step``, a in (0, 1] and the relative residual there; None where all invert elements.
 
@@ -205,6 +253,8 @@ class Newton:
                 high = a
                 a = 0.5 * (low + a)
                 continue
+            if drag is not None:
+                r = r + drag.force(trial)
             work = float((r * step).sum())
             best = trial, a, float(np.abs(r).sum()) / scale
             if abs(work) <= 0.5 * abs(before) or (a == 1.0 and work * before > 0.0):

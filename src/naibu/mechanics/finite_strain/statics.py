@@ -10,6 +10,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray, require_finite
 from naibu.core.errors import ConvergenceError
 from naibu.core.status import Status
+from naibu.mechanics.finite_strain.failure_reasons import failure_reason
 from naibu.mechanics.finite_strain.newton import Newton
 from naibu.mechanics.finite_strain.penalties import relative_penetrations, stiffened, with_softer_sticking, with_suited_penalties
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
@@ -17,6 +18,8 @@ from naibu.mechanics.linear_algebra.protocols import LinearSolver
 
 USUAL_ITERATIONS = 5.0  # Newton iterations of a load step of suitable length
 MOST_RAISES = 8  # of the penalties of contact at a load
+PSEUDO_TRANSIENT_STEP = 0.3  # first load steps; longer ones are halved before pseudo-transient continuation is tried
+PSEUDO_FAILURES = 4  # of pseudo-transient continuation, each much longer than Newton's method, before no equilibrium is sought further
 PATIENCE = 2  # load steps for which Newton's method fails, before frictional points on soft elements stick more softly
 WarmStart = tuple[float, FloatArray]  # a fraction of the load, and an initial guess of the displacement there (n, 3), mm
 
@@ -134,7 +137,7 @@ def solve(
         newton.problem, known = softer, [(state.load, state.displacement) for state in path.states[1:]]
         path = _LoadPath(newton, [first], known, chosen.first_step, chosen.largest_step, may_soften=False)
         path.follow(callback)
-    return finished(newton, path.states, path.residual, path.status, throw)
+    return finished(newton, path.states, path.residual, path.status, throw, path.seen)
 
 
 @dataclass(slots=True, eq=False)
@@ -149,7 +152,10 @@ class _LoadPath:
     may_soften: bool = True
     residual: float = 0.0
     status: Status = Status.CONVERGED
+    seen: str = ""
     rejected: int = 0
+    pseudo_failed: int = 0
+    smooth_from: int = 0  # the first state after the last jump: nothing is extrapolated across it
 
     def follow(self, callback: Callable[[float], None] | None) -> Problem | None:
         """Follow the load; return the problem with softer sticking where it must be followed again with that, else None."""
@@ -168,9 +174,8 @@ class _LoadPath:
                     return softer
                 self.step = 0.5 * (load - last.load)
                 self.ceiling = 1.6 * self.step
-                if self.step < settings.smallest_step:
-                    reason = Status.PENETRATION if penetrated else Status.STEP_TOO_SMALL
-                    self.status = Status.SINGULAR if self.newton.rigid_motion else reason
+                if self.step < settings.smallest_step or self.pseudo_failed >= PSEUDO_FAILURES:
+                    self.status, self.seen = failure_reason(self.newton, last.displacement, last.anchors, load, penetrated=penetrated)
                     return None
                 continue
             self.residual = found[1]
@@ -187,13 +192,18 @@ class _LoadPath:
     def _solved(self, load: float, passed: WarmStart | None, ahead: WarmStart | None) -> tuple[tuple[FloatArray, float] | None, int]:
         """Return equilibrium at `load` and its residual, None where there is none, and the iterations of the last guess."""
         newton, last, found, before = self.newton, self.states[-1], None, 0
-        for guess in _guesses(self.states, load, passed, ahead):
+        for guess in _guesses(self.states[self.smooth_from :], load, passed, ahead):
             before = newton.iterations
             found = newton.solve(guess, last.anchors, load)
             if found is not None:
                 break
-        if found is None and load - last.load < newton.settings.first_step:
+        if found is None and load - last.load < PSEUDO_TRANSIENT_STEP * newton.settings.first_step:
             found = newton.pseudo_transient(last.displacement, last.anchors, load)
+            if found is None:
+                self.pseudo_failed += 1
+            else:
+                self.smooth_from = len(self.states)
+            return found, int(USUAL_ITERATIONS)
         return found, newton.iterations - before
 
 
@@ -254,8 +264,8 @@ def advanced(problem: Problem, u: FloatArray, anchors: tuple[FloatArray, ...], l
     return LoadState(load, u, moved, tuple(c.normal_stiffness for c in problem.contacts))
 
 
-def finished(newton: Newton, states: list[LoadState], residual: float, status: Status, throw: bool) -> Solution:
-    """Return the solution that ends with the last of `states`, with its reactions.
+def finished(newton: Newton, states: list[LoadState], residual: float, status: Status, throw: bool, seen: str = "") -> Solution:
+    """Return the solution that ends with the last of `states`, with its reactions; `seen` is what the message tells beside the status.
 
     Raises
     ------
@@ -263,7 +273,7 @@ def finished(newton: Newton, states: list[LoadState], residual: float, status: S
         `status` is not converged (only with `throw`).
     """
     if throw and not status.ok:
-        raise ConvergenceError(f"stopped at {100 * states[-1].load:.1f} % of the load. {status.value}")
+        raise ConvergenceError(f"stopped at {100 * states[-1].load:.1f} % of the load. {status.value} {seen}".rstrip())
     problem, last = newton.problem, states[-1]
     reactions: dict[str, FloatArray] = {}
     penetration, relative = 0.0, 0.0

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from naibu.core.arrays import AnyFloatArray, FloatArray
 from naibu.core.errors import ConvergenceError, InputError
+from naibu.core.memory import require_address_space
 from naibu.mechanics.linear_algebra.protocols import Factorization, LinearSolver
 
 
@@ -39,6 +40,13 @@ def pardiso_library() -> ctypes.CDLL | None:
     return None
 
 
+@functools.cache
+def _require_room() -> None:
+    """Raise a MemoryError where oneMKL, which loads most of itself at its first use, would end the process for want of address space."""
+    threads = int(os.environ.get("OMP_NUM_THREADS", "").partition(",")[0] or os.cpu_count() or 1)
+    require_address_space(MKL_MB + MKL_THREAD_MB * threads, f"PARDISO (oneMKL) and its {threads} threads (OMP_NUM_THREADS)")
+
+
 def use_one_thread() -> None:
     """Restrict the direct solver to one thread when called from the present thread; for problems solved in parallel."""
     library = pardiso_library()
@@ -46,6 +54,8 @@ def use_one_thread() -> None:
         library.MKL_Set_Num_Threads_Local(1)
 
 
+MKL_MB = 400  # of address space for the libraries, twice of what they took here
+MKL_THREAD_MB = 80  # for the stack and the heap of a thread
 _NO_MEMORY = -2  # PARDISO's number of this error
 
 
@@ -73,6 +83,7 @@ class PardisoSolver:
         library = pardiso_library()
         if library is None:
             raise InputError('PARDISO is not installed; run: pip install "naibu[fast]"')
+        _require_room()
         self._library = library
         self._symmetric = symmetric
         marked = sp.bsr_matrix(

@@ -1,0 +1,66 @@
+"""How much address space a process may still take, and which errors are those of too little memory.
+
+Under a limit of the address space (``ulimit -v``, batch systems) libraries in C end the process with messages of their own, or wait for
+ever; what they need is therefore asked for before they are loaded. Only POSIX systems have such limits.
+"""
+
+from __future__ import annotations
+
+import errno
+import sys
+from pathlib import Path
+
+MEGABYTE = 2**20
+LIBRARIES_MB = 640  # for Python, NumPy, SciPy and LLVM: they do not load with 450 MB, small computations run with 700
+_SIGNS = ("failed to map segment", "cannot allocate memory", "can't start new thread", "unable to allocate", "not enough memory")
+
+
+def address_space() -> tuple[float, float]:
+    """Return how much address space the process may take and how much it has taken, MB; infinite and 0 where there is no limit."""
+    if sys.platform == "win32":
+        return float("inf"), 0.0
+    import resource
+
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit == resource.RLIM_INFINITY:
+        return float("inf"), 0.0
+    try:
+        taken = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
+    except OSError:  # no such file on macOS
+        taken = 0
+    return limit / MEGABYTE, taken / MEGABYTE
+
+
+def require_address_space(needed_mb: float, what: str) -> None:
+    """Raise an error unless a limit of the address space leaves enough room.
+
+    Parameters
+    ----------
+    needed_mb : float
+        Room that `what` takes, MB.
+    what : str
+        What takes it, for the message.
+
+    Raises
+    ------
+    MemoryError
+        Too little room is left.
+    """
+    limit, taken = address_space()
+    if limit - taken < needed_mb:
+        raise MemoryError(
+            f"{what} take {needed_mb:.0f} MB of address space, and {max(limit - taken, 0.0):.0f} MB of a limit of {limit:.0f} MB are left: "
+            "raise the limit (ulimit -v)"
+        )
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Tell whether an error, or one that caused it, is that of too little memory, whatever its class."""
+    seen: BaseException | None = error
+    while seen is not None:
+        if isinstance(seen, MemoryError) or (isinstance(seen, OSError) and seen.errno == errno.ENOMEM):
+            return True
+        if isinstance(seen, OSError | ImportError | RuntimeError) and any(sign in str(seen).lower() for sign in _SIGNS):
+            return True
+        seen = seen.__cause__ or seen.__context__
+    return False
