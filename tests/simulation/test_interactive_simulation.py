@@ -135,12 +135,35 @@ def test_a_cut_keeps_momentum_and_the_halves_part_under_tension() -> None:
     assert len(touched.last.positions) == mesh.n_points
 
 
+def test_a_lattice_is_cut_while_it_is_touched() -> None:
+    touched = simulation()
+    before = touched.body.engine.lattice  # type: ignore[attr-defined]
+    touched.take("sphere")
+    touched.move((20.0, 20.0, TOP + 4.0))
+    for _ in range(10):
+        touched.advance()
+    found = touched.cut([[[-50.0, y, 21.0], [50.0, y, 21.0]] for y in (-50.0, 50.0)])
+    assert found.n_pieces == 2
+    engine = touched.body.engine  # type: ignore[attr-defined]
+    assert engine.lattice.total_mass == pytest.approx(before.total_mass, rel=1e-12)
+    corner = int(np.argmax(engine.lattice.points.sum(axis=1)))
+    touched.grip(corner, 12.0)
+    touched.pull(engine.lattice.points[corner] + [0.0, 0.0, 15.0])
+    for _ in range(40):
+        frame = touched.advance()
+    upper, lower = (frame.positions[engine.lattice.cells[found.piece == found.piece[k]]] for k in (-1, 0))
+    assert upper[..., 2].min() > 25.0
+    assert lower[..., 2].max() < 24.0
+    assert touched.undo() and touched.undo()
+    assert len(touched.last.positions) == before.n_nodes
+
+
 def test_what_cannot_be_is_refused() -> None:
     touched = simulation()
     with pytest.raises(InputError, match="there is no tool 'hammer'; choose one of sphere, far"):
         touched.take("hammer")
-    with pytest.raises(InputError, match="is a lattice, which is not cut"):
-        touched.cut([[[0.0, 0, 0], [1.0, 0, 0]], [[0.0, 1, 0], [1.0, 1, 0]]])
+    with pytest.raises(InputError, match="faces of the lattice's cubes lie up to 5 mm from the blade; choose 10 mm"):
+        touched.cut([[[-50.0, y, 15.0], [50.0, y, 15.0]] for y in (-50.0, 50.0)], 4.0)
     with pytest.raises(InputError, match="node is 125"):
         touched.grip(125)
     with pytest.raises(InputError, match="begins inside the body"):

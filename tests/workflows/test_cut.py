@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from naibu.core.errors import InputError
+from naibu.core.volume import Volume
+from naibu.io.images import write_volume
 from naibu.io.meshes import read_mesh
 from naibu.io.vtk_files import write_vtu
 from naibu.meshing import box, signed_volumes
@@ -50,6 +52,51 @@ def test_a_whole_cut_parts_the_pieces_by_the_pull(tmp_path: Path) -> None:
     assert done.opening_mm == pytest.approx(2.0, rel=0.05)
 
 
+LATTICE = """
+[object]
+labels = "body.nrrd"
+mass_g = 10.0
+[lattice]
+spacing_mm = 2.0
+[parameters]
+K = 60.0
+C1 = 6.0
+C2 = 1e6
+[simulation]
+duration_s = 1.0
+[floor]
+contact = "sticking"
+"""
+
+
+def study_file(folder: Path) -> Path:
+    """A block of 16 x 8 x 8 mm whose long edge lies along y of the scan, where it begins at 100 mm."""
+    turned = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    labels = Volume.from_array(np.ones((4, 4, 8), np.uint8), spacing_mm=(2.0, 2.0, 2.0), origin_mm=(3.0, 101.0, 1.0), direction=turned)
+    write_volume(folder / "body.nrrd", labels)
+    (folder / "block.toml").write_text(LATTICE)
+    return folder / "block.toml"
+
+
+def test_a_lattice_is_cut_in_the_frame_of_its_scan(tmp_path: Path) -> None:
+    rows = [f"{x},108,-5,{x},108,20" for x in (-20, 20)]
+    done = cut(study_file(tmp_path), path_file(tmp_path, 0.0, "\n".join(rows) + "\n"), out=tmp_path / "out", pull_percent=10.0)
+    numbers = json.loads((tmp_path / "out" / "cut.json").read_text())
+    np.testing.assert_allclose(done.volumes_mm3, 512.0)
+    assert numbers["pulled_along"] == "y"
+    assert numbers["area_of_the_cut_mm2"] == pytest.approx(64.0)
+    assert done.opening_mm == pytest.approx(1.6, rel=0.02)
+    written = read_mesh(tmp_path / "out" / "cut.vtu")
+    np.testing.assert_allclose(written.points.min(axis=0), [-4.0, 100.0, 0.0], atol=1e-4)
+    assert signed_volumes(written).sum() == pytest.approx(1024.0, rel=1e-6)
+
+
+def test_a_lattice_is_not_cut_nearer_to_the_blade_than_its_cubes_let_it(tmp_path: Path) -> None:
+    rows = [f"{x},108.9,-5,{x},108.9,20" for x in (-20, 20)]
+    with pytest.raises(InputError, match=r"distance_mm is 1 mm.*choose 1\.8 mm"):
+        cut(study_file(tmp_path), path_file(tmp_path, 0.0, "\n".join(rows) + "\n"), out=tmp_path / "out", distance_mm=1.0)
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -70,8 +117,6 @@ def test_paths_that_cannot_be_used_are_refused(tmp_path: Path, text: str, said: 
 
 def test_what_cannot_be_cut_is_refused(tmp_path: Path) -> None:
     path = path_file(tmp_path, 0.0)
-    with pytest.raises(InputError, match="is a lattice, which is not cut"):
-        cut("cube-pushing", path, out=tmp_path / "out")
     with pytest.raises(InputError, match="pull_percent"):
         cut(mesh_file(tmp_path), path, out=tmp_path / "out", pull_percent=80.0)
     with pytest.raises(InputError, match=r"blade\.csv: is not UTF-8"):

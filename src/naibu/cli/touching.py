@@ -80,21 +80,23 @@ def cut(
     unit_mm: float | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Cut a mesh, an identified model or a scanned surface, let the cut open, and write mesh, motion, page and numbers.
+    """Cut a mesh, an identified model, a lattice or a scanned surface, let the cut open, and write mesh, motion, page and numbers.
 
     A solid is cut along the path of a blade, and pulled apart. A surface is cut along the path of a tool's tip, and opens under tension.
 
     Parameters
     ----------
     source
-        demo, model.json of an identification or its folder, a mesh (.vtu, .msh), or a surface (.stl, .ply, .obj, .wrl), which may be open.
+        demo, model.json of an identification or its folder, a mesh (.vtu, .msh), a lattice study (STUDY.toml) or the name of one, or a
+        surface (.stl, .ply, .obj, .wrl), which may be open.
     path
         CSV table. Of a blade: each row a pose, x, y, z in mm of the edge's first vertex, then of the second, and so on. Of the tip of a
         tool over a surface: each row x, y, z in mm.
     out
         Folder for cut.html, cut.vtu (mesh with its pieces), cut.vtkhdf (motion) and cut.json.
     distance_mm
-        Twice the largest distance of the cut from the path; half of the mean edge of the mesh or surface by default.
+        Twice the largest distance of the cut from the path; half of the mean edge of the mesh or surface by default. Lattices are not
+        refined: a cut of theirs farther away is refused.
     pull_percent
         Solids: how far the ends along the axis that the cut crosses most are pulled apart, in per cent of their distance; 5 by default.
     experiment

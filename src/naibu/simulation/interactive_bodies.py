@@ -20,10 +20,13 @@ from naibu.mechanics.finite_elements.hyperelasticity import material
 from naibu.mechanics.finite_strain.dynamic_session import DynamicEngine, DynamicState
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState
+from naibu.mechanics.lattices.model.surface import surface_triangles
 from naibu.meshing.cutting.swept_blade import SweptBlade
 from naibu.meshing.cutting.volume import VolumeCut, cut_volume
 from naibu.meshing.element_conversion import to_tetra
+from naibu.meshing.quality import mean_edge_length
 from naibu.meshing.surface import boundary_faces, triangles_of_faces
+from naibu.simulation.lattice_cut import LatticeCut, cut_engine, cut_lattice
 
 NO_NODES: IntArray = np.zeros(0, dtype=np.int64)
 
@@ -64,6 +67,9 @@ class InteractiveBody(Protocol):
 
     def without_contact(self, state: Any) -> Any:
         """Return a copy of a state that no indenter touches."""
+
+    def cut(self, state: Any, blade: SweptBlade, distance_mm: float | None = None) -> tuple[InteractiveBody, Any, VolumeCut | LatticeCut]:
+        """Return the body and its state behind a cut; by default as near to the blade as the body's cells suggest."""
 
     def strain(self, positions: FloatArray) -> FloatArray:
         """Return a scalar strain at the nodes (n,), %, at positions (n, 3), mm."""
@@ -124,6 +130,39 @@ class LatticeBody:
     def without_contact(self, state: LatticeState) -> LatticeState:
         """Return a copy of a state that no indenter touches."""
         return replace(state, contact=None)
+
+    def cut(self, state: LatticeState, blade: SweptBlade, distance_mm: float | None = None) -> tuple[LatticeBody, LatticeState, LatticeCut]:
+        """Return the lattice and its state behind a cut along the faces of its cubes; see `naibu.simulation.cut_lattice`.
+
+        Parameters
+        ----------
+        state : LatticeState
+            Of the lattice as the blade passes.
+        blade : SweptBlade
+            The surface that it sweeps, in the frame of the lattice.
+        distance_mm : float, optional
+            Twice the largest distance that the new surface may have from the blade; by default, as its cubes have it.
+
+        Raises
+        ------
+        InputError
+            What `naibu.simulation.cut_lattice` refuses, or a cut farther from the blade than it may be: lattices are not refined.
+        """
+        if distance_mm is not None:
+            require_positive("distance_mm", distance_mm, "mm")
+        found = cut_lattice(self.engine.lattice, self.engine.parameters, blade, positions=state.position)
+        if distance_mm is not None and found.deviation_mm > 0.5 * distance_mm:
+            raise InputError(
+                f"distance_mm is {distance_mm:g} mm, and faces of the lattice's cubes lie up to {found.deviation_mm:.3g} mm from the "
+                f"blade; choose {2.0 * found.deviation_mm:.3g} mm or more, or a lattice of a smaller spacing. It is as it was"
+            )
+        force = None if self.external_force is None else found.divided(np.broadcast_to(self.external_force, state.position.shape))
+        supported = np.flatnonzero(np.isin(found.source, self.supported)).astype(np.int64)
+        cells = to_tetra(found.mesh).cells
+        body = LatticeBody(
+            cut_engine(self.engine, found), surface_triangles(found.lattice), cells, supported, self.fixtures, external_force=force
+        )
+        return body, found.state(state), found
 
     def strain(self, positions: FloatArray) -> FloatArray:
         """Return the mean elongation of the elements at every node (n,), % of their length at rest."""
@@ -246,7 +285,9 @@ class FiniteElementBody:
         """Return a copy of a state that no indenter touches."""
         return DynamicState(state.displacement, state.velocity)
 
-    def cut(self, state: DynamicState, blade: SweptBlade, distance_mm: float) -> tuple[FiniteElementBody, DynamicState, VolumeCut]:
+    def cut(
+        self, state: DynamicState, blade: SweptBlade, distance_mm: float | None = None
+    ) -> tuple[FiniteElementBody, DynamicState, VolumeCut]:
         """Return the body and its state behind a cut; hexahedra are split into tetrahedra first.
 
         Displacements, velocities, materials and supports are kept, and with them momentum and energy.
@@ -257,8 +298,8 @@ class FiniteElementBody:
             Of the body as the blade passes.
         blade : SweptBlade
             The surface that it sweeps.
-        distance_mm : float
-            See `naibu.meshing.cut_volume`.
+        distance_mm : float, optional
+            See `naibu.meshing.cut_volume`; the mean edge of the mesh by default.
 
         Raises
         ------
@@ -266,8 +307,9 @@ class FiniteElementBody:
             What `naibu.meshing.cut_volume` refuses.
         """
         mesh, assembler = to_tetra(self.mesh), self.engine.assembler
+        fine = mean_edge_length(self.mesh) if distance_mm is None else distance_mm
         split = np.repeat(np.arange(self.mesh.n_cells), mesh.n_cells // self.mesh.n_cells)
-        found = cut_volume(mesh, blade, distance_mm, positions=mesh.points + state.displacement)
+        found = cut_volume(mesh, blade, fine, positions=mesh.points + state.displacement)
         before = split[found.parents]
         placeholder = [material(young_modulus=1.0, poisson_ratio=0.3)] * len(mesh.region_names)
         made = Assembler.from_materials(elements(found.mesh, "mean_dilatation"), found.mesh.regions, placeholder)

@@ -20,8 +20,8 @@ from naibu.mechanics.contact.indenter_motion import IndenterVelocity
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.meshing.cutting.volume import VolumeCut
-from naibu.meshing.quality import mean_edge_length
-from naibu.simulation.interactive_bodies import NO_NODES, AnySession, FiniteElementBody, InteractiveBody
+from naibu.simulation.interactive_bodies import NO_NODES, AnySession, InteractiveBody
+from naibu.simulation.lattice_cut import LatticeCut
 
 FRAME_S = 1.0 / 60.0
 REACH = 2.0  # extents of the body around its centre in which the tool stays
@@ -204,7 +204,7 @@ class InteractiveSimulation:
         self._press(self._tool)
         self._last = self._frame(self._last.number + 1, 0.0, np.zeros(3), np.zeros(3), "")
 
-    def cut(self, edges: ArrayLike, distance_mm: float | None = None) -> VolumeCut:
+    def cut(self, edges: ArrayLike, distance_mm: float | None = None) -> VolumeCut | LatticeCut:
         """Cut the body along the surface between successive positions of a blade's edge.
 
         Parameters
@@ -212,17 +212,14 @@ class InteractiveSimulation:
         edges : array_like, shape (p, e, 3)
             See `naibu.meshing.swept_blade`, mm.
         distance_mm : float, optional
-            See `naibu.meshing.cut_volume`; the mean edge of the mesh by default.
+            See `naibu.meshing.cut_volume`; by default the mean edge of a mesh, and what the cubes of a lattice have.
 
         Raises
         ------
         InputError
-            A body that cannot be cut, or what `swept_blade` and `cut_volume` refuse; the body is then as it was.
+            What `swept_blade`, `naibu.meshing.cut_volume` and `naibu.simulation.cut_lattice` refuse; the body is then as it was.
         """
-        if not isinstance(self.body, FiniteElementBody):
-            raise InputError("this body is a lattice, which is not cut; touch a mesh or an identified model to cut it")
-        fine = mean_edge_length(self.body.mesh) if distance_mm is None else distance_mm
-        body, state, found = self.body.cut(self.body.without_contact(self._session.state()), swept_blade(edges), fine)
+        body, state, found = self.body.cut(self.body.without_contact(self._session.state()), swept_blade(edges), distance_mm)
         self._keep()
         self._topology += 1
         self._begin(body, state)
