@@ -12,6 +12,7 @@ from naibu.reproduction.chapter4.cube import chapter4_cube
 from naibu.reproduction.chapter4.cutting import chapter4_cut
 from naibu.reproduction.chapter4.lattice import chapter4_lattice
 from naibu.reproduction.chapter4.octree import chapter4_octree
+from naibu.reproduction.chapter6.tables import chapter6
 from naibu.viewer.chapter import Chapter
 
 CHAPTERS: dict[str, Callable[[int], Chapter]] = {
@@ -23,4 +24,5 @@ CHAPTERS: dict[str, Callable[[int], Chapter]] = {
     "ch4-lattice": chapter4_lattice,
     "ch4-cube": chapter4_cube,
     "ch4-octree": chapter4_octree,
+    "ch6": chapter6,
 }

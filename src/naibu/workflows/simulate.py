@@ -1,4 +1,4 @@
-"""Run a study by its name or from its file: lattices, or the finite element simulations of the 2008 report :cite:p:`hirai2008`."""
+"""Run a study by its name or from its file: lattices, sensing chips, or the finite element simulations of :cite:t:`hirai2008`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress
-from naibu.workflows.lattice_study import NAMED, study_text
+from naibu.workflows.lattice_study import NAMED, TEMPLATE, study_text
+from naibu.workflows.simulate_chip import CHIP, CHIP_TITLE, chip_text, describes_chip, simulate_chip
 from naibu.workflows.simulate_lattice import CHECKPOINT_EVERY, SimulationRun, simulate_lattice
 from naibu.workflows.simulate_study import SLUGS, SQUARES_TOGETHER, simulate_study
 
@@ -22,7 +23,7 @@ class NamedStudy:
     name : str
         What `simulate` takes.
     model : str
-        ``"finite elements"`` or ``"mass-spring-dashpot lattice"``.
+        ``"finite elements"``, ``"mass-spring-dashpot lattice"`` or ``"sensing chip"``.
     title : str
         What is simulated.
     """
@@ -39,7 +40,24 @@ def named_studies() -> tuple[NamedStudy, ...]:
     return (
         *(NamedStudy(name, "finite elements", title) for name, title in elements),
         *(NamedStudy(name, "mass-spring-dashpot lattice", title) for name, title in lattices),
+        NamedStudy(CHIP, "sensing chip", CHIP_TITLE),
     )
+
+
+def example_text(study: str = "") -> str:
+    """Return the file of a study as a template: of a lattice, or of a sensing chip.
+
+    Parameters
+    ----------
+    study : str
+        Its name; a lattice by default.
+
+    Raises
+    ------
+    InputError
+        There is no such study, or it has no file.
+    """
+    return chip_text() if study == CHIP else study_text(study or TEMPLATE)
 
 
 def simulate(
@@ -59,7 +77,7 @@ def simulate(
     Parameters
     ----------
     study : str or path-like
-        Name of a study (see `named_studies`), or a TOML file that describes a lattice, its indenters and their motion.
+        Name of a study (see `named_studies`), or a TOML file that describes a lattice, its indenters and their motion, or a sensing chip.
     out : path-like
         Folder for the files.
     resume : bool
@@ -88,7 +106,8 @@ def simulate(
     """
 
     name = os.fspath(study)
-    if name != SQUARES_TOGETHER and name not in SLUGS:
+    of_chip = describes_chip(study)
+    if not of_chip and name != SQUARES_TOGETHER and name not in SLUGS:
         return simulate_lattice(
             study, out, resume=resume, overwrite=overwrite, checkpoint_every=checkpoint_every, device=device, progress=progress
         )
@@ -96,6 +115,8 @@ def simulate(
         raise InputError(f"{name} takes seconds and keeps nothing to resume from; run it without `resume`")
     if device != "cpu":
         raise InputError(f"device is {device!r}, and {name} is a study of finite elements, which run on 'cpu'; choose that, or a lattice")
+    if of_chip:
+        return SimulationRun(simulate_chip(study, out, overwrite=overwrite, progress=progress), 1, 1)
     files = simulate_study(name, out, overwrite=overwrite, progress=progress)
     count = sum(path.suffix == ".vtkhdf" for path in files)
     return SimulationRun(tuple(files), count, count)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,9 @@ from scipy.signal import lfilter
 
 from naibu.core.arrays import FloatArray, require_positive, require_within
 from naibu.core.errors import InputError
+
+_MOVE = np.array([[1.0, 1.0], [0.0, 1.0]])  # of level and slope from a sample to the next
+_UNKNOWN = 1e4  # variance of a level that jumped, over the square of the jump
 
 
 def first_order_filter(readings: FloatArray, share: float) -> FloatArray:
@@ -65,17 +69,22 @@ class RampKalman:
         Standard deviation of a reading.
     slope_sd : float
         Standard deviation of the change of the slope from a sample to the next.
+    jump : float
+        Difference of a reading from its prediction, in standard deviations, beyond which the level has jumped and is found anew.
     """
 
     noise_sd: float
     slope_sd: float
+    jump: float = np.inf
 
     def __post_init__(self) -> None:
         require_positive("noise_sd", self.noise_sd)
         require_positive("slope_sd", self.slope_sd)
+        if not self.jump > 0.0:
+            raise InputError(f"jump must be positive, or infinite for none, not {self.jump:g}")
 
     @classmethod
-    def with_noise_gain(cls, noise_sd: float, gain: float) -> RampKalman:
+    def with_noise_gain(cls, noise_sd: float, gain: float, *, jump: float = np.inf) -> RampKalman:
         """Return the filter that lets through a given share of white noise, such as `noise_gain` of another filter.
 
         Raises
@@ -88,7 +97,7 @@ class RampKalman:
         def excess(log_ratio: float) -> float:
             return cls(noise_sd, noise_sd * np.exp(log_ratio)).steady_noise_gain - gain
 
-        return cls(noise_sd, noise_sd * float(np.exp(brentq(excess, -25.0, 8.0))))
+        return cls(noise_sd, noise_sd * float(np.exp(brentq(excess, -25.0, 8.0))), jump)
 
     @property
     def steady_gains(self) -> tuple[float, float]:
@@ -105,34 +114,38 @@ class RampKalman:
         return float(np.sqrt((2.0 * a**2 + b * (2.0 - 3.0 * a)) / (a * (4.0 - 2.0 * a - b))))
 
     def filtered(self, readings: FloatArray) -> FloatArray:
-        """Return the level (n, ...) after every reading, from the readings until then only."""
-        return self._forward(readings)[0][:, 0]
+        """Return the level (n,) or (n, k) after every reading, from the readings until then only; each column by itself."""
+        return self._by_column(readings, lambda u: self._forward(u)[0][:, 0])
 
     def smoothed(self, readings: FloatArray) -> FloatArray:
-        """Return the level (n, ...) from all readings: the fixed-interval smoother :cite:p:`rauch1965`."""
+        """Return the level (n,) or (n, k) from all readings: the fixed-interval smoother :cite:p:`rauch1965`; each column by itself."""
+        return self._by_column(readings, self._smoothed)
+
+    def _by_column(self, readings: FloatArray, apply: Callable[[FloatArray], FloatArray]) -> FloatArray:
+        u = np.asarray(readings, dtype=float)
+        return apply(u) if u.ndim == 1 else np.stack([apply(column) for column in u.T], axis=1)
+
+    def _smoothed(self, readings: FloatArray) -> FloatArray:
         states, covariances, predicted = self._forward(readings)
-        move = np.array([[1.0, 1.0], [0.0, 1.0]])
         result = states.copy()
         for k in range(len(states) - 2, -1, -1):
-            gain = covariances[k] @ move.T @ np.linalg.inv(predicted[k + 1])
-            ahead = np.tensordot(move, states[k], 1)
-            result[k] = states[k] + np.tensordot(gain, result[k + 1] - ahead, 1)
+            gain = covariances[k] @ _MOVE.T @ np.linalg.inv(predicted[k + 1])
+            result[k] = states[k] + gain @ (result[k + 1] - _MOVE @ states[k])
         return np.asarray(result[:, 0])
 
     def _forward(self, readings: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return states (n, 2, ...), their covariances and those of their predictions (n, 2, 2)."""
-        u = np.asarray(readings, dtype=float)
-        move = np.array([[1.0, 1.0], [0.0, 1.0]])
+        """Return states (n, 2), their covariances and those of their predictions (n, 2, 2)."""
+        variance, start = self.noise_sd**2, (10.0 * self.noise_sd) ** 2
         # the slope changes at once by a random amount, of which the level takes half within the sample
         drift = self.slope_sd**2 * np.array([[0.25, 0.5], [0.5, 1.0]])
-        state = np.stack([u[0], np.zeros_like(u[0])])
-        covariance = np.diag([self.noise_sd**2, (10.0 * self.noise_sd) ** 2])
+        state, covariance = np.array([readings[0], 0.0]), np.diag([variance, start])
         states, covariances, predicted = [state], [covariance], [covariance]
-        for reading in u[1:]:
-            ahead = np.tensordot(move, state, 1)
-            before = move @ covariance @ move.T + drift
-            gain = before[:, 0] / (before[0, 0] + self.noise_sd**2)
-            state = ahead + np.multiply.outer(gain, reading - ahead[0])
+        for reading in readings[1:]:
+            ahead, before = _MOVE @ state, _MOVE @ covariance @ _MOVE.T + drift
+            if abs(reading - ahead[0]) > self.jump * np.sqrt(before[0, 0] + variance):
+                before = before + np.diag([(reading - ahead[0]) ** 2 * _UNKNOWN, start])
+            gain = before[:, 0] / (before[0, 0] + variance)
+            state = ahead + gain * (reading - ahead[0])
             covariance = before - np.outer(gain, before[0])
             states.append(state)
             covariances.append(covariance)
