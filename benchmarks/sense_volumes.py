@@ -34,6 +34,7 @@ Array = NDArray[Any]
 TISSUES = {
     "limb": {"skin+fat": (1, 2), "muscle": (3, 6), "bone": (4, 5)},
     "gel": {"soft": (1,), "hard": (2,)},
+    "ball": {"ball": (1,)},
     "thorax": {"soft": (1,), "lung": (2,), "bone": (3,)},
 }
 CHI_SQUARED_95 = 7.815  # three degrees of freedom

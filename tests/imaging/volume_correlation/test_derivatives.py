@@ -118,6 +118,7 @@ def test_bending_force_and_stiffness_are_derivatives_of_its_energy() -> None:
     f, rng = fit(), np.random.default_rng(1)
     weights = rng.uniform(0.5, 2.0, (len(f.system.cells), 3))
     load = f.system.assembled(f.c, *no_data(f.system), weights, np.zeros(len(f.system.cells)))
+    assert np.allclose(f.system.bending_load(f.c, weights), load, atol=1e-4 * np.abs(load).max())
     energies = [bending_energy(f.system, f.along(f.directions[0], s), weights) for s in (-STEP, STEP)]
     assert -(load * f.directions[0]).sum() == pytest.approx((energies[1] - energies[0]) / (2 * STEP), rel=1e-4)
     assert 0.5 * float((f.system.bending_energy * weights).sum()) == pytest.approx(bending_energy(f.system, f.c, weights), rel=1e-5)
@@ -199,8 +200,9 @@ def test_anchors_are_springs_to_the_first_displacement() -> None:
     np.testing.assert_allclose(comparison.force - before, stiffness.mean() * (first - comparison.displacement), rtol=1e-2, atol=1e-2)
 
 
-def inclusion(gain: float = 1.3) -> tuple[RigidInclusion, IntensityComparison]:
+def inclusion(gain: float = 1.3, noise: float = 0.0) -> tuple[RigidInclusion, IntensityComparison]:
     """Return an inclusion at its true motion, and the comparison that holds the gain."""
+    rng = np.random.default_rng(7)
     grid = Volume.from_array(np.zeros(SHAPE), spacing_mm=SPACING)
     x, pattern = grid.positions(), texture(5, (8.0, 16.0))
     turn, shift = Rotation.from_rotvec([0.05, -0.08, 0.1]).as_matrix(), np.array([0.4, -0.3, 0.5])
@@ -208,7 +210,8 @@ def inclusion(gain: float = 1.3) -> tuple[RigidInclusion, IntensityComparison]:
     deformed = (pattern((x - middle - shift) @ turn + middle) - 7.0) / gain
     mask = np.zeros(SHAPE, dtype=bool)
     mask[6:-6, 6:-6, 6:-6] = True
-    images = ImageLevel(pattern(x).astype(np.float32), deformed.astype(np.float32), mask, SPACING, (1, 1, 1), 0.0)
+    before, after = ((v + noise * rng.standard_normal(SHAPE)).astype(np.float32) for v in (pattern(x), deformed))
+    images = ImageLevel(before, after, mask, SPACING, (1, 1, 1), 0.0)
     comparison = IntensityComparison(images, ComparisonSettings(np.inf, 0.0, 0.0, 0.0))
     comparison.gain[:], comparison.offset[:], comparison.residual_sd = gain, 7.0, 1.0
     found = RigidInclusion(1, np.arange(0, len(images.intensity), 3), images)
@@ -219,7 +222,7 @@ def inclusion(gain: float = 1.3) -> tuple[RigidInclusion, IntensityComparison]:
 def test_rigid_inclusions_have_the_derivatives_of_their_residuals() -> None:
     found, comparison = inclusion()
     rotation, shift = found.rotation, found.shift
-    r, derivatives, _ = found.linearised(comparison)
+    r, derivatives, _, _ = found.linearised(comparison)
     assert np.sqrt(np.mean(r**2)) < 0.02 * np.ptp(comparison.level.intensity)
     steps = np.array([2e-3, 2e-3, 2e-3, 0.02, 0.02, 0.02])
     for k, step in enumerate(steps):
@@ -240,6 +243,21 @@ def test_rigid_inclusions_come_back_to_their_motion() -> None:
     found.fit(comparison)
     assert np.abs(found.shift - shift).max() < 0.01
     assert np.abs(found.rotation - rotation).max() < 1e-3
+
+
+def test_noise_in_the_gradients_of_an_inclusion_is_no_information() -> None:
+    """Both counts are those of the same texture: one holds the noise of the gradients, too."""
+    shift = slice(3, None)
+    matrices = []
+    for noise in (0.0, 10.0):
+        found, comparison = inclusion(noise=noise)
+        comparison.residual_sd = 30.0
+        found.fit(comparison)
+        matrices.append((found.normal[shift, shift], found.information[shift, shift]))
+    assert np.allclose(matrices[0][1], matrices[0][0], rtol=0.03, atol=0.03 * np.trace(matrices[0][0]))
+    truth = np.trace(matrices[0][0])
+    assert np.trace(matrices[1][0]) > 1.5 * truth
+    assert np.trace(matrices[1][1]) == pytest.approx(truth, rel=0.1)
 
 
 def test_inclusions_pull_the_field_to_their_motion() -> None:

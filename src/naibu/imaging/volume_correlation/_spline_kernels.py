@@ -319,40 +319,47 @@ def _add_forces(
 
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
-def add_noise(
-    loads: AnyArray,
-    tasks: AnyArray,
-    cells: AnyArray,
-    slot: AnyArray,
-    c: AnyArray,
-    forces: AnyArray,
-    which: AnyArray,
-    starts: Any,
-    weights: Any,
-    bending_draws: AnyArray,
-    dilatation: AnyArray,
-    gradients: AnyArray,
-    dilatation_draws: AnyArray,
+def add_forces(
+    loads: AnyArray, tasks: AnyArray, cells: AnyArray, slot: AnyArray, forces: AnyArray, which: AnyArray, starts: Any, weights: Any
 ) -> None:
-    """Add the loads of random residuals and of random draws from the penalties to loads (n, 3, s).
-
-    forces (voxels, 3, s): of random residuals; bending_draws (m, 3, 64, s): random loads of bending; dilatation_draws (m, 8, s): random
-    dilatations.
-    """
-    samples = loads.shape[2]
+    """Add the loads of forces (voxels, 3, s) to loads (n, 3, s)."""
+    samples = forces.shape[2]
     for colour in range(len(tasks) - 1):
         for task in prange(tasks[colour], tasks[colour + 1]):
             f1, f2, load = np.empty((4, 3, samples), F), np.empty((16, 3, samples), F), np.empty((64, 3, samples), F)
-            local, cof, box = np.empty((64, 3), F), np.empty((3, 3), F), np.empty(6, np.int64)
+            box = np.empty(6, np.int64)
             for m in range(cells[task, 0], cells[task, 1]):
                 cell = cells[m]
                 for a in range(3):
                     box[2 * a], box[2 * a + 1] = starts[a][cell[4 - a]], starts[a][cell[4 - a] + 1]
+                load[:] = F(0)
+                _add_forces(forces, which, box, weights[0], weights[1], weights[2], f1, f2, load)
+                for a in range(64):
+                    n = slot[cell[2] + (a >> 4), cell[3] + ((a >> 2) & 3), cell[4] + (a & 3)]
+                    for i in range(3):
+                        for s in range(samples):
+                            loads[n, i, s] += load[a, i, s]
+
+
+@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
+def add_noise(
+    loads: AnyArray, tasks: AnyArray, cells: AnyArray, slot: AnyArray, c: AnyArray, bending_draws: AnyArray, dilatation: AnyArray,
+    gradients: AnyArray, dilatation_draws: AnyArray,
+) -> None:  # fmt: skip
+    """Add the loads of random draws from the penalties to loads (n, 3, s).
+
+    bending_draws (m, 3, 64, s): random loads of bending; dilatation_draws (m, 8, s): random dilatations.
+    """
+    samples = loads.shape[2]
+    for colour in range(len(tasks) - 1):
+        for task in prange(tasks[colour], tasks[colour + 1]):
+            load, local, cof = np.empty((64, 3, samples), F), np.empty((64, 3), F), np.empty((3, 3), F)
+            for m in range(cells[task, 0], cells[task, 1]):
+                cell = cells[m]
                 for a in range(64):
                     for i in range(3):
                         for s in range(samples):
                             load[a, i, s] = bending_draws[m, i, a, s]
-                _add_forces(forces, which, box, weights[0], weights[1], weights[2], f1, f2, load)
                 if dilatation[m] > 0:
                     _gather(c, cell, local)
                     for q in range(gradients.shape[0]):

@@ -23,7 +23,7 @@ from naibu.imaging.volume_correlation.rigid_inclusions import RigidInclusion
 
 # relative accuracy of the linear solves: a Gauss-Newton step is repeated, a random field need not be more exact than it is random
 STEP_TOLERANCE, SAMPLE_TOLERANCE = 0.1, 0.06
-SAMPLES_AT_ONCE = 16  # right sides of one solve, which bounds its memory
+SAMPLES_AT_ONCE, FORCES_AT_ONCE = 16, 4  # right sides of one solve, and random forces on all voxels at once, which bound the memory
 # empirical, fractions of the unknowns: at least so many count as determined by the data of a kind, and a cell's own weight starts from the
 # common one with the worth of so many
 LEAST_FRACTION, COMMON = 0.02, 0.05
@@ -158,15 +158,18 @@ class CorrelationFit(IntensityComparison):
         out = np.empty((self.system.n, 3, count), np.float32)
         sensitivity = self.gradient * np.sqrt(self.weight)[:, None]
         for first in range(0, count, SAMPLES_AT_ONCE):
-            rng = np.random.default_rng((seed, first))
-            forces = np.empty((*sensitivity.shape, min(SAMPLES_AT_ONCE, count - first)), np.float32)
-            for k in range(forces.shape[2]):
-                random = rng.standard_normal(len(sensitivity), dtype=np.float32) if noise is None else noise.draw(rng)
-                force = sensitivity * random[:, None]
-                for inclusion in self.inclusions:
-                    inclusion.perturb(force, random, rng)
-                forces[:, :, k] = force
-            loads = self.system.noise_loads(c, forces, bending, dilatation, rng)
+            rng, many = np.random.default_rng((seed, first)), min(SAMPLES_AT_ONCE, count - first)
+            loads = np.empty((self.system.n, 3, many), np.float32)
+            for k in range(0, many, FORCES_AT_ONCE):
+                forces = np.empty((*sensitivity.shape, min(FORCES_AT_ONCE, many - k)), np.float32)
+                for j in range(forces.shape[2]):
+                    random = rng.standard_normal(len(sensitivity), dtype=np.float32) if noise is None else noise.draw(rng)
+                    force = sensitivity * random[:, None]
+                    for inclusion in self.inclusions:
+                        inclusion.perturb(force, random, rng)
+                    forces[:, :, j] = force
+                loads[:, :, k : k + FORCES_AT_ONCE] = self.system.force_loads(forces)
+            self.system.add_penalty_noise(loads, c, bending, dilatation, rng)
             out[:, :, first : first + SAMPLES_AT_ONCE] = self.system.solved_many(loads, SAMPLE_TOLERANCE)[0]
         return out
 

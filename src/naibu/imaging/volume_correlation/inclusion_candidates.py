@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from naibu.core.arrays import BoolArray, FloatArray, Int32Array
+from naibu.core.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 from naibu.core.volume import Volume
 
 # rims are thin and broken: candidates are found at each of these thresholds, between the intensity of air (0) and of the object (1), and
@@ -19,6 +19,7 @@ VOTES = 3
 LARGEST_AREA = 25.0  # enclosed in a slice, in squares of the size
 LEAST_VOLUME = 3.0  # in cubes of the size
 DEPTH, OPENING = 0.47, 0.31
+ENOUGH_VOXELS = 4.0  # along the size: finer volumes are thinned out
 
 
 def inclusion_candidates(volume: Volume, mask: BoolArray, size_mm: float) -> Int32Array:
@@ -39,18 +40,29 @@ def inclusion_candidates(volume: Volume, mask: BoolArray, size_mm: float) -> Int
     ndarray, shape (nz, ny, nx), int32
         Label of every voxel from 1, 0 outside of all candidates.
     """
-    spacing = volume.spacing_mm[::-1]
-    smooth = ndimage.gaussian_filter(np.asarray(volume.values, dtype=np.float32), 0.5)
-    out = np.zeros(volume.shape, np.int32)
-    if mask.all():
-        return out
+    stride = np.maximum((size_mm / (ENOUGH_VOXELS * volume.spacing_mm[::-1])).astype(int), 1)
+    thin = tuple(slice(None, None, int(n)) for n in stride)
+    smooth = ndimage.gaussian_filter(np.asarray(volume.values, dtype=np.float32), 0.5 * stride)[thin]
+    if mask[thin].all():
+        return np.zeros(volume.shape, np.int32)
+    found = _in_thinned(smooth, mask[thin], volume.spacing_mm[::-1] * stride, size_mm)
+    for axis, n in enumerate(stride):
+        # a coarse voxel stands for those around its middle
+        nearest = np.minimum((np.arange(volume.shape[axis]) + n // 2) // n, found.shape[axis] - 1)
+        found = found.take(nearest, axis=axis)
+    return found
+
+
+def _in_thinned(smooth: Float32Array, mask: BoolArray, spacing: FloatArray, size_mm: float) -> Int32Array:
+    """Return the labels (nz, ny, nx) in a volume that is no finer than the size needs."""
+    out = np.zeros(mask.shape, np.int32)
     air = float(np.median(smooth[~mask]))
     tissue = float(np.median(smooth[mask]))
     where = np.argwhere(mask)
     box = tuple(slice(int(a), int(b)) for a, b in zip(where.min(axis=0), where.max(axis=0) + 1, strict=True))
     smooth, inside = smooth[box], mask[box]
     # the object goes on beyond the faces of the volume that it touches
-    rim = [(int(w.start > 0), int(w.stop < n)) for w, n in zip(box, volume.shape, strict=True)]
+    rim = [(int(w.start > 0), int(w.stop < n)) for w, n in zip(box, mask.shape, strict=True)]
     cut = tuple(slice(a, a + n) for (a, _), n in zip(rim, inside.shape, strict=True))
     depth = ndimage.distance_transform_edt(np.pad(inside, rim), sampling=spacing)[cut]
     deep = depth > DEPTH * size_mm

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from naibu.imaging.volume_correlation._spline_kernels import add_noise, assemble, product, products_of_many, sample_energies
+from naibu.imaging.volume_correlation._spline_kernels import add_forces, add_noise, assemble, product, products_of_many, sample_energies
 from naibu.imaging.volume_correlation._warp_kernels import warp_voxels
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable
@@ -174,18 +174,34 @@ class SplineSystem:
             rz = new
         return x, steps
 
-    def noise_loads(
-        self, c: FloatArray, forces: Float32Array, bending: FloatArray, dilatation: FloatArray, rng: np.random.Generator
-    ) -> Float32Array:
-        """Return loads (n, 3, s) of random residuals, given as forces (voxels, 3, s), and of random draws from the penalties."""
-        count, m = forces.shape[2], len(self.cells)
-        loads = np.zeros((self.n, 3, count), np.float32)
-        drawn = rng.standard_normal((m, 3, 64, count), dtype=np.float32) * np.sqrt(bending)[:, :, None, None].astype(np.float32)
-        add_noise(
-            loads, self.tasks, self.cells, self.slot, c.astype(np.float32), forces, self.level.number, self.starts, self.weights,
-            np.matmul(self.root, drawn), dilatation.astype(np.float32), self.gauss, rng.standard_normal((m, 8, count), dtype=np.float32),
-        )  # fmt: skip
+    def bending_load(self, c: FloatArray, bending: FloatArray) -> Float32Array:
+        """Return the loads (n, 3) of the bending penalty of weights (m, 3) at coefficients c."""
+        z, y, x = self.cells[:, 2:].T
+        a = np.arange(64)
+        at = z[:, None] + (a >> 4), y[:, None] + ((a >> 2) & 3), x[:, None] + (a & 3)
+        near = c[at]
+        each = -bending[:, None, :] * np.matmul(self.stiffness.astype(float), near - near[:, :1])
+        loads = np.zeros((self.n, 3))
+        np.add.at(loads, self.slot[at], each)
+        return loads.astype(np.float32)
+
+    def force_loads(self, forces: Float32Array) -> Float32Array:
+        """Return loads (n, 3, s) of forces (voxels, 3, s) on the voxels."""
+        loads = np.zeros((self.n, 3, forces.shape[2]), np.float32)
+        add_forces(loads, self.tasks, self.cells, self.slot, forces, self.level.number, self.starts, self.weights)
         return loads
+
+    def add_penalty_noise(
+        self, loads: Float32Array, c: FloatArray, bending: FloatArray, dilatation: FloatArray, rng: np.random.Generator
+    ) -> None:
+        """Add loads of random draws from the penalties to loads (n, 3, s)."""
+        count, m = loads.shape[2], len(self.cells)
+        drawn = rng.standard_normal((m, 3, 64, count), dtype=np.float32)
+        drawn *= np.sqrt(bending)[:, :, None, None].astype(np.float32)
+        add_noise(
+            loads, self.tasks, self.cells, self.slot, c.astype(np.float32), np.matmul(self.root, drawn), dilatation.astype(np.float32),
+            self.gauss, rng.standard_normal((m, 8, count), dtype=np.float32),
+        )  # fmt: skip
 
     def energies(self, samples: Float32Array, c: FloatArray) -> tuple[Float32Array, Float32Array]:
         """Return the mean energies (m, 3) and (m,) of samples (n, 3, s) about coefficients c: of bending, and of linear dilatation."""

@@ -27,6 +27,11 @@ LEAST_VOXELS = 50  # too few for six unknowns and a test
 WORSE, APART, PRUNED = 0.15, 0.6, 2
 OUTLIER = 9.0  # residual variances at which a residual counts half, and what a voxel outside the deformed volume counts
 UNSEEN = 1e-30  # least value there: of an inclusion that has left the field of view no voxel counts, and it does not move
+# least part of the normal matrix that is information, in any direction: an inclusion without texture is then very uncertain
+LEAST_SHARE = 0.02
+# empirical: root mean square error of the motion of bones along their axis over that which random residuals give: errors of gain, of offset
+# and of voxels that hold two tissues are shared by many voxels
+SYSTEMATIC = 2.0
 REGULAR = 1e-9  # of the trace, on the diagonal of the normal matrix: an inclusion without texture does not move
 
 
@@ -95,11 +100,12 @@ class RigidInclusion:
         """Displaced positions of its voxels (n, 3), mm."""
         return np.asarray((self.points - self.centre) @ self.rotation.T + self.centre + self.shift)
 
-    def linearised(self, comparison: IntensityComparison) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return residuals (n,), their derivatives (n, 6) with reversed sign, and weights (n,) at the present motion.
+    def linearised(self, comparison: IntensityComparison) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return residuals (n,), their derivatives (n, 6) with reversed sign, weights (n,), and information (6, 6) at the present motion.
 
         Derivatives are by a small further rotation about the displaced centroid, rad, and by the displacement of the centroid, mm. The
-        intensity gradient is the mean of those of both volumes, which converges from further away.
+        intensity gradient is the mean of those of both volumes, which converges from further away. The information is that of the
+        derivatives by the gradient of one volume with those by the other: noise, which is not the same in both, does not count.
         """
         level, at, x = self.level, self.voxels, self.moved
         gain, offset = comparison.gain[at], comparison.offset[at]
@@ -107,15 +113,19 @@ class RigidInclusion:
         level.sample(x, value, gradient)
         seen = value > 0.9 * OUTSIDE
         r = np.where(seen, level.intensity[at] - gain * value - offset, 0.0)
-        g = 0.5 * (gain[:, None] * gradient / level.spacing + level.gradient[at] @ self.rotation.T)
-        precision = 1 / (comparison.residual_sd**2 + (JITTER * level.spacing.mean()) ** 2 * (g**2).sum(axis=1))
+        each = [gain[:, None] * gradient / level.spacing, level.gradient[at] @ self.rotation.T]
+        arm = x - self.centre - self.shift
+        own, other = (np.concatenate([np.cross(arm, g), g], axis=1) for g in each)
+        derivatives = 0.5 * (own + other)
+        precision = 1 / (comparison.residual_sd**2 + (JITTER * level.spacing.mean()) ** 2 * (derivatives[:, 3:] ** 2).sum(axis=1))
         w = np.where(seen, precision / (1 + r * r * precision / comparison.settings.robust**2) ** 2, 0.0)
-        return r, np.concatenate([np.cross(x - self.centre - self.shift, g), g], axis=1), w
+        common = (own * w[:, None]).T @ other
+        return r, derivatives, w, 0.5 * (common + common.T)
 
     def fit(self, comparison: IntensityComparison) -> None:
         """Find the motion from the intensities of its voxels by Gauss-Newton, with gain and offset of the whole object."""
         for _ in range(STEPS):
-            r, self.derivatives, w = self.linearised(comparison)
+            r, self.derivatives, w, common = self.linearised(comparison)
             matrix = (self.derivatives * w[:, None]).T @ self.derivatives
             self.normal = matrix + max(REGULAR * np.trace(matrix), UNSEEN) * np.eye(6)
             d = np.linalg.solve(self.normal, self.derivatives.T @ (w * r))
@@ -123,6 +133,10 @@ class RigidInclusion:
             if np.abs(d[3:]).max() < CONVERGED_MM:
                 break
         self.root_weight = np.sqrt(w)
+        root = np.linalg.cholesky(self.normal)
+        inverse = np.linalg.inv(root)
+        shares, axes = np.linalg.eigh(inverse @ common @ inverse.T)
+        self.information = root @ (axes * np.clip(shares, LEAST_SHARE, 1.0)) @ axes.T @ root.T
 
     def misfits(self, comparison: IntensityComparison, positions: FloatArray) -> FloatArray:
         """Return the bounded squared residuals (n,), in residual variances, of its voxels displaced to positions (n, 3), mm."""
@@ -168,7 +182,7 @@ class RigidInclusion:
     def perturb(self, force: Float32Array, random: Float32Array, rng: np.random.Generator) -> None:
         """Replace random forces (n, 3) of its voxels by those of the motion that random residuals (n,) give."""
         at = self.voxels
-        d = np.linalg.solve(self.normal, self.derivatives.T @ (self.root_weight * random[at]))
+        d = SYSTEMATIC * np.linalg.solve(self.information, self.derivatives.T @ (self.root_weight * random[at]))
         self.draws.append(d)
         drawn = np.cross(d[:3], self.moved - self.centre - self.shift) + d[3:]
         white = rng.standard_normal((len(at), 3)) / np.sqrt(self.weight)
