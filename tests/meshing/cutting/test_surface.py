@@ -130,6 +130,64 @@ def test_refinement_is_local_and_between_half_and_whole_distance():
     np.testing.assert_allclose(cut.points[halved], cut.points[cut.ends[halved]].mean(axis=1), atol=1e-12)
 
 
+def smallest_angle(points, triangles) -> float:
+    out = []
+    for k in range(3):
+        a, b, c = (points[triangles[:, (k + j) % 3]] for j in range(3))
+        cosine = ((b - a) * (c - a)).sum(axis=1) / (np.linalg.norm(b - a, axis=1) * np.linalg.norm(c - a, axis=1))
+        out.append(np.arccos(np.clip(cosine, -1.0, 1.0)).min())
+    return float(np.degrees(min(out)))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_bisection_along_longest_edges_keeps_half_of_the_smallest_angle(seed):
+    # Rosenberg and Stenger's bound for bisection of the longest edge; the wave leaves no two triangles in a plane, so that none is swapped
+    points, triangles = plate(6, seed)
+    points[:, 2] = 5.0 * np.sin(0.07 * points[:, 0]) * np.cos(0.05 * points[:, 1] + seed)
+    x = np.linspace(5.0, 95.0, 60)
+    path = np.stack([x, 30 + 0.4 * x, 5.0 * np.sin(0.07 * x) * np.cos(0.05 * (30 + 0.4 * x) + seed)], axis=1)
+    cut = cut_surface(points, triangles, path, D)
+    require_sound(cut, area(points, triangles))
+    assert len(cut.triangles) > 3 * len(triangles)
+    assert smallest_angle(cut.points, cut.triangles) >= 0.5 * smallest_angle(points, triangles) - 1e-9
+
+
+QUADRILATERAL = np.array([[0, 0, 0], [10, 0, 0], [10, 8, 0], [0, 8, 0.0]])
+
+
+def test_the_next_vertex_may_lie_across_a_shared_longest_edge_which_is_swapped_then():
+    across = [[0.0, 8.0, 0.0], [10.0, 0.0, 0.0]]
+    cut = cut_surface(QUADRILATERAL, [[0, 1, 2], [0, 2, 3]], across, 4.0, refined=False)
+    np.testing.assert_allclose(cut.areas_mm2, [40.0, 40.0])
+    np.testing.assert_allclose(np.sort(cut.cut_edges[0], axis=0), [[0, 0, 0], [10, 8, 0]])
+    assert len(cut.triangles) == 2 and len(cut.points) == 6
+    bent = QUADRILATERAL.copy()
+    bent[2, 2] = 3.0
+    same = cut_surface(bent, [[0, 1, 2], [0, 2, 3]], across, 4.0, refined=False)
+    assert same.n_pieces == 1 and not len(same.cut_edges)  # a swap would change the shape
+    np.testing.assert_allclose(same.areas_mm2, area(bent, np.array([[0, 1, 2], [0, 2, 3]])))
+
+
+def test_a_tool_that_comes_back_far_away_cuts_again():
+    points, triangles = plate()
+    there = [[-10, 20, 0], [110, 22, 0], [200, 22, 0], [200, 300, 0], [-150, 300, 0], [-150, 80, 0], [110, 78, 0]]
+    cut = cut_surface(points, triangles, there, D)
+    require_sound(cut, SIZE**2)
+    np.testing.assert_allclose(np.sort(cut.areas_mm2), [2100, 2100, 5800], rtol=0.03)
+    high = cut_surface(points, triangles, [[-10, 50, 40], [20, 50, 40], [20, 50, 0], [60, 52, 0], [60, 52, 40], [90, 52, 40]], D)
+    assert high.n_pieces == 1 and high.length_mm == pytest.approx(40.0, rel=0.15)
+
+
+def test_a_vertex_of_very_many_triangles_is_refused():
+    n = 600
+    turn = np.linspace(0.0, 2.0 * np.pi, n, endpoint=False)
+    points = np.concatenate([[[0, 0, 0]], np.stack([50 * np.cos(turn), 50 * np.sin(turn), 0 * turn], axis=1)])
+    fan = np.stack([np.zeros(n, dtype=int), 1 + np.arange(n), 1 + (np.arange(n) + 1) % n], axis=1)
+    for refined in (True, False):
+        with pytest.raises(InputError, match="more than 512 triangles"):
+            cut_surface(points, fan, [[-20, 0.1, 0], [20, -0.1, 0]], 10.0, refined=refined)
+
+
 def test_without_refinement_the_cut_strays_along_the_edges_that_there_are():
     points, triangles = plate()
     path = [[-10, 33, 0], [110, 57, 0]]

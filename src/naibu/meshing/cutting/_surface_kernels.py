@@ -24,6 +24,7 @@ class SurfaceArrays(NamedTuple):
     ends: IntArray  # (v, 2) ends of the edge that a vertex halves, -1 of others
     source: IntArray  # (v,) vertex that a vertex was copied from, itself of others
     parent: IntArray  # (t,) triangle of the surface before that a triangle is a part of
+    next_part: IntArray  # (t,) next triangle in the list of these parts, which begins with the number of the triangle before; -1 at its end
     sides: IntArray  # (t, 3) number of the edge opposite to each corner; the two lips of a cut have edges of their own
     stamp: IntArray  # (t,)
     marked: IntArray  # (t,) 1 for triangles in `touched`
@@ -93,6 +94,7 @@ def _halve(s, t, i):  # type: ignore[no-untyped-def]  # pragma: no cover
         s.position[m, k] = 0.5 * (s.position[b, k] + s.position[c, k])
     s.twin[m], s.source[m], s.ends[m, 0], s.ends[m, 1] = m, m, b, c
     s.stamp[t2], s.parent[t2], s.marked[t2] = 0, s.parent[t], 0
+    s.next_part[t2], s.next_part[t] = s.next_part[t], t2
     e0, at_b, at_c = s.sides[t, i], s.sides[t, (i + 1) % 3], s.sides[t, (i + 2) % 3]
     e1, e2 = s.n[3], s.n[3] + 1  # the second half of the edge, and the edge to the opposite corner
     s.n[3] += 2 if u < 0 else 3
@@ -103,6 +105,7 @@ def _halve(s, t, i):  # type: ignore[no-untyped-def]  # pragma: no cover
         e, near_c, near_b = s.triangles[u, j], s.neighbours[u, (j + 1) % 3], s.neighbours[u, (j + 2) % 3]
         side_c, side_b = s.sides[u, (j + 1) % 3], s.sides[u, (j + 2) % 3]
         s.stamp[u2], s.parent[u2], s.marked[u2] = 0, s.parent[u], 0
+        s.next_part[u2], s.next_part[u] = s.next_part[u], u2
         _set(s, u, (e, m, b), (t, near_c, u2), (e0, side_c, e2 + 1))
         _set(s, u2, (e, c, m), (t2, u, near_b), (e1, e2 + 1, side_b))
         _replace(s, near_b, u, u2)

@@ -55,17 +55,6 @@ def nearest_on_triangle(p, a, b, c, qx, qy, qz):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def nearest_of_all(s, qx, qy, qz):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return the triangle nearest to q."""
-    best, where = np.inf, 0
-    for t in range(s.n[1]):
-        d2 = nearest_on_triangle(s.position, s.triangles[t, 0], s.triangles[t, 1], s.triangles[t, 2], qx, qy, qz)[0]
-        if d2 < best:
-            best, where = d2, t
-    return where
-
-
-@njit(cache=True)
 def _queue_beside(s, t, mark, jump, queue, tail):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Append what hangs together with a triangle and has not been met, also across cuts where `jump`; returns the number in the queue."""
     for i in range(3):

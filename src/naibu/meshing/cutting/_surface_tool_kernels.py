@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import njit
-from naibu.meshing.cutting._surface_search_kernels import dot, first_at, nearest, nearest_of_all, on_path
+from naibu.meshing.cutting._surface_grid_kernels import nearest_listed
+from naibu.meshing.cutting._surface_search_kernels import dot, first_at, nearest, on_path
 from naibu.meshing.cutting._surface_walk_kernels import (
     AT,
     AT_BOUNDARY,
@@ -26,8 +27,6 @@ from naibu.meshing.cutting._surface_walk_kernels import (
     PIECES,
     REACH,
     SAMPLED,
-    SEARCHED,
-    SOUGHT,
     STEPPED,
     STUCK,
     WAITING,
@@ -64,27 +63,17 @@ def append(k, point, tip, triangle, over):  # type: ignore[no-untyped-def]  # pr
 
 
 @njit(cache=True)
-def _lost(k, tip):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Whether the whole surface is to be searched: not more often than every distance in which nothing was found."""
-    x, y, z = tip[0] - k.real[SOUGHT], tip[1] - k.real[SOUGHT + 1], tip[2] - k.real[SOUGHT + 2]
-    beyond = not k.whole[SEARCHED] or not k.whole[COUNT] or np.sqrt(dot(x, y, z, x, y, z)) >= k.real[DISTANCE]
-    if beyond:
-        k.whole[SEARCHED] = 1
-        for i in range(3):
-            k.real[SOUGHT + i] = tip[i]
-    return beyond
-
-
-@njit(cache=True)
-def sample(s, k, tip, near):  # type: ignore[no-untyped-def]  # pragma: no cover
+def sample(s, k, grid, tip, near):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Append a position of the tip and the point of the surface beneath it, searched from a triangle (-1: everywhere)."""
     distance, reach, point = k.real[DISTANCE], k.real[REACH], np.empty(3)
     radius = 2.0 * distance + k.real[HEIGHT]
-    t, beside, d2 = 0, 0.0, np.inf
+    t, beside, d2 = max(near, 0), 0.0, np.inf
     if near >= 0:
         t, beside, d2, _ = nearest(s, near, tip, radius, True, k.queue, point)
-    if d2 > reach * reach and _lost(k, tip):  # far from where the tool was, the whole surface is searched
-        t, beside, d2, _ = nearest(s, nearest_of_all(s, tip[0], tip[1], tip[2]), tip, radius, True, k.queue, point)
+    if d2 > reach * reach:  # far from where the tool was
+        found = nearest_listed(s, grid, tip[0], tip[1], tip[2], reach)
+        if found >= 0:
+            t, beside, d2, _ = nearest(s, found, tip, radius, True, k.queue, point)
     if beside > BESIDE * distance or d2 > reach * reach:
         k.real[HEIGHT] = 0.0
         append(k, tip, tip, t, 0)
@@ -177,11 +166,11 @@ def walk(s, k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 
 @njit(cache=True)
-def follow(s, k, goal, again):  # type: ignore[no-untyped-def]  # pragma: no cover
+def follow(s, k, grid, goal, again):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Move the tip along a straight line; FULL where there is no room, after which it is called `again` with more."""
     whole, real = k.whole, k.real
     if not whole[COUNT]:
-        sample(s, k, goal, -1)
+        sample(s, k, grid, goal, -1)
         return WAITING
     if not again:
         last = k.tips[whole[COUNT] - 1]
@@ -195,7 +184,7 @@ def follow(s, k, goal, again):  # type: ignore[no-untyped-def]  # pragma: no cov
                 return FULL
             for i in range(3):
                 tip[i] = real[BEGIN + i] + whole[PIECE] / whole[PIECES] * (goal[i] - real[BEGIN + i])
-            sample(s, k, tip, k.triangle[whole[COUNT] - 1])
+            sample(s, k, grid, tip, k.triangle[whole[COUNT] - 1])
             whole[SAMPLED] = 1
         if walk(s, k, False) == FULL:
             return FULL

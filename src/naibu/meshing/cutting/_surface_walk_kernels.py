@@ -16,10 +16,10 @@ NO_ROOM = -2
 FINEST = 4  # times that the allowed edge is halved where no edge leads on
 
 # entries of `ToolArrays.whole`: lengths of the path and of the list of cut edges, where the cut is, and how far a movement has come
-COUNT, EDGES, NOW, AT_BOUNDARY, BEGAN, LEFT_BEFORE, SEARCHED, FREE, PIECE, PIECES, SAMPLED = range(11)
+COUNT, EDGES, NOW, AT_BOUNDARY, BEGAN, LEFT_BEFORE, FREE, PIECE, PIECES, SAMPLED = range(10)
 # entries of `ToolArrays.real`: distance, reach, length of the path beside the cut, height of the tip, length at which a loop is closed,
-# where the cut left the surface, where the whole surface was searched, where a movement began
-DISTANCE, REACH, AT, HEIGHT, CLOSING, LAST, SOUGHT, BEGIN = 0, 1, 2, 3, 4, 5, 8, 11
+# where the cut left the surface, where a movement began
+DISTANCE, REACH, AT, HEIGHT, CLOSING, LAST, BEGIN = 0, 1, 2, 3, 4, 5, 8
 
 
 class ToolArrays(NamedTuple):
@@ -133,9 +133,9 @@ def advance(s, k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
         return WAITING
     if whole[AT_BOUNDARY]:
         return LEFT
-    if whole[EDGES] == len(k.edges):
-        return FULL
     r = whole[NOW]
+    if whole[EDGES] == len(k.edges) or fan(s, r, k.around)[0] < 0:
+        return FULL
     for h in range(FINEST + 1):
         if not free and not refine_around(s, r, distance * 0.5**h, k.around):
             return FULL

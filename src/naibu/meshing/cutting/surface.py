@@ -18,6 +18,7 @@ from naibu.core.arrays import FloatArray, IntArray, as_points, as_vector, requir
 from naibu.core.errors import InputError
 from naibu.meshing.cutting import _surface_tool_kernels as tool_kernels
 from naibu.meshing.cutting import _surface_walk_kernels as walk
+from naibu.meshing.cutting._surface_grid_kernels import grid_of
 from naibu.meshing.cutting._surface_kernels import MOST_AROUND, SurfaceArrays, number_edges
 from naibu.meshing.cutting._surface_walk_kernels import ToolArrays
 from naibu.meshing.cutting.surface_input import LinkedSurface, linked_surface
@@ -63,6 +64,8 @@ class SurfaceCutter:
         self.reach_mm = 2.0 * self.distance_mm if reach_mm is None else require_positive("reach_mm", reach_mm, "mm")
         self._start = start
         self.arrays = _arrays(start)
+        size = float(np.linalg.norm(np.diff(start.points[start.triangles], axis=1), axis=2).mean())
+        self._grid = grid_of(start.points, start.triangles, max(size, self.reach_mm))
         self._tool = _tool(self.distance_mm, self.reach_mm, refined)
         self._paths: list[ToolPath] = []
 
@@ -80,8 +83,8 @@ class SurfaceCutter:
             NaN, or a surface that has grown beyond 5 million triangles.
         """
         goal = as_vector("tip", tip)
-        if tool_kernels.follow(self.arrays, self._tool, goal, False) == walk.FULL:
-            self._with_room(lambda: int(tool_kernels.follow(self.arrays, self._tool, goal, True)))
+        if tool_kernels.follow(self.arrays, self._tool, self._grid, goal, False) == walk.FULL:
+            self._with_room(lambda: int(tool_kernels.follow(self.arrays, self._tool, self._grid, goal, True)))
 
     def lift(self) -> None:
         """Take the tool off: the cut is finished up to where it was."""
@@ -185,7 +188,7 @@ def _tool(distance_mm: float, reach_mm: float, refined: bool) -> ToolArrays:
 
 def _put_down(tool: ToolArrays) -> None:
     """Set the state of a tool that begins another cut."""
-    tool.whole[[walk.COUNT, walk.AT_BOUNDARY, walk.BEGAN, walk.LEFT_BEFORE, walk.SEARCHED]] = 0
+    tool.whole[[walk.COUNT, walk.AT_BOUNDARY, walk.BEGAN, walk.LEFT_BEFORE]] = 0
     tool.whole[walk.NOW], tool.real[walk.AT], tool.real[walk.CLOSING] = -1, 0.0, np.inf
 
 
@@ -196,6 +199,6 @@ def _arrays(start: LinkedSurface) -> SurfaceArrays:
     at[triangles.ravel()] = np.repeat(np.arange(t), 3)
     own, none, zero = np.arange(n), np.full((n, 2), -1, dtype=np.int64), np.zeros(t, dtype=np.int64)
     edges = int(number_edges(neighbours, sides))
-    rows = [points, points, triangles, neighbours, at, own, none, own, np.arange(t), sides, zero, zero, zero]
+    rows = [points, points, triangles, neighbours, at, own, none, own, np.arange(t), zero - 1, sides, zero, zero, zero]
     room: list[Any] = [_grown(np.ascontiguousarray(a), len(a) // 2 + 20_000) for a in rows]
     return SurfaceArrays(*[*room, np.array([n, t, 0, edges, 0])])
