@@ -27,7 +27,14 @@ from naibu.io.sensing_chip_schema import ChipFile, LoadTable, StudyTable, load_c
 from naibu.io.vtk_files import write_vtu
 from naibu.mechanics.small_strain.cubic_elasticity import miller_indices
 from naibu.reproduction.chapter6 import chip_figures
-from naibu.reproduction.chapter6.chip_sections import crosstalk_tables, model_table, readout_section, sensitivity_table, study_section
+from naibu.reproduction.chapter6.chip_sections import (
+    crosstalk_tables,
+    model_table,
+    placement_figure,
+    readout_section,
+    sensitivity_table,
+    study_section,
+)
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
@@ -243,7 +250,7 @@ def _sections(chip: PreparedChip, analysis: ChipAnalysis) -> tuple[Section, ...]
     rounded = tuple(float(f"{v:.3g}") for v in full_scale)
     loads = (_loads_table(chip, analysis),) if chip.settings.load else ()
     sections = [
-        Section("Sensitivity and stiffness", (), (sensitivity_table(analysis), model_table(analysis)), (along,)),
+        Section("Sensitivity and stiffness", (), (sensitivity_table(analysis), model_table(analysis)), (along, placement_figure(analysis))),
         Section("Crosstalk", (), crosstalk_tables(analysis, rounded)),
         Section("Loads", text, loads, (safe,)),
         readout_section(analysis, chip.readout, chip.settings.readout.filter_share, seed=0),

@@ -13,6 +13,7 @@ from naibu.applications.sensing_chip.bridge import (
     crosstalk,
     decoupled,
     half_bridge,
+    sensitivity_by_place,
     sensitivity_matrix,
 )
 from naibu.applications.sensing_chip.chip_mesh import ChipResolution
@@ -115,6 +116,16 @@ def test_a_misaligned_mask_couples_them(whole: ChipResponse) -> None:
     off = [abs(crosstalk(sensitivity_matrix(whole, shift_mm=(s, s)), full_scale)[0, 1]) for s in (0.002, 0.004)]
     assert 1e-3 < off[0] < 1e-2
     assert off[1] == pytest.approx(2.0 * off[0], rel=0.2)
+
+
+def test_sensitivity_by_place_is_that_of_the_resistors_where_they_are(beams_alone: ChipResponse) -> None:
+    design, matrix = beams_alone.design, sensitivity_matrix(beams_alone)
+    # over the length of a resistor the stress is nearly linear
+    assert sensitivity_by_place(beams_alone, np.array([design.force_resistor_mm]))[0, 0] == pytest.approx(matrix[0, 2], rel=0.02)
+    assert sensitivity_by_place(beams_alone, np.array([design.moment_resistor_mm]))[1, 0] == pytest.approx(matrix[2, 4], rel=0.02)
+    # between the ends nothing is left of the force, and of the moment what bends both halves alike
+    middle = sensitivity_by_place(beams_alone, np.array([0.5 * design.beam_length_mm]))
+    assert middle[0, 0] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_loads_are_read_back_from_the_bridges(whole: ChipResponse) -> None:

@@ -101,6 +101,29 @@ def closed_form_sensitivities(design: ChipDesign) -> FloatArray:
     return np.asarray(1e3 * design.supply_voltage * np.array([of_force, across * of_moment, along * of_moment]))
 
 
+def sensitivity_by_place(response: ChipResponse, distance_mm: FloatArray) -> FloatArray:
+    """Return what the sensitivities to F_z and M_y (2, n) would be with short resistors elsewhere on the axes, mV/mN and mV/(mN mm).
+
+    Parameters
+    ----------
+    response : ChipResponse
+        Of the chip.
+    distance_mm : ndarray, shape (n,)
+        Distance of the resistors from the ends of the beams, mm.
+    """
+    design = response.design
+
+    def changes(distance: FloatArray) -> FloatArray:
+        stress = response.stress_at(beam_points(design, "A", distance))[[2, 4]]
+        return design.piezoresistance.relative_change(stress, np.eye(3)[0], design.axes)
+
+    outer, inner = changes(distance_mm), changes(design.beam_length_mm - distance_mm)
+    # beam B bears the same as A under a force, the opposite under a moment
+    of_force = half_bridge(outer[0], inner[0], design.supply_voltage)
+    moment = 0.5 * (inner[1] - outer[1])
+    return np.asarray(1e3 * np.stack([of_force, half_bridge(moment, -moment, design.supply_voltage)]))
+
+
 def crosstalk(matrix: FloatArray, full_scale: ArrayLike) -> FloatArray:
     """Return the output of every bridge at the full scale of every load, over its output at that of its own load (3, 6).
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from naibu.applications.sensing_chip.analysis import ChipAnalysis
+from naibu.applications.sensing_chip.bridge import sensitivity_by_place
 from naibu.applications.sensing_chip.design import ChipDesign, beam_points
 from naibu.applications.sensing_chip.design_study import DesignStudy
 from naibu.applications.sensing_chip.filter_comparison import NAMES, ONLINE, FilterComparison
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
+MODELS = ("finite elements, rigid block and clamps", "finite elements, whole chip")
 _MPA = 1e-3  # kPa in MPa
 _UM = 1e3  # mm in um
 _WORK = (("F_z", 2, 5000.0, "mN"), ("M_y", 4, 800.0, "N um"))
@@ -33,15 +35,32 @@ def stress_along_beam(canvas: Canvas, analysis: ChipAnalysis) -> None:
     places = (design.force_resistor_mm, design.moment_resistor_mm)
     for axes, (name, load, size, unit), stress, place in zip(canvas.subplots(1, 2), _WORK, closed, places, strict=True):
         axes.plot(_UM * x, _MPA * size * stress, "k--", label="closed form")
-        for response, label in (
-            (analysis.beams, "finite elements, rigid block and clamps"),
-            (analysis.whole, "finite elements, whole chip"),
-        ):
+        for response, label in zip((analysis.beams, analysis.whole), MODELS, strict=True):
             axes.plot(_UM * x, _MPA * size * response.stress_at(points)[load, :, 0, 0], label=label)
         for centre in (place, design.beam_length_mm - place):
             axes.axvspan(*(_UM * (centre + s * 0.5 * design.resistor_length_mm) for s in (-1, 1)), color="0.85", linewidth=0)
         axes.axhline(0.0, color="k", linewidth=0.5)
         axes.set(title=f"{name} = {size:g} {unit}", xlabel="distance from the clamp (um)", ylabel="stress along the beam (MPa)")
+    canvas.axes[0].legend(fontsize=7)
+
+
+def placement(canvas: Canvas, analysis: ChipAnalysis) -> None:
+    """Draw the sensitivities that resistors at other distances from the ends of the beams would have."""
+    design, beams = analysis.design, analysis.design.closed_forms
+    length = design.beam_length_mm
+    x = np.linspace(0.02, 0.48, 47) * length
+    coefficient = 1e3 * design.supply_voltage * design.piezoresistance.longitudinal(design.beam_direction)
+    bending = 0.25 * (beams.bending_stress(length - x) - beams.bending_stress(x)) / beams.moment_stiffness
+    closed = (0.5 * coefficient * beams.force_stress(x), coefficient * bending)
+    found = [sensitivity_by_place(response, x) for response in (analysis.beams, analysis.whole)]
+    own = (analysis.of_whole[0, 2], analysis.of_whole[2, 4])
+    places = (design.force_resistor_mm, design.moment_resistor_mm)
+    for k, (axes, name, unit) in enumerate(zip(canvas.subplots(1, 2), ("F_z", "M_y"), ("mV/mN", "mV/(N um)"), strict=True)):
+        axes.plot(_UM * x, closed[k], "k--", label="closed form")
+        for values, label in zip(found, MODELS, strict=True):
+            axes.plot(_UM * x, values[k], label=label)
+        axes.plot(_UM * places[k], own[k], "k*", markersize=8, label="resistors of this chip, with their length")
+        axes.set(xlabel="distance from the ends (um)", ylabel=f"sensitivity to {name} ({unit})", ylim=(0.0, None))
     canvas.axes[0].legend(fontsize=7)
 
 

@@ -76,6 +76,12 @@ def sensitivity_table(analysis: ChipAnalysis, paper: Sequence[float] | None = No
     )
 
 
+def placement_figure(analysis: ChipAnalysis) -> Figure:
+    """Return the sensitivities that other places of the resistors would give."""
+    caption = "Sensitivity of resistors at other distances from both ends of the beams, on their axes."
+    return Figure("Placement", caption, lambda canvas: chip_figures.placement(canvas, analysis), (10.0, 3.6))
+
+
 def crosstalk_tables(analysis: ChipAnalysis, full_scale: Sequence[float]) -> tuple[Table, Table]:
     """Return output at full scale of every load over that of the bridge's own load, aligned and with a shifted mask, %."""
     columns = ("bridge", *(f"{name} = {size:g} {unit}" for name, size, unit in zip(LOADS, full_scale, UNITS, strict=True)))

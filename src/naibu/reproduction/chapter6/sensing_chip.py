@@ -12,7 +12,14 @@ from naibu.applications.sensing_chip.design_study import DesignStudy, study_desi
 from naibu.applications.sensing_chip.electronics import report_readout
 from naibu.applications.sensing_chip.load_envelope import largest_stress, load_limits
 from naibu.reproduction.chapter6 import chip_figures
-from naibu.reproduction.chapter6.chip_sections import crosstalk_tables, model_table, readout_section, sensitivity_table, study_section
+from naibu.reproduction.chapter6.chip_sections import (
+    crosstalk_tables,
+    model_table,
+    placement_figure,
+    readout_section,
+    sensitivity_table,
+    study_section,
+)
 from naibu.reproduction.printed_tables import printed_table
 from naibu.viewer.chapter import Figure, Section
 from naibu.viewer.tables import Cell, Table
@@ -37,7 +44,7 @@ def chip_sections(seed: int, resolution: ChipResolution | None = None) -> tuple[
         _equations(analysis),
         _piezoresistance(design),
         _specification(analysis),
-        readout_section(analysis, report_readout(), SHARE, seed),
+        _electronics(analysis, seed),
         study_section(design, designs_around(design)),
     )
 
@@ -206,6 +213,25 @@ def _piezoresistance(design: ChipDesign) -> Section:
     return Section("Piezoresistance in the axes of the crystal", text, (table,), (figure,))
 
 
+def _electronics(analysis: ChipAnalysis, seed: int) -> Section:
+    readout = report_readout()
+    section = readout_section(analysis, readout, SHARE, seed)
+    _, (strength, sensitivity) = printed_table("6.1")
+    full_mv = float(strength[1]) * float(sensitivity[1])
+    end_mn = 1e3 * readout.adc_limit / (readout.gains[0] * float(sensitivity[1]))
+    text = (
+        f"An offset of 10 % of the largest output, as the report has it, is {0.1 * full_mv:.0f} mV at the bridge of F_z and would be "
+        f"{1e-4 * full_mv * readout.gains[0]:.0f} V after the amplifier: it must be trimmed at the bridge, as Fig. 6.6 does. What the "
+        "trimmer "
+        f"leaves may drift by {1e3 * readout.adc_limit / readout.gains[0]:.0f} mV at most before the converter saturates.",
+        f"A converter of {readout.adc_limit:g} V and the printed sensitivity and gain read at most {end_mn:.0f} mN, and 17 mN with the "
+        "papers' "
+        "gain of 3000. The fingertip bears 3 N and 60 N in the tests while the readings stay on scale: either less than 1 % of the force "
+        "passes through the chip, or the sensitivity of Table 6.1 is not that of the chip inside its rubber.",
+    )
+    return Section("Offset, gain and filter (Figs 6.6 and 6.10)", (*text, *section.paragraphs), section.tables, section.figures)
+
+
 def _specification(analysis: ChipAnalysis) -> Section:
     design = analysis.design
     _, (strength, sensitivity) = printed_table("6.1")
@@ -249,4 +275,4 @@ def _specification(analysis: ChipAnalysis) -> Section:
         "elastic frame and enter the moments by 1.5 % of full scale. A mask that is off by 2 um adds twist and lateral force by less.",
     )
     tables = (sensitivity_table(analysis, (s_f, s_m, s_m)), strength_table, *crosstalk_tables(analysis, (5e3, 5e3, 5e3, 8e2, 8e2, 8e2)))
-    return Section("Specification (Table 6.1)", text, tables, (figure,))
+    return Section("Specification (Table 6.1)", text, tables, (placement_figure(analysis), figure))

@@ -1,0 +1,34 @@
+"""Convergence of the finite elements of the assumed sensing chip: ``python benchmarks/sensing_chip.py``.
+
+Prints, for ever finer meshes of the whole chip, nodes, processor time, stiffness and the sensitivities to F_z and M_y.
+"""
+
+from __future__ import annotations
+
+import time
+
+from naibu.applications.sensing_chip.bridge import sensitivity_matrix
+from naibu.applications.sensing_chip.chip_mesh import ChipResolution
+from naibu.applications.sensing_chip.design import assumed_chip
+from naibu.applications.sensing_chip.finite_elements import solve_chip
+
+RESOLUTIONS = (ChipResolution(6, 1, 2, 2, 3), ChipResolution(8, 2, 2, 2, 3), ChipResolution(), ChipResolution(12, 2, 4, 4, 6))
+
+
+def main() -> None:
+    """Print one line a mesh."""
+    print("nodes   processor s   stiffness N/mm   tilt mN m/rad   F_z mV/mN   M_y mV/(N um)")
+    for resolution in RESOLUTIONS:
+        began = time.process_time()
+        response = solve_chip(assumed_chip(), resolution)
+        matrix = sensitivity_matrix(response)
+        seconds = time.process_time() - began
+        print(
+            f"{response.chip.mesh.n_points:6d} {seconds:11.1f} {1e-3 * response.force_stiffness:15.1f} "
+            f"{1e-3 * response.moment_stiffness:15.2f} {matrix[0, 2]:12.4f} {matrix[2, 4]:13.3f}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
