@@ -87,7 +87,8 @@ def test_the_example_of_a_page_runs(page: str, capsys: pytest.CaptureFixture[str
 def test_citations_and_bibliography_agree() -> None:
     entries = re.findall(r"^@\w+\{(\w+),", (DOCS / "references.bib").read_text(encoding="utf-8"), re.MULTILINE)
     assert len(entries) == len(set(entries)), sorted(key for key in set(entries) if entries.count(key) > 1)
-    files = [*(DOCS.parent / "src").rglob("*.py"), *DOCS.glob("*.rst"), *(DOCS / "gallery_src").glob("*")]
+    pages = [*DOCS.glob("*.rst"), *(DOCS / "applications").glob("*.rst")]
+    files = [*(DOCS.parent / "src").rglob("*.py"), *pages, *(DOCS / "gallery_src").glob("*")]
     cited = {
         key.strip()
         for file in files

@@ -77,7 +77,13 @@ def test_each_public_name_stands_once_in_the_page_of_its_package(package: str) -
 
 
 def test_pages_and_examples_import_public_names_only() -> None:
-    pages = [ROOT / "README.md", *DOCS.glob("*.rst"), *(DOCS / "api").glob("*.rst"), *(DOCS / "gallery_src").glob("*.py")]
+    pages = [
+        ROOT / "README.md",
+        *DOCS.glob("*.rst"),
+        *(DOCS / "applications").glob("*.rst"),
+        *(DOCS / "api").glob("*.rst"),
+        *(DOCS / "gallery_src").glob("*.py"),
+    ]
     statement = re.compile(r"^\s*from (naibu[\w.]*) import (\([^)]*\)|[^\n]+)", re.MULTILINE)
     private = []
     for page in pages:

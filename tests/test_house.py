@@ -188,7 +188,7 @@ def loaded_by(statement: str) -> set[str]:
 def test_importing_naibu_is_light() -> None:
     assert loaded_by("import naibu; dir(naibu)") == set()
     # the packages of public names load nothing until a name is used
-    for package in ("core", "identification", "imaging", "io", "mechanics", "meshing", "validation", "workflows"):
+    for package in ("applications", "core", "identification", "imaging", "io", "mechanics", "meshing", "validation", "workflows"):
         assert loaded_by(f"import naibu; dir(naibu.{package})") == set()
 
 

@@ -13,6 +13,10 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from naibu._numba.reports import reported_compilation
+from naibu.applications.sensing_chip.bridge import sensitivity_matrix
+from naibu.applications.sensing_chip.chip_mesh import ChipResolution
+from naibu.applications.sensing_chip.design import assumed_chip
+from naibu.applications.sensing_chip.finite_elements import solve_chip
 from naibu.core.arrays import AnyArray, FloatArray
 from naibu.core.errors import NaibuError
 from naibu.core.progress import Progress, report_progress
@@ -122,6 +126,7 @@ def _problems(folder: Path) -> dict[str, Callable[[], object]]:
         ),
         "predict": partial(predict, model, "ct_two_material_2", out=folder / "prediction"),
         "large meshes": _large_meshes,
+        "chip": _chip,
         "track": partial(_track, folder),
         "track-sequence": partial(_track_sequence, folder),
     }
@@ -149,6 +154,11 @@ def _large_meshes() -> None:
         made = Assembler.from_materials(elements(mesh, formulation), mesh.regions, [from_moduli(LAWS["neo_hookean"], 10.0, 50.0)])
         made.evaluate(np.zeros(mesh.points.shape))
         made.forces(np.zeros(mesh.points.shape))
+
+
+def _chip() -> None:
+    """Solve the beams of a sensing chip, and read their piezoresistors."""
+    sensitivity_matrix(solve_chip(assumed_chip(), ChipResolution(along=2, across=1, through=1), whole=False))
 
 
 def _write_texture(reference: Path, deformed: Path) -> None:
