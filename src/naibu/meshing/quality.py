@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
+from naibu.meshing._quality_kernels import largest_cosine
 
 # The three neighbours of every corner, in the order that makes a positive triple product in a good cell.
 _CORNERS = {
@@ -18,7 +19,6 @@ _EDGES = {
     "hexahedron": np.array([[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]]),
     "tetra": np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]]),
 }
-_TETRA_FACES = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))  # opposite to every corner, counterclockwise from outside
 _HEX_SIGNS = np.array([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], dtype=float)
 # Degree-3 rule of a tetrahedron (barycentric points, weights of sum 1): exact for the Jacobian of a curved quadratic cell.
 _TETRA_POINTS = np.vstack([np.full((1, 4), 0.25), np.full((4, 4), 1 / 6) + np.eye(4) / 3])
@@ -77,11 +77,7 @@ def mean_edge_length(mesh: Mesh) -> float:
 
 def smallest_dihedral_angle(points: FloatArray, cells: IntArray | Int32Array) -> float:
     """Return the smallest angle between two faces of tetrahedra (m, 4), degrees."""
-    corners = points[cells]
-    normals = np.stack([np.cross(corners[:, f[1]] - corners[:, f[0]], corners[:, f[2]] - corners[:, f[0]]) for f in _TETRA_FACES], axis=1)
-    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-    cosines = -np.einsum("mik,mjk->mij", normals, normals)[:, *np.triu_indices(4, 1)]
-    return float(np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)).min()))
+    return float(np.degrees(np.arccos(np.clip(largest_cosine(points, cells), -1.0, 1.0))))
 
 
 def unused_nodes(mesh: Mesh) -> IntArray:

@@ -11,7 +11,7 @@ from .force_limits import ForceLimits
 from .haptic_loop import DeviceChannel, DeviceForce, DevicePose, HapticHand
 from .interactive_bodies import FiniteElementBody, InteractiveBody, LatticeBody
 from .interactive_simulation import Frame, InteractiveSimulation
-from .lattice_cut import LatticeCut, cut_lattice, cut_session
+from .lattice_cut import LatticeCut, cut_engine, cut_lattice, cut_session
 from .real_time_loop import RealTimeLoop
 from .simulated_device import SimulatedDevice
 from .surface_opening import opened, opening
@@ -44,6 +44,7 @@ __all__ = [
     "StressError",
     "SurfaceSprings",
     "VirtualCoupling",
+    "cut_engine",
     "cut_lattice",
     "cut_session",
     "face_force",

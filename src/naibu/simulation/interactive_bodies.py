@@ -25,6 +25,7 @@ from naibu.meshing.cutting.swept_blade import SweptBlade
 from naibu.meshing.cutting.volume import VolumeCut, cut_volume
 from naibu.meshing.element_conversion import to_tetra
 from naibu.meshing.quality import mean_edge_length
+from naibu.meshing.refinement.forest import BisectionForest
 from naibu.meshing.surface import boundary_faces, triangles_of_faces
 from naibu.simulation.lattice_cut import LatticeCut, cut_engine, cut_lattice
 
@@ -196,6 +197,8 @@ class FiniteElementBody:
         Nodes that never move.
     fixtures : tuple of RigidIndenter
         Rigid bodies in contact that never move.
+    forest : BisectionForest, optional
+        Of the cut that the mesh comes from, for the next one.
     """
 
     engine: DynamicEngine
@@ -206,6 +209,7 @@ class FiniteElementBody:
     cells: IntArray
     supported: IntArray
     fixtures: tuple[RigidIndenter, ...]
+    forest: BisectionForest | None = None
 
     @classmethod
     def of(
@@ -309,7 +313,7 @@ class FiniteElementBody:
         mesh, assembler = to_tetra(self.mesh), self.engine.assembler
         fine = mean_edge_length(self.mesh) if distance_mm is None else distance_mm
         split = np.repeat(np.arange(self.mesh.n_cells), mesh.n_cells // self.mesh.n_cells)
-        found = cut_volume(mesh, blade, fine, positions=mesh.points + state.displacement)
+        found = cut_volume(mesh, blade, fine, positions=mesh.points + state.displacement, forest=self.forest)
         before = split[found.parents]
         placeholder = [material(young_modulus=1.0, poisson_ratio=0.3)] * len(mesh.region_names)
         made = Assembler.from_materials(elements(found.mesh, "mean_dilatation"), found.mesh.regions, placeholder)
@@ -321,6 +325,7 @@ class FiniteElementBody:
             density=self.density, gravity=self.gravity, step_s=self.engine.step, normal_stiffness=self.engine.normal_stiffness,
             tangential_stiffness=self.engine.tangential_stiffness,
         )  # fmt: skip
+        body = replace(body, forest=found.forest)
         return body, DynamicState(found.nodal(state.displacement), found.nodal(state.velocity)), found
 
     def strain(self, positions: FloatArray) -> FloatArray:

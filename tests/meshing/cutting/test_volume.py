@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import operator
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -92,6 +95,26 @@ def test_crossing_cuts_give_four_pieces_and_cells_hang_on_faces_only() -> None:
     assert second.n_pieces == 4
     volumes = [signed_volumes(second.mesh)[second.piece == k].sum() for k in range(4)]
     np.testing.assert_allclose(volumes, SIZE**3 / 4.0, rtol=0.35)
+
+
+def test_a_blade_that_goes_on_step_by_step_cuts_as_in_one_go() -> None:
+    mesh, ys = cube(), np.linspace(-15.0, 15.0, 31)
+    steps = [swept_blade([[[1.3 + 0.1 * y, y, -5.0], [1.3 + 0.1 * y, y, 25.0]] for y in ys[k : k + 2]]) for k in range(30)]
+    cut, first = None, mesh
+    for k, blade in enumerate(steps):
+        before = mesh if cut is None else cut.mesh
+        earlier = None if k == 0 else functools.reduce(operator.add, steps[max(0, k - 8) : k])
+        made = cut_volume(before, blade, 2.0, forest=None if cut is None else cut.forest, earlier=earlier)
+        check(before, made, 2.0)
+        assert cut is None or (cut.forest is not made.forest and cut.forest.n_cells == cut.mesh.n_cells)
+        cut = made
+    whole = cut_volume(first, plane(1.3, tilt=0.1), 2.0)
+    assert cut is not None and cut.n_pieces == whole.n_pieces == 2
+    assert cut.smallest_angle_deg == pytest.approx(45.0, abs=1e-6)
+    sizes = [np.bincount(c.piece, signed_volumes(c.mesh)) for c in (cut, whole)]
+    np.testing.assert_allclose(sizes[0], sizes[1], rtol=0.02)
+    with pytest.raises(InputError, match="give that of the cut that made the mesh"):
+        cut_volume(mesh, steps[0], 2.0, forest=cut.forest)
 
 
 def test_a_closed_path_cuts_a_column_out() -> None:

@@ -25,14 +25,14 @@ def _beside(p, q, points, i, j):  # type: ignore[no-untyped-def]  # pragma: no c
 
 
 @njit(cache=True)
-def crosses(p, q, points, triangles, low, high):  # type: ignore[no-untyped-def]  # pragma: no cover
+def crosses(p, q, points, triangles, low, high, count):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return 0 where the segment from p to q crosses no triangle, else which end sees the last one counterclockwise: 1 if p, -1 if q does.
 
-    `low` and `high` are the boxes of the triangles.
+    `low` and `high` are the boxes of the triangles, of which the first `count` are looked at.
     A segment through an edge or a vertex of a surface crosses one of its triangles, as the signs of zero volumes are agreed on.
     """
     side = 0
-    for t in range(len(triangles)):
+    for t in range(count):
         apart = False
         for k in range(3):
             apart |= min(p[k], q[k]) > high[t, k] or max(p[k], q[k]) < low[t, k]
@@ -53,7 +53,7 @@ def crosses(p, q, points, triangles, low, high):  # type: ignore[no-untyped-def]
 def crossed_segments(starts, ends, points, triangles, low, high, side):  # type: ignore[no-untyped-def]  # pragma: no cover
     """What `crosses` says of every segment."""
     for s in range(len(starts)):
-        side[s] = crosses(starts[s], ends[s], points, triangles, low, high)
+        side[s] = crosses(starts[s], ends[s], points, triangles, low, high, len(triangles))
 
 
 @njit(cache=True)

@@ -2,7 +2,9 @@
 """Kernels: faces of a bisection forest that a blade crosses, which of them are too far from it, and the separation of cells along them.
 
 Arrays of forests are those of `naibu.meshing.refinement._forest_kernels`. A list of faces has a row for each: cell, place of the vertex
-opposite to it, the cell on the other side, the place there; the first cell is the one above the blade.
+opposite to it, the cell on the other side, the place there; the first cell is the one above the blade. A blade is its points, triangles
+and their boxes, the number of triangles that are swept now, which come first, and which cells are `fresh`: the other triangles, swept
+before, count for these only.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ def inverted(cells, leaves, count, positions):  # type: ignore[no-untyped-def]  
 @njit(cache=True)
 def crossed_faces(cells, leaves, count, positions, blade, centres, found):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Enter the faces whose cells have their centres on two sides of the blade; returns their number, also where they do not fit."""
-    points, triangles, low, high = blade
+    points, triangles, low, high, now, fresh = blade
     lowest, highest = np.empty(3), np.empty(3)
     for k in range(3):
         lowest[k], highest[k] = low[:, k].min(), high[:, k].max()
@@ -59,7 +61,7 @@ def crossed_faces(cells, leaves, count, positions, blade, centres, found):  # ty
                 apart |= min(p, q) > highest[k] or max(p, q) < lowest[k]
             if apart:
                 continue
-            side = crosses(centres[t], centres[u], points, triangles, low, high)
+            side = crosses(centres[t], centres[u], points, triangles, low, high, len(triangles) if fresh[t] or fresh[u] else now)
             if side == 0:
                 continue
             if size < len(found):
@@ -80,7 +82,7 @@ def too_coarse(cells, faces, positions, blade, tolerance, gap, coarse):  # type:
 
     Returns the number of entries, and the largest distance.
     """
-    points, triangles, low, high = blade
+    points, triangles, low, high, _, _ = blade
     size, largest = 0, 0.0
     for f in range(len(faces)):
         far = False
@@ -105,7 +107,7 @@ def unresolved(cells, leaves, count, faces, positions, blade, centres, tolerance
     So thin slices are found in cells whose centres all lie on one side. `touched` (vertices) is filled with 0 before. Returns the number of
     entries, also where they do not fit.
     """
-    points, triangles, low, high = blade
+    points, triangles, low, high, now, fresh = blade
     lowest, highest = np.empty(3), np.empty(3)
     for k in range(3):
         lowest[k], highest[k] = low[:, k].min(), high[:, k].max()
@@ -124,7 +126,7 @@ def unresolved(cells, leaves, count, faces, positions, blade, centres, tolerance
             for k in range(3):
                 p, q = centres[t, k], positions[v, k]
                 apart |= min(p, q) > highest[k] or max(p, q) < lowest[k]
-            if apart or crosses(centres[t], positions[v], points, triangles, low, high) == 0:
+            if apart or crosses(centres[t], positions[v], points, triangles, low, high, len(triangles) if fresh[t] else now) == 0:
                 continue
             if gap[v] < 0.0:
                 gap[v] = distance(positions[v], points, triangles, low, high)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from naibu.core.arrays import AnyArray, FloatArray, IntArray, require_positive, require_shape
+from naibu.core.arrays import AnyArray, BoolArray, FloatArray, IntArray, require_positive, require_shape
 from naibu.core.errors import InputError
 from naibu.meshing.cutting import _separation_kernels as kernels
 from naibu.meshing.cutting._crossing_kernels import distances
@@ -24,7 +24,7 @@ from naibu.meshing.refinement._forest_kernels import COUNT, FLIPPED, LEAF, NODES
 from naibu.meshing.refinement.forest import BisectionForest, MeshChange
 from naibu.meshing.refinement.transfer import transferred_cells, transferred_nodes
 
-KernelBlade = tuple[FloatArray, IntArray, FloatArray, FloatArray]
+KernelBlade = tuple[FloatArray, IntArray, FloatArray, FloatArray, int, BoolArray]
 _FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])  # face k is opposite to vertex k, counterclockwise from outside
 ROUNDS = 60  # of bisection at most
 MOST_CELLS = 20_000_000
@@ -78,6 +78,7 @@ def cut_forest(
     *,
     positions: FloatArray | None = None,
     least_angle_deg: float | None = None,
+    earlier: SweptBlade | None = None,
 ) -> ForestCut:
     """Cut the leaves of a forest of tetrahedra along the surface that a blade has swept.
 
@@ -94,6 +95,9 @@ def cut_forest(
     least_angle_deg : float, optional
         The cut is refused where it would make cells with a smaller dihedral angle; by default a tenth of the smallest one of the cells that
         are bisected.
+    earlier : SweptBlade, optional
+        Of a blade that goes on step by step, what it swept in the steps before, as far back as a cell reaches. Cells that are bisected now
+        are separated along it too; without it, parts of them would hold the two sides together.
 
     Raises
     ------
@@ -105,19 +109,22 @@ def cut_forest(
     _require_cuttable(forest, where, distance_mm)
     before = forest.copied()
     try:
-        return _cut(forest, blade, distance_mm, where, least_angle_deg)
+        return _cut(forest, blade, blade if earlier is None else blade + earlier, distance_mm, where, least_angle_deg)
     except BaseException:
         forest.become(before)
         raise
 
 
-def _cut(forest: BisectionForest, blade: SweptBlade, distance_mm: float, where: FloatArray, least_angle_deg: float | None) -> ForestCut:
+def _cut(
+    forest: BisectionForest, blade: SweptBlade, whole: SweptBlade, distance_mm: float, where: FloatArray, least_angle_deg: float | None
+) -> ForestCut:
     changes: list[MeshChange] = []
-    gap = np.full(forest.node_rows, -1.0)
-    surface, centres = blade.arrays, np.empty((0, 3))
+    gap, centres, fresh = np.full(forest.node_rows, -1.0), np.empty((0, 3)), np.zeros(0, dtype=bool)
     for _ in range(ROUNDS):
         if len(centres) < forest.cell_rows:
             centres = np.empty((2 * forest.cell_rows, 3))
+            fresh = np.append(fresh, np.zeros(2 * forest.cell_rows - len(fresh), dtype=bool))
+        surface = (*whole.arrays, len(blade.triangles), fresh)
         faces = _crossed(forest, surface, where, centres)
         coarse = _too_coarse(forest, faces, where, surface, centres, 0.5 * distance_mm, gap)
         if not len(coarse):
@@ -125,13 +132,15 @@ def _cut(forest: BisectionForest, blade: SweptBlade, distance_mm: float, where: 
         if forest.n_cells + 2 * len(coarse) > MOST_CELLS:
             raise _too_fine(distance_mm)
         changes.append(forest.refine(coarse))
+        fresh = np.append(fresh, np.zeros(max(0, forest.cell_rows - len(fresh)), dtype=bool))
+        fresh[changes[-1].children] = True
         where = transferred_nodes(forest, changes[-1], where)
         gap = np.concatenate([gap, np.full(forest.node_rows - len(gap), -1.0)])
         gap[changes[-1].nodes] = -1.0
     else:
         raise _too_fine(distance_mm)
     angle = _quality(forest, changes, distance_mm, least_angle_deg)
-    faces = _opened(forest, faces, centres, blade, 0.5 * distance_mm)
+    faces = _opened(forest, faces, centres, whole, 0.5 * distance_mm)
     _, deviation = kernels.too_coarse(forest.arrays[0], faces, where, surface, np.inf, gap, np.empty(0, dtype=np.int64))
     return ForestCut(tuple(changes), _separated(forest, faces), faces, float(deviation), angle)
 

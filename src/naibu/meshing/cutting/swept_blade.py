@@ -37,6 +37,10 @@ class SweptBlade:
         corners = self.points[self.triangles]
         return self.points, self.triangles, corners.min(axis=1), corners.max(axis=1)
 
+    def __add__(self, other: SweptBlade) -> SweptBlade:
+        """Return both surfaces."""
+        return SweptBlade(np.concatenate([self.points, other.points]), np.concatenate([self.triangles, other.triangles + len(self.points)]))
+
     @property
     def extent_mm(self) -> float:
         """Largest edge of the box around the surface, mm."""

@@ -105,7 +105,9 @@ class AdaptiveMesh:
         nodes, cells = self.leaf.nodes, self.leaf.cells
         return MeshState(nodal[nodes], velocity[nodes], mass[nodes], cell_mass[cells], history[cells])
 
-    def cut(self, state: MeshState, blade: SweptBlade, distance_mm: float) -> tuple[MeshState, ForestCut]:
+    def cut(
+        self, state: MeshState, blade: SweptBlade, distance_mm: float, earlier: SweptBlade | None = None
+    ) -> tuple[MeshState, ForestCut]:
         """Cut the deformed mesh along the surface that a blade has swept; return the state behind the cut, and the cut.
 
         Vertices are doubled with displacement and velocity, masses follow from the cells on each side.
@@ -119,7 +121,7 @@ class AdaptiveMesh:
         displacement = _scattered(state.displacement, leaf.nodes, forest.node_rows)
         velocity = _scattered(state.velocity, leaf.nodes, forest.node_rows)
         cell_mass, history = (_scattered(v, leaf.cells, forest.cell_rows) for v in (state.cell_mass, state.history))
-        found = cut_forest(forest, blade, distance_mm, positions=forest.points + displacement)
+        found = cut_forest(forest, blade, distance_mm, positions=forest.points + displacement, earlier=earlier)
         nodal = [found.nodal(forest, values) for values in (displacement, velocity)]
         self.leaf = forest.leaf_mesh()
         nodes, cells = self.leaf.nodes, self.leaf.cells

@@ -173,7 +173,7 @@ class AdaptiveBody:
         wanted = (np.asarray(cells, dtype=np.int64) for cells in (refine, coarsen))
         return self._follow(self.mesh.changed(self._mesh_state(), *wanted))
 
-    def cut(self, blade: SweptBlade, distance_mm: float) -> ForestCut:
+    def cut(self, blade: SweptBlade, distance_mm: float, *, earlier: SweptBlade | None = None) -> ForestCut:
         """Cut the body, as it is deformed now, along the surface that a blade has swept; the next step is that of the cut body.
 
         Displacements, velocities, history variables and regions are kept, and with them momentum; pieces that come loose move on as bodies
@@ -185,13 +185,15 @@ class AdaptiveBody:
             The surface; it may end inside the body.
         distance_mm : float
             See `naibu.meshing.cut_forest`.
+        earlier : SweptBlade, optional
+            Of a blade that goes on step by step; see `naibu.meshing.cut_forest`.
 
         Raises
         ------
         InputError
             Triangles, or what `naibu.meshing.cut_forest` refuses; the body is then as it was.
         """
-        state, found = self.mesh.cut(self._mesh_state(), blade, distance_mm)
+        state, found = self.mesh.cut(self._mesh_state(), blade, distance_mm, earlier)
         self._follow(state)
         return found
 

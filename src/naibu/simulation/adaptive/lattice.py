@@ -243,7 +243,7 @@ class AdaptiveLattice:
         wanted = (np.asarray(cells, dtype=np.int64) for cells in (refine, coarsen))
         return self._follow(self.mesh.changed(self._mesh_state(), *wanted))
 
-    def cut(self, blade: SweptBlade, distance_mm: float) -> ForestCut:
+    def cut(self, blade: SweptBlade, distance_mm: float, *, earlier: SweptBlade | None = None) -> ForestCut:
         """Cut the lattice, as it is deformed now, along the surface that a blade has swept; the next step is that of the cut lattice.
 
         Springs, masses and dampings of each side follow from its tetrahedra, so that mass and momentum are conserved; pieces that come
@@ -255,13 +255,15 @@ class AdaptiveLattice:
             The surface; it may end inside the lattice.
         distance_mm : float
             See `naibu.meshing.cut_forest`.
+        earlier : SweptBlade, optional
+            Of a blade that goes on step by step; see `naibu.meshing.cut_forest`.
 
         Raises
         ------
         InputError
             What `naibu.meshing.cut_forest` refuses; the lattice is then as it was.
         """
-        state, found = self.mesh.cut(self._mesh_state(), blade, distance_mm)
+        state, found = self.mesh.cut(self._mesh_state(), blade, distance_mm, earlier)
         self._follow(state)
         return found
 
