@@ -119,8 +119,8 @@ def cut_volume(
     ------
     InputError
         Other cells, a forest of another mesh, inverted or duplicate cells, positions that are not finite, a distance that is not positive
-        or larger than the body, or so small that the mesh would grow beyond 20 million cells or would need cells of lower quality; the mesh is
-        left as it was.
+        or larger than the body, or so small that the mesh would grow beyond 20 million cells or would need cells of lower quality; the mesh
+        is left as it was.
     """
     if mesh.cell_type != "tetra":
         raise InputError(f"cutting needs linear tetrahedra, not {mesh.cell_type!r} cells; split hexahedra by naibu.meshing.to_tetra first")
