@@ -29,6 +29,7 @@ from .finite_elements.hyperelasticity import Law, Material, lame_parameters, law
 from .finite_strain.dynamic_session import DynamicEngine, DynamicSession, DynamicState
 from .finite_strain.problem import Problem, SolverSettings
 from .finite_strain.quasi_static_session import EquilibriumState, QuasiStaticEngine, QuasiStaticSession
+from .finite_strain.real_time_session import RealTimeEngine, RealTimeSession
 from .finite_strain.sensitivities import sensitivities
 from .finite_strain.statics import LoadState, Solution, solve
 from .finite_strain.viscoelasticity import PronySeries, ViscoelasticSolution, simulate_viscoelastic
@@ -107,6 +108,8 @@ __all__ = [
     "PronySeries",
     "QuasiStaticEngine",
     "QuasiStaticSession",
+    "RealTimeEngine",
+    "RealTimeSession",
     "RecordedPush",
     "Rheology",
     "RigidIndenter",

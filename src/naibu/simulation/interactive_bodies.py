@@ -18,6 +18,7 @@ from naibu.mechanics.finite_elements.assembly import Assembler, body_force
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import material
 from naibu.mechanics.finite_strain.dynamic_session import DynamicEngine, DynamicState
+from naibu.mechanics.finite_strain.real_time_session import RealTimeEngine
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState
 from naibu.mechanics.lattices.model.surface import surface_triangles
@@ -256,7 +257,7 @@ class FiniteElementBody:
         require_positive("density", density, "kg/mm3")
         faces = boundary_faces(mesh).faces
         mass = body_force(assembler.elements, np.full(mesh.n_cells, density), np.array([1.0, 0.0, 0.0]))[:, 0]
-        engine = DynamicEngine(mesh.points, assembler, mass, faces, step_s, normal_stiffness, tangential_stiffness)
+        engine = RealTimeEngine(mesh.points, assembler, mass, faces, step_s, normal_stiffness, tangential_stiffness)
         triangles, cells = triangles_of_faces(faces), to_tetra(mesh).cells
         return cls(engine, mesh, density, as_vector("gravity", gravity), triangles, cells, supported, tuple(fixtures))
 

@@ -6,6 +6,7 @@ exact outside of a shape; inside, they are those to the nearest face.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -88,8 +89,14 @@ class IndenterGeometry:
         """Return signed distances (p,), mm, their gradients (p, 3) and second derivatives (p, 3, 3), 1/mm, at points (p, 3)."""
         at = np.ascontiguousarray(points, dtype=float)
         gap, gradient, second = np.empty(len(at)), np.empty((len(at), 3)), np.empty((len(at), 3, 3))
-        distances(packed_geometries([self]), self.axes, at, gap, gradient, second)
+        distances(packed_geometry(self), self.axes, at, gap, gradient, second)
         return gap, gradient, second
+
+
+@functools.lru_cache(maxsize=64)
+def packed_geometry(shape: IndenterGeometry) -> GeometryArrays:
+    """Return one shape as the kernels read it, see `packed_geometries`; kept, as evaluations of one contact ask for it many times."""
+    return packed_geometries([shape])
 
 
 def packed_geometries(shapes: Sequence[IndenterGeometry]) -> GeometryArrays:

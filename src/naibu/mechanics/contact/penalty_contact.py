@@ -16,7 +16,7 @@ from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
 from naibu.core.rigid_transform import rotation_matrix
 from naibu.mechanics.contact._geometry_kernels import distance_with_derivatives
-from naibu.mechanics.contact.indenter_geometry import IndenterGeometry, packed_geometries
+from naibu.mechanics.contact.indenter_geometry import IndenterGeometry, packed_geometry
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 
 RAMP_MM = 0.01  # penetration over which the contact pressure rises smoothly
@@ -122,7 +122,7 @@ class Contact:
         vectors, matrices = np.zeros((3, n, 3)), np.zeros((3, n, 3, 3))
         response = ContactResponse(self.orientation(load), y, np.empty(n), *vectors, *matrices)
         _tractions(
-            packed_geometries([self.surface]), self.surface.axes, y, anchors, self.normal_stiffness, self.tangential_stiffness,
+            packed_geometry(self.surface), self.surface.axes, y, anchors, self.normal_stiffness, self.tangential_stiffness,
             self.friction_coefficient, self.tied, float(curvature), response.gap, response.force, response.tangential,
             response.slip_direction, response.stiffness, response.tangential_stiffness, response.anchor_stiffness,
         )  # fmt: skip

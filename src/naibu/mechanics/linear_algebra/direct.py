@@ -49,9 +49,14 @@ def _require_room() -> None:
 
 def use_one_thread() -> None:
     """Restrict the direct solver to one thread when called from the present thread; for problems solved in parallel."""
+    use_threads(1)
+
+
+def use_threads(count: int) -> None:
+    """Restrict the direct solver to a number of threads when called from the present thread."""
     library = pardiso_library()
     if library is not None:
-        library.MKL_Set_Num_Threads_Local(1)
+        library.MKL_Set_Num_Threads_Local(count)
 
 
 MKL_MB = 400  # of address space for the libraries, twice of what they took here

@@ -1,0 +1,146 @@
+"""How long a frame of a live body of finite elements takes: quasi-Newton steps with earlier tangents beside steps of Newton's method.
+
+A plate (or another tool) is led onto the body, into it, held and taken away, the same way with both. Times are processor time of the
+thread that steps, so that other programs on the machine change them little; the work of the one that renews the tangents stands beside.
+`static` compares the rest under the tool with the offline solution of `QuasiStaticSession`.
+
+Run: ``OMP_NUM_THREADS=1 python benchmarks/live_bodies.py [--body demo|11|13] [--tool plate] [--speed 24] [--static]``; a number N is a box
+of 6 N^3 tetrahedra, nu 0.499.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray
+from naibu.core.rigid_transform import RigidTransform
+from naibu.mechanics import Assembler, DynamicEngine, QuasiStaticEngine, elements, material
+from naibu.meshing import box, to_tetra
+from naibu.simulation import FiniteElementBody, InteractiveSimulation
+from naibu.workflows import tools_for, touchable
+
+FRAME_S = 1.0 / 60.0
+SETTLE, PUSH, HOLD, LEAVE = 30, 40, 40, 20  # frames
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Processor times of all frames, ms, and the rest under the tool."""
+
+    ms: FloatArray
+    background_ms: float
+    positions: FloatArray
+    force: FloatArray
+    centre: FloatArray
+    failed: int
+
+
+def body_named(name: str) -> FiniteElementBody:
+    """The bundled gels, or a box of tetrahedra held at its floor."""
+    if name == "demo":
+        body = touchable("demo").body
+        assert isinstance(body, FiniteElementBody)
+        return body
+    mesh = to_tetra(box((60.0, 60.0, 60.0), (int(name),) * 3))
+    law = material(young_modulus=70.0, poisson_ratio=0.499)
+    assembler = Assembler.from_materials(elements(mesh, "mean_dilatation"), mesh.regions, [law])
+    return FiniteElementBody.of(mesh, assembler, supported=np.flatnonzero(mesh.points[:, 2] < 1e-9))
+
+
+def newtons(body: FiniteElementBody) -> FiniteElementBody:
+    """The same body, stepped by Newton's method."""
+    e = body.engine
+    plain = DynamicEngine(e.points, e.assembler, e.mass, e.faces, e.step, e.normal_stiffness, e.tangential_stiffness)
+    return replace(body, engine=plain)
+
+
+def touched(body: FiniteElementBody, tool: str, speed: float) -> Run:
+    """Lead the tool into the body and away, one frame every 1/60 s where the machine keeps up."""
+    simulation = InteractiveSimulation(body, tools_for(body))
+    frames, failed = [], 0
+
+    def advance() -> None:
+        nonlocal failed
+        began, processor = time.perf_counter(), time.thread_time()
+        failed += bool(simulation.advance().failed)
+        frames.append(1e3 * (time.thread_time() - processor))
+        time.sleep(max(0.0, FRAME_S - (time.perf_counter() - began)))
+
+    for _ in range(SETTLE):
+        advance()
+    simulation.take(tool)
+    centre = np.array(tools_for(body)[tool].centre)
+    centre[2] -= 0.07 * simulation.extent_mm
+    simulation.move(centre)
+    for _ in range(SETTLE):  # it comes near, as a hand leads it
+        advance()
+    frames.clear()
+    whole, own = time.process_time(), time.thread_time()
+    for _ in range(PUSH):
+        centre = centre - np.array([0.0, 0.0, speed * FRAME_S])
+        simulation.move(centre)
+        advance()
+    for _ in range(HOLD):
+        advance()
+    rest = simulation.last
+    for _ in range(LEAVE):
+        centre = centre + np.array([0.0, 0.0, 2.0 * speed * FRAME_S])
+        simulation.move(centre)
+        advance()
+    background = 1e3 * (time.process_time() - whole - (time.thread_time() - own)) / len(frames)
+    simulation.close()
+    return Run(np.array(frames), background, rest.positions, rest.force, rest.tool_centre, failed)
+
+
+def offline(body: FiniteElementBody, tool: str, centre: FloatArray) -> FloatArray:
+    """Positions under the tool by the static solver."""
+    e, indenter = body.engine, tools_for(body)[tool]
+    engine = QuasiStaticEngine(
+        e.points, e.assembler, e.faces, normal_stiffness=e.normal_stiffness, tangential_stiffness=e.tangential_stiffness
+    )
+    weight = e.mass[:, None] * body.gravity
+    still = [RigidTransform.of(np.eye(3), (0.0, 0.0, 0.0)) for _ in body.fixtures]
+    session = engine.session(constrained=[body.supported], external_force=weight, indenters=[*body.fixtures, indenter])
+    way = centre - np.array(indenter.centre)
+    for part in np.linspace(0.25, 1.0, 16):
+        session.step(motions=[*still, RigidTransform.of(np.eye(3), part * way)])
+    return session.positions()
+
+
+def report(name: str, run: Run) -> None:
+    median, high = np.median(run.ms), np.quantile(run.ms, 0.99)
+    print(
+        f"{name:>22}: processor ms a frame: median {median:6.1f}, p99 {high:6.1f}, worst {run.ms.max():6.1f}; other threads "
+        f"{run.background_ms:5.1f}; failed {run.failed}; force {1e-3 * run.force[2]:.3f} N"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--body", default="demo")
+    parser.add_argument("--tool", default="plate")
+    parser.add_argument("--speed", type=float, default=24.0, help="mm/s")
+    parser.add_argument("--static", action="store_true")
+    given = parser.parse_args()
+    body = body_named(given.body)
+    print(f"{given.body}: {body.mesh.n_cells} cells, {body.mesh.n_points} nodes; {given.tool}, {given.speed:g} mm/s")
+    fast = touched(body, given.tool, given.speed)
+    report("earlier tangents", fast)
+    slow = touched(newtons(body), given.tool, given.speed)
+    report("Newton", slow)
+    moved = np.abs(slow.positions - body.points).max()
+    high = np.quantile(slow.ms, 0.99) / np.quantile(fast.ms, 0.99)
+    print(f"ratio of medians {np.median(slow.ms) / np.median(fast.ms):.1f}, of p99 {high:.1f}")
+    apart = np.abs(fast.positions - slow.positions).max() / moved
+    print(f"rest under the tool, greatest difference: {100 * apart:.2f} % of the displacement")
+    if given.static:
+        static = offline(body, given.tool, fast.centre)
+        print(f"and from the offline solution: {100 * np.abs(fast.positions - static).max() / moved:.2f} %")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,93 @@
+"""The contact points of a rigid body that a step may concern: those near it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from naibu._numba.compilation import njit
+from naibu.core.arrays import FloatArray, Int32Array, IntArray
+from naibu.mechanics.contact._geometry_kernels import mesh_of, signed_distance
+from naibu.mechanics.contact.indenter_geometry import packed_geometry
+from naibu.mechanics.contact.penalty_contact import Contact, ContactResponse
+from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
+
+
+@dataclass(slots=True, eq=False)
+class NearbyContact:
+    """Points of a contact that lie near its body.
+
+    Attributes
+    ----------
+    contact : Contact
+        Of these points only.
+    anchors : ndarray, shape (p, 3)
+        Their anchors.
+    points : ndarray, shape (p,), int64
+        Their numbers.
+    response : ContactResponse
+        At the last evaluation.
+    """
+
+    contact: Contact
+    anchors: FloatArray
+    points: IntArray
+    response: ContactResponse = field(init=False)
+
+    @classmethod
+    def of(cls, contact: Contact, anchors: FloatArray, gap: FloatArray, margin_mm: float) -> NearbyContact:
+        """Return the points whose gaps (p,) are below a margin, mm."""
+        near = np.flatnonzero(gap < margin_mm).astype(np.int64)
+        part = replace(
+            contact, nodes=contact.nodes[near], shape=contact.shape[near], rest=contact.rest[near], area=contact.area[near],
+            normal_stiffness=contact.normal_stiffness[near], tangential_stiffness=contact.tangential_stiffness[near],
+            friction_coefficient=contact.friction_coefficient[near], element_size=contact.element_size[near],
+        )  # fmt: skip
+        return cls(part, anchors[near], near)
+
+    def add_force(self, displacement: FloatArray, force: FloatArray) -> None:
+        """Evaluate the contact at a displacement (n, 3), mm, and add its forces to `force` (n, 3), mN."""
+        self.response = self.contact.evaluate(displacement, self.anchors, 1.0)
+        if len(self.points):
+            _scatter_forces(self.contact.nodes, self.contact.shape, self.response.force @ self.response.orientation.T, force)
+
+    def add_stiffness(self, pattern: BlockPattern, positions: Int32Array, blocks: FloatArray) -> None:
+        """Add the stiffness at the last evaluation; `positions` are those of all points in the pattern."""
+        if len(self.points):
+            self.contact.add_stiffness(self.response, pattern, positions[self.points], blocks)
+
+
+def local_positions(contact: Contact, displacement: FloatArray, load: float) -> tuple[FloatArray, FloatArray]:
+    """Return the positions (p, 3) of all points in the frame of the body at a fraction of its path, and their gaps (p,), mm."""
+    y, gap = np.empty((len(contact.nodes), 3)), np.empty(len(contact.nodes))
+    _local(
+        packed_geometry(contact.surface), contact.surface.axes, contact.nodes, contact.shape, contact.rest, displacement,
+        contact.start + load * (contact.stop - contact.start), contact.orientation(load), y, gap,
+    )  # fmt: skip
+    return y, gap
+
+
+@njit(cache=True, nogil=True)
+def _local(geometry, axes, nodes, shape, rest, u, centre, orientation, y, gap):  # type: ignore[no-untyped-def]  # pragma: no cover
+    kinds, sizes, _ = geometry
+    mesh = mesh_of(geometry, 0)
+    d, q, n, none = np.empty(3), np.empty(3), np.empty(3), np.empty((0, 0))
+    for p in range(len(nodes)):
+        for i in range(3):
+            d[i] = rest[p, i] - centre[i]
+            for a in range(shape.shape[1]):
+                d[i] += shape[p, a] * u[nodes[p, a], i]
+        for i in range(3):
+            y[p, i] = d[0] * orientation[0, i] + d[1] * orientation[1, i] + d[2] * orientation[2, i]
+        for i in range(3):
+            q[i] = y[p, 0] * axes[i, 0] + y[p, 1] * axes[i, 1] + y[p, 2] * axes[i, 2]
+        gap[p] = signed_distance(kinds[0], sizes[0], mesh, q, n, none)
+
+
+@njit(cache=True, nogil=True)
+def _scatter_forces(nodes, shape, point_force, force):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for p in range(len(nodes)):
+        for a in range(shape.shape[1]):
+            for i in range(3):
+                force[nodes[p, a], i] += shape[p, a] * point_force[p, i]

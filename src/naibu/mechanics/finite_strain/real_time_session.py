@@ -1,0 +1,349 @@
+"""Dynamic sessions of finite elements in real time: the steps of `dynamic_session` by a quasi-Newton method with earlier tangents.
+
+Each step solves the same balance of momentum, with the same elements, law and contact, by iterations that need no tangent of their own.
+They use the factors of the tangent of an earlier state, which a thread renews in the background, as in the asynchronous preconditioning of
+:cite:t:`courtecuisse2010`. Two things change faster than those factors, and are treated exactly: what resists a change of volume, by
+pressures of their own (`naibu.mechanics.finite_elements.pressure_elements`), and contacts that open, close, stick or slip, by the formula
+of Woodbury. Anderson's acceleration does the rest. A step that these iterations do not solve is taken by Newton's method.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from naibu.core.arrays import FloatArray, Int32Array, IntArray
+from naibu.core.rigid_transform import rotation_matrix
+from naibu.mechanics.contact.penalty_contact import Contact
+from naibu.mechanics.contact.rigid_indenters import RigidIndenter
+from naibu.mechanics.finite_elements.pressure_elements import PressureElements
+from naibu.mechanics.finite_strain.dynamic_session import DynamicEngine, DynamicSession, DynamicState
+from naibu.mechanics.finite_strain.earlier_tangent import ContactChange, EarlierTangent, SolverPool, TangentThread, contact_change
+from naibu.mechanics.finite_strain.nearby_contact import NearbyContact, local_positions
+from naibu.mechanics.linear_algebra.anderson import AndersonMixing
+from naibu.mechanics.linear_algebra.block_matrix import BlockPattern, block_pattern, with_dirichlet_rows
+from naibu.mechanics.linear_algebra.direct import PardisoSolver, SuperLUSolver, pardiso_library
+from naibu.mechanics.linear_algebra.updated_factors import BlockChange, UpdatedFactors
+
+ITERATIONS = 8  # of a step at most
+DEPTH = 4  # earlier iterations that are mixed
+FINISHED = 5e-3  # out-of-balance force, as a fraction of all forces, at which a step ends
+SETTLED = 1e-3  # below which no iteration is worth while
+VOLUME_ERROR = 2e-4  # difference of the volume strain and that of its pressure
+ACCEPTED = 0.05  # out-of-balance force of a step that has used up its iterations
+DIVERGED = 10.0  # growth of the out-of-balance force from which a step is tried from another beginning
+AHEAD = 160  # nodes in contact, or about to be, for which the inverse is prepared
+REACH = 0.2  # extents of the body around an indenter in which they are sought
+PERIOD = 10  # steps after which a tangent is renewed without a thread
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RealTimeEngine(DynamicEngine):
+    """A finite element model prepared for implicit dynamic steps in real time; see `DynamicEngine` for the other attributes.
+
+    Attributes
+    ----------
+    background : bool
+        Whether a thread renews the factors; otherwise they are renewed before every tenth step, so that runs are repeatable.
+    """
+
+    background: bool = True
+    _elements: PressureElements = field(init=False)
+    _surface: BlockPattern = field(init=False)
+    _solvers: SolverPool = field(init=False)
+    _rest: list[EarlierTangent] = field(init=False, default_factory=list)
+
+    def __post_init__(self) -> None:
+        DynamicEngine.__post_init__(self)
+        object.__setattr__(self, "_elements", PressureElements.of(self.assembler))
+        object.__setattr__(self, "_surface", block_pattern(len(self.points), self.faces))
+        object.__setattr__(self, "_solvers", SolverPool(partial(_solver, self.assembler.pattern)))
+
+    def session(
+        self,
+        state: DynamicState | None = None,
+        constrained: Sequence[ArrayLike] | None = None,
+        external_force: ArrayLike | None = None,
+        indenters: Sequence[RigidIndenter] = (),
+    ) -> RealTimeSession:
+        """Begin a session; see `DynamicEngine.session`."""
+        load = np.broadcast_to(np.asarray(0.0 if external_force is None else external_force, dtype=float), self.points.shape)
+        session = RealTimeSession(self, load, self.rest())
+        session.constrain(constrained or ())
+        session.press(indenters)
+        if state is not None:
+            session.restore(state)
+        return session
+
+
+def _solver(pattern: BlockPattern) -> PardisoSolver | SuperLUSolver:
+    """A solver for unsymmetric matrices of a pattern, in single precision where that is possible."""
+    if pardiso_library() is None:
+        return SuperLUSolver()
+    return PardisoSolver(pattern.matrix(np.zeros((pattern.n_blocks, 3, 3))), symmetric=False, single_precision=True)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Trial:
+    """A displacement and its pressures, and what is out of balance there."""
+
+    displacement: FloatArray
+    pressure: FloatArray
+    balance: FloatArray  # all forces, those on constrained nodes included
+    mismatch: FloatArray
+    error: float
+
+    def better(self, other: _Trial | None) -> _Trial:
+        return self if other is None or self.error <= other.error else other
+
+
+@dataclass(slots=True, eq=False)
+class RealTimeSession(DynamicSession):
+    """A body in motion that a loop steps in real time; made by `RealTimeEngine.session`. See `DynamicSession` for the other attributes.
+
+    Attributes
+    ----------
+    newton_steps : int
+        Steps so far that Newton's method had to take.
+    iterations : int
+        Quasi-Newton iterations so far.
+    """
+
+    newton_steps: int = field(init=False, default=0)
+    iterations: int = field(init=False, default=0)
+    _earlier: EarlierTangent | None = field(init=False, default=None)
+    _thread: TangentThread = field(init=False, default_factory=TangentThread)
+    _near: tuple[NearbyContact, ...] = field(init=False, default=())
+    _gaps: tuple[FloatArray, ...] = field(init=False, default=())
+    _places: tuple[Int32Array, ...] = field(init=False, default=())
+    _pressure: FloatArray | None = field(init=False, default=None)
+    _trial: _Trial | None = field(init=False, default=None)
+    _changed: ContactChange | None = field(init=False, default=None)
+    _motion: FloatArray = field(init=False, default_factory=lambda: np.zeros(0))
+    _seen: FloatArray | None = field(init=False, default=None)
+    _age: int = field(init=False, default=0)
+
+    def press(self, indenters: Sequence[RigidIndenter]) -> None:
+        """Bring these indenters, and no others, into play; see `DynamicSession.press`."""
+        DynamicSession.press(self, indenters)
+        self._places = tuple(self._engine._surface.positions(c.nodes) for c in self._templates)
+        self._near, self._gaps, self._trial = (), (), None
+
+    def restore(self, state: DynamicState) -> None:
+        """Go on from a state; see `DynamicSession.restore`."""
+        DynamicSession.restore(self, state)
+        self._pressure, self._near, self._gaps, self._trial = None, (), (), None
+
+    def close(self) -> None:
+        """End the thread and release the factors."""
+        self._thread.close()
+        for tangent in (self._thread.take(), self._earlier):
+            self._release(tangent)
+        self._earlier = None
+        DynamicSession.close(self)
+
+    @property
+    def _engine(self) -> RealTimeEngine:
+        assert isinstance(self.engine, RealTimeEngine)
+        return self.engine
+
+    def _balanced(self, h: float, moving: FloatArray, contacts: tuple[Contact, ...]) -> FloatArray | None:
+        """Return the displacement that balances momentum after a time `h`; by Newton's method where it is not found in real time."""
+        if h == self.engine.step:
+            self._trial = self._quasi_newton(moving, contacts)
+            if self._trial is not None:
+                return self._trial.displacement
+            self.newton_steps += 1
+        self._pressure, self._trial, self._near, self._gaps = None, None, (), ()
+        return DynamicSession._balanced(self, h, moving, contacts)
+
+    def _quasi_newton(self, moving: FloatArray, contacts: tuple[Contact, ...]) -> _Trial | None:
+        """Return the balance at the end of a step, or None."""
+        tangent, start, h = self._current_tangent(), self.reached, self.engine.step
+        inertial = start.displacement + h * start.velocity
+        travel = [float(np.linalg.norm(c.stop - c.start)) for c in contacts]
+        fastest = h * float(np.sqrt((start.velocity**2).sum(axis=1).max()))
+        if len(self._gaps) != len(contacts):
+            self._gaps = tuple(local_positions(c, start.displacement, 0.0)[1] for c in contacts)
+        self._near = tuple(
+            NearbyContact.of(c, a, gap, 2.0 * (fastest + way) + 0.01 * self._extent())
+            for c, a, gap, way in zip(contacts, start.anchors, self._gaps, travel, strict=True)
+        )
+        motion = np.concatenate([moving.ravel(), *[c.stop - c.start for c in contacts]])
+        changes = not np.array_equal(motion, self._motion)
+        self._motion = motion
+        pressure = self._pressure
+        if pressure is None:
+            pressure = self._engine._elements.bulk * self._engine._elements.dilatation(start.displacement)[0]
+
+        def begun(guess: FloatArray) -> _Trial | None:
+            target = np.where(self._constrained, start.displacement, guess)
+            for nodes, speed in zip(self.bodies, moving, strict=True):
+                target[nodes] = start.displacement[nodes] + h * speed
+            return self._tried(target, inertial, pressure)
+
+        first = begun(inertial)
+        if first is None or (changes and first.error > FINISHED):
+            other = begun(start.displacement)
+            first = other if first is None else first.better(other)
+        found = None if first is None else self._iterated(tangent, first, inertial)
+        if found is None and first is not None and first.displacement is not start.displacement:
+            again = begun(start.displacement)
+            found = None if again is None else self._iterated(tangent, again, inertial)
+        return found
+
+    def _iterated(self, tangent: EarlierTangent, trial: _Trial, inertial: FloatArray) -> _Trial | None:
+        """Return the balance that the iterations find from a beginning, None where they diverge."""
+        first, mixing = trial.error, AndersonMixing(DEPTH)
+        for k in range(ITERATIONS):
+            wrong = float(np.abs(trial.mismatch / self._engine._elements.bulk).max())
+            if trial.error <= (FINISHED if k else SETTLED) and wrong <= VOLUME_ERROR:
+                return trial
+            after = self._improved(tangent, trial, inertial, mixing)
+            if after is None or after.error > DIVERGED * max(first, ACCEPTED):
+                return None
+            trial = after
+        return trial if trial.error <= ACCEPTED else None
+
+    def _improved(self, tangent: EarlierTangent, trial: _Trial, inertial: FloatArray, mixing: AndersonMixing) -> _Trial | None:
+        """Return the end of one quasi-Newton iteration; None where it inverts an element."""
+        elements = self._engine._elements
+        self.iterations += 1
+        force = trial.balance.copy()
+        elements.add_pressures(tangent.dilatation, trial.mismatch, force)
+        force[self._constrained] = 0.0
+        step = -tangent.factors.solve(force.ravel(), self._change(tangent)).reshape(-1, 3)
+        step[self._constrained] = 0.0
+        rise = elements.pressure_change(tangent.dilatation, step, trial.mismatch)
+        scale = 1e-2 * self._extent() / float(self.engine.assembler.parameters[:, 0].max())  # mm/kPa
+        now = np.concatenate([trial.displacement.ravel(), scale * trial.pressure])
+        mixed = mixing.step(now, np.concatenate([step.ravel(), scale * rise]))
+        step, rise = mixed[: step.size].reshape(-1, 3), mixed[step.size :] / scale
+        for a in (1.0, 0.5, 0.25):
+            after = self._tried(trial.displacement + a * step, inertial, trial.pressure + a * rise)
+            if after is not None:
+                return after
+        return None
+
+    def _tried(self, u: FloatArray, inertial: FloatArray, pressure: FloatArray) -> _Trial | None:
+        """Return what is out of balance at a displacement; None where an element is inverted."""
+        engine = self._engine
+        balance, mismatch, smallest = engine._elements.forces(u, pressure)
+        if not smallest > 0.0:
+            return None
+        contact = np.zeros_like(balance)
+        for near in self._near:
+            near.add_force(u, contact)
+        residual, scale = self._balance(engine.step, u, inertial, balance, contact)
+        balance += (engine.mass / engine.step**2)[:, None] * (u - inertial) - self.external_force - contact
+        return _Trial(u, pressure, balance, mismatch, float(np.abs(residual).sum()) / scale)
+
+    def _change(self, tangent: EarlierTangent) -> BlockChange:
+        """Return where contacts and grips differ from those of a tangent."""
+        surface = self._engine._surface
+        blocks = np.zeros((surface.n_blocks, 3, 3))
+        for near, places in zip(self._near, self._places, strict=True):
+            near.add_stiffness(surface, places, blocks)
+        gripped = np.concatenate([*self.bodies[1:], np.zeros(0, np.int64)])
+        last = self._changed
+        if last is None or not last.serves(tangent, blocks, gripped):
+            hold = 1e3 * float(self._engine._elements.bulk.max()) * self._extent()
+            last = ContactChange(tangent, blocks, gripped, contact_change(surface, blocks, tangent, gripped, hold))
+            self._changed = last
+        return last.change
+
+    def _accepted(self, h: float, u: FloatArray, contacts: tuple[Contact, ...], spin: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Keep the end of a step; returns the forces of the bodies and of the indenters, mN."""
+        trial, start = self._trial, self.reached
+        if trial is None:
+            return DynamicSession._accepted(self, h, u, contacts, spin)
+        of_indenters, anchors, gaps = np.zeros((len(contacts), 3)), [], []
+        for k, (contact, near) in enumerate(zip(contacts, self._near, strict=True)):
+            of_indenters[k] = near.response.orientation @ near.response.force.sum(axis=0)
+            local, gap = local_positions(contact, u, 1.0)
+            gaps.append(gap)
+            local[near.points] = near.contact.next_anchors(near.response)
+            anchors.append(local)
+        centres = np.array([c.stop for c in contacts]).reshape(-1, 3)
+        turned = [rotation_matrix(h * w) @ r if w.any() else r for w, r in zip(spin, start.rotations, strict=True)]
+        rotations = np.array(turned).reshape(-1, 3, 3)
+        self.reached = DynamicState(u, (u - start.displacement) / h, centres, rotations, tuple(anchors))
+        self._pressure, self._gaps = trial.pressure, tuple(gaps)
+        self._renew(self._soon_touched(contacts, gaps))
+        return np.array([trial.balance[nodes].sum(axis=0) for nodes in self.bodies]).reshape(-1, 3), of_indenters
+
+    def _soon_touched(self, contacts: Sequence[Contact], gaps: Sequence[FloatArray]) -> IntArray:
+        """Nodes where contact is about to begin, the nearest first, and then those in contact, the least deep first."""
+        nodes, order = [np.zeros(0, np.int64)], [np.zeros(0)]
+        reach = REACH * self._extent()
+        for contact, gap in zip(contacts, gaps, strict=True):
+            near = np.flatnonzero(gap < reach)
+            distance = np.where(gap[near] >= 0.0, gap[near], reach - gap[near])
+            nodes.append(contact.nodes[near].ravel())
+            order.append(np.repeat(distance, contact.nodes.shape[1]))
+        ranked = np.concatenate(nodes)[np.argsort(np.concatenate(order), kind="stable")]
+        return np.asarray(ranked[np.sort(np.unique(ranked, return_index=True)[1])][:AHEAD], dtype=np.int64)
+
+    def _current_tangent(self) -> EarlierTangent:
+        """Return the newest tangent; where there is none for these supports, it is made now."""
+        done = self._thread.take()
+        if done is not None:
+            self._release(self._earlier)
+            self._earlier, self._age = done, 0
+        held = self.bodies[0] if self.bodies else np.zeros(0, np.int64)
+        for known in (self._earlier, *self._engine._rest):
+            if known is not None and np.array_equal(known.held, held):
+                self._earlier = known
+                return known
+        gaps = [local_positions(c, self.reached.displacement, 0.0)[1] for c in self._templates]
+        touched = self._soon_touched(self._templates, gaps)
+        self._engine._rest[:] = [self._made(np.zeros_like(self.engine.points), (), (), held, touched)]
+        self._earlier = self._engine._rest[0]
+        return self._earlier
+
+    def _renew(self, ahead: IntArray) -> None:
+        """Have a tangent made of the state reached, if anything has changed since the last one."""
+        u = self.reached.displacement
+        still = self._seen is not None and float(np.abs(u - self._seen).max()) < 1e-4 * self._extent()
+        still &= self._earlier is not None and self._earlier.factors.covers(ahead[: len(ahead) // 2])
+        self._age += 1
+        if still or not self._thread.idle or (not self._engine.background and self._age < PERIOD):
+            return
+        held = self.bodies[0] if self.bodies else np.zeros(0, np.int64)
+        make = partial(self._made, u, self._near, self._places, held, ahead)
+        self._seen = u
+        if self._engine.background:
+            self._thread.submit(make)
+        else:
+            self._release(self._earlier)
+            self._earlier, self._age = make(), 0
+
+    def _made(
+        self, u: FloatArray, near: tuple[NearbyContact, ...], places: tuple[Int32Array, ...], held: IntArray, ahead: IntArray
+    ) -> EarlierTangent:
+        """Return the tangent at a displacement with contacts, and columns of its inverse for nodes `ahead`."""
+        engine, pattern = self._engine, self._engine.assembler.pattern
+        blocks = engine.assembler.evaluate(u)[2]
+        contact = np.zeros((engine._surface.n_blocks, 3, 3))
+        for some, place, all_places in zip(near, places, self._positions, strict=False):
+            some.add_stiffness(pattern, all_places, blocks)
+            some.add_stiffness(engine._surface, place, contact)
+        blocks[self._diagonal] += (engine.mass / engine.step**2)[:, None, None] * np.eye(3)
+        fixed = np.zeros(engine.points.shape, dtype=bool)
+        fixed[held] = True
+        solver = engine._solvers.get()
+        factors = UpdatedFactors(solver.factorize(with_dirichlet_rows(pattern.matrix(blocks), fixed)), len(u))
+        factors.prepare(ahead)
+        return EarlierTangent(factors, engine._elements.dilatation(u)[1], contact, held, solver)
+
+    def _release(self, tangent: EarlierTangent | None) -> None:
+        """Let the solver of a tangent factorize again, unless the tangent is kept for the next session."""
+        if tangent is not None and not any(tangent is kept for kept in self._engine._rest):
+            self._engine._solvers.put(tangent.solver)
+
+    def _extent(self) -> float:
+        return float(np.ptp(self.engine.points, axis=0).max())

@@ -1,0 +1,110 @@
+"""Sessions in real time: the steps of Newton's method, the equilibrium of the static solver, and grips."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from naibu.core.arrays import FloatArray
+from naibu.core.rigid_transform import RigidTransform
+from naibu.mechanics import (
+    Assembler,
+    DynamicEngine,
+    IndenterVelocity,
+    QuasiStaticEngine,
+    RealTimeEngine,
+    body_force,
+    elements,
+    material,
+    plane_indenter,
+    spherical_indenter,
+)
+from naibu.meshing import boundary_faces, box
+from naibu.meshing.element_conversion import to_tetra
+
+SIZE = 40.0
+
+
+def engine(cells: str = "hexahedron", kind: type[DynamicEngine] = RealTimeEngine, **options: bool) -> DynamicEngine:
+    mesh = box((SIZE, SIZE, SIZE), (4, 4, 4))
+    mesh = to_tetra(mesh) if cells == "tetra" else mesh
+    discrete = elements(mesh, "mean_dilatation")
+    assembler = Assembler.from_materials(discrete, mesh.regions, [material(young_modulus=70.0, poisson_ratio=0.499)])
+    mass = body_force(discrete, np.full(mesh.n_cells, 1e-6), np.array([1.0, 0.0, 0.0]))[:, 0]
+    return kind(mesh.points, assembler, mass, boundary_faces(mesh).faces, normal_stiffness=2e3, **options)
+
+
+def lowest(points: FloatArray) -> np.ndarray:
+    return np.flatnonzero(points[:, 2] < 1e-9)
+
+
+@pytest.mark.parametrize("cells", ["hexahedron", "tetra"])
+def test_it_settles_where_the_static_solver_finds_equilibrium(cells: str) -> None:
+    made = engine(cells, background=False)
+    plate = plane_indenter((0.0, 0.0, SIZE), (0.0, 0.0, -1.0), static_friction=0.5, kinetic_friction=0.5)
+    held = [lowest(made.points)]
+    session = made.session(constrained=held, indenters=[plate])
+    for _ in range(20):
+        session.step(motions=[IndenterVelocity((0.0, 0.0, -0.2 * SIZE / 20 * 60.0))])
+    session.step(steps=30)
+    static = QuasiStaticEngine(made.points, made.assembler, made.faces, normal_stiffness=2e3).session(constrained=held, indenters=[plate])
+    for part in (0.5, 1.0):
+        expected = static.step(motions=[RigidTransform.of(np.eye(3), (0.0, 0.0, -0.2 * SIZE * part))])
+    moved = np.abs(static.positions() - made.points).max()
+    assert np.abs(session.positions() - static.positions()).max() < 0.01 * moved
+    force = session.forces()
+    assert force.indenters[-1, 0, 2] == pytest.approx(expected.indenters[0, 0, 2], rel=0.01)
+    assert -force.bodies[-1, 0, 2] == pytest.approx(force.indenters[-1, 0, 2], rel=5e-3)
+
+
+@pytest.mark.parametrize("background", [False, True])
+def test_the_path_under_a_sphere_is_that_of_newtons_method(background: bool) -> None:
+    paths = []
+    for made in (engine(background=background), engine(kind=DynamicEngine)):
+        sphere = spherical_indenter((3.0, 0.0, SIZE + 9.0), 8.0, static_friction=0.3, kinetic_friction=0.3)
+        with made.session(constrained=[lowest(made.points)], indenters=[sphere]) as session:
+            path, forces = [], []
+            for _ in range(13):
+                time.sleep(0.005 if background else 0.0)
+                session.step(motions=[IndenterVelocity((0.0, 0.0, -24.0))])
+                path.append(session.positions())
+                forces.append(session.forces().indenters[0, 0, 2])
+            paths.append((np.array(path), np.array(forces)))
+    (found, force), (expected, newton) = paths
+    moved = np.abs(expected - made.points).max()
+    assert np.abs(found - expected).max() < 0.02 * moved
+    np.testing.assert_allclose(force, newton, atol=0.02 * np.abs(newton).max())
+
+
+def test_gripped_nodes_follow_and_let_go() -> None:
+    made = engine(background=False)
+    top = np.flatnonzero((made.points[:, 2] > SIZE - 1e-9) & (np.abs(made.points[:, :2]).max(axis=1) < 0.3 * SIZE))
+    session = made.session(constrained=[lowest(made.points)])
+    session.constrain([lowest(made.points), top])
+    for _ in range(10):
+        session.step(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 24.0]]))
+    session.step(np.zeros((2, 3)), steps=15)
+    np.testing.assert_allclose(session.positions(top)[:, 2], SIZE + 4.0, atol=1e-9)
+    bodies = session.forces().bodies[-1]
+    assert bodies[1, 2] > 0.0
+    assert bodies[0, 2] == pytest.approx(-bodies[1, 2], rel=0.01)
+    assert session.newton_steps == 0
+    session.constrain([lowest(made.points), []])
+    session.step(np.zeros((2, 3)), steps=60)
+    assert np.abs(session.positions() - made.points).max() < 0.05
+
+
+def test_a_session_goes_on_from_its_state() -> None:
+    made = engine(background=False)
+    sphere = spherical_indenter((0.0, 0.0, SIZE + 8.0), 8.0)
+    down = [IndenterVelocity((0.0, 0.0, -40.0))]
+    session = made.session(constrained=[lowest(made.points)], indenters=[sphere])
+    session.step(motions=down, steps=3)
+    kept = session.state()
+    session.step(motions=down, steps=2)
+    first = session.positions()
+    session.restore(kept)
+    session.step(motions=down, steps=2)
+    np.testing.assert_allclose(session.positions(), first, atol=0.01 * np.abs(first - made.points).max())
