@@ -79,9 +79,11 @@ def test_a_person_pushes_pulls_looks_inside_and_saves(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
-def test_a_person_cuts_a_mesh_and_takes_it_back(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["mesh", "lattice"])
+def test_a_person_cuts_a_body_and_takes_it_back(tmp_path: Path, kind: str) -> None:
     write_vtu(tmp_path / "gel.vtu", box((30.0, 30.0, 30.0), (4, 4, 4), cell_type="tetra"))
-    with served(touchable(tmp_path / "gel.vtu")) as (address, simulation), opened_browser() as page:
+    model = touchable(tmp_path / "gel.vtu") if kind == "mesh" else None  # of 5 x 5 x 5 nodes both
+    with served(model) as (address, simulation), opened_browser() as page:
         page.open(address)
         page.wait("document.querySelector('.stage[data-ready]') !== null && naibuLive.frame.tool === 0", 60)
         page.value("naibuLive.take(''); naibuLive.setMode('cut')")
@@ -96,6 +98,7 @@ def test_a_person_cuts_a_mesh_and_takes_it_back(tmp_path: Path) -> None:
         page.wait("naibuLive.scene.topology === 1 && naibuLive.frame.topology === 1", 60)
         assert page.value("naibuLive.scene.points.length") > 3 * 125
         assert simulation.scene.topology == 1
+        page.picture(tmp_path / f"{kind}.png")
         page.value("naibuLive.command('undo')")
         page.wait("naibuLive.scene.topology === 2 && naibuLive.scene.points.length === 375", 60)
         assert page.console == []

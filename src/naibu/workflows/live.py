@@ -14,7 +14,7 @@ import numpy as np
 from naibu.core.errors import InputError
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.simulation.haptic_loop import HapticHand
-from naibu.simulation.interactive_bodies import FiniteElementBody, InteractiveBody
+from naibu.simulation.interactive_bodies import InteractiveBody
 from naibu.simulation.interactive_simulation import FRAME_S, Frame, InteractiveSimulation
 from naibu.simulation.real_time_loop import RealTimeLoop
 from naibu.viewer.live.commands import LiveCommand
@@ -55,7 +55,7 @@ class LiveSimulation:
             [_shape(f"support {k + 1}", fixture) for k, fixture in enumerate(body.fixtures)],
             np.array([f.centre for f in body.fixtures], dtype=float).reshape(-1, 3),
             self.model.strain, self.loop.simulation.frame_s, self.model.marker_nodes[: None if whole else 0],
-            self.model.marker_weights[: None if whole else 0], topology, isinstance(body, FiniteElementBody),
+            self.model.marker_weights[: None if whole else 0], topology, cuttable=True,
         )  # fmt: skip
 
     def frame(self) -> LiveFrame:
