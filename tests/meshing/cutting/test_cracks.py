@@ -31,30 +31,53 @@ def straight_cut(mesh: Mesh, x: tuple[float, float], z: float) -> Mesh:
     return cut.mesh
 
 
-def test_a_centre_crack_in_a_strip_under_tension_opens_as_fracture_mechanics_says() -> None:
-    half_width, half_crack, stress = 20.0, 8.0, 1.0
-    half = np.concatenate([np.arange(0.0, 2.01, 0.25), np.geomspace(2.4, 60.0, 16)])
-    across = np.concatenate([np.arange(0.0, 5.0, 1.0), np.arange(5.0, 10.51, 0.25), np.arange(11.0, 20.1, 0.75)])
-    heights, widths = (np.concatenate([-values[:0:-1], values]) for values in (half, across))
-    mesh = box_from_coordinates(widths, [-0.5, 0.5], heights, cell_type="tetra")
-    plate = straight_cut(mesh, (-half_crack, half_crack), 0.0)
+HALF_WIDTH, HALF_CRACK, STRESS = 20.0, 8.0, 1.0
+
+
+def crack_opening(plate: Mesh) -> FloatArray:
+    """Displacement of a strip under tension of its ends at z = +-60 mm."""
     force = np.zeros(plate.points.shape)
     for sign in (-1.0, 1.0):
         ends = nodes_on_plane(plate, (0.0, 0.0, sign * 60.0), (0.0, 0.0, 1.0))
         faces = boundary_faces(plate).faces
-        on_end = faces[np.isin(faces, ends).all(axis=1)]
-        force[:, 2] += sign * stress * node_areas(plate, on_end)
+        force[:, 2] += sign * STRESS * node_areas(plate, faces[np.isin(faces, ends).all(axis=1)])
     held = np.zeros(plate.points.shape, dtype=bool)
-    corner = np.argmin(np.abs(plate.points - [-half_width, 0.0, -60.0]).sum(axis=1))
-    other = np.argmin(np.abs(plate.points - [half_width, 0.0, -60.0]).sum(axis=1))
+    corner = np.argmin(np.abs(plate.points - [-HALF_WIDTH, 0.0, -60.0]).sum(axis=1))
+    other = np.argmin(np.abs(plate.points - [HALF_WIDTH, 0.0, -60.0]).sum(axis=1))
     held[corner, [0, 2]] = held[other, 2] = True
-    u = solved(plate, held, force)
+    return solved(plate, held, force)
+
+
+def expected_opening() -> float:
+    """Opening in the middle of a crack in a strip of finite width (Tada, Paris, Irwin)."""
+    ratio = HALF_CRACK / HALF_WIDTH
+    width = -0.071 - 0.535 * ratio + 0.169 * ratio**2 + 0.020 * ratio**3 - 1.071 / ratio * np.log(1.0 - ratio)
+    return float(4.0 * STRESS * HALF_CRACK / E * width)
+
+
+def test_a_centre_crack_in_a_strip_under_tension_opens_as_fracture_mechanics_says() -> None:
+    half = np.concatenate([np.arange(0.0, 2.01, 0.25), np.geomspace(2.4, 60.0, 16)])
+    across = np.concatenate([np.arange(0.0, 5.0, 1.0), np.arange(5.0, 10.51, 0.25), np.arange(11.0, 20.1, 0.75)])
+    heights, widths = (np.concatenate([-values[:0:-1], values]) for values in (half, across))
+    plate = straight_cut(box_from_coordinates(widths, [-0.5, 0.5], heights, cell_type="tetra"), (-HALF_CRACK, HALF_CRACK), 0.0)
     middle = np.flatnonzero(np.abs(plate.points[:, [0, 2]]).max(axis=1) < 1e-9)
     assert len(middle) == 4  # two nodes across y, on each side of the crack
-    opening = np.ptp(u[middle, 2])
-    ratio = half_crack / half_width
-    width = -0.071 - 0.535 * ratio + 0.169 * ratio**2 + 0.020 * ratio**3 - 1.071 / ratio * np.log(1.0 - ratio)  # Tada, Paris, Irwin
-    assert opening == pytest.approx(4.0 * stress * half_crack / E * width, rel=0.03)
+    assert np.ptp(crack_opening(plate)[middle, 2]) == pytest.approx(expected_opening(), rel=0.03)
+
+
+def test_so_does_a_crack_that_the_blade_cuts_through_cells() -> None:
+    widths = np.arange(-HALF_WIDTH, HALF_WIDTH + 0.01, 0.5)
+    far = np.geomspace(9.0, 60.0, 10)
+    mesh = box_from_coordinates(widths, [-0.5, 0.5], np.concatenate([-far[::-1], np.arange(-8.0, 8.01, 0.5), far]), cell_type="tetra")
+    edges = np.stack([[[x, -5.0, 0.185], [x, 5.0, 0.185]] for x in np.linspace(-HALF_CRACK, HALF_CRACK, 4)])
+    cut = cut_volume(mesh, swept_blade(edges), 0.125)
+    assert cut.forest.n_cells > mesh.n_cells and cut.n_pieces == 1
+    first, second = np.flatnonzero(np.bincount(cut.source)[cut.source] == 2).reshape(2, -1)  # copies follow, in the order of their nodes
+    second = second[np.argsort(cut.source[second])]
+    np.testing.assert_array_equal(cut.source[first], cut.source[second])
+    u = crack_opening(cut.mesh)
+    opening = np.abs(u[first, 2] - u[second, 2])
+    assert opening[np.abs(cut.mesh.points[first, 0]) < 1.0].max() == pytest.approx(expected_opening(), rel=0.03)
 
 
 @pytest.mark.parametrize("length", [25.0, 40.0])
