@@ -90,6 +90,24 @@ def test_libraries_that_do_not_fit_are_not_loaded(megabytes: int) -> None:
 
 
 @posix
+def test_openblas_does_not_wait_for_memory_for_ever() -> None:
+    """Its work space is reserved first: without that, the last line does not end."""
+    steps = (
+        "import mmap, resource, numpy as np, scipy.linalg\n"
+        "from naibu.core.memory import address_space, reserve_work_space\n"
+        "taken = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()\n"
+        "limit = taken + 100 * 2**20\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (limit, limit))\n"
+        "reserve_work_space()\n"
+        "limit, taken = address_space()\n"
+        "kept = mmap.mmap(-1, int((limit - taken - 8.0) * 2**20))\n"
+        "print(scipy.linalg.cholesky(4.0 * np.eye(64))[0, 0], np.linalg.cholesky(4.0 * np.eye(64))[0, 0])"
+    )
+    done = subprocess.run([sys.executable, "-c", steps], capture_output=True, text=True, check=False, timeout=60)
+    assert done.stdout.split() == ["2.0", "2.0"], done.stderr[-2000:]
+
+
+@posix
 @pytest.mark.slow
 @pytest.mark.parametrize("megabytes", [660, 800, 1000, 1300])
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from naibu._version import __version__
-from naibu.core.memory import LIBRARIES_MB, require_address_space
+from naibu.core.memory import LIBRARIES_MB, require_address_space, reserve_work_space
 
 _LOST = (errno.EPIPE, errno.ENOSPC, errno.EFBIG, errno.EBADF, errno.EIO)
 
@@ -48,7 +48,7 @@ def unexpected(error: Exception, verb: str) -> str:
 
 
 def require_room(verb: str) -> None:
-    """Raise an error unless the libraries of a verb fit into the address space that the process may take.
+    """Raise an error unless the libraries of a verb fit into the address space that the process may take, and reserve their work space.
 
     Raises
     ------
@@ -56,6 +56,7 @@ def require_room(verb: str) -> None:
         They do not; loading them would end in messages that are not naibu's, or never.
     """
     require_address_space(LIBRARIES_MB, f"the libraries of naibu {verb}".rstrip())
+    reserve_work_space()
 
 
 def out_of_memory(error: BaseException, verb: str) -> str:

@@ -54,6 +54,21 @@ def require_address_space(needed_mb: float, what: str) -> None:
         )
 
 
+def reserve_work_space() -> None:
+    """Under a limit of the address space, let the copies of OpenBLAS in NumPy and SciPy take their work space while there is some.
+
+    They take it at their first use, keep it, and try for ever where there is none.
+    """
+    if address_space()[0] == float("inf"):
+        return
+    import numpy as np
+    import scipy.linalg
+
+    matrix = np.eye(512)  # large enough for all their threads
+    np.linalg.cholesky(matrix @ matrix)
+    scipy.linalg.cholesky(matrix)
+
+
 def is_out_of_memory(error: BaseException) -> bool:
     """Tell whether an error, or one that caused it, is that of too little memory, whatever its class."""
     seen: BaseException | None = error

@@ -19,6 +19,7 @@ from naibu.mechanics.linear_algebra.protocols import LinearSolver
 USUAL_ITERATIONS = 5.0  # Newton iterations of a load step of suitable length
 MOST_RAISES = 8  # of the penalties of contact at a load
 PSEUDO_TRANSIENT_STEP = 0.3  # first load steps; longer ones are halved before pseudo-transient continuation is tried
+JUMP = 4.0  # times the displacement that was to be expected
 PSEUDO_FAILURES = 4  # of pseudo-transient continuation, each much longer than Newton's method, before no equilibrium is sought further
 PATIENCE = 2  # load steps for which Newton's method fails, before frictional points on soft elements stick more softly
 WarmStart = tuple[float, FloatArray]  # a fraction of the load, and an initial guess of the displacement there (n, 3), mm
@@ -201,10 +202,19 @@ class _LoadPath:
             found = newton.pseudo_transient(last.displacement, last.anchors, load)
             if found is None:
                 self.pseudo_failed += 1
-            else:
+            elif _jumped(self.states, found[0], load):
                 self.smooth_from = len(self.states)
-            return found, int(USUAL_ITERATIONS)
+                return found, int(USUAL_ITERATIONS)
         return found, newton.iterations - before
+
+
+def _jumped(states: list[LoadState], u: FloatArray, load: float) -> bool:
+    """Tell whether the way from the last state to `u` (n, 3), mm, at `load` is much longer than that before lets expect."""
+    last = states[-1]
+    if len(states) < 2:
+        return False
+    rate = float(np.abs(last.displacement - states[-2].displacement).max()) / (last.load - states[-2].load)
+    return float(np.abs(u - last.displacement).max()) > JUMP * rate * (load - last.load)
 
 
 def _growth(iterations: int) -> float:

@@ -43,7 +43,8 @@ def pardiso_library() -> ctypes.CDLL | None:
 @functools.cache
 def _require_room() -> None:
     """Raise a MemoryError where oneMKL, which loads most of itself at its first use, would end the process for want of address space."""
-    threads = int(os.environ.get("OMP_NUM_THREADS", "").partition(",")[0] or os.cpu_count() or 1)
+    stated = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()
+    threads = int(stated) if stated.isdecimal() else os.cpu_count() or 1
     require_address_space(MKL_MB + MKL_THREAD_MB * threads, f"PARDISO (oneMKL) and its {threads} threads (OMP_NUM_THREADS)")
 
 
