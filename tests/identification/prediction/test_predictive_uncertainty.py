@@ -98,6 +98,24 @@ def test_a_gel_of_another_law_stays_within_the_intervals(gel: Experiment, found:
     assert f"{np.median(interval.per_axis(with_law.sd_model_mm)):.2f} mm (standard deviation per axis" in with_law.interval
 
 
+def test_what_coarse_elements_miss_in_a_state_is_in_its_interval() -> None:
+    """A neo-Hookean gel made on elements of half the size, so that the law is right and the elements are not."""
+    template = box_experiment(
+        "gel", (40.0,) * 3, [("gel", 40.0)], Loading("plate"), {"little": 34.0, "more": 26.0}, spacing_mm=10.0, margin_mm=5.0
+    )
+    made = virtual_specimen(template, {n: TRUTH[n] for n in TRUTH if n != STIFFENING}, settings=replace(COARSE, element_size_mm=5.0))
+    seen = made.scanned(seed=1, scanner=Scanner(NOISE_MM, 0.0, 0.0)).experiment
+    model = CalibratedModel.of(calibrate([seen], states={"gel": ["little"]}, settings=COARSE, noise=NoiseModel(NOISE_MM)))
+    assert model.predictive is not None and any(model.predictive.mesh_step)
+    honest = predict_state(model, seen, "more", heights_from_markers=True)
+    bold = predict_state(replace(model, predictive=replace(model.predictive, mesh_step=())), seen, "more", heights_from_markers=True)
+    np.testing.assert_allclose(honest.points, bold.points, atol=1e-9)
+    assert (honest.sd_model_mm >= bold.sd_model_mm).all()
+    assert covered(honest) > 0.9
+    told = np.sqrt(np.mean(honest.sd_mm**2 - bold.sd_mm**2))
+    assert 0.5 < told / np.sqrt(np.mean(honest.residual**2)) < 2.0
+
+
 def test_without_measured_markers_positions_stand_in_the_reference_scan(gel: Experiment, found: Calibration) -> None:
     blind = replace(gel, states=tuple(replace(s, markers=None if s.loaded else s.markers) for s in gel.states))
     model = CalibratedModel.of(found)

@@ -37,6 +37,8 @@ REFERENCE_MODULUS_KPA = 200.0  # of the known region when only ratios are sought
 START_POISSON_RATIO = 0.49
 START_FRICTION = 0.2
 START_SPRING = 30.0  # kPa/mm
+BASE_SD_MM = 0.5  # of the height of the markers above the base
+GUESSED_BASE_SD_MM = 3.0  # the same where the markers' clearance in a dome is all that tells it
 PIXEL_SCALE_SD = 0.005  # a size printed with two digits, 0.29 mm for 0.293
 BATCH_SD = 0.3  # of ln(stiffness) between batches: the samples of one gel in Hirai et al. (2008), Table 3.4, have an SD of 0.2
 TRUSTED_RATIO = (0.05, 20.0)  # of an unknown modulus to the known ones; the equilibrium gap is not used beyond
@@ -189,7 +191,7 @@ def initial_parameters(specimens: Sequence[Specimen], states: Mapping[str, Seque
             if p.name not in found or (found[p.name].fixed and not p.fixed):  # free wherever one experiment determines it
                 found[p.name] = p
         offset = base_offset(s.experiment)
-        found.setdefault(offset, Parameter(offset, 0.0, "mm", prior_sd=0.5))
+        found.setdefault(offset, Parameter(offset, 0.0, "mm", prior_sd=GUESSED_BASE_SD_MM if s.has_unknown_base else BASE_SD_MM))
         if s.settings.pixel_scale == "sought":
             found.setdefault(name := pixel_scale(s.experiment), Parameter(name, s.experiment.xy_scale, "", prior_sd=PIXEL_SCALE_SD))
         if s.has_unknown_base:

@@ -72,7 +72,7 @@ def mesh_error(load_cases: Sequence[MarkerLoadCase], match: Match, priors: Param
     sizes = [element_size(t.specimen.experiment, t.specimen.settings.element_size_mm) for t in load_cases]
     try:
         changes = [
-            _change_on_mesh(load_case, fit, values, size / RATIO if finer else size * RATIO)
+            change_on_mesh(load_case, fit, values, size / RATIO if finer else size * RATIO)
             for load_case, fit, size in zip(load_cases, match.fits, sizes, strict=True)
         ]
     except (ConvergenceError, InputError):
@@ -90,7 +90,16 @@ def mesh_error(load_cases: Sequence[MarkerLoadCase], match: Match, priors: Param
     return MeshError(max(sizes), abs(factor) * float(np.sqrt(squares.mean())), factor * step)
 
 
-def _change_on_mesh(load_case: MarkerLoadCase, fit: LoadCaseFit, values: Mapping[str, float], element_size_mm: float) -> FloatArray:
+def marker_error(load_case: MarkerLoadCase, fit: LoadCaseFit, values: Mapping[str, float]) -> FloatArray:
+    """Return how far vanishing elements would move the markers (k, 3) of a solved load case, mm, by a coarser mesh; 0 where it has none."""
+    size = element_size(load_case.specimen.experiment, load_case.specimen.settings.element_size_mm)
+    try:
+        return np.asarray(-change_on_mesh(load_case, fit, values, size * RATIO) / (RATIO**ORDER - 1.0))
+    except (ConvergenceError, InputError):
+        return np.zeros_like(fit.predicted)
+
+
+def change_on_mesh(load_case: MarkerLoadCase, fit: LoadCaseFit, values: Mapping[str, float], element_size_mm: float) -> FloatArray:
     """Return by how much the markers (k, 3) of a load case lie elsewhere, mm, on elements of another size at the same parameters."""
     coarse = load_case.specimen
     body = specimen(coarse.experiment, replace(coarse.settings, element_size_mm=element_size_mm))

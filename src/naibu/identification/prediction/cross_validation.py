@@ -129,7 +129,6 @@ def leave_one_out(
             noise=noise,
             search=search,
             start=start,
-            with_mesh_error=False,
             warm_starts=warm_starts,
             progress=_under_stage(progress, f"without {left.name}", stop),
         )

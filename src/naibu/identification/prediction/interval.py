@@ -15,6 +15,7 @@ from naibu.identification.from_markers.parameter_names import base_offset, strai
 from naibu.identification.from_markers.specimen_model import Specimen
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.platen_position import Gauge
+from naibu.identification.prediction.predictive_uncertainty import PredictiveUncertainty
 
 WIDTH = 1.959964  # standard deviations to either side that hold 95 %
 BISECTIONS = 40
@@ -69,6 +70,7 @@ def coordinate_uncertainty(
     gauge: Gauge | None = None,
     pose: RigidTransform | None = None,
     seen: BoolArray | None = None,
+    elements_mm: FloatArray | None = None,
 ) -> CoordinateUncertainty:
     """Return the uncertainty of the coordinates of a predicted state.
 
@@ -94,22 +96,37 @@ def coordinate_uncertainty(
         Transform that registered the prediction to the measured markers: rigid motions do not count then.
     seen : ndarray, shape (k,), bool, optional
         The markers to which it was registered.
+    elements_mm : ndarray, shape (k, 3), optional
+        How far vanishing elements would move the markers, mm; what they would do to the parameters is known to the model.
     """
     moment = _second_moment(model, parameters, {} if platen_sd_mm is None else {platen: platen_sd_mm})
     j = fit.jacobian * np.array([p.slope(p.value) for p in parameters.free])
+    names = [p.name for p in parameters.free]
+    mesh = _error_of_elements(known := model.uncertainty, names, j, elements_mm)
     if gauge is not None:
-        moment = _gauged(moment, gauge.derivatives(fit.predicted, j), [p.name for p in parameters.free].index(platen), gauge.sd_mm)
+        rates = gauge.derivatives(fit.predicted, j)
+        mesh -= j[:, :, names.index(platen)] * (gauge.derivatives(fit.predicted, mesh[:, :, None])[0] / rates[names.index(platen)])
+        moment = _gauged(moment, rates, names.index(platen), gauge.sd_mm)
     if pose is not None and seen is not None:
-        j = np.einsum("il,klp->kip", pose.rotation, _without_rigid_motion(j, fit.pose_jacobian, seen))
+        both = np.concatenate([j, mesh[:, :, None]], axis=2)
+        both = np.einsum("il,klp->kip", pose.rotation, _without_rigid_motion(both, fit.pose_jacobian, seen))
+        j, mesh = both[:, :, :-1], both[:, :, -1]
     else:  # the markers of the reference scan stay where they are, however high above the base the model puts them
         lifting = [p.name in (base_offset(body.experiment), straight_base(body.experiment)) for p in parameters.free]
         j[:, :, lifting] -= fit.pose.rotation[:, 2, None]
     variance = np.einsum("kip,pq,kiq->ki", j, moment, j)
-    known = model.uncertainty
     # the parameters have taken up what is proportional to the strain; what is left grows with its square
     discrepancy = known.discrepancy_mm * float(np.fmax(1.0, strain_ratio)) ** 2
-    sd = np.sqrt(np.maximum(variance, 0.0) + discrepancy**2)
+    sd = np.sqrt(np.maximum(variance, 0.0) + discrepancy**2 + mesh**2)
     return CoordinateUncertainty(sd, np.sqrt(sd**2 + (known.noise_factor * fit.sd) ** 2))
+
+
+def _error_of_elements(known: PredictiveUncertainty, names: list[str], j: FloatArray, elements_mm: FloatArray | None) -> FloatArray:
+    """Error (k, 3), mm, that the elements leave: their own in this state, less what parameters identified on such elements make up for."""
+    if elements_mm is None or not known.mesh_step:
+        return np.zeros(j.shape[:2])
+    steps = dict(zip(known.names, known.mesh_step, strict=True))
+    return np.asarray(elements_mm + j @ np.array([steps.get(name, 0.0) for name in names]))
 
 
 def _second_moment(model: CalibratedModel, parameters: ParameterSet, given: dict[str, float]) -> FloatArray:

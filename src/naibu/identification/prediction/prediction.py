@@ -13,6 +13,7 @@ from naibu.core.parameters import Parameter, ParameterSet
 from naibu.core.rigid_transform import registration
 from naibu.identification.from_markers.gauss_newton import Matcher
 from naibu.identification.from_markers.marker_grid import FILLED_SD_MM
+from naibu.identification.from_markers.mesh_error import marker_error
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase, SolvedLoadCase
 from naibu.identification.from_markers.parameter_names import platen_position
 from naibu.identification.from_markers.specimen_model import Specimen, specimen
@@ -129,7 +130,7 @@ def predict_state(
         gauge = outermost_markers(body, target, fit.sd)
         parameters, fit = fitted_platen_position(matcher, fit, name, gauge, notes)
     sought = [p.name for p in wanted]
-    return _finished(model, body, target, parameters, fit, _PlatenPosition(name, sd, gauge), sought, notes)
+    return _finished(model, load_case, target, parameters, fit, _PlatenPosition(name, sd, gauge), sought, notes)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,7 +150,7 @@ def _unmeasured(body: Specimen, state: str, model: CalibratedModel) -> MarkerLoa
 
 def _finished(
     model: CalibratedModel,
-    body: Specimen,
+    load_case: MarkerLoadCase,
     state: State,
     parameters: ParameterSet,
     fit: LoadCaseFit,
@@ -157,6 +158,7 @@ def _finished(
     sought: Sequence[str],
     notes: list[str],
 ) -> Prediction:
+    body = load_case.specimen
     scale, values = body.placement.scale, {name: parameters.values()[name] for name in sought}
     measured = state.markers.aligned(body.marker_ids) * scale if state.markers is not None else np.full(fit.predicted.shape, np.nan)
     whole: BoolArray = np.asarray(np.isfinite(measured).all(axis=1))
@@ -166,7 +168,7 @@ def _finished(
     ratio = _strain_ratio(model, body, values, fit)
     sd = coordinate_uncertainty(
         model, body, parameters, fit, strain_ratio=ratio, platen=platen.name, platen_sd_mm=platen.sd_mm, gauge=platen.gauge,
-        pose=pose, seen=whole,
+        pose=pose, seen=whole, elements_mm=marker_error(load_case, fit, values) if model.uncertainty.mesh_step else None,
     )  # fmt: skip
     notes += _extrapolation(model, body, ratio)
     return Prediction(

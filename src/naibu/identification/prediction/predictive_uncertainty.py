@@ -60,6 +60,8 @@ class PredictiveUncertainty:
         Factor on the stated measurement noise that explains the rest of the residuals.
     states : mapping of str to CalibratedState
         The states used, by ``experiment/state``.
+    mesh_step : tuple of float
+        Change of `names` that would fit best with vanishing elements, on the optimiser's scale; empty where that was not estimated.
     """
 
     names: tuple[str, ...]
@@ -67,6 +69,7 @@ class PredictiveUncertainty:
     discrepancy_mm: float
     noise_factor: float
     states: Mapping[str, CalibratedState]
+    mesh_step: tuple[float, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers and strings, for JSON."""
@@ -76,6 +79,7 @@ class PredictiveUncertainty:
             "discrepancy_mm": self.discrepancy_mm,
             "noise_factor": self.noise_factor,
             "states": {label: asdict(s) for label, s in self.states.items()},
+            "mesh_step": list(self.mesh_step),
         }
 
     @classmethod
@@ -84,7 +88,14 @@ class PredictiveUncertainty:
         names = tuple(data["names"])
         covariance = np.array(data["covariance"], dtype=float).reshape(len(names), len(names))
         states = {str(label): CalibratedState(str(s["loading"]), float(s["strain"])) for label, s in data["states"].items()}
-        return cls(names, covariance, float(data["discrepancy_mm"]), float(data["noise_factor"]), states)
+        return cls(
+            names,
+            covariance,
+            float(data["discrepancy_mm"]),
+            float(data["noise_factor"]),
+            states,
+            tuple(map(float, data.get("mesh_step", ()))),
+        )
 
 
 def with_considered(body: Specimen, parameters: ParameterSet) -> ParameterSet:
@@ -144,7 +155,13 @@ def predictive_uncertainty(calibration: Calibration) -> PredictiveUncertainty:
         t.name: CalibratedState(t.specimen.experiment.loading.kind, strain_at_markers(t.specimen, match.parameters.values(), f))
         for t, f in zip(load_cases, match.fits, strict=True)
     }
-    return PredictiveUncertainty(tuple(names), covariance + np.outer(shift, shift), float(np.sqrt(smooth)), float(np.sqrt(white)), states)
+    steps = (
+        {} if calibration.mesh is None else dict(zip((p.name for p in match.parameters.free), calibration.mesh.step.tolist(), strict=True))
+    )
+    return PredictiveUncertainty(
+        tuple(names), covariance + np.outer(shift, shift), float(np.sqrt(smooth)), float(np.sqrt(white)), states,
+        tuple(steps.get(name, 0.0) for name in names) if steps else (),
+    )  # fmt: skip
 
 
 def smooth_variance(load_cases: Sequence[MarkerLoadCase], fits: Sequence[LoadCaseFit]) -> float:

@@ -57,6 +57,10 @@ def _check_predictive(predictive: Mapping[str, Any]) -> None:
     _check_covariance(predictive.get("covariance"), names)
     _number("predictive discrepancy_mm", predictive.get("discrepancy_mm"), 0.0, 1e6)
     _number("predictive noise_factor", predictive.get("noise_factor"), 0.0, 1e12)
+    steps = predictive.get("mesh_step", [])
+    _require(isinstance(steps, list) and len(steps) in (0, len(names)), "predictive mesh_step", steps, "must be a number for each name")
+    for step in steps:
+        _number("predictive mesh_step", step, -1e6, 1e6)
     for label, state in _mapping(predictive, "states").items():
         _require(isinstance(state, Mapping), f"predictive state {label!r}", state, "must be a table")
         _number(f"predictive state {label!r} strain", state.get("strain"), 0.0, 1e3)
