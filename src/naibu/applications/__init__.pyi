@@ -6,7 +6,7 @@ from .sensing_chip.design_study import DesignStudy, pareto_front, study_designs
 from .sensing_chip.electronics import Readout, report_readout
 from .sensing_chip.filters import RampKalman, first_order_filter, forward_backward_filter
 from .sensing_chip.finite_elements import ChipResponse, solve_chip
-from .sensing_chip.load_envelope import largest_stress, load_envelope, load_limits, require_bearable
+from .sensing_chip.load_envelope import largest_stress, load_envelope, load_limits, require_bearable, surface_stress
 from .sensing_chip.piezoresistance import Piezoresistance, doping_factor, n_type_silicon, p_type_silicon
 
 __all__ = [
@@ -40,4 +40,5 @@ __all__ = [
     "sensitivity_matrix",
     "solve_chip",
     "study_designs",
+    "surface_stress",
 ]

@@ -17,7 +17,7 @@ from naibu.applications.sensing_chip.design import ChipDesign
 from naibu.applications.sensing_chip.design_study import DesignStudy, study_designs
 from naibu.applications.sensing_chip.electronics import Readout
 from naibu.applications.sensing_chip.finite_elements import LOADS
-from naibu.applications.sensing_chip.load_envelope import load_limits, require_bearable
+from naibu.applications.sensing_chip.load_envelope import load_limits, require_bearable, surface_stress
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress
@@ -264,15 +264,23 @@ def _loads_table(chip: PreparedChip, analysis: ChipAnalysis) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for k, load in enumerate(chip.settings.load):
         used = require_bearable(chip.design, load.force_z_mN, load.moment_x_Num, load.moment_y_Num)
+        corner = 100.0 * float(surface_stress(analysis.whole, _six(load)).max()) / chip.design.strength_kpa
         bridge = analysis.of_whole @ _six(load)
         volts = 1e-3 * np.array(chip.readout.gains) * bridge
         over = [name for name, v in zip(("F_z", "M_x", "M_y"), volts, strict=True) if abs(v) > chip.readout.adc_limit]
         rows.append(
-            (_named(load, k), load.force_z_mN, load.moment_x_Num, load.moment_y_Num, 100.0 * used,
+            (_named(load, k), load.force_z_mN, load.moment_x_Num, load.moment_y_Num, 100.0 * used, corner,
              *(float(v) for v in bridge), *(float(v) for v in volts), ", ".join(over) or "none")
         )  # fmt: skip
     columns = (
-        "load", "F_z, mN", "M_x, N um", "M_y, N um", "of the strength, %",
+        "load", "F_z, mN", "M_x, N um", "M_y, N um", "nominal, % of strength", "near corners, % of strength",
         *(f"bridge {name}, mV" for name in ("F_z", "M_x", "M_y")), *(f"amplified {name}, V" for name in ("F_z", "M_x", "M_y")), "saturated",
     )  # fmt: skip
-    return Table("Loads", columns, tuple(rows), caption="Outputs by finite elements of the whole chip, without offset and noise.")
+    return Table(
+        "Loads",
+        columns,
+        tuple(rows),
+        caption="Outputs by finite elements of the whole chip, without offset and noise.",
+        note="Near corners: largest tension of finite elements up to a quarter of the thickness from the beams' ends. In a sharp "
+        "corner itself it has no bound; where it exceeds the strength, corners must be rounded, or the load be less.",
+    )

@@ -19,7 +19,7 @@ from naibu.applications.sensing_chip.bridge import (
 from naibu.applications.sensing_chip.chip_mesh import ChipResolution
 from naibu.applications.sensing_chip.design import assumed_chip
 from naibu.applications.sensing_chip.finite_elements import ChipResponse, solve_chip
-from naibu.applications.sensing_chip.load_envelope import largest_stress, load_envelope, load_limits, require_bearable
+from naibu.applications.sensing_chip.load_envelope import largest_stress, load_envelope, load_limits, require_bearable, surface_stress
 from naibu.applications.sensing_chip.piezoresistance import doping_factor, n_type_silicon, p_type_silicon
 from naibu.core.errors import InputError
 from naibu.mechanics.small_strain.cubic_elasticity import crystal_frame
@@ -177,6 +177,21 @@ def test_each_printed_limit_is_borne_and_both_together_are_not() -> None:
         require_bearable(design, 5000.0, 0.0, 800.0)
     with pytest.raises(InputError, match="stresses"):
         require_bearable(design, np.nan, 0.0, 0.0)
+
+
+def test_surface_stress_is_nominal_between_rigid_clamps_and_proportional_to_the_load(
+    whole: ChipResponse, beams_alone: ChipResponse
+) -> None:
+    load = (0.0, 0.0, 5000.0, 0.0, 0.0, 0.0)
+    upper, lower = surface_stress(beams_alone, load)
+    # at a quarter of the thickness from the ends, of which (1) is a linear function
+    design = beams_alone.design
+    expected = 5000.0 * float(design.closed_forms.force_stress(0.25 * design.beam_thickness_mm))
+    assert upper == pytest.approx(expected, rel=0.1)
+    assert lower == pytest.approx(upper, rel=0.02)  # without block and frame below, both sides are alike
+    upper, lower = surface_stress(whole, load)
+    assert lower > upper  # block and frame below the beams make sharp corners there
+    assert surface_stress(whole, 2.0 * np.array(load)) == pytest.approx(2.0 * np.array([upper, lower]))
 
 
 def test_the_envelope_lies_where_the_stress_reaches_the_strength() -> None:

@@ -43,7 +43,7 @@ def test_the_printed_limits_together_exceed_the_strength_and_each_alone_does_not
 
 def test_misprints_are_told_with_what_they_change(chapter: Chapter) -> None:
     rows = {row[0]: row for row in table(chapter, "Misprints").rows}
-    assert set(rows) == {"(8)", "(11)", "(18)", "(21)", "(22)"}
+    assert set(rows) == {"(8)", "(11)", "(18)", "(20)", "(21)", "(22)"}
     assert rows["(8)"][4] == pytest.approx(2.0 * rows["(8)"][5])
     assert rows["(18)"][4] == pytest.approx(2.0 * rows["(18)"][5])
     # small at the printed limit: less than a hundredth of the stress

@@ -9,9 +9,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from naibu.applications.sensing_chip.design import ChipDesign
+from naibu.applications.sensing_chip.design import ChipDesign, beam_points
+from naibu.applications.sensing_chip.finite_elements import ChipResponse
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
+
+_FROM_CORNERS = 0.25  # of the thickness
 
 
 def largest_stress(design: ChipDesign, force: ArrayLike, moment_x: ArrayLike, moment_y: ArrayLike) -> FloatArray:
@@ -65,6 +68,32 @@ def load_envelope(design: ChipDesign, *, azimuth_deg: float = 0.0, count: int = 
     turn = np.deg2rad(azimuth_deg)
     scale = design.strength_kpa / largest_stress(design, force, moment * np.cos(turn), moment * np.sin(turn))
     return np.stack([scale * force, scale * moment], axis=1)
+
+
+def surface_stress(response: ChipResponse, load: ArrayLike) -> FloatArray:
+    """Return the largest tension on the upper and on the lower surface of the beams (2,), kPa, by finite elements.
+
+    Points nearer than a quarter of the thickness to the ends are left out: at the sharp corners there the stress has no bound, and grows as
+    the mesh is refined. Only tension counts, so that the sign of the load matters.
+
+    Parameters
+    ----------
+    response : ChipResponse
+        Of the chip.
+    load : array_like, shape (6,)
+        mN and mN mm.
+    """
+    design = response.design
+    margin = _FROM_CORNERS * design.beam_thickness_mm
+    x = np.linspace(margin, design.beam_length_mm - margin, 60)
+    largest = np.zeros(2)
+    for beam in "ABCD":
+        for aside in (-0.4 * design.beam_width_mm, 0.0, 0.4 * design.beam_width_mm):
+            points = beam_points(design, beam, x, (0.0, aside) if beam in "AB" else (aside, 0.0))
+            for k, side in enumerate((1.0, -1.0)):
+                stress = np.tensordot(np.asarray(load, dtype=float), response.stress_at(points * [1.0, 1.0, side]), 1)
+                largest[k] = max(largest[k], float(np.linalg.eigvalsh(stress).max()))
+    return largest
 
 
 def require_bearable(design: ChipDesign, force: float, moment_x: float, moment_y: float) -> float:

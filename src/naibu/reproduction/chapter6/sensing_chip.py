@@ -10,7 +10,7 @@ from naibu.applications.sensing_chip.closed_forms import CrossBeam, orthotropic_
 from naibu.applications.sensing_chip.design import ChipDesign, assumed_chip, beam_points
 from naibu.applications.sensing_chip.design_study import DesignStudy, study_designs
 from naibu.applications.sensing_chip.electronics import report_readout
-from naibu.applications.sensing_chip.load_envelope import largest_stress, load_limits
+from naibu.applications.sensing_chip.load_envelope import largest_stress, load_limits, surface_stress
 from naibu.reproduction.chapter6 import chip_figures
 from naibu.reproduction.chapter6.chip_sections import (
     crosstalk_tables,
@@ -80,7 +80,7 @@ def _assumptions(d: ChipDesign) -> Section:
         "chip's dimensions, its supply, the places of the resistors, nor the silicon's constants. What is assumed here stands in the "
         "table.",
         "The dimensions are chosen so that the closed forms give both printed sensitivities, with the same largest stress at either of the "
-        "printed limits; one dimension and the ratios c / L and w / t remain free.",
+        "printed limits; the ratios c / L and w / t and the place of the moments' resistors remain free.",
         "The soft fingertip around the chip (Figs. 6.4 to 6.9, 6.11 and 6.12) is not reproduced here.",
     )
     return Section("What is printed, and what is assumed", text, (Table("Assumptions", ("quantity", "value", "why"), rows),))
@@ -113,7 +113,7 @@ def _misprints(forms: CrossBeam, moment: float) -> Table:
     theta = moment / float(forms.moment_stiffness)
     c, length, t, e = (float(v) for v in (forms.half_width, forms.length, forms.thickness, forms.young_modulus))
     edge, whole = (e * float(forms.axial_strain(theta, bending=b)) for b in (False, True))
-    largest = float(forms.stress(length, theta))
+    smallest, largest = (float(forms.stress(at, theta)) for at in (0.0, length))
     x0 = float(forms.stress_free_point(theta))
     printed_x0 = length / (2 * c + length) * ((length + 3 * c) / 3 + length * c * theta / (3 * t))
     rows: tuple[tuple[Cell, ...], ...] = (
@@ -127,6 +127,7 @@ def _misprints(forms: CrossBeam, moment: float) -> Table:
             edge * float(forms.width) * t,
         ),
         ("(18)", "E c theta^2 / L", "E c theta^2 / (2 L)", "stress, MPa", 2e-3 * edge, 1e-3 * edge),
+        ("(20)", "... + E c theta^2 / L", "... + E c theta^2 / (2 L)", "stress at x = 0, MPa", 1e-3 * (smallest + edge), 1e-3 * smallest),
         ("(21)", "... + E c theta^2 / L", "... + E c theta^2 / (2 L)", "stress at x = L, MPa", 1e-3 * (largest + edge), 1e-3 * largest),
         ("(22)", "... + L c theta / (3 t)", "... - L c theta / (6 t)", "stress-free point, um", 1e3 * printed_x0, 1e3 * x0),
     )
@@ -241,25 +242,31 @@ def _specification(analysis: ChipAnalysis) -> Section:
     needed = [1e-6 * 2.0 * 1e-3 * s * load / (design.supply_voltage * coefficient) for s, load in ((s_f, force), (s_m, moment))]
     at = [1e-6 * float(largest_stress(design, *loads)) for loads in ((force, 0, 0), (0, 0, moment), (force, 0, moment))]
     limits = load_limits(design)
+    surface = [
+        tuple(1e-6 * float(v) for v in surface_stress(analysis.whole, (0.0, 0.0, f, 0.0, m, 0.0)))
+        for f, m in ((force, 0.0), (0.0, moment), (force, moment))
+    ]
     strength_table = Table(
         "Table 6.1, strength",
         (
             "load",
             "paper",
-            "at that load: largest nominal stress, GPa",
-            "at that load: stress at the resistors, GPa",
+            "largest nominal stress, GPa",
+            "stress at the resistors, GPa",
+            "upper surface, finite elements, GPa",
+            "lower surface, finite elements, GPa",
             "borne at the assumed strength",
         ),
         (
-            ("F_z, mN", force, at[0], needed[0], float(limits[0])),
-            ("M_x or M_y, N um", moment, at[1], needed[1], float(limits[1])),
-            ("both together", None, at[2], None, None),
+            ("F_z, mN", force, at[0], needed[0], *surface[0], float(limits[0])),
+            ("M_x or M_y, N um", moment, at[1], needed[1], *surface[1], float(limits[1])),
+            ("both together", None, at[2], None, *surface[2], None),
         ),
         note="The stress at the resistors follows from the printed sensitivity, the supply and the piezoresistance alone, whatever the "
-        "dimensions: V = pi sigma V_in / 2. It is a lower bound of the largest stress. Either limit is borne by good etched silicon, both "
-        f"together are not trusted: {at[2]:.2g} GPa. A combined load must stay below the line F_z / {limits[0]:.0f} mN + M / "
-        f"{limits[1]:.0f} "
-        "N um = 1.",
+        "dimensions: V = pi sigma V_in / 2. It is a lower bound of the largest stress. Finite elements: largest tension on the beams up to "
+        "a quarter of the thickness from their ends, where it is below the nominal stress; nearer to the sharp corners it rises without "
+        "bound, so that they must be rounded. Either limit is nominally borne by good etched silicon, both together are not trusted: "
+        f"{at[2]:.2g} GPa. A combined load must stay below the line F_z / {limits[0]:.0f} mN + M / {limits[1]:.0f} N um = 1.",
     )
     figure = Figure(
         "Safe loads",
