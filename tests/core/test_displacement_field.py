@@ -63,6 +63,11 @@ def test_the_least_certain_direction_is_the_largest_principal_axis() -> None:
     assert field.largest_sd_mm is not None
     assert field.largest_sd_mm[0] == pytest.approx(0.5)
     assert np.isnan(field.largest_sd_mm[1])
+    # also where two or all principal values are equal, or all but one vanish
+    factors = np.random.default_rng(0).standard_normal((50, 3, 3)) * np.array([1.0, 0.1, 1e-4])
+    some = np.concatenate([factors @ np.swapaxes(factors, 1, 2), [0.04 * np.eye(3), np.diag([0.0, 0.0, 0.09]), np.diag([0.25, 0.25, 0.0])]])
+    known = DisplacementField(np.zeros((len(some), 3)), np.zeros((len(some), 3)), some, np.ones(len(some), dtype=bool))
+    assert known.largest_sd_mm == pytest.approx(np.sqrt(np.linalg.eigvalsh(some)[:, -1]), rel=1e-7)
 
 
 def test_a_field_without_covariance_is_not_an_exact_one() -> None:

@@ -365,10 +365,9 @@ def slice_view(pair: Pair, run: SenseRun) -> SliceView:
     box = _box(measured.mask)
     u = measured.displacement.vectors
     back = warped(pair.deformed, np.nan_to_num(u), grid)
-    strain = green_lagrange_strain_of(measured.gradient)
-    inside = measured.mask & np.isfinite(strain).all(axis=(-2, -1))
+    inside = measured.mask & np.isfinite(measured.gradient).all(axis=(-2, -1))
     principal = np.full((*grid.shape, 3), np.nan)
-    principal[inside] = np.linalg.eigvalsh(strain[inside])
+    principal[inside] = np.linalg.eigvalsh(green_lagrange_strain_of(measured.gradient[inside]))
     ratio = np.full(grid.shape, np.nan)
     ratio[inside] = np.linalg.det(np.eye(3) + measured.gradient[inside])
     overlays = [

@@ -370,6 +370,21 @@ def test_padding_is_not_compared_and_what_it_hides_is_not_answered(side: int, en
     assert (np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error) < CHI_SQUARED_95).mean() >= 0.9
 
 
+def test_padding_in_the_intensity_of_air_is_not_compared() -> None:
+    """A fifth of the object is zero in the second scan, and so is, without noise, the air in both: it was squeezed into what is left."""
+    motion, back = waves()
+    before, after = scans(frame(), back)
+    silent = [np.where(ndimage.gaussian_filter(v.values, 1.0) < 60.0, 0.0, v.values) for v in (before, after)]
+    silent[1][28:] = 0.0
+    found = correlate_volumes(*(before.with_values(v) for v in silent))
+    x = positions(before)
+    shown = (x + motion(x))[..., 2] < 28.0
+    assert np.linalg.norm(errors(found, motion), axis=1).mean() < 0.15
+    assert not (found.valid & ~ndimage.binary_dilation(shown, iterations=2)).any()
+    assert (found.valid & shown).sum() > 0.9 * (shown & (depth(x) > 1.0)).sum()
+    assert covered(found, motion, depth(x) > 0.0) >= 0.9
+
+
 def test_scans_of_noise_are_refused() -> None:
     """Also where a mask says that there is an object: a search always finds some displacement."""
     rng, grid = np.random.default_rng(3), frame()

@@ -34,8 +34,10 @@ def displacement_gradient(displacement: ArrayLike, grid: Volume) -> FloatArray:
 def jacobian_determinant(displacement: ArrayLike, grid: Volume) -> FloatArray:
     """Return the volume ratio ``det(I + du/dx)`` (nz, ny, nx); the field folds where it is not positive."""
     gradient = displacement_gradient(displacement, grid)
-    with np.errstate(invalid="ignore"):  # the field may be unknown at some voxels
-        return np.asarray(np.linalg.det(np.eye(3) + gradient))
+    known = np.isfinite(gradient).all(axis=(-2, -1))
+    out = np.full(known.shape, np.nan)
+    out[known] = np.linalg.det(np.eye(3) + gradient[known])
+    return out
 
 
 def folded_fraction(displacement: ArrayLike, grid: Volume, mask: ArrayLike | None = None) -> float:
