@@ -176,6 +176,10 @@ def test_a_loose_piece_falls_and_the_other_stays() -> None:
     weight = lattice.node_mass[:, None] * np.array([0.0, 0.0, -9800.0])
     held = ConstrainedNodes.of(np.flatnonzero(lattice.points[:, 0] < 1e-9))
     session = LatticeEngine.of(lattice, parameters, step=1e-3, tolerance=1e-8).session(None, held, weight)
+    session, cut = cut_session(session, level(9.0))
+    old = np.flatnonzero(np.isin(cut.source, held.node))  # copies are held too
+    assert len(old) > len(np.unique(held.node))
+    np.testing.assert_array_equal(np.unique(session.constrained.node), old)
     session, cut = cut_session(session, upright(7.0))
     session.step(np.zeros((1, 3)), steps=30)
     moved, loose = session.positions() - cut.lattice.points, cut.lattice.points[:, 0] > 8.5

@@ -103,8 +103,11 @@ class LatticeCut:
 
     def constrained(self, before: ConstrainedNodes) -> ConstrainedNodes:
         """Return the constraints of nodes and their copies from those before the cut."""
-        row, node = np.nonzero(before.node[:, None] == self.source)
-        return ConstrainedNodes(node.astype(np.int64), before.direction[row], before.weight[row], before.body[row])
+        order = np.argsort(self.source, kind="stable")
+        first, last = (np.searchsorted(self.source, before.node, side, sorter=order) for side in ("left", "right"))
+        row = np.repeat(np.arange(len(before.node)), last - first)
+        place = np.arange(len(row)) - np.repeat(np.cumsum(last - first) - (last - first), last - first)
+        return ConstrainedNodes(order[first[row] + place], before.direction[row], before.weight[row], before.body[row])
 
     def _contact(self, before: ContactState) -> ContactState:
         """Contact of the nodes that were in it, their copies, and the nodes of the new surface."""

@@ -109,7 +109,7 @@ def cut(
     """
     if not 0.0 <= pull_percent <= LARGEST_PULL:
         raise InputError(f"pull_percent must lie between 0 and {LARGEST_PULL:g} %, not {pull_percent:g}")
-    blade = swept_blade(read_blade_path(path))
+    blade = _blade(path)
     folder = output_folder(out, FILES, overwrite=overwrite)
     model = touchable(source, experiment=experiment, material=material)
     before, after, found, distance = _cut(model.body, blade, distance_mm)
@@ -135,6 +135,15 @@ def cut(
     }  # fmt: skip
     files = _written(folder, model, after.faces, found, numbers, times, moved)
     return CutRun(files, found, volumes, opening)
+
+
+def _blade(path: str | os.PathLike[str]) -> SweptBlade:
+    """Surface that the blade of a file sweeps."""
+    poses = read_blade_path(path)
+    try:
+        return swept_blade(poses)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 def _cut(
