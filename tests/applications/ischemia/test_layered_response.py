@@ -1,0 +1,146 @@
+"""Response of layered skin against the time integration, closed forms of creep, and the frequency domain."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from naibu.applications.ischemia.layered_response import LayeredModes, frequency_response, laplace_modulus, simulate_skin
+from naibu.applications.ischemia.skin import Layer, SkinPatch, SurfaceLoad, from_planes, meshed
+from naibu.core.errors import InputError
+from naibu.mechanics.small_strain.dynamics import simulate_motion
+from naibu.mechanics.small_strain.linear_elasticity import LinearBody
+from naibu.mechanics.small_strain.rheology import per_region, three_element, voigt
+from naibu.mechanics.small_strain.supports import Support
+from naibu.meshing.structured_2d import rectangle
+
+UPPER, LOWER = three_element(3.8, 0.03, 30.0, 0.49), three_element(0.5, 1.0, 30.0, 0.49)
+PATCH = SkinPatch((Layer(0.5, LOWER), Layer(0.5, UPPER)), 4.0)
+TIMES = np.array([0.002, 0.01, 0.03, 0.1, 0.3, 0.47, 0.48, 0.5, 0.6, 1.0, 2.0])
+
+
+@pytest.fixture(scope="module")
+def modes() -> LayeredModes:
+    return LayeredModes.of(meshed(PATCH, 0.5, across=8, upwards=6))
+
+
+def test_a_uniform_column_creeps_as_the_closed_form_says() -> None:
+    # a bar whose sides are free, loaded over its whole width but for its last column, by superposition of elastic solutions:
+    # the response of one material is its elastic response times its creep function
+    material = three_element(2.0, 0.5, 40.0, 0.3)
+    one = LayeredModes.of(meshed(SkinPatch((Layer(1.0, material),), 2.0), 0.4, across=6, upwards=6))
+    load = SurfaceLoad(3.0, 0.5, 0.4)
+    creeping = simulate_skin(one, (material,), load, TIMES).indentation
+    elastic = simulate_skin(one, (three_element(2.0, 0.0, np.inf, 0.3),), load, [0.1]).indentation[0]
+
+    def creep(t: np.ndarray) -> np.ndarray:
+        return np.where(t > 0.0, 1.0 - np.exp(-np.maximum(t, 0.0) * 2.0 / 0.5) + 2.0 * t / 40.0, 0.0)
+
+    assert_allclose(creeping, elastic * (creep(TIMES) - creep(TIMES - 0.5)), rtol=1e-9)
+
+
+def test_two_layers_move_as_the_time_integration_of_triangles_says() -> None:
+    mesh = rectangle((4.0, 1.0), (48, 16))
+    upper = mesh.points[mesh.cells][..., 1].mean(axis=1) > 0.5
+    mesh = replace(mesh, regions=upper.astype(np.int64), region_names=("lower", "upper"))
+    soft = three_element(0.5, 1.0, 30.0, 0.3), three_element(3.8, 0.03, 30.0, 0.3)
+    x = mesh.points[:, 0] - mesh.points[:, 0].mean()
+    top = mesh.points[:, 1] == mesh.points[:, 1].max()
+    share = np.where(np.isclose(np.abs(x), 0.5), 0.5, np.abs(x) < 0.5) * top
+    force = np.zeros(mesh.points.shape)
+    force[:, 1] = -50.0 * share / share.sum()
+    base = Support("base", np.flatnonzero(mesh.points[:, 1] == mesh.points[:, 1].min()))
+    motion = simulate_motion(
+        LinearBody.of(mesh), per_region(mesh, {"lower": soft[0], "upper": soft[1]}), None, [base], [0.0, 0.1, 0.47, 0.8], step=0.005,
+        load=lambda t: force if t < 0.47 else 0.0 * force, breaks=[0.47],
+    )  # fmt: skip
+    middle = int(np.flatnonzero(top & np.isclose(x, 0.0))[0])
+    patch = SkinPatch((Layer(0.5, soft[0]), Layer(0.5, soft[1])), 4.0)
+    found = simulate_skin(LayeredModes.of(meshed(patch, 0.5, across=20, upwards=14)), soft, SurfaceLoad(50.0, 0.47, 0.5), [0.1, 0.47, 0.8])
+    assert_allclose(found.indentation, -motion.displacement[1:, middle, 1], rtol=0.02)
+
+
+def test_the_frequency_response_is_the_transform_of_the_step_response(modes: LayeredModes) -> None:
+    # load for half a period, repeatedly: its first harmonic against the direct solution
+    hertz, cycles = 2.0, 40
+    count = 400
+    times = (cycles + np.arange(count) / count) / hertz
+    period = 1.0 / hertz
+    single = [simulate_skin(modes, (LOWER, UPPER), SurfaceLoad(1.0, 0.5 * period, 0.5), times - k * period).indentation for k in range(cycles + 1)]
+    total = np.sum(single, axis=0)
+    flow = np.linspace(0.0, 1.0, count, endpoint=False) * (simulate_skin(modes, (LOWER, UPPER), SurfaceLoad(1.0, 0.5 * period, 0.5), [1e4]).indentation[0])
+    wave = np.exp(-2j * np.pi * hertz * times)
+    square = np.where((times * hertz) % 1.0 < 0.5, 1.0, 0.0)
+    found = ((total - flow) * wave).mean() / ((square - 0.5) * wave).mean()
+    direct = frequency_response(modes.meshed, (LOWER, UPPER), [hertz], inertia=False)[0]
+    assert abs(found / direct - 1.0) < 0.02
+
+
+def test_inertia_is_negligible_in_skin_and_makes_an_elastic_column_resonate(modes: LayeredModes) -> None:
+    with_mass, without = (np.abs(frequency_response(modes.meshed, (LOWER, UPPER), [1.0, 100.0], inertia=i)) for i in (True, False))
+    assert_allclose(with_mass, without, rtol=0.02)
+    spring = three_element(3.8, 0.0, np.inf, 0.0)
+    column = meshed(SkinPatch((Layer(1.0, spring),), 0.1), 0.049, across=4, upwards=24)
+    first = np.sqrt(3.8 / 1.2e-6) / 4.0  # Hz: a quarter of a wavelength in a height of 1 mm
+    below, above = frequency_response(column, (spring,), [0.99 * first, 1.01 * first]).real
+    assert below > 0.0 > above
+
+
+@pytest.mark.parametrize("kinematics", ["plane_strain", "axisymmetric", "three_dimensional"])
+def test_pressure_below_the_load_carries_it(kinematics: str) -> None:
+    material = voigt(3.8, 0.03, 0.49)
+    size = {"across": 5, "upwards": 4} if kinematics == "three_dimensional" else {"across": 12, "upwards": 10}
+    mesh = meshed(SkinPatch((Layer(1.0, material),), 4.0, kinematics=kinematics), 0.8, **size)  # type: ignore[arg-type]
+    assert mesh.load[:, -1].sum() == pytest.approx(-1.0)
+    motion = simulate_skin(LayeredModes.of(mesh), (material,), SurfaceLoad(10.0, 1.0, 0.8), [0.999])
+    loaded = 1.6 if kinematics == "plane_strain" else np.pi * 0.64
+    # nearly incompressible: under a wide load the pressure in the surface is about that on it, and none is far from it
+    under = motion.pressure[0].max()
+    assert 0.6 * 10.0 / loaded < under < 1.7 * 10.0 / loaded
+    area = motion.pale_area(0.3 * 10.0 / loaded)[0]
+    assert 0.6 * loaded < area < 1.9 * loaded
+    assert motion.pale_area(100.0)[0] == 0.0
+
+
+def test_moduli_have_the_limits_of_springs_and_dashpots() -> None:
+    numerator, denominator = laplace_modulus(three_element(2.0, 0.5, 40.0, 0.3))
+    slow, fast = 1e-9, 1e9
+    assert np.polyval(numerator[::-1], slow) / np.polyval(denominator[::-1], slow) == pytest.approx(40.0 * slow)
+    assert np.polyval(numerator[::-1], fast) / np.polyval(denominator[::-1], fast) == pytest.approx(0.5 * 40.0 / 40.5 * fast)
+
+
+def test_the_printed_grid_can_be_taken() -> None:
+    patch = SkinPatch((Layer(0.5, LOWER), Layer(0.5, UPPER)), 4.0)
+    mesh = from_planes(patch, (np.linspace(-2.0, 2.0, 5), np.linspace(0.0, 1.0, 11)), 0.0)
+    assert len(mesh.grid.cells) == 40 and mesh.grid.points[mesh.middle].tolist() == [0.0, 1.0]
+    assert mesh.load[mesh.middle, 1] == -1.0 and np.count_nonzero(mesh.load) == 1
+
+
+@pytest.mark.parametrize(
+    ("what", "make"),
+    [
+        ("layers must be one or two", lambda m: SkinPatch((), 4.0)),
+        ("one Poisson ratio, not 0.49, 0.3", lambda m: Layer(1.0, three_element(1.0, 1.0, 1.0, 0.49, voigt_poisson_ratio=0.3))),
+        ("thickness_mm must be positive", lambda m: Layer(-1.0, UPPER)),
+        ("force_mn must be positive", lambda m: SurfaceLoad(0.0, 1.0)),
+        ("radius_mm must be zero", lambda m: SurfaceLoad(1.0, 1.0, np.nan)),
+        ("smaller than half of the width of the patch, 2 mm, not 3", lambda m: meshed(PATCH, 3.0)),
+        ("for the 2 layers of the patch, not 1", lambda m: simulate_skin(m, (UPPER,), SurfaceLoad(1.0, 1.0), [1.0])),
+        ("Poisson ratio of 0.3; the modes", lambda m: simulate_skin(m, (voigt(1.0, 1.0, 0.3), UPPER), SurfaceLoad(1.0, 1.0), [1.0])),
+        ("times must be finite", lambda m: simulate_skin(m, (LOWER, UPPER), SurfaceLoad(1.0, 1.0), [np.inf])),
+        ("frequencies_hz must be positive", lambda m: frequency_response(m.meshed, (LOWER, UPPER), [0.0])),
+        ("use fewer cells", lambda m: LayeredModes.of(meshed(replace(PATCH, kinematics="three_dimensional"), 0.5, across=12))),
+    ],
+)
+def test_bad_input_is_named(what: str, make: object, modes: LayeredModes) -> None:
+    with pytest.raises(InputError, match=what):
+        make(modes)  # type: ignore[operator]
+
+
+def test_a_threshold_must_be_positive(modes: LayeredModes) -> None:
+    motion = simulate_skin(modes, (LOWER, UPPER), SurfaceLoad(1.0, 1.0, 0.5), [0.5])
+    with pytest.raises(InputError, match="threshold_kpa must be positive"):
+        motion.pale_area(-1.0)
