@@ -8,6 +8,7 @@ is a sum of exponentials and a linear flow.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,7 @@ from naibu.core.arrays import ComplexArray, FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.mechanics.small_strain.rheology import Rheology
 
+PARTS = 8  # of a cell of the surface, for areas
 LARGEST = 6000  # unknowns whose eigenvectors are computed
 
 
@@ -148,9 +150,10 @@ class SkinMotion:
     surface : ndarray, shape (t, k, d)
         Displacement of the surface, mm.
     pressure : ndarray, shape (t, j)
-        Pressure (minus a third of the trace of the stress) in the cells below the surface, kPa.
+        Pressure (minus a third of the trace of the stress) below parts of the surface, kPa: in the uppermost cells, and linear between
+        their centres (except in three dimensions).
     areas : ndarray, shape (j,)
-        Surface above these cells, mm^2.
+        Areas of these parts, from the middle or from one side to the other, mm^2.
     """
 
     times: FloatArray
@@ -210,9 +213,20 @@ def simulate_skin(modes: LayeredModes, materials: tuple[Rheology, ...], load: Su
     last = len(layers) - 1
     lame, shear = meshed.unit_stiffness(last)
     bulk = (lame + 2.0 / 3.0 * shear)[cells]
-    pressure = -(bulk[:, None] * (strain @ of_load(last))).T
+    pressure, areas = _subdivided(meshed, -(bulk[:, None] * (strain @ of_load(last))).T)
     middle = int(np.flatnonzero(top == meshed.middle)[0])
-    return SkinMotion(instants, -surface[:, middle, -1], top.astype(np.int64), surface, pressure, meshed.surface_areas)
+    return SkinMotion(instants, -surface[:, middle, -1], top.astype(np.int64), surface, pressure, areas)
+
+
+def _subdivided(meshed: MeshedPatch, pressure: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return pressure (t, j) and areas (j,) of parts of the cells, linear between their centres, so that the edge of an area moves evenly."""
+    planes, kinematics = meshed.grid.planes[0], meshed.grid.kinematics
+    if kinematics == "three_dimensional":
+        return pressure, meshed.surface_areas
+    parts = np.concatenate([*(np.linspace(a, b, PARTS, endpoint=False) for a, b in itertools.pairwise(planes)), planes[-1:]])
+    at, centres = 0.5 * (parts[1:] + parts[:-1]), 0.5 * (planes[1:] + planes[:-1])
+    areas = np.pi * np.diff(parts**2) if kinematics == "axisymmetric" else np.diff(parts) * meshed.patch.depth_mm
+    return np.stack([np.interp(at, centres, row) for row in pressure]), areas
 
 
 def frequency_response(meshed: MeshedPatch, materials: tuple[Rheology, ...], frequencies_hz: ArrayLike, *, inertia: bool = True) -> ComplexArray:
