@@ -1,4 +1,4 @@
-"""Uses of mechanics and imaging: the silicon chip that senses force and moment."""
+"""Uses of mechanics and imaging: the silicon chip that senses force and moment, and skin that turns pale."""
 
 import lazy_loader
 

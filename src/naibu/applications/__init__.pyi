@@ -1,3 +1,7 @@
+from .ischemia.layer_identification import LayerEstimate, LayerParameter, identify_layers
+from .ischemia.layered_response import LayeredModes, SkinMotion, frequency_response, simulate_skin
+from .ischemia.response_times import ResponseTimes, response_times
+from .ischemia.skin import MeshedPatch, SkinLayer, SkinPatch, SurfaceLoad, meshed
 from .sensing_chip.bridge import closed_form_sensitivities, crosstalk, decoupled, half_bridge, sensitivity_matrix
 from .sensing_chip.chip_mesh import ChipMesh, ChipResolution, chip_mesh
 from .sensing_chip.closed_forms import CrossBeam, orthotropic_torsion_stiffness
@@ -16,9 +20,18 @@ __all__ = [
     "ChipResponse",
     "CrossBeam",
     "DesignStudy",
+    "LayerEstimate",
+    "LayerParameter",
+    "LayeredModes",
+    "MeshedPatch",
     "Piezoresistance",
     "RampKalman",
     "Readout",
+    "ResponseTimes",
+    "SkinLayer",
+    "SkinMotion",
+    "SkinPatch",
+    "SurfaceLoad",
     "assumed_chip",
     "chip_mesh",
     "closed_form_sensitivities",
@@ -27,17 +40,22 @@ __all__ = [
     "doping_factor",
     "first_order_filter",
     "forward_backward_filter",
+    "frequency_response",
     "half_bridge",
+    "identify_layers",
     "largest_stress",
     "load_envelope",
     "load_limits",
+    "meshed",
     "n_type_silicon",
     "orthotropic_torsion_stiffness",
     "p_type_silicon",
     "pareto_front",
     "report_readout",
     "require_bearable",
+    "response_times",
     "sensitivity_matrix",
+    "simulate_skin",
     "solve_chip",
     "study_designs",
     "surface_stress",

@@ -14,7 +14,7 @@ from naibu.cli.console import INTERRUPTED, app, errors, print_table, progress_di
 from naibu.cli.described import Flag, Whole
 from naibu.core.progress import ProgressReport
 
-ChapterName = Literal["ch1", "ch2", "ch3", "ch4-adaptive", "ch4-cut", "ch4-lattice", "ch4-cube", "ch4-octree", "ch6"]
+ChapterName = Literal["ch1", "ch2", "ch3", "ch4-adaptive", "ch4-cut", "ch4-lattice", "ch4-cube", "ch4-octree", "ch5", "ch6"]
 
 
 @app.command
@@ -69,7 +69,7 @@ def simulate(
     Parameters
     ----------
     study
-        Name of a study, or your own file STUDY.toml of a mass-spring-dashpot lattice or of a sensing chip.
+        Name of a study, or your own file STUDY.toml of a mass-spring-dashpot lattice, a sensing chip, or layered skin.
     out
         Folder for the files.
     resume
@@ -82,7 +82,7 @@ def simulate(
         Where a lattice is computed: cpu, cuda (an NVIDIA GPU; needs naibu[gpu]), or warp-cpu (the GPU's kernels on the CPU, for tests).
     example
         Print the file of a study as a template for your own: naibu simulate --example > my_study.toml, or, of a sensing chip,
-        naibu simulate chip --example > my_chip.toml
+        naibu simulate chip --example > my_chip.toml; the same for ischemia
     """
     from naibu.workflows.simulate import example_text, named_studies
     from naibu.workflows.simulate import simulate as simulated

@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 import os
-from io import StringIO
-from pathlib import Path
-
-import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
-from naibu.io.files.reading import read_bytes
-
-MOST_ROWS = 100_000
+from naibu.io.number_table import read_number_rows
 
 
 def read_blade_path(path: str | os.PathLike[str]) -> FloatArray:
@@ -35,7 +28,7 @@ def read_blade_path(path: str | os.PathLike[str]) -> FloatArray:
     InputError
         Not a readable text, a cell that is no finite number, rows of different length, fewer than two poses or two vertices.
     """
-    rows = _rows(path)
+    rows = read_number_rows(path)
     if len(rows) < 2 or rows.shape[1] < 6 or rows.shape[1] % 3:
         tip = "; one vertex is the path of a tip, which cuts surfaces, not solids" if rows.shape[1] == 3 else ""
         raise InputError(
@@ -62,7 +55,7 @@ def read_tip_path(path: str | os.PathLike[str]) -> FloatArray:
     InputError
         Not a readable text, a cell that is no finite number, rows of different length, fewer than two rows, or other than three columns.
     """
-    rows = _rows(path)
+    rows = read_number_rows(path)
     if len(rows) < 2 or rows.shape[1] != 3:
         blade = (
             "; rows of several vertices are the path of a blade, which cuts solids: name a mesh of tetrahedra (.vtu, .msh), or keep the "
@@ -77,48 +70,3 @@ def read_tip_path(path: str | os.PathLike[str]) -> FloatArray:
 
 def _size(rows: FloatArray) -> str:
     return f"{len(rows)} rows of {rows.shape[1]} numbers"
-
-
-def _rows(path: str | os.PathLike[str]) -> FloatArray:
-    """Read rows (p, c) of numbers."""
-    file = Path(path)
-    try:
-        text = read_bytes(file).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{file}: is not UTF-8 text ({error.reason} at byte {error.start}); save the table as CSV in UTF-8") from error
-    rows: list[list[float]] = []
-    try:
-        for line, cells in enumerate(csv.reader(StringIO(text)), start=1):
-            if not any(cell.strip() for cell in cells) or cells[0].lstrip().startswith("#") or (not rows and _names(cells)):
-                continue
-            rows.append([_number(file, line, cell) for cell in cells])
-            if len(rows[-1]) != len(rows[0]):
-                raise InputError(f"{file}: row {line} has {len(rows[-1])} numbers, the first has {len(rows[0])}; give each pose the same")
-            if len(rows) > MOST_ROWS:
-                raise InputError(f"{file}: has more than {MOST_ROWS} poses; keep every tenth or so")
-    except csv.Error as error:
-        raise InputError(f"{file}: is no table of comma-separated values ({error}); save it as CSV") from error
-    return np.array(rows).reshape(len(rows), -1 if rows else 0)
-
-
-def _names(cells: list[str]) -> bool:
-    """Whether a row names columns: none of its cells is a number."""
-
-    def is_number(cell: str) -> bool:
-        try:
-            float(cell)
-        except ValueError:
-            return False
-        return True
-
-    return not any(is_number(cell) for cell in cells)
-
-
-def _number(file: Path, line: int, cell: str) -> float:
-    try:
-        value = float(cell)
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise InputError(f"{file}: row {line} has {cell.strip()[:40]!r} where a number in mm belongs")
-    return value

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, Field
 
-from naibu.core.errors import InputError
 from naibu.io.experiment_folder.schema import Finite, Positive, between
-from naibu.io.files.parsing import parsed_toml
+from naibu.io.files.checked_tables import CheckedTable, checked_file
 
 Micrometres = Annotated[Positive, between(1e-2, 1e5)]
 Shift = Annotated[Finite, between(-100.0, 100.0)]
@@ -28,11 +26,7 @@ def _growing(values: list[float]) -> list[float]:
 Span = Annotated[list[Micrometres], Field(min_length=2, max_length=2), AfterValidator(_growing)]
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
-
-
-class ChipTable(_Table):
+class ChipTable(CheckedTable):
     """``[chip]``: dimensions."""
 
     beam_length_um: Micrometres
@@ -45,7 +39,7 @@ class ChipTable(_Table):
     pillar_mass_mg: Annotated[Positive, between(1e-6, 1e6)] = 0.1
 
 
-class SiliconTable(_Table):
+class SiliconTable(CheckedTable):
     """``[silicon]``: orientation, strength and doping."""
 
     beam_direction: str = "110"
@@ -54,28 +48,28 @@ class SiliconTable(_Table):
     doping_per_cm3: Annotated[Positive, between(1e14, 1e21)] | None = None
 
 
-class ResistorsTable(_Table):
+class ResistorsTable(CheckedTable):
     """``[resistors]``: places of the piezoresistors."""
 
     force_from_end_um: Micrometres
     moment_from_end_um: Micrometres
     length_um: Micrometres = 20.0
-    mask_shift_um: Annotated[list[Shift], Field(min_length=2, max_length=2)] = [2.0, 2.0]
+    mask_shift_um: Annotated[list[Shift], Field(min_length=2, max_length=2)] = Field(default=[2.0, 2.0])
 
 
-class ReadoutTable(_Table):
+class ReadoutTable(CheckedTable):
     """``[readout]``: supply, amplifiers, converter and filter."""
 
     supply_V: Annotated[Positive, between(1e-3, 1e3)] = 5.0
-    gains: Three = [2000.0, 500.0, 500.0]
-    noise_width_V: Three = [0.37, 0.1, 0.1]
+    gains: Three = Field(default=[2000.0, 500.0, 500.0])
+    noise_width_V: Three = Field(default=[0.37, 0.1, 0.1])
     adc_bits: Annotated[int, Field(ge=1, le=32)] = 12
     adc_limit_V: Annotated[Positive, between(1e-3, 1e4)] = 10.0
     sample_rate_Hz: Annotated[Positive, between(1e-3, 1e9)] = 100.0
     filter_share: Annotated[float, Field(ge=0.001, le=1.0)] = 0.1
 
 
-class LoadTable(_Table):
+class LoadTable(CheckedTable):
     """``[[load]]``: a load on the block."""
 
     name: str = ""
@@ -84,7 +78,7 @@ class LoadTable(_Table):
     moment_y_Num: Load = 0.0
 
 
-class StudyTable(_Table):
+class StudyTable(CheckedTable):
     """``[study]``: smallest and largest sizes of the beams of other designs."""
 
     beam_length_um: Span
@@ -93,7 +87,7 @@ class StudyTable(_Table):
     steps: Annotated[int, Field(ge=2, le=60)] = 21
 
 
-class MeshTable(_Table):
+class MeshTable(CheckedTable):
     """``[mesh]``: numbers of cells."""
 
     along: Count = 10
@@ -103,7 +97,7 @@ class MeshTable(_Table):
     frame: Count = 4
 
 
-class ChipFile(_Table):
+class ChipFile(CheckedTable):
     """Contents of the file."""
 
     title: str = ""
@@ -111,12 +105,12 @@ class ChipFile(_Table):
     silicon: SiliconTable = SiliconTable()
     resistors: ResistorsTable
     readout: ReadoutTable = ReadoutTable()
-    load: list[LoadTable] = []
+    load: list[LoadTable] = Field(default=[])
     study: StudyTable | None = None
     mesh: MeshTable = MeshTable()
 
 
-_TABLES: dict[str, type[_Table]] = {
+_TABLES: dict[str, type[CheckedTable]] = {
     "chip": ChipTable,
     "silicon": SiliconTable,
     "resistors": ResistorsTable,
@@ -135,29 +129,4 @@ def load_chip(path: Path | str, content: bytes) -> ChipFile:
     InputError
         The text is not UTF-8 or not TOML (the line is shown), or a key is unknown, missing or holds a value that cannot be.
     """
-    data = parsed_toml(path, content)
-    try:
-        return ChipFile.model_validate(data)
-    except ValidationError as error:
-        faults = [f"{path}: {_told(dict(fault))}" for fault in error.errors(include_url=False)]
-        raise InputError("\n".join(dict.fromkeys(faults))) from error
-
-
-def _told(fault: dict[str, Any]) -> str:
-    """One fault of the check, in words that name the field, its value and the mend."""
-    loc = [part for part in fault["loc"] if not isinstance(part, int)]
-    table = _TABLES.get(str(loc[0]), ChipFile)
-    number = next((f" number {part + 1}" for part in fault["loc"][1:2] if isinstance(part, int) and loc[0] == "load"), "")
-    place = f"[[{loc[0]}]]{number}" if loc[0] == "load" else f"[{loc[0]}]" if loc[0] in _TABLES else str(loc[0])
-    key = str(loc[-1])
-    place = f"{place} {key}" if len(loc) > 1 else place
-    if fault["type"] == "extra_forbidden":
-        known = list((table if len(loc) > 1 else ChipFile).model_fields)
-        close = difflib.get_close_matches(key, known, n=1, cutoff=0.6)
-        return f"{place} is not a known key; " + (
-            f"did you mean {close[0]!r}?" if close else f"remove it, or use one of {', '.join(known)}"
-        )
-    if fault["type"] == "missing":
-        return f"{place} is missing; add it; the example of the study 'chip' shows every key"
-    message = str(fault["msg"]).removeprefix("Value error, ").replace("Input should", "must")
-    return f"{place} = {repr(fault['input'])[:60]}: {message[:1].lower()}{message[1:]}; correct it in this file"
+    return checked_file(path, content, ChipFile, _TABLES, "chip")

@@ -12,6 +12,7 @@ from naibu.reproduction.chapter4.cube import chapter4_cube
 from naibu.reproduction.chapter4.cutting import chapter4_cut
 from naibu.reproduction.chapter4.lattice import chapter4_lattice
 from naibu.reproduction.chapter4.octree import chapter4_octree
+from naibu.reproduction.chapter5.tables import chapter5
 from naibu.reproduction.chapter6.tables import chapter6
 from naibu.viewer.chapter import Chapter
 
@@ -24,5 +25,6 @@ CHAPTERS: dict[str, Callable[[int], Chapter]] = {
     "ch4-lattice": chapter4_lattice,
     "ch4-cube": chapter4_cube,
     "ch4-octree": chapter4_octree,
+    "ch5": chapter5,
     "ch6": chapter6,
 }

@@ -1,4 +1,4 @@
-"""Run a study by its name or from its file: lattices, sensing chips, or the finite element simulations of :cite:t:`hirai2008`."""
+"""Run a study by its name or from its file: lattices, sensing chips, layered skin, or the simulations of :cite:t:`hirai2008`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from naibu.core.errors import InputError
 from naibu.core.progress import Progress
 from naibu.workflows.lattice_study import NAMED, TEMPLATE, study_text
 from naibu.workflows.simulate_chip import CHIP, CHIP_TITLE, chip_text, describes_chip, simulate_chip
+from naibu.workflows.simulate_ischemia import ISCHEMIA, ISCHEMIA_TITLE, describes_ischemia, ischemia_text, simulate_ischemia
 from naibu.workflows.simulate_lattice import CHECKPOINT_EVERY, SimulationRun, simulate_lattice
 from naibu.workflows.simulate_study import SLUGS, SQUARES_TOGETHER, simulate_study
 
@@ -23,7 +24,7 @@ class NamedStudy:
     name : str
         What `simulate` takes.
     model : str
-        ``"finite elements"``, ``"mass-spring-dashpot lattice"`` or ``"sensing chip"``.
+        ``"finite elements"``, ``"mass-spring-dashpot lattice"``, ``"sensing chip"`` or ``"layered skin"``.
     title : str
         What is simulated.
     """
@@ -41,11 +42,12 @@ def named_studies() -> tuple[NamedStudy, ...]:
         *(NamedStudy(name, "finite elements", title) for name, title in elements),
         *(NamedStudy(name, "mass-spring-dashpot lattice", title) for name, title in lattices),
         NamedStudy(CHIP, "sensing chip", CHIP_TITLE),
+        NamedStudy(ISCHEMIA, "layered skin", ISCHEMIA_TITLE),
     )
 
 
 def example_text(study: str = "") -> str:
-    """Return the file of a study as a template: of a lattice, or of a sensing chip.
+    """Return the file of a study as a template: of a lattice, a sensing chip, or layered skin.
 
     Parameters
     ----------
@@ -57,7 +59,8 @@ def example_text(study: str = "") -> str:
     InputError
         There is no such study, or it has no file.
     """
-    return chip_text() if study == CHIP else study_text(study or TEMPLATE)
+    of_name = {CHIP: chip_text, ISCHEMIA: ischemia_text}
+    return of_name[study]() if study in of_name else study_text(study or TEMPLATE)
 
 
 def simulate(
@@ -77,7 +80,8 @@ def simulate(
     Parameters
     ----------
     study : str or path-like
-        Name of a study (see `named_studies`), or a TOML file that describes a lattice, its indenters and their motion, or a sensing chip.
+        Name of a study (see `named_studies`), or a TOML file that describes a lattice, its indenters and their motion, a sensing chip, or
+        layered skin.
     out : path-like
         Folder for the files.
     resume : bool
@@ -106,8 +110,8 @@ def simulate(
     """
 
     name = os.fspath(study)
-    of_chip = describes_chip(study)
-    if not of_chip and name != SQUARES_TOGETHER and name not in SLUGS:
+    of_chip, of_skin = describes_chip(study), describes_ischemia(study)
+    if not (of_chip or of_skin) and name != SQUARES_TOGETHER and name not in SLUGS:
         return simulate_lattice(
             study, out, resume=resume, overwrite=overwrite, checkpoint_every=checkpoint_every, device=device, progress=progress
         )
@@ -117,6 +121,8 @@ def simulate(
         raise InputError(f"device is {device!r}, and {name} is a study of finite elements, which run on 'cpu'; choose that, or a lattice")
     if of_chip:
         return SimulationRun(simulate_chip(study, out, overwrite=overwrite, progress=progress), 1, 1)
+    if of_skin:
+        return SimulationRun(simulate_ischemia(study, out, overwrite=overwrite, progress=progress), 1, 1)
     files = simulate_study(name, out, overwrite=overwrite, progress=progress)
     count = sum(path.suffix == ".vtkhdf" for path in files)
     return SimulationRun(tuple(files), count, count)

@@ -9,7 +9,7 @@ import pytest
 
 from naibu.applications.ischemia.layer_identification import identify_layers
 from naibu.applications.ischemia.layered_response import LayeredModes, simulate_skin
-from naibu.applications.ischemia.skin import Layer, SkinPatch, SurfaceLoad, meshed
+from naibu.applications.ischemia.skin import SkinLayer, SkinPatch, SurfaceLoad, meshed
 from naibu.core.errors import InputError
 from naibu.mechanics.small_strain.rheology import three_element
 
@@ -20,13 +20,13 @@ TIMES = np.concatenate([np.linspace(0.005, 0.47, 60), np.linspace(0.475, 2.0, 60
 
 @pytest.fixture(scope="module")
 def modes() -> LayeredModes:
-    return LayeredModes.of(meshed(SkinPatch((Layer(0.5, LOWER), Layer(0.5, UPPER)), 4.0), 0.5, across=8, upwards=6))
+    return LayeredModes.of(meshed(SkinPatch((SkinLayer(0.5, LOWER), SkinLayer(0.5, UPPER)), 4.0), 0.5, across=8, upwards=6))
 
 
 @pytest.fixture(scope="module")
 def record() -> np.ndarray:
     """The indentation of a finer mesh."""
-    fine = LayeredModes.of(meshed(SkinPatch((Layer(0.5, LOWER), Layer(0.5, UPPER)), 4.0), 0.5, across=18, upwards=14))
+    fine = LayeredModes.of(meshed(SkinPatch((SkinLayer(0.5, LOWER), SkinLayer(0.5, UPPER)), 4.0), 0.5, across=18, upwards=14))
     return simulate_skin(fine, (LOWER, UPPER), LOAD, TIMES).indentation
 
 
@@ -54,7 +54,7 @@ def test_a_record_of_another_process_is_not_explained(modes: LayeredModes, recor
 
 
 def test_one_layer_cannot_stand_for_two(modes: LayeredModes, record: np.ndarray) -> None:
-    single = LayeredModes.of(meshed(SkinPatch((Layer(1.0, UPPER),), 4.0), 0.5, across=8, upwards=6))
+    single = LayeredModes.of(meshed(SkinPatch((SkinLayer(1.0, UPPER),), 4.0), 0.5, across=8, upwards=6))
     found = identify_layers(single, LOAD, TIMES, record, 0.02)
     assert not found.explained and len(found.parameters) == 3
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from naibu.applications.ischemia.layered_response import LayeredModes, frequency_response, laplace_modulus, simulate_skin
-from naibu.applications.ischemia.skin import Layer, SkinPatch, SurfaceLoad, from_planes, meshed
+from naibu.applications.ischemia.skin import SkinLayer, SkinPatch, SurfaceLoad, from_planes, meshed
 from naibu.core.errors import InputError
 from naibu.mechanics.small_strain.dynamics import simulate_motion
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
@@ -18,7 +18,7 @@ from naibu.mechanics.small_strain.supports import Support
 from naibu.meshing.structured_2d import rectangle
 
 UPPER, LOWER = three_element(3.8, 0.03, 30.0, 0.49), three_element(0.5, 1.0, 30.0, 0.49)
-PATCH = SkinPatch((Layer(0.5, LOWER), Layer(0.5, UPPER)), 4.0)
+PATCH = SkinPatch((SkinLayer(0.5, LOWER), SkinLayer(0.5, UPPER)), 4.0)
 TIMES = np.array([0.002, 0.01, 0.03, 0.1, 0.3, 0.47, 0.48, 0.5, 0.6, 1.0, 2.0])
 
 
@@ -31,7 +31,7 @@ def test_a_uniform_column_creeps_as_the_closed_form_says() -> None:
     # a bar whose sides are free, loaded over its whole width but for its last column, by superposition of elastic solutions:
     # the response of one material is its elastic response times its creep function
     material = three_element(2.0, 0.5, 40.0, 0.3)
-    one = LayeredModes.of(meshed(SkinPatch((Layer(1.0, material),), 2.0), 0.4, across=6, upwards=6))
+    one = LayeredModes.of(meshed(SkinPatch((SkinLayer(1.0, material),), 2.0), 0.4, across=6, upwards=6))
     load = SurfaceLoad(3.0, 0.5, 0.4)
     creeping = simulate_skin(one, (material,), load, TIMES).indentation
     elastic = simulate_skin(one, (three_element(2.0, 0.0, np.inf, 0.3),), load, [0.1]).indentation[0]
@@ -58,7 +58,7 @@ def test_two_layers_move_as_the_time_integration_of_triangles_says() -> None:
         load=lambda t: force if t < 0.47 else 0.0 * force, breaks=[0.47],
     )  # fmt: skip
     middle = int(np.flatnonzero(top & np.isclose(x, 0.0))[0])
-    patch = SkinPatch((Layer(0.5, soft[0]), Layer(0.5, soft[1])), 4.0)
+    patch = SkinPatch((SkinLayer(0.5, soft[0]), SkinLayer(0.5, soft[1])), 4.0)
     found = simulate_skin(LayeredModes.of(meshed(patch, 0.5, across=20, upwards=14)), soft, SurfaceLoad(50.0, 0.47, 0.5), [0.1, 0.47, 0.8])
     assert_allclose(found.indentation, -motion.displacement[1:, middle, 1], rtol=0.02)
 
@@ -69,9 +69,14 @@ def test_the_frequency_response_is_the_transform_of_the_step_response(modes: Lay
     count = 400
     times = (cycles + np.arange(count) / count) / hertz
     period = 1.0 / hertz
-    single = [simulate_skin(modes, (LOWER, UPPER), SurfaceLoad(1.0, 0.5 * period, 0.5), times - k * period).indentation for k in range(cycles + 1)]
+    single = [
+        simulate_skin(modes, (LOWER, UPPER), SurfaceLoad(1.0, 0.5 * period, 0.5), times - k * period).indentation for k in range(cycles + 1)
+    ]
     total = np.sum(single, axis=0)
-    flow = np.linspace(0.0, 1.0, count, endpoint=False) * (simulate_skin(modes, (LOWER, UPPER), SurfaceLoad(1.0, 0.5 * period, 0.5), [1e4]).indentation[0])
+    flow = (
+        np.linspace(0.0, 1.0, count, endpoint=False)
+        * (simulate_skin(modes, (LOWER, UPPER), SurfaceLoad(1.0, 0.5 * period, 0.5), [1e4]).indentation[0])
+    )
     wave = np.exp(-2j * np.pi * hertz * times)
     square = np.where((times * hertz) % 1.0 < 0.5, 1.0, 0.0)
     found = ((total - flow) * wave).mean() / ((square - 0.5) * wave).mean()
@@ -83,7 +88,7 @@ def test_inertia_is_negligible_in_skin_and_makes_an_elastic_column_resonate(mode
     with_mass, without = (np.abs(frequency_response(modes.meshed, (LOWER, UPPER), [1.0, 100.0], inertia=i)) for i in (True, False))
     assert_allclose(with_mass, without, rtol=0.02)
     spring = three_element(3.8, 0.0, np.inf, 0.0)
-    column = meshed(SkinPatch((Layer(1.0, spring),), 0.1), 0.049, across=4, upwards=24)
+    column = meshed(SkinPatch((SkinLayer(1.0, spring),), 0.1), 0.049, across=4, upwards=24)
     first = np.sqrt(3.8 / 1.2e-6) / 4.0  # Hz: a quarter of a wavelength in a height of 1 mm
     below, above = frequency_response(column, (spring,), [0.99 * first, 1.01 * first]).real
     assert below > 0.0 > above
@@ -93,7 +98,7 @@ def test_inertia_is_negligible_in_skin_and_makes_an_elastic_column_resonate(mode
 def test_pressure_below_the_load_carries_it(kinematics: str) -> None:
     material = voigt(3.8, 0.03, 0.49)
     size = {"across": 5, "upwards": 4} if kinematics == "three_dimensional" else {"across": 12, "upwards": 10}
-    mesh = meshed(SkinPatch((Layer(1.0, material),), 4.0, kinematics=kinematics), 0.8, **size)  # type: ignore[arg-type]
+    mesh = meshed(SkinPatch((SkinLayer(1.0, material),), 4.0, kinematics=kinematics), 0.8, **size)  # type: ignore[arg-type]
     assert mesh.load[:, -1].sum() == pytest.approx(-1.0)
     motion = simulate_skin(LayeredModes.of(mesh), (material,), SurfaceLoad(10.0, 1.0, 0.8), [0.999])
     loaded = 1.6 if kinematics == "plane_strain" else np.pi * 0.64
@@ -113,7 +118,7 @@ def test_moduli_have_the_limits_of_springs_and_dashpots() -> None:
 
 
 def test_the_printed_grid_can_be_taken() -> None:
-    patch = SkinPatch((Layer(0.5, LOWER), Layer(0.5, UPPER)), 4.0)
+    patch = SkinPatch((SkinLayer(0.5, LOWER), SkinLayer(0.5, UPPER)), 4.0)
     mesh = from_planes(patch, (np.linspace(-2.0, 2.0, 5), np.linspace(0.0, 1.0, 11)), 0.0)
     assert len(mesh.grid.cells) == 40 and mesh.grid.points[mesh.middle].tolist() == [0.0, 1.0]
     assert mesh.load[mesh.middle, 1] == -1.0 and np.count_nonzero(mesh.load) == 1
@@ -123,8 +128,8 @@ def test_the_printed_grid_can_be_taken() -> None:
     ("what", "make"),
     [
         ("layers must be one or two", lambda m: SkinPatch((), 4.0)),
-        ("one Poisson ratio, not 0.49, 0.3", lambda m: Layer(1.0, three_element(1.0, 1.0, 1.0, 0.49, voigt_poisson_ratio=0.3))),
-        ("thickness_mm must be positive", lambda m: Layer(-1.0, UPPER)),
+        ("one Poisson ratio, not 0.49, 0.3", lambda m: SkinLayer(1.0, three_element(1.0, 1.0, 1.0, 0.49, voigt_poisson_ratio=0.3))),
+        ("thickness_mm must be positive", lambda m: SkinLayer(-1.0, UPPER)),
         ("force_mn must be positive", lambda m: SurfaceLoad(0.0, 1.0)),
         ("radius_mm must be zero", lambda m: SurfaceLoad(1.0, 1.0, np.nan)),
         ("smaller than half of the width of the patch, 2 mm, not 3", lambda m: meshed(PATCH, 3.0)),

@@ -85,8 +85,8 @@ def identify_layers(
 ) -> LayerEstimate:
     """Find E, C1 and C2 of every layer from the indentation in the middle.
 
-    Weighted least squares in the logarithms of the parameters; intervals are profile likelihoods :cite:p:`venzon1988`, so that a parameter that
-    has no effect gets an interval that says so. They hold the error of the mesh, estimated on one of halved cells.
+    Weighted least squares in the logarithms of the parameters; intervals are profile likelihoods :cite:p:`venzon1988`, so that a
+    parameter that has no effect gets an interval that says so. They hold the error of the mesh, estimated on one of halved cells.
 
     Parameters
     ----------
@@ -101,7 +101,8 @@ def identify_layers(
     start : sequence of Rheology, optional
         First guess of the layers; those of the patch by default. Layers that differ keep the search from a symmetric start.
     known : sequence of (int, str)
-        Parameters that keep their first guess: number of the layer, and ``"young_modulus"``, ``"voigt_viscosity"`` or ``"series_viscosity"``.
+        Parameters that keep their first guess: number of the layer, and ``"young_modulus"``, ``"voigt_viscosity"`` or
+        ``"series_viscosity"``.
 
     Raises
     ------
@@ -136,7 +137,9 @@ def identify_layers(
         parameters.append(LayerParameter(layer, name, value, *ends, bool(ends[1] < WIDE * ends[0])))
     fitted = fit.indentation(best.x)
     residuals = measured - fitted
-    return LayerEstimate(materials, tuple(parameters), fitted, float(np.sqrt(np.mean(residuals**2))), _explained(residuals / noise_mm, len(names)))
+    return LayerEstimate(
+        materials, tuple(parameters), fitted, float(np.sqrt(np.mean(residuals**2))), _explained(residuals / noise_mm, len(names))
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

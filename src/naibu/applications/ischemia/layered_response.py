@@ -116,7 +116,7 @@ def _step_responses(numerator: FloatArray, denominator: FloatArray, times: Float
 
 
 def _responses_of_one_kind(numerator: FloatArray, d: FloatArray, flow: bool, times: FloatArray) -> FloatArray:
-    """Return the responses (k, t) for denominators ``D`` (without a flow) or ``s D`` (with one) of one degree, D (k, p) by rising powers."""
+    """Return the responses (k, t) for denominators ``D`` (without a flow) or ``s D`` (with one), D (k, p) by rising powers."""
     k, degree = len(d), d.shape[1] - 1
     at_zero = numerator[0] / d[:, :1]
     found = np.broadcast_to(at_zero, (k, len(times))).copy()
@@ -196,13 +196,19 @@ def simulate_skin(modes: LayeredModes, materials: tuple[Rheology, ...], load: Su
         raise InputError(f"materials must be given for the {len(layers)} layers of the patch, not {len(materials)}")
     for i, (given, layer) in enumerate(zip(materials, layers, strict=True)):
         if given.poisson_ratio != layer.material.poisson_ratio:
-            raise InputError(f"materials[{i}] has a Poisson ratio of {given.poisson_ratio:g}; the modes are those of {layer.material.poisson_ratio:g}")
+            raise InputError(
+                f"materials[{i}] has a Poisson ratio of {given.poisson_ratio:g}; the modes are those of {layer.material.poisson_ratio:g}"
+            )
     if instants.ndim != 1 or len(instants) == 0 or not np.isfinite(instants).all():
         raise InputError("times must be finite numbers, s")
 
     def of_load(stress_in: int | None) -> FloatArray:
         loaded = modes.step_response(materials, instants, stress_in=stress_in)
-        return load.force_mn * modes.amplitude[:, None] * (loaded - modes.step_response(materials, instants - load.duration_s, stress_in=stress_in))
+        return (
+            load.force_mn
+            * modes.amplitude[:, None]
+            * (loaded - modes.step_response(materials, instants - load.duration_s, stress_in=stress_in))
+        )
 
     d = meshed.constrained.shape[1]
     top = np.flatnonzero(meshed.grid.points[:, -1] == meshed.grid.points[:, -1].max())
@@ -218,8 +224,16 @@ def simulate_skin(modes: LayeredModes, materials: tuple[Rheology, ...], load: Su
     return SkinMotion(instants, -surface[:, middle, -1], top.astype(np.int64), surface, pressure, areas)
 
 
+def skin_displacements(modes: LayeredModes, materials: tuple[Rheology, ...], load: SurfaceLoad, times: ArrayLike) -> FloatArray:
+    """Return the displacement of all nodes (t, n, d), mm; see `simulate_skin`."""
+    instants = np.asarray(times, dtype=float)
+    under, after = (modes.step_response(materials, instants - start) for start in (0.0, load.duration_s))
+    moved = modes.vectors @ (load.force_mn * modes.amplitude[:, None] * (under - after))
+    return np.asarray(moved.T.reshape(len(instants), *modes.meshed.constrained.shape))
+
+
 def _subdivided(meshed: MeshedPatch, pressure: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return pressure (t, j) and areas (j,) of parts of the cells, linear between their centres, so that the edge of an area moves evenly."""
+    """Return pressure (t, j) and areas (j,) of parts of cells, linear between their centres: the edge of an area moves evenly."""
     planes, kinematics = meshed.grid.planes[0], meshed.grid.kinematics
     if kinematics == "three_dimensional":
         return pressure, meshed.surface_areas
@@ -229,7 +243,9 @@ def _subdivided(meshed: MeshedPatch, pressure: FloatArray) -> tuple[FloatArray, 
     return np.stack([np.interp(at, centres, row) for row in pressure]), areas
 
 
-def frequency_response(meshed: MeshedPatch, materials: tuple[Rheology, ...], frequencies_hz: ArrayLike, *, inertia: bool = True) -> ComplexArray:
+def frequency_response(
+    meshed: MeshedPatch, materials: tuple[Rheology, ...], frequencies_hz: ArrayLike, *, inertia: bool = True
+) -> ComplexArray:
     """Return the complex indentation in the middle (f,) for a force of 1 mN that oscillates, mm/mN.
 
     The equations are solved directly at every frequency, with the complex moduli of the layers.

@@ -1,4 +1,4 @@
-"""Rise and fall times of an indentation or of a pale area, and what remains: the measures of active ischemia :cite:p:`kaneko2004`."""
+"""Rise and fall times of an indentation or of a pale area, and what remains: the measures of active ischemia :cite:p:`kaneko2007`."""
 
 from __future__ import annotations
 
@@ -55,11 +55,14 @@ def response_times(times: ArrayLike, values: ArrayLike, release_s: float) -> Res
     """
     t, v = np.asarray(times, dtype=float), np.asarray(values, dtype=float)
     if t.ndim != 1 or t.shape != v.shape or not (np.isfinite(t).all() and np.isfinite(v).all()) or not (np.diff(t) > 0.0).all():
-        raise InputError(f"times and values must be finite numbers of one shape, times increasing; they have shapes {t.shape} and {v.shape}")
+        raise InputError(
+            f"times and values must be finite numbers of one shape, times increasing; they have shapes {t.shape} and {v.shape}"
+        )
     under, after = t <= release_s, t >= release_s
     if under.sum() < 4 or after.sum() < 4:
         raise InputError(
-            f"times must have four or more instants up to the release at {release_s:g} s, and from there on; they have {under.sum()} and {after.sum()}"
+            f"times must have four or more instants up to the release at {release_s:g} s, and from there on; they have "
+            f"{under.sum()} and {after.sum()}"
         )
     peak = float(np.interp(release_s, t, v))
     return ResponseTimes(

@@ -1,7 +1,7 @@
 """A patch of layered viscoelastic skin under a load on its surface: geometry, materials and the load.
 
 Layers of three-element material (a Voigt solid in series with a dashpot) lie on a rigid base, as in the study of active ischemia of
-:cite:t:`hirai2008` (chapter 5.3). The load is a force on one node, as there, or the pressure of an air jet :cite:p:`kaneko2004`.
+:cite:t:`hirai2008` (chapter 5.3). The load is a force on one node, as there, or the pressure of an air jet :cite:p:`kaneko2007`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Sides = Literal["free", "fixed"]
 
 
 @dataclass(frozen=True, slots=True)
-class Layer:
+class SkinLayer:
     """A layer of skin.
 
     Attributes
@@ -82,7 +82,7 @@ class SkinPatch:
 
     Attributes
     ----------
-    layers : tuple of Layer
+    layers : tuple of SkinLayer
         From the base upwards, one or two.
     width_mm : float
         Width of the patch, mm: its diameter if axisymmetric.
@@ -94,7 +94,7 @@ class SkinPatch:
         Whether the outer sides move.
     """
 
-    layers: tuple[Layer, ...]
+    layers: tuple[SkinLayer, ...]
     width_mm: float
     kinematics: Kinematics = "plane_strain"
     depth_mm: float = 1.0
@@ -237,8 +237,8 @@ def graded(half_mm: float, fine_mm: float, count: int) -> FloatArray:
         ratio = 1.0 + 1.5 / count
         steps = ratio ** np.arange(count)
         return np.asarray(np.concatenate([[0.0], np.cumsum(steps)]) * half_mm / steps.sum())
-    inner = max(2, count // 2)
-    outer = max(2, count - inner)
+    inner = max(1, count // 2)
+    outer = count - inner
     even = np.linspace(0.0, fine_mm, inner + 1)
     return np.concatenate([even, np.geomspace(fine_mm, half_mm, outer + 1)[1:]])
 

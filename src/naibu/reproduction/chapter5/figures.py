@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from naibu.applications.ischemia.layered_response import SkinMotion
 from naibu.core.arrays import ComplexArray, FloatArray
 from naibu.reproduction.chapter5.ischemia import DURATION_S, THRESHOLD_KPA, Response
 
@@ -22,12 +23,34 @@ def indentations(fine: Sequence[Response], coarse: Sequence[Response]) -> Draw:
 
     def draw(canvas: Canvas) -> None:
         axes = canvas.subplots(1, 2)
-        for axis, found, title in zip(axes, (fine, coarse), ("converged mesh, load on 1 mm", "printed grid, force on one node"), strict=True):
+        for axis, found, title in zip(
+            axes, (fine, coarse), ("converged mesh, load on 1 mm", "printed grid, force on one node"), strict=True
+        ):
             for response, line in zip(found, LINES, strict=False):
                 axis.plot(response.times, response.indentation, line, label=response.name, lw=1.3)
             axis.axvline(DURATION_S, color="0.8", lw=0.8, zorder=0)
             axis.set(title=title, xlabel="time, s", ylabel="indentation, mm", xlim=(0.0, 1.5), ylim=(0.0, None))
         axes[0].legend(frameon=False, fontsize=8)
+
+    return draw
+
+
+def response_curves(motion: SkinMotion, area: FloatArray, release_s: float, record: FloatArray | None = None) -> Draw:
+    """Draw indentation and pale area over time, with a measured record (t, 2) where there is one."""
+
+    def draw(canvas: Canvas) -> None:
+        left, right = canvas.subplots(1, 2)
+        if record is not None:
+            left.plot(record[:, 0], record[:, 1], ".", color="0.6", ms=3, label="measured")
+        left.plot(motion.times, motion.indentation, lw=1.3, label="model")
+        right.plot(motion.times, area, lw=1.3)
+        for axis in (left, right):
+            axis.axvline(release_s, color="0.8", lw=0.8, zorder=0)
+            axis.set(xlabel="time, s", ylim=(0.0, None))
+        left.set_ylabel("indentation, mm")
+        right.set_ylabel("pale area, mm$^2$")
+        if record is not None:
+            left.legend(frameon=False, fontsize=8)
 
     return draw
 
@@ -45,7 +68,15 @@ def pale_areas(found: Sequence[Response]) -> Draw:
             radius = np.sqrt(np.cumsum(motion.areas) / np.pi)
             for time, shade in ((0.002, 0.4), (0.46, 1.0)):
                 row = motion.pressure[int(np.argmin(np.abs(motion.times - time)))]
-                right.plot(radius, row, line, color="C0" if response is found[0] else "C1", alpha=shade, lw=1.3, label=f"{response.name}, {1e3 * time:g} ms")
+                right.plot(
+                    radius,
+                    row,
+                    line,
+                    color="C0" if response is found[0] else "C1",
+                    alpha=shade,
+                    lw=1.3,
+                    label=f"{response.name}, {1e3 * time:g} ms",
+                )
         right.axhline(THRESHOLD_KPA, color="0.6", lw=0.8)
         left.set(xlabel="time, ms", ylabel="pale area, mm$^2$", xlim=(-10.0, 560.0), ylim=(0.0, None), title=f"above {THRESHOLD_KPA:g} kPa")
         right.set(xlabel="radius, mm", ylabel="pressure below the surface, kPa", xlim=(0.0, 1.6), title="pressure")

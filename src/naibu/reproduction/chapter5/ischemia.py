@@ -9,7 +9,7 @@ import numpy as np
 from naibu.applications.ischemia.layer_identification import LayerEstimate, identify_layers
 from naibu.applications.ischemia.layered_response import LayeredModes, SkinMotion, frequency_response, simulate_skin
 from naibu.applications.ischemia.response_times import ResponseTimes, response_times
-from naibu.applications.ischemia.skin import Layer, SkinPatch, SurfaceLoad, from_planes, meshed
+from naibu.applications.ischemia.skin import SkinLayer, SkinPatch, SurfaceLoad, from_planes, meshed
 from naibu.core.arrays import ComplexArray, FloatArray
 from naibu.mechanics.finite_elements.linear_simplices import lumped_mass
 from naibu.mechanics.small_strain.averaged_dilatation import Kinematics
@@ -54,7 +54,7 @@ class Response:
 def patch(lower: Rheology, upper: Rheology, kinematics: Kinematics = "plane_strain") -> SkinPatch:
     """Return the patch of the report."""
     half = 0.5 * HEIGHT_MM
-    return SkinPatch((Layer(half, lower, DENSITY), Layer(half, upper, DENSITY)), WIDTH_MM, kinematics, DEPTH_MM)
+    return SkinPatch((SkinLayer(half, lower, DENSITY), SkinLayer(half, upper, DENSITY)), WIDTH_MM, kinematics, DEPTH_MM)
 
 
 def modes_of(kinematics: Kinematics, radius_mm: float, *, across: int = 20, upwards: int = 14) -> LayeredModes:
@@ -68,9 +68,13 @@ def printed_grid_modes() -> LayeredModes:
     return LayeredModes.of(from_planes(patch(UPPER, UPPER), planes, 0.0))
 
 
-def response(name: str, modes: LayeredModes, lower: Rheology, upper: Rheology, radius_mm: float, duration_s: float = DURATION_S) -> Response:
+def response(
+    name: str, modes: LayeredModes, lower: Rheology, upper: Rheology, radius_mm: float, duration_s: float = DURATION_S
+) -> Response:
     """Simulate a press and its release, without inertia."""
-    times = TIMES if duration_s == DURATION_S else np.unique(np.concatenate([TIMES * duration_s / DURATION_S, TIMES - DURATION_S + duration_s]))
+    times = (
+        TIMES if duration_s == DURATION_S else np.unique(np.concatenate([TIMES * duration_s / DURATION_S, TIMES - DURATION_S + duration_s]))
+    )
     times = times[times >= 0.0]
     motion = simulate_skin(modes, (lower, upper), SurfaceLoad(FORCE_MN, duration_s, radius_mm), times)
     return Response(name, times, motion.indentation, response_times(times, motion.indentation, duration_s), motion)

@@ -16,7 +16,14 @@ from naibu.viewer.tables import Cell, Table
 FREQUENCIES_HZ = np.geomspace(0.1, 100.0, 25)
 NOISE_MM = 0.02
 UNITS = {"young_modulus": ("E", "kPa"), "voigt_viscosity": ("C1", "kPa s"), "series_viscosity": ("C2", "kPa s")}
-TIMES_OF = ("rise 10-90 %, s", "fall 10-90 %, s", "rise, time constant, s", "fall, time constant, s", "at release, mm", "residual at 3 s, mm")
+TIMES_OF = (
+    "rise 10-90 %, s",
+    "fall 10-90 %, s",
+    "rise, time constant, s",
+    "fall, time constant, s",
+    "at release, mm",
+    "residual at 3 s, mm",
+)
 
 
 def chapter5(seed: int = 0) -> Chapter:
@@ -65,14 +72,20 @@ def _model() -> Section:
     table = Table(
         "Models", ("model", *TIMES_OF), tuple(rows),
         caption=f"Skin of one material, C1 = 30 Pa s; {ischemia.FORCE_MN:g} mN for {DURATION_S:g} s.",
-        note=f"Triangles with one strain each lock at a Poisson ratio of {ischemia.POISSON_RATIO:g}: on the printed grid they are too stiff by a factor "
-        f"of {converged / triangles:.1f} against the converged mesh although their force acts on a point, where bricks that do not lock give {bricks:.1f} mm. "
-        "Time constants do not depend on the mesh. All indentations exceed the height of the skin, 1 mm: with the printed force and modulus the "
-        "strains are not small, and the linear model, which the report uses, does not hold in amplitude; its time constants are those of small forces.",
+        note=f"Triangles with one strain each lock at a Poisson ratio of {ischemia.POISSON_RATIO:g}: on the printed grid they "
+        f"are too stiff by a factor "
+        f"of {converged / triangles:.1f} against the converged mesh although their force acts on a point, where bricks that do "
+        f"not lock give {bricks:.1f} mm. "
+        "Time constants do not depend on the mesh. All indentations exceed the height of the skin, 1 mm: with the printed force "
+        "and modulus the "
+        "strains are not small, and the linear model, which the report uses, does not hold in amplitude; its time constants are "
+        "those of small forces.",
     )  # fmt: skip
     paragraphs = (
-        "Layers of three-element material on a fixed base, loaded by a force in the middle of the surface, and released. Without inertia the "
-        "response of two layers is known in closed form in the eigenvectors of their stiffnesses; bricks with averaged dilatation do not lock. "
+        "Layers of three-element material on a fixed base, loaded by a force in the middle of the surface, and released. "
+        "Without inertia the "
+        "response of two layers is known in closed form in the eigenvectors of their stiffnesses; bricks with averaged "
+        "dilatation do not lock. "
         f"The mass of the patch is {1e6 * ischemia.patch_mass_kg():.1f} mg: inertia changes nothing that can be seen.",
         "The report compares with measurements of a fingertip that are printed as curves only and are not reproduced here.",
     )
@@ -84,7 +97,8 @@ def _same(fine: Sequence[Response], coarse: Sequence[Response]) -> Section:
     table = Table("Figure 5.8, numbers", ("layers", "mesh", *TIMES_OF), rows, caption="Both layers alike.")
     figure = Figure("Fig. 5.8", "Indentation over time, both layers alike.", figures.indentations(fine, coarse), (10.0, 3.8))
     text = (
-        "As the report says, the residual displacement depends on the dashpot in series only, and rise and fall are faster with C1 = 30 than with "
+        "As the report says, the residual displacement depends on the dashpot in series only, and rise and fall are faster with "
+        "C1 = 30 than with "
         "80 Pa s.",
     )
     return Section("One material (Figure 5.8)", text, (table,), (figure,))
@@ -92,10 +106,16 @@ def _same(fine: Sequence[Response], coarse: Sequence[Response]) -> Section:
 
 def _layers(fine: Sequence[Response], coarse: Sequence[Response]) -> Section:
     rows = tuple((r.name, mesh, *_row(r)) for mesh, found in (("converged", fine), ("printed", coarse)) for r in found)
-    table = Table("Figure 5.9, numbers", ("layers", "mesh", *TIMES_OF), rows, caption="Soft lower layer: E 0.5 kPa; upper layer: E 3.8 kPa, C1 30 Pa s.")
+    table = Table(
+        "Figure 5.9, numbers",
+        ("layers", "mesh", *TIMES_OF),
+        rows,
+        caption="Soft lower layer: E 0.5 kPa; upper layer: E 3.8 kPa, C1 30 Pa s.",
+    )
     figure = Figure("Fig. 5.9", "Indentation over time, soft lower layer.", figures.indentations(fine, coarse), (10.0, 3.8))
     text = (
-        "The soft layer gives the curved rise between 0.1 and 0.5 s which the report looked for: after the fast rise of the upper layer comes the slow "
+        "The soft layer gives the curved rise between 0.1 and 0.5 s which the report looked for: after the fast rise of the "
+        "upper layer comes the slow "
         "one of the lower layer.",
     )
     return Section("Two layers (Figure 5.9)", text, (table,), (figure,))
@@ -110,12 +130,16 @@ def _time_constants() -> Section:
     table = Table(
         "What the time constants depend on", ("changed", "value", *TIMES_OF[:4]), rows,
         caption="Skin of one material; otherwise E = 3.8 kPa, C1 = 30 Pa s, C2 = 30 kPa s, 0.47 s.",
-        note=f"In skin of one material both time constants are C1/E exactly: {1e3 * UPPER.retardation_time:.1f} ms for 3.8 kPa and 30 Pa s.",
+        note=f"In skin of one material both time constants are C1/E exactly: {1e3 * UPPER.retardation_time:.1f} ms for 3.8 kPa "
+        f"and 30 Pa s.",
     )  # fmt: skip
     text = (
-        "The report concludes (5.5) that the time constants do not depend on viscoelasticity but on how long the force acts. This contradicts its own "
-        "Figure 5.8, and is not so: the time constants are proportional to C1 and to 1/E, and do not depend on the duration. What depends on "
-        "the duration is the time from 10 to 90 % of the rise, because the flow of the dashpot in series goes on as long as the force acts.",
+        "The report concludes (5.5) that the time constants do not depend on viscoelasticity but on how long the force acts. "
+        "This contradicts its own "
+        "Figure 5.8, and is not so: the time constants are proportional to C1 and to 1/E, and do not depend on the duration. "
+        "What depends on "
+        "the duration is the time from 10 to 90 % of the rise, because the flow of the dashpot in series goes on as long as the "
+        "force acts.",
     )
     return Section("Time constants and viscoelasticity", text, (table,))
 
@@ -136,7 +160,8 @@ def _pale_area() -> Section:
     table = Table(
         "Pale area", ("lower layer", "threshold, kPa", *(f"at {t:g} s, mm^2" for t in (0.001, 0.05, 0.46, 0.475, 0.55))), tuple(rows),
         caption="Area in which the pressure in the tissue exceeds that of capillaries; round jet of 0.79 mm^2, axisymmetric.",
-        note="A pressure follows the load at once where the layers relax alike; where they do not, it is redistributed at the rates of the layers. What "
+        note="A pressure follows the load at once where the layers relax alike; where they do not, it is redistributed at the "
+        "rates of the layers. What "
         "is slow in a pale area that is seen is then either this, or the blood that returns, which is not modelled.",
     )  # fmt: skip
     figure = Figure("Pale area", "Area over time, and pressure along the radius.", figures.pale_areas(found), (10.0, 3.8))
@@ -156,19 +181,28 @@ def _frequencies() -> Section:
     )
     columns = ("frequency, Hz", "amplitude, mm/mN", "from the time domain", "phase, degrees", "from the time domain")
     table = Table(
-        "Frequency response", columns, rows, caption="C1 = 30 Pa s: direct with inertia, and the transform of the response to a pulse without."
+        "Frequency response",
+        columns,
+        rows,
+        caption="C1 = 30 Pa s: direct with inertia, and the transform of the response to a pulse without.",
     )
-    figure = Figure("Frequency response", "Indentation for an oscillating force.", figures.bode_diagram(FREQUENCIES_HZ, found, from_time), (8.0, 5.0))
-    return Section("Frequency response", ("The report names the frequency response as a measure and does not compute it.",), (table,), (figure,))
+    figure = Figure(
+        "Frequency response", "Indentation for an oscillating force.", figures.bode_diagram(FREQUENCIES_HZ, found, from_time), (8.0, 5.0)
+    )
+    return Section(
+        "Frequency response", ("The report names the frequency response as a measure and does not compute it.",), (table,), (figure,)
+    )
 
 
 def _identification(seed: int) -> Section:
     lower = LOWER["model 2, lower C1 = 1000 Pa s"]
     estimate = ischemia.identified(lower, NOISE_MM, seed)
     table = Table(
-        "Identified layers", ("layer", "parameter", "true", "estimate", "95 % from", "to", "determined"), _identified_rows(estimate, (lower, UPPER)),
+        "Identified layers", ("layer", "parameter", "true", "estimate", "95 % from", "to", "determined"),
+        _identified_rows(estimate, (lower, UPPER)),
         caption=f"From the indentation over 3 s of a finer mesh, with {NOISE_MM:g} mm of noise.",
-        note="Not determined: the interval spans more than a factor of 4. The flow of the lower layer and its spring are hard to tell apart from one press.",
+        note="Not determined: the interval spans more than a factor of 4. The flow of the lower layer and its spring are hard "
+        "to tell apart from one press.",
     )  # fmt: skip
     return Section("Identification of the layers", (), (table,))
 

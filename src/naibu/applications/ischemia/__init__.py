@@ -1,0 +1,1 @@
+"""Active ischemia: skin that is pressed, and turns pale."""

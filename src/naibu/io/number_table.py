@@ -1,0 +1,104 @@
+"""Read tables of numbers without labels: paths of tools, and records over time."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Sequence
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import InputError
+from naibu.io.files.reading import read_bytes
+
+MOST_ROWS = 100_000
+
+
+def read_numbers(path: str | os.PathLike[str], columns: Sequence[str]) -> FloatArray:
+    """Read a table of comma-separated numbers with given columns.
+
+    Parameters
+    ----------
+    path : path-like
+        Rows of numbers. Rows that begin with ``#``, and a first row of names, are passed over.
+    columns : sequence of str
+        What the columns hold, for messages.
+
+    Returns
+    -------
+    ndarray, shape (r, c)
+        The numbers.
+
+    Raises
+    ------
+    InputError
+        Not a readable text, a cell that is no finite number, no rows, or another number of columns.
+    """
+    rows = read_number_rows(path)
+    if len(rows) == 0 or rows.shape[1] != len(columns):
+        raise InputError(f"{path}: has {len(rows)} rows of {rows.shape[1]} numbers; it needs rows of {len(columns)}: {'; '.join(columns)}")
+    return rows
+
+
+def read_number_rows(path: str | os.PathLike[str]) -> FloatArray:
+    """Read rows of numbers.
+
+    Parameters
+    ----------
+    path : path-like
+        Comma-separated; rows that begin with ``#``, and a first row of names, are passed over.
+
+    Returns
+    -------
+    ndarray, shape (r, c)
+        The numbers; (0, 0) where there are none.
+
+    Raises
+    ------
+    InputError
+        Not a readable text, a cell that is no finite number, or rows of different length.
+    """
+    file = Path(path)
+    try:
+        text = read_bytes(file).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{file}: is not UTF-8 text ({error.reason} at byte {error.start}); save the table as CSV in UTF-8") from error
+    rows: list[list[float]] = []
+    try:
+        for line, cells in enumerate(csv.reader(StringIO(text)), start=1):
+            if not any(cell.strip() for cell in cells) or cells[0].lstrip().startswith("#") or (not rows and _names(cells)):
+                continue
+            rows.append([_number(file, line, cell) for cell in cells])
+            if len(rows[-1]) != len(rows[0]):
+                raise InputError(f"{file}: row {line} has {len(rows[-1])} numbers, the first has {len(rows[0])}; give each row the same")
+            if len(rows) > MOST_ROWS:
+                raise InputError(f"{file}: has more than {MOST_ROWS} rows; keep every tenth or so")
+    except csv.Error as error:
+        raise InputError(f"{file}: is no table of comma-separated values ({error}); save it as CSV") from error
+    return np.array(rows).reshape(len(rows), -1 if rows else 0)
+
+
+def _names(cells: list[str]) -> bool:
+    """Whether a row names columns: none of its cells is a number."""
+
+    def is_number(cell: str) -> bool:
+        try:
+            float(cell)
+        except ValueError:
+            return False
+        return True
+
+    return not any(is_number(cell) for cell in cells)
+
+
+def _number(file: Path, line: int, cell: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise InputError(f"{file}: row {line} has {cell.strip()[:40]!r} where a number belongs")
+    return value
