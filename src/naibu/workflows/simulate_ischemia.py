@@ -174,7 +174,9 @@ def simulate_ischemia(
         if study.record is not None and study.settings.record is not None:
             tell(3)
             known = [(i, name) for i, layer in enumerate(study.settings.layer) for name in layer.known]
-            estimate = identify_layers(modes, study.load, *study.record.T, study.settings.record.noise_mm, known=known)
+            estimate = identify_layers(
+                modes, study.load, study.record[:, 0], study.record[:, 1], study.settings.record.noise_mm, known=known
+            )
             materials = estimate.materials
     except InputError as error:
         raise InputError(f"{study.source}: {_in_keys(str(error))}") from error
@@ -182,7 +184,8 @@ def simulate_ischemia(
     after = duration + np.concatenate([[0.0], np.geomspace(1e-3 * (end - duration), end - duration, 400)])
     motion = simulate_skin(modes, materials, study.load, np.unique(np.concatenate([np.linspace(0.0, duration, 400), after])))
     tell(2)
-    frequencies = np.geomspace(*study.settings.frequency.range_Hz, study.settings.frequency.count)
+    lowest, highest = study.settings.frequency.range_Hz
+    frequencies = np.geomspace(lowest, highest, study.settings.frequency.count)
     response = frequency_response(modes.meshed, materials, frequencies)
     sections = [_motion_section(study, motion), _frequency_section(frequencies, response)]
     if estimate is not None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import OptimizeResult, least_squares
+from scipy.optimize import least_squares
 from scipy.stats import chi2, norm
 from scipy.stats import t as student
 
@@ -143,6 +143,15 @@ def identify_layers(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Minimum:
+    """A minimum of half the sum of squares: all logarithms, its value, and the Jacobian of those that were free."""
+
+    x: FloatArray
+    cost: float
+    jac: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Fit:
     summed: LayeredModes
     load: SurfaceLoad
@@ -167,7 +176,7 @@ class _Fit:
     def residuals(self, logs: FloatArray) -> FloatArray:
         return (self.indentation(logs) - self.measured) / self.noise_mm
 
-    def search(self, start: FloatArray, held: tuple[int, float] | None = None) -> OptimizeResult:
+    def search(self, start: FloatArray, held: tuple[int, float] | None = None) -> _Minimum:
         free = np.array([i for i in range(len(start)) if held is None or i != held[0]])
         logs = start.copy()
         if held is not None:
@@ -180,12 +189,12 @@ class _Fit:
 
         bound = np.log(SEARCHED)
         if len(free) == 0:
-            return OptimizeResult(x=logs, cost=0.5 * float((self.residuals(logs) ** 2).sum()))
+            return _Minimum(logs, 0.5 * float((self.residuals(logs) ** 2).sum()), np.zeros((len(self.times), 0)))
         found = least_squares(of_free, np.clip(logs[free], -bound, bound), bounds=(-bound, bound), x_scale=1.0, max_nfev=200)
         if not found.success:
             raise ConvergenceError(f"the search for the layers' parameters did not converge: {found.message}; state `known` parameters")
         logs[free] = found.x
-        return OptimizeResult(x=logs, cost=float(found.cost), jac=found.jac)
+        return _Minimum(logs, float(found.cost), np.asarray(found.jac))
 
     def interval(self, best: FloatArray, i: int) -> tuple[float, float]:
         """Return the ends where the profile of the misfit has risen by what 95 % allow, within the range that is searched."""
@@ -210,13 +219,13 @@ class _Fit:
                 inside, at, step = trial, found.x, 2.0 * step
         return ends[0], ends[1]
 
-    def discretisation_error(self, best: OptimizeResult, finer: _Fit) -> FloatArray:
+    def discretisation_error(self, best: _Minimum, finer: _Fit) -> FloatArray:
         """Return how far the logarithms move, in the first order, if the mesh is refined once and for all.
 
         The error of the mesh is at most twice its change by halved cells if it falls at least in proportion to their size.
         """
         missing = 2.0 * (finer.residuals(best.x) - self.residuals(best.x))
-        return np.abs(np.linalg.lstsq(best.jac, missing, rcond=1e-4)[0])
+        return np.asarray(np.abs(np.linalg.lstsq(best.jac, missing, rcond=1e-4)[0]))
 
     def _crossing(self, i: int, inside: float, outside: float, at: FloatArray, allowed: float) -> float:
         for _ in range(12):

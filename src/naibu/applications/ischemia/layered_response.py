@@ -132,7 +132,7 @@ def _responses_of_one_kind(numerator: FloatArray, d: FloatArray, flow: bool, tim
     derivative = np.arange(1, degree + 1) * d[:, 1:]
     steepness = sum(derivative[:, i : i + 1] * poles**i for i in range(degree))
     residues = np.polyval(numerator[::-1], poles) / (poles ** (2 if flow else 1) * steepness)
-    return found + np.einsum("kp,kpt->kt", residues, np.exp(poles[:, :, None] * times))
+    return np.asarray(found + np.einsum("kp,kpt->kt", residues, np.exp(poles[:, :, None] * times)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -280,8 +280,10 @@ def frequency_response(
     for i, frequency in enumerate(frequencies):
         s = 2j * np.pi * frequency
         moduli = [np.polyval(n[::-1], s) / np.polyval(q[::-1], s) for n, q in map(laplace_modulus, materials)]
-        matrix = sum((e * k for e, k in zip(moduli[1:], matrices[1:], strict=True)), moduli[0] * matrices[0])
+        matrix = moduli[0] * matrices[0]
+        for modulus, stiffness in zip(moduli[1:], matrices[1:], strict=True):
+            matrix = matrix + modulus * stiffness
         if inertia:
             matrix = matrix + s * s * mass
-        found[i] = -spla.spsolve(matrix.tocsc(), load)[middle]
+        found[i] = -spla.spsolve(sp.csc_matrix(matrix), load)[middle]
     return found

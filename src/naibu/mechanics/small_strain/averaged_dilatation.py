@@ -88,12 +88,12 @@ class BrickGrid:
     @property
     def centres(self) -> FloatArray:
         """Centres of the cells (m, d), mm."""
-        return self.points[self.cells].mean(axis=1)
+        return np.asarray(self.points[self.cells].mean(axis=1))
 
     @property
     def volumes(self) -> FloatArray:
         """Volumes of the cells (m,), mm^3."""
-        return self.weights.sum(axis=1)
+        return np.asarray(self.weights.sum(axis=1))
 
     def mean_divergence(self) -> sp.csr_matrix:
         """Return the matrix (m, n d) that gives the mean dilatation of every cell for a displacement of the nodes."""
@@ -123,14 +123,14 @@ class BrickGrid:
     def lumped_mass(self, density: FloatArray) -> FloatArray:
         """Return the mass of the nodes (n,), kg, for the density of the cells (m,), kg/mm^3."""
         k = self.cells.shape[1]
-        return np.bincount(self.cells.ravel(), np.repeat(density * self.volumes / k, k), minlength=len(self.points))
+        return np.bincount(self.cells.ravel(), np.repeat(density * self.volumes / k, k), minlength=len(self.points)).astype(float)
 
     def _dilatation_rows(self) -> FloatArray:
         """Return the mean dilatation of every cell for each of its unknowns (m, k d), 1/mm."""
         rows = self.gradients.copy()
         rows[..., 0] += self.over_radius
         mean = np.einsum("mq,mqia->mia", self.weights, rows) / self.volumes[:, None, None]
-        return mean.reshape(len(self.cells), -1)
+        return np.asarray(mean.reshape(len(self.cells), -1))
 
     def _scattered(self, rows: FloatArray) -> sp.csr_matrix:
         m, k = self.cells.shape
