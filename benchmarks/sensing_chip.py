@@ -12,7 +12,7 @@ from naibu.applications.sensing_chip.chip_mesh import ChipResolution
 from naibu.applications.sensing_chip.design import assumed_chip
 from naibu.applications.sensing_chip.finite_elements import solve_chip
 
-RESOLUTIONS = (ChipResolution(6, 1, 2, 2, 3), ChipResolution(8, 2, 2, 2, 3), ChipResolution(), ChipResolution(12, 2, 4, 4, 6))
+RESOLUTIONS = (ChipResolution(6, 1, 2, 2, 3), ChipResolution(8, 2, 2, 2, 3), ChipResolution(), ChipResolution(12, 2, 4, 3, 5))
 
 
 def main() -> None:
