@@ -26,6 +26,7 @@ STEP_ITERATIONS = 10  # of Newton's method within a step in pseudo-time
 RIGID_MOTION = 100.0  # extents of the body: a longer Newton step is a rigid-body motion that nothing constrains
 FIRST_DRAG = 0.02  # viscosity over the first step in pseudo-time, as a fraction of the mean diagonal of the tangent
 MOST_DRAG = 1e3  # likewise; a step so short hardly moves the body
+PATIENCE = 4  # iterations in which the residual of a step in pseudo-time must fall to half of the first
 CALM = 2  # steps in pseudo-time after a failed one that do not grow
 _COARSE = 0.01  # relative tolerance of linear solves far from equilibrium, for solvers that can make use of it
 
@@ -171,7 +172,7 @@ class Newton:
         cycles. Slowed down by a viscous drag it follows a path of which every step of implicit Euler has a solution if it is short enough;
         the steps grow with success until the drag vanishes :cite:p:`kelley1998`.
         """
-        drag, calm, budget = FIRST_DRAG, 0, self.iterations + PSEUDO_TRANSIENT_ITERATIONS
+        drag, failed, calm, budget = FIRST_DRAG, 0.0, 0, self.iterations + PSEUDO_TRANSIENT_ITERATIONS
         before, self.restless = u, None
         try:
             u = self._predicted(u, anchors, load)
@@ -179,7 +180,7 @@ class Newton:
                 begun = self.iterations
                 found = self._pseudo_step(u, anchors, load, drag)
                 if found is None:
-                    drag, calm = 4.0 * drag, CALM
+                    drag, failed, calm = 4.0 * drag, drag, CALM
                     continue
                 u, residual = found
                 if residual <= self.settings.tolerance:
@@ -187,7 +188,8 @@ class Newton:
                 calm -= 1
                 if calm <= 0:
                     taken = self.iterations - begun
-                    drag *= 0.25 if taken <= 4 else 0.5 if taken < 7 else 1.0
+                    drag *= 0.25 if taken <= 4 and 0.25 * drag > failed else 0.5 if taken < 7 else 1.0
+                    failed = 0.0 if drag < failed else failed
         except ConvergenceError:
             return None
         self.restless = u - before
@@ -196,6 +198,7 @@ class Newton:
     def _pseudo_step(self, start: FloatArray, anchors: tuple[FloatArray, ...], load: float, drag: float) -> tuple[FloatArray, float] | None:
         """Return displacement (n, 3) mm and relative residual (without the drag) after a step in pseudo-time; None where it is too long."""
         u, viscous = start, None
+        norms: list[float] = []
         for _ in range(STEP_ITERATIONS):
             residual, scale, matrix, _ = self._tangent(u, anchors, load)
             mean = float(matrix.diagonal().mean())  # contact changes it
@@ -205,6 +208,9 @@ class Newton:
             norm, static = float(np.abs(unbalanced).sum()), float(np.abs(residual).sum())
             if norm <= max(self.settings.tolerance * scale, _COARSE * static):
                 return u, static / scale
+            norms.append(norm)
+            if len(norms) == PATIENCE and norm > 0.5 * norms[0]:
+                return None
             self.iterations += 1
             step = -solved(self._factorized(matrix, viscous.stiffness / mean), unbalanced, _COARSE)
             found = self.line_search(u, step, anchors, load, unbalanced, viscous)
