@@ -144,6 +144,19 @@ def test_what_cannot_be_cut_is_refused(tmp_path: Path, text: str, options: dict[
     assert list((tmp_path / "out").glob("*")) == []
 
 
+def test_the_page_of_a_large_surface_shows_what_is_near_the_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("naibu.workflows.cut_surface.PAGE_TRIANGLES", 300)
+    done = cut_surface_file(surface_file(tmp_path), path_file(tmp_path), out=tmp_path / "out", distance_mm=2.0, tension_percent=0.0)
+    assert done.numbers["triangles"] > 512
+    text = (tmp_path / "out" / "cut.html").read_text()
+    assert "the 300 triangles nearest to the cut" in text
+    frames = json.loads(text.split('id="naibu-frames">')[1].split("</script>")[0])
+    assert len(frames["faces"]) == 900
+    at = np.array(frames["reference"]).reshape(-1, 3)
+    away = [np.linalg.norm(p[:, None] - done.cut.cut_edges.mean(axis=1), axis=2).min(axis=1).max() for p in (at, done.cut.points)]
+    assert away[0] < 0.75 * away[1]
+
+
 def test_edges_of_three_triangles_are_opened_and_said(tmp_path: Path) -> None:
     points, triangles = sheet()
     fin = np.concatenate([points, [[20.0, 20.0, 30.0]]]), np.concatenate([triangles, [[20, 21, len(points)]]])

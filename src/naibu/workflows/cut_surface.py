@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from naibu._version import __version__
 from naibu.core.arrays import FloatArray, IntArray, require_positive, require_within
@@ -29,9 +30,11 @@ from naibu.viewer.tables import Table
 from naibu.workflows.output_folder import output_folder
 
 FILES = ("cut.html", "cut.vtu", "cut.vtkhdf", "cut.json")
-FRAMES = 24
+FRAMES, LARGE_FRAMES = 24, 8
+LARGE_POINTS = 30_000  # surfaces of more have fewer frames
 FRAME_S = 0.1
 PAGE_BYTES = 24_000_000
+PAGE_TRIANGLES = 60_000  # those nearest to the cut are shown
 INSIDE = 0.5  # of the distance: tips deeper than this below the surface cut a groove
 
 
@@ -128,7 +131,7 @@ def cut_surface_file(
             f"{path}: is too short to cut anything at a distance of {distance:.3g} mm; give a longer path or a smaller distance_mm"
         )
     points, walls, wall_area = _grooved(found, groove_depth_mm, distance)
-    frames = FRAMES if tension_percent else 1
+    frames = 1 if not tension_percent else FRAMES if len(found.points) <= LARGE_POINTS else LARGE_FRAMES
     moved = np.zeros((frames + 1, len(points), 3))
     for k, displacement in enumerate(opening(found, 0.01 * tension_percent, frames=frames)):
         moved[k, : len(found.points)] = displacement
@@ -209,8 +212,16 @@ def _written(
     times = np.asarray(FRAME_S * np.arange(len(moved)), dtype=np.float64)
     write_vtkhdf_series(folder / "cut.vtkhdf", mesh, times, {"displacement_mm": moved})
     write_atomically(folder / "cut.json", json.dumps(dict(numbers), indent=1) + "\n")
-    text = motion_html(_page(found, points, triangles, numbers, times, moved), PAGE_BYTES)
+    text = motion_html(_page(found, points, _shown(found, points, triangles), numbers, times, moved), PAGE_BYTES)
     return (write_atomically(folder / "cut.html", text), *(folder / name for name in FILES[1:]))
+
+
+def _shown(found: SurfaceCut, points: FloatArray, triangles: IntArray) -> IntArray:
+    """Return the triangles that the page shows: all, or those nearest to the cut."""
+    if len(triangles) <= PAGE_TRIANGLES:
+        return triangles
+    away = cKDTree(found.cut_edges.mean(axis=1)).query(points[triangles].mean(axis=1))[0]
+    return triangles[np.sort(np.argsort(away, kind="stable")[:PAGE_TRIANGLES])]
 
 
 def _page(
@@ -228,18 +239,22 @@ def _page(
         said.append(f"No cut was found for {found.missed_mm:.3g} mm of the path.")
     if found.repairs:
         said.append(f"Before the cut: {'; '.join(found.repairs)}.")
+    if len(triangles) < numbers["triangles"]:
+        said.append(f"The page shows the {len(triangles)} triangles nearest to the cut; cut.vtkhdf has all of them.")
+    nodes, faces = np.unique(triangles, return_inverse=True)
+    moved = moved[:, nodes]
     rows = [(name.replace("_", " "), v) for name, v in numbers.items() if isinstance(v, int | float) and not isinstance(v, bool)]
     fields = [ColourField("displacement, mm", np.linalg.norm(moved, axis=2))]
     if found.n_pieces > 1:
         piece = np.zeros(len(points))
         piece[found.triangles] = found.piece[:, None]
-        fields.append(ColourField("piece, 0 the largest", np.tile(piece, (len(times), 1))))
+        fields.append(ColourField("piece, 0 the largest", np.tile(piece[nodes], (len(times), 1))))
     way = np.concatenate([tips for _, tips, _ in found.paths])
     at = way[np.rint(np.linspace(0.0, len(way) - 1, len(times))).astype(int)][:, None]
     radius = 0.01 * float(np.ptp(points, axis=0).max())
     tool = RigidShape("tip of the tool", "sphere", np.full(3, radius), np.eye(3))
     provenance = {"source": numbers["source"], "naibu": numbers["naibu"], "SHA-256": numbers["inputs_sha256"]}
     return MotionPage(
-        f"{Path(numbers['source']).name}, cut", said, times, triangles, points, moved, fields, [tool], at, np.zeros(0),
+        f"{Path(numbers['source']).name}, cut", said, times, faces.reshape(-1, 3), points[nodes], moved, fields, [tool], at, np.zeros(0),
         np.zeros((0, 1, 3)), [Table("Numbers", ("quantity", "value"), tuple(rows))], provenance,
     )  # fmt: skip
