@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import operator
+
 import numpy as np
 import pytest
 
@@ -10,7 +13,7 @@ from naibu.mechanics.finite_elements.hyperelasticity import material
 from naibu.mechanics.finite_strain.viscoelasticity import PronySeries
 from naibu.mechanics.lattices.model.state import LatticeState
 from naibu.mechanics.small_strain.rheology import three_element
-from naibu.meshing import EdgeStretch, box, rectangle, swept_blade
+from naibu.meshing import EdgeStretch, box, forest_pieces, rectangle, signed_volumes, swept_blade
 from naibu.meshing.cutting.swept_blade import SweptBlade
 from naibu.simulation import AdaptiveBody, AdaptiveLattice, Conditions, HyperelasticDynamics, LinearDynamics, SpringMaterial, weight
 from naibu.simulation.adaptive.body import BodyState
@@ -96,6 +99,24 @@ def test_a_loose_piece_falls_as_a_body_of_its_own() -> None:
     fall = 0.5 * gravity[2] * time * (time + 5e-4)  # of implicit Euler steps
     np.testing.assert_allclose(state.displacement[loose], np.tile([0.0, 0.0, fall], (int(loose.sum()), 1)), atol=1e-6 * abs(fall))
     assert np.abs(state.displacement[mesh.points[:, 0] < 1e-9]).max() == 0.0
+
+
+def test_a_blade_that_goes_on_while_the_body_swings_parts_it() -> None:
+    body = AdaptiveBody.of(block(2), DYNAMICS["hyperelastic"], Conditions(nowhere), EdgeStretch(1.02, 1.005), max_level=6, interval=3)
+    points = body.mesh.leaf.mesh.points
+    body.state = BodyState(0.0, points * [0.06, 0.0, 0.0], np.tile([0.0, 200.0, 0.0], (len(points), 1)), body.state.history)
+    poses, strips = [[[10.9, y, -5.0], [10.9, y, 30.0]] for y in np.linspace(-3.0, 27.0, 16)], []
+    for k in range(15):
+        body.step(3)
+        swept = swept_blade(poses[max(0, k - 1) : k + 2])  # from one pose before the last, as the body has moved since
+        body.cut(swept, 4.0, earlier=functools.reduce(operator.add, strips[-6:]) if strips else None)
+        strips.append(swept)
+    piece = forest_pieces(body.mesh.forest)
+    volumes = np.bincount(piece, signed_volumes(body.mesh.leaf.mesh))
+    assert len(volumes) == 2
+    assert volumes.sum() == pytest.approx(SIDE**3, rel=1e-12)
+    assert volumes.min() > 0.4 * SIDE**3
+    assert body.adaptations > 15
 
 
 def test_adaptive_lattices_are_cut_while_they_move() -> None:
