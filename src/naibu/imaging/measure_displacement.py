@@ -280,9 +280,13 @@ def _correlated(
     }
     valid = found.valid & inside
     outside = ~valid
-    vectors, gradient, covariance = found.displacement.vectors.copy(), found.gradient(), found.covariance().astype(np.float64)
-    for values in (vectors, gradient, covariance):
+    vectors, gradient = found.displacement.vectors.copy(), found.gradient()
+    for values in (vectors, gradient):
         values[outside] = np.nan
+    covariance = np.full((*valid.shape, 3, 3), np.nan)
+    for z in np.flatnonzero(valid.any(axis=(1, 2))):
+        y, x = np.nonzero(valid[z])
+        covariance[z, y, x] = found.covariance_at(found.volume.to_physical(np.stack([x, y, np.full(len(x), z)], axis=1)))
     field = DisplacementField.on_grid(reference, vectors, covariance=covariance, valid=valid)
     return MeasuredDisplacement("default", field, inside, gradient, facts=facts, warnings=_convergence_doubts(unconverged, cells))
 

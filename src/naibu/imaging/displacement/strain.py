@@ -28,6 +28,8 @@ def displacement_gradient(displacement: ArrayLike, grid: Volume) -> FloatArray:
     for c in range(3):
         if grid.shape[2 - c] > 1:
             along[..., c] = np.gradient(u, grid.spacing_mm[c], axis=2 - c)
+    if np.array_equal(grid.direction, np.eye(3)):
+        return along
     return np.asarray(along @ grid.direction.T)
 
 
