@@ -26,7 +26,7 @@ from naibu.io.files.reading import file_beside, guarded_reading, read_bytes, req
 from naibu.io.images import read_volume
 from naibu.io.lattice_study_schema import FloorTable, IndenterTable, ObjectTable, StudyFile, load_study
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter, box_indenter, cylindrical_indenter, plane_indenter, spherical_indenter
-from naibu.mechanics.lattices.model.contact_state import begin_contact
+from naibu.mechanics.lattices.model.contact_state import check_outside
 from naibu.mechanics.lattices.model.hexahedra import lattice_mesh
 from naibu.mechanics.lattices.model.lattice import CLASSES, Lattice, box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.octree import octree_lattice
@@ -245,7 +245,7 @@ def _bodies(path: Path, settings: StudyFile, lattice: Lattice) -> tuple[StudyBod
     for k, table in enumerate(settings.indenter):
         body = _indenter(table, k, settings.simulation.duration_s)
         try:
-            begin_contact(lattice, [body.indenter])
+            check_outside(lattice, [body.indenter])
         except InputError as error:
             told = re.sub(r"^indenters\[0\], an? \w+, ", "the indenter ", str(error))
             raise InputError(f"{path}: [[indenter]] number {k + 1} centre_mm = {table.centre_mm}: {told}") from error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -17,7 +17,7 @@ from naibu.mechanics.lattices.model.state import LatticeState
 from naibu.mechanics.lattices.simulation.loading_history import StudyState
 from naibu.workflows.lattice_study import PreparedStudy
 
-CONTACT_ARRAYS = ("nodes", "mode", "friction", "touched", "centres", "axes")
+CONTACT_ARRAYS = tuple(field.name for field in fields(ContactState))
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +115,7 @@ def _packed(state: StudyState, fingerprint: str, series: str) -> bytes:
 
 def _unpacked(data: dict[str, Any]) -> StudyState:
     contact = None
-    if "contact_nodes" in data:
+    if "contact_mode" in data:
         contact = ContactState(*(data[f"contact_{name}"] for name in CONTACT_ARRAYS))
     lattice = LatticeState(data["position"], data["velocity"], data["extension"], data.get("length"), contact)
     speed, external_work, unsettled = data["numbers"].tolist()

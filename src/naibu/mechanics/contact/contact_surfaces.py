@@ -129,17 +129,34 @@ def interface(
     )  # fmt: skip
 
 
-def face_quadrature(points: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return shape functions (q, k) at the quadrature points of faces, and their weights (f, q), mm2."""
+def face_quadrature(points: FloatArray, faces: IntArray, order: int = QUADRATURE_ORDER) -> tuple[FloatArray, FloatArray]:
+    """Return shape functions (q, k) at the quadrature points of faces, and their weights (f, q), mm2.
+
+    Quadrilaterals have `order` Gauss points a side; triangles three points in each of ``(order // 2)^2`` parts, at least one.
+    """
     corners = points[faces]
     if faces.shape[1] == 3:
-        shape = np.full((3, 3), 1.0 / 6.0) + 0.5 * np.eye(3)
+        shape = _triangle_points(max(order // 2, 1))
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        return shape, np.repeat(np.linalg.norm(normal, axis=1)[:, None] / 6.0, 3, axis=1)
-    nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE_ORDER)
+        area = 0.5 * np.linalg.norm(normal, axis=1)
+        return shape, np.repeat(area[:, None] / len(shape), len(shape), axis=1)
+    nodes, weights = np.polynomial.legendre.leggauss(order)
     xi, eta = (a.ravel() for a in np.meshgrid(nodes, nodes, indexing="ij"))
     weight = np.outer(weights, weights).ravel()
     signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=float)
     along, across = 1 + xi[:, None] * signs[:, 0], 1 + eta[:, None] * signs[:, 1]
     tangents = [np.einsum("qk,fki->fqi", d, corners) for d in (0.25 * signs[:, 0] * across, 0.25 * along * signs[:, 1])]
     return 0.25 * along * across, weight * np.linalg.norm(np.cross(*tangents), axis=2)
+
+
+def _triangle_points(parts: int) -> FloatArray:
+    """Return barycentric coordinates (3 parts^2, 3): the three points of degree two in every part of a divided triangle."""
+    rule = np.full((3, 3), 1.0 / 6.0) + 0.5 * np.eye(3)
+    corners = []
+    for i in range(parts):
+        for j in range(parts - i):
+            corners.append([(i, j), (i + 1, j), (i, j + 1)])
+            if i + j < parts - 1:
+                corners.append([(i + 1, j + 1), (i, j + 1), (i + 1, j)])
+    at = np.array(corners, dtype=float) / parts
+    return np.einsum("qk,tkc->tqc", rule, np.concatenate([1.0 - at.sum(axis=2, keepdims=True), at], axis=2)).reshape(-1, 3)

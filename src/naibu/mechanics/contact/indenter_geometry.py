@@ -81,6 +81,23 @@ class IndenterGeometry:
             return float(volume / area)
         return float(self.size[0])
 
+    @property
+    def curvature(self) -> float:
+        """Largest curvature of the round part of the surface, 1/mm; 0 where all is flat."""
+        return {CYLINDER: 1.0, SPHERE: 1.0, CAPSULE: 1.0}.get(self.kind, 0.0) / max(float(self.size[0]), 1e-300)
+
+    @property
+    def volume_per_area(self) -> float:
+        """Volume over area of the surface, mm: a third of the radius of a sphere, half of the thickness of a thin plate."""
+        r, length = float(self.size[0]), 2.0 * float(self.size[1])
+        if self.kind == BOX:
+            return float(0.5 / (1.0 / (2.0 * self.size)).sum())
+        if self.kind == CYLINDER:
+            return r * length / (2.0 * (r + length))
+        if self.kind == CAPSULE:
+            return r * (length + 4.0 / 3.0 * r) / (2.0 * length + 4.0 * r)
+        return {SPHERE: r / 3.0, BAR: 0.5 * r}.get(self.kind, self.inradius)
+
     def distance(self, points: ArrayLike) -> FloatArray:
         """Return the signed distances (p,), mm, of points (p, 3) in the indenter's frame; positive outside."""
         return self.distance_derivatives(points)[0]

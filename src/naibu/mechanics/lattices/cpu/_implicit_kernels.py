@@ -18,6 +18,7 @@ import numpy as np
 from naibu._numba.compilation import njit
 from naibu._numba.simd import WIDTH, inverse_root, load, single, splat, store, total
 from naibu.mechanics.lattices.cpu._coarse_kernels import begin_with, follow
+from naibu.mechanics.lattices.cpu._contact_operator import FACES, add_contact
 from naibu.mechanics.lattices.cpu._pcg_kernels import dot, multiply, project, solve
 
 _FAST = {"contract", "nsz"}
@@ -109,13 +110,13 @@ def rigid_part(x, mass, impulse, out):  # type: ignore[no-untyped-def]  # pragma
 
 
 @njit(cache=True, fastmath=_FAST)
-def settle(first, second, rows, stiff, axes, mass, constrained, x, v, r, p, q):  # type: ignore[no-untyped-def]  # pragma: no cover
+def settle(first, second, rows, stiff, axes, mass, touched, constrained, x, v, r, p, q):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Make v1 . r of free components not negative, so that the early end of the solver raises no energy; keep a free body's momenta.
 
     Returns the v1 . r that is left.
     """
     pad = len(mass)
-    free = len(constrained[0]) == 0
+    free = len(constrained[0]) == 0 and touched[5][FACES] == 0
     if free:
         rigid_part(x, mass, r, p)
         for i in range(len(v)):
@@ -134,6 +135,7 @@ def settle(first, second, rows, stiff, axes, mass, constrained, x, v, r, p, q): 
         for i in range(len(v)):
             p[i] = v[i] - q[i]
     curvature = multiply(first, second, rows, stiff, axes, mass, p, q)
+    curvature += add_contact(touched[0], touched[1], touched[5][FACES], 1.0, p, q)
     fraction = dot(p, r) / curvature if curvature > 0.0 else 0.0
     for i in range(len(v)):
         v[i] += fraction * p[i]
@@ -220,9 +222,10 @@ def new_velocity(blocks, tables, x, v, y, mass, right, work, inner, constrained,
     follow(inner[8], inner[3], constrained, False)
     r[:] = right
     add_momenta(mass, v, -1.0, r)
+    add_contact(inner[9][0], inner[9][1], inner[9][5][FACES], -1.0, v, r)
     floor = prepare(first, second, rows, tables, x, y, v, axes, inner[1], r, step) * 1e-20 / mass.max()
     count = solve(first, second, rows, tables[5], axes, mass, v, r, p, q, inner, constrained, floor, solver[0], solver[1])
-    return count, settle(first, second, rows, tables[5], axes, mass, constrained, x, v, r, p, q)
+    return count, settle(first, second, rows, tables[5], axes, mass, inner[9], constrained, x, v, r, p, q)
 
 
 @njit(cache=True, fastmath=_FAST)

@@ -12,6 +12,7 @@ import numpy as np
 from naibu._numba.compilation import njit
 from naibu._numba.simd import WIDTH, double, load, splat, store, total
 from naibu.mechanics.lattices.cpu._coarse_kernels import CREDIT, correct, gather, turn_with
+from naibu.mechanics.lattices.cpu._contact_operator import FACES, NODES, add_contact, add_preconditioned, extra_energy
 
 _FAST = {"contract", "nsz"}
 
@@ -115,10 +116,10 @@ def _scaled_square(r, smoother):  # type: ignore[no-untyped-def]  # pragma: no c
 def conjugate_gradients(first, second, rows, inner, constrained, goal, limit, helped):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Set w to about A^-1 r with constrained components zero, until the square of the residual's norm, times `smoother`, is below `goal`.
 
-    `inner` are h^2 a, axes, mass, smoother, w, r, p, q and what coarse functions need, which is used if `helped`. Returns the number of
-    iterations and whether the goal was reached or the limit.
+    `inner` are h^2 a, axes, mass, smoother, w, r, p, q, what coarse functions need, which is used if `helped`, and what contact adds to
+    the matrix. Returns the number of iterations and whether the goal was reached or the limit.
     """
-    stiff, axes, mass, smoother, w, r, p, q, coarse = inner
+    stiff, axes, mass, smoother, w, r, p, q, coarse, (corners, _, rough, nodes, inverse, counts) = inner
     kind, pad = w.dtype.type, len(mass)
     w[:] = 0
     p[:] = 0
@@ -128,19 +129,26 @@ def conjugate_gradients(first, second, rows, inner, constrained, goal, limit, he
     count = 0
     while count < limit and norm > goal:
         energy = norm
+        if counts[NODES]:
+            energy += extra_energy(nodes, inverse, counts[NODES], r)
         if helped:
             gather(coarse[0][0], coarse[1][0][0], r.reshape(3, pad), 0, pad - WIDTH)
             energy += correct(coarse)
-            if not energy > 0.0:
-                return count, False
+        if not energy > 0.0:
+            return count, False
         beta = energy / old if count else 0.0
         old = energy
         if helped:
             turn_with(coarse[0][0], coarse[1][1], p.reshape(3, pad), r.reshape(3, pad), smoother, kind(beta), 0, pad - WIDTH)
-            project(constrained, p, pad)
         else:
             _turn(p, r, smoother, kind(beta))
+        if counts[NODES]:
+            add_preconditioned(nodes, inverse, counts[NODES], r, p)
+        if helped or counts[NODES]:
+            project(constrained, p, pad)
         curvature = multiply(first, second, rows, stiff, axes, mass, p, q)
+        if counts[FACES]:
+            curvature += add_contact(corners, rough, counts[FACES], 1.0, p, q)
         if not curvature > 0.0:
             return count, False
         project(constrained, q, pad)
@@ -173,7 +181,7 @@ def solve(first, second, rows, stiff, axes, mass, v, r, p, q, inner, constrained
 
     It stops where the residual's norm fell to `tolerance` of its start or its square below `floor`. Returns the number of iterations.
     """
-    smoother, w, rough, coarse = inner[3], inner[4], inner[5], inner[8]
+    smoother, w, rough, coarse, touched = inner[3], inner[4], inner[5], inner[8], inner[9]
     norm = _norm(r, smoother, constrained)
     goal = max(tolerance**2 * norm, floor)
     count, helped = 0, len(coarse[5][2]) > 0
@@ -189,6 +197,7 @@ def solve(first, second, rows, stiff, axes, mass, v, r, p, q, inner, constrained
             p[i] = unit * w[i]
             v[i] += p[i]
         multiply(first, second, rows, stiff, axes, mass, p, q)
+        add_contact(touched[0], touched[1], touched[5][FACES], 1.0, p, q)
         for i in range(len(r)):
             r[i] -= q[i]
         norm = _norm(r, smoother, constrained)

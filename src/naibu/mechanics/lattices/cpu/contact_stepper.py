@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
-from naibu.core.arrays import AnyFloatArray, BoolArray, FloatArray, IntArray
+from naibu.core.arrays import AnyArray, FloatArray
 from naibu.mechanics.contact.indenter_geometry import GeometryArrays, packed_geometries
 from naibu.mechanics.contact.indenter_motion import SHARE, safe_fraction
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
-from naibu.mechanics.lattices.cpu._contact_kernels import FREE, contact_steps
+from naibu.mechanics.lattices.cpu._contact_kernels import contact_steps
+from naibu.mechanics.lattices.cpu._contact_operator import new_operator
+from naibu.mechanics.lattices.cpu._contact_points import COLUMNS, RESULTS
+from naibu.mechanics.lattices.cpu.scratch import KernelTuple
 from naibu.mechanics.lattices.cpu.stepper import MOST_ITERATIONS, ImplicitStepper
 from naibu.mechanics.lattices.model.contact_state import ContactState
+from naibu.mechanics.lattices.model.contact_surface import ContactSurface
 
 PASSES = 20  # solutions in a step, at most
 SECANT_STEPS = 12  # of the speed of an indenter that a force drives
+DEEP = 0.6  # volume of an indenter over its area: depth from which foundations are stiffer
 MOST_PARTS = 4096  # of a step whose indenters are fast
-SLOW = 1e-5  # spacings a step: nodes that slide more slowly stick
 
 
 @dataclass(slots=True, eq=False)
@@ -31,51 +36,65 @@ class ContactStepper:
         State of the lattice, and what its nodes are constrained to.
     contact : ContactState
         Changed in place by the steps.
+    surface : ContactSurface
+        Faces that may touch.
     geometry : tuple
         Of the indenters, as the kernels read it.
     friction : ndarray, shape (k, 2)
         Static and kinetic coefficients.
     pull : ndarray, shape (k, 3)
         K_r, C_r and V_t of pull-off.
-    slow : float
-        Slip velocity, mm/s, below which nodes stick.
+    form : ndarray, shape (k, 2)
+        Curvature, 1/mm, and the depth, mm, from which foundations are stiffer.
     passes : int
         Most solutions in a step.
     indenters : tuple of RigidIndenter
         As they were made.
     divided : callable
         Returns a stepper of the same arrays whose steps are shorter by a whole number.
+    points : tuple
+        Nodes of the faces, inverse areas, shape functions and weights, and where those of each indenter begin.
+    scratch : tuple
+        Of the kernels.
     """
 
     base: ImplicitStepper
     contact: ContactState
+    surface: ContactSurface
     geometry: GeometryArrays
     friction: FloatArray
     pull: FloatArray
-    slow: float
+    form: FloatArray
     passes: int
     indenters: tuple[RigidIndenter, ...]
     divided: Callable[[ImplicitStepper, int], ImplicitStepper]
+    points: KernelTuple
+    scratch: KernelTuple
     _finer: dict[int, ImplicitStepper] = field(default_factory=dict)
+    _foundation: dict[int, FloatArray] = field(default_factory=dict)
 
     @classmethod
     def of(
-        cls, base: ImplicitStepper, indenters: Sequence[RigidIndenter], contact: ContactState, spacing_mm: float,
+        cls, base: ImplicitStepper, indenters: Sequence[RigidIndenter], contact: ContactState, surface: ContactSurface,
         divided: Callable[[ImplicitStepper, int], ImplicitStepper], passes: int = PASSES,
     ) -> ContactStepper:  # fmt: skip
         """Put indenters beside a lattice; the contact state is copied."""
-        own = ContactState(*(getattr(contact, name).copy() for name in ("nodes", "mode", "friction", "touched", "centres", "axes")))
         friction = np.array([(p.static_friction, p.kinetic_friction) for p in indenters])
         pull = np.array([(p.pull_stiffness, p.pull_damping, p.pull_speed) for p in indenters])
-        geometry = packed_geometries([p.geometry for p in indenters])
-        return cls(base, own, geometry, friction, pull, SLOW * spacing_mm / base.step, passes, tuple(indenters), divided)
+        form = np.array([(p.geometry.curvature, DEEP * p.geometry.volume_per_area) for p in indenters])
+        geometry, own = packed_geometries([p.geometry for p in indenters]), contact.copied()
+        points = _points(surface, own)
+        scratch = _scratch(len(surface.faces), len(indenters), len(own.mode), len(base.mass))
+        stepper = cls(base, own, surface, geometry, friction, pull, form, passes, tuple(indenters), divided, points, scratch)
+        stepper._look_everywhere()
+        return stepper
 
     def advance(
         self, held_velocity: FloatArray, velocity: FloatArray, spin: FloatArray, reactions: tuple[FloatArray, FloatArray]
     ) -> tuple[int, int, int]:
         """Take len(velocity) steps; return iterations, passes and the steps whose contacts did not settle.
 
-        A step in which an indenter would pass through nodes is taken in shorter ones.
+        A step in which an indenter would pass through the surface is taken in shorter ones.
 
         Parameters
         ----------
@@ -89,22 +108,23 @@ class ContactStepper:
         allowed = SHARE * np.array([p.geometry.inradius for p in self.indenters])
         ways = self.base.step * np.linalg.norm(velocity, axis=2)
         if not spin.any() and (ways <= allowed).all():
-            return self._taken(self.base, held_velocity, velocity, spin, reactions)
+            return self._taken(self.base, 1, held_velocity, velocity, spin, reactions)
         found = np.zeros(3, dtype=np.int64)
         for n in range(len(velocity)):
             parts = self._parts(velocity[n], spin[n], allowed)
             own = [np.repeat(motion[n : n + 1], parts, axis=0) for motion in (held_velocity, velocity, spin)]
             forces = (np.empty_like(own[0]), np.empty_like(own[1]))
-            taken = self._taken(self._finer_by(parts), own[0], own[1], own[2], forces)
+            taken = self._taken(self._finer_by(parts), parts, own[0], own[1], own[2], forces)
             found += (taken[0], taken[1], min(taken[2], 1))
             for whole, pieces in zip(reactions, forces, strict=True):
                 whole[n] = pieces.mean(axis=0)
         return int(found[0]), int(found[1]), int(found[2])
 
     def _parts(self, velocity: FloatArray, spin: FloatArray, allowed: FloatArray) -> int:
-        """Parts of a step, a power of two, in each of which no indenter passes through nodes."""
+        """Parts of a step, a power of two, in each of which no indenter passes through the surface."""
         base, contact, duration = self.base, self.contact, self.base.step
-        points = base.position.reshape(3, -1)[:, contact.nodes].T.astype(np.float64)
+        corners = base.position.reshape(3, -1)[:, self.points[0]].transpose(1, 2, 0)
+        points = np.concatenate([corners.reshape(-1, 3), corners.mean(axis=1)])
         turn = duration * spin
         arms = np.array([np.linalg.norm(points - centre, axis=1).max() for centre in contact.centres])
         ways = duration * np.linalg.norm(velocity, axis=1) + np.linalg.norm(turn, axis=1) * arms
@@ -125,49 +145,74 @@ class ContactStepper:
         return self._finer[parts]
 
     def _taken(
-        self, base: ImplicitStepper, held_velocity: FloatArray, velocity: FloatArray, spin: FloatArray,
+        self, base: ImplicitStepper, parts: int, held_velocity: FloatArray, velocity: FloatArray, spin: FloatArray,
         reactions: tuple[FloatArray, FloatArray],
     ) -> tuple[int, int, int]:  # fmt: skip
         """Take steps of a stepper that shares the state."""
         contact = self.contact
-        free = ~np.isin(contact.nodes, base.constrained[0])  # constrained nodes are in no contact
-        contact.mode[~free] = FREE
-        contact.friction[~free] = 0.0
-        history = (contact.mode[free], contact.friction[free], contact.touched[free])
-        indenters = ((self.geometry, contact.axes), contact.centres, self.friction, self.pull, contact.nodes[free])
+        if parts not in self._foundation:
+            self._foundation[parts] = self.surface.foundation(base.step)
+        history = (contact.mode, contact.touched, contact.compression, contact.extension, contact.friction, contact.multiplier)
+        indenters = ((self.geometry, contact.axes), contact.centres, self.friction, self.pull, self.form)
+        corners, spread, *rest = self.points
         (blocks, tables), (work, inner) = base.kernel, base.scratch
+        operator, *scratch = self.scratch
         for values in reactions:
             values[:] = 0.0
         found: tuple[int, int, int] = contact_steps(
-            blocks, tables, (base.position, base.velocity, base.extension, base.length), base.mass, base.external, work, inner, indenters,
-            history, base.constrained, (held_velocity, velocity, spin), base.step, (base.tolerance, MOST_ITERATIONS), reactions,
-            (self.passes, self.slow * self.base.step / base.step),
+            blocks, tables, (base.position, base.velocity, base.extension, base.length), base.mass, base.external, work,
+            (*inner[:9], operator), indenters, (corners, spread, self._foundation[parts], *rest), history, tuple(scratch),
+            base.constrained, (held_velocity, velocity, spin), base.step, (base.tolerance, MOST_ITERATIONS), reactions, self.passes,
         )  # fmt: skip
-        contact.mode[free], contact.friction[free], contact.touched[free] = history
         return found
 
-    def saved(self) -> tuple[AnyFloatArray | IntArray | BoolArray, ...]:
+    def _look_everywhere(self) -> None:
+        """Forget how far indenters are from faces, and find the faces that hold something of a contact."""
+        contact, (_, _, clear, moved, live) = self.contact, self.scratch[1]
+        clear[:], moved[:] = -np.inf, 0.0
+        some = (contact.mode > 0) | (contact.compression != 0.0) | contact.touched
+        for k, (low, high) in enumerate(pairwise(contact.first)):
+            live[k] = some[low:high].reshape(len(live[k]), -1).any(axis=1)
+
+    def saved(self) -> tuple[AnyArray, ...]:
         """Return copies of all that steps change, for `put_back`."""
         return tuple(array.copy() for array in self._changing())
 
-    def put_back(self, saved: tuple[AnyFloatArray | IntArray | BoolArray, ...]) -> None:
+    def put_back(self, saved: tuple[AnyArray, ...]) -> None:
         """Undo the steps since `saved`."""
         for array, old in zip(self._changing(), saved, strict=True):
             array[...] = old
+        self._look_everywhere()
 
-    def _changing(self) -> tuple[AnyFloatArray | IntArray | BoolArray, ...]:
+    def _changing(self) -> tuple[AnyArray, ...]:
         base, contact = self.base, self.contact
         assert base.length is not None  # as of all implicit steps
         lattice = (base.position, base.velocity, base.extension, base.length)
-        return (*lattice, contact.mode, contact.friction, contact.touched, contact.centres, contact.axes)
+        history = (contact.mode, contact.touched, contact.compression, contact.extension, contact.friction, contact.multiplier)
+        return (*lattice, *history, contact.centres, contact.axes)
 
-    def copied_contact(self) -> ContactState:
-        """Return a copy of the state of the contacts."""
-        contact = self.contact
-        return replace(
-            contact, mode=contact.mode.copy(), friction=contact.friction.copy(), touched=contact.touched.copy(),
-            centres=contact.centres.copy(), axes=contact.axes.copy(),
-        )  # fmt: skip
+
+def _points(surface: ContactSurface, contact: ContactState) -> KernelTuple:
+    """Return nodes of faces, inverse areas, shape functions with inverse thickness, weights, and where those of each indenter begin."""
+    rules = [surface.quadrature(int(own)) for own in contact.order]
+    rule = np.concatenate([[0], np.cumsum([len(shape) for shape, _ in rules])]).astype(np.int64)
+    shape = np.concatenate([shape for shape, _ in rules])
+    shapes = np.ascontiguousarray(np.column_stack([shape, 1.0 / surface.compliance(shape)]))
+    weights = np.concatenate([weight.ravel() for _, weight in rules])
+    return np.ascontiguousarray(surface.nodes), surface.spread, shapes, weights, contact.first, rule
+
+
+def _scratch(faces: int, indenters: int, points: int, pad: int) -> KernelTuple:
+    """Return an empty operator, what `near_faces` lists, linearized points and what they exert, which slide, slots and diagonal blocks."""
+    pairs = faces * indenters
+    lists = (
+        np.zeros(pairs, np.int64), np.zeros(pairs, np.int64), np.zeros((indenters, faces)), np.zeros(indenters),
+        np.zeros((indenters, faces), np.bool_),
+    )  # fmt: skip
+    exerted = (np.zeros((points, COLUMNS)), np.zeros((points, RESULTS)))
+    slots = min(4 * faces, pad)
+    operator = new_operator(pairs, slots)
+    return operator, lists, exerted, np.zeros(points, np.bool_), np.full(pad, -1, np.int64), np.zeros((slots, 3, 3)), np.zeros((3, indenters, pad))
 
 
 @dataclass(slots=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numba
@@ -19,6 +19,7 @@ from naibu.mechanics.lattices.cpu.element_blocks import Blocks, explicit_kernel,
 from naibu.mechanics.lattices.cpu.scratch import KernelTuple, Scratch, ScratchPool
 from naibu.mechanics.lattices.cpu.session import LatticeSession
 from naibu.mechanics.lattices.cpu.stepper import ExplicitStepper, ImplicitStepper, Stepper
+from naibu.mechanics.lattices.model.contact_surface import ContactSurface
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters, require_positive
 from naibu.mechanics.lattices.model.state import (
     STEP_S,
@@ -76,6 +77,7 @@ class LatticeEngine:
     kernel: KernelTuple
     mass: AnyFloatArray
     scratch: ScratchPool
+    _surface: list[ContactSurface] = field(default_factory=list, repr=False)
 
     @classmethod
     def of(
@@ -216,6 +218,12 @@ class LatticeEngine:
         own = scratch or self.scratch.made()
         return ImplicitStepper(x, v, y, self.stored_lengths(state), self.kernel, own, external, self.step, self.mass, self.tolerance)
 
+    def surface(self) -> ContactSurface:
+        """Return the faces that indenters may touch; found when they are first asked for."""
+        if not self._surface:
+            self._surface.append(ContactSurface.of(self.lattice, self.parameters))
+        return self._surface[0]
+
     def divided(self, stepper: ImplicitStepper, parts: int) -> ImplicitStepper:
         """Return a stepper of the same arrays whose steps are shorter by a whole number."""
         kernel, scratch = implicit_kernel(self.lattice, self.parameters, self.step / parts, self.blocks, self.mass)
@@ -333,4 +341,4 @@ def with_parameters(engine: LatticeEngine, parameters: LatticeParameters) -> Lat
     precision: Literal["double", "single"] = "single" if engine.mass.dtype == np.float32 else "double"
     _check(engine.lattice, parameters, engine.step, engine.method, precision, engine.tolerance, engine.threads)
     kernel, scratch = _kernel(engine.lattice, parameters, engine.step, engine.method, engine.blocks, engine.mass, engine.threads)
-    return replace(engine, parameters=parameters, kernel=kernel, scratch=scratch)
+    return replace(engine, parameters=parameters, kernel=kernel, scratch=scratch, _surface=[])

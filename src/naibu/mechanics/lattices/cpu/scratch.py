@@ -11,6 +11,7 @@ import numpy as np
 
 from naibu._numba.simd import aligned
 from naibu.core.arrays import AnyArray, AnyFloatArray
+from naibu.mechanics.lattices.cpu._contact_operator import new_operator
 
 KernelTuple = tuple[Any, ...]  # arrays and numbers as kernels take them, in nested tuples, whose types Numba works out
 Scratch = tuple[KernelTuple, KernelTuple]
@@ -64,7 +65,8 @@ class ScratchPool:
         work = (aligned((3, self.places), float), *(aligned((3 * pad,), float) for _ in range(3)))
         vectors = tuple(aligned((3 * pad,), single) for _ in range(4))
         own = (_copied(self.light), _copied(self.smoother))
-        return work, (self.table, aligned((3, self.places), single), *own, *vectors, _copied_tuple(self.coarse))
+        inner = (self.table, aligned((3, self.places), single), *own, *vectors, _copied_tuple(self.coarse), new_operator(0, 0))
+        return work, inner
 
     def __getstate__(self) -> tuple[AnyFloatArray, AnyFloatArray, AnyFloatArray, KernelTuple, int]:
         """Leave out the sets: another process makes its own."""

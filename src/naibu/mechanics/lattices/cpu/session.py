@@ -20,6 +20,7 @@ from naibu.mechanics.contact.session_protocol import StepForces
 from naibu.mechanics.lattices.cpu.contact_stepper import ContactStepper, DrivenIndenter
 from naibu.mechanics.lattices.cpu.stepper import ImplicitStepper, Stepper
 from naibu.mechanics.lattices.model.contact_state import begin_contact
+from naibu.mechanics.lattices.model.contact_surface import ContactSurface
 from naibu.mechanics.lattices.model.lattice import Lattice
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState, Method, checked_velocity, require_constrained
 
@@ -53,6 +54,9 @@ class SteppedEngine(Protocol):
 
     def check(self, stepper: Stepper, steps: int) -> None:
         """Check that explicit steps did not diverge."""
+
+    def surface(self) -> ContactSurface:
+        """Return the faces that indenters may touch."""
 
     def divided(self, stepper: ImplicitStepper, parts: int) -> ImplicitStepper:
         """Return a stepper of the same arrays whose steps are shorter by a whole number."""
@@ -230,7 +234,7 @@ class LatticeSession:
         """
         self._check()
         found = self.engine.state(self.stepper)
-        return found if self._contact is None else replace(found, contact=self._contact.copied_contact())
+        return found if self._contact is None else replace(found, contact=self._contact.contact.copied())
 
     def restore(self, state: LatticeState) -> None:
         """Go on from a state, with the same constraints and indenters.
@@ -270,8 +274,9 @@ class LatticeSession:
         lattice, stepper = self.engine.lattice, self.stepper
         if not isinstance(stepper, ImplicitStepper):
             raise InputError(f"contact needs method='implicit', which is stable when nodes stop at an indenter, not {self.engine.method!r}")
-        known = state.contact if state is not None and state.contact is not None else begin_contact(lattice, indenters, self.positions())
-        self._contact = ContactStepper.of(stepper, indenters, known, lattice.spacing_mm, self.engine.divided)
+        known, surface = None if state is None else state.contact, self.engine.surface()
+        known = known or begin_contact(lattice, surface, indenters, self.positions())
+        self._contact = ContactStepper.of(stepper, indenters, known, surface, self.engine.divided)
         self.indenters, self._speed, self._largest_force = tuple(indenters), np.zeros((len(indenters), 3)), 0.0
 
     def _advance(self, reaction: FloatArray) -> None:
@@ -322,8 +327,8 @@ class LatticeSession:
 
 def _require_indenters(state: LatticeState, indenters: Sequence[RigidIndenter]) -> None:
     """Refuse a state whose contacts are those of other indenters: nothing is left out silently."""
-    if state.contact is not None and state.contact.mode.shape[1] != len(indenters):
+    if state.contact is not None and state.contact.indenters != len(indenters):
         raise InputError(
-            f"state is in contact with {state.contact.mode.shape[1]} indenters, and indenters has {len(indenters)}; give those of the "
+            f"state is in contact with {state.contact.indenters} indenters, and indenters has {len(indenters)}; give those of the "
             "state, or its copy without contact: dataclasses.replace(state, contact=None)"
         )

@@ -1,64 +1,72 @@
-"""State of the contact of a lattice with rigid indenters: which nodes stick, slide, or once touched which indenter."""
+"""State of the contact of a lattice with rigid indenters, at the quadrature points of its faces."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from naibu.core.arrays import BoolArray, FloatArray, IntArray
+from naibu.core.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from naibu.core.errors import InputError
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
+from naibu.mechanics.lattices.model.contact_surface import ContactSurface, contact_faces
 from naibu.mechanics.lattices.model.lattice import Lattice
 
-TOUCH_MM = 1e-6  # gap below which a node counts as touching at the start
+TOUCH_MM = 1e-6  # gap below which a point counts as touching at the start
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContactState:
     """State of the contact between a lattice and its indenters.
 
+    The points are the quadrature points of all faces, those of the first indenter first, then face by face.
+
     Attributes
     ----------
-    nodes : ndarray, shape (c,), int64
-        Nodes that may touch.
-    mode : ndarray, shape (c, indenters), int64
+    order : ndarray, shape (indenters,), int64
+        Quadrature order of the faces for each indenter.
+    first : ndarray, shape (indenters + 1,), int64
+        Where the points of each indenter begin, and how many there are.
+    mode : ndarray, shape (p,), int8
         0 free, 1 sticking, 2 sliding.
-    friction : ndarray, shape (c, indenters, 3)
-        Friction on sliding nodes, mN.
-    touched : ndarray, shape (c, indenters), bool
-        Whether the node ever touched the indenter, so that pull-off acts when it leaves slowly.
+    touched : ndarray, shape (p,), bool
+        Whether the point ever touched the indenter, so that pull-off acts when it leaves slowly.
+    compression, extension : ndarray, shape (p,)
+        Of the foundation of each point (see `ContactSurface`), and of its Voigt part, mm.
+    friction : ndarray, shape (p, 3)
+        Traction of friction on the lattice, kPa.
+    multiplier : ndarray, shape (indenters, n)
+        Pressure at the nodes, kPa, that the foundation between them need not carry.
     centres : ndarray, shape (indenters, 3)
         Reference points of the indenters, mm.
     axes : ndarray, shape (indenters, 3, 3)
         Axes of the indenters, in rows.
     """
 
-    nodes: IntArray
-    mode: IntArray
-    friction: FloatArray
+    order: IntArray
+    first: IntArray
+    mode: Int8Array
     touched: BoolArray
+    compression: FloatArray
+    extension: FloatArray
+    friction: FloatArray
+    multiplier: FloatArray
     centres: FloatArray
     axes: FloatArray
 
+    @property
+    def indenters(self) -> int:
+        """Number of indenters."""
+        return len(self.centres)
 
-def begin_contact(
-    lattice: Lattice, indenters: Sequence[RigidIndenter], position: FloatArray | None = None, nodes: ArrayLike | None = None
-) -> ContactState:
-    """Return the contact of a lattice with indenters before anything moves: nodes on an indenter's surface touch it, the others are free.
+    def copied(self) -> ContactState:
+        """Return a copy of all arrays."""
+        return replace(self, **{field.name: getattr(self, field.name).copy() for field in fields(self)})
 
-    Parameters
-    ----------
-    lattice : Lattice
-        Nodes and elements.
-    indenters : sequence of RigidIndenter
-        Floors included.
-    position : ndarray, shape (n, 3)
-        Of the nodes, mm; by default those of the reference configuration.
-    nodes : array_like
-        Nodes that may touch; by default those on the surface, all where the lattice names none.
+
+def check_outside(lattice: Lattice, indenters: Sequence[RigidIndenter], position: FloatArray | None = None) -> None:
+    """Check that indenters begin outside of a lattice.
 
     Raises
     ------
@@ -67,21 +75,50 @@ def begin_contact(
     """
     if not indenters:
         raise InputError("indenters is empty; give at least a floor")
-    if nodes is None:
-        chosen = np.flatnonzero(lattice.surface_node) if lattice.surface_node.any() else np.arange(lattice.n_nodes)
-    else:
-        chosen = np.asarray(nodes, dtype=np.int64)
     points = lattice.points if position is None else position
-    gaps = np.stack([indenter.gap(points[chosen]) for indenter in indenters], axis=1)
     middles = points[lattice.elements].mean(axis=1)  # a small indenter may lie between the nodes
+    at = np.concatenate([points[np.unique(contact_faces(lattice))], middles])
     for k, indenter in enumerate(indenters):
-        inside = np.append(gaps[:, k], indenter.gap(middles))
+        inside = indenter.gap(at)
         if inside.min() < -TOUCH_MM:
-            at = np.concatenate([points[chosen], middles])[int(np.argmin(inside))]
+            deepest = at[int(np.argmin(inside))]
             raise InputError(
-                f"indenters[{k}], a {indenter.geometry.name}, begins inside the object: ({at[0]:.4g}, {at[1]:.4g}, {at[2]:.4g}) mm lies "
-                f"{-inside.min():.4g} mm deep in it; move it back by that"
+                f"indenters[{k}], a {indenter.geometry.name}, begins inside the object: ({deepest[0]:.4g}, {deepest[1]:.4g}, "
+                f"{deepest[2]:.4g}) mm lies {-inside.min():.4g} mm deep in it; move it back by that"
             )
-    mode = np.where(gaps < TOUCH_MM, [2 if p.static_friction == 0.0 else 1 for p in indenters], 0).astype(np.int64)
+
+
+def begin_contact(
+    lattice: Lattice, surface: ContactSurface, indenters: Sequence[RigidIndenter], position: FloatArray | None = None
+) -> ContactState:
+    """Return the contact of a lattice with indenters before anything moves: points on an indenter's surface touch it, the others are free.
+
+    Parameters
+    ----------
+    lattice : Lattice
+        Nodes and elements.
+    surface : ContactSurface
+        Its faces.
+    indenters : sequence of RigidIndenter
+        Floors included.
+    position : ndarray, shape (n, 3)
+        Of the nodes, mm; by default those of the reference configuration.
+
+    Raises
+    ------
+    InputError
+        What `check_outside` refuses.
+    """
+    check_outside(lattice, indenters, position)
+    points = lattice.points if position is None else position
+    order = np.array([surface.order(p.geometry) for p in indenters], dtype=np.int64)
+    gaps = []
+    for indenter, own in zip(indenters, order, strict=True):
+        shape, _ = surface.quadrature(int(own))
+        gaps.append(indenter.gap(np.einsum("qk,fki->fqi", shape, points[surface.nodes]).reshape(-1, 3)))
+    gap, first = np.concatenate(gaps), np.cumsum([0, *(len(g) for g in gaps)]).astype(np.int64)
+    touched, none, at_node = gap < TOUCH_MM, np.zeros(len(gap)), np.zeros((len(indenters), lattice.n_nodes))
     centres, axes = np.array([p.centre for p in indenters], dtype=float), np.array([p.geometry.axes for p in indenters], dtype=float)
-    return ContactState(chosen, mode, np.zeros((*mode.shape, 3)), mode > 0, centres, axes)
+    return ContactState(
+        order, first, touched.astype(np.int8), touched, none, none.copy(), np.zeros((len(gap), 3)), at_node, centres, axes,
+    )  # fmt: skip

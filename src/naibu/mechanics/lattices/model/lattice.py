@@ -49,6 +49,9 @@ class Lattice:
         classic lattice does: see `naibu.mechanics.lattices.model.octree.octree_lattice`. One in classic lattices.
     cells : ndarray, shape (c, 8), int64, optional
         Nodes of the cubes in VTK's order of a hexahedron; None of lattices of any other shape.
+    faces : ndarray, shape (f, 3) or (f, 4), int64, optional
+        Outer faces that may come into contact, counter-clockwise seen from outside; None: those of the cells, or single nodes where there
+        are none.
     frame : RigidTransform
         From `points` to the frame of the scanner, in which results are written; the identity where there was no scan.
     """
@@ -64,6 +67,7 @@ class Lattice:
     scale: FloatArray
     cells: IntArray | None = None
     frame: RigidTransform = field(default_factory=RigidTransform.identity)
+    faces: IntArray | None = None
 
     @property
     def n_nodes(self) -> int:

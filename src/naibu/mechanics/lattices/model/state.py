@@ -163,7 +163,7 @@ def require_no_contact(state: LatticeState) -> None:
     """
     if state.contact is not None:
         raise InputError(
-            f"state is in contact with {state.contact.mode.shape[1]} indenters, which these steps leave out; go on by a session or "
+            f"state is in contact with {state.contact.indenters} indenters, which these steps leave out; go on by a session or "
             "`push`, or drop the contact: dataclasses.replace(state, contact=None)"
         )
 

@@ -1,6 +1,8 @@
-"""The triangulated surface of a lattice, from the faces of its cubes."""
+"""The surface of a lattice, from the faces of its cubes."""
 
 from __future__ import annotations
+
+import numpy as np
 
 from naibu.core.arrays import IntArray
 from naibu.mechanics.contact.triangle_tree import TriangleTree
@@ -29,3 +31,15 @@ def surface_triangles(lattice: Lattice) -> IntArray:
     """
     cells, faces = require_cubes(lattice), cube_faces(lattice)
     return faces.triangles(cells, faces.outer())
+
+
+def surface_faces(lattice: Lattice) -> IntArray:
+    """Return the outer faces (f, 4) of a lattice's cubes, counterclockwise seen from outside.
+
+    Raises
+    ------
+    InputError
+        A lattice without cubes.
+    """
+    pairs = surface_triangles(lattice).reshape(-1, 2, 3)  # a, b, c and a, c, d of every face
+    return np.concatenate([pairs[:, 0], pairs[:, 1, 2:]], axis=1)

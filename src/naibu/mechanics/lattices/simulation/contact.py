@@ -164,14 +164,15 @@ def _begun(
         raise InputError(f"contact needs method='implicit', which is stable when nodes stop at an indenter, not {engine.method!r}")
     if passes < 1:
         raise InputError(f"passes must be at least 1, not {passes}")
-    known = state.contact or begin_contact(engine.lattice, indenters, state.position)
-    if known.mode.shape[1] != len(indenters):
-        raise InputError(f"state is in contact with {known.mode.shape[1]} indenters, and there are {len(indenters)}")
+    surface = engine.surface()
+    known = state.contact or begin_contact(engine.lattice, surface, indenters, state.position)
+    if known.indenters != len(indenters):
+        raise InputError(f"state is in contact with {known.indenters} indenters, and there are {len(indenters)}")
     base = engine.stepper(state, external_force, scratch)
     assert isinstance(base, ImplicitStepper)
     none = ConstrainedNodes.none()
     base.constrain((none.node, none.direction, none.weight, none.body), 0)
-    return ContactStepper.of(base, indenters, known, engine.lattice.spacing_mm, engine.divided, passes)
+    return ContactStepper.of(base, indenters, known, surface, engine.divided, passes)
 
 
 def _motion(

@@ -13,7 +13,8 @@ from naibu.core.errors import InputError
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.contact.session_protocol import Engine, Session
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
-from naibu.mechanics.lattices.model.contact_state import TOUCH_MM, begin_contact
+from naibu.mechanics.lattices.model.contact_state import TOUCH_MM, begin_contact, check_outside
+from naibu.mechanics.lattices.model.contact_surface import ContactSurface
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState, Method
 from naibu.mechanics.lattices.simulation.contact import push, push_by_force
@@ -201,7 +202,7 @@ def tied_nodes(lattice: Lattice, bodies: tuple[StudyBody, ...]) -> tuple[IntArra
     free = np.ones(lattice.n_nodes, dtype=bool)
     found = []
     for body in bodies:
-        begin_contact(lattice, [body.indenter])
+        check_outside(lattice, [body.indenter])
         touched = np.abs(body.indenter.gap(lattice.points)) < TOUCH_MM
         if not touched.any():
             nearest = float(body.indenter.gap(lattice.points).min())
@@ -236,7 +237,7 @@ def check_study(study: LatticeStudy) -> None:
     moving = [body.name for body in study.bodies if body.drive is None and body.motion is not None]
     if driven and moving:
         raise InputError(f"{', '.join(moving)} cannot move while {driven[0].name} is driven by a force")
-    begin_contact(study.lattice, [body.indenter for body in study.bodies])
+    check_outside(study.lattice, [body.indenter for body in study.bodies])
 
 
 def begin_study(study: LatticeStudy) -> StudyState:
@@ -251,7 +252,7 @@ def begin_study(study: LatticeStudy) -> StudyState:
     indenters = [body.indenter for body in study.bodies]
     state = LatticeState(study.lattice.points.copy(), np.zeros_like(study.lattice.points), np.zeros(study.lattice.n_elements))
     if not study.tied:
-        state = replace(state, contact=begin_contact(study.lattice, indenters))
+        state = replace(state, contact=begin_contact(study.lattice, ContactSurface.of(study.lattice, study.parameters), indenters))
     positions = np.array([p.centre for p in indenters], dtype=float).reshape(-1, 3)
     return StudyState(0, state, 0.0, positions, np.zeros(len(indenters)), 0.0, 0)
 

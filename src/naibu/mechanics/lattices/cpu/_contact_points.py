@@ -1,0 +1,414 @@
+"""Contact at the quadrature points of faces: pressure of the foundation, friction, their linearization, and what a step leaves behind.
+
+A point stands for a cell of its face, over which the gap changes by its slope; W is the mean depth of the part of the cell that the
+indenter covers, its fraction c. The foundation of the cell is compressed by ``dw = W - w0`` in a step. With the multiplier p' of
+the nodes at the end of the step before the pressure is ``p = max(0, a dw + b y0 + c p')``: an augmented Lagrangian :cite:p:`simo1992` whose
+multiplier lives at the nodes, as far as the indenter covers what lies around them. An indenter that is large
+beside the faces thus leaves no penetration; to a small one the foundation yields, as the solid does between the nodes. Friction follows by a return mapping of ``t0 - k_t h (slip velocity)`` to
+``|t| <= mu p``. In a pass, points in contact have the pressure and the friction that are linear in the velocity, the latter with the ratio
+of the return mapping of the pass before: the matrix stays symmetric and positive, and no friction turns a point round.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from naibu._numba.compilation import njit
+from naibu.mechanics.contact._geometry_kernels import mesh_of, signed_distance
+from naibu.mechanics.lattices.cpu._contact_operator import FACES
+
+FREE, STICK, SLIDE = range(3)
+TANGENTIAL = 8.0  # stiffness of a point before it slips, of that along the normal
+MARGIN = 0.25  # of the radius of a face, by which it may be off what was foreseen
+GONE = 1e-9  # compression of a foundation that counts as none, mm
+HARD = 20.0  # how many times the foundation is stiffer where an indenter is deep in it
+LEAST_SLOPE = 1e-3  # of a gap over a cell
+WIDTH = 0.75  # of a cell, over the root of its area: Gauss points lie nearer to the edge of a face than their cells are wide
+# columns of what is kept of a linearized point: normal, pressure and friction at no slip, drags along the normal (kPa s/mm) and across,
+# velocity of the indenter, fraction of the cell that is covered
+NORMAL, PRESSURE, FRICTION, STIFF, DRAG, SURFACE, ACTIVE, COLUMNS = 0, 3, 4, 7, 8, 9, 12, 13
+# columns of what it exerts: force, friction, pressure, covered fraction, pressure besides the multiplier
+FORCE, TANGENT, ALONG, TOUCHING, OWN, RESULTS = 0, 3, 6, 7, 8, 9
+
+
+@njit(cache=True)
+def near_faces(x, v, step, indenters, motion, surface, lists):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """List the faces that indenters may touch in this step, or that still hold what they left there; return how many there are.
+
+    `x` are the positions before the step, from where nodes go on with v; `lists` indenter and face of every entry, clearances (k, f), how
+    far things moved since these were found (k,), and which faces hold something (k, f).
+    """
+    (geometry, axes), centres, _, _, _ = indenters
+    velocity, spin = motion
+    corners = surface[0]
+    body, face, clear, moved, live = lists
+    pad, count = len(x) // 3, 0
+    fastest = 0.0
+    for i in range(pad):
+        fastest = max(fastest, v[i] ** 2 + v[pad + i] ** 2 + v[2 * pad + i] ** 2)
+    for k in range(len(centres)):
+        fastest = max(fastest, velocity[k, 0] ** 2 + velocity[k, 1] ** 2 + velocity[k, 2] ** 2)
+    c, d, q, n, none = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty((0, 0))
+    for k in range(len(centres)):
+        turns = spin[k, 0] != 0.0 or spin[k, 1] != 0.0 or spin[k, 2] != 0.0
+        moved[k] = 0.0 if turns else moved[k] + 2.0 * step * np.sqrt(fastest)
+        mesh = mesh_of(geometry, k)
+        for f in range(len(corners)):
+            if not turns and clear[k, f] > moved[k] and not live[k, f]:
+                continue
+            for a in range(3):
+                c[a] = 0.0
+                for m in range(4):
+                    c[a] += 0.25 * (x[a * pad + corners[f, m]] + step * v[a * pad + corners[f, m]])
+                d[a] = c[a] - centres[k, a]
+            radius = 0.0
+            for m in range(4):
+                away = 0.0
+                for a in range(3):
+                    away += (x[a * pad + corners[f, m]] + step * v[a * pad + corners[f, m]] - c[a]) ** 2
+                radius = max(radius, away)
+            for a in range(3):
+                q[a] = axes[k, a, 0] * d[0] + axes[k, a, 1] * d[1] + axes[k, a, 2] * d[2]
+            free = signed_distance(geometry[0][k], geometry[1][k], mesh, q, n, none) - (1.0 + MARGIN) * np.sqrt(radius)
+            clear[k, f] = free + moved[k]
+            if free <= 0.0 or live[k, f]:
+                body[count], face[count] = k, f
+                count += 1
+    return count
+
+
+@njit(cache=True)
+def _gap(geometry, mesh, axes, k, d, q, m, n, none):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return the gap of a point at d (3,) from the reference point of indenter k, and set its outward normal n; q and m are scratch."""
+    for a in range(3):
+        q[a] = axes[k, a, 0] * d[0] + axes[k, a, 1] * d[1] + axes[k, a, 2] * d[2]
+    gap = signed_distance(geometry[0][k], geometry[1][k], mesh, q, m, none)
+    for a in range(3):
+        n[a] = axes[k, 0, a] * m[0] + axes[k, 1, a] * m[1] + axes[k, 2, a] * m[2]
+    return gap
+
+
+@njit(cache=True)
+def _gather(x, v, step, nodes, at, speed):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set at and speed (4, 3) to the positions after the step and the velocities of the nodes (4,) of a face."""
+    pad = len(x) // 3
+    for c in range(4):
+        for a in range(3):
+            speed[c, a] = v[a * pad + nodes[c]]
+            at[c, a] = x[a * pad + nodes[c]] + step * speed[c, a]
+
+
+@njit(cache=True)
+def _combine(shape, values, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set out (3,) to the values (4, 3) of the nodes of a face at a point with these shape functions (4,)."""
+    for a in range(3):
+        out[a] = shape[0] * values[0, a] + shape[1] * values[1, a] + shape[2] * values[2, a] + shape[3] * values[3, a]
+
+
+@njit(cache=True)
+def look(count, x, v, step, indenters, motion, surface, history, lists, slid, points, begins):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Linearize all points of the listed faces about the velocity v, having found what the linearization before gave at it.
+
+    `slid` (p,) says which points slide; `points` are the linearizations (p, COLUMNS) and what they exert (p, RESULTS). Returns how much
+    what they exert differs from what it ought to be, pressure and friction, and the sum of the pressures and of the limits of friction,
+    mN; if the step `begins`, nothing was exerted yet.
+    """
+    (geometry, axes), centres, friction, _, form = indenters
+    corners, _, foundation, shapes, weights, first, rule = surface
+    _, _, compression, extension, traction, multiplier = history
+    linear, found = points
+    across = np.empty(3)
+    at, speed, share = np.empty((4, 3)), np.empty((4, 3)), np.empty(4)
+    slip, d, q, m, n, none = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty((0, 0))
+    wrong, wrong_friction, total, limits = 0.0, 0.0, 0.0, 0.0
+    for entry in range(count):
+        k, f = lists[0][entry], lists[1][entry]
+        mesh, each = mesh_of(geometry, k), rule[k + 1] - rule[k]
+        _gather(x, v, step, corners[f], at, speed)
+        at -= centres[k]
+        for c in range(4):
+            share[c] = multiplier[k, corners[f, c]]
+        _face_normal(at, across)
+        for g in range(each):
+            p, shape = first[k] + f * each + g, shapes[rule[k] + g]
+            own, result, weight = linear[p], found[p], weights[p]
+            stiff, spring = shape[4] * foundation[f, 0], shape[4] * foundation[f, 1]
+            _combine(shape, at, d)
+            _combine(shape, speed, slip)
+            if begins:
+                own[ACTIVE] = 0.0
+            _exerted(own, slip, result)
+            gap = _gap(geometry, mesh, axes, k, d, q, m, n, none)
+            carried = shape[0] * share[0] + shape[1] * share[1] + shape[2] * share[2] + shape[3] * share[3]
+            depth, covered, growth = _covered(-gap, n, across, WIDTH * np.sqrt(weight), form[k, 0])
+            pressure, hard = 0.0, 0.0
+            if covered > 0.0:
+                pressure = stiff * (depth - compression[p]) + spring * extension[p] + covered * carried
+                if depth > form[k, 1]:
+                    hard = HARD * stiff
+                    pressure += hard * (depth - form[k, 1])
+            wrong += weight * abs(max(pressure, 0.0) - result[ALONG])
+            own[ACTIVE] = 0.0
+            if pressure <= 0.0:
+                continue
+            total += weight * pressure
+            own[ACTIVE] = covered
+            away = _open(own, n, motion, k, d, slip)
+            own[STIFF] = step * ((stiff + hard) * covered + growth * carried)
+            own[PRESSURE] = pressure + own[STIFF] * away
+            if friction[k, 0] > 0.0:
+                drag = step * TANGENTIAL * stiff
+                wrong_friction += weight * _return_mapping(own, traction[p], slip, drag, pressure, friction[k], slid, p, result)
+                limits += weight * friction[k, 1] * pressure
+    return wrong, wrong_friction, total, limits
+
+
+@njit(cache=True)
+def _face_normal(at, across):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set across (3,) to the normal of a face with nodes at (4, 3); zero of a single node."""
+    size = 0.0
+    for a in range(3):
+        b, c = (a + 1) % 3, (a + 2) % 3
+        across[a] = (at[2, b] - at[0, b]) * (at[3, c] - at[1, c]) - (at[2, c] - at[0, c]) * (at[3, b] - at[1, b])
+        size += across[a] ** 2
+    for a in range(3):
+        across[a] /= np.sqrt(size) if size > 0.0 else 1.0
+
+
+@njit(cache=True)
+def _covered(depth, n, across, width, curvature):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return mean depth and covered fraction of a cell, and how fast the fraction grows with the depth at its middle."""
+    along = n[0] * across[0] + n[1] * across[1] + n[2] * across[2]
+    slope = np.sqrt(max(1.0 - along * along, 0.0)) if across[0] != 0.0 or across[1] != 0.0 or across[2] != 0.0 else 0.0
+    half = 0.5 * width * (slope + 0.25 * width * curvature + LEAST_SLOPE)
+    depth -= 0.5 * width * LEAST_SLOPE  # nothing where a flat indenter just touches
+    if depth >= half:
+        return depth, 1.0, 0.0
+    if depth <= -half:
+        return 0.0, 0.0, 0.0
+    return (depth + half) ** 2 / (4.0 * half), (depth + half) / (2.0 * half), 0.5 / half
+
+
+@njit(cache=True)
+def _open(own, n, motion, k, d, slip):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set normal and velocity of the indenter at a point, without friction; make `slip` its slip, and return how fast it opens."""
+    velocity, spin = motion
+    away = 0.0
+    for a in range(3):
+        b, e = (a + 1) % 3, (a + 2) % 3
+        own[NORMAL + a] = n[a]
+        own[SURFACE + a] = velocity[k, a] + (spin[k, b] * d[e] - spin[k, e] * d[b])
+        slip[a] -= own[SURFACE + a]
+        away += slip[a] * n[a]
+        own[FRICTION + a] = 0.0
+    own[DRAG] = 0.0
+    for a in range(3):
+        slip[a] -= away * n[a]
+    return away
+
+
+@njit(cache=True)
+def _exerted(own, slip, result):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set what a linearized point exerts while it moves with the velocity `slip`."""
+    if own[ACTIVE] == 0.0:
+        result[:] = 0.0
+        return
+    away = 0.0
+    for a in range(3):
+        away += own[NORMAL + a] * (slip[a] - own[SURFACE + a])
+    pressure = own[PRESSURE] - own[STIFF] * away
+    for a in range(3):
+        tangential = slip[a] - own[SURFACE + a] - away * own[NORMAL + a]
+        result[TANGENT + a] = own[FRICTION + a] - own[DRAG] * tangential
+        result[FORCE + a] = pressure * own[NORMAL + a] + result[TANGENT + a]
+    result[ALONG], result[TOUCHING] = pressure, own[ACTIVE]
+
+
+@njit(cache=True)
+def _return_mapping(own, traction, slip, stiff, pressure, friction, slid, p, result):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set the linear friction of a point that slips with the velocity `slip`; return how much it differs from that exerted, kPa."""
+    along = traction[0] * own[NORMAL] + traction[1] * own[NORMAL + 1] + traction[2] * own[NORMAL + 2]
+    size = 0.0
+    for a in range(3):
+        own[FRICTION + a] = traction[a] - along * own[NORMAL + a]
+        size += (own[FRICTION + a] - stiff * slip[a]) ** 2
+    size = np.sqrt(size)
+    if not slid[p] and size > friction[0] * pressure:
+        slid[p] = True
+    limit = (friction[1] if slid[p] else friction[0]) * pressure
+    ratio = limit / size if size > limit else 1.0
+    own[DRAG] = ratio * stiff
+    wrong = 0.0
+    for a in range(3):
+        own[FRICTION + a] *= ratio
+        wrong += (own[FRICTION + a] - own[DRAG] * slip[a] - result[TANGENT + a]) ** 2
+    return np.sqrt(wrong)
+
+
+@njit(cache=True, fastmath={"contract", "nsz", "reassoc"})
+def assemble(count, step, surface, lists, linear, right, operator):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Write the blocks of the faces with points in contact into the operator, and add their impulses to `right` (3 pad,)."""
+    corners, _, _, shapes, weights, first, rule = surface
+    body, face = lists[0], lists[1]
+    nodes, blocks, counts = operator[0], operator[1], operator[5]
+    pad, used = len(right) // 3, 0
+    d = np.empty((3, 3))
+    for entry in range(count):
+        k, f = body[entry], face[entry]
+        each, touched = rule[k + 1] - rule[k], False
+        block = blocks[used]
+        for g in range(each):
+            p, shape = first[k] + f * each + g, shapes[rule[k] + g]
+            own = linear[p]
+            if own[ACTIVE] == 0.0:
+                continue
+            if not touched:
+                touched = True
+                block[:] = 0.0
+            normal, drag, impulse = own[STIFF], own[DRAG], step * weights[p]
+            along = own[NORMAL] * own[SURFACE] + own[NORMAL + 1] * own[SURFACE + 1] + own[NORMAL + 2] * own[SURFACE + 2]
+            for a in range(3):
+                given = (own[PRESSURE] + (normal - drag) * along) * own[NORMAL + a] + own[FRICTION + a] + drag * own[SURFACE + a]
+                for c in range(4):
+                    right[a * pad + corners[f, c]] += impulse * shape[c] * given
+                for b in range(3):
+                    d[a, b] = impulse * ((normal - drag) * own[NORMAL + a] * own[NORMAL + b] + (drag if a == b else 0.0))
+            for c in range(4):
+                for e in range(c + 1):
+                    both = shape[c] * shape[e]
+                    for a in range(3):
+                        for b in range(3):
+                            block[3 * c + a, 3 * e + b] += both * d[a, b]
+        if touched:
+            nodes[used] = corners[f]
+            for c in range(4):
+                for e in range(c):
+                    for a in range(3):
+                        for b in range(3):
+                            block[3 * e + b, 3 * c + a] = block[3 * c + a, 3 * e + b]
+            used += 1
+    counts[FACES] = used
+
+
+@njit(cache=True)
+def pull_off(count, x, v, step, mass, indenters, motion, surface, history, lists, base, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add the impulses of pull-off to `base`: on points that touched an indenter and leave it slowly, never more than stops them."""
+    (geometry, axes), centres, _, pull, _ = indenters
+    velocity, spin = motion
+    corners, _, _, shapes, weights, first, rule = surface
+    mode, touched = history[0], history[1]
+    body, face = lists[0], lists[1]
+    pad = len(mass)
+    slip, d, q, m, n, none = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty((0, 0))
+    for entry in range(count):
+        k, f = body[entry], face[entry]
+        if pull[k, 2] <= 0.0:
+            continue
+        mesh, each = mesh_of(geometry, k), rule[k + 1] - rule[k]
+        area = 0.0
+        for g in range(each):
+            area += weights[first[k] + f * each + g]
+        for g in range(each):
+            p, shape = first[k] + f * each + g, shapes[rule[k] + g]
+            if not touched[p] or mode[p] != FREE:
+                continue
+            own = 0.0
+            for a in range(3):
+                slip[a], d[a] = -velocity[k, a], -centres[k, a]
+                for c in range(4):
+                    slip[a] += shape[c] * v[a * pad + corners[f, c]]
+                    d[a] += shape[c] * x[a * pad + corners[f, c]]
+            for c in range(4):
+                own += shape[c] * mass[corners[f, c]]
+            for a in range(3):
+                b, e = (a + 1) % 3, (a + 2) % 3
+                slip[a] -= spin[k, b] * d[e] - spin[k, e] * d[b]
+            gap = _gap(geometry, mesh, axes, k, d, q, m, n, none)
+            rate = slip[0] * n[0] + slip[1] * n[1] + slip[2] * n[2]
+            if gap >= 0.0 and 0.0 < rate < pull[k, 2]:
+                force = min(pull[k, 0] * gap + pull[k, 1] * rate, own * rate / step) * weights[p] / area
+                for a in range(3):
+                    reaction[k, a] -= force * n[a]
+                    for c in range(4):
+                        base[a * pad + corners[f, c]] -= step * force * n[a] * shape[c]
+
+
+@njit(cache=True)
+def keep(count, indenters, surface, history, lists, slid, found, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add up the forces of the indenters, mN, and leave the history of the contact as it is at the end of the step."""
+    _, _, friction, pull, form = indenters
+    corners, _, foundation, shapes, weights, first, rule = surface
+    _, touched, compression, extension, _, multiplier = history
+    for entry in range(count):
+        k, f = lists[0][entry], lists[1][entry]
+        each, left = rule[k + 1] - rule[k], False
+        stiff, spring, decay, growth = foundation[f, 0], foundation[f, 1], foundation[f, 2], foundation[f, 3]
+        for g in range(each):
+            p, shape = first[k] + f * each + g, shapes[rule[k] + g]
+            before = compression[p]
+            compression[p] -= spring / stiff * extension[p]
+            if found[p, TOUCHING] > 0.0:
+                carried = 0.0
+                for c in range(4):
+                    carried += shape[c] * multiplier[k, corners[f, c]]
+                found[p, OWN] = found[p, ALONG] - found[p, TOUCHING] * carried
+                compression[p] += found[p, OWN] / (shape[4] * stiff)
+                over = compression[p] - form[k, 1]
+                if over > 0.0:
+                    compression[p] -= over * HARD / (1.0 + HARD)
+            extension[p] = decay * extension[p] + growth * (compression[p] - before)
+            _keep_friction(p, k, found[p], weights[p], friction, slid, history, reaction)
+            if found[p, TOUCHING] == 0.0 and abs(compression[p]) < GONE:
+                compression[p], extension[p] = 0.0, 0.0
+            left |= found[p, TOUCHING] > 0.0 or compression[p] != 0.0 or (touched[p] and pull[k, 2] > 0.0)
+        lists[4][k, f] = left
+
+
+@njit(cache=True)
+def update_multipliers(count, surface, multiplier, lists, found, nodal):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Give the nodes what the foundation carries besides their multipliers (k, n), as far as the area around them is covered.
+
+    `nodal` (3, k, n) is scratch.
+    """
+    corners, spread, _, shapes, weights, first, rule = surface
+    gain, covering, largest = nodal[0], nodal[1], nodal[2]
+    for entry in range(count):
+        for c in range(4):
+            k, i = lists[0][entry], corners[lists[1][entry], c]
+            gain[k, i], covering[k, i], largest[k, i] = 0.0, 0.0, 0.0
+    for entry in range(count):
+        k, f = lists[0][entry], lists[1][entry]
+        each = rule[k + 1] - rule[k]
+        for g in range(each):
+            p, shape = first[k] + f * each + g, shapes[rule[k] + g]
+            if found[p, TOUCHING] == 0.0:
+                continue
+            for c in range(4):
+                i, part = corners[f, c], weights[p] * shape[c]
+                gain[k, i] += part * found[p, OWN]
+                covering[k, i] += part * found[p, TOUCHING]
+                if part > 0.0:
+                    largest[k, i] = max(largest[k, i], spread[f, c])
+    for entry in range(count):
+        for c in range(4):
+            k, i = lists[0][entry], corners[lists[1][entry], c]
+            if largest[k, i] >= 0.0:
+                fraction = min(covering[k, i] * largest[k, i], 1.0)
+                multiplier[k, i] = max(fraction**2 * (multiplier[k, i] + largest[k, i] * gain[k, i]), 0.0)
+                largest[k, i] = -1.0
+
+
+@njit(cache=True)
+def _keep_friction(p, k, result, weight, friction, slid, history, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Keep friction and mode of a point, and add what it exerts to the reaction of its indenter k."""
+    mode, touched, _, _, traction, _ = history
+    size = 0.0
+    for a in range(3):
+        reaction[k, a] += weight * result[FORCE + a]
+        traction[p, a] = result[TANGENT + a]
+        size += traction[p, a] ** 2
+    mode[p] = FREE
+    if result[TOUCHING] > 0.0:
+        touched[p] = True
+        slides = friction[k, 0] == 0.0 or (slid[p] and np.sqrt(size) > 0.98 * friction[k, 1] * result[ALONG])
+        mode[p] = SLIDE if slides else STICK
