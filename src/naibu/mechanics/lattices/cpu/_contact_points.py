@@ -1,12 +1,13 @@
 """Contact at the quadrature points of faces: pressure of the foundation, friction, their linearization, and what a step leaves behind.
 
 A point stands for a cell of its face, over which the gap changes by its slope; W is the mean depth of the part of the cell that the
-indenter covers, its fraction c. The foundation of the cell is compressed by ``dw = W - w0`` in a step. With the multiplier p' of
-the nodes at the end of the step before the pressure is ``p = max(0, a dw + b y0 + c p')``: an augmented Lagrangian :cite:p:`simo1992` whose
-multiplier lives at the nodes, as far as the indenter covers what lies around them. An indenter that is large
-beside the faces thus leaves no penetration; to a small one the foundation yields, as the solid does between the nodes. Friction follows by a return mapping of ``t0 - k_t h (slip velocity)`` to
-``|t| <= mu p``. In a pass, points in contact have the pressure and the friction that are linear in the velocity, the latter with the ratio
-of the return mapping of the pass before: the matrix stays symmetric and positive, and no friction turns a point round.
+indenter covers, its fraction c. The foundation of the cell is compressed by ``dw = W - w0`` in a step. With the multiplier p' of the
+nodes at the end of the step before the pressure is ``p = max(0, a dw + b y0 + c p')``: an augmented Lagrangian :cite:p:`simo1992` whose
+multiplier lives at the nodes, as far as the indenter covers what lies around them. An indenter that is large beside the faces thus leaves
+hardly any penetration; to a small one the foundation yields, as the solid does between the nodes. Friction follows by a return mapping of
+``t0 - k_t h (slip velocity)`` to ``|t| <= mu p``. In a pass, points in contact have the pressure and the friction that are linear in the
+velocity, the latter with the ratio of the return mapping of the pass before: the matrix stays symmetric and positive, and no friction
+turns a point round.
 """
 
 from __future__ import annotations
@@ -22,8 +23,11 @@ TANGENTIAL = 8.0  # stiffness of a point before it slips, of that along the norm
 MARGIN = 0.25  # of the radius of a face, by which it may be off what was foreseen
 GONE = 1e-9  # compression of a foundation that counts as none, mm
 HARD = 20.0  # how many times the foundation is stiffer where an indenter is deep in it
+BARELY, NEARLY = 0.4, 0.9  # covered fractions around a node between which it begins to carry pressure without the foundation
+EARNEST = 0.25  # covered fraction of a face that counts
+STEEP, FLAT = -0.7, -0.3  # cosines of the angle between the normals of an indenter and of a face, between which the latter takes over
 LEAST_SLOPE = 1e-3  # of a gap over a cell
-WIDTH = 0.75  # of a cell, over the root of its area: Gauss points lie nearer to the edge of a face than their cells are wide
+UPRIGHT = 0.75  # width of the cells of a face that stands upright on an indenter: Gauss points lie nearer to its edge than they are wide
 # columns of what is kept of a linearized point: normal, pressure and friction at no slip, drags along the normal (kPa s/mm) and across,
 # velocity of the indenter, fraction of the cell that is covered
 NORMAL, PRESSURE, FRICTION, STIFF, DRAG, SURFACE, ACTIVE, COLUMNS = 0, 3, 4, 7, 8, 9, 12, 13
@@ -139,8 +143,10 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
                 own[ACTIVE] = 0.0
             _exerted(own, slip, result)
             gap = _gap(geometry, mesh, axes, k, d, q, m, n, none)
+            slope = _slope(n, across)
             carried = shape[0] * share[0] + shape[1] * share[1] + shape[2] * share[2] + shape[3] * share[3]
-            depth, covered, growth = _covered(-gap, n, across, WIDTH * np.sqrt(weight), form[k, 0])
+            _towards_face(n, across)
+            depth, covered, growth = _covered(-gap, slope, np.sqrt(weight), form[k, 0])
             pressure, hard = 0.0, 0.0
             if covered > 0.0:
                 pressure = stiff * (depth - compression[p]) + spring * extension[p] + covered * carried
@@ -176,10 +182,36 @@ def _face_normal(at, across):  # type: ignore[no-untyped-def]  # pragma: no cove
 
 
 @njit(cache=True)
-def _covered(depth, n, across, width, curvature):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return mean depth and covered fraction of a cell, and how fast the fraction grows with the depth at its middle."""
+def _slope(n, across):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return the slope of the gap along a face with the normal `across`; zero of a single node."""
     along = n[0] * across[0] + n[1] * across[1] + n[2] * across[2]
-    slope = np.sqrt(max(1.0 - along * along, 0.0)) if across[0] != 0.0 or across[1] != 0.0 or across[2] != 0.0 else 0.0
+    single = across[0] == 0.0 and across[1] == 0.0 and across[2] == 0.0
+    return 0.0 if single else np.sqrt(max(1.0 - along * along, 0.0))
+
+
+@njit(cache=True)
+def _towards_face(n, across):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Turn the normal of an indenter against that of the face where it lies nearly along the face: a deep one is to push, not to spread.
+
+    Otherwise an indenter smaller than a face would fall through it once its widest part has come to the face.
+    """
+    if across[0] == 0.0 and across[1] == 0.0 and across[2] == 0.0:
+        return
+    along = n[0] * across[0] + n[1] * across[1] + n[2] * across[2]
+    part = min(max((along - STEEP) / (FLAT - STEEP), 0.0), 1.0)
+    if part > 0.0 and along < -FLAT:
+        size = 0.0
+        for a in range(3):
+            n[a] = (1.0 - part) * n[a] - part * across[a]
+            size += n[a] ** 2
+        for a in range(3):
+            n[a] /= np.sqrt(size)
+
+
+@njit(cache=True)
+def _covered(depth, slope, width, curvature):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return mean depth and covered fraction of a cell, and how fast the fraction grows with the depth at its middle."""
+    width *= 1.0 - (1.0 - UPRIGHT) * min(max((slope - 0.7) / 0.3, 0.0), 1.0)
     half = 0.5 * width * (slope + 0.25 * width * curvature + LEAST_SLOPE)
     depth -= 0.5 * width * LEAST_SLOPE  # nothing where a flat indenter just touches
     if depth >= half:
@@ -187,6 +219,26 @@ def _covered(depth, n, across, width, curvature):  # type: ignore[no-untyped-def
     if depth <= -half:
         return 0.0, 0.0, 0.0
     return (depth + half) ** 2 / (4.0 * half), (depth + half) / (2.0 * half), 0.5 / half
+
+
+@njit(cache=True)
+def rest_at(x, indenters, surface, compression):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set the compression of all foundations to what indenters cover at the positions x: a contact that begins there exerts nothing."""
+    (geometry, axes), centres, _, _, form = indenters
+    corners, _, _, shapes, weights, first, rule = surface
+    at, speed, across = np.empty((4, 3)), np.empty((4, 3)), np.empty(3)
+    d, q, m, n, none = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty((0, 0))
+    for k in range(len(centres)):
+        mesh, each = mesh_of(geometry, k), rule[k + 1] - rule[k]
+        for f in range(len(corners)):
+            _gather(x, x, 0.0, corners[f], at, speed)
+            at -= centres[k]
+            _face_normal(at, across)
+            for g in range(each):
+                p = first[k] + f * each + g
+                _combine(shapes[rule[k] + g], at, d)
+                gap = _gap(geometry, mesh, axes, k, d, q, m, n, none)
+                compression[p] = _covered(-gap, _slope(n, across), np.sqrt(weights[p]), form[k, 0])[0]
 
 
 @njit(cache=True)
@@ -368,14 +420,14 @@ def keep(count, indenters, surface, history, lists, slid, found, reaction):  # t
 def update_multipliers(count, surface, multiplier, lists, found, nodal):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Give the nodes what the foundation carries besides their multipliers (k, n), as far as the area around them is covered.
 
-    `nodal` (3, k, n) is scratch.
+    `nodal` (4, k, n) is scratch.
     """
     corners, spread, _, shapes, weights, first, rule = surface
-    gain, covering, largest = nodal[0], nodal[1], nodal[2]
+    gain, covering, largest, fraction = nodal[0], nodal[1], nodal[2], nodal[3]
     for entry in range(count):
         for c in range(4):
             k, i = lists[0][entry], corners[lists[1][entry], c]
-            gain[k, i], covering[k, i], largest[k, i] = 0.0, 0.0, 0.0
+            gain[k, i], covering[k, i], largest[k, i], fraction[k, i] = 0.0, 0.0, 0.0, 1.0
     for entry in range(count):
         k, f = lists[0][entry], lists[1][entry]
         each = rule[k + 1] - rule[k]
@@ -389,12 +441,27 @@ def update_multipliers(count, surface, multiplier, lists, found, nodal):  # type
                 covering[k, i] += part * found[p, TOUCHING]
                 if part > 0.0:
                     largest[k, i] = max(largest[k, i], spread[f, c])
+    for entry in range(count):  # a node is covered as the least covered one of the faces around it, those hardly touched left out
+        k, f = lists[0][entry], lists[1][entry]
+        each, least = rule[k + 1] - rule[k], 1.0
+        for c in range(4):
+            if spread[f, c] > 0.0:
+                least = min(least, covering[k, corners[f, c]] * largest[k, corners[f, c]])
+        touching, area = 0.0, 0.0
+        for g in range(each):
+            p = first[k] + f * each + g
+            touching, area = touching + weights[p] * found[p, TOUCHING], area + weights[p]
+        earnest = min(touching / (EARNEST * area), 1.0)
+        for c in range(4):
+            i = corners[f, c]
+            own = min(covering[k, i] * largest[k, i], earnest * least + 1.0 - earnest)
+            fraction[k, i] = min(fraction[k, i], own)
     for entry in range(count):
         for c in range(4):
             k, i = lists[0][entry], corners[lists[1][entry], c]
             if largest[k, i] >= 0.0:
-                fraction = min(covering[k, i] * largest[k, i], 1.0)
-                multiplier[k, i] = max(fraction**2 * (multiplier[k, i] + largest[k, i] * gain[k, i]), 0.0)
+                kept = min(max((fraction[k, i] - BARELY) / (NEARLY - BARELY), 0.0), 1.0) ** 2
+                multiplier[k, i] = max(kept * (multiplier[k, i] + largest[k, i] * gain[k, i]), 0.0)
                 largest[k, i] = -1.0
 
 

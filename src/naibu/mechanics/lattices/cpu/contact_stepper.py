@@ -14,7 +14,7 @@ from naibu.mechanics.contact.indenter_motion import SHARE, safe_fraction
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.lattices.cpu._contact_kernels import contact_steps
 from naibu.mechanics.lattices.cpu._contact_operator import new_operator
-from naibu.mechanics.lattices.cpu._contact_points import COLUMNS, RESULTS
+from naibu.mechanics.lattices.cpu._contact_points import COLUMNS, RESULTS, rest_at
 from naibu.mechanics.lattices.cpu.scratch import KernelTuple
 from naibu.mechanics.lattices.cpu.stepper import MOST_ITERATIONS, ImplicitStepper
 from naibu.mechanics.lattices.model.contact_state import ContactState
@@ -22,7 +22,7 @@ from naibu.mechanics.lattices.model.contact_surface import ContactSurface
 
 PASSES = 20  # solutions in a step, at most
 SECANT_STEPS = 12  # of the speed of an indenter that a force drives
-DEEP = 0.6  # volume of an indenter over its area: depth from which foundations are stiffer
+DEEP = 0.5  # of the radius of the largest sphere in an indenter: depth from which foundations are stiffer
 MOST_PARTS = 4096  # of a step whose indenters are fast
 
 
@@ -81,11 +81,16 @@ class ContactStepper:
         """Put indenters beside a lattice; the contact state is copied."""
         friction = np.array([(p.static_friction, p.kinetic_friction) for p in indenters])
         pull = np.array([(p.pull_stiffness, p.pull_damping, p.pull_speed) for p in indenters])
-        form = np.array([(p.geometry.curvature, DEEP * p.geometry.volume_per_area) for p in indenters])
+        form = np.array([(p.geometry.curvature, DEEP * p.geometry.inradius) for p in indenters])
         geometry, own = packed_geometries([p.geometry for p in indenters]), contact.copied()
         points = _points(surface, own)
         scratch = _scratch(len(surface.faces), len(indenters), len(own.mode), len(base.mass))
         stepper = cls(base, own, surface, geometry, friction, pull, form, passes, tuple(indenters), divided, points, scratch)
+        if not own.begun:
+            own.begun[...] = True
+            corners, spread, *rest = points
+            shapes = ((geometry, own.axes), own.centres, friction, pull, form)
+            rest_at(base.position, shapes, (corners, spread, surface.foundation(base.step), *rest), own.compression)
         stepper._look_everywhere()
         return stepper
 
@@ -212,7 +217,8 @@ def _scratch(faces: int, indenters: int, points: int, pad: int) -> KernelTuple:
     exerted = (np.zeros((points, COLUMNS)), np.zeros((points, RESULTS)))
     slots = min(4 * faces, pad)
     operator = new_operator(pairs, slots)
-    return operator, lists, exerted, np.zeros(points, np.bool_), np.full(pad, -1, np.int64), np.zeros((slots, 3, 3)), np.zeros((3, indenters, pad))
+    nodal = (np.full(pad, -1, np.int64), np.zeros((slots, 3, 3)), np.zeros((4, indenters, pad)))
+    return operator, lists, exerted, np.zeros(points, np.bool_), *nodal
 
 
 @dataclass(slots=True, eq=False)

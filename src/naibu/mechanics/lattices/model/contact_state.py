@@ -42,6 +42,8 @@ class ContactState:
         Reference points of the indenters, mm.
     axes : ndarray, shape (indenters, 3, 3)
         Axes of the indenters, in rows.
+    begun : ndarray, shape (), bool
+        Whether the foundations are compressed by what the indenters cover at the start.
     """
 
     order: IntArray
@@ -54,6 +56,7 @@ class ContactState:
     multiplier: FloatArray
     centres: FloatArray
     axes: FloatArray
+    begun: BoolArray
 
     @property
     def indenters(self) -> int:
@@ -119,6 +122,7 @@ def begin_contact(
     gap, first = np.concatenate(gaps), np.cumsum([0, *(len(g) for g in gaps)]).astype(np.int64)
     touched, none, at_node = gap < TOUCH_MM, np.zeros(len(gap)), np.zeros((len(indenters), lattice.n_nodes))
     centres, axes = np.array([p.centre for p in indenters], dtype=float), np.array([p.geometry.axes for p in indenters], dtype=float)
+    begun, traction = np.zeros((), dtype=bool), np.zeros((len(gap), 3))
     return ContactState(
-        order, first, touched.astype(np.int8), touched, none, none.copy(), np.zeros((len(gap), 3)), at_node, centres, axes,
+        order, first, touched.astype(np.int8), touched, none, none.copy(), traction, at_node, centres, axes, begun,
     )  # fmt: skip

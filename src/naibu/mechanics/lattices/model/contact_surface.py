@@ -20,10 +20,10 @@ from naibu.mechanics.lattices.model.coefficients import explicit_coefficients, i
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
 from naibu.mechanics.lattices.model.surface import surface_faces
 
-AT_NODE, BETWEEN = 0.2, 0.48
+AT_NODE, BETWEEN = 0.15, 0.6
 FLAT_ORDER = 2  # Gauss points per side of a face under a plane, exact for the product of two shape functions
 LEAST_ORDER, MOST_ORDER = 3, 8
-FINENESS = 0.8  # quadrature points along the volume of an indenter over its area; 2.4 along the radius of a sphere
+FINENESS = 1.2  # quadrature points along the volume of an indenter over its area; 3.6 along the radius of a sphere
 
 
 @dataclass(frozen=True, slots=True, eq=False)

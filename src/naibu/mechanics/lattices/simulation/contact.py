@@ -61,9 +61,10 @@ def push(
 ) -> ContactMotion:
     """Move rigid indenters on prescribed paths against a lattice: unilateral contact with Coulomb friction.
 
-    Nodes cannot enter an indenter. They stick to it while their tangential force is below the static friction, else slide against the
-    kinetic one; both follow from the forces of the same step, which is solved again until all contacts agree with its solution. Nodes that
-    leave an indenter at less than V_t are pulled back by ``K_r gap + C_r speed``, but never by more than stops them.
+    Contact acts at the quadrature points of the faces. They stick to an indenter while their friction is below the static one, else slide
+    against the kinetic one; pressure and friction follow from the solution at the end of the step, which is found again until all contacts
+    agree with it. Faces that leave an indenter at less than V_t are pulled back by ``K_r gap + C_r speed``, but never by more than stops
+    them.
 
     Parameters
     ----------
