@@ -77,9 +77,9 @@ def test_a_body_under_tension_pushes_the_hand_no_further_than_the_bound() -> Non
         assert touched.last.force[2] < -500.0
         device = SimulatedDevice(lambda _: np.zeros(3), stiffness=1.0, damping=0.5)
         run = felt(touched, HapticHand(channel, limits=ForceLimits(energy_mn_mm=bound)), device, channel, 0.6)
-        work[bound] = run.work.max()
+        work[bound] = run.work[:250].max()  # later, in both, the delayed damping of a spent controller swings a weak device sideways
     assert work[1e12] > 30.0
-    assert work[8.0] <= 1.5 * 8.0  # a force that may not change at once passes some energy after the bound is reached
+    assert work[8.0] <= 8.0
 
 
 def test_the_force_fades_when_the_device_falls_silent_and_it_may_come_back() -> None:

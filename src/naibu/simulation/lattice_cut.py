@@ -30,6 +30,7 @@ from naibu.mechanics.lattices.model.cube_faces import FACES, CubeFaces, corner_v
 from naibu.mechanics.lattices.model.hexahedra import lattice_mesh
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState
+from naibu.mechanics.lattices.model.surface import surface_faces
 from naibu.meshing.cutting._crossing_kernels import crossed_segments, distances
 from naibu.meshing.cutting.swept_blade import SweptBlade
 
@@ -110,15 +111,24 @@ class LatticeCut:
         return ConstrainedNodes(order[first[row] + place], before.direction[row], before.weight[row], before.body[row])
 
     def _contact(self, before: ContactState) -> ContactState:
-        """Contact of the nodes that were in it, their copies, and the nodes of the new surface."""
-        nodes = np.union1d(np.flatnonzero(np.isin(self.source, before.nodes)), self.faces.ravel())
-        row = np.full(len(self.source), -1)
-        row[before.nodes] = np.arange(len(before.nodes))
-        old = row[self.source[nodes]]
-        known = (old >= 0)[:, None]
-        friction = before.friction[old] * self.share[nodes][:, None, None]
-        mode, touched = np.where(known, before.mode[old], 0), known & before.touched[old]
-        return replace(before, nodes=nodes, mode=mode, touched=touched, friction=np.where(known[..., None], friction, 0.0))
+        """Contact of the faces that were in it, behind whose order that of the new surface comes in between, in no contact."""
+        added = {tuple(triangle) for triangle in self.faces.tolist()}
+        known = np.array([tuple(face) not in added for face in surface_faces(self.lattice)[:, :3].tolist()])
+        each = np.diff(before.first) // int(known.sum())  # points of a face, for every indenter
+
+        def carried(values: AnyArray) -> AnyArray:
+            parts = []
+            for count, low, high in zip(each, before.first[:-1], before.first[1:], strict=True):
+                part = np.zeros((len(known), count, *values.shape[1:]), values.dtype)
+                part[known] = values[low:high].reshape(-1, count, *values.shape[1:])
+                parts.append(part.reshape(-1, *values.shape[1:]))
+            return np.concatenate(parts)
+
+        return replace(
+            before, first=np.concatenate([[0], np.cumsum(each * len(known))]).astype(np.int64), mode=carried(before.mode),
+            touched=carried(before.touched), compression=carried(before.compression), extension=carried(before.extension),
+            friction=carried(before.friction), multiplier=np.ascontiguousarray(before.multiplier[:, self.source]),
+        )  # fmt: skip
 
 
 def cut_session(session: LatticeSession, blade: SweptBlade) -> tuple[LatticeSession, LatticeCut]:
