@@ -10,8 +10,9 @@ import numpy as np
 
 from naibu._numba.compilation import njit
 from naibu.mechanics.lattices.cpu._coarse_kernels import begin
+from naibu.mechanics.lattices.cpu._contact_history import keep, pull_off, update_multipliers
 from naibu.mechanics.lattices.cpu._contact_operator import FACES, NODES, close_operator
-from naibu.mechanics.lattices.cpu._contact_points import SLIDE, assemble, keep, look, near_faces, pull_off, update_multipliers
+from naibu.mechanics.lattices.cpu._contact_points import SLIDE, assemble, look, near_faces
 from naibu.mechanics.lattices.cpu._implicit_kernels import add_momenta, add_reactions, advance, new_velocity
 
 AGREED = 1e-4  # error of the pressures, as a fraction of their sum, at which a step is settled
