@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse import bsr_array, coo_array, csr_array, eye_array, kron
+from scipy.sparse import bsr_array, bsr_matrix, coo_array, csr_array, eye_array, kron
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray, require_positive, require_within
 from naibu.core.errors import ConvergenceError, InputError
+from naibu.mechanics.linear_algebra.direct import direct_solver
 from naibu.meshing.cutting.surface_result import SurfaceCut
 from naibu.simulation.surface_springs import SurfaceSprings, surface_springs
 
 ITERATIONS = 200
 SMALLEST_SHARE = 1e-4
-SINGULAR = 1e-10  # of the largest stiffness: added where nothing resists
+SINGULAR = 1e-7  # of the largest stiffness: added where nothing resists
 BALANCED = 1e-5  # of the largest force of a spring at the start
 LARGEST_TENSION = 0.9
 
@@ -139,7 +138,9 @@ def _at_rest(
         left = float(np.abs(gradient).max(initial=0.0))
         if left <= balanced:
             break
-        step = -_stiffness_factor(operator, gap, now, stiffness, rest).solve(gradient)
+        matrix = _stiffness(operator, gap, now, stiffness, rest)
+        solver = direct_solver(matrix, symmetric=True)  # a new one: entries that vanish are not stored, so that the pattern changes
+        step = -solver.factorize(matrix).solve(gradient)
         share, least = 1.0, energy(unknown)
         while energy(unknown + share * step) > least + 1e-4 * share * float(gradient @ step) and share > SMALLEST_SHARE:
             share *= 0.5
@@ -166,15 +167,17 @@ def _directions(free: BoolArray, normal: FloatArray) -> csr_array:
     return coo_array((values, (rows, columns)), shape=(3 * len(free), len(node) + 2 * len(sliding))).tocsr()
 
 
-def _stiffness_factor(operator: csr_array, gap: FloatArray, now: FloatArray, stiffness: FloatArray, rest: FloatArray) -> Any:
-    """Factorise the second derivatives of the energy, without what makes springs under compression buckle."""
+def _stiffness(operator: csr_array, gap: FloatArray, now: FloatArray, stiffness: FloatArray, rest: FloatArray) -> bsr_matrix:
+    """Return the second derivatives of the energy, without what makes springs under compression buckle."""
     along = gap / now[:, None]
     across = np.maximum(1.0 - rest / now, 0.0)
     blocks = (1.0 - across)[:, None, None] * along[:, :, None] * along[:, None, :] + across[:, None, None] * np.eye(3)
     e = len(now)
     matrix = operator.T @ (bsr_array((stiffness[:, None, None] * blocks, np.arange(e), np.arange(e + 1))) @ operator)
     firm = SINGULAR * float(matrix.diagonal().max(initial=1e-300))
-    return splu((matrix + firm * eye_array(matrix.shape[0])).tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+    whole = bsr_matrix((matrix + firm * eye_array(matrix.shape[0])).tocsr(), blocksize=(1, 1))
+    whole.sort_indices()
+    return whole
 
 
 def opening(cut: SurfaceCut, tension: float, *, free_mm: float | None = None, frames: int = 24) -> Iterator[FloatArray]:
