@@ -117,7 +117,7 @@ def coordinate_uncertainty(
     variance = np.einsum("kip,pq,kiq->ki", j, moment, j)
     # the parameters have taken up what is proportional to the strain; what is left grows with its square
     discrepancy = known.discrepancy_mm * float(np.fmax(1.0, strain_ratio)) ** 2
-    sd = np.sqrt(np.maximum(variance, 0.0) + discrepancy**2 + mesh**2)
+    sd = np.sqrt(np.maximum(variance, 0.0) + discrepancy**2 + mesh**2 / 3.0)  # elements: anything up to that, to either side
     return CoordinateUncertainty(sd, np.sqrt(sd**2 + (known.noise_factor * fit.sd) ** 2))
 
 
