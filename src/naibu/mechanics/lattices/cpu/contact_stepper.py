@@ -22,7 +22,10 @@ from naibu.mechanics.lattices.model.contact_surface import ContactSurface
 
 PASSES = 20  # solutions in a step, at most
 SECANT_STEPS = 12  # of the speed of an indenter that a force drives
-DEEP = 0.5  # of the radius of the largest sphere in an indenter: depth from which foundations are stiffer
+DEEP, ROUND = (
+    0.5,
+    0.9,
+)  # of the radius of the largest sphere in an indenter: depth from which foundations are stiffer, of flat and round ones
 MOST_PARTS = 4096  # of a step whose indenters are fast
 
 
@@ -81,7 +84,7 @@ class ContactStepper:
         """Put indenters beside a lattice; the contact state is copied."""
         friction = np.array([(p.static_friction, p.kinetic_friction) for p in indenters])
         pull = np.array([(p.pull_stiffness, p.pull_damping, p.pull_speed) for p in indenters])
-        form = np.array([(p.geometry.curvature, DEEP * p.geometry.inradius) for p in indenters])
+        form = np.array([(g.curvature, (ROUND if g.curvature else DEEP) * g.inradius) for g in (p.geometry for p in indenters)])
         geometry, own = packed_geometries([p.geometry for p in indenters]), contact.copied()
         points = _points(surface, own)
         scratch = _scratch(len(surface.faces), len(indenters), len(own.mode), len(base.mass))
