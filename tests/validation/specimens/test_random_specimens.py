@@ -18,10 +18,9 @@ def test_a_specimen_converges(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [25, 50])
-def test_a_specimen_that_snaps_through_converges(seed):
-    """The surface of 25 slips around the corner of the bar, 50 rises between the side plates: equilibrium is several mm away."""
-    drawn = random_specimen(seed)
+def test_a_specimen_that_snaps_through_converges():
+    """It rises between the side plates: the next equilibrium is 5 mm away, and Newton's method cycles on the way."""
+    drawn = random_specimen(50)
     solution = virtual_specimen(drawn.experiment, drawn.truth, settings=drawn.settings).solutions["pressed"]
     assert solution.status is Status.CONVERGED
     assert solution.relative_penetration <= 0.01
