@@ -4,8 +4,8 @@ A plate (or another tool) is led onto the body, into it, held and taken away, th
 thread that steps, so that other programs on the machine change them little; the work of the one that renews the tangents stands beside.
 `static` compares the rest under the tool with the offline solution of `QuasiStaticSession`.
 
-Run: ``OMP_NUM_THREADS=1 python benchmarks/live_bodies.py [--body demo|11|13] [--tool plate] [--speed 24] [--static]``; a number N is a box
-of 6 N^3 tetrahedra, nu 0.499.
+Run: ``OMP_NUM_THREADS=1 python benchmarks/live_bodies.py [--body demo|11|13] [--tool plate] [--speed 24] [--static | --cut]``; a number N
+is a box of 6 N^3 tetrahedra, nu 0.499.
 """
 
 from __future__ import annotations
@@ -111,6 +111,32 @@ def offline(body: FiniteElementBody, tool: str, centre: FloatArray) -> FloatArra
     return session.positions()
 
 
+def cut(body: FiniteElementBody) -> None:
+    """Cut the body half through while it sinks under its weight, and print the frames until the cut has opened, and some more."""
+    simulation = InteractiveSimulation(replace(body, gravity=np.array([0.0, 0.0, -9810.0])), {})
+    low, high = body.points.min(axis=0), body.points.max(axis=0)
+    height, middle = 0.6 * low[2] + 0.4 * high[2], 0.5 * (low[1] + high[1])
+    frames, opened, simulated = [], -1, time.perf_counter()
+    for k in range(1000):
+        began, processor = time.perf_counter(), time.thread_time()
+        if k == SETTLE:
+            simulated = began
+            simulation.begin_cut([[[x, low[1] - 5.0, height], [x, middle, height]] for x in (low[0] - 5.0, high[0] + 5.0)])
+        if simulation.finish_cut():
+            opened, waited = k, began - simulated
+        simulation.advance()
+        frames.append(1e3 * (time.thread_time() - processor))
+        if opened >= 0 and k > opened + HOLD:
+            break
+        time.sleep(max(0.0, FRAME_S - (time.perf_counter() - began)))
+    ms = np.array(frames[SETTLE:])
+    print(
+        f"cut, {body.mesh.n_cells} to {simulation.body.cells.shape[0]} cells: processor ms a frame: median {np.median(ms):.1f}, "
+        f"p99 {np.quantile(ms, 0.99):.1f}, worst {ms.max():.1f}, at the opening {frames[opened]:.1f}; {waited:.1f} s after the command"
+    )
+    simulation.close()
+
+
 def report(name: str, run: Run) -> None:
     median, high = np.median(run.ms), np.quantile(run.ms, 0.99)
     print(
@@ -125,9 +151,13 @@ def main() -> None:
     parser.add_argument("--tool", default="plate")
     parser.add_argument("--speed", type=float, default=24.0, help="mm/s")
     parser.add_argument("--static", action="store_true")
+    parser.add_argument("--cut", action="store_true", help="only time a cut")
     given = parser.parse_args()
     body = body_named(given.body)
     print(f"{given.body}: {body.mesh.n_cells} cells, {body.mesh.n_points} nodes; {given.tool}, {given.speed:g} mm/s")
+    if given.cut:
+        cut(body)
+        return
     fast = touched(body, given.tool, given.speed)
     report("earlier tangents", fast)
     slow = touched(newtons(body), given.tool, given.speed)

@@ -135,6 +135,32 @@ def test_a_cut_keeps_momentum_and_the_halves_part_under_tension() -> None:
     assert len(touched.last.positions) == mesh.n_points
 
 
+def test_a_body_moves_on_while_its_cut_is_prepared() -> None:
+    mesh = box((20.0, 20.0, 20.0), (3, 3, 3), cell_type="tetra")
+    law = material(young_modulus=20.0, poisson_ratio=0.45)
+    assembler = Assembler.from_materials(elements(mesh, "mean_dilatation"), mesh.regions, [law])
+    body = FiniteElementBody.of(mesh, assembler, supported=np.flatnonzero(mesh.points[:, 2] < 1e-9), gravity=(0.0, 0.0, -9810.0))
+    touched = InteractiveSimulation(body, {})
+    through = [[[x, -20.0, 12.0], [x, 20.0, 12.0]] for x in (-20.0, 20.0)]
+    touched.begin_cut(through, 4.0)
+    with pytest.raises(InputError, match="a cut is under way"):
+        touched.begin_cut(through, 4.0)
+    moved = touched.advance()
+    assert moved.topology == 0
+    before = touched._session.state().displacement
+    assert touched.finish_cut(wait=True)
+    after = touched._session.state().displacement
+    np.testing.assert_allclose(after.min(axis=0), before.min(axis=0), atol=1e-12)  # what it had become meanwhile is kept
+    assert touched.last.topology == 1
+    assert len(touched.body.points) > mesh.n_points
+    assert not touched.advance().failed
+    assert not touched.finish_cut()
+    touched.begin_cut(through, -1.0)
+    with pytest.raises(InputError, match="distance_mm"):
+        touched.finish_cut(wait=True)
+    assert touched.last.topology == 1
+
+
 def test_a_lattice_is_cut_while_it_is_touched() -> None:
     touched = simulation()
     before = touched.body.engine.lattice  # type: ignore[attr-defined]

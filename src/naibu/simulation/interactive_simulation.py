@@ -20,7 +20,8 @@ from naibu.mechanics.contact.indenter_motion import IndenterVelocity
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.meshing.cutting.volume import VolumeCut
-from naibu.simulation.interactive_bodies import NO_NODES, AnySession, InteractiveBody
+from naibu.simulation.background_cut import BackgroundCut
+from naibu.simulation.interactive_bodies import NO_NODES, AnySession, FiniteElementBody, InteractiveBody
 from naibu.simulation.lattice_cut import LatticeCut
 
 FRAME_S = 1.0 / 60.0
@@ -113,6 +114,7 @@ class InteractiveSimulation:
     _last: Frame = field(init=False)
     _topology: int = field(init=False, default=0)
     _surface: IntArray = field(init=False)
+    _cutting: BackgroundCut | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         require_positive("frame_s", self.frame_s, "s")
@@ -221,11 +223,60 @@ class InteractiveSimulation:
         """
         body, state, found = self.body.cut(self.body.without_contact(self._session.state()), swept_blade(edges), distance_mm)
         self._keep()
+        self._go_on(body, state)
+        return found
+
+    def begin_cut(self, edges: ArrayLike, distance_mm: float | None = None) -> None:
+        """Cut the body as `cut` does, where it is now; finite elements move on, whole, until the cut is ready and `finish_cut` is called.
+
+        Raises
+        ------
+        InputError
+            A cut that is under way already, or what `cut` refuses of the blade.
+        """
+        if not isinstance(self.body, FiniteElementBody):
+            self.cut(edges, distance_mm)
+            return
+        if self._cutting is not None:
+            raise InputError("a cut is under way; wait until it opens")
+        cutting = BackgroundCut(self.body)
+        cutting.begin(self.body.without_contact(self._session.state()), swept_blade(edges), distance_mm)
+        self._cutting = cutting
+
+    def finish_cut(self, *, wait: bool = False) -> bool:
+        """Go on with the body behind the cut that was begun; False where none is ready.
+
+        Parameters
+        ----------
+        wait : bool
+            Whether to wait for it.
+
+        Raises
+        ------
+        InputError
+            What `cut` refuses, or another body than the one that was cut; the body is then as it was.
+        """
+        cutting = self._cutting
+        if cutting is None:
+            return False
+        if wait:
+            cutting.wait()
+        if not cutting.finished:
+            return False
+        self._cutting = None
+        if cutting.body is not self.body:
+            raise InputError("the cut came to nothing, as the one before it was undone meanwhile; cut again")
+        body, state = cutting.result(self.body.without_contact(self._session.state()))
+        self._keep()
+        self._go_on(body, state)
+        return True
+
+    def _go_on(self, body: InteractiveBody, state: Any) -> None:
+        """Go on with a body that was cut."""
         self._topology += 1
         self._begin(body, state)
         self._press(self._tool)
         self._last = self._frame(self._last.number + 1, self._last.time_s, np.zeros(3), np.zeros(3), "")
-        return found
 
     def undo(self) -> bool:
         """Return to the state before the last grip, cut, change of tool or reset; False where there is none left."""
@@ -261,7 +312,9 @@ class InteractiveSimulation:
         return self._last
 
     def close(self) -> None:
-        """Release what the session holds."""
+        """Release what the session holds, and wait for a cut under way."""
+        if self._cutting is not None:
+            self._cutting.wait()
         self._session.close()
 
     def _begin(self, body: InteractiveBody, state: Any = None) -> None:

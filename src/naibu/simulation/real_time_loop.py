@@ -181,6 +181,11 @@ class RealTimeLoop:
             self._keep(frame)
 
     def _obey(self) -> None:
+        try:
+            if self.simulation.finish_cut():
+                self._latest = self.simulation.last
+        except NaibuError as error:
+            self._trouble = str(error)
         while self._commands:
             try:
                 self._commands.popleft()(self.simulation)

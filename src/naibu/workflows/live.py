@@ -27,6 +27,7 @@ from naibu.workflows.touchable_models import MeshMaterial, TouchableModel, tools
 
 GRIP_RADIUS = 0.08  # of the extent of the body
 PAGE_BYTES = 5_000_000
+WARM_FRAMES = 6  # before the page is ready
 SWITCH_S = 2e-4  # in which the page leaves the interpreter to the physics of a haptic device
 
 
@@ -176,7 +177,15 @@ def touched_loop(model: TouchableModel, haptics_port: int | None = None) -> Iter
             gc.freeze()  # a collection over all that was imported takes more than 5 ms
         frame_s = FRAME_S if hand is None else body.step_s
         simulation = InteractiveSimulation(body, tools_for(body), frame_s)
+        _warm(simulation)
         yield stack.enter_context(RealTimeLoop(simulation, hand=hand))
+
+
+def _warm(simulation: InteractiveSimulation) -> None:
+    """Compile and factorize what frames need, by the first ones, in which the body settles on its supports."""
+    if isinstance(simulation.body, FiniteElementBody):
+        for _ in range(WARM_FRAMES):
+            simulation.advance()
 
 
 def _order(kind: str, command: LiveCommand) -> Callable[[InteractiveSimulation], None]:
@@ -199,7 +208,7 @@ def _order(kind: str, command: LiveCommand) -> Callable[[InteractiveSimulation],
             case "undo":
                 simulation.undo()
             case "cut":
-                simulation.cut(command.edges)
+                simulation.begin_cut(command.edges)
 
     return carry_out
 

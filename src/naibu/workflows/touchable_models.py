@@ -128,8 +128,8 @@ def touchable(source: str | os.PathLike[str], *, experiment: Source | None = Non
     if str(source) in NAMED or path.suffix == ".toml":
         return _lattice(prepared_study(source))
     raise InputError(
-        f"{source}: is neither a {MODEL_FILE} or its folder, nor a mesh ({', '.join(MESH_READERS)}), nor a study (.toml); studies by name "
-        f"are {', '.join(NAMED)}"
+        f"{source}: is neither a {MODEL_FILE} or its folder, nor a mesh ({', '.join(MESH_READERS)}), nor a study (.toml); what naibu "
+        f"brings with it is demo (the gels of naibu demo) and the lattices {', '.join(NAMED)}"
     )
 
 

@@ -29,14 +29,15 @@ from naibu.mechanics.linear_algebra.block_matrix import BlockPattern, block_patt
 from naibu.mechanics.linear_algebra.direct import PardisoSolver, SuperLUSolver, pardiso_library
 from naibu.mechanics.linear_algebra.updated_factors import BlockChange, UpdatedFactors
 
-ITERATIONS = 8  # of a step at most
+ITERATIONS = 12  # of a step at most
 DEPTH = 4  # earlier iterations that are mixed
 FINISHED = 5e-3  # out-of-balance force, as a fraction of all forces, at which a step ends
 SETTLED = 1e-3  # below which no iteration is worth while
 VOLUME_ERROR = 2e-4  # difference of the volume strain and that of its pressure
 ACCEPTED = 0.05  # out-of-balance force of a step that has used up its iterations
-DIVERGED = 10.0  # growth of the out-of-balance force from which a step is tried from another beginning
-AHEAD = 160  # nodes in contact, or about to be, for which the inverse is prepared
+DIVERGED = 1e6  # out-of-balance force from which a step is tried from another beginning
+JUMP = 10.0  # its growth from which earlier iterations are forgotten, as where contacts close
+AHEAD = 240  # nodes in contact, or about to be, for which the inverse is prepared
 REACH = 0.2  # extents of the body around an indenter in which they are sought
 PERIOD = 10  # steps after which a tangent is renewed without a thread
 
@@ -131,7 +132,7 @@ class RealTimeSession(DynamicSession):
         """Bring these indenters, and no others, into play; see `DynamicSession.press`."""
         DynamicSession.press(self, indenters)
         self._places = tuple(self._engine._surface.positions(c.nodes) for c in self._templates)
-        self._near, self._gaps, self._trial = (), (), None
+        self._near, self._gaps, self._trial, self._changed = (), (), None, None
 
     def restore(self, state: DynamicState) -> None:
         """Go on from a state; see `DynamicSession.restore`."""
@@ -198,14 +199,16 @@ class RealTimeSession(DynamicSession):
 
     def _iterated(self, tangent: EarlierTangent, trial: _Trial, inertial: FloatArray) -> _Trial | None:
         """Return the balance that the iterations find from a beginning, None where they diverge."""
-        first, mixing = trial.error, AndersonMixing(DEPTH)
+        mixing = AndersonMixing(DEPTH)
         for k in range(ITERATIONS):
             wrong = float(np.abs(trial.mismatch / self._engine._elements.bulk).max())
             if trial.error <= (FINISHED if k else SETTLED) and wrong <= VOLUME_ERROR:
                 return trial
             after = self._improved(tangent, trial, inertial, mixing)
-            if after is None or after.error > DIVERGED * max(first, ACCEPTED):
+            if after is None or after.error > DIVERGED:
                 return None
+            if after.error > JUMP * trial.error:
+                mixing = AndersonMixing(DEPTH)
             trial = after
         return trial if trial.error <= ACCEPTED else None
 
@@ -277,8 +280,9 @@ class RealTimeSession(DynamicSession):
         return np.array([trial.balance[nodes].sum(axis=0) for nodes in self.bodies]).reshape(-1, 3), of_indenters
 
     def _soon_touched(self, contacts: Sequence[Contact], gaps: Sequence[FloatArray]) -> IntArray:
-        """Nodes where contact is about to begin, the nearest first, and then those in contact, the least deep first."""
-        nodes, order = [np.zeros(0, np.int64)], [np.zeros(0)]
+        """Nodes whose contact has changed, where it is about to begin, the nearest first, and those in contact, the least deep first."""
+        changed = np.zeros(0, np.int64) if self._changed is None else self._changed.change.nodes  # they will change again
+        nodes, order = [changed], [np.full(len(changed), -1.0)]
         reach = REACH * self._extent()
         for contact, gap in zip(contacts, gaps, strict=True):
             near = np.flatnonzero(gap < reach)
@@ -309,7 +313,7 @@ class RealTimeSession(DynamicSession):
         """Have a tangent made of the state reached, if anything has changed since the last one."""
         u = self.reached.displacement
         still = self._seen is not None and float(np.abs(u - self._seen).max()) < 1e-4 * self._extent()
-        still &= self._earlier is not None and self._earlier.factors.covers(ahead[: len(ahead) // 2])
+        still &= self._earlier is not None and self._earlier.factors.covers(ahead[: len(ahead) // 3])
         self._age += 1
         if still or not self._thread.idle or (not self._engine.background and self._age < PERIOD):
             return
