@@ -14,7 +14,7 @@ import numpy as np
 from naibu.core.errors import InputError
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.simulation.haptic_loop import HapticHand
-from naibu.simulation.interactive_bodies import InteractiveBody
+from naibu.simulation.interactive_bodies import FiniteElementBody, InteractiveBody
 from naibu.simulation.interactive_simulation import FRAME_S, Frame, InteractiveSimulation
 from naibu.simulation.real_time_loop import RealTimeLoop
 from naibu.viewer.live.commands import LiveCommand
