@@ -14,17 +14,19 @@ from naibu.cli.console import INTERRUPTED, app, errors, print_table, progress_di
 from naibu.cli.described import Flag, Whole
 from naibu.core.progress import ProgressReport
 
-ChapterName = Literal["ch1", "ch2", "ch3", "ch4-adaptive", "ch4-cut", "ch4-lattice", "ch4-cube", "ch4-octree", "ch5", "ch6"]
+ChapterName = Literal["ch1", "ch2", "ch3", "ch4-adaptive", "ch4-cut", "ch4-lattice", "ch4-cube", "ch4-octree", "ch5", "ch6", "all"]
 
 
 @app.command
 def reproduce(chapter: ChapterName, *, out: Path = Path("naibu-reproduction"), seed: Whole = 0, overwrite: Flag = False) -> None:
     """Recompute the tables and figures of a chapter of the 2008 report, and compare them with the printed ones.
 
+    With all, every chapter is computed that the folder does not hold yet, and an index page is written over them.
+
     Parameters
     ----------
     chapter
-        Chapter of the report.
+        Chapter of the report, or all.
     out
         Folder for the page (ch3.html) and the numbers (ch3.json).
     seed
@@ -32,22 +34,28 @@ def reproduce(chapter: ChapterName, *, out: Path = Path("naibu-reproduction"), s
     overwrite
         Replace results, or files of your own, that the folder already holds.
     """
-    from naibu.core.arrays import require_count
     from naibu.reproduction.chapters import CHAPTERS
-    from naibu.viewer.chapter_page import write_chapter
-    from naibu.workflows.output_folder import output_folder
+    from naibu.workflows.reproduce import missing_chapters, processor_seconds, reproduce_all
+    from naibu.workflows.reproduce import reproduce as reproduced
 
-    require_count("seed", seed, 0)
-    output_folder(out, (f"{chapter}.html", f"{chapter}.json"), overwrite=overwrite)
     began = time.perf_counter()
+    if chapter == "all":
+        left = tuple(CHAPTERS) if overwrite else missing_chapters(out, seed)
+        minutes = processor_seconds(left) / 60.0
+        errors.print(
+            f"{len(left)} chapters are to be computed: about {minutes:.0f} minutes on one common core. Ctrl-C keeps those that are done."
+        )
+        with progress_display() as progress:
+            index, _ = reproduce_all(out, seed=seed, overwrite=overwrite, progress=progress)
+        say(f"{time.perf_counter() - began:.0f} s. Index: {index}")
+        return
     with errors.status("starting"):
-        done = CHAPTERS[chapter](seed)
+        done, page, numbers = reproduced(chapter, out=out, seed=seed, overwrite=overwrite)
     for section in done.sections:
         for table in section.tables:
             print_table(f"{table.title}: {table.caption}", table.columns, table.rows)
             if table.note:
                 say(table.note, "dim")
-    page, numbers = write_chapter(done, out)
     say(f"{time.perf_counter() - began:.0f} s. Page: {page}   numbers: {numbers}")
 
 

@@ -28,3 +28,17 @@ CHAPTERS: dict[str, Callable[[int], Chapter]] = {
     "ch5": chapter5,
     "ch6": chapter6,
 }
+
+# processor seconds, to say beforehand how long all of them take
+PROCESSOR_S: dict[str, float] = {
+    "ch1": 60.0,
+    "ch2": 60.0,
+    "ch3": 60.0,
+    "ch4-adaptive": 60.0,
+    "ch4-cut": 60.0,
+    "ch4-lattice": 60.0,
+    "ch4-cube": 60.0,
+    "ch4-octree": 60.0,
+    "ch5": 18.0,
+    "ch6": 20.0,
+}

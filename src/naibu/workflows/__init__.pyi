@@ -5,6 +5,7 @@ from .haptics.device import DeviceRecord, drive_live_simulation
 from .identify import Identification
 from .identify_fields import FieldIdentification, identify_fields
 from .live import live, touched_loop
+from .reproduce import ReproducedChapter, reproduce, reproduce_all
 from .sense import Pair, SenseRun, read_pair, sense_pair
 from .simulate import NamedStudy, named_studies
 from .simulate_lattice import SimulationRun
@@ -22,6 +23,7 @@ __all__ = [
     "NamedStudy",
     "ObjectDescription",
     "Pair",
+    "ReproducedChapter",
     "SenseRun",
     "SequenceRun",
     "SimulationRun",
@@ -36,6 +38,8 @@ __all__ = [
     "live",
     "named_studies",
     "read_pair",
+    "reproduce",
+    "reproduce_all",
     "sense_pair",
     "tools_for",
     "touchable",

@@ -1,0 +1,171 @@
+"""Reproduce the chapters of the 2008 report :cite:p:`hirai2008`: pages of tables and figures, and an index over all of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from naibu._version import __version__
+from naibu.core.arrays import require_count
+from naibu.core.errors import InputError
+from naibu.core.progress import Progress, report_progress
+from naibu.io.files.atomic import write_atomically
+from naibu.reproduction.chapters import CHAPTERS, PROCESSOR_S
+from naibu.viewer.chapter import Chapter
+from naibu.viewer.chapter_page import write_chapter
+from naibu.viewer.page_frame import page_html
+from naibu.workflows.output_folder import output_folder
+
+ALL = "all"
+
+
+@dataclass(frozen=True, slots=True)
+class ReproducedChapter:
+    """A chapter whose page is written.
+
+    Attributes
+    ----------
+    name, title : str
+        Of the chapter.
+    page, numbers : Path
+        Its files.
+    resumed : bool
+        Whether they were there already, of the same version and seed.
+    seconds : float
+        What computing them took; NaN where they were there.
+    """
+
+    name: str
+    title: str
+    page: Path
+    numbers: Path
+    resumed: bool
+    seconds: float
+
+
+def reproduce(chapter: str, *, out: str | os.PathLike[str], seed: int = 0, overwrite: bool = False) -> tuple[Chapter, Path, Path]:
+    """Recompute the tables and figures of a chapter; write ``CHAPTER.html`` and ``CHAPTER.json``.
+
+    Parameters
+    ----------
+    chapter : str
+        One of `naibu.reproduction.chapters.CHAPTERS`.
+    out : path-like
+        Folder of the files.
+    seed : int
+        Seed of the random numbers.
+    overwrite : bool
+        Whether results that the folder holds are replaced.
+
+    Returns
+    -------
+    tuple of Chapter, Path, Path
+        The content, the page and the numbers.
+
+    Raises
+    ------
+    InputError
+        No such chapter, a negative seed, or a folder that cannot be written to or holds results.
+    """
+    require_count("seed", seed, 0)
+    if chapter not in CHAPTERS:
+        raise InputError(f"chapter {chapter!r} is not known; use one of {', '.join(CHAPTERS)}")
+    folder = output_folder(out, (f"{chapter}.html", f"{chapter}.json"), overwrite=overwrite)
+    content = CHAPTERS[chapter](seed)
+    return content, *write_chapter(content, folder)
+
+
+def missing_chapters(out: str | os.PathLike[str], seed: int = 0) -> tuple[str, ...]:
+    """Return the chapters that the folder does not hold yet, of this version of naibu and this seed."""
+    return tuple(name for name in CHAPTERS if _finished(Path(out), name, seed) is None)
+
+
+def processor_seconds(chapters: tuple[str, ...]) -> float:
+    """Return about how long chapters take on one core of a common processor, s."""
+    return sum(PROCESSOR_S[name] for name in chapters)
+
+
+def reproduce_all(
+    out: str | os.PathLike[str], *, seed: int = 0, overwrite: bool = False, progress: Progress | None = None
+) -> tuple[Path, tuple[ReproducedChapter, ...]]:
+    """Recompute all chapters, and write ``index.html`` over them: what each has, and what its notes say of agreement and misprints.
+
+    Chapters that the folder holds, of the same version of naibu and the same seed, are kept: an interrupted run goes on.
+
+    Parameters
+    ----------
+    out : path-like
+        Folder of the pages.
+    seed : int
+        Seed of the random numbers.
+    overwrite : bool
+        Whether all chapters are computed again.
+    progress : callable, optional
+        Called with a `ProgressReport` before every chapter.
+
+    Returns
+    -------
+    tuple of Path and tuple of ReproducedChapter
+        The index, and the chapters.
+
+    Raises
+    ------
+    InputError
+        A negative seed, a folder that cannot be written to, or one that holds other results, as of another seed.
+    """
+    require_count("seed", seed, 0)
+    folder = Path(out)
+    left = tuple(CHAPTERS) if overwrite else missing_chapters(folder, seed)
+    # the page of a chapter is written before its numbers: a run that was killed between them is resumed
+    written = [f"{name}.json" for name in left]
+    if overwrite or len(left) == len(CHAPTERS):  # else the index is that of an earlier run
+        written.append("index.html")
+    output_folder(folder, written, overwrite=overwrite)
+    done: list[ReproducedChapter] = []
+    for name in CHAPTERS:
+        report_progress(progress, f"reproduce {name}", done=len(done), total=len(CHAPTERS))
+        files = folder / f"{name}.html", folder / f"{name}.json"
+        kept = None if name in left else _finished(folder, name, seed)
+        began = time.perf_counter()
+        title = str(kept["title"]) if kept is not None else reproduce(name, out=folder, seed=seed, overwrite=True)[0].title
+        seconds = float("nan") if kept is not None else time.perf_counter() - began
+        done.append(ReproducedChapter(name, title, *files, kept is not None, seconds))
+    return write_atomically(folder / "index.html", _index(done, seed)), tuple(done)
+
+
+def _finished(folder: Path, name: str, seed: int) -> dict[str, Any] | None:
+    """Return the numbers of a chapter whose page is there, of this version and seed."""
+    try:
+        found = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    if not isinstance(found, dict) or not (folder / f"{name}.html").is_file() or not isinstance(found.get("settings"), dict):
+        return None
+    return found if found.get("naibu") == __version__ and found["settings"].get("seed") == seed else None
+
+
+def _index(done: list[ReproducedChapter], seed: int) -> str:
+    links = "".join(f'<li><a href="#{c.name}">{escape(c.title)}</a></li>' for c in done)
+    sections = "\n".join(_entry(c) for c in done)
+    contents = f'<nav aria-label="Contents"><ul>{links}</ul></nav>'
+    return page_html("The 2008 report, reproduced", contents, sections, f"naibu {__version__}, seed {seed}.")
+
+
+def _entry(chapter: ReproducedChapter) -> str:
+    """Return the section of a chapter: its link, its tables, and the notes that tell of assumptions, misprints and differences."""
+    tables = json.loads(chapter.numbers.read_text(encoding="utf-8"))["tables"]
+    rows = "".join(
+        f"<tr><td>{escape(t['section'])}</td><td>{escape(t['title'])}</td><td>{escape(t['note'] or t['caption'])}</td></tr>" for t in tables
+    )
+    head = "<thead><tr><th>section</th><th>table</th><th>what to know</th></tr></thead>"
+    return (
+        f'<section id="{chapter.name}" class="long" aria-labelledby="h-{chapter.name}">'
+        f'<h2 id="h-{chapter.name}">{escape(chapter.title)}</h2>'
+        f'<p><a href="{chapter.page.name}">Page with all tables and figures</a>, <a href="{chapter.numbers.name}">numbers</a></p>'
+        f"<table>{head}<tbody>{rows}</tbody></table></section>"
+    )
