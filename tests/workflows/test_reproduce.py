@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,8 @@ from naibu.core.errors import InputError
 from naibu.reproduction import chapters
 from naibu.viewer.chapter import Chapter, Section
 from naibu.viewer.tables import Table
-from naibu.workflows import reproduce as workflow
+
+workflow = importlib.import_module("naibu.workflows.reproduce")  # the package has a function of this name
 
 
 @pytest.fixture
