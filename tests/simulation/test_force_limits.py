@@ -49,7 +49,7 @@ def test_an_environment_that_drives_the_hand_gives_no_more_than_the_bound(gain: 
     """A force along the motion is negative damping; without the controller it gives without end."""
     given = {}
     for limits in (ForceLimits(), replace(ForceLimits(), energy_mn_mm=1e12)):
-        controller, limiter = PassivityController(limits), StepLimiter(limits.step_mn)
+        controller, limiter = PassivityController(limits, 500.0), StepLimiter(limits.step_mn)
         position, velocity, force, work, most = 0.0, 20.0, 0.0, 0.0, 0.0
         for _ in range(5000):
             velocity += 1e-3 * (force - 100.0 * position) / 0.2
@@ -66,7 +66,7 @@ def test_an_environment_that_drives_the_hand_gives_no_more_than_the_bound(gain: 
 
 
 def test_an_environment_that_takes_energy_is_left_alone() -> None:
-    controller = PassivityController(ForceLimits())
+    controller = PassivityController(ForceLimits(), 500.0)
     force, velocity = np.array([-500.0, 20.0, 0.0]), np.array([40.0, 0.0, 0.0])
     assert controller.controlled(force, velocity, 1e-3) is force
 

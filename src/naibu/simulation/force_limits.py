@@ -66,11 +66,14 @@ class PassivityController:
     ----------
     limits : ForceLimits
         Energy that may be handed out in advance, and the largest damping.
+    stiffness : float
+        Of the coupling between device and tool, mN/mm.
     absorbed : float
         Energy that the device has put in so far less what it got, mN mm.
     """
 
     limits: ForceLimits
+    stiffness: float
     absorbed: float = 0.0
 
     def observe(self, force: FloatArray, moved: FloatArray) -> None:
@@ -78,26 +81,28 @@ class PassivityController:
         self.absorbed -= float(force @ moved)
 
     def controlled(self, force: FloatArray, velocity: FloatArray, step_s: float) -> FloatArray:
-        """Return a force (3,), mN, damped where a device at a velocity (3,), mm/s, would get more energy than there is.
+        """Return a force (3,), mN, reduced where a device at a velocity (3,), mm/s, would get more energy than there is.
 
-        The energy that passes while the force is taken back at its limited rate is counted, too.
+        No force exceeds that of the coupling when it has stored what is left, and the energy that passes while the force is taken back at
+        its limited rate is counted, too. Where nothing is left, a damping takes back what was handed out.
         """
         speed = float(np.linalg.norm(velocity))
-        along = float(force @ velocity) / speed if speed > 0.0 else 0.0
-        if along <= 0.0:
-            return force
         left = self.absorbed + self.limits.energy_mn_mm
-        left *= RESERVED if left > 0.0 else 1.0
-        rate = self.limits.step_mn / (CONFIRMED_AFTER * step_s)
-        # largest a with speed * (a delay + a^2 / (2 rate)) = left: a delay until an answer acts, then the force is taken back
-        delay = CONFIRMED_AFTER * step_s * rate
-        allowed = np.sqrt(delay**2 + 2.0 * rate * left / speed) - delay if left > 0.0 else left / (speed * step_s)
-        excess = along - float(allowed)
-        if excess <= 0.0:
-            return force
-        if left > 0.0:
-            return np.asarray(force - excess * velocity / speed)
-        return np.asarray(force - (along + min(-float(allowed), self.limits.damping * speed)) * velocity / speed)
+        if left <= 0.0:
+            return (
+                np.asarray(-min(-left / (speed * step_s), self.limits.damping * speed) * velocity / speed) if speed > 0.0 else np.zeros(3)
+            )
+        size = float(np.linalg.norm(force))
+        kept = min(1.0, np.sqrt(2.0 * self.stiffness * left) / size) if size > 0.0 else 1.0
+        along = kept * float(force @ velocity) / speed if speed > 0.0 else 0.0
+        if along > 0.0:
+            # largest a with speed * (a delay + a^2 / (2 rate)) = left: a delay until an answer acts, then the force is taken back
+            rate = self.limits.step_mn / (CONFIRMED_AFTER * step_s)
+            delay = CONFIRMED_AFTER * step_s * rate
+            allowed = float(np.sqrt(delay**2 + 2.0 * rate * RESERVED * left / speed) - delay)
+            # the whole force: one that loses only its component along the motion turns as the device turns, and swings it
+            kept *= min(1.0, allowed / along)
+        return force if kept == 1.0 else np.asarray(kept * force)
 
 
 @dataclass(slots=True, eq=False)

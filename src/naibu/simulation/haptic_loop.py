@@ -123,7 +123,7 @@ class HapticHand:
     _silence: float = field(init=False, default=0.0)
 
     def __post_init__(self) -> None:
-        self.passivity = PassivityController(self.limits)
+        self.passivity = PassivityController(self.limits, self.coupling.stiffness)
         self._limiter = StepLimiter(self.limits.step_mn)
 
     @property
@@ -215,7 +215,7 @@ class HapticHand:
 
     def _leave(self) -> None:
         self._pose, self._tool = None, None
-        self.passivity = PassivityController(self.limits)
+        self.passivity = PassivityController(self.limits, self.coupling.stiffness)
         self._limiter.forget()
         self.channel.leave()
 
