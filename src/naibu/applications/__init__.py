@@ -1,4 +1,4 @@
-"""Uses of mechanics and imaging: the silicon chip that senses force and moment, and skin that turns pale."""
+"""Uses of mechanics and imaging: a silicon chip that senses force and moment, skin that turns pale, two views of a compressed breast."""
 
 import lazy_loader
 

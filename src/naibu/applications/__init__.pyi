@@ -2,6 +2,11 @@ from .ischemia.layer_identification import LayerEstimate, LayerParameter, identi
 from .ischemia.layered_response import LayeredModes, SkinMotion, frequency_response, simulate_skin
 from .ischemia.response_times import ResponseTimes, response_times
 from .ischemia.skin import MeshedPatch, SkinLayer, SkinPatch, SurfaceLoad, meshed
+from .mammography.breast_outline import BreastOutline, breast_outline, mask_outline
+from .mammography.breast_shape import BreastShape, half_ellipsoid_shape, shape_from_widths
+from .mammography.epipolar import EpipolarCurve, LesionPosition, MammographicPair, ModelUncertainty, mammographic_pair
+from .mammography.geometric_model import Compression, CompressionParameters, compressed
+from .mammography.two_views import TwoViews, two_views
 from .sensing_chip.bridge import closed_form_sensitivities, crosstalk, decoupled, half_bridge, sensitivity_matrix
 from .sensing_chip.chip_mesh import ChipMesh, ChipResolution, chip_mesh
 from .sensing_chip.closed_forms import CrossBeam, orthotropic_torsion_stiffness
@@ -14,16 +19,24 @@ from .sensing_chip.load_envelope import largest_stress, load_envelope, load_limi
 from .sensing_chip.piezoresistance import Piezoresistance, doping_factor, n_type_silicon, p_type_silicon
 
 __all__ = [
+    "BreastOutline",
+    "BreastShape",
     "ChipDesign",
     "ChipMesh",
     "ChipResolution",
     "ChipResponse",
+    "Compression",
+    "CompressionParameters",
     "CrossBeam",
     "DesignStudy",
+    "EpipolarCurve",
     "LayerEstimate",
     "LayerParameter",
     "LayeredModes",
+    "LesionPosition",
+    "MammographicPair",
     "MeshedPatch",
+    "ModelUncertainty",
     "Piezoresistance",
     "RampKalman",
     "Readout",
@@ -32,9 +45,12 @@ __all__ = [
     "SkinMotion",
     "SkinPatch",
     "SurfaceLoad",
+    "TwoViews",
     "assumed_chip",
+    "breast_outline",
     "chip_mesh",
     "closed_form_sensitivities",
+    "compressed",
     "crosstalk",
     "decoupled",
     "doping_factor",
@@ -42,10 +58,13 @@ __all__ = [
     "forward_backward_filter",
     "frequency_response",
     "half_bridge",
+    "half_ellipsoid_shape",
     "identify_layers",
     "largest_stress",
     "load_envelope",
     "load_limits",
+    "mammographic_pair",
+    "mask_outline",
     "meshed",
     "n_type_silicon",
     "orthotropic_torsion_stiffness",
@@ -55,8 +74,10 @@ __all__ = [
     "require_bearable",
     "response_times",
     "sensitivity_matrix",
+    "shape_from_widths",
     "simulate_skin",
     "solve_chip",
     "study_designs",
     "surface_stress",
+    "two_views",
 ]

@@ -6,7 +6,7 @@ import sys
 
 from cyclopts import CycloptsError
 
-from naibu.cli import experiments, imaging, studies, touching  # noqa: F401  they bring their verbs
+from naibu.cli import applications, experiments, imaging, studies, touching  # noqa: F401  they bring their verbs
 from naibu.cli.cold_start import first_run
 from naibu.cli.console import BAD_INPUT, FAILED, INTERRUPTED, app, errors, fail, print_table, progress_display, say
 from naibu.cli.described import Flag

@@ -1,0 +1,124 @@
+"""Shape of an unloaded breast: an ellipse at each distance from the chest wall."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import InputError
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BreastShape:
+    """Ellipses parallel to the chest wall.
+
+    A point (x, y) at depth d lies inside where (x - m)^T S^-1 (x - m) <= 1, with m and S interpolated linearly between the depths.
+
+    Attributes
+    ----------
+    depths : ndarray, shape (n,)
+        Distances from the chest wall, mm, from 0 to the nipple, growing.
+    centres : ndarray, shape (n, 2)
+        Centres m of the ellipses, mm: laterally and upwards.
+    squares : ndarray, shape (n, 3)
+        S_xx, S_yy and S_xy, mm^2: squares of the half widths laterally and upwards, and the tilt.
+    """
+
+    depths: FloatArray
+    centres: FloatArray
+    squares: FloatArray
+
+    @property
+    def depth_mm(self) -> float:
+        """Distance of the nipple from the chest wall."""
+        return float(self.depths[-1])
+
+    @property
+    def volume_mm3(self) -> float:
+        """Volume between the chest wall and the nipple, with the areas of the ellipses interpolated linearly."""
+        xx, yy, xy = self.squares.T
+        return float(np.trapezoid(np.pi * np.sqrt(np.maximum(xx * yy - xy**2, 0.0)), self.depths))
+
+    def in_view(self, angle_deg: float, depths: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return ellipses at depths in the axes of a view.
+
+        Parameters
+        ----------
+        angle_deg : float
+            Positioner angle: 0 of CC, where the detector's axis along the chest wall points laterally; 90 of a lateral view.
+        depths : array_like, shape (k,)
+            Distances from the chest wall, mm.
+
+        Returns
+        -------
+        centres : ndarray, shape (k, 2)
+            Along the detector, then along the compression, mm.
+        squares : ndarray, shape (k, 3)
+            Likewise, mm^2.
+        """
+        d = np.asarray(depths, dtype=float)
+        m = np.stack([np.interp(d, self.depths, column) for column in self.centres.T], axis=-1)
+        xx, yy, xy = (np.interp(d, self.depths, column) for column in self.squares.T)
+        c, s = np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))
+        centres = np.stack([c * m[..., 0] + s * m[..., 1], c * m[..., 1] - s * m[..., 0]], axis=-1)
+        along = c * c * xx + s * s * yy + 2 * c * s * xy
+        across = s * s * xx + c * c * yy - 2 * c * s * xy
+        mixed = c * s * (yy - xx) + (c * c - s * s) * xy
+        return centres, np.stack([along, across, mixed], axis=-1)
+
+
+def half_ellipsoid_shape(size_mm: ArrayLike, sections: int = 200) -> BreastShape:
+    """Return a half ellipsoid.
+
+    Parameters
+    ----------
+    size_mm : array_like, shape (3,)
+        Diameters laterally and upwards, and depth.
+    sections : int
+        Number of ellipses.
+    """
+    x, y, depth = np.asarray(size_mm, dtype=float)
+    d = depth * np.linspace(0.0, 1.0, sections)
+    rest = 1.0 - (d / depth) ** 2
+    return BreastShape(d, np.zeros((sections, 2)), np.column_stack([rest * (x / 2) ** 2, rest * (y / 2) ** 2, 0.0 * rest]))
+
+
+def shape_from_widths(depths: FloatArray, first: FloatArray, second: FloatArray, angle_deg: float) -> BreastShape:
+    """Return the roundest ellipses with given widths in two directions.
+
+    With the half widths a and b in directions that enclose the angle, S has the mean (a^2 + b^2)/2 of its
+    principal squares, and they differ
+    as little as the widths allow, by abs(b^2 - a^2)/sin(angle).
+
+    Parameters
+    ----------
+    depths : ndarray, shape (n,)
+        Distances from the chest wall, mm.
+    first, second : ndarray, shape (n, 2)
+        Least and greatest positions laterally (CC), and in the direction of the angle (MLO), mm.
+    angle_deg : float
+        Angle between the two directions.
+
+    Raises
+    ------
+    InputError
+        The widths differ so much that no ellipse has both.
+    """
+    t = np.deg2rad(angle_deg)
+    a2, b2 = (np.square(0.5 * (w[:, 1] - w[:, 0])) for w in (first, second))
+    mean, difference = 0.5 * (a2 + b2), b2 - a2
+    if np.any(np.abs(difference[:-1]) > 0.98 * 2.0 * mean[:-1] * abs(np.sin(t))):
+        at = int(np.argmax(np.abs(difference[:-1]) / mean[:-1]))
+        raise InputError(
+            f"the outlines do not fit together: {depths[at]:.3g} mm from the chest wall the half widths are {np.sqrt(a2[at]):.3g} and "
+            f"{np.sqrt(b2[at]):.3g} mm, which no section has in directions {angle_deg:g} degrees apart; check "
+            f"angle_deg, the units, and that "
+            "both outlines end at the same height of the chest wall"
+        )
+    p, r = -0.5 * difference, difference * np.sin(2 * t) / (4.0 * np.sin(t) ** 2)
+    middles = [0.5 * (w[:, 0] + w[:, 1]) for w in (first, second)]
+    upwards = (middles[1] - np.cos(t) * middles[0]) / np.sin(t)
+    return BreastShape(depths, np.column_stack([middles[0], upwards]), np.column_stack([mean + p, mean - p, r]))

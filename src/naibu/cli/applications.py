@@ -1,0 +1,85 @@
+"""Verbs of applications: ``mammography``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from naibu.cli.console import app, print_table, say
+from naibu.cli.described import Flag, Whole
+from naibu.core.errors import InputError
+
+
+@app.command
+def mammography(
+    *,
+    cc: Path,
+    mlo: Path,
+    thickness_mm: str,
+    angle_deg: float,
+    point_cc: Annotated[str, Parameter(allow_leading_hyphen=True)] = "",
+    point_mlo: Annotated[str, Parameter(allow_leading_hyphen=True)] = "",
+    pixel_mm: float | None = None,
+    draws: Whole = 100,
+    seed: Whole = 0,
+    out: Path = Path("naibu-mammography"),
+    overwrite: Flag = False,
+) -> None:
+    """Predict where a point of one mammographic view lies in the other, or where a lesion that both show lies in the breast.
+
+    Research software, not a medical device. At least one point is needed; with both, the position of the lesion is estimated.
+
+    Parameters
+    ----------
+    cc
+        Outline of the breast in CC: a CSV table of points along the skin, in mm, perpendicular to the chest wall and along it, laterally;
+        or a mask (TIFF, MetaImage, NRRD, NIfTI), lateral side up, whose breast touches the side of the image that is the chest wall.
+    mlo
+        The same in MLO, upper side up.
+    thickness_mm
+        Distance of the compression plates, mm: one number, or CC,MLO.
+    angle_deg
+        Positioner angle of MLO against CC, degrees: 20 to 90.
+    point_cc
+        Point X,Y in CC, mm, in the coordinates of the outline; of masks, from the lower left corner.
+    point_mlo
+        Point X,Y in MLO.
+    pixel_mm
+        Size of a pixel of the masks, mm, where the files do not state it.
+    draws
+        Number of models drawn from the uncertainty of the parameters.
+    seed
+        Seed of the random numbers.
+    out
+        Folder for mammography.html and mammography.json.
+    overwrite
+        Replace results, or files of your own, that the folder already holds.
+    """
+    from naibu.workflows.mammography import relate_views
+
+    run = relate_views(
+        cc,
+        mlo,
+        thickness_mm=_numbers("thickness_mm", thickness_mm),
+        angle_deg=angle_deg,
+        point_cc=_numbers("point_cc", point_cc) if point_cc else None,
+        point_mlo=_numbers("point_mlo", point_mlo) if point_mlo else None,
+        pixel_mm=pixel_mm,
+        draws=draws,
+        seed=seed,
+        out=out,
+        overwrite=overwrite,
+    )
+    print_table("naibu mammography", ("quantity", "value"), run.rows, left=True)
+    for warning in run.warnings:
+        say(warning, "yellow")
+    say(f"Page: {run.files[0]}   numbers: {run.files[1]}")
+
+
+def _numbers(name: str, text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise InputError(f"{name} is {text!r}: needs numbers separated by commas, such as 52.0,31.5") from None

@@ -1,0 +1,139 @@
+"""Two views of a breast: shape from outlines, epipolar curve and band, position of a lesion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from naibu.applications.mammography.breast_outline import BreastOutline, breast_outline
+from naibu.applications.mammography.breast_shape import half_ellipsoid_shape
+from naibu.applications.mammography.epipolar import MammographicPair, ModelUncertainty, mammographic_pair
+from naibu.applications.mammography.geometric_model import DEFAULT_PARAMETERS, Compression, CompressionParameters, compressed
+from naibu.applications.mammography.two_views import two_views
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import InputError
+
+SHAPE = half_ellipsoid_shape((130.0, 140.0, 90.0))
+PLATES, ANGLE = (60.0, 55.0), 45.0
+
+
+def shadow(state: Compression) -> BreastOutline:
+    """Return the outline of a compressed breast: the largest extents of its columns, from their maps."""
+    depths = np.linspace(0.0, state.shape.depth_mm, 300)
+    centres, squares = state.shape.in_view(state.angle_deg, depths)
+    t = np.deg2rad(state.angle_deg)
+    ends = []
+    for sign in (-1.0, 1.0):
+        along = centres[:, 0] + sign * np.sqrt(squares[:, 0])
+        across = centres[:, 1] + sign * squares[:, 2] / np.sqrt(np.maximum(squares[:, 0], 1e-9))
+        points = np.column_stack([np.cos(t) * along - np.sin(t) * across, np.sin(t) * along + np.cos(t) * across, depths])
+        ends.append(state.project(points))
+    return breast_outline(np.vstack([ends[0], ends[1][::-1]]))
+
+
+def views(
+    first: CompressionParameters = DEFAULT_PARAMETERS, second: CompressionParameters = DEFAULT_PARAMETERS
+) -> tuple[Compression, Compression]:
+    return compressed(SHAPE, 0.0, PLATES[0], first), compressed(SHAPE, ANGLE, PLATES[1], second)
+
+
+def interior(count: int) -> FloatArray:
+    random = np.random.default_rng(2)
+    points = random.uniform(-1.0, 1.0, (20 * count, 3)) * [1, 1, 0.5] + [0, 0, 0.5]
+    kept = points[(points**2).sum(axis=1) < 0.6][:count]
+    return kept * [65.0, 70.0, 90.0]
+
+
+@pytest.fixture(scope="module")
+def pair() -> MammographicPair:
+    cc, mlo = views()
+    return mammographic_pair(shadow(cc), shadow(mlo), PLATES, ANGLE, draws=60, seed=1)
+
+
+def test_the_unloaded_shape_is_found_from_the_outlines() -> None:
+    cc, mlo = views()
+    found = two_views(shadow(cc), shadow(mlo), PLATES, ANGLE)
+    assert found.shape.volume_mm3 == pytest.approx(SHAPE.volume_mm3, rel=0.03)
+    assert found.shape.depth_mm == pytest.approx(90.0, rel=0.02)
+    for state in (found.cc, found.mlo):
+        assert state.volume_mm3() == pytest.approx(found.shape.volume_mm3, rel=0.05)
+
+
+def test_the_curve_goes_through_the_own_projection_of_a_point(pair: MammographicPair) -> None:
+    for position in interior(8):
+        cc, mlo = pair.project(position)
+        assert pair.epipolar_curve(cc).distance(mlo) < 0.05
+        back = pair.epipolar_curve(mlo, from_view="MLO")
+        assert back.distance(cc) < 0.05
+        lesion = pair.lesion(cc, mlo)
+        np.testing.assert_allclose(lesion.position, position, atol=0.6)
+        assert lesion.agrees and np.all((lesion.low <= position + 0.6) & (position <= lesion.high + 0.6))
+
+
+def test_the_middle_of_a_symmetric_breast_stays_in_the_middle() -> None:
+    turn = np.linspace(-np.pi / 2, np.pi / 2, 181)
+    outline = breast_outline(np.column_stack([110.0 * np.cos(turn), 80.0 * np.sin(turn)]))
+    found = mammographic_pair(outline, outline, (60.0, 60.0), 90.0, draws=20)
+    curve = found.epipolar_curve([50.0, 0.0]).curve
+    np.testing.assert_allclose(curve[:, 1], -curve[::-1, 1], atol=0.5)
+    np.testing.assert_allclose(curve[:, 0], curve[::-1, 0], atol=0.05)
+
+
+def test_the_band_covers_breasts_with_other_parameters() -> None:
+    """Breasts pressed with drawn parameters and displacements; the model is built from their outlines, and knows neither."""
+    sds, random = ModelUncertainty(), np.random.default_rng(7)
+    held = total = 0
+    for _ in range(5):
+        own = [
+            CompressionParameters(
+                *np.clip([1.0 + sds.volume_ratio * a, 0.5 + sds.along_share * b, 0.3 + sds.bending * c], [0.8, -0.4, -0.9], 1.4)
+            )
+            for a, b, c in random.standard_normal((2, 3))
+        ]
+        cc, mlo = views(own[0], own[1])
+        found = mammographic_pair(shadow(cc), shadow(mlo), PLATES, ANGLE, draws=30, seed=3)
+        for position in interior(9):
+            noise = sds.unresolved_mm * random.standard_normal((2, 2))
+            seen = cc.project(position) + noise[0]
+            if not found.outlines[0].contains(seen):
+                continue
+            try:
+                curve = found.epipolar_curve(seen)
+            except InputError:
+                continue
+            held += int(curve.in_band(mlo.project(position) + noise[1]))
+            total += 1
+    assert total > 35
+    assert held / total >= 0.85
+
+
+def test_the_same_seed_gives_the_same_band(pair: MammographicPair) -> None:
+    again = mammographic_pair(*pair.outlines, PLATES, ANGLE, draws=60, seed=1)
+    np.testing.assert_array_equal(again.epipolar_curve([50.0, 10.0]).band, pair.epipolar_curve([50.0, 10.0]).band)
+
+
+def test_points_that_belong_to_no_lesion_are_told(pair: MammographicPair) -> None:
+    assert not pair.lesion([30.0, 20.0], [95.0, 0.0]).agrees
+
+
+def test_what_cannot_be_is_refused(pair: MammographicPair) -> None:
+    cc, mlo = pair.outlines
+    for plates in ((200.0, 60.0), (60.0, 200.0)):
+        with pytest.raises(InputError, match="thickness_mm"):
+            two_views(cc, mlo, plates, ANGLE)
+    with pytest.raises(InputError, match="thickness_mm is -3"):
+        two_views(cc, mlo, (-3.0, 60.0), ANGLE)
+    with pytest.raises(InputError, match="angle_deg is 5"):
+        two_views(cc, mlo, PLATES, 5.0)
+    with pytest.raises(InputError, match=r"point_cc is .* outside of the outline of CC"):
+        pair.epipolar_curve([500.0, 0.0])
+    with pytest.raises(InputError, match="outside of the unloaded breast"):
+        pair.project([0.0, 0.0, 500.0])
+    with pytest.raises(InputError, match="from_view"):
+        pair.epipolar_curve([50.0, 0.0], from_view="LM")
+    turn = np.linspace(-np.pi / 2, np.pi / 2, 91)
+    small = breast_outline(np.column_stack([50.0 * np.cos(turn), 40.0 * np.sin(turn)]))
+    with pytest.raises(InputError, match="do not belong to one breast"):
+        two_views(cc, small, PLATES, ANGLE)
+    with pytest.raises(InputError, match="bending"):
+        ModelUncertainty(bending=-1.0)
