@@ -31,14 +31,14 @@ CHAPTERS: dict[str, Callable[[int], Chapter]] = {
 
 # processor seconds, to say beforehand how long all of them take
 PROCESSOR_S: dict[str, float] = {
-    "ch1": 60.0,
-    "ch2": 60.0,
-    "ch3": 60.0,
-    "ch4-adaptive": 60.0,
-    "ch4-cut": 60.0,
+    "ch1": 70.0,
+    "ch2": 25.0,
+    "ch3": 36.0,
+    "ch4-adaptive": 9.0,
+    "ch4-cut": 7.0,
     "ch4-lattice": 60.0,
     "ch4-cube": 60.0,
     "ch4-octree": 60.0,
     "ch5": 18.0,
-    "ch6": 20.0,
+    "ch6": 15.0,
 }
