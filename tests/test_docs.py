@@ -73,7 +73,10 @@ def test_every_linear_solver_is_told() -> None:
         assert f"{limit:,} unknowns".replace(",", " ") in concepts
 
 
-@pytest.mark.parametrize("page", ["motion", "viscoelasticity", "fields", "sensing", "lattices", "adaptive", "applications/sensing_chip"])
+@pytest.mark.parametrize(
+    "page",
+    ["motion", "viscoelasticity", "fields", "sensing", "lattices", "adaptive", "applications/sensing_chip", "applications/mammography"],
+)
 def test_the_example_of_a_page_runs(page: str, capsys: pytest.CaptureFixture[str]) -> None:
     text = (DOCS / f"{page}.rst").read_text(encoding="utf-8")
     found = re.findall(r"^\.\. code-block:: python\n\n((?:   .*\n|\n)+)", text, re.MULTILINE)

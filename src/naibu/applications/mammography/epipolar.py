@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import stdtrit
 
 from naibu.applications.mammography.breast_outline import BreastOutline, inside_polygon
 from naibu.applications.mammography.geometric_model import DEFAULT_PARAMETERS, Compression, CompressionParameters
@@ -191,11 +192,9 @@ class MammographicPair:
         if not found:
             raise InputError("the points lie so near the skin that no drawn model holds both; no interval can be given")
         tail = 0.5 * (1.0 - probability)
-        low, high = np.quantile(np.array(found), (tail, 1.0 - tail), axis=0)
         position = _nearest(_views(self.nominal), places)
-        return LesionPosition(
-            position, np.minimum(low, position), np.maximum(high, position), curve.distance(places[1]), bool(curve.in_band(places[1]))
-        )
+        half = float(stdtrit(len(found), 1.0 - tail)) * np.sqrt(((np.array(found) - position) ** 2).mean(axis=0))
+        return LesionPosition(position, position - half, position + half, curve.distance(places[1]), bool(curve.in_band(places[1])))
 
     def project(self, position: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return the places in CC and MLO, depth and position along the chest wall, mm, of a point (3,) of the unloaded breast.
@@ -276,7 +275,10 @@ def mammographic_pair(
         raise InputError(
             f"{refused} of {draws} models drawn from the uncertainty give no breast: the outlines, thickness_mm and angle_deg hardly fit"
         )
-    noise = uncertainty.unresolved_mm * random.standard_normal((len(drawn), 2, 2))
+    z = random.standard_normal((len(drawn), 4))
+    z -= z.mean(axis=0)
+    z = np.linalg.solve(np.linalg.cholesky(z.T @ z / len(z)), z.T).T  # so few draws would have another covariance than the stated one
+    noise = uncertainty.unresolved_mm * z.reshape(-1, 2, 2)
     return MammographicPair((cc, mlo), nominal, tuple(drawn), noise, refused)
 
 
@@ -345,18 +347,17 @@ def _nearest(views: tuple[Compression, Compression], places: tuple[FloatArray, F
 
 
 def _band(curve: FloatArray, offsets: FloatArray, probability: float) -> FloatArray:
-    """Return the polygon between quantiles of the offsets (k, n, 2) across the curve, lengthened by those along it at its ends."""
+    """Return a polygon: Student quantiles times the root mean squares of offsets (k, n, 2) across the curve, and along it at its ends."""
     tangent = np.gradient(curve, axis=0)
     tangent /= np.maximum(np.hypot(*tangent.T), 1e-12)[:, None]
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
     tail = 0.5 * (1.0 - probability)
     across = np.einsum("kni,ni->kn", offsets, normal)
-    low, high = np.quantile(across, (tail, 1.0 - tail), axis=0)
-    low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
-    before = float(np.quantile(offsets[:, 0] @ tangent[0], tail))
-    after = float(np.quantile(offsets[:, -1] @ tangent[-1], 1.0 - tail))
+    reach = float(stdtrit(len(offsets), 1.0 - tail))
+    half = reach * np.sqrt((across**2).mean(axis=0))
     shift = np.zeros_like(curve)
-    shift[0], shift[-1] = min(before, 0.0) * tangent[0], max(after, 0.0) * tangent[-1]
-    upper = curve + shift + high[:, None] * normal
-    lower = curve + shift + low[:, None] * normal
+    for end, sign in ((0, -1.0), (-1, 1.0)):
+        shift[end] = sign * reach * np.sqrt(np.mean((offsets[:, end] @ tangent[end]) ** 2)) * tangent[end]
+    upper = curve + shift + half[:, None] * normal
+    lower = curve + shift - half[:, None] * normal
     return np.vstack([upper, lower[::-1]])
