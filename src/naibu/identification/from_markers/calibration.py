@@ -148,8 +148,8 @@ def calibrate(
     match = Matcher(load_cases, parameters, search or MatchingSettings()).run(
         progress=progress, checkpoint=checkpoint, start=begin, warm_starts=warm_starts
     )
-    ended = match.status is not Status.INTERRUPTED
-    mesh = mesh_error(load_cases, match, parameters) if with_mesh_error and ended else None
+    estimated = with_mesh_error and match.status is not Status.INTERRUPTED
+    mesh = mesh_error(load_cases, match, parameters) if estimated else None
     return Calibration(load_cases, match, chosen, measured, known, parameters, mesh)
 
 
