@@ -87,6 +87,12 @@ def test_the_example_of_a_page_runs(page: str, capsys: pytest.CaptureFixture[str
     assert capsys.readouterr().out
 
 
+def test_entries_of_the_bibliography_are_whole() -> None:
+    text = (DOCS / "references.bib").read_text(encoding="utf-8")
+    broken = [entry.partition(",")[0] for entry in re.split(r"\n(?=@)", text) if entry.count("{") != entry.count("}")]
+    assert not broken, f"braces do not match in {broken}"
+
+
 def test_citations_and_bibliography_agree() -> None:
     entries = re.findall(r"^@\w+\{(\w+),", (DOCS / "references.bib").read_text(encoding="utf-8"), re.MULTILINE)
     assert len(entries) == len(set(entries)), sorted(key for key in set(entries) if entries.count(key) > 1)
