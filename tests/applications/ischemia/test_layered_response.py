@@ -110,6 +110,11 @@ def test_pressure_below_the_load_carries_it(kinematics: str) -> None:
     assert motion.pale_area(100.0)[0] == 0.0
 
 
+def test_a_pressure_that_jumps_is_that_under_the_load_when_the_load_is_removed(modes: LayeredModes) -> None:
+    pressure = simulate_skin(modes, (LOWER, UPPER), SurfaceLoad(50.0, 0.47, 0.5), [0.469, 0.47, 0.471]).pressure.max(axis=1)
+    assert pressure[1] == pytest.approx(pressure[0], rel=0.01) and pressure[2] < 0.9 * pressure[0]
+
+
 def test_moduli_have_the_limits_of_springs_and_dashpots() -> None:
     numerator, denominator = laplace_modulus(three_element(2.0, 0.5, 40.0, 0.3))
     slow, fast = 1e-9, 1e9

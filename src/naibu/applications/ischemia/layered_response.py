@@ -112,7 +112,7 @@ def _step_responses(numerator: FloatArray, denominator: FloatArray, times: Float
     for flow, last in set(zip(flows.tolist(), degree.tolist(), strict=True)):
         alike = np.flatnonzero((flows == flow) & (degree == last))
         found[alike] = _responses_of_one_kind(numerator, given[alike, int(flow) : last + 1], flow, after)
-    return np.where(times < 0.0, 0.0, found)
+    return np.where(times <= 0.0, 0.0, found)  # at a jump the value before it: the load still acts when it is removed
 
 
 def _responses_of_one_kind(numerator: FloatArray, d: FloatArray, flow: bool, times: FloatArray) -> FloatArray:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import curve_fit
+from scipy.optimize import least_squares
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
@@ -96,17 +96,15 @@ def _time_constant(t: FloatArray, v: FloatArray, *, flow: bool) -> float:
     if change == 0.0:
         return float("nan")
     x, y = (t - t[0]) / span, (v - v[0]) / change
-    weight = np.gradient(x)  # instants may be denser where more happens
-    sigma = 1.0 / np.sqrt(weight / weight.sum())
+    root = np.sqrt(np.gradient(x))  # instants may be denser where more happens
 
-    def saturating(at: FloatArray, size: float, log_rate: float, slope: float = 0.0) -> FloatArray:
-        return np.asarray(size * -np.expm1(-at * np.exp(log_rate)) + slope * at)
+    def residuals(p: FloatArray) -> FloatArray:
+        size, log_rate = p[0], p[1]
+        flowing = p[2] * x if flow else 0.0
+        return np.asarray(root * (size * -np.expm1(-x * np.exp(log_rate)) + flowing - y))
 
     start = [1.0, np.log(1.0 / max(_tenth_to_nine_tenths(x, y) / 2.2, 1e-6)), *([0.0] if flow else [])]
-    try:
-        best, _ = curve_fit(saturating, x, y, start, sigma=sigma, maxfev=2000)
-    except RuntimeError:
-        return float("nan")
-    constant = float(span * np.exp(-best[1]))
+    found = least_squares(residuals, start, xtol=1e-12, ftol=1e-12, gtol=1e-12, max_nfev=500)
+    constant = float(span * np.exp(-found.x[1]))
     # slower than the record: the exponential and the flow are not told apart
-    return constant if constant < span else float("nan")
+    return constant if found.success and constant < span else float("nan")

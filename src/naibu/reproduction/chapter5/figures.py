@@ -94,10 +94,10 @@ def bode_diagram(frequencies: FloatArray, found: Mapping[str, ComplexArray], fro
         for (name, values), line in zip(found.items(), LINES, strict=False):
             upper.loglog(frequencies, np.abs(values), line, lw=1.3, label=name)
             lower.semilogx(frequencies, np.degrees(np.angle(values)), line, lw=1.3)
-        at = np.array(list(from_time))
-        points = np.array(list(from_time.values()))
-        upper.loglog(at, np.abs(points), "k.", label="from the time domain")
-        lower.semilogx(at, np.degrees(np.angle(points)), "k.")
+        if from_time:
+            at, points = np.array(list(from_time)), np.array(list(from_time.values()))
+            upper.loglog(at, np.abs(points), "k.", label="from the time domain")
+            lower.semilogx(at, np.degrees(np.angle(points)), "k.")
         upper.set_ylabel("amplitude, mm/mN")
         lower.set(xlabel="frequency, Hz", ylabel="phase, degrees", yticks=(-90, -60, -30, 0))
         upper.legend(frameon=False, fontsize=8)
