@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from naibu.io import lattice_study_schema
-from naibu.workflows.lattice_study import NAMED
+from naibu.workflows.studies.lattice_study import NAMED
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "simulating.rst").read_text(encoding="utf-8")
 TABLES = [name for name in dir(lattice_study_schema) if name.endswith("Table") and not name.startswith("_")]

@@ -7,11 +7,11 @@ from .core.volume import Volume
 from .io.images import read_volume
 from .workflows.compare import compare
 from .workflows.identify import identify
+from .workflows.measurement.sense import sense
+from .workflows.measurement.track import track
 from .workflows.predict import predict
 from .workflows.report import report
-from .workflows.sense import sense
-from .workflows.simulate import simulate
-from .workflows.track import track
+from .workflows.studies.simulate import simulate
 
 __all__ = [
     "DisplacementField",

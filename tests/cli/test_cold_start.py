@@ -18,7 +18,7 @@ from rich.console import Console
 from naibu import cli
 from naibu._numba.reports import report
 from naibu.cli.cold_start import SECONDS, TERMINATED, CompilationNotice, first_run
-from naibu.workflows import warm_up
+from naibu.workflows.installation import warm_up
 
 
 def plain_console() -> Console:

@@ -12,7 +12,7 @@ import pytest
 
 from naibu import cli
 from naibu.cli import installation
-from naibu.workflows import self_test
+from naibu.workflows.installation import self_test
 
 
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:

@@ -15,7 +15,7 @@ from naibu.mechanics import Assembler, elements, material, spherical_indenter
 from naibu.meshing import box
 from naibu.simulation import FiniteElementBody, ForceLimits, HapticHand, InteractiveSimulation, RealTimeLoop, SimulatedDevice
 from naibu.simulation.haptic_loop import CONTACT, HOLDS, LEAVES_S, STALE
-from naibu.workflows.haptics.packets import pose_bytes, read_force
+from naibu.workflows.interactive.haptics.packets import pose_bytes, read_force
 
 START = 54.0
 RADIUS = 8.0

@@ -49,7 +49,7 @@ def doctor(*, warm: Flag = False, self_test: Flag = False) -> None:
 
 
 def _warm_up() -> None:
-    from naibu.workflows.warm_up import warm_up
+    from naibu.workflows.installation.warm_up import warm_up
 
     with progress_display() as progress:
         done = warm_up(progress)
@@ -61,7 +61,7 @@ def _warm_up() -> None:
 
 
 def _self_test() -> None:
-    from naibu.workflows import self_test
+    from naibu.workflows.installation import self_test
 
     with progress_display() as progress:
         checks = self_test.self_test(progress)

@@ -57,7 +57,7 @@ def mammography(
     overwrite
         Replace results, or files of your own, that the folder already holds.
     """
-    from naibu.workflows.mammography import relate_views
+    from naibu.workflows.applications.mammography import relate_views
 
     run = relate_views(
         cc,

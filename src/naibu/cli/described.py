@@ -56,7 +56,7 @@ class PairOptions:
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """As `naibu.workflows.sense.read_pair` takes them."""
+        """As `naibu.workflows.measurement.sense.read_pair` takes them."""
         return {
             "mask": self.mask,
             "deformed_mask": self.deformed_mask,

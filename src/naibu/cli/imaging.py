@@ -41,7 +41,7 @@ def sense(
     overwrite
         Replace results, or files of your own, that the folder already holds.
     """
-    from naibu.workflows.sense import read_pair, sense_pair
+    from naibu.workflows.measurement.sense import read_pair, sense_pair
 
     with progress_display() as progress:
         scans = read_pair(reference, deformed, **(pair or PairOptions()).arguments)
@@ -78,8 +78,8 @@ def compare_methods(
         Replace results, or files of your own, that the folder already holds.
     """
     from naibu.imaging.measure_displacement import METHODS
-    from naibu.workflows.compare_methods import compare_methods as compared
-    from naibu.workflows.sense import read_pair
+    from naibu.workflows.measurement.compare_methods import compare_methods as compared
+    from naibu.workflows.measurement.sense import read_pair
 
     with progress_display() as progress:
         scans = read_pair(reference, deformed, **(pair or PairOptions()).arguments)
@@ -131,7 +131,7 @@ def track(
     overwrite
         Use the folder even if it is not empty, and replace files of the same names.
     """
-    from naibu.workflows import track as tracking
+    from naibu.workflows.measurement import track as tracking
 
     options = described or ObjectOptions()
     description = None
@@ -188,7 +188,7 @@ def track_sequence(
     overwrite
         Replace results, or files of your own, that the folder already holds.
     """
-    from naibu.workflows.track_sequence import track_sequence_file
+    from naibu.workflows.measurement.track_sequence import track_sequence_file
 
     with progress_display() as progress:
         run = track_sequence_file(

@@ -92,8 +92,8 @@ def simulate(
         Print the file of a study as a template for your own: naibu simulate --example > my_study.toml, or, of a sensing chip,
         naibu simulate chip --example > my_chip.toml; the same for ischemia
     """
-    from naibu.workflows.simulate import example_text, named_studies
-    from naibu.workflows.simulate import simulate as simulated
+    from naibu.workflows.studies.simulate import example_text, named_studies
+    from naibu.workflows.studies.simulate import simulate as simulated
 
     if example:
         sys.stdout.write(example_text(study))

@@ -10,7 +10,7 @@ from naibu.cli.console import app, errors, progress_display, say
 from naibu.core.errors import InputError
 
 if TYPE_CHECKING:
-    from naibu.workflows.touchable_models import MeshMaterial
+    from naibu.workflows.interactive.touchable_models import MeshMaterial
 
 
 @app.command
@@ -46,7 +46,7 @@ def live(
     browser
         Open the page in the browser.
     """
-    from naibu.workflows.live import live as served
+    from naibu.workflows.interactive.live import live as served
 
     def ready(address: str) -> None:
         say(f"Live page: {address}")
@@ -118,8 +118,8 @@ def cut(
     overwrite
         Replace results that the folder holds.
     """
-    from naibu.workflows.cut import cut as run
-    from naibu.workflows.cut_surface import is_surface
+    from naibu.workflows.interactive.cut import cut as run
+    from naibu.workflows.interactive.cut_surface import is_surface
 
     solid = {
         "pull_percent": pull_percent, "experiment": experiment, "young_modulus_kpa": young_modulus_kpa, "poisson_ratio": poisson_ratio,
@@ -144,8 +144,8 @@ def cut(
 
 
 def _cut_surface(source: str, path: Path, out: Path, distance_mm: float | None, overwrite: bool, options: dict[str, Any]) -> None:
-    from naibu.workflows.cut_surface import areas_text
-    from naibu.workflows.cut_surface import cut_surface_file as run
+    from naibu.workflows.interactive.cut_surface import areas_text
+    from naibu.workflows.interactive.cut_surface import cut_surface_file as run
 
     stated = {name: value for name, value in options.items() if value is not None}
     with progress_display() as progress:
@@ -170,7 +170,7 @@ def _require_unset(options: dict[str, Any], reason: str) -> None:
 
 def _material(young_modulus_kpa: float | None, poisson_ratio: float | None) -> MeshMaterial | None:
     """Return the material of a mesh, None where nothing of it is stated."""
-    from naibu.workflows.touchable_models import MeshMaterial
+    from naibu.workflows.interactive.touchable_models import MeshMaterial
 
     given = {"young_modulus_kpa": young_modulus_kpa, "poisson_ratio": poisson_ratio}
     stated = {name: value for name, value in given.items() if value is not None}

@@ -1,17 +1,17 @@
-from .compare_methods import MethodComparison, compare_methods
-from .cut import CutRun, cut
-from .cut_surface import SurfaceCutRun, cut_surface_file
-from .haptics.device import DeviceRecord, drive_live_simulation
 from .identify import Identification
 from .identify_fields import FieldIdentification, identify_fields
-from .live import live, touched_loop
+from .interactive.cut import CutRun, cut
+from .interactive.cut_surface import SurfaceCutRun, cut_surface_file
+from .interactive.haptics.device import DeviceRecord, drive_live_simulation
+from .interactive.live import live, touched_loop
+from .interactive.touchable_models import MeshMaterial, TouchableModel, tools_for, touchable
+from .measurement.compare_methods import MethodComparison, compare_methods
+from .measurement.sense import Pair, SenseRun, read_pair, sense_pair
+from .measurement.track import ObjectDescription, TrackRun
+from .measurement.track_sequence import SequenceRun, track_sequence_file
 from .reproduce import ReproducedChapter, reproduce, reproduce_all
-from .sense import Pair, SenseRun, read_pair, sense_pair
-from .simulate import NamedStudy, named_studies
-from .simulate_lattice import SimulationRun
-from .touchable_models import MeshMaterial, TouchableModel, tools_for, touchable
-from .track import ObjectDescription, TrackRun
-from .track_sequence import SequenceRun, track_sequence_file
+from .studies.simulate import NamedStudy, named_studies
+from .studies.simulate_lattice import SimulationRun
 
 __all__ = [
     "CutRun",

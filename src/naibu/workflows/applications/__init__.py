@@ -1,0 +1,1 @@
+"""Verbs of applications: sensing chips, skin, breasts."""

@@ -1,0 +1,1 @@
+"""Examination and preparation of an installation."""

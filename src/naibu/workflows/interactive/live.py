@@ -1,0 +1,218 @@
+"""Touch a body in the browser: push it, pull it and look inside while it is simulated."""
+
+from __future__ import annotations
+
+import gc
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from naibu.core.errors import InputError
+from naibu.mechanics.contact.rigid_indenters import RigidIndenter
+from naibu.simulation.haptic_loop import HapticHand
+from naibu.simulation.interactive_bodies import FiniteElementBody, InteractiveBody
+from naibu.simulation.interactive_simulation import FRAME_S, Frame, InteractiveSimulation
+from naibu.simulation.real_time_loop import RealTimeLoop
+from naibu.viewer.live.commands import LiveCommand
+from naibu.viewer.live.scene import FAILED, PAUSED, RECORDING, REPLAYING, LiveFrame, LiveScene
+from naibu.viewer.live.server import LiveServer, serve
+from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, motion_html
+from naibu.workflows.experiments import Source
+from naibu.workflows.interactive.haptics.endpoint import HapticEndpoint
+from naibu.workflows.interactive.touchable_models import MeshMaterial, TouchableModel, tools_for, touchable
+
+GRIP_RADIUS = 0.08  # of the extent of the body
+PAGE_BYTES = 5_000_000
+WARM_FRAMES = 6  # before the page is ready
+SWITCH_S = 2e-4  # in which the page leaves the interpreter to the physics of a haptic device
+
+
+@dataclass(slots=True, eq=False)
+class LiveSimulation:
+    """The source of the live page: a loop with its scene."""
+
+    model: TouchableModel
+    loop: RealTimeLoop
+    _scene: LiveScene | None = None
+
+    @property
+    def scene(self) -> LiveScene:
+        """What is drawn; another one after a cut."""
+        frame = self.loop.latest()[0]
+        if self._scene is None or self._scene.topology != frame.topology:
+            self._scene = self._made_scene(frame.body, frame.topology)
+        return self._scene
+
+    def _made_scene(self, body: InteractiveBody, topology: int) -> LiveScene:
+        tools = self.loop.simulation.tools
+        whole = topology == 0  # the numbers of nodes that markers refer to
+        return LiveScene(
+            self.model.title, self.model.sentences, body.points, body.faces, body.cells,
+            [_shape(name, tool) for name, tool in tools.items()],
+            [_shape(f"support {k + 1}", fixture) for k, fixture in enumerate(body.fixtures)],
+            np.array([f.centre for f in body.fixtures], dtype=float).reshape(-1, 3),
+            self.model.strain, self.loop.simulation.frame_s, self.model.marker_nodes[: None if whole else 0],
+            self.model.marker_weights[: None if whole else 0], topology, cuttable=True,
+        )  # fmt: skip
+
+    def frame(self) -> LiveFrame:
+        """Return the last frame."""
+        frame, pace = self.loop.latest()
+        flags = PAUSED * pace.paused | RECORDING * pace.recording | REPLAYING * pace.replaying | FAILED * bool(frame.failed)
+        tool = list(self.loop.simulation.tools).index(frame.tool) if frame.tool else -1
+        return LiveFrame(
+            frame.number, frame.time_s, frame.positions, tool, frame.gripped, frame.tool_centre, frame.force, frame.pull,
+            frame.penetration_mm, pace.steps_per_s, pace.real_time, flags,
+            lambda: frame.body.strain(frame.positions), frame.topology,
+        )  # fmt: skip
+
+    def command(self, command: LiveCommand) -> None:
+        """Carry out a command of the page that drives."""
+        loop = self.loop
+        match command.kind:
+            case "pause":
+                loop.pause(command.switch)
+            case "record":
+                loop.record(command.switch)
+            case "replay":
+                loop.replay()
+            case kind:
+                loop.submit(_order(kind, command))
+
+    def trouble(self) -> str:
+        """Return what was wrong with the last command that failed, once."""
+        return self.loop.trouble()
+
+    def recording_html(self) -> str:
+        """Return the recorded motion as a page.
+
+        Raises
+        ------
+        InputError
+            Nothing is recorded.
+        """
+        recorded = self.loop.recorded()
+        frames = tuple(f for f in recorded if f.topology == recorded[-1].topology)  # a page shows one surface: that of the end
+        if len(frames) < 2:
+            raise InputError("nothing is recorded; press Record, touch the body, press Stop, and save again")
+        return motion_html(self._page(frames), PAGE_BYTES)
+
+    def _page(self, frames: tuple[Frame, ...]) -> MotionPage:
+        body = frames[-1].body
+        nodes, faces = np.unique(body.faces, return_inverse=True)
+        moved = np.stack([frame.positions[nodes] for frame in frames]) - body.points[nodes]
+        times = np.array([frame.time_s for frame in frames]) - frames[0].time_s
+        last = next((frame.tool for frame in reversed(frames) if frame.tool), "")
+        shapes = [_shape(last, self.loop.simulation.tools[last])] if last else []
+        centres = np.array([[frame.tool_centre] if last else [] for frame in frames]).reshape(len(frames), len(shapes), 3)
+        force = np.array([[frame.force] if last else [] for frame in frames]).reshape(len(frames), len(shapes), 3)
+        return MotionPage(
+            self.model.title, [*self.model.sentences, "Recorded from the live page."], times, faces.reshape(-1, 3), body.points[nodes],
+            moved, [ColourField("displacement, mm", np.linalg.norm(moved, axis=2))], shapes, centres, times, force,
+        )  # fmt: skip
+
+
+def live(
+    source: str | os.PathLike[str],
+    *,
+    experiment: Source | None = None,
+    material: MeshMaterial | None = None,
+    port: int = 8765,
+    haptics_port: int | None = None,
+    ready: Callable[[str], None],
+) -> None:
+    """Serve the live page of a model until Ctrl-C.
+
+    Parameters
+    ----------
+    source : str or path-like
+        See `naibu.workflows.interactive.touchable_models.touchable`.
+    experiment : path, str or Experiment, optional
+        Whose body an identified model is made for; by default the first one that it was identified from.
+    material : MeshMaterial, optional
+        Of a mesh.
+    port : int
+        Of the loopback interface; 0 takes a free one.
+    haptics_port : int, optional
+        UDP port of the loopback interface for a haptic device, which then leads the tool; the body is a lattice.
+    ready : callable
+        Called with the address of the page once it can be opened.
+
+    Raises
+    ------
+    InputError
+        A source that cannot be used or, with a device, has steps of more than 2 ms; or a port that is taken.
+    """
+    if not 0 <= port <= 65535:
+        raise InputError(f"port must lie between 0 and 65535, not {port}")
+    if haptics_port is not None and not 1 <= haptics_port <= 65535:
+        raise InputError(f"haptics_port must lie between 1 and 65535, not {haptics_port}")
+    model = touchable(source, experiment=experiment, material=material)
+    with touched_loop(model, haptics_port) as loop:
+        serve(LiveServer(LiveSimulation(model, loop)), port, ready)
+
+
+@contextmanager
+def touched_loop(model: TouchableModel, haptics_port: int | None = None) -> Iterator[RealTimeLoop]:
+    """Simulate a model in a thread of its own, with an endpoint for a haptic device at a port, until the context ends.
+
+    Raises
+    ------
+    InputError
+        A port that is taken, or a body that is not stepped finely enough for a device.
+    """
+    body = model.body
+    with ExitStack() as stack:
+        hand = None
+        if haptics_port is not None:
+            hand = HapticHand(stack.enter_context(HapticEndpoint(haptics_port)))
+            stack.callback(sys.setswitchinterval, sys.getswitchinterval())
+            sys.setswitchinterval(SWITCH_S)
+            stack.callback(gc.unfreeze)
+            gc.collect()
+            gc.freeze()  # a collection over all that was imported takes more than 5 ms
+        frame_s = FRAME_S if hand is None else body.step_s
+        simulation = InteractiveSimulation(body, tools_for(body), frame_s)
+        _warm(simulation)
+        yield stack.enter_context(RealTimeLoop(simulation, hand=hand))
+
+
+def _warm(simulation: InteractiveSimulation) -> None:
+    """Compile and factorize what frames need, by the first ones, in which the body settles on its supports."""
+    if isinstance(simulation.body, FiniteElementBody):
+        for _ in range(WARM_FRAMES):
+            simulation.advance()
+
+
+def _order(kind: str, command: LiveCommand) -> Callable[[InteractiveSimulation], None]:
+    """Return what a command does to the simulation."""
+
+    def carry_out(simulation: InteractiveSimulation) -> None:
+        match kind:
+            case "tool":
+                simulation.take(command.name)
+            case "move":
+                simulation.move(command.vector)
+            case "grip":
+                simulation.grip(command.number, GRIP_RADIUS * simulation.extent_mm)
+            case "pull":
+                simulation.pull(command.vector)
+            case "release":
+                simulation.release()
+            case "reset":
+                simulation.reset()
+            case "undo":
+                simulation.undo()
+            case "cut":
+                simulation.begin_cut(command.edges)
+
+    return carry_out
+
+
+def _shape(name: str, indenter: RigidIndenter) -> RigidShape:
+    geometry = indenter.geometry
+    return RigidShape(name, geometry.name, np.asarray(geometry.size), np.asarray(geometry.axes))

@@ -1,0 +1,1 @@
+"""Displacement from scans: volume correlation, marker tracking, comparison of methods."""

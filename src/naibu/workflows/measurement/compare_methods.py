@@ -1,0 +1,152 @@
+"""Comparison of methods that measure displacement, on one pair of volumes: table and images, as a page and as numbers."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from naibu.core.arrays import BoolArray, FloatArray
+from naibu.core.errors import NaibuError
+from naibu.core.progress import Progress, report_progress
+from naibu.imaging.displacement.accuracy import end_point_error
+from naibu.imaging.measure_displacement import Method
+from naibu.imaging.preprocessing.resampling import warped
+from naibu.viewer.chapter import Chapter, Figure, Section
+from naibu.viewer.chapter_page import write_chapter
+from naibu.viewer.tables import Cell, Table
+from naibu.workflows.measurement.sense import FIGURES, Pair, SenseRun, sense_pair
+from naibu.workflows.output_folder import output_folder
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
+
+OMITTED = ("initial_residual_rms", "median_displacement_mm", "largest_displacement_mm")  # the same for all methods, or nearly so
+
+
+@dataclass(frozen=True, slots=True)
+class MethodComparison:
+    """Table, page and file of numbers of a comparison."""
+
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    page: Path
+    numbers: Path
+
+
+def compare_methods(
+    pair: Pair,
+    methods: Sequence[Method],
+    *,
+    out: str | os.PathLike[str],
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> MethodComparison:
+    """Measure the displacement of one pair by several methods, one after the other, and write ``methods.html`` and ``methods.json``.
+
+    A method that cannot be used on the pair is listed with the reason, and does not stop the others.
+
+    Parameters
+    ----------
+    pair : Pair
+        From `naibu.workflows.measurement.sense.read_pair`.
+    methods : sequence of str
+        Among `naibu.imaging.measure_displacement.METHODS`.
+    out : path-like
+        Folder for the page and the numbers.
+    overwrite : bool
+        Whether results, or other files of these names, that `out` holds already are replaced.
+    progress : Progress, optional
+        Called at the beginning of every method.
+
+    Raises
+    ------
+    InputError
+        A folder that cannot be written to, or no method that could be used.
+    """
+    folder = output_folder(out, ("methods.html", "methods.json"), overwrite=overwrite)
+    runs: dict[Method, SenseRun] = {}
+    failures: dict[Method, str] = {}
+    wanted = tuple(dict.fromkeys(methods))
+    for k, method in enumerate(wanted):
+        report_progress(progress, method, done=k, total=len(wanted))
+        try:
+            runs[method] = sense_pair(pair, method=method)
+        except NaibuError as error:
+            failures[method] = str(error)
+            if len(failures) == len(wanted):
+                raise
+    columns, rows = _table(pair, runs)
+    note = " ".join(f"{name} could not be used: {why}." for name, why in failures.items())
+    caption = f"{pair.names[0]} to {pair.names[1]}; 'rigid' is the rigid motion of the whole object."
+    table = Table("Methods", columns, rows, caption=caption, note=note)
+    figures = tuple(_figure(pair, name, run) for name, run in runs.items())
+    section = Section("Comparison of methods", _words(pair), (table,), figures)
+    settings: dict[str, Cell] = {**pair.inputs, "mask": "given" if pair.mask is not None else "found"}
+    page, numbers = write_chapter(Chapter("methods", "Methods of measuring displacement", (section,), settings), folder)
+    return MethodComparison(columns, rows, page, numbers)
+
+
+def _words(pair: Pair) -> tuple[str, ...]:
+    first = (
+        "Every method has the same volumes, the same mask and, but for the default, the same rigid registration to start from. The "
+        "intensity residual RMS is the root mean square difference inside the object after the deformed volume was warped back."
+    )
+    if pair.truth is None and pair.check_points is None:
+        return (
+            first,
+            "The true displacement is not known: a small residual alone proves nothing, since a field may match noise by folding.",
+        )
+    return (first,)
+
+
+def _table(pair: Pair, runs: dict[Method, SenseRun]) -> tuple[tuple[str, ...], tuple[tuple[Cell, ...], ...]]:
+    shared = [name for name in next(iter(runs.values())).figures if name not in OMITTED]
+    best = runs.get("default")
+    names = (FIGURES[name] for name in shared)
+    columns = ["method", "time, s", *names, *(["mean distance from the default, mm"] if best is not None else [])]
+    rows = []
+    for name, run in runs.items():
+        row: list[Cell] = [name, run.seconds, *(run.figures[c] for c in shared)]
+        if best is not None:
+            u = best.measured.displacement.vectors
+            row.append(
+                None if run is best else end_point_error(run.measured.displacement.vectors, u, best.measured.mask & known(u)).mean_mm
+            )
+        rows.append(tuple(row))
+    return tuple(columns), tuple(rows)
+
+
+def known(vectors: FloatArray) -> BoolArray:
+    """Where a displacement (nz, ny, nx, 3) is known."""
+    return np.asarray(np.isfinite(vectors).all(axis=-1))
+
+
+def _figure(pair: Pair, name: Method, run: SenseRun) -> Figure:
+    u, mask = run.measured.displacement.vectors, run.measured.mask
+    z = int(np.argmax(mask.sum(axis=(1, 2))))
+    inside = np.argwhere(mask[z])
+    rows, columns = (slice(int(a), int(b) + 1) for a, b in zip(inside.min(axis=0), inside.max(axis=0), strict=True))
+    size = np.where(mask, np.linalg.norm(u, axis=-1), np.nan)[z, rows, columns]
+    back = warped(pair.deformed, np.nan_to_num(u), pair.reference)
+    rest = np.where(mask, back - pair.reference.values, np.nan)[z, rows, columns]
+    contrast = float(np.ptp(np.percentile(pair.reference.values[mask], (1, 99))))
+    off = None if pair.truth is None else np.where(mask, np.linalg.norm(u - pair.truth, axis=-1), np.nan)[z, rows, columns]
+    dx, dy = pair.reference.spacing_mm[:2]
+    extent = (0.0, dx * size.shape[1], dy * size.shape[0], 0.0)
+
+    def draw(canvas: Canvas) -> None:
+        axes = canvas.subplots(1, 2 if off is None else 3, squeeze=False)[0]
+        shown = [(size, "displacement, mm", "viridis", 0.0, None), (rest, "intensity residual", "RdBu_r", -0.5 * contrast, 0.5 * contrast)]
+        if off is not None:
+            shown.append((off, "error, mm", "magma", 0.0, 3.0))
+        for axis, (values, label, colours, low, high) in zip(axes, shown, strict=True):
+            image = axis.imshow(values, cmap=colours, vmin=low, vmax=high, extent=extent, interpolation="nearest")
+            canvas.colorbar(image, ax=axis, label=label, shrink=0.75, extend="max" if label.startswith("error") else "neither")
+            axis.set(xlabel="x, mm", ylabel="y, mm")
+
+    return Figure(name, f"Slice {z}, the one with most of the object.", draw, (10.0, 3.3))

@@ -1,0 +1,424 @@
+"""Measure the displacement between two scans, from files to files: fields for other programs, numbers, and a page of slices."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from naibu._version import __version__
+from naibu.core.arrays import BoolArray, FloatArray, require_lengths
+from naibu.core.errors import InputError
+from naibu.core.markers import Markers
+from naibu.core.mesh import Mesh
+from naibu.core.progress import Progress
+from naibu.core.volume import Volume
+from naibu.imaging.displacement.accuracy import check_point_errors, end_point_error, intensity_rms
+from naibu.imaging.displacement.strain import folded_fraction, green_lagrange_strain_of
+from naibu.imaging.measure_displacement import FACTS, MeasuredDisplacement, Method, measure_displacement
+from naibu.imaging.preprocessing.resampling import warped
+from naibu.io.displacement_fields import write_field
+from naibu.io.files.atomic import write_atomically
+from naibu.io.files.provenance import input_record
+from naibu.io.images import read_displacement, read_volume, write_displacement, write_volume
+from naibu.io.marker_tables import import_markers, write_markers
+from naibu.io.vtk_files import write_vtu
+from naibu.meshing.primitives import grid_cells
+from naibu.viewer.slices import Overlay, SliceView, slices_html
+from naibu.viewer.tables import Cell, Table
+from naibu.workflows.output_folder import output_folder
+
+# bounds of the size of files: hexahedra for ParaView, and points of the field for the identification
+MESH_CELLS, FIELD_POINTS = 60_000, 40_000
+MARKER_TABLES, MARKERS = ("initial", "pressed"), 250
+FILES = (
+    *("report.html", "displacement.mha", "standard_deviation.mha", "displacement.vtu", "field.h5", "sense.json"),
+    *(f"{table}.csv" for table in MARKER_TABLES),
+)
+LEAST_CERTAIN = 4.0  # median standard deviations; positions of a larger one make no markers; empirical
+# what the figures of a run mean, with their units
+FIGURES = {
+    "measured_fraction": "measured fraction of the object",
+    "median_displacement_mm": "median displacement, mm",
+    "largest_displacement_mm": "largest displacement, mm",
+    "initial_residual_rms": "intensity residual RMS without displacement",
+    "residual_rms": "intensity residual RMS",
+    "folded_fraction": "folded fraction",
+    "median_sd_mm": "stated SD, median, mm",
+    "mean_error_mm": "mean error, mm",
+    "median_error_mm": "median error, mm",
+    "p95_error_mm": "95th percentile of the error, mm",
+    "mean_check_point_error_mm": "mean error of the check points, mm",
+    "p95_check_point_error_mm": "95th percentile of the error of the check points, mm",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pair:
+    """Two volumes on one grid, the mask of the object in the reference, and true displacements where they are known."""
+
+    reference: Volume
+    deformed: Volume
+    mask: BoolArray | None
+    inputs: dict[str, str]
+    names: tuple[str, str]
+    truth: FloatArray | None = None
+    check_points: tuple[FloatArray, FloatArray] | None = None
+    deformed_mask: BoolArray | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SenseRun:
+    """Measured displacement with its figures (see `FIGURES`) and files."""
+
+    measured: MeasuredDisplacement
+    seconds: float
+    figures: dict[str, float | int | str | None]
+    files: tuple[Path, ...] = ()
+
+    def rows(self) -> list[tuple[str, Cell]]:
+        """Return figures and diagnostics of the method, each with its meaning and unit."""
+        figures = [(FIGURES[name], value) for name, value in self.figures.items()]
+        return figures + [(FACTS[name], value) for name, value in self.measured.facts.items()]
+
+
+def read_pair(
+    reference: str | os.PathLike[str],
+    deformed: str | os.PathLike[str],
+    *,
+    mask: str | os.PathLike[str] | None = None,
+    deformed_mask: str | os.PathLike[str] | None = None,
+    truth: str | os.PathLike[str] | None = None,
+    check_points: tuple[str | os.PathLike[str], str | os.PathLike[str]] | None = None,
+    spacing_mm: Sequence[float] | None = None,
+) -> Pair:
+    """Read the volumes of a pair, and its mask and true displacements.
+
+    Parameters
+    ----------
+    reference, deformed : path-like
+        Volumes before and after the deformation (see `naibu.io.images.read_volume`); NaN where they were not measured.
+    mask : path-like, optional
+        Volume on the grid of the reference, not zero in the object.
+    deformed_mask : path-like, optional
+        The same for the deformed scan: digital volume correlation starts from its position and outline.
+    truth : path-like, optional
+        True displacement on that grid, an image of vectors, mm.
+    check_points : two path-like, optional
+        Tables of points in the reference and in the deformed configuration (see `naibu.io.marker_tables.import_markers`), with one number
+        for each point.
+    spacing_mm : sequence of float, optional
+        Voxel spacing along x, y, z, mm, for files without it.
+
+    Raises
+    ------
+    InputError
+        A file that cannot be read, or a mask or truth on another grid.
+    """
+    require_lengths(spacing_mm=spacing_mm)
+    a, b = (read_volume(p, spacing_mm=spacing_mm, missing=True) for p in (reference, deformed))
+    masks: list[BoolArray | None] = [None, None]
+    for k, (path, grid, scan) in enumerate(((mask, a, reference), (deformed_mask, b, deformed))):
+        if path is not None:
+            m = read_volume(path, spacing_mm=spacing_mm)
+            _same(m, grid, Path(path), Path(scan))
+            masks[k] = np.asarray(m.values != 0)
+    known = None
+    if truth is not None:
+        known, grid = read_displacement(truth)
+        _same(grid, a, Path(truth), Path(reference))
+    points = None if check_points is None else _common_points(*check_points)
+    files = {"reference": reference, "deformed": deformed, "mask": mask, "deformed_mask": deformed_mask, "truth": truth}
+    tables = dict(zip(("reference_check_points", "deformed_check_points"), check_points or (), strict=False))
+    names = (Path(reference).name, Path(deformed).name)
+    return Pair(a, b, masks[0], input_record(files | tables), names, known, points, masks[1])
+
+
+def _common_points(reference: str | os.PathLike[str], deformed: str | os.PathLike[str]) -> tuple[FloatArray, FloatArray]:
+    a, b = import_markers(reference), import_markers(deformed)
+    _, i, j = np.intersect1d(a.ids, b.ids, return_indices=True)
+    known = np.isfinite(a.points[i]).all(axis=1) & np.isfinite(b.points[j]).all(axis=1)
+    if not known.any():
+        raise InputError(
+            f"{Path(reference).name} and {Path(deformed).name} have no point number in common, of {len(a.ids)} and {len(b.ids)}"
+        )
+    return a.points[i][known], b.points[j][known]
+
+
+def _same(grid: Volume, other: Volume, file: Path, reference: Path) -> None:
+    if different := grid.grid_difference(other):
+        raise InputError(f"{file.name} does not lie on the grid of {reference.name}: {different}; resample it to that grid")
+
+
+def sense(
+    reference: str | os.PathLike[str],
+    deformed: str | os.PathLike[str],
+    *,
+    method: Method = "default",
+    mask: str | os.PathLike[str] | None = None,
+    deformed_mask: str | os.PathLike[str] | None = None,
+    truth: str | os.PathLike[str] | None = None,
+    check_points: tuple[str | os.PathLike[str], str | os.PathLike[str]] | None = None,
+    spacing_mm: Sequence[float] | None = None,
+    out: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> SenseRun:
+    """Measure the displacement between two scans, by digital volume correlation or a classic method, and write it.
+
+    Parameters
+    ----------
+    reference, deformed : path-like
+        Volumes before and after the deformation, on one grid: MetaImage, NIfTI, NRRD, TIFF, HDF5, Zarr or a folder of DICOM.
+    method : str
+        ``"default"`` for digital volume correlation, or a classic method (see `naibu.imaging.measure_displacement`).
+    mask : path-like, optional
+        Volume on the grid of the reference, not zero in the object; by default the object is segmented.
+    deformed_mask : path-like, optional
+        The same for the deformed scan: digital volume correlation starts from its position and outline.
+    truth : path-like, optional
+        True displacement on that grid, an image of vectors, mm, to compare with.
+    check_points : two path-like, optional
+        Tables of points in the reference and in the deformed configuration, with one number for each point, to compare with.
+    spacing_mm : sequence of float, optional
+        Voxel spacing along x, y, z, mm, for files without it.
+    out : path-like, optional
+        Folder for fields, markers, numbers and the page of slices (see `naibu.workflows.measurement.sense.sense_pair`).
+    overwrite : bool
+        Whether results, or other files of these names, that `out` holds already are replaced.
+    progress : Progress, optional
+        Called at the beginning of every stage.
+
+    Returns
+    -------
+    SenseRun
+        The displacement (``measured.displacement``), figures and files.
+
+    Raises
+    ------
+    InputError
+        A file that cannot be read; volumes, mask or truth on different grids; volumes that cannot be compared; a folder that cannot be
+        written to.
+    """
+    pair = read_pair(
+        reference, deformed, mask=mask, deformed_mask=deformed_mask, truth=truth, check_points=check_points, spacing_mm=spacing_mm
+    )
+    return sense_pair(pair, method=method, out=out, overwrite=overwrite, progress=progress)
+
+
+def sense_pair(
+    pair: Pair,
+    *,
+    method: Method = "default",
+    out: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> SenseRun:
+    """Measure the displacement of a pair, and write it.
+
+    Parameters
+    ----------
+    pair : Pair
+        From `read_pair`.
+    method : str
+        See `naibu.imaging.measure_displacement.measure_displacement`.
+    out : path-like, optional
+        Folder for ``displacement.mha``, ``standard_deviation.mha`` (where the method states one), ``displacement.vtu`` (of volumes),
+        ``field.h5``, ``initial.csv`` and ``pressed.csv`` (positions in the object as markers), ``sense.json``, ``report.html``.
+    overwrite : bool
+        Whether results, or other files of these names, that `out` holds already are replaced.
+    progress : Progress, optional
+        Called at the beginning of every stage.
+
+    Raises
+    ------
+    InputError
+        As `naibu.imaging.measure_displacement.measure_displacement`; also a folder that cannot be written to.
+    """
+    folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
+    began = time.perf_counter()
+    measured = measure_displacement(
+        pair.reference, pair.deformed, method=method, mask=pair.mask, deformed_mask=pair.deformed_mask, progress=progress
+    )
+    run = SenseRun(measured, time.perf_counter() - began, figures(pair, measured))
+    return run if folder is None else SenseRun(measured, run.seconds, run.figures, tuple(_written(pair, run, folder)))
+
+
+def figures(pair: Pair, measured: MeasuredDisplacement) -> dict[str, float | int | str | None]:
+    """Return the figures of a displacement (see `FIGURES`): size, residual, folding, and errors where the truth is known."""
+    u, inside = measured.displacement.vectors, measured.mask & measured.displacement.valid
+    size, sd = np.linalg.norm(u[inside], axis=1), measured.displacement.largest_sd_mm
+    out: dict[str, float | int | str | None] = {
+        "measured_fraction": float(inside.sum() / measured.mask.sum()),
+        "median_displacement_mm": float(np.median(size)),
+        "largest_displacement_mm": float(size.max()),
+        "initial_residual_rms": intensity_rms(pair.reference, pair.deformed, np.zeros_like(u), region=measured.mask, frame="reference"),
+        "residual_rms": intensity_rms(pair.reference, pair.deformed, u, region=measured.mask, frame="reference"),
+        "folded_fraction": folded_fraction(u, pair.reference, measured.mask),
+        "median_sd_mm": None if sd is None else float(np.nanmedian(sd[inside])),
+    }
+    if pair.truth is not None:
+        e = end_point_error(u, pair.truth, measured.mask)
+        out |= {"mean_error_mm": e.mean_mm, "median_error_mm": e.median_mm, "p95_error_mm": e.p95_mm}
+    if pair.check_points is not None:
+        e = check_point_errors(u, pair.reference, *pair.check_points)
+        out |= {"mean_check_point_error_mm": e.mean_mm, "p95_check_point_error_mm": e.p95_mm}
+    return out
+
+
+def _written(pair: Pair, run: SenseRun, folder: Path) -> list[Path]:
+    measured, grid = run.measured, pair.reference
+    files = [
+        write_atomically(folder / "report.html", slices_html(slice_view(pair, run))),
+        write_displacement(folder / "displacement.mha", measured.displacement.vectors, grid),
+    ]
+    sd = measured.displacement.largest_sd_mm
+    if sd is not None:
+        files.append(write_volume(folder / "standard_deviation.mha", grid.with_values(np.nan_to_num(sd).astype(np.float32))))
+    if min(grid.shape) > 1:  # between the voxels of a single slice there are no cells
+        files.append(_vtu(folder / "displacement.vtu", grid, measured))
+    files.append(_field(folder / "field.h5", pair, measured))
+    files += [
+        write_markers(folder / f"{name}.csv", markers) for name, markers in zip(MARKER_TABLES, _as_markers(measured, grid), strict=True)
+    ]
+    numbers = {
+        "naibu": __version__,
+        "method": measured.method,
+        "mask": "given" if pair.mask is not None else "found",
+        "inputs": pair.inputs,
+        "seed": "none: the search is deterministic",
+        "seconds": round(run.seconds, 2),
+        "units": "mm; displacement u of the reference configuration: the material at x is found at x + u(x)",
+        "figures": run.figures,
+        "diagnostics": measured.facts,
+        "warnings": list(measured.warnings),
+    }
+    text = json.dumps(_plain(numbers), indent=1, ensure_ascii=False) + "\n"
+    return [*files, write_atomically(folder / "sense.json", text)]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _vtu(path: Path, grid: Volume, measured: MeasuredDisplacement) -> Path:
+    """Write the object as hexahedra between voxels, subsampled for ParaView."""
+    known = np.isfinite(measured.displacement.vectors).all(axis=-1) & measured.mask
+    step = 1
+    while known[::step, ::step, ::step].sum() > MESH_CELLS:
+        step += 1
+    some = (slice(None, None, step),) * 3
+    nz, ny, nx = known[some].shape
+    cells = grid_cells(nx - 1, ny - 1, nz - 1)
+    cells = cells[known[some].ravel()[cells].all(axis=1)]
+    if not len(cells):
+        raise InputError("the displacement is known at too few neighbouring voxels for a mesh; enlarge the mask")
+    used, numbers = np.unique(cells, return_inverse=True)
+    mesh = Mesh.from_arrays(grid.positions()[some].reshape(-1, 3)[used], numbers.reshape(cells.shape), "hexahedron")
+    strain = green_lagrange_strain_of(measured.gradient[some].reshape(-1, 3, 3)[used])
+    data: dict[str, FloatArray] = {
+        "displacement_mm": measured.displacement.vectors[some].reshape(-1, 3)[used],
+        "green_lagrange_strain": strain,
+    }
+    if (covariance := measured.displacement.covariance) is not None:
+        data["displacement_covariance_mm2"] = covariance[some].reshape(-1, 3, 3)[used]
+    write_vtu(path, mesh, data)
+    return path
+
+
+def _field(path: Path, pair: Pair, measured: MeasuredDisplacement) -> Path:
+    """Write the field as the identification takes it (`naibu.io.read_field`)."""
+    step = 1
+    while (measured.mask & measured.displacement.valid)[::step, ::step, ::step].sum() > FIELD_POINTS:
+        step += 1
+    provenance = {"naibu": __version__, "method": measured.method, "inputs": pair.inputs, "every_voxel": step}
+    return write_field(path, measured.displacement.at_points(step=step), provenance=provenance)
+
+
+def _as_markers(measured: MeasuredDisplacement, grid: Volume) -> tuple[Markers, Markers]:
+    """Return some 250 positions on a lattice in the object and their displaced positions, as markers for `naibu import`."""
+    good = measured.mask & measured.displacement.valid
+    if (sd := measured.displacement.largest_sd_mm) is not None:
+        good &= np.nan_to_num(sd, nan=np.inf) <= LEAST_CERTAIN * np.nanmedian(sd[good])
+    apart = (good.sum() * float(np.prod(grid.spacing_mm)) / MARKERS) ** (1.0 / 3.0)
+    every = np.maximum(1, np.round(apart / grid.spacing_mm)).astype(int)[::-1]
+    some = np.zeros(grid.shape, dtype=bool)
+    some[tuple(slice(k // 2, None, k) for k in every)] = True
+    some &= good
+    points, ids = grid.positions()[some], np.arange(1, int(some.sum()) + 1)
+    return Markers.from_arrays(ids, points), Markers.from_arrays(ids, points + measured.displacement.vectors[some])
+
+
+def slice_view(pair: Pair, run: SenseRun) -> SliceView:
+    """Return the slices of the page of a run."""
+    measured, grid = run.measured, pair.reference
+    box = _box(measured.mask)
+    u = measured.displacement.vectors
+    back = warped(pair.deformed, np.nan_to_num(u), grid)
+    inside = measured.mask & np.isfinite(measured.gradient).all(axis=(-2, -1))
+    principal = np.full((*grid.shape, 3), np.nan)
+    principal[inside] = np.linalg.eigvalsh(green_lagrange_strain_of(measured.gradient[inside]))
+    ratio = np.full(grid.shape, np.nan)
+    ratio[inside] = np.linalg.det(np.eye(3) + measured.gradient[inside])
+    overlays = [
+        Overlay("displacement, mm", np.linalg.norm(u, axis=-1)[box]),
+        Overlay("largest principal Green-Lagrange strain", principal[..., 2][box]),
+        Overlay("smallest principal Green-Lagrange strain", principal[..., 0][box]),
+        Overlay("volume ratio J", ratio[box], middle=1.0),
+    ]
+    if (sd := measured.displacement.largest_sd_mm) is not None:
+        overlays.append(Overlay("standard deviation of the displacement, mm", np.where(measured.mask, sd, np.nan)[box]))
+    images = [("reference", pair.reference.values), ("deformed", pair.deformed.values), ("deformed, warped back", back)]
+    return SliceView(
+        title=f"Displacement from {pair.names[0]} to {pair.names[1]}",
+        sentences=_sentences(run),
+        spacing_mm=grid.spacing_mm,
+        images=[(name, np.asarray(v, dtype=np.float32)[box]) for name, v in images],
+        displacement=(u @ grid.direction)[box],
+        overlays=overlays,
+        tables=[_table(run)],
+        origin_mm=grid.to_physical([b.start for b in box[::-1]]) @ grid.direction,
+        difference=(("reference minus deformed", 0, 1), ("reference minus deformed, warped back", 0, 2)),
+    )
+
+
+def _box(mask: BoolArray, margin: int = 4) -> tuple[slice, ...]:
+    inside = np.argwhere(mask)
+    return tuple(slice(max(0, int(a) - margin), int(b) + 1 + margin) for a, b in zip(inside.min(axis=0), inside.max(axis=0), strict=True))
+
+
+def _sentences(run: SenseRun) -> list[str]:
+    f = run.figures
+    sentences = [
+        f"Method {run.measured.method}, {run.seconds:.1f} s. The object moved by {f['median_displacement_mm']:.2f} mm (median), at most "
+        f"{f['largest_displacement_mm']:.2f} mm; the intensity residual inside it fell from {f['initial_residual_rms']:.4g} to "
+        f"{f['residual_rms']:.4g} (root mean square)."
+    ]
+    if f["median_sd_mm"] is not None:
+        sentences.append(
+            f"The standard deviation of the displacement is {f['median_sd_mm']:.3f} mm (along the least certain direction, median)."
+        )
+    else:
+        sentences.append("This method states no uncertainty.")
+    if isinstance(f["measured_fraction"], float) and f["measured_fraction"] < 0.995:
+        sentences.append(
+            f"The displacement of {1.0 - f['measured_fraction']:.1%} of the object was not measured: that part lies outside one of the "
+            "scans, or in its padding, or the scans show no common texture there."
+        )
+    if isinstance(f["folded_fraction"], float) and f["folded_fraction"] > 0.0:
+        sentences.append(f"The field folds at {f['folded_fraction']:.2%} of the voxels: it is wrong there.")
+    return sentences + [text.replace("`", "") for text in run.measured.warnings]
+
+
+def _table(run: SenseRun) -> Table:
+    return Table("Figures", ("quantity", "value"), tuple(run.rows()))

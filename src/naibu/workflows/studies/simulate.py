@@ -1,0 +1,128 @@
+"""Run a study by its name or from its file: lattices, sensing chips, layered skin, or the simulations of :cite:t:`hirai2008`."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from dataclasses import dataclass
+
+from naibu.core.errors import InputError
+from naibu.core.progress import Progress
+from naibu.workflows.applications.simulate_chip import CHIP, CHIP_TITLE, chip_text, describes_chip, simulate_chip
+from naibu.workflows.applications.simulate_ischemia import ISCHEMIA, ISCHEMIA_TITLE, describes_ischemia, ischemia_text, simulate_ischemia
+from naibu.workflows.studies.lattice_study import NAMED, TEMPLATE, study_text
+from naibu.workflows.studies.simulate_lattice import CHECKPOINT_EVERY, SimulationRun, simulate_lattice
+from naibu.workflows.studies.simulate_study import SLUGS, SQUARES_TOGETHER, simulate_study
+
+
+@dataclass(frozen=True, slots=True)
+class NamedStudy:
+    """A study that naibu brings along.
+
+    Attributes
+    ----------
+    name : str
+        What `simulate` takes.
+    model : str
+        ``"finite elements"``, ``"mass-spring-dashpot lattice"``, ``"sensing chip"`` or ``"layered skin"``.
+    title : str
+        What is simulated.
+    """
+
+    name: str
+    model: str
+    title: str
+
+
+def named_studies() -> tuple[NamedStudy, ...]:
+    """Return the studies that `simulate` knows by name."""
+    elements = [(name, SLUGS.get(name, "three squares side by side")) for name in (SQUARES_TOGETHER, *SLUGS)]
+    lattices = [(name, tomllib.loads(study_text(name))["title"]) for name in NAMED]
+    return (
+        *(NamedStudy(name, "finite elements", title) for name, title in elements),
+        *(NamedStudy(name, "mass-spring-dashpot lattice", title) for name, title in lattices),
+        NamedStudy(CHIP, "sensing chip", CHIP_TITLE),
+        NamedStudy(ISCHEMIA, "layered skin", ISCHEMIA_TITLE),
+    )
+
+
+def example_text(study: str = "") -> str:
+    """Return the file of a study as a template: of a lattice, a sensing chip, or layered skin.
+
+    Parameters
+    ----------
+    study : str
+        Its name; a lattice by default.
+
+    Raises
+    ------
+    InputError
+        There is no such study, or it has no file.
+    """
+    of_name = {CHIP: chip_text, ISCHEMIA: ischemia_text}
+    return of_name[study]() if study in of_name else study_text(study or TEMPLATE)
+
+
+def simulate(
+    study: str | os.PathLike[str],
+    *,
+    out: str | os.PathLike[str],
+    resume: bool = False,
+    overwrite: bool = False,
+    checkpoint_every: int = CHECKPOINT_EVERY,
+    device: str = "cpu",
+    progress: Progress | None = None,
+) -> SimulationRun:
+    """Simulate a study, and write its motion for ParaView, an animated page and the numbers.
+
+    Ctrl-C (KeyboardInterrupt) ends the run of a lattice: the frames computed so far are kept, and the run can be resumed.
+
+    Parameters
+    ----------
+    study : str or path-like
+        Name of a study (see `named_studies`), or a TOML file that describes a lattice, its indenters and their motion, a sensing chip, or
+        layered skin.
+    out : path-like
+        Folder for the files.
+    resume : bool
+        Whether an interrupted or killed run of a lattice is resumed; the result is the same as without an interruption.
+    overwrite : bool
+        Whether results that the folder holds are replaced.
+    checkpoint_every : int
+        Number of frames of a lattice between checkpoints, from which a run that was killed can be resumed.
+    device : str
+        Where a lattice is computed: ``"cpu"``, ``"cuda"`` (an NVIDIA GPU; ``"cuda:1"`` for the second), or ``"warp-cpu"`` (the kernels of
+        the GPU on the processor, for tests). Contact with friction is computed on the CPU only.
+    progress : callable, optional
+        Called with a `ProgressReport` after every frame of a lattice, and after every study of finite elements.
+
+    Returns
+    -------
+    SimulationRun
+        The files, and how many frames they hold.
+
+    Raises
+    ------
+    InputError
+        A study that cannot be used, a folder that cannot be written to or holds results, or nothing to resume.
+    ConvergenceError
+        An explicit method became unstable; the frames before are kept.
+    """
+
+    name = os.fspath(study)
+    of_chip, of_skin = describes_chip(study), describes_ischemia(study)
+    if not (of_chip or of_skin) and name != SQUARES_TOGETHER and name not in SLUGS:
+        return simulate_lattice(
+            study, out, resume=resume, overwrite=overwrite, checkpoint_every=checkpoint_every, device=device, progress=progress
+        )
+    if resume:
+        raise InputError(f"{name} takes seconds and keeps nothing to resume from; run it without `resume`")
+    if device != "cpu":
+        raise InputError(f"device is {device!r}, and {name} is a study of finite elements, which run on 'cpu'; choose that, or a lattice")
+    if of_chip:
+        return SimulationRun(simulate_chip(study, out, overwrite=overwrite, progress=progress), 1, 1)
+    if of_skin:
+        return SimulationRun(simulate_ischemia(study, out, overwrite=overwrite, progress=progress), 1, 1)
+    files = simulate_study(name, out, overwrite=overwrite, progress=progress)
+    count = sum(path.suffix == ".vtkhdf" for path in files)
+    return SimulationRun(tuple(files), count, count)

@@ -1,0 +1,78 @@
+"""A simulated device drives a live lattice over the loopback interface."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from touched_lattice import TOP, touched_lattice
+
+from naibu.core.errors import InputError
+from naibu.io.vtk_files import write_vtu
+from naibu.meshing import box
+from naibu.simulation import SimulatedDevice
+from naibu.workflows import TouchableModel, drive_live_simulation, live, touched_loop
+
+
+def device() -> SimulatedDevice:
+    """A hand that comes down 16 mm and stirs."""
+    return SimulatedDevice(lambda t: np.array([3.0 * np.sin(6.0 * t), 0.0, -16.0 * min(t, 1.0)]))
+
+
+def driven(seconds: float) -> None:
+    model = TouchableModel("Cube", (), touched_lattice(), "mean elongation, %")
+    interval = sys.getswitchinterval()
+    with touched_loop(model, 0) as loop:
+        assert loop.hand is not None
+        port, limits = loop.hand.channel.port, loop.hand.limits
+        record = drive_live_simulation(device(), port, seconds, loss=0.01, reordering=0.01, seed=3)
+        frame = loop.latest()[0]
+        counted = loop.hand.channel.datagrams.dropped
+    assert sys.getswitchinterval() == interval
+    assert record.steps_mn.max() <= limits.step_mn * (1 + 1e-9)
+    assert np.linalg.norm(record.forces, axis=1).max() > 50.0
+    assert record.most_work <= limits.energy_mn_mm
+    assert frame.tool_centre[2] < TOP + 20.0
+    assert counted["old"] > 0
+    assert not counted["foreign"]
+    assert not counted["malformed"]
+
+
+def test_a_device_drives_a_lattice_over_udp() -> None:
+    driven(2.0)
+
+
+@pytest.mark.slow
+def test_a_device_drives_a_lattice_for_a_while() -> None:
+    driven(10.0)
+
+
+def test_what_cannot_be_felt_is_refused(tmp_path: Path) -> None:
+    write_vtu(tmp_path / "gel.vtu", box((30.0, 30.0, 30.0), (2, 2, 2), cell_type="tetra"))
+    with pytest.raises(InputError, match="steps of at most 2 ms"):
+        live(tmp_path / "gel.vtu", port=0, haptics_port=48766, ready=lambda _: None)
+    with pytest.raises(InputError, match="haptics_port must lie between 1 and 65535"):
+        live("cube-pushing", port=0, haptics_port=0, ready=lambda _: None)
+    with pytest.raises(InputError, match="no answer came"):
+        drive_live_simulation(device(), 9, 0.05)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None or sys.platform != "linux", reason="needs a C compiler on Linux")
+def test_the_client_of_the_documentation_is_led_by_the_same_rules(tmp_path: Path) -> None:
+    source = Path(__file__).parents[4] / "docs" / "haptic_client.c"
+    client = tmp_path / "client"
+    subprocess.run(["cc", "-Wall", "-Wextra", "-Werror", source, "-o", client, "-lm"], check=True)
+    with touched_loop(TouchableModel("Cube", (), touched_lattice(), "mean elongation, %"), 0) as loop:
+        assert loop.hand is not None
+        said = subprocess.run([client, str(loop.hand.channel.port), "2.5"], check=True, capture_output=True, text=True).stdout
+        assert not loop.hand.channel.datagrams.dropped
+    numbers = [float(word) for word in said.replace(",", " ").split() if word.lstrip("-").replace(".", "").isdigit()]
+    poses, answers, x, y, z, flags = numbers
+    assert poses == 2500
+    assert answers > 50
+    assert z > 100.0 > 10.0 * max(abs(x), abs(y))
+    assert int(flags) & 1

@@ -1,0 +1,142 @@
+"""The live page in a real browser: it loads, pushes, pulls, reads the force, looks inside, comes back; and what can be touched."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import uvicorn
+from browser import CHROMIUM, opened_browser
+from touched_lattice import touched_lattice
+
+from naibu.core.errors import InputError
+from naibu.io.vtk_files import write_vtu
+from naibu.meshing import box
+from naibu.simulation import InteractiveSimulation, RealTimeLoop
+from naibu.viewer.live.server import LiveServer
+from naibu.workflows import MeshMaterial, TouchableModel, live, tools_for, touchable
+from naibu.workflows.interactive.live import LiveSimulation
+
+
+@contextmanager
+def served(model: TouchableModel | None = None, port: int = 0) -> Iterator[tuple[str, LiveSimulation]]:
+    """Serve a model, by default a small lattice; yields the address and the simulation."""
+    model = model or TouchableModel("Cube", ("a small lattice",), touched_lattice(), "mean elongation, %")
+    with RealTimeLoop(InteractiveSimulation(model.body, tools_for(model.body))) as loop:
+        simulation = LiveSimulation(model, loop)
+        pages = LiveServer(simulation, "secret")
+        bound = uvicorn.Config(pages.app(0), host="127.0.0.1", port=port, log_level="critical").bind_socket()
+        chosen = bound.getsockname()[1]
+        server = uvicorn.Server(uvicorn.Config(pages.app(chosen), log_level="critical", lifespan="off", ws="websockets-sansio"))
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [bound]}, daemon=True)
+        thread.start()
+        yield f"http://127.0.0.1:{chosen}/?token=secret", simulation
+        server.should_exit = True
+        thread.join(timeout=10)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
+def test_a_person_pushes_pulls_looks_inside_and_saves(tmp_path: Path) -> None:
+    frame = "window.naibuLive && naibuLive.frame"
+    with served() as (address, simulation), opened_browser() as page:
+        page.open(address)
+        page.wait("document.querySelector('.stage[data-ready]') !== null && naibuLive.frame.tool === 0", 60)
+        page.value("naibuLive.command('record', {on: true})")
+        page.value("naibuLive.command('move', {at: [20, 20, 43]})")
+        page.wait(f"{frame}.force[2] < -1", 60)
+        assert page.value("naibuLive.numbers.force.textContent").endswith(" N")
+        page.value("naibuLive.view.setClip(1, 0.5)")
+        assert page.value("naibuLive.view.cap.geometry.attributes.position.count") > 50
+        page.value("naibuLive.command('colour', {name: 'strain'}, true)")
+        page.wait(f"{frame}.values !== null", 30)
+        page.value("naibuLive.view.setClip(null)")
+
+        page.value("naibuLive.take(''); naibuLive.setMode('pull')")
+        page.wait(f"{frame}.tool === -1", 30)
+        at = page.value(
+            "(() => { const b = naibuLive.view.canvas.getBoundingClientRect(); const c = [b.left + b.width / 2, b.top + b.height / 2];"
+            " return naibuLive.view.pick(...c) ? c : null; })()"
+        )
+        page.mouse("mousePressed", *at)
+        page.wait(f"{frame}.gripped >= 0", 30)
+        page.mouse("mouseMoved", at[0] + 40, at[1] - 20)
+        page.wait(f"Math.hypot(...{frame}.pull) > 1", 30)
+        page.mouse("mouseReleased", at[0] + 40, at[1] - 20)
+        page.wait(f"{frame}.gripped < 0", 30)
+
+        page.value("naibuLive.command('pause', {on: true})")
+        page.wait("naibuLive.badge.textContent.startsWith('paused')", 30)
+        page.value("naibuLive.link.socket.close()")
+        page.wait("naibuLive.badge.textContent === 'not connected'", 30)
+        page.wait("naibuLive.badge.textContent.startsWith('paused')", 30)
+        assert page.console == []
+        assert len(page.picture(tmp_path / "live.png").read_bytes()) > 10_000
+        assert "Recorded from the live page." in simulation.recording_html()
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
+@pytest.mark.parametrize("kind", ["mesh", "lattice"])
+def test_a_person_cuts_a_body_and_takes_it_back(tmp_path: Path, kind: str) -> None:
+    write_vtu(tmp_path / "gel.vtu", box((30.0, 30.0, 30.0), (4, 4, 4), cell_type="tetra"))
+    model = touchable(tmp_path / "gel.vtu") if kind == "mesh" else None  # of 5 x 5 x 5 nodes both
+    with served(model) as (address, simulation), opened_browser() as page:
+        page.open(address)
+        page.wait("document.querySelector('.stage[data-ready]') !== null && naibuLive.frame.tool === 0", 60)
+        page.value("naibuLive.take(''); naibuLive.setMode('cut')")
+        left, top, width, height = page.value(
+            "(() => { const b = naibuLive.view.canvas.getBoundingClientRect(); return [b.left, b.top, b.width, b.height]; })()"
+        )
+        path = [(left + width * 0.5, top + height * (0.08 + 0.03 * k)) for k in range(16)]
+        page.mouse("mousePressed", *path[0])
+        for at in path[1:]:
+            page.mouse("mouseMoved", *at)
+        page.mouse("mouseReleased", *path[-1])
+        page.wait("naibuLive.scene.topology === 1 && naibuLive.frame.topology === 1", 60)
+        assert page.value("naibuLive.scene.points.length") > 3 * 125
+        assert simulation.scene.topology == 1
+        page.picture(tmp_path / f"{kind}.png")
+        page.value("naibuLive.command('undo')")
+        page.wait("naibuLive.scene.topology === 2 && naibuLive.scene.points.length === 375", 60)
+        assert page.console == []
+
+
+def test_a_mesh_is_held_at_its_lowest_nodes_and_pressed(tmp_path: Path) -> None:
+    mesh = box((30.0, 30.0, 30.0), (3, 3, 3), cell_type="tetra")
+    write_vtu(tmp_path / "gel.vtu", mesh)
+    model = touchable(tmp_path / "gel.vtu", material=MeshMaterial(young_modulus_kpa=20.0, poisson_ratio=0.49))
+    touched = InteractiveSimulation(model.body, tools_for(model.body))
+    touched.take("plate")
+    touched.move((0.0, 0.0, 30.0 + 0.06 * 30.0 - 3.0))
+    for _ in range(30):
+        frame = touched.advance()
+    stress = -frame.force[2] / 900.0
+    assert 20.0 * 0.1 < stress < 20.0 * 0.1 * 2.5  # 10 % of a block whose ends stick: above E times strain
+    low = mesh.points[:, 2] < 1e-9
+    np.testing.assert_allclose(frame.positions[low], mesh.points[low], atol=1e-12)
+    assert model.body.strain(frame.positions).max() > 5.0
+    assert frame.penetration_mm < 0.1
+
+
+def test_what_cannot_be_touched_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is neither a model"):
+        touchable("no-such-thing")
+    with pytest.raises(InputError, match="material goes with a mesh"):
+        touchable("cube-pushing", material=MeshMaterial())
+    with pytest.raises(InputError, match="poisson_ratio"):
+        MeshMaterial(poisson_ratio=0.5)
+    (tmp_path / "model.json").write_text("{}")
+    with pytest.raises(InputError, match="not a naibu model"):
+        touchable(tmp_path / "model.json")
+
+
+def test_a_taken_port_is_named() -> None:
+    with served() as (address, _):
+        port = int(address.split(":")[2].split("/")[0])
+        with pytest.raises(InputError, match=f"port {port} is taken"):
+            live("cube-pushing", port=port, ready=lambda _: None)
+    with pytest.raises(InputError, match="between 0 and 65535"):
+        live("cube-pushing", port=70000, ready=lambda _: None)
