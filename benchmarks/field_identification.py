@@ -27,9 +27,9 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.mesh import Mesh
 from naibu.core.progress import ProgressReport
 from naibu.identification.from_fields.estimate import FieldEstimate, identify_field
-from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
+from naibu.identification.from_fields.forward.sensitivities import logarithms, young_and_poisson
 from naibu.identification.from_fields.regularization import cell_volumes
-from naibu.identification.from_fields.sensitivities import logarithms, young_and_poisson
 from naibu.identification.from_fields.uncertainty import cramer_rao_bound
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters

@@ -21,8 +21,8 @@ from naibu.core.experiment import Experiment, Loading
 from naibu.identification.from_markers.calibration import calibrate
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
-from naibu.identification.from_markers.parameter_names import friction, poisson_ratio, shape_parameter, young_modulus
-from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.from_markers.specimen.parameter_names import friction, poisson_ratio, shape_parameter, young_modulus
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.interval import per_axis
 from naibu.identification.prediction.prediction import Prediction, predict_state, rms

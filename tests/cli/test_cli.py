@@ -17,8 +17,8 @@ import pytest
 from virtual_press import KNOWN, Press, stop_at
 
 from naibu import cli
-from naibu.identification.from_markers.marker_checks import Doubt
-from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.from_markers.checks.marker_checks import Doubt
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.io.experiment_folder.reader import read_experiment
 from naibu.mechanics.finite_strain.newton import Newton
 from naibu.workflows import compare as comparison

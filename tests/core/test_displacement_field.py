@@ -13,7 +13,7 @@ from naibu.core.mesh import Mesh
 from naibu.core.rigid_transform import rotation_matrix
 from naibu.core.volume import Volume
 from naibu.identification.equilibrium_gap.equations import nodal_field
-from naibu.identification.from_fields.load_cases import FieldLoadCase
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
 
 SHAPE = (3, 4, 5)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from naibu.core.displacement_field import DisplacementField
-from naibu.identification.from_fields.load_cases import FieldLoadCase
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
 from naibu.meshing.point_location import interpolation_operator
 from naibu.reproduction.chapter3.bodies import PushedBody
 

@@ -8,7 +8,7 @@ from functools import cache
 from naibu.core.experiment import Experiment
 from naibu.identification.from_markers.calibration import Calibration, calibrate
 from naibu.identification.from_markers.known_materials import KnownMaterials
-from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.validation.specimens.marker_phantoms import Scanner, two_gels, virtual_specimen
 
 

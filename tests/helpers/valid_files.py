@@ -17,7 +17,7 @@ from naibu.core.parameters import Parameter, ParameterSet
 from naibu.core.volume import Volume
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
-from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.io.experiment_folder.reader import read_experiment
 from naibu.io.images import read_displacement, read_volume, write_displacement, write_volume

@@ -11,7 +11,7 @@ import pytest
 
 from naibu.core.experiment import Loading
 from naibu.identification.from_markers.gauss_newton import Matcher
-from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.io.marker_tables import write_experiment_folder
 from naibu.validation.specimens.marker_phantoms import Phantom, Scanner, box_experiment, phantom
 from naibu.workflows.identify import Identification

@@ -7,9 +7,9 @@ import pytest
 
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
-from naibu.identification.from_fields.load_cases import FieldLoadCase
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
 from naibu.identification.from_markers.observations import MarkerLoadCase, NoiseModel
-from naibu.identification.from_markers.specimen_model import ModelSettings, specimen
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings, specimen
 from naibu.identification.from_motion.rheology import MotionLoadCase
 from naibu.identification.load_case import LoadCase, require_load_cases
 from naibu.meshing.primitives import box

@@ -9,7 +9,7 @@ from naibu.core.parameters import Parameter, ParameterSet
 from naibu.core.status import Status
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
-from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.workflows.report_content import parameter_label, parameter_rows, search_sentence, undetermined
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from naibu.core.experiment import Loading
-from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.baselines import affine
 from naibu.identification.prediction.prediction import Prediction
 from naibu.imaging.markers.tracking import TrackedMarkers, track_markers

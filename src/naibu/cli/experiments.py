@@ -18,7 +18,7 @@ from naibu.core.errors import InputError
 
 # imported where used, so that --help is immediate and doctor runs even if numpy is broken
 if TYPE_CHECKING:
-    from naibu.identification.from_markers.specimen_model import ModelSettings
+    from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
     from naibu.workflows.identify import Identification
 
 DEMO = ("ct_two_material_1", "ct_two_material_2", "ct_two_material_3")
@@ -113,7 +113,7 @@ def identify(
             element_size_mm=element_size_mm, out=out, overwrite=overwrite,
         )  # fmt: skip
         return
-    from naibu.identification.from_markers.specimen_model import ModelSettings
+    from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 
     settings = ModelSettings(law=law, contact=contact, joined=joined, element_size_mm=element_size_mm, pixel_scale=pixel_scale)
     states = _states(experiments, state or [])
@@ -314,7 +314,7 @@ def compare(
     overwrite
         Discard what the folder already contains, and compute everything anew.
     """
-    from naibu.identification.from_markers.specimen_model import ModelSettings
+    from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
     from naibu.workflows import compare as compare_workflow
     from naibu.workflows.report_content import comparison_table
 

@@ -4,13 +4,13 @@ from .equilibrium_gap.weighted import weighted_equilibrium_gap
 from .from_fields.assumptions import Assumption
 from .from_fields.estimate import FieldEstimate, identify_field
 from .from_fields.experiment_design import Accuracy, expected_accuracy
-from .from_fields.load_cases import FieldLoadCase, KnownRegion, Zones
+from .from_fields.forward.load_cases import FieldLoadCase, KnownRegion, Zones
 from .from_fields.uncertainty import ErrorBudget, cramer_rao_bound
 from .from_markers.calibration import Calibration, calibrate
 from .from_markers.gauss_newton import MatchingSettings
 from .from_markers.known_materials import KnownMaterials
 from .from_markers.observations import NoiseModel
-from .from_markers.specimen_model import ModelSettings
+from .from_markers.specimen.specimen_model import ModelSettings
 from .from_motion.rheology import MotionEstimate, MotionLoadCase, identify_motion
 from .lattice_calibration.evolutionary import search_cma_es, search_genetic
 from .lattice_calibration.forward_model import Capture, PushedFace, Pushing

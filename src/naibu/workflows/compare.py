@@ -8,9 +8,9 @@ from dataclasses import replace
 
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress, ProgressReport
-from naibu.identification.from_markers.marker_checks import check_markers
-from naibu.identification.from_markers.marker_outliers import without_outliers
-from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.from_markers.checks.marker_checks import check_markers
+from naibu.identification.from_markers.checks.marker_outliers import without_outliers
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.cross_validation import ModelRow, compare_models
 from naibu.workflows.experiments import Source, load_experiments, parse_known, provenance_of, require_element_size
 from naibu.workflows.output_folder import output_folder

@@ -15,7 +15,7 @@ from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment
 from naibu.core.units import kilopascals
 from naibu.identification.from_markers.known_materials import KnownMaterials
-from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.io.experiment_folder.reader import META_FILE, read_experiment
 from naibu.io.files.paths import require_usable_path
 

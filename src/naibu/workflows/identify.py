@@ -14,11 +14,11 @@ from naibu.core.progress import Progress
 from naibu.core.rigid_transform import registration
 from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration, calibrate
-from naibu.identification.from_markers.marker_checks import check_markers
-from naibu.identification.from_markers.marker_outliers import Outlier, distrusted, outliers_of_fit, without_outliers
+from naibu.identification.from_markers.checks.marker_checks import check_markers
+from naibu.identification.from_markers.checks.marker_outliers import Outlier, distrusted, outliers_of_fit, without_outliers
+from naibu.identification.from_markers.checks.verdict import verdict_of
 from naibu.identification.from_markers.observations import MarkerLoadCase
-from naibu.identification.from_markers.specimen_model import ModelSettings
-from naibu.identification.from_markers.verdict import verdict_of
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.baselines import affine, baselines, equilibrium_gap_baseline
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.cross_validation import LeftOut, leave_one_out

@@ -20,9 +20,9 @@ from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.estimate import FieldEstimate, identify_field
-from naibu.identification.from_fields.field_laws import LawName
-from naibu.identification.from_fields.load_cases import KNOWN, FieldLoadCase, Zones
-from naibu.identification.from_fields.sensitivities import young_and_poisson
+from naibu.identification.from_fields.forward.field_laws import LawName
+from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones
+from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
 from naibu.io.displacement_fields import read_field
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record

@@ -12,7 +12,7 @@ from naibu.core.parameters import Parameter, ParameterSet
 from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase
-from naibu.identification.from_markers.specimen_model import Specimen
+from naibu.identification.from_markers.specimen.specimen_model import Specimen
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.cross_validation import LeftOut, ModelRow
 from naibu.identification.prediction.platen_position import marker_layers

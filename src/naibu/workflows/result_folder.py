@@ -16,7 +16,7 @@ import numpy as np
 
 from naibu.core.errors import InputError
 from naibu.identification.from_markers.calibration import Calibration
-from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.cross_validation import LeftOut, ModelRow
 from naibu.identification.prediction.interval import per_axis

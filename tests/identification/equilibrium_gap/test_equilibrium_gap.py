@@ -18,7 +18,7 @@ from naibu.identification.equilibrium_gap.batch import EquilibriumGapEstimate, b
 from naibu.identification.equilibrium_gap.equations import load_case_equations, nodal_field
 from naibu.identification.equilibrium_gap.incremental import incremental_equilibrium_gap
 from naibu.identification.equilibrium_gap.weighted import weighted_equilibrium_gap
-from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.mechanics.finite_elements.linear_simplices import connection_matrices, lumped_mass, simplices

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from naibu.identification.from_fields.forward.load_cases import Zones
+from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, logarithms, young_and_poisson
 from naibu.identification.from_fields.gauss_newton import Objective, first_point
-from naibu.identification.from_fields.load_cases import Zones
 from naibu.identification.from_fields.regularization import Laplacian, ZoneGraph
-from naibu.identification.from_fields.sensitivities import FieldModel, Linearised, logarithms, young_and_poisson
 from naibu.identification.from_fields.uncertainty import (
     Uncertainty,
     cramer_rao_bound,

@@ -14,7 +14,7 @@ from naibu.identification.from_markers.calibration import calibrate, initial_par
 from naibu.identification.from_markers.gauss_newton import Matcher
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import MarkerLoadCase, NoiseModel, SolvedLoadCase
-from naibu.identification.from_markers.parameter_names import (
+from naibu.identification.from_markers.specimen.parameter_names import (
     base_offset,
     batch_stiffness,
     pixel_scale,
@@ -22,7 +22,7 @@ from naibu.identification.from_markers.parameter_names import (
     straight_base,
     young_modulus,
 )
-from naibu.identification.from_markers.specimen_model import ModelSettings, specimen
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings, specimen
 from naibu.identification.prediction.baselines import affine
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.prediction import predict_state, rms

@@ -11,9 +11,9 @@ from naibu.core.experiment import Experiment, Loading
 from naibu.core.mesh import Mesh
 from naibu.identification.from_markers.initial_guess import equilibrium_gap, equilibrium_gap_of_meshes
 from naibu.identification.from_markers.known_materials import KnownMaterials
-from naibu.identification.from_markers.marker_mesh import MarkerMesh, marker_mesh
-from naibu.identification.from_markers.parameter_names import poisson_ratio, young_modulus
-from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.from_markers.specimen.marker_mesh import MarkerMesh, marker_mesh
+from naibu.identification.from_markers.specimen.parameter_names import poisson_ratio, young_modulus
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from pressed_gels import identified, scanned
 
-from naibu.identification.from_markers.parameter_names import young_modulus
-from naibu.identification.from_markers.verdict import coarse_elements, verdict_of
+from naibu.identification.from_markers.checks.verdict import coarse_elements, verdict_of
+from naibu.identification.from_markers.specimen.parameter_names import young_modulus
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.verdict import Explanation
 

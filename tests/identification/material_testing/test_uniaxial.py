@@ -12,7 +12,7 @@ from scipy.stats import t as student
 from naibu import datasets
 from naibu.core.errors import InputError
 from naibu.core.markers import Markers
-from naibu.identification.from_markers.marker_mesh import marker_mesh
+from naibu.identification.from_markers.specimen.marker_mesh import marker_mesh
 from naibu.identification.material_testing.marker_strain import marker_strain, poisson_ratio_from_markers
 from naibu.identification.material_testing.uniaxial import Specimen, compression_test, poisson_ratio, specimen_mean
 from naibu.mechanics.finite_elements.assembly import Assembler

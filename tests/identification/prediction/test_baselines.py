@@ -11,8 +11,8 @@ from naibu.core.experiment import Loading
 from naibu.identification.from_markers.calibration import calibrate
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import MarkerLoadCase, NoiseModel
-from naibu.identification.from_markers.parameter_names import platen_position, poisson_ratio, young_modulus
-from naibu.identification.from_markers.specimen_model import ModelSettings, specimen
+from naibu.identification.from_markers.specimen.parameter_names import platen_position, poisson_ratio, young_modulus
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings, specimen
 from naibu.identification.prediction.baselines import affine, baselines, equilibrium_gap_baseline, linear_parameters
 from naibu.identification.prediction.prediction import rms
 from naibu.validation.specimens.marker_phantoms import Scanner, box_experiment, phantom

@@ -11,8 +11,8 @@ from naibu.identification.from_markers.calibration import calibrate
 from naibu.identification.from_markers.gauss_newton import MatchingSettings
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
-from naibu.identification.from_markers.parameter_names import poisson_ratio, young_modulus
-from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.from_markers.specimen.parameter_names import poisson_ratio, young_modulus
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction import cross_validation
 from naibu.identification.prediction.cross_validation import LeftOut, compare_models, leave_one_out, pooled_rms
 from naibu.validation.specimens.marker_phantoms import Scanner, box_experiment, virtual_specimen

@@ -11,8 +11,8 @@ from naibu.core.markers import Markers
 from naibu.identification.from_markers.calibration import initial_parameters
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
-from naibu.identification.from_markers.parameter_names import friction, poisson_ratio, young_modulus
-from naibu.identification.from_markers.specimen_model import ModelSettings, specimen
+from naibu.identification.from_markers.specimen.parameter_names import friction, poisson_ratio, young_modulus
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings, specimen
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.platen_position import Gauge, outermost_markers
 from naibu.identification.prediction.prediction import predict_state

@@ -11,8 +11,14 @@ from naibu.core.experiment import Experiment, Loading
 from naibu.identification.from_markers.calibration import Calibration, calibrate
 from naibu.identification.from_markers.gauss_newton import Matcher
 from naibu.identification.from_markers.observations import NoiseModel
-from naibu.identification.from_markers.parameter_names import base_offset, pixel_scale, poisson_ratio, shape_parameter, young_modulus
-from naibu.identification.from_markers.specimen_model import ModelSettings, specimen
+from naibu.identification.from_markers.specimen.parameter_names import (
+    base_offset,
+    pixel_scale,
+    poisson_ratio,
+    shape_parameter,
+    young_modulus,
+)
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings, specimen
 from naibu.identification.prediction import interval
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.prediction import Prediction, predict_state

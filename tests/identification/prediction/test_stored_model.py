@@ -15,7 +15,7 @@ from naibu.core.errors import InputError
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
-from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.workflows.result_folder import read_model
 

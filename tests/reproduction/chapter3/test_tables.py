@@ -11,7 +11,7 @@ from matplotlib.figure import Figure as Canvas
 from naibu import datasets
 from naibu.core.errors import InputError
 from naibu.identification.equilibrium_gap.batch import batch_equilibrium_gap
-from naibu.identification.from_fields.load_cases import Zones
+from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.mechanics.finite_elements.linear_simplices import simplices
 from naibu.reproduction.chapter3.bodies import LAYERS, UNIFORM, PushedBody, Split, cube, shape_error_percent, split_hexahedra, square
 from naibu.reproduction.chapter3.cubes import (

@@ -9,9 +9,9 @@ from naibu import datasets
 from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, Loading
 from naibu.core.rigid_transform import registration
-from naibu.identification.from_markers.parameter_names import friction, platen_position, poisson_ratio, young_modulus
-from naibu.identification.from_markers.scan_alignment import placement
-from naibu.identification.from_markers.specimen_model import ModelSettings, specimen
+from naibu.identification.from_markers.specimen.parameter_names import friction, platen_position, poisson_ratio, young_modulus
+from naibu.identification.from_markers.specimen.scan_alignment import placement
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings, specimen
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import material
 from naibu.mechanics.finite_strain.statics import solve

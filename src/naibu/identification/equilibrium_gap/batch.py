@@ -20,7 +20,7 @@ from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.status import Status
 from naibu.identification.equilibrium_gap.equations import LoadCaseEquations, load_case_equations, require_scale
-from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.mechanics.finite_elements.modulus_derivatives import SimplexLaw
 

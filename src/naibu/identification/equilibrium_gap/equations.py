@@ -19,7 +19,7 @@ from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.load_cases import KNOWN, FieldLoadCase, Zones
+from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones
 from naibu.identification.load_case import require_load_cases
 from naibu.mechanics.finite_elements.linear_simplices import Simplices, simplices
 from naibu.mechanics.finite_elements.modulus_derivatives import SimplexLaw, cell_tangents, unit_forces

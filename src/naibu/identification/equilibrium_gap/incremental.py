@@ -18,7 +18,7 @@ from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.identification.equilibrium_gap.batch import RANK_TOLERANCE, EquilibriumGapEstimate
 from naibu.identification.equilibrium_gap.equations import LoadCaseEquations, load_case_equations, require_scale
-from naibu.identification.from_fields.load_cases import KNOWN, FieldLoadCase, Zones
+from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones
 from naibu.mechanics.finite_elements.modulus_derivatives import SimplexLaw
 
 

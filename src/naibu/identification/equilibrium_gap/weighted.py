@@ -27,7 +27,7 @@ from naibu.core.mesh import Mesh
 from naibu.core.status import Status
 from naibu.identification.equilibrium_gap.batch import EquilibriumGapEstimate, batch_equilibrium_gap
 from naibu.identification.equilibrium_gap.equations import LoadCaseEquations, load_case_equations
-from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.mechanics.finite_elements.modulus_derivatives import SimplexLaw
 from naibu.mechanics.linear_algebra.direct import direct_solver
 

@@ -11,11 +11,11 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError
-from naibu.identification.from_fields.field_laws import FieldLaw, LawName, field_law
-from naibu.identification.from_fields.forward_model import Solvers, equilibrium
-from naibu.identification.from_fields.load_cases import KnownRegion, Zones
+from naibu.identification.from_fields.forward.field_laws import FieldLaw, LawName, field_law
+from naibu.identification.from_fields.forward.forward_model import Solvers, equilibrium
+from naibu.identification.from_fields.forward.load_cases import KnownRegion, Zones
+from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of, young_and_poisson
 from naibu.identification.from_fields.mesh_error import refitted
-from naibu.identification.from_fields.sensitivities import Concentrated, Linearised, moduli_of, young_and_poisson
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
 OTHER_YOUNG, OTHER_POISSON = 0.1, 0.02  # changes whose effect is stated: relative, of Young's modulus; absolute, of Poisson's ratio

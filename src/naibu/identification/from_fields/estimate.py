@@ -22,7 +22,17 @@ from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress, report_progress
 from naibu.core.status import Status
 from naibu.identification.from_fields.assumptions import Assumption, assumptions, covariance_of, effects
-from naibu.identification.from_fields.field_laws import FieldElements, LawName
+from naibu.identification.from_fields.forward.field_laws import FieldElements, LawName
+from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones
+from naibu.identification.from_fields.forward.sensitivities import (
+    Concentrated,
+    FieldModel,
+    Linearised,
+    Point,
+    logarithms,
+    moduli_of,
+    young_and_poisson,
+)
 from naibu.identification.from_fields.gauss_newton import (
     Bounds,
     Found,
@@ -33,20 +43,10 @@ from naibu.identification.from_fields.gauss_newton import (
     first_point,
     search,
 )
-from naibu.identification.from_fields.load_cases import KNOWN, FieldLoadCase, Zones
 from naibu.identification.from_fields.mesh_error import COARSE, EXTRAPOLATED, changes_on_finer_mesh, doubt_of, refitted
 from naibu.identification.from_fields.regularization import Regularization, RegularizationName, ZoneGraph, regularization
 from naibu.identification.from_fields.regularization_weight import WeightChoice, WeightRule, WeightTrial, choose_weight
 from naibu.identification.from_fields.segmentation import EXPLICIT, Segmentation, segment
-from naibu.identification.from_fields.sensitivities import (
-    Concentrated,
-    FieldModel,
-    Linearised,
-    Point,
-    logarithms,
-    moduli_of,
-    young_and_poisson,
-)
 from naibu.identification.from_fields.truncated_newton import truncated_step
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, report, resolution, resolution_report
 from naibu.identification.from_fields.verdict import inflation, verdict

@@ -17,8 +17,8 @@ from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.parameters import MAX_POISSON_RATIO
 from naibu.core.status import Status
+from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, Point
 from naibu.identification.from_fields.regularization import Regularization
-from naibu.identification.from_fields.sensitivities import FieldModel, Linearised, Point
 
 LONGEST_STEP = 1.0  # of a logarithm of a modulus in one iteration
 SHORTEST_FRACTION = 1e-3  # of a step, below which the search ends

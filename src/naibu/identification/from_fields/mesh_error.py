@@ -14,10 +14,10 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError
-from naibu.identification.from_fields.field_laws import LawName, computed_mesh, field_law
-from naibu.identification.from_fields.forward_model import Observed, Solvers, equilibrium
-from naibu.identification.from_fields.refinement import Refinement
-from naibu.identification.from_fields.sensitivities import Concentrated, Linearised, moduli_of
+from naibu.identification.from_fields.forward.field_laws import LawName, computed_mesh, field_law
+from naibu.identification.from_fields.forward.forward_model import Observed, Solvers, equilibrium
+from naibu.identification.from_fields.forward.refinement import Refinement
+from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of
 from naibu.meshing.point_location import interpolation_operator
 
 EXTRAPOLATED = 1.4  # whole error over the change to half the element size: 1 / (1 - 2^-1.8)

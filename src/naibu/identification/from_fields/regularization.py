@@ -15,7 +15,7 @@ import scipy.sparse as sp
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.load_cases import KNOWN, Zones
+from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
 from naibu.meshing.quality import signed_volumes
 from naibu.meshing.surface import CELL_FACES
 

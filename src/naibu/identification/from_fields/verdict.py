@@ -14,7 +14,7 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.rigid_transform import registration
-from naibu.identification.from_fields.forward_model import Observed
+from naibu.identification.from_fields.forward.forward_model import Observed
 from naibu.identification.verdict import Explanation, Verdict, shared_part
 
 WITHIN_NOISE = 1.25  # residuals over the noise that need no explanation even if neighbours share them

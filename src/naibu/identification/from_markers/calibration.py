@@ -18,7 +18,7 @@ from naibu.identification.from_markers.initial_guess import equilibrium_gap
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.mesh_error import MeshError, mesh_error
 from naibu.identification.from_markers.observations import MarkerLoadCase, NoiseModel, SolvedLoadCase
-from naibu.identification.from_markers.parameter_names import (
+from naibu.identification.from_markers.specimen.parameter_names import (
     SHAPE_NAMES,
     base_offset,
     batch_stiffness,
@@ -31,7 +31,7 @@ from naibu.identification.from_markers.parameter_names import (
     straight_base,
     young_modulus,
 )
-from naibu.identification.from_markers.specimen_model import ModelSettings, Specimen, specimen
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings, Specimen, specimen
 
 REFERENCE_MODULUS_KPA = 200.0  # of the known region when only ratios are sought
 START_POISSON_RATIO = 0.49

@@ -22,8 +22,8 @@ from naibu.core.progress import Progress, report_progress
 from naibu.core.rigid_transform import RigidTransform, registration
 from naibu.core.status import Status
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase, SolvedLoadCase
-from naibu.identification.from_markers.parameter_names import pixel_scale
-from naibu.identification.from_markers.specimen_model import Specimen
+from naibu.identification.from_markers.specimen.parameter_names import pixel_scale
+from naibu.identification.from_markers.specimen.specimen_model import Specimen
 from naibu.mechanics.finite_strain.newton import Newton
 from naibu.mechanics.finite_strain.penalties import with_normal_stiffness
 from naibu.mechanics.finite_strain.problem import SolverSettings

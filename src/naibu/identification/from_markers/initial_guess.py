@@ -23,8 +23,8 @@ from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment
 from naibu.core.parameters import MAX_POISSON_RATIO
-from naibu.identification.from_markers.marker_mesh import MarkerMesh, marker_mesh
 from naibu.identification.from_markers.observations import NoiseModel
+from naibu.identification.from_markers.specimen.marker_mesh import MarkerMesh, marker_mesh
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import from_moduli, law_named

@@ -19,8 +19,8 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.parameters import ParameterSet
 from naibu.identification.from_markers.gauss_newton import PATH, Match, Matcher
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase
-from naibu.identification.from_markers.specimen_mesh import element_size
-from naibu.identification.from_markers.specimen_model import specimen
+from naibu.identification.from_markers.specimen.specimen_mesh import element_size
+from naibu.identification.from_markers.specimen.specimen_model import specimen
 from naibu.mechanics.finite_strain.statics import WarmStart, solve
 from naibu.meshing.point_location import interpolation_operator
 

@@ -12,8 +12,8 @@ from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment
 from naibu.core.parameters import ParameterSet
 from naibu.core.rigid_transform import RigidTransform
-from naibu.identification.from_markers.marker_grid import FILLED_SD_MM
-from naibu.identification.from_markers.specimen_model import Specimen
+from naibu.identification.from_markers.specimen.marker_grid import FILLED_SD_MM
+from naibu.identification.from_markers.specimen.specimen_model import Specimen
 from naibu.mechanics.finite_strain.statics import Solution, WarmStart
 
 WARM_START_SPACING = 0.05  # of the load, between states that the next evaluation starts from

@@ -14,8 +14,8 @@ from naibu.core.rigid_transform import registration
 from naibu.identification.from_markers.calibration import Calibration
 from naibu.identification.from_markers.initial_guess import equilibrium_gap
 from naibu.identification.from_markers.observations import MarkerLoadCase
-from naibu.identification.from_markers.parameter_names import platen_position, poisson_ratio, young_modulus
-from naibu.identification.from_markers.specimen_model import ModelSettings, specimen
+from naibu.identification.from_markers.specimen.parameter_names import platen_position, poisson_ratio, young_modulus
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings, specimen
 from naibu.identification.prediction.prediction import rms
 from naibu.mechanics.finite_strain.statics import solve
 

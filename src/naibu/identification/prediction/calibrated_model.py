@@ -14,7 +14,7 @@ from naibu.core.parameters import Parameter, ParameterSet
 from naibu.identification.from_markers.calibration import Calibration
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
-from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.predictive_uncertainty import PredictiveUncertainty, predictive_uncertainty
 from naibu.identification.prediction.stored_model import check_stored_model
 

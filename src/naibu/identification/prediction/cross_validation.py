@@ -18,7 +18,7 @@ from naibu.identification.from_markers.calibration import Calibration, calibrate
 from naibu.identification.from_markers.gauss_newton import MatchingSettings
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
-from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.prediction import Prediction, predict_state, rms
 from naibu.mechanics.linear_algebra.direct import use_one_thread

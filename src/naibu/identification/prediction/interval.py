@@ -11,8 +11,8 @@ from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.parameters import ParameterSet
 from naibu.core.rigid_transform import RigidTransform
 from naibu.identification.from_markers.observations import LoadCaseFit
-from naibu.identification.from_markers.parameter_names import base_offset, straight_base
-from naibu.identification.from_markers.specimen_model import Specimen
+from naibu.identification.from_markers.specimen.parameter_names import base_offset, straight_base
+from naibu.identification.from_markers.specimen.specimen_model import Specimen
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.platen_position import Gauge
 from naibu.identification.prediction.predictive_uncertainty import PredictiveUncertainty

@@ -12,8 +12,8 @@ from naibu.core.experiment import Experiment, State
 from naibu.core.parameters import ParameterSet
 from naibu.identification.from_markers.gauss_newton import Matcher
 from naibu.identification.from_markers.observations import LoadCaseFit, SolvedLoadCase
-from naibu.identification.from_markers.parameter_names import platen_position
-from naibu.identification.from_markers.specimen_model import Specimen
+from naibu.identification.from_markers.specimen.parameter_names import platen_position
+from naibu.identification.from_markers.specimen.specimen_model import Specimen
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 
 LAYER_GAP = 0.4  # a new marker layer starts where the height jumps by this fraction of the markers' spacing

@@ -12,11 +12,11 @@ from naibu.core.experiment import Experiment, State
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.core.rigid_transform import registration
 from naibu.identification.from_markers.gauss_newton import Matcher
-from naibu.identification.from_markers.marker_grid import FILLED_SD_MM
 from naibu.identification.from_markers.mesh_error import marker_error
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase, SolvedLoadCase
-from naibu.identification.from_markers.parameter_names import platen_position
-from naibu.identification.from_markers.specimen_model import Specimen, specimen
+from naibu.identification.from_markers.specimen.marker_grid import FILLED_SD_MM
+from naibu.identification.from_markers.specimen.parameter_names import platen_position
+from naibu.identification.from_markers.specimen.specimen_model import Specimen, specimen
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.interval import coordinate_uncertainty
 from naibu.identification.prediction.platen_position import Gauge, fitted_platen_position, outermost_markers, stated_platen_position

@@ -23,8 +23,8 @@ from naibu.core.parameters import Parameter, ParameterSet
 from naibu.identification.from_markers.calibration import Calibration
 from naibu.identification.from_markers.gauss_newton import Matcher
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase
-from naibu.identification.from_markers.parameter_names import SHAPE_NAMES, friction, pixel_scale, shape_parameter, young_modulus
-from naibu.identification.from_markers.specimen_model import Specimen
+from naibu.identification.from_markers.specimen.parameter_names import SHAPE_NAMES, friction, pixel_scale, shape_parameter, young_modulus
+from naibu.identification.from_markers.specimen.specimen_model import Specimen
 
 # standard deviations of what is taken for known, on the optimiser's scale
 SHAPE_SD: Mapping[str, float] = {"c01_fraction": 0.3, "c20_ratio": 0.3}

@@ -9,7 +9,7 @@ import numpy as np
 
 from naibu.core.errors import InputError
 from naibu.core.parameters import Scale
-from naibu.identification.from_markers.specimen_model import ContactModel
+from naibu.identification.from_markers.specimen.specimen_model import ContactModel
 from naibu.mechanics.finite_elements.hyperelasticity import LAWS
 
 UNITS = "mm, kg, s, mN, kPa"

@@ -11,7 +11,7 @@ from naibu.core.experiment import Experiment, State
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.identification.from_markers.calibration import REFERENCE_MODULUS_KPA, START_FRICTION, START_SPRING, initial_parameters
 from naibu.identification.from_markers.known_materials import KnownMaterials
-from naibu.identification.from_markers.specimen_model import Specimen
+from naibu.identification.from_markers.specimen.specimen_model import Specimen
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 
 UNKNOWN_SD = {"tilt_x": 0.007, "tilt_y": 0.007, "bar_offset": 0.5, "bar_yaw": 0.01, "base_offset": 0.5, "friction": 0.5}

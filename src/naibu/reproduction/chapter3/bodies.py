@@ -19,7 +19,7 @@ from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.identification.equilibrium_gap.batch import EquilibriumGapEstimate, batch_equilibrium_gap
-from naibu.identification.from_fields.load_cases import Zones
+from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.reproduction.chapter3.bodies import PushedBody, shape_error_percent
 
 SIDE_MM = 40.0

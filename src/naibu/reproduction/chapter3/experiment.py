@@ -13,8 +13,8 @@ from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.identification.equilibrium_gap.batch import EquilibriumGapEstimate, batch_equilibrium_gap
 from naibu.identification.equilibrium_gap.weighted import weighted_equilibrium_gap
-from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
-from naibu.identification.from_markers.marker_mesh import MarkerMesh, marker_mesh
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
+from naibu.identification.from_markers.specimen.marker_mesh import MarkerMesh, marker_mesh
 from naibu.mechanics.finite_elements.modulus_derivatives import SimplexLaw
 from naibu.reproduction.chapter3 import figures as drawn
 from naibu.reproduction.chapter3.bodies import LAYERS, Split, cube, split_hexahedra

@@ -10,7 +10,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.identification.equilibrium_gap.batch import batch_equilibrium_gap
 from naibu.identification.equilibrium_gap.incremental import IncrementalStep, incremental_equilibrium_gap
-from naibu.identification.from_fields.load_cases import KNOWN, Zones
+from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
 from naibu.reproduction.chapter3.bodies import SQUARE, PushedBody, square
 from naibu.reproduction.printed_tables import printed_table
 from naibu.viewer.chapter import Figure, Section

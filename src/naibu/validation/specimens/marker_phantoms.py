@@ -20,9 +20,9 @@ from naibu.core.experiment import Experiment, Layer, Loading, Shape, State
 from naibu.core.markers import Markers
 from naibu.core.rigid_transform import RigidTransform, rotation_matrix
 from naibu.identification.from_markers.calibration import state_parameters
-from naibu.identification.from_markers.parameter_names import friction, poisson_ratio, young_modulus
-from naibu.identification.from_markers.scan_alignment import placement
-from naibu.identification.from_markers.specimen_model import ModelSettings, Specimen, specimen
+from naibu.identification.from_markers.specimen.parameter_names import friction, poisson_ratio, young_modulus
+from naibu.identification.from_markers.specimen.scan_alignment import placement
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings, Specimen, specimen
 from naibu.mechanics.finite_strain.problem import SolverSettings
 from naibu.mechanics.finite_strain.statics import Solution, solve
 from naibu.meshing.point_location import interpolation_operator

@@ -8,8 +8,8 @@ from typing import get_args
 import numpy as np
 
 from naibu.core.experiment import Experiment, Loading, LoadingKind
-from naibu.identification.from_markers.parameter_names import friction, poisson_ratio, young_modulus
-from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.from_markers.specimen.parameter_names import friction, poisson_ratio, young_modulus
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.validation.specimens.marker_phantoms import box_experiment
 
 EDGES_MM = (40.0, 100.0)

@@ -17,7 +17,7 @@ from naibu.core.experiment import Layer, Loading, Shape
 from naibu.core.markers import Markers
 from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
-from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.io.images import write_displacement, write_volume
 from naibu.io.marker_tables import write_experiment_folder
 from naibu.workflows.identify import identify

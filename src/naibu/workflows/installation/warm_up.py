@@ -21,7 +21,7 @@ from naibu.core.arrays import AnyArray, FloatArray
 from naibu.core.errors import NaibuError
 from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
-from naibu.identification.from_markers.specimen_model import ModelSettings
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.imaging.measure_displacement import Method
 from naibu.io.images import write_volume
 from naibu.mechanics.finite_elements.assembly import LARGE, Assembler

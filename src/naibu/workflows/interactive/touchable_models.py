@@ -12,7 +12,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray, IntArray, require_positive
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
-from naibu.identification.from_markers.specimen_model import GRAVITY, Specimen, specimen
+from naibu.identification.from_markers.specimen.specimen_model import GRAVITY, Specimen, specimen
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.io.meshes import MESH_READERS, read_mesh
 from naibu.mechanics.contact.rigid_indenters import (

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from pressed_gels import identified
 
-from naibu.identification.from_markers.layer_heights import contradicted_layers
-from naibu.identification.from_markers.verdict import verdict_of
+from naibu.identification.from_markers.checks.layer_heights import contradicted_layers
+from naibu.identification.from_markers.checks.verdict import verdict_of
 from naibu.identification.verdict import Explanation
 
 

@@ -11,8 +11,8 @@ from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment
 from naibu.core.mesh import Mesh
 from naibu.core.rigid_transform import registration
-from naibu.identification.from_markers.marker_grid import completed, lattice_indices
-from naibu.identification.from_markers.scan_alignment import placement
+from naibu.identification.from_markers.specimen.marker_grid import completed, lattice_indices
+from naibu.identification.from_markers.specimen.scan_alignment import placement
 
 ON_LAYER = 0.15  # an interface this near to a marker layer, in gaps between layers, gets no nodes of its own
 

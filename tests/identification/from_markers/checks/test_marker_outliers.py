@@ -11,7 +11,7 @@ from squeezed_box import squeezed_box
 from naibu import datasets
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
-from naibu.identification.from_markers.marker_outliers import isolated, without_outliers
+from naibu.identification.from_markers.checks.marker_outliers import isolated, without_outliers
 
 
 def off_by_16_mm(points: FloatArray) -> FloatArray:

@@ -20,11 +20,11 @@ import scipy.sparse as sp
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.field_laws import FieldElements, FieldLaw, LawName, computed_mesh, field_law
-from naibu.identification.from_fields.forward_model import Observed, Solvers, equilibrium, loaded_from_rest
-from naibu.identification.from_fields.load_cases import KNOWN, FieldLoadCase, Zones
-from naibu.identification.from_fields.loaded_components import BLOCK, BoundaryPreconditioner, alike, conjugate_gradients
-from naibu.identification.from_fields.refinement import Refinement
+from naibu.identification.from_fields.forward.field_laws import FieldElements, FieldLaw, LawName, computed_mesh, field_law
+from naibu.identification.from_fields.forward.forward_model import Observed, Solvers, equilibrium, loaded_from_rest
+from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones
+from naibu.identification.from_fields.forward.loaded_components import BLOCK, BoundaryPreconditioner, alike, conjugate_gradients
+from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.mechanics.linear_algebra.protocols import Factorization
 
 REFRESHED = 400  # loaded components up to which their Hessian is made anew at every point

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from naibu.identification.from_markers.calibration import Calibration
+from naibu.identification.from_markers.checks.marker_checks import Doubt
 from naibu.identification.from_markers.gauss_newton import Matcher
-from naibu.identification.from_markers.marker_checks import Doubt
 
 LAYER = ": shift_of_layer_at_"
 CONTRADICTED = 2.5  # standard deviations between the height that the markers show and the stated one

@@ -10,7 +10,7 @@ import scipy.sparse as sp
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.meshing.element_conversion import to_quadratic
 from naibu.meshing.primitives import grid_cells
 from naibu.meshing.surface import boundary_faces

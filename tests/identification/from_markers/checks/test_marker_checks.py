@@ -14,7 +14,7 @@ from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, Loading, Shape
 from naibu.core.markers import Markers
 from naibu.core.rigid_transform import rotation_matrix
-from naibu.identification.from_markers.marker_checks import check_markers
+from naibu.identification.from_markers.checks.marker_checks import check_markers
 
 
 def shuffled(points: FloatArray) -> FloatArray:

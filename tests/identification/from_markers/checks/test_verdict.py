@@ -10,9 +10,9 @@ import pytest
 
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.core.status import Status
-from naibu.identification.from_markers.marker_checks import Doubt
-from naibu.identification.from_markers.marker_outliers import Outlier
-from naibu.identification.from_markers.verdict import CaseEvidence, prior_deviations, verdict
+from naibu.identification.from_markers.checks.marker_checks import Doubt
+from naibu.identification.from_markers.checks.marker_outliers import Outlier
+from naibu.identification.from_markers.checks.verdict import CaseEvidence, prior_deviations, verdict
 from naibu.identification.verdict import Explanation, Verdict
 
 SD = 0.2

@@ -14,9 +14,9 @@ from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, Layer
 from naibu.core.mesh import Mesh
 from naibu.core.rigid_transform import rotation_matrix
-from naibu.identification.from_markers.boundary_conditions import material_of, rigid_bodies, sliding_joints
-from naibu.identification.from_markers.marker_grid import completed
-from naibu.identification.from_markers.parameter_names import (
+from naibu.identification.from_markers.specimen.boundary_conditions import material_of, rigid_bodies, sliding_joints
+from naibu.identification.from_markers.specimen.marker_grid import completed
+from naibu.identification.from_markers.specimen.parameter_names import (
     SHAPE_NAMES,
     base_offset,
     batch_stiffness,
@@ -31,8 +31,8 @@ from naibu.identification.from_markers.parameter_names import (
     straight_base,
     young_modulus,
 )
-from naibu.identification.from_markers.scan_alignment import Placement, placement
-from naibu.identification.from_markers.specimen_mesh import element_size, model_mesh, on_straight_base
+from naibu.identification.from_markers.specimen.scan_alignment import Placement, placement
+from naibu.identification.from_markers.specimen.specimen_mesh import element_size, model_mesh, on_straight_base
 from naibu.mechanics.contact.penalty_contact import STICK, Contact
 from naibu.mechanics.finite_elements.assembly import Assembler, body_force
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement

@@ -16,8 +16,8 @@ from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, State
 from naibu.core.markers import Markers
-from naibu.identification.from_markers.marker_grid import lattice_indices
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase, NoiseModel
+from naibu.identification.from_markers.specimen.marker_grid import lattice_indices
 from naibu.identification.neighbours import neighbours
 
 FEWEST = 30  # markers that bear a quadratic polynomial and a median of neighbours

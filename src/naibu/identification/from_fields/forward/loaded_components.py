@@ -11,10 +11,10 @@ import scipy.linalg as sl
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError
-from naibu.identification.from_fields.forward_model import Observed
+from naibu.identification.from_fields.forward.forward_model import Observed
 
 if TYPE_CHECKING:
-    from naibu.identification.from_fields.sensitivities import Linearised
+    from naibu.identification.from_fields.forward.sensitivities import Linearised
 
 BLOCK = 256  # right-hand sides solved together
 BOUNDARY_TOLERANCE = 1e-5

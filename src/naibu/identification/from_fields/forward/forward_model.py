@@ -16,9 +16,9 @@ from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.field_laws import FieldLaw, NeoHookean
-from naibu.identification.from_fields.load_cases import FieldLoadCase
-from naibu.identification.from_fields.refinement import Refinement
+from naibu.identification.from_fields.forward.field_laws import FieldLaw, NeoHookean
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
+from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
 from naibu.mechanics.finite_strain.statics import solve

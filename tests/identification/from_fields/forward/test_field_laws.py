@@ -8,10 +8,10 @@ import pytest
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.field_laws import FieldLaw, computed_mesh, field_law
-from naibu.identification.from_fields.load_cases import FieldLoadCase, Zones
-from naibu.identification.from_fields.refinement import Refinement
-from naibu.identification.from_fields.sensitivities import FieldModel
+from naibu.identification.from_fields.forward.field_laws import FieldLaw, computed_mesh, field_law
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
+from naibu.identification.from_fields.forward.refinement import Refinement
+from naibu.identification.from_fields.forward.sensitivities import FieldModel
 from naibu.meshing.primitives import box
 from naibu.meshing.quality import signed_volumes
 from naibu.validation.specimens.quadratic_body import QuadraticBody

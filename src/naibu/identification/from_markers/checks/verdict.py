@@ -18,12 +18,12 @@ from naibu.core.parameters import ParameterSet
 from naibu.core.rigid_transform import registration
 from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration
-from naibu.identification.from_markers.layer_heights import LAYER, contradicted_layers
-from naibu.identification.from_markers.marker_checks import Doubt, robust_affine
-from naibu.identification.from_markers.marker_outliers import Outlier
+from naibu.identification.from_markers.checks.layer_heights import LAYER, contradicted_layers
+from naibu.identification.from_markers.checks.marker_checks import Doubt, robust_affine
+from naibu.identification.from_markers.checks.marker_outliers import Outlier
 from naibu.identification.from_markers.mesh_error import RATIO, STIFFNESSES
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase
-from naibu.identification.from_markers.parameter_names import platen_position
+from naibu.identification.from_markers.specimen.parameter_names import platen_position
 from naibu.identification.verdict import NEIGHBOURS, Explanation, Verdict, shared_part
 
 NOISE_EXPLAINED = 2.0  # residuals below this many times the stated noise need no explanation
@@ -110,7 +110,7 @@ def verdict_of(calibration: Calibration, doubts: Sequence[Doubt] = (), outliers:
     calibration : Calibration
         The finished search.
     doubts : sequence of Doubt
-        From `naibu.identification.from_markers.marker_checks.check_markers`.
+        From `naibu.identification.from_markers.checks.marker_checks.check_markers`.
     outliers : sequence of Outlier
         Markers that were left out.
     """

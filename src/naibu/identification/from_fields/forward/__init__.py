@@ -1,0 +1,1 @@
+"""Equilibrium under measured displacement, its load cases, laws, and sensitivities."""
