@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from naibu.cli import console
-from naibu.core.progress import report_progress
+from naibu.core.progress import ProgressReport, report_progress
 
 
 class Clock:
@@ -54,4 +54,11 @@ def test_a_terminal_gets_a_bar_for_each_stage(monkeypatch: pytest.MonkeyPatch) -
         report_progress(progress, "solving", done=1, total=2, objective=5.0)
         report_progress(progress, "writing [bold]")
     shown = out.getvalue()
-    assert "solving" in shown and "1 of 2, objective 5" in shown and "writing [bold]" in shown
+    assert "solving" in shown and "1 of 2, 50 %, objective 5" in shown and "writing [bold]" in shown
+
+
+def test_the_time_left_follows_from_the_share_done_since_the_stage_began() -> None:
+    left = console.TimeLeft()
+    stages = [("a", 0.2, 10.0), ("a", 0.4, 20.0), ("b", 0.0, 21.0), ("b", None, 22.0), ("b", 0.1, 121.0)]
+    told = [left.after(ProgressReport(stage, share, None if share is None else 1.0), now) for stage, share, now in stages]
+    assert told == ["", "about 30 s left", "", "", "about 15 min left"]

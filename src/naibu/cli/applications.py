@@ -7,12 +7,14 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from naibu.cli.console import app, print_table, say
-from naibu.cli.described import Flag, Whole
+from naibu.cli.console import WARNING, print_table, say
+from naibu.cli.described import Out, Overwrite, Whole
+from naibu.cli.run_record import wrote
+from naibu.cli.verbs import SCANS, verb
 from naibu.core.errors import InputError
 
 
-@app.command
+@verb(SCANS, "mammography --cc cc.csv --mlo mlo.csv --thickness-mm 52,55 --angle-deg 45 --point-cc 40,12 --open")
 def mammography(
     *,
     cc: Path,
@@ -24,8 +26,8 @@ def mammography(
     pixel_mm: float | None = None,
     draws: Whole = 100,
     seed: Whole = 0,
-    out: Path = Path("naibu-mammography"),
-    overwrite: Flag = False,
+    out: Out = Path("naibu-mammography"),
+    overwrite: Overwrite = False,
 ) -> None:
     """Predict where a point of one mammographic view lies in the other, or where a lesion that both show lies in the breast.
 
@@ -73,8 +75,9 @@ def mammography(
         overwrite=overwrite,
     )
     print_table("naibu mammography", ("quantity", "value"), run.rows, left=True)
+    wrote(*run.files)
     for warning in run.warnings:
-        say(warning, "yellow")
+        say(warning, WARNING)
     say(f"Page: {run.files[0]}   numbers: {run.files[1]}")
 
 

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from naibu.core.experiment import Layer
 
 Flag = Annotated[bool, Parameter(negative=())]
+# the options that many verbs have, with their short names
+Out = Annotated[Path, Parameter(name=("--out", "-o"))]
+Overwrite = Annotated[bool, Parameter(name=("--overwrite", "-f"), negative=())]
+Known = Annotated[list[str] | None, Parameter(name=("--known", "-k"))]
 
 
 def _whole(hint: object, tokens: Sequence[Token]) -> int:
@@ -48,7 +52,7 @@ class PairOptions:
         Two tables of points, reference and deformed, to compare with.
     """
 
-    mask: Path | None = None
+    mask: Annotated[Path | None, Parameter(name=("--mask", "-m"))] = None
     deformed_mask: Path | None = None
     spacing_mm: tuple[float, float, float] | None = None
     truth: Path | None = None
@@ -88,7 +92,7 @@ class ObjectOptions:
     shape: Literal["box", "half_ellipsoid", "cylinder", "hemisphere"] = "box"
     loading: Literal["plate", "bar", "side_plates"] = "plate"
     bar_width_mm: float | None = None
-    layer: list[str] | None = None
+    layer: Annotated[list[str] | None, Parameter(name=("--layer", "-l"))] = None
     stated_mm: list[str] | None = None
 
     def described(self, size_mm: tuple[float, float, float]) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 import time
 from collections.abc import Sequence
@@ -12,8 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from naibu.cli.console import INTERRUPTED, NOT_EXPLAINED, app, print_table, progress_display, say
-from naibu.cli.described import Flag, ObjectOptions
+from naibu.cli.console import GRAVE, INTERRUPTED, NOT_EXPLAINED, WARNING, print_table, progress_display, say
+from naibu.cli.described import Flag, Known, ObjectOptions, Out, Overwrite
+from naibu.cli.run_record import found, wrote
+from naibu.cli.verbs import MARKERS, START, verb
 from naibu.core.errors import InputError
 
 # imported where used, so that --help is immediate and doctor runs even if numpy is broken
@@ -30,8 +31,8 @@ Joined = Literal["tied", "sliding"]
 Law = Literal["neo_hookean", "neo_hookean_isochoric", "mooney_rivlin", "yeoh", "saint_venant_kirchhoff"]
 
 
-@app.command
-def demo(*, out: Path = Path("naibu-demo"), overwrite: Flag = False) -> None:
+@verb(START, "demo --open   # about a minute; opens the report")
+def demo(*, out: Out = Path("naibu-demo"), overwrite: Overwrite = False) -> None:
     """Calibrate both gels of the bundled two-material experiments, predict each experiment from the others, and write a report.
 
     Parameters
@@ -45,13 +46,18 @@ def demo(*, out: Path = Path("naibu-demo"), overwrite: Flag = False) -> None:
     _identify(DEMO, known=(DEMO_KNOWN,), out=out, cross_validate=True, overwrite=overwrite)
 
 
-@app.command
+@verb(
+    MARKERS,
+    "identify my_gel -k 'gel=20 kPa' --open          # your experiment folder, one modulus known",
+    "identify ct_two_material_1 -k 'hardness 5'      # bundled data, moduli as ratios",
+    "identify naibu-sense/field.h5 --mask object.mha # a displacement field",
+)
 def identify(
     experiments: list[str],
     *,
-    known: list[str] | None = None,
-    state: list[str] | None = None,
-    out: Path = Path("naibu-results"),
+    known: Known = None,
+    state: Annotated[list[str] | None, Parameter(name=("--state", "-s"))] = None,
+    out: Out = Path("naibu-results"),
     law: Law = "neo_hookean",
     contact: ContactModel = "coulomb",
     joined: Joined = "tied",
@@ -63,7 +69,7 @@ def identify(
     zones: Path | None = None,
     zone_name: list[str] | None = None,
     cell_map: Annotated[bool, Parameter(name="--map", negative=())] = False,
-    overwrite: Flag = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Identify material parameters, friction and boundary conditions by finite element model updating (FEMU).
 
@@ -154,13 +160,15 @@ def _identify_fields(
         )  # fmt: skip
     usable = result.estimate.verdict is None or result.estimate.verdict.ok
     for number, line in enumerate(result.notes):
-        say(line, "dim" if number else "bold" if usable else "bold red")
+        say(line, "dim" if number else "bold" if usable else GRAVE)
     for table in (table_of_zones(result), table_of_assumptions(result)):
         if table.rows:
-            print_table(table.title, table.columns, [tuple(_figure(v) if isinstance(v, float) else v for v in row) for row in table.rows])
+            print_table(table.title, table.columns, table.rows, digits=4)
+    wrote(out / "report.html")
+    found(usable=usable)
     say(f"{time.perf_counter() - began:.0f} s. Results in {out}: open report.html.")
     if not usable:
-        say("The model does not explain the data: the results are marked as not to be used.", "bold red")
+        say("The model does not explain the data: the results are marked as not to be used.", GRAVE)
         sys.exit(NOT_EXPLAINED)
 
 
@@ -186,7 +194,7 @@ def _identify(
     settings: ModelSettings | None = None,
     cross_validate: bool = False,
     resume: bool = True,
-    overwrite: bool = False,
+    overwrite: Overwrite = False,
 ) -> None:
     from naibu.workflows import identify
 
@@ -197,12 +205,13 @@ def _identify(
             overwrite=overwrite, progress=progress,
         )  # fmt: skip
     _show(result)
+    wrote(*(out / name for name in ("report.html", "model.json", "identification.json", "residuals.csv")))
     say(f"{time.perf_counter() - began:.0f} s. Results in {out}: open report.html; naibu predict takes model.json.")
     if result.interrupted:
         say("Interrupted: these are the results so far. The same command continues from here.")
         sys.exit(INTERRUPTED)
     if not result.verdict.ok:
-        say("The model does not explain the data: the results are marked as not to be used.", "bold red")
+        say("The model does not explain the data: the results are marked as not to be used.", GRAVE)
         sys.exit(NOT_EXPLAINED)
 
 
@@ -212,7 +221,8 @@ def _show(result: Identification) -> None:
 
     calibration, model = result.calibration, result.model
     note = verdict_note(result.verdict)
-    say(note.sentence, "bold" if note.sound else "bold red")
+    say(note.sentence, "bold" if note.sound else GRAVE)
+    found(verdict=note.sentence, usable=result.verdict.ok, noise_factor=model.noise_factor)
     for line in note.details:
         say(f"- {line}")
     experiments = {t.specimen.experiment.name: t.specimen.experiment for t in calibration.load_cases}
@@ -222,28 +232,27 @@ def _show(result: Identification) -> None:
     table = accuracy_table(calibration, result.baselines, result.left_out)
     print_table(table.title, table.columns, table.rows)
     names = shared_names(model)
-    rows = [(r.name, *(_figure(v) for v in (r.estimate, r.lower, r.upper)), r.unit, r.note) for r in parameter_rows(model, names)]
-    print_table("Parameters", ("parameter", "estimate", "95 % from", "to", "unit", ""), rows)
+    rows = [(r.name, r.estimate, r.lower, r.upper, r.unit, r.note) for r in parameter_rows(model, names)]
+    print_table("Parameters", ("parameter", "estimate", "95 % from", "to", "unit", "note"), rows, digits=4)
     for line in undetermined(model, names, calibration.priors):
         say(line, "dim")
     say(f"{search_sentence(calibration.match.status)} Residuals are {model.noise_factor:.2f} times the stated noise.")
 
 
-def _figure(value: float) -> str:
-    """Four significant digits; nothing for a bound that the data do not give."""
-    return f"{value:.4g}" if math.isfinite(value) else "-"
-
-
-@app.command
+@verb(
+    MARKERS,
+    "predict naibu-results my_gel -s pressed --height-mm 42",
+    "predict naibu-demo ct_two_material_1 --heights-from-markers",
+)
 def predict(
     model: Path,
     experiment: str,
     *,
-    state: str | None = None,
+    state: Annotated[str | None, Parameter(name=("--state", "-s"))] = None,
     height_mm: float | None = None,
     heights_from_markers: Flag = False,
-    out: Path = Path("naibu-prediction"),
-    overwrite: Flag = False,
+    out: Out = Path("naibu-prediction"),
+    overwrite: Overwrite = False,
 ) -> None:
     """Predict the markers of a state with a calibrated model.
 
@@ -278,20 +287,21 @@ def predict(
         rms = f"RMS x {a.x:.3f}, y {a.y:.3f}, z {a.z:.3f}, 3-D {a.total:.3f} mm"
         say(f"{a.markers} markers: {rms} ({a.noise_units:.2f} times the noise)")
     say(result.interval)
+    wrote(*(out / name for name in ("predicted.html", "predicted.csv", "summary.json")))
     say(f"Predicted at {result.platen_position_mm:.2f} mm: {out / 'predicted.csv'}   page: {out / 'predicted.html'}")
 
 
-@app.command
+@verb(MARKERS, "compare my_gel -k gel --law neo_hookean --law yeoh   # which law explains the markers best")
 def compare(
     experiments: list[str],
     *,
-    known: list[str] | None = None,
+    known: Known = None,
     law: list[Law] | None = None,
     contact: list[ContactModel] | None = None,
     joined: list[Joined] | None = None,
     element_size_mm: float = 0.0,
-    out: Path = Path("naibu-comparison"),
-    overwrite: Flag = False,
+    out: Out = Path("naibu-comparison"),
+    overwrite: Overwrite = False,
 ) -> None:
     """Compare material laws and contact models: calibrate each combination, and predict each experiment from the others.
 
@@ -329,12 +339,13 @@ def compare(
         rows = compare_workflow.compare(
             experiments, candidates=candidates, known=known or (), out=out, overwrite=overwrite, progress=progress
         )
+    wrote(out / "comparison.json")
     table = comparison_table(rows)
     print_table(table.title, table.columns, table.rows)
     say(table.note, "dim")
 
 
-@app.command
+@verb(MARKERS, "report naibu-results --open")
 def report(folder: Path) -> None:
     """Write the HTML pages again from the results in a folder, without solving.
 
@@ -346,15 +357,20 @@ def report(folder: Path) -> None:
     from naibu.workflows import report as report_workflow
 
     for page in report_workflow.report(folder):
+        wrote(page)
         say(f"Report: {page}")
 
 
-@app.command(name="import")
+@verb(
+    MARKERS,
+    "import free.csv pressed.csv --size-mm 60 60 60 -l 'gel=0..60' --stated-mm pressed=45 -o my_gel",
+    "import positions.xlsx pressed.xlsx --size-mm 60 60 60 --unit cm --preview   # look, and write nothing",
+    name="import",
+)
 def import_tables(
     initial: Path,
     loaded: list[Path],
     *,
-    out: Path,
     size_mm: tuple[float, float, float],
     described: ObjectOptions | None = None,
     title: str = "Imported experiment",
@@ -362,9 +378,13 @@ def import_tables(
     spacing_mm: float | None = None,
     xy_step_mm: float | None = None,
     z_step_mm: float | None = None,
-    overwrite: Flag = False,
+    preview: Flag = False,
+    out: Out = Path("naibu-experiment"),
+    overwrite: Overwrite = False,
 ) -> None:
     """Make an experiment folder from tables of marker positions (CSV, TSV or Excel).
+
+    What was read is shown first: markers in common, their span beside the object, their spacing, how far they moved.
 
     Parameters
     ----------
@@ -372,8 +392,6 @@ def import_tables(
         Table of the unloaded state, with columns for label, x, y and z.
     loaded
         Tables of the loaded states, which are named after their files.
-    out
-        Folder to make.
     size_mm
         Dimensions of the object along x, y, z.
     title
@@ -386,17 +404,27 @@ def import_tables(
         Resolution of the in-plane coordinates, such as the pixel size, from which their uncertainty is computed.
     z_step_mm
         Resolution of the heights, such as the slice spacing.
+    preview
+        Only show what the tables hold; nothing is written.
+    out
+        Folder to make.
     overwrite
         Use the folder even if it is not empty, and replace files of the same names.
     """
     from naibu.workflows import import_tables as import_workflow
 
     about = (described or ObjectOptions()).described(size_mm)
+    seen = import_workflow.preview_tables(initial, loaded, unit=unit, size_mm=size_mm)
+    print_table(seen.title, seen.columns, seen.rows)
+    say(seen.note, "dim")
+    if preview:
+        return
     notes = import_workflow.import_tables(
         initial, loaded, out=out, unit=unit, title=title, spacing_mm=spacing_mm, xy_step_mm=xy_step_mm, z_step_mm=z_step_mm,
         overwrite=overwrite, **about,
     )  # fmt: skip
+    wrote(out)
     for note in notes:
-        say(f"Warning: {note}", "yellow")
+        say(f"Warning: {note}", WARNING)
     before = "" if about["layers"] else "Describe layers and materials in its meta.toml, then run"
     say(f"Wrote {out}. {before or 'Run'}: naibu identify {out}")

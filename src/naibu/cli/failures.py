@@ -41,7 +41,7 @@ def unexpected(error: Exception, verb: str) -> str:
     """
     head = f"naibu {__version__}, Python {platform.python_version()}, {platform.platform()}\ncommand: {' '.join(sys.argv)}\n\n"
     text = head + "".join(traceback.format_exception(error))
-    reason = f"naibu {verb} ended with an error of its own ({type(error).__name__}: {' '.join(str(error).split())[:200]})"
+    reason = f"{f'naibu {verb}'.rstrip()} ended with an error of its own ({type(error).__name__}: {' '.join(str(error).split())[:200]})"
     log = _kept(text)
     where = f"the details are in {log}" if log is not None else "its details could not be written to a file"
     return f"{reason}; {where}. Please report it with the command that you gave; results that were written are complete"

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from naibu.cli.console import app, print_table, progress_display, say
-from naibu.cli.described import Flag, ObjectOptions, PairOptions, Whole
+from cyclopts import Parameter
+
+from naibu.cli.console import WARNING, print_table, progress_display, say
+from naibu.cli.described import ObjectOptions, Out, Overwrite, PairOptions, Whole
+from naibu.cli.run_record import wrote
+from naibu.cli.verbs import MARKERS, SCANS, verb
 from naibu.core.errors import InputError
 
 # other parts are imported where they are used: --help answers at once
@@ -15,15 +19,20 @@ Polarity = Literal["auto", "bright", "dark"]
 Spacing = tuple[float, float, float]
 
 
-@app.command
+@verb(
+    SCANS,
+    "sense free.mha pressed.mha -o moved --open",
+    "sense free.nii.gz pressed.nii.gz -m object.nii.gz   # the object is known",
+    "sense dicom_before dicom_after --json > summary.json",
+)
 def sense(
     reference: Path,
     deformed: Path,
     *,
     method: Method = "default",
     pair: PairOptions | None = None,
-    out: Path = Path("naibu-sense"),
-    overwrite: Flag = False,
+    out: Out = Path("naibu-sense"),
+    overwrite: Overwrite = False,
 ) -> None:
     """Measure the displacement inside an object between two scans by digital volume correlation (DVC), with its uncertainty.
 
@@ -48,19 +57,24 @@ def sense(
         run = sense_pair(scans, method=method, out=out, overwrite=overwrite, progress=progress)
     print_table(f"{reference.name} -> {deformed.name}, {run.measured.method}", ("quantity", "value"), run.rows())
     for warning in run.measured.warnings:
-        say(warning.replace("`mask`", "--mask"), "yellow")
+        say(warning.replace("`mask`", "--mask"), WARNING)
+    wrote(*run.files)
     say(f"{run.seconds:.1f} s. Page: {run.files[0]}   fields: {', '.join(str(p.name) for p in run.files[1:])}")
 
 
-@app.command
+@verb(
+    SCANS,
+    "compare-methods free.mha pressed.mha",
+    "compare-methods free.mha pressed.mha --method default --method ncc-blocks --truth true.mha",
+)
 def compare_methods(
     reference: Path,
     deformed: Path,
     *,
     method: list[Method] | None = None,
     pair: PairOptions | None = None,
-    out: Path = Path("naibu-methods"),
-    overwrite: Flag = False,
+    out: Out = Path("naibu-methods"),
+    overwrite: Overwrite = False,
 ) -> None:
     """Measure the displacement between two scans by every method, and compare errors, times and images.
 
@@ -83,12 +97,17 @@ def compare_methods(
 
     with progress_display() as progress:
         scans = read_pair(reference, deformed, **(pair or PairOptions()).arguments)
-        result = compared(scans, method or METHODS, out=out, overwrite=overwrite, progress=progress)
+        result = compared(scans, method or METHODS, out=out, overwrite=overwrite, progress=progress, told=say)
+    wrote(result.page, result.numbers)
     print_table(f"{reference.name} -> {deformed.name}", result.columns, result.rows)
     say(f"Page: {result.page}   numbers: {result.numbers}")
 
 
-@app.command
+@verb(
+    MARKERS,
+    "track free.mha pressed.mha --diameter-mm 2.5 --size-mm 60 60 60 -l 'gel=0..60' -o my_gel",
+    "track free.mha pressed.mha --diameter-mm 2.8 --thickness-mm 0.3   # washers; only the tables",
+)
 def track(
     scans: list[Path],
     *,
@@ -96,13 +115,13 @@ def track(
     thickness_mm: float | None = None,
     polarity: Polarity = "auto",
     count: Whole | None = None,
-    mask: Path | None = None,
+    mask: Annotated[Path | None, Parameter(name=("--mask", "-m"))] = None,
     spacing_mm: Spacing | None = None,
     size_mm: tuple[float, float, float] | None = None,
     described: ObjectOptions | None = None,
     title: str = "Markers followed through scans",
-    out: Path = Path("naibu-markers"),
-    overwrite: Flag = False,
+    out: Out = Path("naibu-markers"),
+    overwrite: Overwrite = False,
 ) -> None:
     """Detect markers in scans of several states, match them between the states, and make an experiment folder for 'naibu identify'.
 
@@ -144,6 +163,7 @@ def track(
             scans, out=out, diameter_mm=diameter_mm, thickness_mm=thickness_mm, polarity=polarity, count=count, mask=mask,
             spacing_mm=spacing_mm, description=description, overwrite=overwrite, progress=progress,
         )  # fmt: skip
+    wrote(run.page, out)
     print_table("Markers", run.columns, run.rows)
     say(f"Wrote {out}. Page: {run.page}")
     if description is None:
@@ -152,7 +172,7 @@ def track(
         say(f"{'Run' if description.layers else 'Describe layers and materials in its meta.toml, then run'}: naibu identify {out}")
 
 
-@app.command
+@verb(MARKERS, "track-sequence ultrasound.tif --pixel-mm 0.1 --diameter-mm 1 --frame-rate-hz 30")
 def track_sequence(
     frames: Path,
     *,
@@ -162,8 +182,8 @@ def track_sequence(
     region_mm: tuple[float, float, float, float] | None = None,
     count: Whole | None = None,
     polarity: Literal["bright", "dark"] = "bright",
-    out: Path = Path("naibu-tracks"),
-    overwrite: Flag = False,
+    out: Out = Path("naibu-tracks"),
+    overwrite: Overwrite = False,
 ) -> None:
     """Track markers through a sequence of images, such as B-mode ultrasound.
 
@@ -195,5 +215,6 @@ def track_sequence(
             frames, out=out, pixel_mm=pixel_mm, diameter_mm=diameter_mm, frame_rate_hz=frame_rate_hz, region_mm=region_mm, count=count,
             polarity=polarity, overwrite=overwrite, progress=progress,
         )  # fmt: skip
+    wrote(run.page, run.table)
     print_table("Markers", run.columns, run.rows)
     say(f"Table: {run.table}   page: {run.page}")

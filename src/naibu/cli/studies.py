@@ -10,15 +10,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
-from naibu.cli.console import INTERRUPTED, app, errors, print_table, progress_display, say
-from naibu.cli.described import Flag, Whole
+from naibu.cli.console import INTERRUPTED, errors, print_table, progress_display, say
+from naibu.cli.described import Flag, Out, Overwrite, Whole
+from naibu.cli.run_record import wrote
+from naibu.cli.verbs import REPRODUCE, SIMULATE, verb
 from naibu.core.progress import ProgressReport
 
 ChapterName = Literal["ch1", "ch2", "ch3", "ch4-adaptive", "ch4-cut", "ch4-lattice", "ch4-cube", "ch4-octree", "ch5", "ch6", "all"]
 
 
-@app.command
-def reproduce(chapter: ChapterName, *, out: Path = Path("naibu-reproduction"), seed: Whole = 0, overwrite: Flag = False) -> None:
+@verb(REPRODUCE, "reproduce ch3 --open", "reproduce all -o report   # every chapter that the folder does not hold yet")
+def reproduce(chapter: ChapterName, *, out: Out = Path("naibu-reproduction"), seed: Whole = 0, overwrite: Overwrite = False) -> None:
     """Recompute the tables and figures of a chapter of the 2008 report, and compare them with the printed ones.
 
     With all, every chapter is computed that the folder does not hold yet, and an index page is written over them.
@@ -47,6 +49,7 @@ def reproduce(chapter: ChapterName, *, out: Path = Path("naibu-reproduction"), s
         )
         with progress_display() as progress:
             index, _ = reproduce_all(out, seed=seed, overwrite=overwrite, progress=progress)
+        wrote(index)
         say(f"{time.perf_counter() - began:.0f} s. Index: {index}")
         return
     with errors.status("starting"):
@@ -56,16 +59,22 @@ def reproduce(chapter: ChapterName, *, out: Path = Path("naibu-reproduction"), s
             print_table(f"{table.title}: {table.caption}", table.columns, table.rows)
             if table.note:
                 say(table.note, "dim")
+    wrote(page, numbers)
     say(f"{time.perf_counter() - began:.0f} s. Page: {page}   numbers: {numbers}")
 
 
-@app.command
+@verb(
+    SIMULATE,
+    "simulate                        # lists the studies that come with naibu",
+    "simulate dough-pressed-by-sphere --open",
+    "simulate --example > my_study.toml && naibu simulate my_study.toml",
+)
 def simulate(
     study: str = "",
     *,
-    out: Path = Path("naibu-simulation"),
+    out: Out = Path("naibu-simulation"),
     resume: Flag = False,
-    overwrite: Flag = False,
+    overwrite: Overwrite = False,
     checkpoint_every: Whole = 10,
     device: str = "cpu",
     example: Flag = False,
@@ -112,6 +121,7 @@ def simulate(
         run = simulated(
             study, out=out, resume=resume, overwrite=overwrite, checkpoint_every=checkpoint_every, device=device, progress=progress
         )
+    wrote(*run.files)
     say(f"{time.perf_counter() - began:.0f} s. {', '.join(str(path) for path in run.files)}")
     if not run.finished:
         errors.print(f"Interrupted: {run.frames} of {run.of} frames are kept. The same command with --resume goes on.", soft_wrap=True)

@@ -6,14 +6,22 @@ import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from naibu.cli.console import app, errors, progress_display, say
+from naibu.cli.console import errors, progress_display, say
+from naibu.cli.described import Out, Overwrite
+from naibu.cli.run_record import wrote
+from naibu.cli.verbs import TOUCH, verb
 from naibu.core.errors import InputError
 
 if TYPE_CHECKING:
     from naibu.workflows.interactive.touchable_models import MeshMaterial
 
 
-@app.command
+@verb(
+    TOUCH,
+    "live                             # the gels of the demonstration",
+    "live naibu-results               # the model that you identified",
+    "live liver.vtu --young-modulus-kpa 5 --haptics-port 8766",
+)
 def live(
     source: str = "demo",
     *,
@@ -62,12 +70,12 @@ def live(
     )  # fmt: skip
 
 
-@app.command
+@verb(TOUCH, "cut demo --path blade.csv --open", "cut skin.stl --path tip.csv --tension-percent 8")
 def cut(
     source: str,
     *,
     path: Path,
-    out: Path = Path("naibu-cut"),
+    out: Out = Path("naibu-cut"),
     distance_mm: float | None = None,
     pull_percent: float | None = None,
     experiment: str | None = None,
@@ -78,7 +86,7 @@ def cut(
     reach_mm: float | None = None,
     refine: bool | None = None,
     unit_mm: float | None = None,
-    overwrite: bool = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Cut a mesh, an identified model, a lattice or a scanned surface, let the cut open, and write mesh, motion, page and numbers.
 
@@ -138,6 +146,7 @@ def cut(
             material=_material(young_modulus_kpa, poisson_ratio), overwrite=overwrite, progress=progress,
             **({} if pull_percent is None else {"pull_percent": pull_percent}),
         )  # fmt: skip
+    wrote(*done.files)
     sizes = ", ".join(f"{volume:.4g}" for volume in done.volumes_mm3[:6])
     say(f"{done.cut.n_pieces} piece(s) of {sizes} mm3; the cut deviates from the blade by {done.cut.deviation_mm:.2g} mm at most.")
     say(f"Page: {done.files[0]}   {', '.join(str(file) for file in done.files[1:])}")
@@ -150,6 +159,7 @@ def _cut_surface(source: str, path: Path, out: Path, distance_mm: float | None, 
     stated = {name: value for name, value in options.items() if value is not None}
     with progress_display() as progress:
         done = run(source, path, out=out, distance_mm=distance_mm, overwrite=overwrite, progress=progress, **stated)
+    wrote(*done.files)
     say(
         f"{done.cut.n_pieces} piece(s) of {areas_text(done.cut)} mm2; the cut deviates from the path by {done.cut.deviation_mm:.2g} mm at "
         f"most, {done.cut.mean_deviation_mm:.2g} mm on average."

@@ -1,3 +1,3 @@
-from .measurements import load, names, paper_tables, path
+from .measurements import experiment_template, load, names, paper_tables, path
 
-__all__ = ["load", "names", "paper_tables", "path"]
+__all__ = ["experiment_template", "load", "names", "paper_tables", "path"]

@@ -12,6 +12,7 @@ from naibu.core.experiment import Experiment
 from naibu.io.experiment_folder.reader import META_FILE, read_experiment
 
 _DATA = Path(__file__).resolve().parent / "data"
+_TEMPLATES = _DATA.parent / "templates"
 
 
 def names() -> tuple[str, ...]:
@@ -44,6 +45,11 @@ def load(name: str) -> Experiment:
         There is no such experiment.
     """
     return read_experiment(path(name))
+
+
+def experiment_template() -> str:
+    """Return a commented ``meta.toml`` to start an experiment folder from; it describes the cube of ``ct_cube_plate`` at 45 mm."""
+    return (_TEMPLATES / "experiment.toml").read_text(encoding="utf-8")
 
 
 def paper_tables() -> dict[str, Any]:

@@ -8,13 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from naibu.core.errors import InputError
 from naibu.core.markers import Markers
 from naibu.imaging.markers.motion_coherence import require_coherent, strays_named
 from naibu.imaging.markers.tracking import FEWEST_COMMON
-from naibu.io.marker_tables import import_markers, write_experiment_folder
+from naibu.io.marker_tables import MM_PER_UNIT, import_markers, write_experiment_folder
+from naibu.viewer.tables import Cell, Table
 
+LEAST_SHARE = 0.15  # of the object's extent, which markers span; below, another unit is suspected
 MOST_STRAYS = 0.2  # fraction of stray markers from which on the labels are not believed
 
 
@@ -56,10 +59,68 @@ def import_tables(
     if len(set(names)) < len(names):
         raise InputError(f"two tables would both be the state {max(names, key=names.count)!r}; rename one file")
     first = import_markers(initial, unit=unit)
+    if unit is None:
+        _require_plausible_unit(first, description["shape"].size_mm, Path(initial).name)
     states = {name: import_markers(table, unit=unit) for name, table in zip(names, loaded, strict=True)}
     notes = [note for name, markers in states.items() if (note := _checked(first, markers, Path(initial).name, name))]
     write_experiment_folder(out, first, states, **description)
     return tuple(notes)
+
+
+def preview_tables(
+    initial: str | os.PathLike[str], loaded: Sequence[str | os.PathLike[str]], *, size_mm: Sequence[float], unit: str | None = None
+) -> Table:
+    """Return what tables of marker positions hold, beside the size of the object: what to look at before they are imported.
+
+    Parameters
+    ----------
+    initial, loaded, unit
+        As of `import_tables`.
+    size_mm : sequence of float
+        Dimensions of the object along x, y, z, mm.
+
+    Raises
+    ------
+    InputError
+        Tables that cannot be read, or positions that are in another unit than they say.
+    """
+    first = import_markers(initial, unit=unit)
+    if unit is None:
+        _require_plausible_unit(first, size_mm, Path(initial).name)
+    rows = [_seen(Path(initial).stem, first, first)]
+    rows += [_seen(Path(table).stem, import_markers(table, unit=unit), first) for table in loaded]
+    columns = ("state", "markers", "in common", "span x, mm", "span y, mm", "span z, mm", "spacing, mm", "moved (median), mm")
+    size = " x ".join(f"{edge:g}" for edge in size_mm)
+    note = f"The object measures {size} mm. Spacing: median distance to the nearest marker. Rigid motion of the scan is part of 'moved'."
+    return Table("Tables as they are read", columns, tuple(rows), note=note)
+
+
+def _seen(name: str, markers: Markers, first: Markers) -> tuple[Cell, ...]:
+    points = markers.points[np.isfinite(markers.points[:, :2]).all(axis=1)]
+    moved = np.linalg.norm(np.nan_to_num(markers.points - first.aligned(markers.ids)), axis=1)
+    common = np.isfinite(markers.points[:, :2] + first.aligned(markers.ids)[:, :2]).all(axis=1)
+    spacing = float(np.median(cKDTree(np.nan_to_num(points)).query(np.nan_to_num(points), k=2)[0][:, 1])) if len(points) > 1 else None
+    median = float(np.median(moved[common])) if common.any() else None
+    return (name, len(markers.ids), int(common.sum()), *_span(markers), spacing, median)
+
+
+def _span(markers: Markers) -> tuple[float, float, float]:
+    """Extent of the markers along x, y, z, mm; NaN along z of markers in one plane."""
+    known = [column[np.isfinite(column)] for column in markers.points.T]
+    x, y, z = (float(np.ptp(column)) if len(column) else np.nan for column in known)
+    return x, y, z
+
+
+def _require_plausible_unit(first: Markers, size_mm: Sequence[float], name: str) -> None:
+    """Refuse positions that fill the object only in another unit."""
+    share = np.nanmax(np.array(_span(first)) / np.array(size_mm, dtype=float))
+    for unit in ("cm", "m", "inch"):
+        if share < LEAST_SHARE and 2.0 * LEAST_SHARE < share * MM_PER_UNIT[unit] <= 1.05:
+            span, size = (" x ".join(f"{edge:.3g}" for edge in edges) for edges in (_span(first), size_mm))
+            raise InputError(
+                f"{name}: the markers span {span} mm, a small part of an object whose size_mm is {size}; in "
+                f"{unit} they would fill it. Give `unit` as {unit}, or as mm if they are so close together"
+            )
 
 
 def _checked(first: Markers, markers: Markers, initial: str, name: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +12,7 @@ import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import NaibuError
-from naibu.core.progress import Progress, report_progress
+from naibu.core.progress import Progress, ProgressReport, report_progress
 from naibu.imaging.displacement.accuracy import end_point_error
 from naibu.imaging.measure_displacement import Method
 from naibu.imaging.preprocessing.resampling import warped
@@ -25,6 +25,7 @@ from naibu.workflows.output_folder import output_folder
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
+TOLD = ("residual_rms", "median_sd_mm", "mean_error_mm", "p95_error_mm", "p95_check_point_error_mm")  # figures told as they come
 OMITTED = ("initial_residual_rms", "median_displacement_mm", "largest_displacement_mm")  # the same for all methods, or nearly so
 
 
@@ -45,10 +46,12 @@ def compare_methods(
     out: str | os.PathLike[str],
     overwrite: bool = False,
     progress: Progress | None = None,
+    told: Callable[[str], None] | None = None,
 ) -> MethodComparison:
     """Measure the displacement of one pair by several methods, one after the other, and write ``methods.html`` and ``methods.json``.
 
-    A method that cannot be used on the pair is listed with the reason, and does not stop the others.
+    Both files are written again after every method, so that an interruption loses only the one that is running. A method that cannot be
+    used on the pair is listed with the reason, and does not stop the others.
 
     Parameters
     ----------
@@ -61,7 +64,9 @@ def compare_methods(
     overwrite : bool
         Whether results, or other files of these names, that `out` holds already are replaced.
     progress : Progress, optional
-        Called at the beginning of every method.
+        Called with the share done.
+    told : callable, optional
+        Called with a sentence on every method as soon as it is done.
 
     Raises
     ------
@@ -73,22 +78,71 @@ def compare_methods(
     failures: dict[Method, str] = {}
     wanted = tuple(dict.fromkeys(methods))
     for k, method in enumerate(wanted):
-        report_progress(progress, method, done=k, total=len(wanted))
+        report_progress(progress, method, done=k / len(wanted), total=1)
         try:
-            runs[method] = sense_pair(pair, method=method)
+            runs[method] = sense_pair(pair, method=method, progress=_within(progress, method, k, len(wanted)))
         except NaibuError as error:
             failures[method] = str(error)
             if len(failures) == len(wanted):
                 raise
+        if told is not None:
+            told(_sentence(method, runs.get(method), failures.get(method, "")))
+        if runs:
+            done = _written(pair, runs, failures, folder)
+    return done
+
+
+def _within(progress: Progress | None, method: str, k: int, methods: int) -> Progress:
+    """Return a callback that turns the share done of one method into that of all."""
+
+    def report(part: ProgressReport) -> None:
+        report_progress(progress, method, done=(k + (part.fraction or 0.0)) / methods, total=1)
+
+    return report
+
+
+def _sentence(method: str, run: SenseRun | None, failure: str) -> str:
+    if run is None:
+        return f"{method}: could not be used: {failure}"
+    told = [f"{FIGURES[name]} {run.figures[name]:.3g}" for name in TOLD if run.figures.get(name) is not None]
+    return f"{method}: {run.seconds:.1f} s, {', '.join(told)}"
+
+
+def _written(pair: Pair, runs: dict[Method, SenseRun], failures: dict[Method, str], folder: Path) -> MethodComparison:
     columns, rows = _table(pair, runs)
     note = " ".join(f"{name} could not be used: {why}." for name, why in failures.items())
     caption = f"{pair.names[0]} to {pair.names[1]}; 'rigid' is the rigid motion of the whole object."
     table = Table("Methods", columns, rows, caption=caption, note=note)
-    figures = tuple(_figure(pair, name, run) for name, run in runs.items())
-    section = Section("Comparison of methods", _words(pair), (table,), figures)
+    largest = _largest_displacement(runs)
+    figures = tuple(_figure(pair, name, run, largest) for name, run in runs.items())
+    section = Section("Comparison of methods", (_verdict(pair, runs), *_words(pair)), (table,), figures)
     settings: dict[str, Cell] = {**pair.inputs, "mask": "given" if pair.mask is not None else "found"}
     page, numbers = write_chapter(Chapter("methods", "Methods of measuring displacement", (section,), settings), folder)
     return MethodComparison(columns, rows, page, numbers)
+
+
+def _largest_displacement(runs: dict[Method, SenseRun]) -> float:
+    """Return the end of the common colour scale, mm: the 99th percentile over all methods but what failed methods made up."""
+    sizes = [np.linalg.norm(run.measured.displacement.vectors[run.measured.mask], axis=-1) for run in runs.values()]
+    return float(np.median([np.nanpercentile(size, 99.0) for size in sizes])) or 1.0
+
+
+def _verdict(pair: Pair, runs: dict[Method, SenseRun]) -> str:
+    """Return which method was nearest to the truth; where none is known, that nothing is decided."""
+    name = next((n for n in ("p95_error_mm", "p95_check_point_error_mm") if all(n in run.figures for run in runs.values())), None)
+    if name is None:
+        return "Which method is best cannot be told: the true displacement is not known (see --truth and --check-points)."
+    best = min(runs, key=lambda method: _figure_of(runs[method], name))
+    mean = name.replace("p95", "mean")
+    return (
+        f"Nearest to the truth by the 95th percentile of the error: {best}, with {_figure_of(runs[best], name):.3g} mm (mean "
+        f"{_figure_of(runs[best], mean):.3g} mm). A mean alone hides large errors of small parts."
+    )
+
+
+def _figure_of(run: SenseRun, name: str) -> float:
+    value = run.figures[name]
+    return float(value) if isinstance(value, float | int) and np.isfinite(value) else np.inf
 
 
 def _words(pair: Pair) -> tuple[str, ...]:
@@ -126,7 +180,7 @@ def known(vectors: FloatArray) -> BoolArray:
     return np.asarray(np.isfinite(vectors).all(axis=-1))
 
 
-def _figure(pair: Pair, name: Method, run: SenseRun) -> Figure:
+def _figure(pair: Pair, name: Method, run: SenseRun, largest: float) -> Figure:
     u, mask = run.measured.displacement.vectors, run.measured.mask
     z = int(np.argmax(mask.sum(axis=(1, 2))))
     inside = np.argwhere(mask[z])
@@ -141,12 +195,15 @@ def _figure(pair: Pair, name: Method, run: SenseRun) -> Figure:
 
     def draw(canvas: Canvas) -> None:
         axes = canvas.subplots(1, 2 if off is None else 3, squeeze=False)[0]
-        shown = [(size, "displacement, mm", "viridis", 0.0, None), (rest, "intensity residual", "RdBu_r", -0.5 * contrast, 0.5 * contrast)]
+        shown = [
+            (size, "displacement, mm", "viridis", 0.0, largest),
+            (rest, "intensity residual", "RdBu_r", -0.5 * contrast, 0.5 * contrast),
+        ]
         if off is not None:
             shown.append((off, "error, mm", "magma", 0.0, 3.0))
         for axis, (values, label, colours, low, high) in zip(axes, shown, strict=True):
             image = axis.imshow(values, cmap=colours, vmin=low, vmax=high, extent=extent, interpolation="nearest")
-            canvas.colorbar(image, ax=axis, label=label, shrink=0.75, extend="max" if label.startswith("error") else "neither")
+            canvas.colorbar(image, ax=axis, label=label, shrink=0.75, extend="both" if low < 0.0 else "max")
             axis.set(xlabel="x, mm", ylabel="y, mm")
 
     return Figure(name, f"Slice {z}, the one with most of the object.", draw, (10.0, 3.3))
