@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -13,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from virtual_press import Press
 
 from naibu import cli, datasets
 from naibu.cli.run_record import RunRecord
@@ -72,11 +74,12 @@ def test_the_log_keeps_what_was_said_and_how_it_ended(naibu: Run) -> None:
     assert code == 2 and "nowhere/run.log" in err and not Path("my_experiment").exists()
 
 
-def test_open_shows_the_page(naibu: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_open_shows_the_page(naibu: Run, press: Press, monkeypatch: pytest.MonkeyPatch) -> None:
     shown: list[str] = []
     monkeypatch.setattr(webbrowser, "open", shown.append)
-    code, _, _ = naibu("simulate", "chip", "--open", "-o", "chip")
-    assert code == 0 and len(shown) == 1 and shown[0].startswith("file://") and shown[0].endswith(".html")
+    shutil.copytree(press.results, "results")
+    code, _, _ = naibu("report", "results", "--open")
+    assert code == 0 and len(shown) == 1 and shown[0].startswith("file://") and shown[0].endswith("results/report.html")
     naibu("new", "--open")
     assert len(shown) == 1
 

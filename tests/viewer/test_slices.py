@@ -89,3 +89,13 @@ def test_arrays_on_different_grids_are_refused() -> None:
         slices_html(view(overlays=[Overlay("strain", np.zeros((2, 2, 2)))]))
     with pytest.raises(InputError, match="at least one image"):
         slices_html(view(images=[]))
+
+
+def test_letters_name_the_nearest_direction_of_the_scan_at_both_ends_of_each_axis() -> None:
+    turn = np.array(
+        [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
+    )  # columns: x of the grid to the back, y to the right, z downwards
+    data = payload(slices_html(view(direction=turn)))
+    assert data["letters"] == [["A", "P"], ["L", "R"], ["S", "I"]]
+    assert data["direction"] == turn.tolist()
+    assert payload(slices_html(view()))["letters"] == [["R", "L"], ["A", "P"], ["I", "S"]]

@@ -78,4 +78,8 @@ def _figure(figure: Figure) -> str:
         canvas.savefig(stream, format="svg", metadata={"Date": None})
     data = base64.b64encode(stream.getvalue()).decode()
     caption = f"<b>{escape(figure.name)}</b> {escape(figure.caption)}"
-    return f'<figure><img alt="{escape(figure.name)}" src="data:image/svg+xml;base64,{data}"><figcaption>{caption}</figcaption></figure>'
+    alt = escape(f"{figure.name}. {figure.caption}", quote=True)
+    picture = f'<img alt="{alt}" src="data:image/svg+xml;base64,{data}">'
+    # a checkbox enlarges the figure without a script, by mouse and by keyboard
+    zoom = f'<input type="checkbox" class="visually-hidden" aria-label="Enlarge {escape(figure.name, quote=True)}">'
+    return f'<figure><label class="zoom">{zoom}<span>{picture}</span></label><figcaption>{caption}</figcaption></figure>'

@@ -17,6 +17,7 @@ from naibu.viewer.ticks import ticks_between
 
 STEPS = 4000  # quantisation levels from zero to the largest displacement
 LEVELS = 255  # quantisation levels of the colours
+SMALLEST_IN_NEWTON = 500.0  # mN
 POINTS_OF_A_CURVE = 600
 WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 420.0, 330.0, 66.0, 12.0, 14.0, 44.0
 CURVES = 5  # curve colours in the style sheet
@@ -162,7 +163,7 @@ def _html(page: MotionPage) -> str:
         '<noscript><p class="no-3d">The 3-D view needs JavaScript; curves and tables are complete without it.</p></noscript>'
         f"{curves}</section>{f'<section>{tables}</section>' if tables else ''}{provenance}"
     )
-    footer = "Lengths in mm, forces in mN. This page is self-contained: it loads nothing from the network."
+    footer = "Lengths in mm, forces in mN or N, as stated at the curves. This page is self-contained: it loads nothing from the network."
     frames = f'<script type="application/json" id="naibu-frames">{data}</script>'
     return page_html(page.title, lead, main, footer, data=frames, script="report.js")
 
@@ -208,7 +209,8 @@ def _levels(colours: ColourField) -> dict[str, object]:
 
 def force_curves(page: MotionPage) -> str:
     """Return the force-time curve of every body as SVG, along the axis of its largest force, with a time marker that the page moves."""
-    t, curves = page.force_times, [_strongest(page.force[:, k]) for k in range(len(page.bodies))]
+    unit, factor = force_unit(float(np.abs(page.force).max(initial=0.0)))
+    t, curves = page.force_times, [_strongest(factor * page.force[:, k]) for k in range(len(page.bodies))]
     values = np.concatenate([v for v, _ in curves])
     low, high = min(float(values.min()), 0.0), max(float(values.max()), 0.0)
     low, high = (low, high) if high > low else (0.0, 1.0)
@@ -234,7 +236,7 @@ def force_curves(page: MotionPage) -> str:
     middle = 0.5 * (LEFT + WIDTH - RIGHT)
     body += f'<text x="{middle:.0f}" y="{HEIGHT - 8:.0f}" text-anchor="middle">time (s)</text>'
     up = 0.5 * (TOP + HEIGHT - BOTTOM)
-    body += f'<text transform="translate(12 {up:.0f}) rotate(-90)" text-anchor="middle">force on the object (mN)</text>'
+    body += f'<text transform="translate(12 {up:.0f}) rotate(-90)" text-anchor="middle">force on the object ({unit})</text>'
     body += (
         f'<g id="naibu-now" data-from="{LEFT:g}" data-to="{WIDTH - RIGHT:g}" transform="translate({LEFT:g} 0)">'
         f'<path d="M0 {TOP:g}V{HEIGHT - BOTTOM:g}" class="now"/></g>'
@@ -242,6 +244,11 @@ def force_curves(page: MotionPage) -> str:
     label = f"Forces of {', '.join(b.name for b in page.bodies)} on the object over time"
     svg = f'<svg viewBox="0 0 {WIDTH:.0f} {HEIGHT:.0f}" role="img" aria-label="{escape(label)}">{body}</svg>'
     return f'<p class="fig-title">Forces on the object</p>{svg}<ul class="curve-key">{keys}</ul>'
+
+
+def force_unit(largest: float) -> tuple[str, float]:
+    """Return the unit in which forces up to `largest`, mN, are read most easily, and the factor from mN."""
+    return ("N", 1e-3) if largest >= SMALLEST_IN_NEWTON else ("mN", 1.0)
 
 
 def _strongest(force: FloatArray) -> tuple[FloatArray, str]:

@@ -50,7 +50,7 @@ def asset(name: str) -> str:
 
 
 def filled_template(name: str, values: Mapping[str, str]) -> str:
-    """Return a page whose template is an asset: ``$POLICY`` and the names of `values` are replaced, once.
+    """Return a page whose template is an asset: ``$STYLE``, the common one, ``$POLICY`` and the names of `values` are replaced, once.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def filled_template(name: str, values: Mapping[str, str]) -> str:
     values : mapping of str to str
         HTML, or JSON from `naibu.viewer.embedding.embedded_json`, by name without the dollar sign.
     """
-    template = _read(name)
+    template = _read(name).replace("$STYLE", asset("report.css"))
     filled = {**values, "POLICY": content_security_policy(_SCRIPT.findall(template), _STYLE.findall(template))}
     names = "|".join(map(re.escape, filled))
     # in one pass: what is filled in may contain such a name itself

@@ -10,6 +10,7 @@ import numpy as np
 
 from naibu.core.arrays import AnyFloatArray
 from naibu.core.errors import InputError
+from naibu.viewer.cards import Card, cards_html
 from naibu.viewer.embedding import embedded_bytes, embedded_json
 from naibu.viewer.page_frame import filled_template
 from naibu.viewer.tables import Table, table_html
@@ -17,6 +18,11 @@ from naibu.viewer.tables import Table, table_html
 GREY_LEVELS = 255
 LEVELS = 254  # of an overlay; 255 means undefined
 FEW_VOXELS = 1_500_000
+ENDS = ("RL", "AP", "IS")
+FRAME = (
+    "Positions and displacements are in the frame of the scan, as in the tables: x to the left (L), y to the back (P), z upwards (S) of a "
+    "patient who lies in the scanner. The letters at the edges name the nearest of these directions."
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,6 +68,10 @@ class SliceView:
         Position of the first voxel along the axes of the grid, mm.
     difference : tuple of (str, int, int), optional
         Further images to choose from, as differences: name, and the numbers of two images.
+    direction : array_like, shape (3, 3)
+        Axes of the grid in the frame of the scan, in columns: values are read in that frame.
+    cards : sequence of Card
+        What to know first.
     """
 
     title: str
@@ -73,6 +83,8 @@ class SliceView:
     tables: Sequence[Table] = ()
     origin_mm: AnyFloatArray | Sequence[float] = (0.0, 0.0, 0.0)
     difference: tuple[tuple[str, int, int], ...] = ()
+    direction: AnyFloatArray | Sequence[Sequence[float]] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    cards: Sequence[Card] = ()
 
 
 def slices_html(view: SliceView) -> str:
@@ -99,10 +111,21 @@ def slices_html(view: SliceView) -> str:
         "difference": [[name, a, b] for name, a, b in view.difference],
         "overlays": [_overlay(o, o.values[steps]) for o in view.overlays],
         "arrows": _arrows(view.displacement[steps]),
+        "direction": np.asarray(view.direction, dtype=float).tolist(),
+        "letters": _letters(np.asarray(view.direction, dtype=float)),
     }
-    words = "".join(f"<p>{escape(s)}</p>" for s in view.sentences)
+    lead = "".join(f"<p{' class=lead' if i == 0 else ''}>{escape(s)}</p>" for i, s in enumerate(view.sentences))
+    words = f"{cards_html(view.cards)}{lead}"
     tables = "".join(table_html(t) for t in view.tables)
-    return filled_template("slices.html", {"TITLE": escape(view.title), "WORDS": words, "TABLES": tables, "DATA": embedded_json(payload)})
+    return filled_template(
+        "slices.html", {"TITLE": escape(view.title), "WORDS": words, "TABLES": tables, "FRAME": FRAME, "DATA": embedded_json(payload)}
+    )
+
+
+def _letters(direction: AnyFloatArray) -> list[list[str]]:
+    """Return for each axis of the grid the letters of its beginning and its end, in a frame whose axes point to L, P and S."""
+    main = np.argmax(np.abs(direction), axis=0)
+    return [list(ENDS[k] if direction[k, axis] >= 0.0 else ENDS[k][::-1]) for axis, k in enumerate(main)]
 
 
 def _stride(shape: tuple[int, ...], spacing: AnyFloatArray) -> list[int]:

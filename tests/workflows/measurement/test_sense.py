@@ -235,3 +235,23 @@ def test_every_method_has_a_place_on_the_command_line() -> None:
     from naibu.cli.imaging import Method
 
     assert get_args(Method) == METHODS
+
+
+def test_methods_are_told_and_written_one_after_the_other(folder: Path, tmp_path: Path) -> None:
+    pair = read_pair(folder / "before.mha", folder / "after.nrrd", mask=folder / "mask.nii.gz", truth=folder / "truth.mha")
+    seen: list[tuple[str, int]] = []
+    shares: list[float] = []
+
+    def told(sentence: str) -> None:
+        table = json.loads((tmp_path / "methods.json").read_text())["tables"][0]
+        seen.append((sentence.partition(":")[0], len(table["rows"])))
+
+    result = compare_methods(
+        pair, ["rigid", "sad-blocks"], out=tmp_path, told=told, progress=lambda report: shares.append(report.fraction or 0.0)
+    )
+    assert seen == [("rigid", 1), ("sad-blocks", 2)]
+    assert shares == sorted(shares) and set(shares) == {0.0, 0.5}
+    error = {row[0]: dict(zip(result.columns, row, strict=True))["95th percentile of the error, mm"] for row in result.rows}
+    assert f"Nearest to the truth by the 95th percentile of the error: {min(error, key=error.get)}" in result.page.read_text(
+        encoding="utf-8"
+    )

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
+from naibu.viewer.cards import cards_html
 from naibu.viewer.page_frame import page_html
-from naibu.viewer.result_page.estimates import correlation_table, parameter_table
+from naibu.viewer.result_page.estimates import correlation_table, parameter_cards, parameter_table
 from naibu.viewer.result_page.figures import residual_panels, rms_bars
 from naibu.viewer.result_page.packing import packed_scenes
 from naibu.viewer.result_page.payload import Report, ResidualSet, Scene, VerdictNote
@@ -22,7 +23,7 @@ def document(report: Report, scenes: Sequence[Scene]) -> str:
         links += '<li><a href="#provenance">How this was computed</a></li>'
         body += provenance_section(report.provenance)
     header = f'{_headline(report)}<nav aria-label="Contents"><ul>{links}</ul></nav>'
-    footer = "Lengths in mm, pressures and moduli in kPa, forces in mN. This page is self-contained: it loads nothing from the network."
+    footer = "Lengths in mm, pressures and moduli in kPa. This page is self-contained: it loads nothing from the network."
     return page_html(report.title, header, body, footer, data=_scene_data(scenes) if scenes else "", script="report.js" if scenes else "")
 
 
@@ -32,7 +33,8 @@ def _scene_data(scenes: Sequence[Scene]) -> str:
 
 def _headline(report: Report) -> str:
     sentences = "".join(f"<p{' class=lead' if i == 0 else ''}>{escape(s)}</p>" for i, s in enumerate(report.headline))
-    return _verdict(report.verdict) + sentences + rms_bars(report.scenes)
+    cards = cards_html(parameter_cards(report.parameters))
+    return _verdict(report.verdict) + cards + sentences + rms_bars(report.scenes)
 
 
 def _verdict(verdict: VerdictNote | None) -> str:

@@ -9,6 +9,7 @@ from html import escape
 import numpy as np
 
 from naibu.core.arrays import FloatArray
+from naibu.viewer.cards import Card
 from naibu.viewer.result_page.payload import Correlation, ParameterRow
 from naibu.viewer.tables import cell_text, scrollable
 from naibu.viewer.ticks import tick_text, ticks_between
@@ -55,6 +56,27 @@ def parameter_table(rows: Sequence[ParameterRow]) -> str:
     head = "".join(f'<th scope="col">{t}</th>' for t in ("Parameter", "Estimate [95 % interval]", "Interval (one scale per unit)", "Note"))
     inner = f'<table class="params">{columns}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
     return scrollable("Parameters", inner, "wide-params")
+
+
+def parameter_cards(rows: Sequence[ParameterRow]) -> tuple[Card, ...]:
+    """Return what was estimated as cards: value, and the 95 % interval, or why there is none."""
+    return tuple(_card(row) for row in rows)
+
+
+def _card(row: ParameterRow) -> Card:
+    width = row.upper - row.lower
+    value = f"{_plain(row.estimate, width)} {row.unit}".rstrip()
+    low, high = (math.isfinite(v) for v in (row.lower, row.upper))
+    if row.note or not (low or high):
+        return Card(row.label, value, row.note or "not bounded by the data")
+    if low and high:
+        return Card(row.label, value, f"95 %: {_plain(row.lower, width)} to {_plain(row.upper, width)}")
+    return Card(row.label, value, f"95 %: {f'above {_plain(row.lower, width)}' if low else f'below {_plain(row.upper, width)}'}")
+
+
+def _plain(value: float, width: float) -> str:
+    text = _to_width(value, width)
+    return f"{value:.3g}" if "<" in text else text
 
 
 def _unit_row(unit: str, scale: _Scale) -> str:

@@ -85,18 +85,18 @@ def compare_methods(
             failures[method] = str(error)
             if len(failures) == len(wanted):
                 raise
-        if told is not None:
-            told(_sentence(method, runs.get(method), failures.get(method, "")))
         if runs:
             done = _written(pair, runs, failures, folder)
+        if told is not None:
+            told(_sentence(method, runs.get(method), failures.get(method, "")))
     return done
 
 
 def _within(progress: Progress | None, method: str, k: int, methods: int) -> Progress:
-    """Return a callback that turns the share done of one method into that of all."""
+    """Return a callback that turns the share done of one method into that of all; the stages of a method are not known beforehand."""
 
     def report(part: ProgressReport) -> None:
-        report_progress(progress, method, done=(k + (part.fraction or 0.0)) / methods, total=1)
+        report_progress(progress, f"{method}: {part.stage}", done=k / methods, total=1)
 
     return report
 
@@ -113,8 +113,8 @@ def _written(pair: Pair, runs: dict[Method, SenseRun], failures: dict[Method, st
     note = " ".join(f"{name} could not be used: {why}." for name, why in failures.items())
     caption = f"{pair.names[0]} to {pair.names[1]}; 'rigid' is the rigid motion of the whole object."
     table = Table("Methods", columns, rows, caption=caption, note=note)
-    largest = _largest_displacement(runs)
-    figures = tuple(_figure(pair, name, run, largest) for name, run in runs.items())
+    ends = _largest_displacement(runs), _largest_error(pair, runs)
+    figures = tuple(_figure(pair, name, run, *ends) for name, run in runs.items())
     section = Section("Comparison of methods", (_verdict(pair, runs), *_words(pair)), (table,), figures)
     settings: dict[str, Cell] = {**pair.inputs, "mask": "given" if pair.mask is not None else "found"}
     page, numbers = write_chapter(Chapter("methods", "Methods of measuring displacement", (section,), settings), folder)
@@ -125,6 +125,14 @@ def _largest_displacement(runs: dict[Method, SenseRun]) -> float:
     """Return the end of the common colour scale, mm: the 99th percentile over all methods but what failed methods made up."""
     sizes = [np.linalg.norm(run.measured.displacement.vectors[run.measured.mask], axis=-1) for run in runs.values()]
     return float(np.median([np.nanpercentile(size, 99.0) for size in sizes])) or 1.0
+
+
+def _largest_error(pair: Pair, runs: dict[Method, SenseRun]) -> float:
+    """Return the end of the common colour scale of errors, mm: the largest 99th percentile of the methods, at most 3 mm."""
+    if pair.truth is None:
+        return 1.0
+    errors = [np.linalg.norm(run.measured.displacement.vectors - pair.truth, axis=-1)[run.measured.mask] for run in runs.values()]
+    return min(3.0, max(float(np.nanpercentile(error, 99.0)) for error in errors)) or 1.0
 
 
 def _verdict(pair: Pair, runs: dict[Method, SenseRun]) -> str:
@@ -180,7 +188,7 @@ def known(vectors: FloatArray) -> BoolArray:
     return np.asarray(np.isfinite(vectors).all(axis=-1))
 
 
-def _figure(pair: Pair, name: Method, run: SenseRun, largest: float) -> Figure:
+def _figure(pair: Pair, name: Method, run: SenseRun, largest: float, worst: float) -> Figure:
     u, mask = run.measured.displacement.vectors, run.measured.mask
     z = int(np.argmax(mask.sum(axis=(1, 2))))
     inside = np.argwhere(mask[z])
@@ -200,7 +208,7 @@ def _figure(pair: Pair, name: Method, run: SenseRun, largest: float) -> Figure:
             (rest, "intensity residual", "RdBu_r", -0.5 * contrast, 0.5 * contrast),
         ]
         if off is not None:
-            shown.append((off, "error, mm", "magma", 0.0, 3.0))
+            shown.append((off, "error, mm", "magma", 0.0, worst))
         for axis, (values, label, colours, low, high) in zip(axes, shown, strict=True):
             image = axis.imshow(values, cmap=colours, vmin=low, vmax=high, extent=extent, interpolation="nearest")
             canvas.colorbar(image, ax=axis, label=label, shrink=0.75, extend="both" if low < 0.0 else "max")

@@ -30,6 +30,7 @@ from naibu.io.images import read_displacement, read_volume, write_displacement, 
 from naibu.io.marker_tables import import_markers, write_markers
 from naibu.io.vtk_files import write_vtu
 from naibu.meshing.primitives import grid_cells
+from naibu.viewer.cards import Card
 from naibu.viewer.slices import Overlay, SliceView, slices_html
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.output_folder import output_folder
@@ -389,7 +390,31 @@ def slice_view(pair: Pair, run: SenseRun) -> SliceView:
         tables=[_table(run)],
         origin_mm=grid.to_physical([b.start for b in box[::-1]]) @ grid.direction,
         difference=(("reference minus deformed", 0, 1), ("reference minus deformed, warped back", 0, 2)),
+        direction=grid.direction,
+        cards=_cards(run, principal[inside]),
     )
+
+
+def _cards(run: SenseRun, principal: FloatArray) -> tuple[Card, ...]:
+    """Return what to know first; `principal` are the principal Green-Lagrange strains (n, 3) inside the object, in increasing order."""
+    f = run.figures
+    sd = f["median_sd_mm"]
+    cards = [
+        Card("Displacement, median", f"{f['median_displacement_mm']:.3g} mm", f"at most {f['largest_displacement_mm']:.3g} mm"),
+        Card("Standard deviation of it", "not stated" if sd is None else f"{sd:.2g} mm", "median, along the least certain direction"),
+    ]
+    if len(principal):
+        low, high = np.median(principal[:, 0]), np.median(principal[:, 2])
+        cards.append(Card("Principal strains, median", f"{low:+.1%} and {high:+.1%}", "smallest and largest, Green-Lagrange"))
+    cards.append(Card("Part of the object measured", f"{f['measured_fraction']:.1%}", "the rest is left unanswered"))
+    before, after = f["initial_residual_rms"], f["residual_rms"]
+    if isinstance(before, float) and isinstance(after, float) and before > 0.0:
+        cards.append(
+            Card("Difference of the scans explained", f"{1.0 - (after / before) ** 2:.0%}", "of its mean square, inside the object")
+        )
+    if (error := f.get("p95_error_mm", f.get("p95_check_point_error_mm"))) is not None:
+        cards.append(Card("Error against the truth, 95th percentile", f"{error:.3g} mm"))
+    return tuple(cards)
 
 
 def _box(mask: BoolArray, margin: int = 4) -> tuple[slice, ...]:

@@ -232,7 +232,8 @@ def _figure(tracked: TrackedMarkers, s: int) -> Figure:
     def draw(canvas: Canvas) -> None:
         for axis, (a, b) in zip(canvas.subplots(1, 3), ((0, 2), (1, 2), (0, 1)), strict=True):
             _projection(axis, before, after, flags, a, b)
-        canvas.axes[0].legend(loc="upper left", bbox_to_anchor=(0.0, -0.18), ncols=4, frameon=False)
+        handles, names = canvas.axes[0].get_legend_handles_labels()
+        canvas.legend(handles, names, loc="outside lower left", ncols=4, frameon=False)
 
     caption = "Displacement of the markers from the reference state, seen along y, x and z."
     return Figure(f"State {tracked.names[s]}", caption, draw, (10.5, 4.2))

@@ -18,7 +18,7 @@ from naibu.io.files.atomic import write_atomically
 from naibu.io.vtkhdf_series import SeriesFile
 from naibu.mechanics.lattices.model.surface import surface_of
 from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy, StudyFrame, StudyState, run_study
-from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, motion_html
+from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, force_unit, motion_html
 from naibu.viewer.tables import Table
 from naibu.workflows.output_folder import output_folder
 from naibu.workflows.studies.lattice_study import PreparedStudy, prepared_study
@@ -298,9 +298,10 @@ def _tables(prepared: PreparedStudy, force: FloatArray, moved: FloatArray, times
         ("largest displacement of the surface, mm", float(largest.max()), float(times[int(np.argmax(largest))])),
         ("largest displacement of the surface at the end, mm", float(largest[-1]), float(times[-1])),
     ]
+    unit, factor = force_unit(float(np.abs(force).max(initial=0.0)))
     for k, body in enumerate(prepared.study.bodies):
         size = np.linalg.norm(force[:, k], axis=1)
         if len(size):
             at = prepared.study.sample_s * (int(np.argmax(size)) + 1)
-            rows.append((f"largest force of {body.name}, mN", float(size.max()), float(at) if size.max() > 0.0 else None))
+            rows.append((f"largest force of {body.name}, {unit}", factor * float(size.max()), float(at) if size.max() > 0.0 else None))
     return [Table("Largest values", ("quantity", "value", "time, s"), tuple(rows))]
