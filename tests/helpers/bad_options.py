@@ -46,6 +46,10 @@ TRACK = ("{scan}", "{scan2}")
 TABLES = ("{table}", "{table2}")
 SIZE = ("--size-mm", "60", "60", "60")
 DIAMETER = ("--diameter-mm", "2")
+BODY = ("{solid}", "--path", "{blade}")
+SHEET = ("{sheet}", "--path", "{tip}")
+VIEWS = ("--cc", "{cc}", "--mlo", "{mlo}", "--point-cc", "40,5")
+FIELD = ("{field}", "--zones", "{labels}", "--known", "label 2=10 kPa")
 NUMBERS: tuple[tuple[str, tuple[str, ...], str, tuple[str, ...]], ...] = (
     # 0 lets naibu choose the size of the elements
     ("identify", ("{press}",), "--element-size-mm", tuple(v for v in LENGTH if v not in ("0", "-0.0"))),
@@ -63,6 +67,16 @@ NUMBERS: tuple[tuple[str, tuple[str, ...], str, tuple[str, ...]], ...] = (
     ("import", (*TABLES, *SIZE), "--xy-step-mm", LENGTH),
     ("import", (*TABLES, *SIZE), "--z-step-mm", LENGTH),
     ("import", (*TABLES, *SIZE, "--loading", "bar"), "--bar-width-mm", LENGTH),
+    ("cut", BODY, "--distance-mm", LENGTH),
+    ("cut", BODY, "--young-modulus-kpa", LENGTH),
+    ("cut", SHEET, "--distance-mm", LENGTH),
+    ("cut", SHEET, "--reach-mm", LENGTH),
+    ("cut", SHEET, "--unit-mm", LENGTH),
+    ("mammography", (*VIEWS, "--angle-deg", "45"), "--thickness-mm", (*NO_NUMBERS, *NOT_FINITE, *NOT_POSITIVE, *EXTREME)),
+    ("mammography", (*VIEWS, "--thickness-mm", "50"), "--angle-deg", LENGTH),
+    ("mammography", (*VIEWS, "--thickness-mm", "50", "--angle-deg", "45"), "--draws", NO_COUNTS),
+    ("identify", FIELD, "--element-size-mm", tuple(v for v in LENGTH if v not in ("0", "-0.0"))),
+    ("live", ("{solid}", "--no-browser"), "--young-modulus-kpa", LENGTH),
     ("reproduce", ("ch3",), "--seed", tuple(v for v in NO_COUNTS if v != "0")),
     ("simulate", ("{study}",), "--checkpoint-every", NO_COUNTS),
 )

@@ -114,11 +114,16 @@ def identify(
         Replace results, or files of your own, that the folder already holds.
     """
     if mask is not None or zones is not None or all(Path(name).suffix.lower() in FIELD_FILES for name in experiments):
+        _require_left_out(
+            "goes with markers, and these are displacement fields", states=bool(state), contact=contact != "coulomb",
+            joined=joined != "tied", pixel_scale=pixel_scale != "given", cross_validate=cross_validate, resume=not resume,
+        )  # fmt: skip
         _identify_fields(
             experiments, mask=mask, zones=zones, zone_name=zone_name or [], known=known or (), law=law, each_cell=cell_map,
             element_size_mm=element_size_mm, out=out, overwrite=overwrite,
         )  # fmt: skip
         return
+    _require_left_out("goes with displacement fields, and these are markers", zone_names=bool(zone_name), each_cell=cell_map)
     from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 
     settings = ModelSettings(law=law, contact=contact, joined=joined, element_size_mm=element_size_mm, pixel_scale=pixel_scale)
@@ -127,6 +132,13 @@ def identify(
         experiments, known=known or (), states=states, settings=settings, out=out, cross_validate=cross_validate, resume=resume,
         overwrite=overwrite,
     )  # fmt: skip
+
+
+def _require_left_out(reason: str, **given: bool) -> None:
+    """Refuse options that do not belong to the kind of data: they would be ignored without a word."""
+    for name, there in given.items():
+        if there:
+            raise InputError(f"`{name}` {reason}; leave it out")
 
 
 def _identify_fields(
@@ -149,8 +161,10 @@ def _identify_fields(
     names: dict[int, str] = {}
     for text in zone_name:
         name, _, label = text.rpartition("=")
-        if not name or not label.strip().isdigit():
+        if not name.strip() or not label.strip().isdecimal() or len(label) > 9:
             raise InputError(f"zone_name {text!r} must give a name and a label, such as 'gel=1'")
+        if int(label) in names or name.strip() in names.values():
+            raise InputError(f"zone_name {text!r} names a label, or has a name, that another zone_name has; give each label one name")
         names[int(label)] = name.strip()
     began = time.perf_counter()
     with progress_display() as progress:

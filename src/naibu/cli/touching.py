@@ -175,7 +175,7 @@ def _require_unset(options: dict[str, Any], reason: str) -> None:
     """Refuse an option that does not belong to what is cut."""
     for name, value in options.items():
         if value is not None:
-            raise InputError(f"{name} {reason}; leave it out")
+            raise InputError(f"`{name}` {reason}; leave it out")
 
 
 def _material(young_modulus_kpa: float | None, poisson_ratio: float | None) -> MeshMaterial | None:

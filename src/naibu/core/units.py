@@ -9,7 +9,7 @@ import numpy as np
 from naibu.core.errors import InputError
 
 _KILOPASCALS = {"Pa": 1e-3, "kPa": 1.0, "MPa": 1e3, "GPa": 1e6, "N/m^2": 1e-3, "N/mm^2": 1e3}
-_SOFTEST_KPA, _STIFFEST_KPA = 1e-6, 1e10  # diamond: 1.2e9 kPa
+MODULI_KPA = 1e-6, 1e10  # diamond: 1.2e9 kPa
 
 
 def kilopascals(text: str) -> float:
@@ -31,6 +31,7 @@ def kilopascals(text: str) -> float:
     if not value > 0.0:
         raise InputError(f"a modulus must be positive, not {text!r}")
     modulus = value * _KILOPASCALS[unit]
-    if not _SOFTEST_KPA <= modulus <= _STIFFEST_KPA:
-        raise InputError(f"no material has a modulus of {text!r}; it must lie between {_SOFTEST_KPA:g} and {_STIFFEST_KPA:g} kPa")
+    softest, stiffest = MODULI_KPA
+    if not softest <= modulus <= stiffest:
+        raise InputError(f"no material has a modulus of {text!r}; it must lie between {softest:g} and {stiffest:g} kPa")
     return modulus

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import os
 
-from naibu.core.arrays import FloatArray
+import numpy as np
+
+from naibu.core.arrays import LENGTHS_MM, FloatArray
 from naibu.core.errors import InputError
 from naibu.io.number_table import read_number_rows
+
+FARTHEST_MM = LENGTHS_MM[1]
 
 
 def read_blade_path(path: str | os.PathLike[str]) -> FloatArray:
@@ -26,9 +30,10 @@ def read_blade_path(path: str | os.PathLike[str]) -> FloatArray:
     Raises
     ------
     InputError
-        Not a readable text, a cell that is no finite number, rows of different length, fewer than two poses or two vertices.
+        Not a readable text, a cell that is no finite number or a place too far away,
+        rows of different length, fewer than two poses or two vertices.
     """
-    rows = read_number_rows(path)
+    rows = _positions(path)
     if len(rows) < 2 or rows.shape[1] < 6 or rows.shape[1] % 3:
         tip = "; one vertex is the path of a tip, which cuts surfaces, not solids" if rows.shape[1] == 3 else ""
         raise InputError(
@@ -53,9 +58,10 @@ def read_tip_path(path: str | os.PathLike[str]) -> FloatArray:
     Raises
     ------
     InputError
-        Not a readable text, a cell that is no finite number, rows of different length, fewer than two rows, or other than three columns.
+        Not a readable text, a cell that is no finite number or a place too far away,
+        rows of different length, fewer than two rows, or other than three columns.
     """
-    rows = read_number_rows(path)
+    rows = _positions(path)
     if len(rows) < 2 or rows.shape[1] != 3:
         blade = (
             "; rows of several vertices are the path of a blade, which cuts solids: name a mesh of tetrahedra (.vtu, .msh), or keep the "
@@ -65,6 +71,16 @@ def read_tip_path(path: str | os.PathLike[str]) -> FloatArray:
             f"{path}: has {_size(rows)}; the path of a tip over a surface needs at least two rows of x, y, z"
             f"{blade if rows.shape[1] >= 6 and rows.shape[1] % 3 == 0 else ''}"
         )
+    return rows
+
+
+def _positions(path: str | os.PathLike[str]) -> FloatArray:
+    """Read rows of coordinates, none of which is beyond what a scanner holds."""
+    rows = read_number_rows(path)
+    far = np.argwhere(np.abs(rows) > FARTHEST_MM)
+    if len(far):
+        value = rows[tuple(far[0])]
+        raise InputError(f"{path}: pose {far[0][0] + 1} has the coordinate {value:g}; coordinates are in mm, at most {FARTHEST_MM:g}")
     return rows
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from naibu.core.arrays import require_lengths
+from naibu.core.arrays import LENGTHS_MM, require_lengths
 from naibu.core.errors import InputError, MissingDependencyError
 from naibu.core.experiment import Axis, Layer, Loading, Shape
 from naibu.core.markers import Markers
@@ -89,7 +89,8 @@ def import_markers(
     ids = [_label(f"{source}: line {line}, column {header[where['marker']]!r}", row[where["marker"]]) for line, row in body]
     points = np.full((len(body), 3), math.nan)
     for name, factor in factors.items():
-        values = [_number(f"{source}: line {line}, column {header[where[name]]!r}", row[where[name]], mark) for line, row in body]
+        cells = [(f"{source}: line {line}, column {header[where[name]]!r}", row[where[name]]) for line, row in body]
+        values = [_within_reach(_number(place, cell, mark), factor, place) for place, cell in cells]
         # rounding removes the floating-point error of the conversion (1.1 cm would be 11.000000000000002 mm)
         points[:, COORDINATES.index(name)] = np.round(np.array(values) * factor, 9)
     trusted = [_trusted(source, line, row, where) for line, row in body]
@@ -383,6 +384,13 @@ def _number(where: str, text: str, mark: str) -> float:
     if not re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", plain):
         raise InputError(f"{where} = {text!r} is not a number (the table's decimal mark is {mark!r}); correct it, or leave the cell blank")
     return float(plain)
+
+
+def _within_reach(value: float, factor: float, where: str) -> float:
+    """Return a coordinate that a scanner can hold; `factor` is the length of its unit, mm."""
+    if abs(value) * factor > LENGTHS_MM[1]:
+        raise InputError(f"{where} = {value:g} is more than {LENGTHS_MM[1] / factor:g}: no object is so large; correct it, or the unit")
+    return value
 
 
 def _label(where: str, text: str) -> int:

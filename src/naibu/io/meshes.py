@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.arrays import LENGTHS_MM, FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.io.files.reading import guarded_reading, read_bytes
@@ -68,7 +68,7 @@ def read_mesh(path: str | os.PathLike[str], *, unit_mm: float = 1.0) -> Mesh:
     reader = _reader(path, MESH_READERS, SURFACE_READERS, "read_surface")
     with guarded_reading(path):
         mesh = reader(Path(path).name, read_bytes(path))
-    return Mesh(mesh.points * _unit(unit_mm), mesh.cells, mesh.cell_type, mesh.regions, mesh.region_names)
+    return Mesh(_in_mm(Path(path).name, mesh.points, unit_mm), mesh.cells, mesh.cell_type, mesh.regions, mesh.region_names)
 
 
 def read_surface(path: str | os.PathLike[str], *, unit_mm: float = 1.0) -> Surface:
@@ -103,7 +103,7 @@ def read_surface(path: str | os.PathLike[str], *, unit_mm: float = 1.0) -> Surfa
     if not np.isfinite(points).all():
         bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
         raise InputError(f"{name}: point {bad} is {points[bad].tolist()}; every coordinate must be finite")
-    return Surface(points * _unit(unit_mm), triangles)
+    return Surface(_in_mm(name, points, unit_mm), triangles)
 
 
 def _reader(path: str | os.PathLike[str], readers: dict[str, _Reader], others: dict[str, object] | object, instead: str) -> _Reader:
@@ -117,8 +117,13 @@ def _reader(path: str | os.PathLike[str], readers: dict[str, _Reader], others: d
     return readers[ending]
 
 
-def _unit(unit_mm: float) -> float:
-    """Return the length of the file's unit, mm, or raise an error."""
-    if not (np.isfinite(unit_mm) and unit_mm > 0):
+def _in_mm(name: str, points: FloatArray, unit_mm: float) -> FloatArray:
+    """Return points in mm, or raise an error where the unit is no length, or a point lies farther away than anything that is scanned."""
+    if not LENGTHS_MM[0] <= unit_mm <= LENGTHS_MM[1]:
         raise InputError(f"unit_mm is {unit_mm!r}; give the length of the file's unit in mm, 1 for mm or 1000 for metres")
-    return float(unit_mm)
+    farthest = float(np.abs(points).max(initial=0.0)) * unit_mm
+    if farthest > LENGTHS_MM[1]:
+        raise InputError(
+            f"{name}: has a coordinate of {farthest:g} mm, more than {LENGTHS_MM[1]:g} mm; is unit_mm, {unit_mm:g} mm, that of the file?"
+        )
+    return points * float(unit_mm)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,11 +12,12 @@ import numpy as np
 from scipy import ndimage
 
 from naibu._version import __version__
-from naibu.core.arrays import BoolArray, FloatArray, IntArray
+from naibu.core.arrays import AnyArray, BoolArray, FloatArray, IntArray, require_lengths
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress
+from naibu.core.units import kilopascals
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.estimate import FieldEstimate, identify_field
 from naibu.identification.from_fields.forward.field_laws import LawName
@@ -36,10 +36,12 @@ from naibu.workflows.output_folder import output_folder
 FILES = ("report.html", "young_modulus.mha", "young_modulus_sd.mha", "poisson_ratio.mha", "identification.json")
 CELLS, MOST_POINTS = 1200, 6000  # cells of the model by default; measurements of a load case: neighbours in a field say the same
 BLURRED = 0.01  # part of the object that cubes may misrepresent without a word
+MOST_CELLS = 100_000  # of a mesh whose size is asked for: beyond, a factorization does not fit into memory
+MOST_LABEL = 65535
 HALF_FILLED = 0.5  # part of a cell that must lie in the object
 POISSON_RATIO, POISSON_RATIO_SD = 0.45, 0.03  # of a known material of which only Young's modulus is stated
 RIGID = 300.0  # stiffness of what is called rigid over that of the stiffest other known material
-_VALUE = re.compile(r"^\s*(?P<young>[0-9.eE+-]+)\s*(?:kPa)?\s*(?:,\s*(?P<poisson>[0-9.]+)\s*)?$")
+LARGEST_POISSON_RATIO = 0.499  # of a known zone: beyond, elements of one pressure each lock
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,18 +159,13 @@ def parse_known_zones(known: Sequence[str], names: Sequence[str]) -> KnownZones:
     for text in known:
         name, equals, value = (part.strip() for part in text.partition("="))
         if name not in names:
-            raise InputError(f"known {text!r}: there is no zone {name!r}; the zones are {', '.join(map(repr, names))}")
-        match = _VALUE.match(value)
+            raise InputError(f"known={text!r}: there is no zone {name!r}; the zones are {', '.join(map(repr, names))}")
         if equals and value == "rigid":
             rigid.append(name)
-        elif equals and match is not None:
-            poisson = match["poisson"]
-            values[name] = (float(match["young"]), float(poisson) if poisson else POISSON_RATIO)
-            doubts[name] = (0.0, 0.0 if poisson else POISSON_RATIO_SD)
-        elif not equals:
-            relative, values[name], doubts[name] = True, (1.0, POISSON_RATIO), (0.0, POISSON_RATIO_SD)
+        elif equals:
+            values[name], doubts[name] = _stated_moduli(text, value)
         else:
-            raise InputError(f"known {text!r}: write 'gel=12 kPa', 'gel=12 kPa, 0.45' with Poisson's ratio, 'bone=rigid', or 'gel'")
+            relative, values[name], doubts[name] = True, (1.0, POISSON_RATIO), (0.0, POISSON_RATIO_SD)
     if not values:
         raise InputError(
             f"known names no zone with a modulus, so that nothing sets the scale; name one of {', '.join(map(repr, names))}, "
@@ -180,6 +177,20 @@ def parse_known_zones(known: Sequence[str], names: Sequence[str]) -> KnownZones:
     return KnownZones(values | dict.fromkeys(rigid, (stiff, 0.3)), doubts, relative)
 
 
+def _stated_moduli(text: str, value: str) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return Young's modulus, kPa, and Poisson's ratio, and their standard deviations, of ``12 kPa`` or ``12 kPa, 0.45``."""
+    modulus, comma, ratio = (part.strip() for part in value.partition(","))
+    try:
+        young, poisson = kilopascals(modulus), float(ratio) if comma else POISSON_RATIO
+    except ValueError as error:  # an InputError is one
+        said = f" ({error})" if isinstance(error, InputError) else ""
+        ways = "write 'gel=12 kPa', 'gel=12 kPa, 0.45' with Poisson's ratio, 'bone=rigid', or 'gel'"
+        raise InputError(f"known={text!r}: {ways}{said}") from error
+    if not 0.0 <= poisson <= LARGEST_POISSON_RATIO:
+        raise InputError(f"known={text!r}: Poisson's ratio must lie between 0 and {LARGEST_POISSON_RATIO:g}, not {poisson:g}")
+    return (young, poisson), (0.0, 0.0 if comma else POISSON_RATIO_SD)
+
+
 def _object(mask: str | os.PathLike[str] | None, zones: str | os.PathLike[str] | None) -> tuple[Volume, IntArray]:
     """Return the object as a volume of ones and zeros, and the label of every voxel."""
     read = [None if path is None else read_volume(path) for path in (mask, zones)]
@@ -188,11 +199,23 @@ def _object(mask: str | os.PathLike[str] | None, zones: str | os.PathLike[str] |
         raise InputError("give `mask`, the voxels of the object, or `zones`, a label for each material")
     if read[0] is not None and read[1] is not None and not read[0].same_grid(read[1]):
         raise InputError("mask and zones lie on different grids; resample one of them")
-    labels = np.ones(first.shape, dtype=np.int64) if read[1] is None else np.asarray(np.round(read[1].values), dtype=np.int64)
+    labels = np.ones(first.shape, dtype=np.int64) if read[1] is None else _whole(read[1].values)
     inside = (labels > 0) & (True if read[0] is None else read[0].values != 0)
     if not inside.any():
         raise InputError("mask and zones have no voxel in common: there is no object")
     return first.with_values(inside.astype(np.uint8)), labels
+
+
+def _whole(values: AnyArray) -> IntArray:
+    """Return labels as whole numbers."""
+    wrong = ~(np.abs(values) <= MOST_LABEL) | (values != np.round(values))  # also what is not a number
+    if wrong.any():
+        at = tuple(int(i) for i in np.argwhere(wrong)[0])
+        raise InputError(
+            f"zones has the value {values[at]:g} at voxel {at[::-1]} (x, y, z): labels are whole numbers up to {MOST_LABEL}; "
+            "is it a scan, or was it interpolated?"
+        )
+    return values.astype(np.int64)
 
 
 def _names(labels: IntArray, inside: Volume, given: Mapping[int, str]) -> dict[int, str]:
@@ -219,13 +242,18 @@ def block_mesh(inside: Volume, labels: IntArray, names: Mapping[int, str], eleme
     Raises
     ------
     InputError
-        Cells as large as the object.
+        A size that is no length, or so small or large that there are too many cells or too few.
     """
+    if element_size_mm:
+        require_lengths(element_size_mm=element_size_mm)
     voxels = np.argwhere(inside.values != 0)[:, ::-1]
     volume = len(voxels) * float(np.prod(inside.spacing_mm))
     size = element_size_mm or (volume / CELLS) ** (1.0 / 3.0)
     low, high = voxels.min(axis=0), voxels.max(axis=0) + 1
     counts = np.clip(np.round((high - low) * inside.spacing_mm / size).astype(int), 1, high - low)
+    if volume / size**3 > MOST_CELLS and np.prod(counts) > MOST_CELLS:
+        least = (volume / MOST_CELLS) ** (1.0 / 3.0)
+        raise InputError(f"element_size_mm is {size:.3g} mm, which makes more than {MOST_CELLS} cells; choose at least {least:.2g} mm")
     width = (high - low) / counts  # of a cell, in voxels
     block = np.minimum(((voxels + 0.5 - low) / width).astype(int), counts - 1)
     number = block @ np.array([1, counts[0], counts[0] * counts[1]])

@@ -81,7 +81,14 @@ def reproduce(chapter: str, *, out: str | os.PathLike[str], seed: int = 0, overw
 
 
 def missing_chapters(out: str | os.PathLike[str], seed: int = 0) -> tuple[str, ...]:
-    """Return the chapters that the folder does not hold yet, of this version of naibu and this seed."""
+    """Return the chapters that the folder does not hold yet, of this version of naibu and this seed.
+
+    Raises
+    ------
+    InputError
+        A negative seed.
+    """
+    require_count("seed", seed, 0)
     return tuple(name for name in CHAPTERS if _finished(Path(out), name, seed) is None)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from naibu.core.arrays import BoolArray, FloatArray
+from naibu.core.arrays import LENGTHS_MM, BoolArray, FloatArray
 from naibu.core.errors import InputError
 
 _DEPTHS_MM = (15.0, 300.0)  # from the chest wall to the nipple; beyond, another unit is likelier
@@ -89,6 +89,9 @@ def breast_outline(points_mm: ArrayLike, *, what: str = "outline") -> BreastOutl
     points = np.asarray(points_mm, dtype=float)
     if points.ndim != 2 or points.shape[1] != 2 or len(points) < 5 or not np.isfinite(points).all():
         raise InputError(f"{what}: has shape {points.shape}; it needs at least 5 finite points of two coordinates, in mm, along the skin")
+    farthest = float(np.abs(points).max())
+    if farthest > LENGTHS_MM[1]:
+        raise InputError(f"{what}: has a coordinate of {farthest:.4g} mm, more than {LENGTHS_MM[1]:g} mm. Are the coordinates in mm?")
     points = points[np.append(True, np.any(np.diff(points, axis=0) != 0.0, axis=1))]
     points = points[np.unique(np.linspace(0, len(points) - 1, min(len(points), _MOST_POINTS)).round().astype(int))]
     points, at_right = _opened(points, what)

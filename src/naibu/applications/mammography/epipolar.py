@@ -12,11 +12,12 @@ from scipy.special import stdtrit
 from naibu.applications.mammography.breast_outline import BreastOutline, inside_polygon
 from naibu.applications.mammography.geometric_model import DEFAULT_PARAMETERS, Compression, CompressionParameters
 from naibu.applications.mammography.two_views import LEAST_ANGLE, MOST_ANGLE, TwoViews, two_views
-from naibu.core.arrays import BoolArray, FloatArray, require_count
+from naibu.core.arrays import BoolArray, FloatArray, require_count, require_within
 from naibu.core.errors import InputError
 
 _COUNT = 101
 _MOST_REFUSED = 0.5
+_MOST_DRAWS = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,16 +253,17 @@ def mammographic_pair(
     uncertainty : ModelUncertainty
         Its standard deviations.
     draws : int
-        Number of drawn models, at least 20.
+        Number of drawn models, 20 to 10 000.
     seed : int
         Of the random numbers.
 
     Raises
     ------
     InputError
-        What `two_views` refuses, too few draws, or more than half of the draws giving no breast.
+        What `two_views` refuses, too few or too many draws, or more than half of the draws giving no breast.
     """
     require_count("draws", draws, 20)
+    require_within("draws", draws, 20, _MOST_DRAWS)
     require_count("seed", seed, 0)
     nominal = two_views(cc, mlo, thickness_mm, angle_deg, (parameters, parameters))
     random = np.random.default_rng(seed)

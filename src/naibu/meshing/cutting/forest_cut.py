@@ -129,7 +129,7 @@ def _cut(
         coarse = _too_coarse(forest, faces, where, surface, centres, 0.5 * distance_mm, gap)
         if not len(coarse):
             break
-        if forest.n_cells + 2 * len(coarse) > MOST_CELLS:
+        if forest.n_cells + max(2 * len(coarse), _needed(forest, where, coarse, distance_mm)) > MOST_CELLS:
             raise _too_fine(distance_mm)
         changes.append(forest.refine(coarse))
         fresh = np.append(fresh, np.zeros(max(0, forest.cell_rows - len(fresh)), dtype=bool))
@@ -266,6 +266,14 @@ def _quality(forest: BisectionForest, changes: list[MeshChange], distance_mm: fl
             f"{least:.3g}; choose a larger distance, or mend the mesh near the blade. The mesh is as it was"
         )
     return angle
+
+
+def _needed(forest: BisectionForest, where: FloatArray, coarse: IntArray, distance_mm: float) -> float:
+    """Estimate how many cells too coarse ones become at least: as many of the distance as cover the surface that crosses them."""
+    corners = where[forest.simplices[coarse]]
+    across = np.linalg.norm(np.ptp(corners, axis=1), axis=1)
+    with np.errstate(over="ignore"):
+        return float(np.sum((0.75 * across / distance_mm) ** 2))
 
 
 def _too_fine(distance_mm: float) -> InputError:

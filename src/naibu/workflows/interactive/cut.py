@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from naibu._version import __version__
-from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.arrays import FloatArray, IntArray, require_lengths
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress, report_progress
@@ -109,6 +109,7 @@ def cut(
     """
     if not 0.0 <= pull_percent <= LARGEST_PULL:
         raise InputError(f"pull_percent must lie between 0 and {LARGEST_PULL:g} %, not {pull_percent:g}")
+    require_lengths(distance_mm=distance_mm)
     blade = _blade(path)
     folder = output_folder(out, FILES, overwrite=overwrite)
     model = touchable(source, experiment=experiment, material=material)

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from naibu._version import __version__
-from naibu.core.arrays import FloatArray, IntArray, require_positive, require_within
+from naibu.core.arrays import FloatArray, IntArray, require_lengths, require_within
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress, report_progress
@@ -117,8 +117,7 @@ def cut_surface_file(
         The opening cannot be computed.
     """
     require_within("tension_percent", tension_percent, 0.0, 100.0 * LARGEST_TENSION)
-    if groove_depth_mm:
-        require_positive("groove_depth_mm", groove_depth_mm, "mm")
+    require_lengths(distance_mm=distance_mm, groove_depth_mm=groove_depth_mm or None, reach_mm=reach_mm)
     surface, tips = read_surface(source, unit_mm=unit_mm), read_tip_path(path)
     folder = output_folder(out, FILES, overwrite=overwrite)
     distance = 0.5 * mean_edge_mm(surface) if distance_mm is None else distance_mm

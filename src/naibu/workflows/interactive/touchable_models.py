@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray, IntArray, require_positive
+from naibu.core.arrays import FloatArray, IntArray, require_positive, require_within
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
+from naibu.core.units import MODULI_KPA
 from naibu.identification.from_markers.specimen.specimen_model import GRAVITY, Specimen, specimen
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.io.meshes import MESH_READERS, read_mesh
@@ -64,7 +65,7 @@ class MeshMaterial:
     density_g_per_cm3: float = 1.0
 
     def __post_init__(self) -> None:
-        require_positive("young_modulus_kpa", self.young_modulus_kpa, "kPa")
+        require_within("young_modulus_kpa", self.young_modulus_kpa, *MODULI_KPA, "kPa")
         require_positive("density_g_per_cm3", self.density_g_per_cm3, "g/cm3")
         if not -0.9 <= self.poisson_ratio <= 0.499:
             raise InputError(f"poisson_ratio must lie between -0.9 and 0.499, not {self.poisson_ratio:g}")
@@ -118,7 +119,7 @@ def touchable(source: str | os.PathLike[str], *, experiment: Source | None = Non
     is_model = path.suffix == ".json" or (path.is_dir() and (path / MODEL_FILE).is_file())
     is_mesh = path.suffix.lower() in MESH_READERS
     if experiment is not None and not is_model:
-        raise InputError(f"experiment goes with an identified model, and {source} is none; leave it out, or name a {MODEL_FILE}")
+        raise InputError(f"`experiment` goes with an identified model, and {source} is none; leave it out, or name a {MODEL_FILE}")
     if material is not None and not is_mesh:
         raise InputError(f"material goes with a mesh, and {source} is none; leave it out, or name one of {', '.join(MESH_READERS)}")
     if is_model:
