@@ -70,6 +70,7 @@ IndenterMotion = RigidTransform | IndenterVelocity | IndenterForce
 """Motion of an indenter in a step: its pose at the end of it, from the position in which it was made; a velocity; or a force."""
 
 SHARE = 0.5  # of the radius of the largest sphere in an indenter, by which it may move at once where it touches
+MOST_PARTS = 4096  # of a step whose indenters are fast
 CAUTION = 0.9  # of a gap, by which an indenter may move at once
 
 
@@ -105,6 +106,28 @@ def safe_fraction(
             gap = float(replace(indenter.geometry, axes=own).distance(arms).min())
             fraction = min(fraction, max(allowed, CAUTION * gap) / way)
     return fraction
+
+
+def step_parts(
+    indenters: Sequence[RigidIndenter], points: FloatArray, centres: FloatArray, axes: FloatArray, travel: FloatArray, turn: FloatArray,
+    approach: float = 0.0,
+) -> int:  # fmt: skip
+    """Return into how many parts, a power of two, a step is divided in each of which no indenter passes through points.
+
+    The parameters are those of `safe_fraction`.
+    """
+    if not len(indenters):
+        return 1
+    allowed = np.array([SHARE * i.geometry.inradius for i in indenters])
+    ways = np.linalg.norm(travel, axis=1)
+    if not turn.any() and (ways <= allowed).all():
+        return 1
+    if turn.any():
+        arms = np.array([np.linalg.norm(points - centre, axis=1).max() for centre in centres])
+        ways = ways + np.linalg.norm(turn, axis=1) * arms
+    if (ways <= allowed).all() or safe_fraction(indenters, points, centres, axes, travel, turn, approach) >= 1.0:
+        return 1
+    return int(min(2 ** np.ceil(np.log2((ways / allowed).max())), MOST_PARTS))
 
 
 Poses = dict[int, tuple[FloatArray, FloatArray]]

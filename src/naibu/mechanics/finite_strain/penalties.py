@@ -92,6 +92,16 @@ def stiffened(problem: Problem, depths: Sequence[FloatArray], allowed: float) ->
     return problem.with_changes(contacts=contacts)
 
 
+def with_less_penetration(contacts: Sequence[Contact], depths: Sequence[FloatArray], allowed: float) -> tuple[Contact, ...] | None:
+    """Return contacts with higher normal penalties where `depths` (p,) exceed what is allowed; None where they do not."""
+    if not any((depth > allowed).any() for depth in depths):
+        return None
+    return tuple(
+        replace(c, normal_stiffness=np.where(depth > allowed, FACTOR, 1.0) * c.normal_stiffness)
+        for c, depth in zip(contacts, depths, strict=True)
+    )
+
+
 def with_normal_stiffness(problem: Problem, normal_stiffness: Sequence[FloatArray]) -> Problem:
     """Return the problem with these normal penalties of the points (p,) of every contact, kPa/mm; with its own where there are none."""
     if not normal_stiffness:

@@ -1,16 +1,13 @@
 """Quasi-static sessions of finite elements: a loop moves rigid indenters and bodies, and each step ends in equilibrium at finite strain.
 
-They follow the protocol of `naibu.mechanics.contact.session_protocol`, as lattices do, so that a loop can drive either. There is no
-inertia: the length of a step only turns velocities into displacements, and an indenter driven by a force stands where the body balances
-it.
+There is no inertia: the length of a step only turns velocities into displacements, and an indenter driven by a force stands where the body
+balances it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,16 +15,14 @@ from scipy.optimize import brentq
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import ConvergenceError, InputError
-from naibu.mechanics.contact.contact_surfaces import Friction, rigid_contact
+from naibu.mechanics.contact.indenter_contacts import moving_contacts
 from naibu.mechanics.contact.indenter_motion import IndenterForce, IndenterMotion, safe_fraction
-from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
-from naibu.mechanics.contact.session_protocol import StepForces
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
+from naibu.mechanics.finite_strain.indenter_session import IndenterSession
 from naibu.mechanics.finite_strain.penalties import with_normal_stiffness
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
-from naibu.mechanics.finite_strain.session_checks import checked_bodies, checked_velocities, require_one_friction, require_state
 from naibu.mechanics.finite_strain.statics import LoadState, Solution, solve
 
 IN_FEW_STEPS = SolverSettings(first_step=0.5, largest_step=1.0)
@@ -133,153 +128,40 @@ class QuasiStaticEngine:
 
 
 @dataclass(slots=True, eq=False)
-class QuasiStaticSession:
-    """A body that a loop moves from equilibrium to equilibrium; made by `QuasiStaticEngine.session`.
+class QuasiStaticSession(IndenterSession[QuasiStaticEngine, EquilibriumState]):
+    """A body that a loop moves from equilibrium to equilibrium; made by `QuasiStaticEngine.session`. Its attributes: `IndenterSession`.
 
-    Attributes
-    ----------
-    engine : QuasiStaticEngine
-        The model.
-    external_force : ndarray, shape (n, 3)
-        Dead load, mN.
-    reached : EquilibriumState
-        The last equilibrium.
-    bodies : tuple of ndarray
-        Nodes of each rigid body.
-    indenters : tuple of RigidIndenter
-        As they were made.
+    At most one of its indenters is driven by a force. A step raises `ConvergenceError` where there is no equilibrium, or where the body
+    does not balance the force.
     """
 
-    engine: QuasiStaticEngine
-    external_force: FloatArray
-    reached: EquilibriumState
-    bodies: tuple[IntArray, ...] = ()
-    indenters: tuple[RigidIndenter, ...] = ()
-    _forces: StepForces = field(default_factory=lambda: StepForces(np.zeros((0, 0, 3))))
-
-    def constrain(self, constrained: Sequence[ArrayLike], bodies: int = 0) -> None:
-        """Constrain these nodes, and no others, from the next step on.
-
-        Parameters
-        ----------
-        constrained : sequence of array_like
-            Nodes of each rigid body.
-        bodies : int
-            Number of bodies, if some have no node at present.
-
-        Raises
-        ------
-        InputError
-            A node that does not exist, or that belongs to two bodies.
-        """
-        self.bodies = checked_bodies(constrained, len(self.engine.points), bodies)
-
     def press(self, indenters: Sequence[RigidIndenter]) -> None:
-        """Bring these indenters, and no others, into play from the next step on, where they were made.
+        """Bring these indenters, and no others, into play from the next step on; see `IndenterSession.press`."""
+        IndenterSession.press(self, indenters)
+        self.reached = replace(self.reached, normal_stiffness=())
 
-        Raises
-        ------
-        InputError
-            An indenter with pull-off, or with a kinetic friction below the static one: quasi-static contact has neither.
-        """
-        require_one_friction(indenters)
-        self.indenters = tuple(indenters)
-        centres = np.array([i.centre for i in indenters], dtype=float).reshape(-1, 3)
-        placed = replace(self.reached, centres=centres, rotations=np.tile(np.eye(3), (len(centres), 1, 1)), anchors=(), normal_stiffness=())
-        contacts = self._contacts(placed, centres, np.zeros_like(centres))
-        self.reached = replace(placed, anchors=tuple(c.local(placed.displacement, 0.0) for c in contacts))
-
-    def step(self, velocity: ArrayLike = 0.0, motions: Sequence[IndenterMotion] = (), *, steps: int = 1) -> StepForces:
-        """Take steps to equilibrium.
-
-        Parameters
-        ----------
-        velocity : array_like, shape (3,), (bodies, 3) or (steps, bodies, 3)
-            Of the bodies of constrained nodes, mm/s.
-        motions : sequence of IndenterMotion
-            One for each indenter, or none: they stand still. At most one may be a force.
-        steps : int
-            Number of steps; a pose is reached at the end of the last.
-
-        Raises
-        ------
-        InputError
-            Motions for another number of indenters, or values of another shape.
-        ConvergenceError
-            There is no equilibrium, or none at which the body balances the force; the session stays at the last equilibrium.
-        """
-        driven = [k for k, motion in enumerate(motions) if isinstance(motion, IndenterForce)]
-        if len(driven) > 1:
+    def _check_motions(self, motions: Sequence[IndenterMotion]) -> None:
+        if sum(isinstance(motion, IndenterForce) for motion in motions) > 1:
             raise InputError("motions drives several indenters by forces; only one can be driven by a force in a step")
-        speeds = np.broadcast_to(np.asarray(velocity, dtype=float), (steps, len(self.bodies), 3))
-        duration = steps * self.engine.step
-        along, spin = checked_velocities(self.indenters, motions, self.reached.centres, self.reached.rotations, duration)
-        of_bodies, of_indenters = [], []
-        for moving in speeds:
-            ends = self.reached.centres + self.engine.step * along
-            solution = self._driven(motions[driven[0]], driven[0], moving, ends, spin) if driven else self._solved(moving, ends, spin)
-            self.reached = _end_of(solution)
-            of_bodies.append(self._body_forces(solution))
-            of_indenters.append(np.array([solution.reactions[c.name] for c in solution.problem.contacts]).reshape(-1, 3))
-        self._forces = StepForces(np.array(of_bodies).reshape(steps, -1, 3), np.array(of_indenters).reshape(steps, -1, 3))
-        return self._forces
 
-    def positions(self, nodes: ArrayLike | None = None) -> FloatArray:
-        """Return positions of nodes (k, 3), mm, by default of all."""
-        x = self.engine.points + self.reached.displacement
-        return x if nodes is None else np.asarray(x[np.asarray(nodes, dtype=np.int64)])
-
-    def forces(self) -> StepForces:
-        """Return the forces of the last call of `step`."""
-        return self._forces
-
-    def state(self) -> EquilibriumState:
-        """Return the equilibrium, contacts included."""
-        return self.reached
-
-    def restore(self, state: EquilibriumState) -> None:
-        """Go on from a state.
-
-        Raises
-        ------
-        InputError
-            A state of another mesh or of other indenters.
-        """
-        require_state(state.displacement, state.anchors, self.engine.points, self.indenters)
-        self.reached = state if len(state.anchors) == len(self.indenters) else replace(self.reached, displacement=state.displacement)
-
-    def close(self) -> None:
-        """Do nothing: the session holds neither threads nor device memory."""
-
-    def __enter__(self) -> Self:
-        """Return the session."""
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """Close it."""
-
-    def _contacts(self, state: EquilibriumState, ends: FloatArray, turn: FloatArray) -> tuple[Contact, ...]:
-        """Contacts whose bodies move from where they are to their ends during the load, and turn, rad."""
-        engine, out = self.engine, []
-        for k, indenter in enumerate(self.indenters):
-            contact = rigid_contact(
-                f"indenter {k}", engine.points, engine.faces, indenter.geometry, start=state.centres[k], stop=ends[k],
-                friction=Friction(indenter.static_friction, engine.tangential_stiffness), normal_stiffness=engine.normal_stiffness,
-                rotation=state.rotations[k],
-            )  # fmt: skip
-            out.append(replace(contact, tilt=turn[k]) if turn[k].any() else contact)
-        return tuple(out)
+    def _advance(
+        self, moving: FloatArray, along: FloatArray, spin: FloatArray, motions: Sequence[IndenterMotion]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Take one step to equilibrium; returns the forces of the bodies and of the indenters, mN."""
+        ends = self.reached.centres + self.engine.step * along
+        driven = [(k, motion) for k, motion in enumerate(motions) if isinstance(motion, IndenterForce)]
+        solution = self._driven(driven[0][1], driven[0][0], moving, ends, spin) if driven else self._solved(moving, ends, spin)
+        self.reached = _end_of(solution)
+        of_indenters = np.array([solution.reactions[c.name] for c in solution.problem.contacts]).reshape(-1, 3)
+        return self._body_forces(solution), of_indenters
 
     def _solved(self, velocity: FloatArray, ends: FloatArray, spin: FloatArray) -> Solution:
         """Equilibrium at the ends, reached in parts in which no indenter passes through the object."""
         at, left, duration = self.reached, 1.0, self.engine.step
         fastest = float(np.linalg.norm(velocity, axis=1).max(initial=0.0))
-        surface = self._contacts(at, ends, spin)
         for _ in range(MOST_PARTS):
-            points = surface[0].positions(at.displacement) if surface else np.zeros((0, 3))
-            axes = np.array([i.geometry.axes @ r.T for i, r in zip(self.indenters, at.rotations, strict=True)]).reshape(-1, 3, 3)
             travel, turn, approach = ends - at.centres, left * duration * spin, left * duration * fastest
-            fraction = safe_fraction(self.indenters, points, at.centres, axes, travel, turn, approach)
+            fraction = safe_fraction(*self._places_of(at), travel, turn, approach)
             solution = self._part_solved(at, fraction * left * duration * velocity, at.centres + fraction * travel, fraction * turn)
             if fraction >= 1.0:
                 return solution
@@ -294,13 +176,13 @@ class QuasiStaticSession:
             if len(nodes):
                 prescribed = prescribed.and_also(nodes, at.displacement[nodes] + way)
         prescribed = replace(prescribed, start=at.displacement)
-        problem = Problem(self.engine.points, self.engine.assembler, self._contacts(at, ends, turn), prescribed, self.external_force)
+        contacts = moving_contacts(self._templates, at.centres, at.rotations, ends - at.centres, turn)
+        problem = Problem(self.engine.points, self.engine.assembler, contacts, prescribed, self.external_force)
         problem = with_normal_stiffness(problem, at.normal_stiffness)
         return solve(problem, settings=self.engine.settings, start=LoadState(0.0, at.displacement, at.anchors))
 
-    def _driven(self, motion: IndenterMotion, index: int, velocity: FloatArray, ends: FloatArray, spin: FloatArray) -> Solution:
+    def _driven(self, motion: IndenterForce, index: int, velocity: FloatArray, ends: FloatArray, spin: FloatArray) -> Solution:
         """Move an indenter along its guide to where the body balances its force."""
-        assert isinstance(motion, IndenterForce)
         guide, wanted = motion.guide(), float(motion.force)
         extent = float(np.ptp(self.engine.points, axis=0).max())
         tried: dict[float, Solution] = {}

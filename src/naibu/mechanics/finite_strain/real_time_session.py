@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
-from naibu.core.rigid_transform import rotation_matrix
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.pressure_elements import PressureElements
@@ -162,6 +161,15 @@ class RealTimeSession(DynamicSession):
         self._pressure, self._trial, self._near, self._gaps = None, None, (), ()
         return DynamicSession._balanced(self, h, moving, contacts)
 
+    def _depths(self, contacts: tuple[Contact, ...], u: FloatArray) -> list[FloatArray]:
+        """Return how deep indenters go into the faces; see `DynamicSession`. Of quasi-Newton steps only points near them are looked at."""
+        if self._trial is None:
+            return DynamicSession._depths(self, contacts, u)
+        depths = [np.zeros(len(c.nodes)) for c in contacts]
+        for depth, near in zip(depths, self._near, strict=True):
+            depth[near.points] = -near.response.gap / near.contact.element_size
+        return depths
+
     def _quasi_newton(self, moving: FloatArray, contacts: tuple[Contact, ...]) -> _Trial | None:
         """Return the balance at the end of a step, or None."""
         tangent, start, h = self._current_tangent(), self.reached, self.engine.step
@@ -241,9 +249,9 @@ class RealTimeSession(DynamicSession):
         contact = np.zeros_like(balance)
         for near in self._near:
             near.add_force(u, contact)
-        residual, scale = self._balance(engine.step, u, inertial, balance, contact)
+        residual, allowed = self._implicit_step(engine.step, ()).balance(u, balance, contact)
         balance += (engine.mass / engine.step**2)[:, None] * (u - inertial) - self.external_force - contact
-        return _Trial(u, pressure, balance, mismatch, float(np.abs(residual).sum()) / scale)
+        return _Trial(u, pressure, balance, mismatch, engine.tolerance * float(np.abs(residual).sum()) / allowed)
 
     def _change(self, tangent: EarlierTangent) -> BlockChange:
         """Return where contacts and grips differ from those of a tangent."""
@@ -261,7 +269,7 @@ class RealTimeSession(DynamicSession):
 
     def _accepted(self, h: float, u: FloatArray, contacts: tuple[Contact, ...], spin: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Keep the end of a step; returns the forces of the bodies and of the indenters, mN."""
-        trial, start = self._trial, self.reached
+        trial = self._trial
         if trial is None:
             return DynamicSession._accepted(self, h, u, contacts, spin)
         of_indenters, anchors, gaps = np.zeros((len(contacts), 3)), [], []
@@ -271,10 +279,7 @@ class RealTimeSession(DynamicSession):
             gaps.append(gap)
             local[near.points] = near.contact.next_anchors(near.response)
             anchors.append(local)
-        centres = np.array([c.stop for c in contacts]).reshape(-1, 3)
-        turned = [rotation_matrix(h * w) @ r if w.any() else r for w, r in zip(spin, start.rotations, strict=True)]
-        rotations = np.array(turned).reshape(-1, 3, 3)
-        self.reached = DynamicState(u, (u - start.displacement) / h, centres, rotations, tuple(anchors))
+        self.reached = self._behind(h, u, contacts, spin, tuple(anchors))
         self._pressure, self._gaps = trial.pressure, tuple(gaps)
         self._renew(self._soon_touched(contacts, gaps))
         return np.array([trial.balance[nodes].sum(axis=0) for nodes in self.bodies]).reshape(-1, 3), of_indenters
@@ -336,7 +341,7 @@ class RealTimeSession(DynamicSession):
         for some, place, all_places in zip(near, places, self._positions, strict=False):
             some.add_stiffness(pattern, all_places, blocks)
             some.add_stiffness(engine._surface, place, contact)
-        blocks[self._diagonal] += (engine.mass / engine.step**2)[:, None, None] * np.eye(3)
+        blocks[pattern.diagonal()] += (engine.mass / engine.step**2)[:, None, None] * np.eye(3)
         fixed = np.zeros(engine.points.shape, dtype=bool)
         fixed[held] = True
         solver = engine._solvers.get()

@@ -30,21 +30,6 @@ def checked_bodies(constrained: Sequence[ArrayLike], n_points: int, bodies: int)
     return chosen + tuple(np.zeros(0, np.int64) for _ in range(bodies - len(chosen)))
 
 
-def require_one_friction(indenters: Sequence[RigidIndenter]) -> None:
-    """Check that the contact of finite elements can represent indenters.
-
-    Raises
-    ------
-    InputError
-        An indenter with pull-off, or with a kinetic friction below the static one.
-    """
-    for k, indenter in enumerate(indenters):
-        if indenter.pull_stiffness or indenter.pull_damping:
-            raise InputError(f"indenters[{k}] has pull-off, which needs a lattice; use one, or leave pull-off out")
-        if indenter.kinetic_friction != indenter.static_friction:
-            raise InputError(f"indenters[{k}] has two friction coefficients; contact of finite elements has one: give both the same value")
-
-
 def checked_velocities(
     indenters: Sequence[RigidIndenter], motions: Sequence[IndenterMotion], centres: FloatArray, rotations: FloatArray, duration_s: float
 ) -> tuple[FloatArray, FloatArray]:

@@ -75,6 +75,11 @@ class BlockPattern:
         n = blocks.shape[1] * self.n_points
         return sp.bsr_matrix((blocks, self.indices, self.indptr), shape=(n, n))
 
+    def diagonal(self) -> IntArray:
+        """Return the indices (n,) of the diagonal blocks, which are those of nodes that belong to a group."""
+        rows = np.repeat(np.arange(self.n_points), np.diff(self.indptr))
+        return np.flatnonzero(self.indices == rows)
+
     def positions(self, connectivity: IntArray) -> Int32Array:
         """Return the indices (m, k, k) of the blocks of local nodes (a, b) of all groups (m, k)."""
         return np.asarray(_block_positions(self.indptr, self.indices, connectivity))

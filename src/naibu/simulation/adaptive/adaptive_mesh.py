@@ -31,6 +31,8 @@ class MeshState:
         Masses of the cells, kg.
     history : ndarray, shape (m, h)
         History variables of the cells.
+    nodal : ndarray, shape (n, k), optional
+        Other values of the vertices: new ones have the mean of the ends of their edges.
     """
 
     displacement: FloatArray
@@ -38,6 +40,7 @@ class MeshState:
     mass: FloatArray
     cell_mass: FloatArray
     history: FloatArray
+    nodal: FloatArray | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -89,7 +92,8 @@ class AdaptiveMesh:
     def changed(self, state: MeshState, refine: IntArray, coarsen: IntArray) -> MeshState | None:
         """Refine and coarsen given leaves; return the state on the new mesh, or None where nothing changed."""
         forest, leaf = self.forest, self.leaf
-        nodal, velocity = (_scattered(v, leaf.nodes, forest.node_rows) for v in (state.displacement, state.velocity))
+        d = state.displacement.shape[1]
+        nodal, velocity = (_scattered(v, leaf.nodes, forest.node_rows) for v in (_with_nodal(state), state.velocity))
         mass = _scattered(state.mass, leaf.nodes, forest.node_rows)
         cell_mass, history = (_scattered(v, leaf.cells, forest.cell_rows) for v in (state.cell_mass, state.history))
         anything = False
@@ -103,7 +107,8 @@ class AdaptiveMesh:
             return None
         self.leaf = forest.leaf_mesh()
         nodes, cells = self.leaf.nodes, self.leaf.cells
-        return MeshState(nodal[nodes], velocity[nodes], mass[nodes], cell_mass[cells], history[cells])
+        others = None if state.nodal is None else nodal[nodes, d:]
+        return MeshState(nodal[nodes, :d], velocity[nodes], mass[nodes], cell_mass[cells], history[cells], others)
 
     def cut(
         self, state: MeshState, blade: SweptBlade, distance_mm: float, earlier: SweptBlade | None = None
@@ -121,6 +126,7 @@ class AdaptiveMesh:
         displacement = _scattered(state.displacement, leaf.nodes, forest.node_rows)
         velocity = _scattered(state.velocity, leaf.nodes, forest.node_rows)
         cell_mass, history = (_scattered(v, leaf.cells, forest.cell_rows) for v in (state.cell_mass, state.history))
+        others = None if state.nodal is None else _scattered(state.nodal, leaf.nodes, forest.node_rows)
         found = cut_forest(forest, blade, distance_mm, positions=forest.points + displacement, earlier=earlier)
         nodal = [found.nodal(forest, values) for values in (displacement, velocity)]
         self.leaf = forest.leaf_mesh()
@@ -130,7 +136,8 @@ class AdaptiveMesh:
         mass = np.bincount(corners.ravel(), np.repeat(of_cell / corners.shape[1], corners.shape[1]), minlength=len(nodes)).astype(
             np.float64
         )
-        behind = MeshState(nodal[0][nodes], nodal[1][nodes], mass, of_cell, found.cellwise(forest, history)[cells])
+        own = None if others is None else found.nodal(forest, others)[nodes]
+        behind = MeshState(nodal[0][nodes], nodal[1][nodes], mass, of_cell, found.cellwise(forest, history)[cells], own)
         return behind, found
 
     def _changes(self, refine: IntArray, coarsen: IntArray) -> Iterator[MeshChange]:
@@ -147,6 +154,10 @@ class AdaptiveMesh:
                 return
             yield change
             coarsen = np.concatenate([coarsen, change.parents])
+
+
+def _with_nodal(state: MeshState) -> FloatArray:
+    return state.displacement if state.nodal is None else np.concatenate([state.displacement, state.nodal], axis=1)
 
 
 def _scattered(values: FloatArray, rows: IntArray, count: int) -> FloatArray:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,6 +11,8 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import FloatArray, IntArray, require_positive
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
+from naibu.mechanics.contact.indenter_motion import IndenterMotion, IndenterVelocity, indenter_velocities
+from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.contact.session_protocol import StepForces
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.cpu.session import LatticeSession
@@ -19,8 +22,10 @@ from naibu.mechanics.lattices.model.tetrahedral_springs import DampingRule, edge
 from naibu.meshing.cutting.forest_cut import ForestCut
 from naibu.meshing.cutting.swept_blade import SweptBlade
 from naibu.meshing.refinement.marking import Criterion
+from naibu.meshing.surface import boundary_faces
 from naibu.simulation.adaptive.adaptive_mesh import AdaptiveMesh, MeshState
 from naibu.simulation.adaptive.conditions import Conditions
+from naibu.simulation.adaptive.contact_transfer import transferred_contact
 
 _FIRST, _SECOND = np.triu_indices(4, 1)
 
@@ -97,7 +102,8 @@ class MeshSprings:
         stiffness = material.young_modulus * around / lengths**2
         voigt = edge_damping(stiffness, mass[edges].sum(axis=1), lengths, material.damping, material.damping_ratio)
         zero, surface = np.zeros(len(edges), dtype=np.int8), np.zeros(len(points), dtype=bool)
-        lattice = Lattice(points, edges, mass, zero, zero, zero, surface, float(lengths.mean()), np.ones(len(edges)))
+        faces = boundary_faces(mesh.leaf.mesh).faces
+        lattice = Lattice(points, edges, mass, zero, zero, zero, surface, float(lengths.mean()), np.ones(len(edges)), faces=faces)
         series = np.full(len(edges), float(material.series_damping))
         return cls(lattice, LatticeParameters(stiffness, voigt, series, np.full(len(edges), 0.5)), number, material.density * volumes)
 
@@ -108,7 +114,8 @@ class AdaptiveLattice:
 
     Springs, masses and dampings of every mesh follow from the volumes of its tetrahedra at rest, as the report has them, so that the
     stationary state depends on the mesh but not on how it came about. New nodes lie in the middle of their edge and move with its mean
-    velocity; momentum is conserved. The creep of series dashpots is carried as a strain of the cells.
+    velocity; momentum is conserved. The creep of series dashpots is carried as a strain of the cells. Rigid indenters touch the faces of
+    the present mesh; what their contact has come to, pressure and friction, goes on on the next one.
 
     Attributes
     ----------
@@ -154,6 +161,7 @@ class AdaptiveLattice:
         conditions: Conditions,
         criterion: Criterion | None,
         *,
+        indenters: Sequence[RigidIndenter] = (),
         max_level: int = 3,
         bisections: int = 3,
         interval: int = 20,
@@ -171,6 +179,8 @@ class AdaptiveLattice:
             What moves.
         criterion : Criterion or None
             Where the mesh is refined and coarsened; None: nowhere.
+        indenters : sequence of RigidIndenter
+            See `press`.
         max_level, bisections : int
             See `naibu.simulation.adaptive.adaptive_mesh.AdaptiveMesh`.
         interval : int
@@ -181,7 +191,7 @@ class AdaptiveLattice:
         Raises
         ------
         InputError
-            Cells other than tetrahedra, conditions that select nothing they should, or settings out of range.
+            Cells other than tetrahedra, conditions that select nothing they should, settings out of range, or what `press` refuses.
         """
         if mesh.cell_type != "tetra":
             raise InputError(f"volumetric springs lie on the edges of tetrahedra, not of {mesh.cell_type!r} cells; split the cells first")
@@ -190,7 +200,7 @@ class AdaptiveLattice:
         adaptive = AdaptiveMesh.of(mesh, criterion, max_level=max_level, bisections=bisections)
         springs = MeshSprings.of(adaptive, material)
         engine = LatticeEngine.of(springs.lattice, springs.parameters, step=step, method=method, tolerance=tolerance)
-        session = _session(engine, conditions, adaptive, None)
+        session = _session(engine, conditions, adaptive, None, indenters)
         return cls(adaptive, material, conditions, step, method, interval, tolerance, springs, session)
 
     @property
@@ -198,39 +208,71 @@ class AdaptiveLattice:
         """The present lattice."""
         return self.springs.lattice
 
-    def step(self, velocity: ArrayLike = 0.0, *, steps: int = 1) -> StepForces:
+    @property
+    def indenters(self) -> tuple[RigidIndenter, ...]:
+        """Rigid indenters in contact, as they were made."""
+        return self.session.indenters
+
+    def press(self, indenters: Sequence[RigidIndenter]) -> None:
+        """Bring these indenters, and no others, into play from the next step on, where they were made.
+
+        Raises
+        ------
+        InputError
+            An explicit method, or an indenter inside the object.
+        """
+        self.session.press(indenters)
+
+    def indenter_distance(self, positions: FloatArray) -> FloatArray:
+        """Return the signed distance (k,), mm, of positions (k, 3), mm, from the nearest indenter where it is now.
+
+        With `naibu.meshing.NearContact` it is a criterion that follows the indenters.
+        """
+        centres, axes = self.session.poses()
+        gaps = [replace(i.geometry, axes=a).distance(positions - c) for i, c, a in zip(self.indenters, centres, axes, strict=True)]
+        return np.min([np.full(len(positions), np.inf), *gaps], axis=0)
+
+    def step(self, velocity: ArrayLike = 0.0, motions: Sequence[IndenterMotion] = (), *, steps: int = 1) -> StepForces:
         """Take steps, and adapt the mesh after every `interval` of them.
 
         Parameters
         ----------
         velocity : array_like
             Velocities of the bodies that move nodes, mm/s, broadcast to (bodies, 3); the fixed nodes are body 0.
+        motions : sequence of IndenterMotion
+            One for each indenter, or none, and they stand still; see `LatticeSession.step`.
         steps : int
             How many.
 
         Returns
         -------
         StepForces
-            Of the bodies on the lattice in every step, mN.
+            Of the bodies and the indenters on the lattice in every step, mN.
 
         Raises
         ------
         InputError
-            Velocities of another shape, or no step.
+            Velocities or motions of another number of bodies, or no step.
         ConvergenceError
             The explicit method diverged.
         """
         if steps < 1:
             raise InputError(f"steps must be at least 1, not {steps}")
-        forces, left = [], steps
+        parts, left = self._towards(motions, steps), steps
+        forces = []
         while left:
             chunk = min(left, self.interval - self._since)
-            forces.append(self.session.step(velocity, steps=chunk).bodies)
+            forces.append(self.session.step(velocity, motions if chunk == steps else parts, steps=chunk))
             left, self._since = left - chunk, self._since + chunk
             if self._since == self.interval:
                 self.adapt()
                 self._since = 0
-        return StepForces(np.concatenate(forces))
+        return StepForces(np.concatenate([f.bodies for f in forces]), np.concatenate([f.indenters for f in forces]))
+
+    def _towards(self, motions: Sequence[IndenterMotion], steps: int) -> list[IndenterMotion]:
+        """Return motions that hold in each of the steps: poses as the velocities that reach them at the end."""
+        velocity, spin, poses = indenter_velocities(self.indenters, motions, *self.session.poses(), steps * self.time_step)
+        return [IndenterVelocity(velocity[k], spin[k]) if k in poses else motion for k, motion in enumerate(motions)]
 
     def adapt(self) -> bool:
         """Refine and coarsen the mesh by the criterion; return whether it changed."""
@@ -276,7 +318,7 @@ class AdaptiveLattice:
             Nodes that are held by two bodies.
         """
         state = self.session.state()
-        self.session = _session(self._engine(), conditions, self.mesh, state)
+        self.session = _session(self._engine(), conditions, self.mesh, state, self.indenters, self.session.speed)
         self.conditions = conditions
 
     def positions(self, nodes: ArrayLike | None = None) -> FloatArray:
@@ -313,20 +355,27 @@ class AdaptiveLattice:
         if np.isfinite(self.material.series_damping):
             creep = _lengths(state.position, springs.lattice.elements) - springs.lattice.lengths - state.extension
             history = _tensors(springs, self.mesh.leaf.mesh.cells, creep)
-        return MeshState(state.position - springs.lattice.points, state.velocity, springs.lattice.node_mass, springs.cell_mass, history)
+        pressure = None if state.contact is None else state.contact.multiplier.T
+        motion = (state.position - springs.lattice.points, state.velocity)
+        return MeshState(*motion, springs.lattice.node_mass, springs.cell_mass, history, pressure)
 
     def _follow(self, state: MeshState | None) -> bool:
         """Go on, on the mesh that a state belongs to."""
         if state is None:
             return False
+        before, indenters, contact = self.session.engine.surface, self.indenters, self.session.state().contact
         self.springs = MeshSprings.of(self.mesh, self.material)
         lattice = self.springs.lattice
         position = lattice.points + state.displacement
         extension = _lengths(position, lattice.elements) - lattice.lengths
         if state.history.shape[1]:
             extension -= _creep(self.springs, state.history)
+        engine = self._engine()
+        if contact is not None and state.nodal is not None:
+            contact = transferred_contact(contact, before(), engine.surface(), indenters, state.nodal.T)
         self.session.close()
-        self.session = _session(self._engine(), self.conditions, self.mesh, LatticeState(position, state.velocity, extension))
+        followed = LatticeState(position, state.velocity, extension, contact=contact)
+        self.session = _session(engine, self.conditions, self.mesh, followed, indenters, self.session.speed)
         self.adaptations += 1
         return True
 
@@ -335,13 +384,19 @@ class AdaptiveLattice:
         return LatticeEngine.of(springs.lattice, springs.parameters, step=self.time_step, method=self.method, tolerance=self.tolerance)
 
 
-def _session(engine: LatticeEngine, conditions: Conditions, mesh: AdaptiveMesh, state: LatticeState | None) -> LatticeSession:
+def _session(
+    engine: LatticeEngine, conditions: Conditions, mesh: AdaptiveMesh, state: LatticeState | None, indenters: Sequence[RigidIndenter],
+    speed: FloatArray | None = None,
+) -> LatticeSession:  # fmt: skip
     lattice, held = engine.lattice, ConstrainedNodes.none()
     for axis, fixed in enumerate(conditions.constrained(lattice.points).T):
         held = held + ConstrainedNodes.of(np.flatnonzero(fixed), axes=(axis,))
     for body, selected in enumerate(conditions.moved, start=1):
         held = held + ConstrainedNodes.of(np.flatnonzero(selected(lattice.points)), body)
-    return engine.session(state, held, conditions.force(mesh.leaf.mesh, lattice.node_mass))
+    session = engine.session(state, held, conditions.force(mesh.leaf.mesh, lattice.node_mass), indenters)
+    if speed is not None:
+        session.speed[:] = speed
+    return session
 
 
 def _lengths(points: FloatArray, edges: IntArray) -> FloatArray:

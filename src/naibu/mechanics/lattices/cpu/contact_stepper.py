@@ -10,7 +10,7 @@ import numpy as np
 
 from naibu.core.arrays import AnyArray, FloatArray
 from naibu.mechanics.contact.indenter_geometry import GeometryArrays, packed_geometries
-from naibu.mechanics.contact.indenter_motion import SHARE, safe_fraction
+from naibu.mechanics.contact.indenter_motion import SHARE, step_parts
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.lattices.cpu._contact_kernels import contact_steps
 from naibu.mechanics.lattices.cpu._contact_operator import new_operator
@@ -26,7 +26,6 @@ DEEP, ROUND = (
     0.5,
     0.9,
 )  # of the radius of the largest sphere in an indenter: depth from which foundations are stiffer, of flat and round ones
-MOST_PARTS = 4096  # of a step whose indenters are fast
 
 
 @dataclass(slots=True, eq=False)
@@ -119,7 +118,7 @@ class ContactStepper:
             return self._taken(self.base, 1, held_velocity, velocity, spin, reactions)
         found = np.zeros(3, dtype=np.int64)
         for n in range(len(velocity)):
-            parts = self._parts(velocity[n], spin[n], allowed)
+            parts = self._parts(velocity[n], spin[n])
             own = [np.repeat(motion[n : n + 1], parts, axis=0) for motion in (held_velocity, velocity, spin)]
             forces = (np.empty_like(own[0]), np.empty_like(own[1]))
             taken = self._taken(self._finer_by(parts), parts, own[0], own[1], own[2], forces)
@@ -128,20 +127,13 @@ class ContactStepper:
                 whole[n] = pieces.mean(axis=0)
         return int(found[0]), int(found[1]), int(found[2])
 
-    def _parts(self, velocity: FloatArray, spin: FloatArray, allowed: FloatArray) -> int:
+    def _parts(self, velocity: FloatArray, spin: FloatArray) -> int:
         """Parts of a step, a power of two, in each of which no indenter passes through the surface."""
         base, contact, duration = self.base, self.contact, self.base.step
         corners = base.position.reshape(3, -1)[:, self.points[0]].transpose(1, 2, 0)
         points = np.concatenate([corners.reshape(-1, 3), corners.mean(axis=1)])
-        turn = duration * spin
-        arms = np.array([np.linalg.norm(points - centre, axis=1).max() for centre in contact.centres])
-        ways = duration * np.linalg.norm(velocity, axis=1) + np.linalg.norm(turn, axis=1) * arms
-        if (ways <= allowed).all():
-            return 1
         approach = duration * float(np.linalg.norm(base.velocity.reshape(3, -1), axis=0).max())
-        if safe_fraction(self.indenters, points, contact.centres, contact.axes, duration * velocity, turn, approach) >= 1.0:
-            return 1
-        return int(min(2 ** np.ceil(np.log2((ways / allowed).max())), MOST_PARTS))
+        return step_parts(self.indenters, points, contact.centres, contact.axes, duration * velocity, duration * spin, approach)
 
     def _finer_by(self, parts: int) -> ImplicitStepper:
         """Return the stepper whose steps are shorter by `parts`."""

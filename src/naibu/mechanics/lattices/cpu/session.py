@@ -93,6 +93,8 @@ class LatticeSession:
         Implicit steps in which the stretching by rotation was limited.
     unsettled : int
         Steps whose contacts did not settle; each kept what the last pass gave.
+    speed : ndarray, shape (k, 3)
+        Velocities of the indenters at the end of the last step, mm/s.
     clock : callable
         Returns the time, s.
     """
@@ -107,9 +109,9 @@ class LatticeSession:
     iterations: int = 0
     rotation_limited: int = 0
     unsettled: int = 0
+    speed: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     clock: Callable[[], float] = perf_counter
     _contact: ContactStepper | None = None
-    _speed: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     _largest_force: float = 0.0
     _began: float = 0.0
     _ended: float = 0.0
@@ -258,6 +260,12 @@ class LatticeSession:
         chosen = by_component if nodes is None else by_component[:, np.asarray(nodes, dtype=np.int64)]
         return np.ascontiguousarray(chosen.T, dtype=np.float64)
 
+    def poses(self) -> tuple[FloatArray, FloatArray]:
+        """Return where the indenters are: reference points (k, 3), mm, and axes (k, 3, 3), in rows."""
+        if self._contact is None:
+            return np.zeros((0, 3)), np.zeros((0, 3, 3))
+        return self._contact.contact.centres.copy(), self._contact.contact.axes.copy()
+
     def close(self) -> None:
         """Send the threads of the pool away, until the next step; the garbage collector does it as well."""
         self.stepper.close()
@@ -277,7 +285,7 @@ class LatticeSession:
         known, surface = None if state is None else state.contact, self.engine.surface()
         known = known or begin_contact(lattice, surface, indenters, self.positions())
         self._contact = ContactStepper.of(stepper, indenters, known, surface, self.engine.divided)
-        self.indenters, self._speed, self._largest_force = tuple(indenters), np.zeros((len(indenters), 3)), 0.0
+        self.indenters, self.speed, self._largest_force = tuple(indenters), np.zeros((len(indenters), 3)), 0.0
 
     def _advance(self, reaction: FloatArray) -> None:
         now = self.clock()
@@ -302,7 +310,7 @@ class LatticeSession:
             found = stepper.advance(self._path, path, spins, (forces.bodies, forces.indenters))
         for k, (centre, axes) in poses.items():
             contact.centres[k], contact.axes[k] = centre, axes
-        self._speed = path[-1].copy()
+        self.speed = path[-1].copy()
         self.iterations += found[0]
         self.unsettled += found[2]
 
@@ -312,7 +320,7 @@ class LatticeSession:
         assert isinstance(motion, IndenterForce)
         along, inertia = motion.guide(), motion.mass_kg / self.engine.step
         self._largest_force = max(self._largest_force, abs(motion.force), 1e-300)
-        body = DrivenIndenter(number, along, inertia, float(self._speed[number] @ along), inertia)
+        body = DrivenIndenter(number, along, inertia, float(self.speed[number] @ along), inertia)
         total = np.zeros(3, dtype=np.int64)
         for n in range(len(self._path)):
             own = (self._path[n : n + 1], paths[0][n : n + 1], paths[1][n : n + 1])
