@@ -22,18 +22,15 @@ import time
 import numpy as np
 
 from naibu.core.mesh import Mesh
-from naibu.mechanics.contact.contact_surfaces import Friction, rigid_contact
-from naibu.mechanics.contact.indenter_geometry import sphere_geometry
-from naibu.mechanics.contact.penalty_contact import Contact
+from naibu.mechanics.contact.rigid_indenters import spherical_indenter
 from naibu.mechanics.finite_elements.hyperelasticity import material
 from naibu.meshing.primitives import box
 from naibu.meshing.refinement.forest import BisectionForest
-from naibu.meshing.surface import boundary_faces
 from naibu.simulation.adaptive.body import AdaptiveBody
 from naibu.simulation.adaptive.conditions import Conditions, face_force
 from naibu.simulation.adaptive.error_criterion import StressError
 from naibu.simulation.adaptive.hyperelastic_dynamics import HyperelasticDynamics
-from naibu.simulation.adaptive.statics import StaticResult, StaticSolve, hyperelastic_static, solve_adaptively
+from naibu.simulation.adaptive.statics import StaticResult, StaticSolve, hyperelastic_static, pressed_by, solve_adaptively
 
 MARKED, REPEATS = 1000, 7
 RADIUS_MM, DEPTH_MM, HEIGHT_MM = 20.0, 2.0, 50.0
@@ -75,16 +72,6 @@ def timed(forest: BisectionForest, marked: np.ndarray) -> tuple[int, float, floa
     return len(new), refining, coarsening
 
 
-def pressed(mesh: Mesh) -> tuple[Contact, ...]:
-    """Return the contact of the sphere with the upper face."""
-    faces = boundary_faces(mesh).faces
-    top = faces[(mesh.points[faces][:, :, 2] > HEIGHT_MM - 1e-9).all(axis=1)]
-    start = np.array([0.0, 0.0, HEIGHT_MM + RADIUS_MM])
-    stop = start - [0.0, 0.0, DEPTH_MM]
-    surface = sphere_geometry(RADIUS_MM)
-    return (rigid_contact("sphere", mesh.points, top, surface, start=start, stop=stop, friction=Friction(0.0), normal_stiffness=1000.0),)
-
-
 def block(n: int) -> Mesh:
     """Return a quarter of the block, of n cubes along a side, below the middle of its upper face."""
     return box((50.0, 50.0, HEIGHT_MM), (n, n, n), cell_type="tetra", centred=False)
@@ -100,13 +87,19 @@ def forces(solve_on: StaticSolve, n: int, limit: int, **settings: float) -> tupl
         return found
 
     found = solve_adaptively(block(n), clocked, tolerance=0.0, max_unknowns=limit, **settings)  # type: ignore[arg-type]
-    return np.array(found.unknowns, dtype=float), np.array([-4.0 * r.reactions["sphere"][2] / 1e3 for r in found.rounds]), np.array(times)
+    return (
+        np.array(found.unknowns, dtype=float),
+        np.array([-4.0 * r.reactions["indenter 0"][2] / 1e3 for r in found.rounds]),
+        np.array(times),
+    )
 
 
 def indentation(limit: int = 20_000, uniform_limit: int = 40_000) -> None:
     law = material("linear_elastic", young_modulus=10.0, poisson_ratio=0.3)
     planes = tuple((lambda p, axis=axis: p[:, axis] < 1e-9, axis) for axis in range(2))
-    solve_on = hyperelastic_static(Conditions(lambda p: p[:, 2] < 1e-9, rollers=planes), [law], contacts=pressed)
+    sphere = spherical_indenter((0.0, 0.0, HEIGHT_MM + RADIUS_MM), RADIUS_MM)
+    contacts = pressed_by([sphere], (0.0, 0.0, -DEPTH_MM), faces=lambda p: p[:, 2] > HEIGHT_MM - 1e-9)
+    solve_on = hyperelastic_static(Conditions(lambda p: p[:, 2] < 1e-9, rollers=planes), [law], contacts=contacts)
     solve_on(block(4), None)
     adaptive = forces(solve_on, 4, limit, fraction=0.6)
     uniform = forces(solve_on, 6, uniform_limit, fraction=1.0, bisections=3)

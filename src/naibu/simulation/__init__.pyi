@@ -6,7 +6,7 @@ from .adaptive.hyperelastic_dynamics import HyperelasticDynamics
 from .adaptive.lattice import AdaptiveLattice, SpringMaterial
 from .adaptive.linear_dynamics import LinearDynamics
 from .adaptive.spring_levels import level_spring
-from .adaptive.statics import AdaptiveSolution, StaticResult, hyperelastic_static, linear_static, solve_adaptively
+from .adaptive.statics import AdaptiveSolution, StaticResult, hyperelastic_static, linear_static, pressed_by, solve_adaptively
 from .force_limits import ForceLimits
 from .haptic_loop import DeviceChannel, DeviceForce, DevicePose, HapticHand
 from .interactive_bodies import FiniteElementBody, InteractiveBody, LatticeBody
@@ -53,6 +53,7 @@ __all__ = [
     "linear_static",
     "opened",
     "opening",
+    "pressed_by",
     "recovery_indicators",
     "residual_indicators",
     "solve_adaptively",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,12 +16,16 @@ from naibu.mechanics import (
     IndenterVelocity,
     QuasiStaticEngine,
     RealTimeEngine,
+    RigidIndenter,
     body_force,
+    box_indenter,
     elements,
     material,
     plane_indenter,
     spherical_indenter,
 )
+from naibu.mechanics.contact.indenter_contacts import indenter_contacts
+from naibu.mechanics.finite_strain.dynamic_session import DynamicSession
 from naibu.meshing import boundary_faces, box
 from naibu.meshing.element_conversion import to_tetra
 
@@ -108,3 +113,39 @@ def test_a_session_goes_on_from_its_state() -> None:
     session.restore(kept)
     session.step(motions=down, steps=2)
     np.testing.assert_allclose(session.positions(), first, atol=0.01 * np.abs(first - made.points).max())
+
+
+def test_a_pusher_of_5_m_per_s_rests_where_one_that_came_slowly_does() -> None:
+    """It goes 8 mm in a step of 1.6 ms."""
+    made = replace(engine(background=False), step=1.6e-3)
+    held, rests = [lowest(made.points)], []
+    pusher = spherical_indenter((1.0, 2.0, SIZE + 11.0), 8.0)
+    for steps in (1, 8):
+        session = made.session(constrained=held, indenters=[pusher])
+        session.step(motions=[IndenterVelocity((0.0, 0.0, -5000.0 / steps))], steps=steps)
+        assert depth(session, pusher, 8.0) < 0.02 * 10.0 + 1e-9  # of the edge of a face
+        session.step(steps=40)
+        rests.append((session.positions(), session.forces().indenters[-1, 0]))
+    moved = np.abs(rests[1][0] - made.points).max()
+    assert rests[1][1][2] < -100.0
+    np.testing.assert_allclose(rests[0][0], rests[1][0], atol=0.03 * moved)
+    np.testing.assert_allclose(rests[0][1], rests[1][1], atol=0.03 * np.linalg.norm(rests[1][1]))
+
+
+@pytest.mark.parametrize("kind", [DynamicEngine, RealTimeEngine])
+def test_a_thin_plate_of_5_m_per_s_does_not_pass_through_nor_does_the_body_that_bounces(kind: type[DynamicEngine]) -> None:
+    made = replace(engine(kind=kind, **({} if kind is DynamicEngine else {"background": False})), step=1.6e-3)
+    plate = box_indenter((0.0, 0.0, SIZE + 6.0), (60.0, 60.0, 4.0))
+    session = made.session(constrained=[lowest(made.points)], indenters=[plate])
+    for k in range(4):
+        force = session.step(motions=[IndenterVelocity((0.0, 0.0, 0.0 if k else -5000.0))]).indenters[-1, 0]
+        assert force[2] < -1e4 if k == 0 else force[2] <= 0.0  # it bounces off
+        assert depth(session, plate, 8.0) < 0.02 * 10.0 + 1e-9
+        assert session.positions()[:, 2].max() < SIZE - 4.0 + 0.2
+
+
+def depth(session: DynamicSession, pusher: RigidIndenter, lowered: float) -> float:
+    """Return how deep the quadrature points of the faces lie in a pusher that was lowered."""
+    contact = indenter_contacts([pusher], session.engine.points, session.engine.faces, normal_stiffness=1.0, tangential_stiffness=1.0)[0]
+    at = contact.positions(session.state().displacement)
+    return float(-pusher.gap(at + [0.0, 0.0, lowered]).min())

@@ -119,7 +119,7 @@ def step_parts(
     if not len(indenters):
         return 1
     allowed = np.array([SHARE * i.geometry.inradius for i in indenters])
-    ways = np.linalg.norm(travel, axis=1)
+    ways = np.linalg.norm(travel, axis=1) + approach
     if not turn.any() and (ways <= allowed).all():
         return 1
     if turn.any():

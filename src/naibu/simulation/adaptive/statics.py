@@ -6,11 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
+from naibu.mechanics.contact.indenter_contacts import indenter_contacts, moving_contacts
 from naibu.mechanics.contact.penalty_contact import Contact
+from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements
@@ -24,7 +27,8 @@ from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.meshing.refinement.forest import BisectionForest, LeafMesh
 from naibu.meshing.refinement.marking import doerfler_marks
 from naibu.meshing.refinement.transfer import transferred_nodes
-from naibu.simulation.adaptive.conditions import Conditions
+from naibu.meshing.surface import boundary_faces
+from naibu.simulation.adaptive.conditions import Conditions, Selection
 from naibu.simulation.adaptive.error_estimator import recovery_indicators
 
 
@@ -186,6 +190,51 @@ def linear_static(
     return solve_on
 
 
+def pressed_by(
+    indenters: Sequence[RigidIndenter],
+    travel: ArrayLike,
+    *,
+    faces: Selection | None = None,
+    normal_stiffness: float = 1000.0,
+    tangential_stiffness: float = 200.0,
+) -> Callable[[Mesh], tuple[Contact, ...]]:
+    """Return the contacts of any mesh with rigid indenters that move in a straight line, for `hyperelastic_static`.
+
+    Their reactions are called ``"indenter 0"``, ``"indenter 1"``, ...
+
+    Parameters
+    ----------
+    indenters : sequence of RigidIndenter
+        Where they begin; none may have pull-off, or two friction coefficients.
+    travel : array_like, shape (k, 3) or (3,)
+        How far they move, mm.
+    faces : callable, optional
+        From positions at rest (n, 3), mm, to the nodes (n,) whose faces may be touched, all of them by default; fewer take less time.
+    normal_stiffness, tangential_stiffness : float
+        Penalties, kPa/mm.
+
+    Raises
+    ------
+    InputError
+        A travel of another number of indenters, or, on a mesh, what `naibu.mechanics.rigid_contact` refuses.
+    """
+    bodies = tuple(indenters)
+    given = np.asarray(travel, dtype=float)
+    if given.shape not in ((3,), (len(bodies), 3)) or not np.isfinite(given).all():
+        raise InputError(f"travel must be (3,) or ({len(bodies)}, 3), finite, in mm, not {given.shape}")
+    centres = np.array([i.centre for i in bodies], dtype=float).reshape(-1, 3)
+    still = np.zeros_like(centres)
+
+    def contacts(mesh: Mesh) -> tuple[Contact, ...]:
+        outer = boundary_faces(mesh).faces
+        if faces is not None:
+            outer = outer[np.asarray(faces(mesh.points))[outer].all(axis=1)]
+        made = indenter_contacts(bodies, mesh.points, outer, normal_stiffness=normal_stiffness, tangential_stiffness=tangential_stiffness)
+        return moving_contacts(made, centres, np.tile(np.eye(3), (len(bodies), 1, 1)), still + given, still)
+
+    return contacts
+
+
 def hyperelastic_static(
     conditions: Conditions,
     materials: Sequence[Material],
@@ -203,7 +252,7 @@ def hyperelastic_static(
     materials : sequence of Material
         One for each region.
     contacts : callable
-        From a mesh to its contacts with rigid bodies; see `naibu.mechanics.rigid_contact`.
+        From a mesh to its contacts with rigid bodies; such as `pressed_by`.
     density : float
         kg/mm^3, for loads that depend on the mass.
     settings : SolverSettings, optional
