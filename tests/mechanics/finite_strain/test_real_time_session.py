@@ -148,4 +148,4 @@ def depth(session: DynamicSession, pusher: RigidIndenter, lowered: float) -> flo
     """Return how deep the quadrature points of the faces lie in a pusher that was lowered."""
     contact = indenter_contacts([pusher], session.engine.points, session.engine.faces, normal_stiffness=1.0, tangential_stiffness=1.0)[0]
     at = contact.positions(session.state().displacement)
-    return float(-pusher.gap(at + [0.0, 0.0, lowered]).min())
+    return float(-pusher.gap(at + np.array([0.0, 0.0, lowered])).min())

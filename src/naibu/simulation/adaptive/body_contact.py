@@ -107,4 +107,4 @@ class BodyContact:
     def distance(self, positions: FloatArray) -> FloatArray:
         """Return the signed distance (q,), mm, of positions (q, 3), mm, from the nearest indenter where it is now."""
         gaps = [i.geometry.distance((positions - c) @ r) for i, c, r in zip(self.indenters, self.centres, self.rotations, strict=True)]
-        return np.min([np.full(len(positions), np.inf), *gaps], axis=0)
+        return np.asarray(np.min([np.full(len(positions), np.inf), *gaps], axis=0))

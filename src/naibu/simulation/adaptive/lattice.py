@@ -230,7 +230,7 @@ class AdaptiveLattice:
         """
         centres, axes = self.session.poses()
         gaps = [replace(i.geometry, axes=a).distance(positions - c) for i, c, a in zip(self.indenters, centres, axes, strict=True)]
-        return np.min([np.full(len(positions), np.inf), *gaps], axis=0)
+        return np.asarray(np.min([np.full(len(positions), np.inf), *gaps], axis=0))
 
     def step(self, velocity: ArrayLike = 0.0, motions: Sequence[IndenterMotion] = (), *, steps: int = 1) -> StepForces:
         """Take steps, and adapt the mesh after every `interval` of them.
