@@ -115,15 +115,15 @@ def test_a_session_goes_on_from_its_state() -> None:
     np.testing.assert_allclose(session.positions(), first, atol=0.01 * np.abs(first - made.points).max())
 
 
-def test_a_pusher_of_5_m_per_s_rests_where_one_that_came_slowly_does() -> None:
+def test_an_indenter_of_5_m_per_s_rests_where_one_that_came_slowly_does() -> None:
     """It goes 8 mm in a step of 1.6 ms."""
     made = replace(engine(background=False), step=1.6e-3)
     held, rests = [lowest(made.points)], []
-    pusher = spherical_indenter((1.0, 2.0, SIZE + 11.0), 8.0)
+    indenter = spherical_indenter((1.0, 2.0, SIZE + 11.0), 8.0)
     for steps in (1, 8):
-        session = made.session(constrained=held, indenters=[pusher])
+        session = made.session(constrained=held, indenters=[indenter])
         session.step(motions=[IndenterVelocity((0.0, 0.0, -5000.0 / steps))], steps=steps)
-        assert depth(session, pusher, 8.0) < 0.02 * 10.0 + 1e-9  # of the edge of a face
+        assert depth(session, indenter, 8.0) < 0.02 * 10.0 + 1e-9  # of the edge of a face
         session.step(steps=40)
         rests.append((session.positions(), session.forces().indenters[-1, 0]))
     moved = np.abs(rests[1][0] - made.points).max()
@@ -144,8 +144,8 @@ def test_a_thin_plate_of_5_m_per_s_does_not_pass_through_nor_does_the_body_that_
         assert session.positions()[:, 2].max() < SIZE - 4.0 + 0.2
 
 
-def depth(session: DynamicSession, pusher: RigidIndenter, lowered: float) -> float:
-    """Return how deep the quadrature points of the faces lie in a pusher that was lowered."""
-    contact = indenter_contacts([pusher], session.engine.points, session.engine.faces, normal_stiffness=1.0, tangential_stiffness=1.0)[0]
+def depth(session: DynamicSession, indenter: RigidIndenter, lowered: float) -> float:
+    """Return how deep the quadrature points of the faces lie in an indenter that was lowered."""
+    contact = indenter_contacts([indenter], session.engine.points, session.engine.faces, normal_stiffness=1.0, tangential_stiffness=1.0)[0]
     at = contact.positions(session.state().displacement)
-    return float(-pusher.gap(at + np.array([0.0, 0.0, lowered])).min())
+    return float(-indenter.gap(at + np.array([0.0, 0.0, lowered])).min())
