@@ -13,21 +13,31 @@ from pathlib import Path
 import numpy as np
 
 from naibu import datasets
+from naibu.applications.mammography.breast_outline import breast_outline, mask_outline
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.core.volume import Volume
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.calibrated_model import CalibratedModel
+from naibu.io.blade_table import read_blade_path, read_tip_path
+from naibu.io.displacement_fields import read_field, write_field
 from naibu.io.experiment_folder.reader import read_experiment
 from naibu.io.images import read_displacement, read_volume, write_displacement, write_volume
 from naibu.io.lattice_study_schema import load_study
 from naibu.io.marker_tables import import_markers
 from naibu.io.meshes import read_mesh, read_surface
+from naibu.io.number_table import read_numbers
 from naibu.io.vtk_files import write_vtu
+from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.meshing.element_conversion import to_tetra
 from naibu.meshing.primitives import box
+from naibu.workflows.applications.simulate_chip import prepared_chip
+from naibu.workflows.applications.simulate_ischemia import prepared_ischemia
+from naibu.workflows.identify_fields import _names, _object, block_mesh
 from naibu.workflows.result_folder import read_model
+from naibu.workflows.studies.simulate import example_text
 
 
 @dataclass(frozen=True)
@@ -59,6 +69,8 @@ def valid_files(folder: Path) -> list[ValidFile]:
         *_surfaces(folder),
         *_tables(folder),
         *_texts(folder),
+        *_fields(folder),
+        *_records(folder),
     ]
 
 
@@ -271,6 +283,64 @@ def _texts(folder: Path) -> list[ValidFile]:
         ValidFile("lattice study", study, lambda: load_study(study, study.read_bytes())),
         ValidFile("model.json", model, lambda: read_model(model)),
     ]
+
+
+def _fields(folder: Path) -> list[ValidFile]:
+    """Displacement fields with covariance on a grid and at points, and as a table."""
+    rng = np.random.default_rng(0)
+    points, vectors = rng.random((30, 3)), rng.standard_normal((30, 3))
+    at_points = DisplacementField.from_arrays(points, vectors, sd_mm=0.01)
+    grid = _volume()
+    on_grid = DisplacementField.on_grid(grid, np.zeros((*grid.shape, 3)), valid=np.ones(grid.shape, dtype=bool))
+    places = [folder / f"field-{name}" / f"{name}.h5" for name in ("points", "grid")]
+    for place, field in zip(places, (at_points, on_grid), strict=True):
+        place.parent.mkdir(parents=True)
+        write_field(place, field)
+    rows = "\n".join(",".join(f"{v:.6g}" for v in row) for row in np.hstack([points, vectors, np.full((30, 3), 0.01)]))
+    header = "x_mm,y_mm,z_mm,ux_mm,uy_mm,uz_mm,sd_x_mm,sd_y_mm,sd_z_mm"
+    places.append(_written(folder / "field-table" / "table.csv", f"{header}\n{rows}\n".encode()))
+    return [ValidFile(f"field {place.name}", place, lambda place=place: read_field(place)) for place in places]
+
+
+def _records(folder: Path) -> list[ValidFile]:
+    """Paths of tools, outlines of views, masks of zones, and studies of applications."""
+    turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 31)
+    outline = "\n".join(f"{x:.4f},{y:.4f}" for x, y in np.stack([80.0 * np.cos(turn), 60.0 * np.sin(turn)], axis=1).tolist())
+    contents = {
+        "blade.csv": "-1,-1,5,-1,21,5\n10,-1,5,10,21,6\n21,-1,5,21,21,5\n",
+        "tip.csv": "x,y,z\n3,8,0\n10,8.5,0\n17,9,0\n",
+        "outline.csv": outline,
+        "record.csv": "".join(f"{0.1 * k:.2g},{0.01 * k:.3g}\n" for k in range(20)),
+        "chip.toml": example_text("chip"),
+        "ischemia.toml": example_text("ischemia"),
+    }
+    paths = {name: _written(folder / f"record-{name}" / name, text.encode()) for name, text in contents.items()}
+    readers: dict[str, Callable[[Path], object]] = {
+        "blade.csv": lambda path: swept_blade(read_blade_path(path)),
+        "tip.csv": read_tip_path,
+        "outline.csv": lambda path: breast_outline(read_numbers(path, ("deep", "along"))),
+        "record.csv": lambda path: read_numbers(path, ("s", "mm")),
+        "chip.toml": prepared_chip,
+        "ischemia.toml": prepared_ischemia,
+    }
+    plane = np.zeros((1, 100, 60), dtype=np.uint8)
+    y, x = np.mgrid[:100, :60]
+    plane[0] = (x / 50.0) ** 2 + ((y - 50.0) / 40.0) ** 2 < 1.0
+    mask = write_volume(folder / "record-mask" / "mask.mha", Volume.from_array(plane, spacing_mm=(1.6, 1.6, 1.0)))
+    labels = np.zeros((8, 8, 8), dtype=np.uint8)
+    labels[1:4, 1:7, 1:7], labels[4:7, 1:7, 1:7] = 1, 2
+    zones = write_volume(folder / "record-zones" / "zones.mha", Volume.from_array(labels, spacing_mm=(2.0, 2.0, 2.0)))
+    return [
+        *(ValidFile(f"record {name}", path, lambda name=name: readers[name](paths[name])) for name, path in paths.items()),
+        ValidFile("record mask.mha", mask, lambda: mask_outline(read_volume(mask).values[0], 1.6)),
+        ValidFile("record zones.mha", zones, lambda: meshed_zones(zones)),
+    ]
+
+
+def meshed_zones(zones: Path) -> object:
+    """Read a volume of labels, and mesh the object as `naibu identify` does with displacement fields."""
+    inside, labels = _object(None, zones)
+    return block_mesh(inside, labels, _names(labels, inside, {}), 0.0)
 
 
 def _study() -> str:

@@ -124,3 +124,33 @@ def test_a_record_with_too_few_rows_is_named(tmp_path: Path) -> None:
     (tmp_path / "indentation.csv").write_text("0.1,1\n0.2,1\n", encoding="utf-8")
     with pytest.raises(InputError, match=r"\[record\] file has 2 values for 4 parameters"):
         simulate(written(tmp_path, SMALL | RECORDED), out=tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ("1,0.2\n", "instants after the load began"),
+        ("0.1,0\n-0.2,0.1\n", "times from -0.2"),
+        ("0.1,0.1\n0.1,0.2\n", "times from 0.1 to 0.1"),
+        ("0.1,0.1\n0.2,1e300\n", "in skin of 1 mm"),
+        ("0.1,0.1\n0.2,0.11\n0.3,0.1\n", "noise_mm = 0.02"),
+        ("0.1,nan\n", "nan"),
+    ],
+)
+def test_records_that_cannot_be_are_refused_before_the_work(tmp_path: Path, rows: str, said: str) -> None:
+    (tmp_path / "indentation.csv").write_text(rows, encoding="utf-8")
+    with pytest.raises(InputError, match=said) as refused:
+        prepared_ischemia(written(tmp_path, SMALL | RECORDED))
+    assert "indentation.csv" in str(refused.value)
+
+
+@pytest.mark.parametrize("elsewhere", ["../indentation.csv", "/etc/hosts"])
+def test_records_outside_of_the_folder_of_the_study_are_not_read(tmp_path: Path, elsewhere: str) -> None:
+    changes = RECORDED | {'# file = "indentation.csv"': f'file = "{elsewhere}"'}
+    with pytest.raises(InputError, match="outside the folder"):
+        prepared_ischemia(written(tmp_path, SMALL | changes))
+
+
+def test_two_layers_of_one_name_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="'dermis' stands twice"):
+        prepared_ischemia(written(tmp_path, SMALL | {'name = "epidermis"': 'name = "dermis"'}))

@@ -19,8 +19,8 @@ from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress, report_progress
 from naibu.io.files.parsing import parsed_toml
-from naibu.io.files.reading import read_bytes
-from naibu.io.ischemia_schema import IschemiaFile, load_ischemia
+from naibu.io.files.reading import file_beside, read_bytes
+from naibu.io.ischemia_schema import IschemiaFile, RecordTable, load_ischemia
 from naibu.io.number_table import read_numbers
 from naibu.io.vtk_files import write_vtkhdf_series
 from naibu.mechanics.small_strain.rheology import Rheology, three_element
@@ -33,6 +33,8 @@ from naibu.workflows.output_folder import output_folder
 ISCHEMIA = "ischemia"  # name of the study that naibu brings along
 ISCHEMIA_TITLE = "skin that turns pale under an air jet"
 FRAMES = 60
+LONGEST_RECORD_S = 1e7
+DEEPEST = 10.0  # times the thickness: linear models sink deeper than skin, but not so deep
 _KEYS = {
     "radius_mm of the load": "[load] radius_mm",
     "indentation_mm has": "[record] file has",
@@ -120,12 +122,15 @@ def prepared_ischemia(source: str | os.PathLike[str]) -> PreparedIschemia:
         )
         for la in settings.layer
     )
+    named = [la.name for la in settings.layer if la.name]
+    if len(set(named)) < len(named):
+        raise InputError(f"{os.fspath(source)}: [[layer]] name = {named[0]!r} stands twice; give each layer a name of its own")
     if settings.time.end_s <= load.duration_s:
         raise InputError(
             f"{os.fspath(source)}: [time] end_s = {settings.time.end_s:g} must come after the load, which lasts {load.duration_s:g} s"
         )
     patch = SkinPatch(layers, skin.width_mm, skin.geometry, skin.depth_mm, skin.sides)
-    record = None if settings.record is None else read_numbers(Path(source).parent / settings.record.file, ("time, s", "indentation, mm"))
+    record = None if settings.record is None else _record(Path(source), settings.record, patch.height_mm)
     name = ISCHEMIA if own else Path(source).stem
     return PreparedIschemia(
         name, settings.title or name, os.fspath(source), hashlib.sha256(content).hexdigest(), settings, patch,
@@ -197,6 +202,26 @@ def simulate_ischemia(
     moved = skin_displacements(modes, materials, study.load, times)
     write_vtkhdf_series(series, _solid(modes), times, {"displacement_mm": _three_components(moved)})
     return page, numbers, series
+
+
+def _record(source: Path, table: RecordTable, height_mm: float) -> FloatArray:
+    """Read a measured indentation (t, 2): times, s, and indentation, mm, which lies beside the study."""
+    file = file_beside(source, table.file)
+    record = read_numbers(file, ("time, s", "indentation, mm"))
+    times, indentation = record.T
+    if times.min() < 0.0 or times.max() > LONGEST_RECORD_S or np.ptp(times) == 0.0:
+        raise InputError(
+            f"{file}: has times from {times.min():g} to {times.max():g} s; give instants after the load began, at 0, in seconds"
+        )
+    if np.abs(indentation).max() > DEEPEST * height_mm:
+        deepest = indentation[np.abs(indentation).argmax()]
+        raise InputError(f"{file}: has an indentation of {deepest:g} mm in skin of {height_mm:g} mm; is it in mm?")
+    if np.ptp(indentation) <= table.noise_mm:
+        raise InputError(
+            f"{file}: its indentation changes by {np.ptp(indentation):g} mm, not more than [record] noise_mm = {table.noise_mm:g}; "
+            "nothing can be identified from it"
+        )
+    return record
 
 
 def _in_keys(message: str) -> str:
