@@ -121,7 +121,7 @@ def test_bad_records_are_refused(text: str, what: str, tmp_path: Path) -> None:
 
 
 def test_a_record_with_too_few_rows_is_named(tmp_path: Path) -> None:
-    (tmp_path / "indentation.csv").write_text("0.1,1\n0.2,1\n", encoding="utf-8")
+    (tmp_path / "indentation.csv").write_text("0.1,1\n0.2,1.5\n", encoding="utf-8")
     with pytest.raises(InputError, match=r"\[record\] file has 2 values for 4 parameters"):
         simulate(written(tmp_path, SMALL | RECORDED), out=tmp_path / "out")
 

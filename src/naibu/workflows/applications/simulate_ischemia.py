@@ -34,7 +34,7 @@ ISCHEMIA = "ischemia"  # name of the study that naibu brings along
 ISCHEMIA_TITLE = "skin that turns pale under an air jet"
 FRAMES = 60
 LONGEST_RECORD_S = 1e7
-DEEPEST = 10.0  # times the thickness: linear models sink deeper than skin, but not so deep
+DEEPEST = 100.0  # times the thickness: linear models sink deeper than skin, but not so deep
 _KEYS = {
     "radius_mm of the load": "[load] radius_mm",
     "indentation_mm has": "[record] file has",
