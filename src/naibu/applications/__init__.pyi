@@ -4,8 +4,11 @@ from .ischemia.response_times import ResponseTimes, response_times
 from .ischemia.skin import MeshedPatch, SkinLayer, SkinPatch, SurfaceLoad, meshed
 from .mammography.breast_outline import BreastOutline, breast_outline, mask_outline
 from .mammography.breast_shape import BreastShape, half_ellipsoid_shape, shape_from_widths
-from .mammography.epipolar import EpipolarCurve, LesionPosition, MammographicPair, ModelUncertainty, mammographic_pair
+from .mammography.epipolar import EpipolarCurve, LesionPosition, MammographicPair, ModelUncertainty, Projection, mammographic_pair
 from .mammography.geometric_model import Compression, CompressionParameters, compressed
+from .mammography.mechanical_model import MechanicalCompression, MechanicalParameters, mechanically_compressed
+from .mammography.mechanical_views import mechanical_views
+from .mammography.pressed_view import PressedView
 from .mammography.two_views import TwoViews, two_views
 from .sensing_chip.bridge import closed_form_sensitivities, crosstalk, decoupled, half_bridge, sensitivity_matrix
 from .sensing_chip.chip_mesh import ChipMesh, ChipResolution, chip_mesh
@@ -35,9 +38,13 @@ __all__ = [
     "LayeredModes",
     "LesionPosition",
     "MammographicPair",
+    "MechanicalCompression",
+    "MechanicalParameters",
     "MeshedPatch",
     "ModelUncertainty",
     "Piezoresistance",
+    "PressedView",
+    "Projection",
     "RampKalman",
     "Readout",
     "ResponseTimes",
@@ -65,6 +72,8 @@ __all__ = [
     "load_limits",
     "mammographic_pair",
     "mask_outline",
+    "mechanical_views",
+    "mechanically_compressed",
     "meshed",
     "n_type_silicon",
     "orthotropic_torsion_stiffness",

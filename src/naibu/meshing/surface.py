@@ -223,3 +223,26 @@ def _quad_areas(p: FloatArray) -> FloatArray:
         along_s = np.einsum("i,fix->fx", signs[:, 1] * (1 + r * signs[:, 0]) / 4, p)
         parts += np.linalg.norm(np.cross(along_r, along_s), axis=1)[:, None] * shape
     return parts
+
+
+def level_extents(starts: FloatArray, ends: FloatArray, levels: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return how far line segments in a plane reach at levels of their first coordinate.
+
+    Parameters
+    ----------
+    starts, ends : ndarray, shape (e, 2)
+        Ends of the segments, mm: of a curve, or of the edges of a projected surface.
+    levels : ndarray, shape (n,)
+        Levels, mm, growing; the last one may lie at the farthest point.
+
+    Returns
+    -------
+    low, high : ndarray, shape (n,)
+        Least and greatest second coordinate, mm; infinite where no segment crosses the level.
+    """
+    at = np.minimum(levels, levels[-1] * (1.0 - 1e-9))[:, None]
+    crossed = (np.minimum(starts[:, 0], ends[:, 0]) <= at) & (at <= np.maximum(starts[:, 0], ends[:, 0]))
+    run = ends[:, 0] - starts[:, 0]
+    share = np.clip(np.where(run == 0.0, 0.0, (at - starts[:, 0]) / np.where(run == 0.0, 1.0, run)), 0.0, 1.0)
+    reach = starts[:, 1] + share * (ends[:, 1] - starts[:, 1])
+    return np.where(crossed, reach, np.inf).min(axis=1), np.where(crossed, reach, -np.inf).max(axis=1)

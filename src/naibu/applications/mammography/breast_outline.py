@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from naibu.core.arrays import LENGTHS_MM, BoolArray, FloatArray
 from naibu.core.errors import InputError
+from naibu.meshing.surface import level_extents
 
 _DEPTHS_MM = (15.0, 300.0)  # from the chest wall to the nipple; beyond, another unit is likelier
 _WIDTHS_MM = (30.0, 500.0)
@@ -107,7 +108,7 @@ def breast_outline(points_mm: ArrayLike, *, what: str = "outline") -> BreastOutl
     curve = np.column_stack([np.clip(depth, 0.0, None), points[:, 1]])
     curve[[0, -1], 0] = 0.0
     depths = float(depth.max()) * np.sin(0.5 * np.pi * np.linspace(0.0, 1.0, _SECTIONS))
-    low, high = _extent(curve, depths)
+    low, high = level_extents(curve[:-1], curve[1:], depths)
     nipple = 0.5 * float(low[-1] + high[-1])
     curve[:, 1] -= nipple
     return BreastOutline(depths, low - nipple, high - nipple, curve, wall, nipple, at_right)
@@ -218,14 +219,3 @@ def _require_size(depth: FloatArray, along: FloatArray, what: str) -> None:
     for name, size, (least, most) in (("deep", float(depth.max()), _DEPTHS_MM), ("wide", float(np.ptp(along)), _WIDTHS_MM)):
         if not least <= size <= most:
             raise InputError(f"{what}: is {size:.4g} mm {name}; a breast is {least:g} to {most:g} mm {name}. Are the coordinates in mm?")
-
-
-def _extent(curve: FloatArray, depths: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the least and greatest positions along the chest wall where the curve crosses each depth."""
-    a, b = curve[:-1], curve[1:]
-    levels = np.minimum(depths, depths[-1] * (1.0 - 1e-9))[:, None]
-    crossed = (np.minimum(a[:, 0], b[:, 0]) <= levels) & (levels <= np.maximum(a[:, 0], b[:, 0]))
-    run = b[:, 0] - a[:, 0]
-    share = np.clip(np.where(run == 0.0, 0.0, (levels - a[:, 0]) / np.where(run == 0.0, 1.0, run)), 0.0, 1.0)
-    at = a[:, 1] + share * (b[:, 1] - a[:, 1])
-    return np.where(crossed, at, np.inf).min(axis=1), np.where(crossed, at, -np.inf).max(axis=1)

@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 
+_TIP = 0.8  # part of the depth from which on the two outlines need not show one section: the deepest points of two views differ
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BreastShape:
@@ -105,19 +107,22 @@ def shape_from_widths(depths: FloatArray, first: FloatArray, second: FloatArray,
     Raises
     ------
     InputError
-        The widths differ so much that no ellipse has both.
+        The widths differ so much that no ellipse has both, farther from the nipple than its neighbourhood, where they are limited.
     """
     t = np.deg2rad(angle_deg)
     a2, b2 = (np.square(0.5 * (w[:, 1] - w[:, 0])) for w in (first, second))
     mean, difference = 0.5 * (a2 + b2), b2 - a2
-    if np.any(np.abs(difference[:-1]) > 0.98 * 2.0 * mean[:-1] * abs(np.sin(t))):
-        at = int(np.argmax(np.abs(difference[:-1]) / mean[:-1]))
+    limit = 0.98 * 2.0 * mean * abs(np.sin(t))
+    excess = np.abs(difference) - limit
+    if np.any(excess[depths < _TIP * depths[-1]] > 0.0):
+        at = int(np.argmax(np.where(depths < _TIP * depths[-1], excess / np.maximum(mean, 1e-12), -np.inf)))
         raise InputError(
             f"the outlines do not fit together: {depths[at]:.3g} mm from the chest wall the half widths are {np.sqrt(a2[at]):.3g} and "
             f"{np.sqrt(b2[at]):.3g} mm, which no section has in directions {angle_deg:g} degrees apart; check "
             f"angle_deg, the units, and that "
             "both outlines end at the same height of the chest wall"
         )
+    difference = np.clip(difference, -limit, limit)
     p, r = -0.5 * difference, difference * np.sin(2 * t) / (4.0 * np.sin(t) ** 2)
     middles = [0.5 * (w[:, 0] + w[:, 1]) for w in (first, second)]
     upwards = (middles[1] - np.cos(t) * middles[0]) / np.sin(t)

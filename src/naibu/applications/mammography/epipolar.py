@@ -4,18 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import stdtrit
+from scipy.special import fdtri, stdtrit
 
 from naibu.applications.mammography.breast_outline import BreastOutline, inside_polygon
-from naibu.applications.mammography.geometric_model import DEFAULT_PARAMETERS, Compression, CompressionParameters
+from naibu.applications.mammography.geometric_model import DEFAULT_PARAMETERS, CompressionParameters
+from naibu.applications.mammography.mechanical_views import mechanical_views
+from naibu.applications.mammography.pressed_view import PressedView
 from naibu.applications.mammography.two_views import LEAST_ANGLE, MOST_ANGLE, TwoViews, two_views
 from naibu.core.arrays import BoolArray, FloatArray, require_count, require_within
 from naibu.core.errors import InputError
 
+Model = Literal["geometric", "mechanical"]
 _COUNT = 101
+_TURN = np.linspace(0.0, 2.0 * np.pi, 61)
 _MOST_REFUSED = 0.5
 _MOST_DRAWS = 10_000
 
@@ -109,6 +114,22 @@ class LesionPosition:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Projection:
+    """Where a point of the unloaded breast appears in both views.
+
+    Attributes
+    ----------
+    places : ndarray, shape (2, 2)
+        In CC and MLO: depth and position along the chest wall, mm.
+    regions : ndarray, shape (2, n, 2)
+        Ellipses that hold the true places with the probability asked for, if the stated standard deviations are true.
+    """
+
+    places: FloatArray
+    regions: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class MammographicPair:
     """Both views of a breast with models that are drawn from the stated uncertainty.
 
@@ -118,8 +139,8 @@ class MammographicPair:
         CC and MLO.
     nominal : TwoViews
         The model with the parameters as stated.
-    drawn : tuple of TwoViews
-        Models with other parameters.
+    centre, drawn : TwoViews, tuple of TwoViews
+        The geometric model with the parameters as stated and with others: by how much they differ makes bands and intervals.
     noise : ndarray, shape (k, 2, 2)
         Unresolved displacements of each: view, then depth and position along the chest wall, mm.
     refused : int
@@ -128,6 +149,7 @@ class MammographicPair:
 
     outlines: tuple[BreastOutline, BreastOutline]
     nominal: TwoViews
+    centre: TwoViews
     drawn: tuple[TwoViews, ...]
     noise: FloatArray
     refused: int
@@ -156,13 +178,14 @@ class MammographicPair:
             raise InputError(f"probability is {probability:g}: must be between 0 and 1")
         p = self._inside(point, first)
         points, curve = _curve(_views(self.nominal), first, p)
+        _, middle = _curve(_views(self.centre), first, p)
         offsets = []
         for views, noise in zip(self.drawn, self.noise, strict=True):
             try:
                 _, other = _curve(_views(views), first, p + noise[first])
             except InputError:  # displaced out of this breast
                 continue
-            offsets.append(other + noise[1 - first] - curve)
+            offsets.append(other + noise[1 - first] - middle)
         if not offsets:
             raise InputError(f"point ({p[0]:.4g}, {p[1]:.4g}) mm lies so near the skin that no drawn model holds it; no band can be given")
         return EpipolarCurve(curve, points, _band(curve, np.array(offsets), probability), probability)
@@ -194,24 +217,35 @@ class MammographicPair:
             raise InputError("the points lie so near the skin that no drawn model holds both; no interval can be given")
         tail = 0.5 * (1.0 - probability)
         position = _nearest(_views(self.nominal), places)
-        half = float(stdtrit(len(found), 1.0 - tail)) * np.sqrt(((np.array(found) - position) ** 2).mean(axis=0))
+        middle = _nearest(_views(self.centre), places)
+        half = float(stdtrit(len(found), 1.0 - tail)) * np.sqrt(((np.array(found) - middle) ** 2).mean(axis=0))
         return LesionPosition(position, position - half, position + half, curve.distance(places[1]), bool(curve.in_band(places[1])))
 
-    def project(self, position: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return the places in CC and MLO, depth and position along the chest wall, mm, of a point (3,) of the unloaded breast.
+    def project(self, position: ArrayLike, *, probability: float = 0.95) -> Projection:
+        """Return where a point (3,) of the unloaded breast, from the nipple and from the chest wall, mm, appears in CC and MLO.
 
         Raises
         ------
         InputError
-            A point outside of the unloaded breast.
+            A point outside of the unloaded breast, or a probability that is none.
         """
         p = np.asarray(position, dtype=float)
+        if p.shape != (3,) or not np.isfinite(p).all():
+            raise InputError(f"position has shape {p.shape}: needs three finite coordinates, mm")
+        if not 0.0 < probability < 1.0:
+            raise InputError(f"probability is {probability:g}: must be between 0 and 1")
         centre, square = self.nominal.shape.in_view(0.0, p[2])
         x, y = p[:2] - centre
         xx, yy, xy = square
         if not (0.0 <= p[2] <= self.nominal.shape.depth_mm and yy * x * x - 2 * xy * x * y + xx * y * y <= xx * yy - xy * xy):
             raise InputError(f"position ({p[0]:.4g}, {p[1]:.4g}, {p[2]:.4g}) mm lies outside of the unloaded breast")
-        return self.nominal.cc.project(p), self.nominal.mlo.project(p)
+        places = np.array([view.project(p) for view in _views(self.nominal)])
+        middle = np.array([view.project(p) for view in _views(self.centre)])
+        offsets = np.array([[view.project(p) for view in _views(model)] for model in self.drawn]) + self.noise - middle
+        reach = np.sqrt(2.0 * float(fdtri(2, len(offsets), probability)))
+        circle = reach * np.column_stack([np.cos(_TURN), np.sin(_TURN)])
+        roots = [np.linalg.cholesky(o.T @ o / len(o) + 1e-9 * np.eye(2)) for o in np.moveaxis(offsets, 1, 0)]
+        return Projection(places, np.array([place + circle @ root.T for place, root in zip(places, roots, strict=True)]))
 
     def _inside(self, point: ArrayLike, view: int) -> FloatArray:
         p = np.asarray(point, dtype=float)
@@ -233,12 +267,13 @@ def mammographic_pair(
     thickness_mm: tuple[float, float],
     angle_deg: float,
     *,
+    model: Model = "geometric",
     parameters: CompressionParameters = DEFAULT_PARAMETERS,
     uncertainty: ModelUncertainty = DEFAULT_UNCERTAINTY,
     draws: int = 100,
     seed: int = 0,
 ) -> MammographicPair:
-    """Build the geometric model of a breast from both views, and models drawn from its uncertainty.
+    """Build a model of a breast from both views, and geometric models drawn from the uncertainty.
 
     Parameters
     ----------
@@ -248,8 +283,10 @@ def mammographic_pair(
         Distances of the plates in CC and MLO.
     angle_deg : float
         Positioner angle of MLO against CC.
+    model : {"geometric", "mechanical"}
+        Closed maps, or equilibrium of finite elements with the default `MechanicalParameters`.
     parameters : CompressionParameters
-        What the views leave open.
+        What the views leave open in the geometric model.
     uncertainty : ModelUncertainty
         Its standard deviations.
     draws : int
@@ -260,12 +297,17 @@ def mammographic_pair(
     Raises
     ------
     InputError
-        What `two_views` refuses, too few or too many draws, or more than half of the draws giving no breast.
+        What `two_views` refuses, another model, too few or too many draws, or more than half of the draws giving no breast.
+    ConvergenceError
+        No equilibrium was found.
     """
+    if model not in ("geometric", "mechanical"):
+        raise InputError(f"model is {model!r}: must be 'geometric' or 'mechanical'")
     require_count("draws", draws, 20)
     require_within("draws", draws, 20, _MOST_DRAWS)
     require_count("seed", seed, 0)
-    nominal = two_views(cc, mlo, thickness_mm, angle_deg, (parameters, parameters))
+    centre = two_views(cc, mlo, thickness_mm, angle_deg, (parameters, parameters))
+    nominal = centre if model == "geometric" else mechanical_views(cc, mlo, thickness_mm, angle_deg)
     random = np.random.default_rng(seed)
     drawn, refused = [], 0
     for pair, plates, angle in _draws(random, draws, parameters, uncertainty, thickness_mm, angle_deg):
@@ -281,7 +323,7 @@ def mammographic_pair(
     z -= z.mean(axis=0)
     z = np.linalg.solve(np.linalg.cholesky(z.T @ z / len(z)), z.T).T  # so few draws would have another covariance than the stated one
     noise = uncertainty.unresolved_mm * z.reshape(-1, 2, 2)
-    return MammographicPair((cc, mlo), nominal, tuple(drawn), noise, refused)
+    return MammographicPair((cc, mlo), nominal, centre, tuple(drawn), noise, refused)
 
 
 _Draw = tuple[tuple[CompressionParameters, CompressionParameters], tuple[float, float], float]
@@ -315,11 +357,11 @@ def _index(view: str) -> int:
     return int(view == "MLO")
 
 
-def _views(model: TwoViews) -> tuple[Compression, Compression]:
+def _views(model: TwoViews) -> tuple[PressedView, PressedView]:
     return model.cc, model.mlo
 
 
-def _ray(view: Compression, place: FloatArray) -> FloatArray:
+def _ray(view: PressedView, place: FloatArray) -> FloatArray:
     """Return the part (n, 3) inside of the breast of the ray of a place, from the lower to the upper skin."""
     points, inside = view.on_ray(place, 4 * _COUNT)
     kept = np.flatnonzero(inside)
@@ -330,12 +372,12 @@ def _ray(view: Compression, place: FloatArray) -> FloatArray:
     return np.column_stack([np.interp(at, np.arange(len(part)), column) for column in part.T])
 
 
-def _curve(views: tuple[Compression, Compression], first: int, place: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _curve(views: tuple[PressedView, PressedView], first: int, place: FloatArray) -> tuple[FloatArray, FloatArray]:
     ray = _ray(views[first], place)
     return ray, views[1 - first].project(ray)
 
 
-def _nearest(views: tuple[Compression, Compression], places: tuple[FloatArray, FloatArray]) -> FloatArray:
+def _nearest(views: tuple[PressedView, PressedView], places: tuple[FloatArray, FloatArray]) -> FloatArray:
     """Return the mean of the points of both rays that come nearest to the place in the other view."""
     found = []
     for first in (0, 1):

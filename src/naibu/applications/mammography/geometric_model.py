@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -68,6 +68,10 @@ class Compression:
         Mean stretches along the chest wall and away from it.
     bending : float
         See `CompressionParameters`.
+    hidden_mm : float
+        Tissue at the chest wall that the image does not reach: distances in the view are less by this.
+    base_curvature : float
+        Of the base, 1/mm, where it may lift off what it lies on: it arches with its ends down. 0 at a chest wall.
     contact : (float, float)
         Where the plates first touch: least and greatest unloaded position along the compression, mm.
     """
@@ -78,6 +82,8 @@ class Compression:
     along: float
     away: float
     bending: float
+    hidden_mm: float = 0.0
+    base_curvature: float = 0.0
     contact: tuple[float, float] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -112,13 +118,13 @@ class Compression:
         centre, pressed, part, _ = self._columns(along, p[..., 2])
         height = pressed + part * (across - centre)
         stretch_along, stretch_away = self._stretches(height)
-        return np.stack([along * stretch_along, height, p[..., 2] * stretch_away], axis=-1)
+        return np.stack([along * stretch_along, height, p[..., 2] * stretch_away + self._rise(height)], axis=-1)
 
     def uncompress(self, points: ArrayLike) -> FloatArray:
         """Return unloaded positions (..., 3) of positions (..., 3) in the compressed breast: the inverse of `compress`."""
         p = np.asarray(points, dtype=float)
         stretch_along, stretch_away = self._stretches(p[..., 1])
-        along, depth = p[..., 0] / stretch_along, p[..., 2] / stretch_away
+        along, depth = p[..., 0] / stretch_along, (p[..., 2] - self._rise(p[..., 1])) / stretch_away
         centre, pressed, part, _ = self._columns(along, depth)
         across = centre + (p[..., 1] - pressed) / part
         t = np.deg2rad(self.angle_deg)
@@ -126,7 +132,7 @@ class Compression:
 
     def project(self, points: ArrayLike) -> FloatArray:
         """Return depths and positions along the chest wall (..., 2) in the view, mm, of unloaded points (..., 3); by parallel rays."""
-        return self.compress(points)[..., [2, 0]]
+        return np.asarray(self.compress(points)[..., [2, 0]] - np.array([self.hidden_mm, 0.0]))
 
     def on_ray(self, place: ArrayLike, count: int = 101) -> tuple[FloatArray, BoolArray]:
         """Return unloaded positions of the points that appear at one place of the view.
@@ -145,7 +151,7 @@ class Compression:
         inside : ndarray of bool, shape (..., count)
             Which of them lie inside of the breast.
         """
-        at = np.asarray(place, dtype=float)[..., None, :]
+        at = np.asarray(place, dtype=float)[..., None, :] + np.array([self.hidden_mm, 0.0])
         heights = np.broadcast_to(0.5 * self.thickness_mm * np.linspace(-1.0, 1.0, count), (*at.shape[:-2], count))
         ray = np.stack(np.broadcast_arrays(at[..., 1], heights, at[..., 0]), axis=-1)
         points = self.uncompress(ray)
@@ -177,6 +183,9 @@ class Compression:
         area = (stretch_along * stretch_away) @ node_weights
         return float(np.sum(weights * part * half * area))
 
+    def _rise(self, height: FloatArray) -> FloatArray:
+        return np.asarray(0.5 * self.base_curvature * ((0.5 * self.thickness_mm) ** 2 - height**2))
+
     def _stretches(self, height: FloatArray) -> tuple[FloatArray, FloatArray]:
         zeta = np.clip(height / (0.5 * self.thickness_mm), -1.0, 1.0)
         q = 1.0 + self.bending * (1.0 / 3.0 - zeta**2)
@@ -206,7 +215,12 @@ def plate_contact(shape: BreastShape, angle_deg: float) -> tuple[float, float]:
 
 
 def compressed(
-    shape: BreastShape, angle_deg: float, thickness_mm: float, parameters: CompressionParameters = DEFAULT_PARAMETERS
+    shape: BreastShape,
+    angle_deg: float,
+    thickness_mm: float,
+    parameters: CompressionParameters = DEFAULT_PARAMETERS,
+    *,
+    free_base: bool = False,
 ) -> Compression:
     """Return the compression of a breast of known unloaded shape, with the stretches that its volume asks for.
 
@@ -220,13 +234,17 @@ def compressed(
         Distance of the plates.
     parameters : CompressionParameters
         What shape and distance leave open.
+    free_base : bool
+        Whether the base may arch off a table, as that of a phantom does, instead of being held by a chest wall. The plates shorten the base
+        more than what lies above it; sections that stay plane then give a beam the curvature of the regression of the shortening on the
+        height.
 
     Raises
     ------
     InputError
         Plates farther apart than the breast is thick, or closer than a tenth of that.
     """
-    _require_thickness(shape, angle_deg, thickness_mm)
+    require_thickness(shape, angle_deg, thickness_mm)
     growth = 1.0
     for _ in range(_STEPS):
         state = with_growth(shape, angle_deg, thickness_mm, growth, parameters)
@@ -234,7 +252,20 @@ def compressed(
         growth *= ratio
         if abs(ratio - 1.0) < 1e-6:
             break
-    return with_growth(shape, angle_deg, thickness_mm, growth, parameters)
+    state = with_growth(shape, angle_deg, thickness_mm, growth, parameters)
+    return replace(state, base_curvature=_free_curvature(state)) if free_base else state
+
+
+def _free_curvature(state: Compression) -> float:
+    """Return the curvature, 1/mm, by the regression of the columns' shortening on the height, weighted by the sections' areas."""
+    depths = state.shape.depth_mm * (np.arange(_CELLS) + 0.5) / _CELLS
+    centres, squares = state.shape.in_view(state.angle_deg, depths)
+    phi = -0.5 * np.pi + (np.arange(_CELLS) + 0.5) * np.pi / _CELLS
+    along = centres[:, :1] + np.sqrt(squares[:, :1]) * np.sin(phi)
+    _, _, part, half = state._columns(along, np.broadcast_to(depths[:, None], along.shape))
+    weights = half * np.sqrt(squares[:, :1]) * np.cos(phi)
+    height, shortening = depths[:, None] - np.average(depths, weights=weights.sum(axis=1)), 1.0 - part
+    return float(-np.sum(weights * height * shortening) / np.sum(weights * height**2))
 
 
 def with_growth(shape: BreastShape, angle_deg: float, thickness_mm: float, growth: float, parameters: CompressionParameters) -> Compression:
@@ -243,7 +274,8 @@ def with_growth(shape: BreastShape, angle_deg: float, thickness_mm: float, growt
     return Compression(shape, angle_deg, thickness_mm, growth**share, growth ** (1.0 - share), parameters.bending)
 
 
-def _require_thickness(shape: BreastShape, angle_deg: float, thickness_mm: float) -> None:
+def require_thickness(shape: BreastShape, angle_deg: float, thickness_mm: float) -> None:
+    """Raise `InputError` where plates at a distance do not press a breast, or would flatten it."""
     low, high = plate_contact(shape, angle_deg)
     if not _LEAST_PART * (high - low) <= thickness_mm < high - low:
         raise InputError(

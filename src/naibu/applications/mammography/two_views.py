@@ -15,6 +15,7 @@ from naibu.applications.mammography.geometric_model import (
     plate_contact,
     with_growth,
 )
+from naibu.applications.mammography.pressed_view import PressedView
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 
@@ -32,13 +33,13 @@ class TwoViews:
     ----------
     shape : BreastShape
         Unloaded; coordinates are laterally and upwards from the nipple, and away from the chest wall.
-    cc, mlo : Compression
+    cc, mlo : PressedView
         The breast between the plates.
     """
 
     shape: BreastShape
-    cc: Compression
-    mlo: Compression
+    cc: PressedView
+    mlo: PressedView
 
 
 def two_views(
@@ -135,19 +136,17 @@ def _unloaded(
     """Return the shape that has the outlines when it grows so much, and its compressions."""
     nowhere = BreastShape(np.array([0.0, 1.0]), np.zeros((2, 2)), np.ones((2, 3)))
     plain = [with_growth(nowhere, a, t, g, p) for a, t, g, p in zip(angles, thickness_mm, growth, parameters, strict=True)]
-    depths_mm = [o.depth_mm / s.silhouette[1] for o, s in zip(outlines, plain, strict=True)]
-    depth_mm = float(np.sqrt(depths_mm[0] * depths_mm[1]))
+    depth_mm = max(o.depth_mm / s.silhouette[1] for o, s in zip(outlines, plain, strict=True))
     depths = depth_mm * np.sin(0.5 * np.pi * np.linspace(0.0, 1.0, len(outlines[0].depths)))
     widths: list[FloatArray] = []
+    hidden: list[float] = []
     for outline, state in zip(outlines, plain, strict=True):
-        own = outline.depths / outline.depth_mm * depth_mm
+        hidden.append(depth_mm * state.silhouette[1] - outline.depth_mm)
+        own = (outline.depths + hidden[-1]) / state.silhouette[1]
         both = [np.interp(depths, own, end / state.silhouette[0]) for end in (outline.low, outline.high)]
         widths.append(np.column_stack(both))
     shape = shape_from_widths(depths, widths[0], widths[1], angles[1])
-    states = []
-    for k, outline in enumerate(outlines):
-        # the mean stretch away from the chest wall that puts the nipple where this view shows it
-        silhouette = outline.depth_mm / depth_mm
-        away = 1.0 + (silhouette - 1.0) / plain[k].outermost
-        states.append(Compression(shape, angles[k], thickness_mm[k], plain[k].along, away, parameters[k].bending))
+    states = [
+        Compression(shape, a, t, p.along, p.away, p.bending, h) for a, t, p, h in zip(angles, thickness_mm, plain, hidden, strict=True)
+    ]
     return shape, (states[0], states[1])
