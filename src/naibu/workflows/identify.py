@@ -137,7 +137,7 @@ def identify(
         calibration = search(loaded, start=start)
         if misfits := _outliers(calibration):
             loaded, outliers = distrusted(loaded, misfits), (*outliers, *misfits)
-            calibration = search(loaded, start=calibration.match.parameters.values())
+            calibration = search(loaded, start=calibration.match.parameters.values(), warm_starts=calibration.warm_starts)
     except ConvergenceError as error:
         labels = [f"{e.name}/{s.name}" for e in loaded for s in _with_states(e, states or {}).loaded_states]
         one_of = "one of " * (len(labels) > 1) + ", ".join(labels)

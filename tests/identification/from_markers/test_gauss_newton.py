@@ -98,15 +98,6 @@ def test_the_known_materials_batch_is_the_reference() -> None:
     np.testing.assert_allclose(lower[0], 0.5 * upper[0])
 
 
-def test_steps_stay_within_their_limits() -> None:
-    hessian, gradient = np.array([[4.0, 1.0, 0.0], [1.0, 3.0, 1.0], [0.0, 1.0, 2.0]]), np.array([8.0, 1.0, 2.0])
-    free = gauss_newton._bounded_step(hessian, gradient, np.array([np.inf]))
-    np.testing.assert_allclose(hessian @ free, gradient)
-    step = gauss_newton._bounded_step(hessian, gradient, np.array([0.5, 10.0]))
-    assert step[0] == 0.5
-    np.testing.assert_allclose((hessian @ step)[1:], gradient[1:])  # the others are the best for it
-
-
 def test_a_virtual_specimen_is_recovered_within_its_intervals() -> None:
     template, truth = two_gels(45.0)
     virtual = virtual_specimen(template, truth, settings=ModelSettings(element_size_mm=7.5), seed=1)

@@ -299,3 +299,14 @@ def test_forces_and_conditions_for_another_mesh_are_refused():
         replace(body, external_force=np.zeros((1, 3)))
     with pytest.raises(InputError, match=r"prescribed\.constrained must have shape"):
         replace(body, prescribed=PrescribedDisplacement.none(mesh.n_points + 1))
+
+
+def test_a_solve_gives_up_after_the_iterations_it_is_allowed():
+    mesh = box((4, 5, 6), (2, 2, 2), centred=False)
+    support = roller(mesh).and_also(side_nodes(mesh, "z+"), (0, 0, -3.0), (False, False, True))
+    whole = solve(problem(mesh, of("neo_hookean", 0.4), prescribed=support))
+    allowed = whole.iterations // 2
+    settings = SolverSettings(max_total_iterations=allowed)
+    part = solve(problem(mesh, of("neo_hookean", 0.4), prescribed=support), settings=settings, throw=False)
+    assert part.status is Status.ITERATION_LIMIT and part.states[-1].load < 1.0
+    assert allowed <= part.iterations < allowed + settings.max_iterations

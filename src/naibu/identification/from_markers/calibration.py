@@ -13,6 +13,7 @@ from naibu.core.experiment import Experiment, Layer, State
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.core.progress import Progress
 from naibu.core.status import Status
+from naibu.identification.from_markers.coarse_search import coarse_search
 from naibu.identification.from_markers.gauss_newton import Checkpoint, Match, Matcher, MatchingSettings
 from naibu.identification.from_markers.initial_guess import equilibrium_gap
 from naibu.identification.from_markers.known_materials import KnownMaterials
@@ -145,11 +146,17 @@ def calibrate(
     known = known_materials or _first_material(experiments)
     parameters = initial_parameters(specimens, used, known)
     begin = dict(start or {}) or _start_from_equilibrium_gap(experiments, known, used)
-    match = Matcher(load_cases, parameters, search or MatchingSettings()).run(
-        progress=progress, checkpoint=checkpoint, start=begin, warm_starts=warm_starts
-    )
+    finding = search or MatchingSettings()
+    coarse = None
+    if not warm_starts:
+        coarse = coarse_search(load_cases, parameters, measured, finding, start=begin, progress=progress, checkpoint=checkpoint)
+        if coarse is not None and coarse.match.status is Status.INTERRUPTED:
+            return Calibration(coarse.load_cases, coarse.match, chosen, measured, known, parameters)
+        if coarse is not None:
+            begin, warm_starts = coarse.match.parameters.values(), coarse.warm_starts
+    match = Matcher(load_cases, parameters, finding).run(progress=progress, checkpoint=checkpoint, start=begin, warm_starts=warm_starts)
     estimated = with_mesh_error and match.status is not Status.INTERRUPTED
-    mesh = mesh_error(load_cases, match, parameters) if estimated else None
+    mesh = mesh_error(load_cases, match, parameters, None if coarse is None else coarse.solutions) if estimated else None
     return Calibration(load_cases, match, chosen, measured, known, parameters, mesh)
 
 

@@ -11,16 +11,17 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
-from naibu.core.parameters import Parameter, ParameterSet
+from naibu.core.parameters import ParameterSet
 from naibu.core.progress import Progress, report_progress
 from naibu.core.rigid_transform import RigidTransform, registration
 from naibu.core.status import Status
+from naibu.identification.from_markers.bounded_step import bounded_step, next_reach, step_limits
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase, SolvedLoadCase
 from naibu.identification.from_markers.specimen.parameter_names import pixel_scale
 from naibu.identification.from_markers.specimen.specimen_model import Specimen
@@ -33,10 +34,13 @@ from naibu.mechanics.linear_algebra.direct import use_one_thread
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
 
 Checkpoint = Callable[[Mapping[str, float]], None]
-WIDEST_STEP = 3.0  # of an unknown on a linear scale: mm for positions
 UNEVEN = 0.01  # points that slip over an edge make the objective uneven; a step that promises less than this and fails ends the search
+ENOUGH = 2  # steps in succession that gain less than that, and less than half of what they promise, after which the search ends
 ROUGH = 0.1  # a search is rough while a step may lower the objective by more than this fraction
 PATH = SolverSettings(first_step=0.02, largest_step=0.15, tolerance=1e-6)
+NEARBY = replace(PATH, smallest_step=0.15, pseudo_transient=False)  # for a path close to a known one: no load step is halved
+TRIAL_EFFORT = 1.2  # times the iterations of the dearest solution so far, which a step of the search may cost before it is given up
+LEAST_EFFORT = 100  # iterations that a solution at least is taken to have cost
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,11 +133,20 @@ class Matcher:
     settings: MatchingSettings = field(default_factory=MatchingSettings)
     _solvers: dict[int, LinearSolver | None] = field(default_factory=dict)
     _penalties: dict[int, tuple[FloatArray, ...]] = field(default_factory=dict)
+    _dearest: dict[int, int] = field(default_factory=dict)
 
     def evaluate(
-        self, values: Mapping[str, float], warm_starts: Sequence[SolvedLoadCase | None] = (), poses: Sequence[RigidTransform | None] = ()
+        self,
+        values: Mapping[str, float],
+        warm_starts: Sequence[SolvedLoadCase | None] = (),
+        poses: Sequence[RigidTransform | None] = (),
+        *,
+        trial: bool = False,
     ) -> list[LoadCaseFit]:
         """Solve all load cases at `values`, from `warm_starts` where given; `poses` replace those that register the markers best.
+
+        A `trial` is given up early where it costs much more than the solutions before: a shorter step of the search costs less. Its fits
+        have no derivatives, which `differentiated` adds.
 
         Raises
         ------
@@ -143,7 +156,14 @@ class Matcher:
 
         def one(i: int) -> LoadCaseFit:
             near = warm_starts[i] if warm_starts else None
-            return self._evaluate_one(i, values, near.warm_start(values) if near is not None else [], poses[i] if poses else None)
+            estimates, pose = near.warm_start(values) if near else [], poses[i] if poses else None
+            settings = self._trial_settings(i, near, bool(estimates)) if trial else PATH
+            if near and near.between is not None:
+                try:
+                    return self._evaluate_one(i, values, estimates, pose, NEARBY, derivatives=not trial)
+                except ConvergenceError:
+                    estimates = []
+            return self._evaluate_one(i, values, estimates, pose, settings, derivatives=not trial)
 
         if len(self.load_cases) == 1:
             return [one(0)]
@@ -151,25 +171,39 @@ class Matcher:
             return list(pool.map(one, range(len(self.load_cases))))
 
     def _evaluate_one(
-        self, index: int, values: Mapping[str, float], warm_start: Sequence[WarmStart], pose: RigidTransform | None
+        self,
+        index: int,
+        values: Mapping[str, float],
+        warm_start: Sequence[WarmStart],
+        pose: RigidTransform | None,
+        settings: SolverSettings,
+        *,
+        derivatives: bool,
     ) -> LoadCaseFit:
         load_case = self.load_cases[index]
         # as stiff as contact had to be before: the objective does not jump, and no evaluation finds it anew
         problem = with_normal_stiffness(load_case.specimen.problem(values, load_case.state), self._penalties.get(index, ()))
         try:
-            solution = solve(problem, settings=PATH, solver=self._solvers.get(index), warm_start=warm_start)
+            solution = solve(problem, settings=settings, solver=self._solvers.get(index), warm_start=warm_start)
         except ConvergenceError as error:
             raise ConvergenceError(f"{load_case.name}: {error}") from error
+        self._dearest[index] = max(solution.iterations, self._dearest.get(index, 0))
         newton = Newton(solution.problem, PATH, self._solvers.get(index))
-        path = self._path_derivatives(load_case, values, solution, newton)
+        path = self._path_derivatives(load_case, values, solution, newton) if derivatives else ()
         self._solvers[index], self._penalties[index] = newton.solver, solution.states[-1].normal_stiffness
         return self._observed(load_case, values, solution, path, pose)
+
+    def _trial_settings(self, index: int, near: SolvedLoadCase | None, warm: bool) -> SolverSettings:
+        """Settings of a step of the search: what a solution that starts from another one has not needed, it does without."""
+        limit = int(TRIAL_EFFORT * max(self._dearest.get(index, 0), LEAST_EFFORT))
+        rescued = near is not None and near.fit.solution.continued > 0
+        return replace(NEARBY if warm and not rescued else PATH, pseudo_transient=rescued, max_total_iterations=limit)
 
     def differentiated(self, fits: Sequence[LoadCaseFit], values: Mapping[str, float]) -> list[LoadCaseFit]:
         """Return fits at `values` with derivatives with respect to the free parameters of this matcher; nothing is solved anew."""
         out = []
-        for load_case, fit in zip(self.load_cases, fits, strict=True):
-            newton = Newton(fit.solution.problem, PATH)
+        for i, (load_case, fit) in enumerate(zip(self.load_cases, fits, strict=True)):
+            newton = Newton(fit.solution.problem, PATH, self._solvers.get(i))
             path = self._path_derivatives(load_case, values, fit.solution, newton)
             out.append(self._observed(load_case, values, fit.solution, path, fit.pose))
         return out
@@ -211,6 +245,10 @@ class Matcher:
         rotated = specimen.placement.pose.rotation.T  # noise of the reference scan, turned into the object's frame
         both = np.einsum("kij,jl->kil", turned, rotated)
         sd = np.sqrt(load_case.sd**2 + np.einsum("kil,kl->ki", both**2, load_case.free_sd**2))
+        if not path:
+            return LoadCaseFit(
+                solution, pose, predicted, load_case.measured - predicted, sd, np.zeros((*u.shape, 0)), np.zeros((*u.shape, 6)), path
+            )
         du = path[-1]
         n_free = du.shape[2]
         at_markers = np.stack([specimen.observation @ du[:, i, :] for i in range(3)], axis=1) if n_free else np.zeros((len(u), 3, 0))
@@ -237,7 +275,7 @@ class Matcher:
         free = self.parameters.free
         p, size = len(free), len(free) + 6 * len(fits)
         slope = np.array([q.slope(q.physical(x)) for q, x in zip(free, inner, strict=True)])
-        hessian, gradient, objective = np.zeros((size, size)), np.zeros(size), 0.0
+        hessian, gradient = np.zeros((size, size)), np.zeros(size)
         for t, fit in enumerate(fits):
             seen = np.isfinite(fit.residual)
             r = (fit.residual / fit.sd)[seen]
@@ -248,7 +286,6 @@ class Matcher:
             weight = np.minimum(1.0, c / np.maximum(np.abs(r), 1e-300))
             hessian += j.T @ (weight[:, None] * j)
             gradient += j.T @ (weight * r)
-            objective += float(np.where(np.abs(r) <= c, r * r, 2.0 * c * np.abs(r) - c * c).sum())
         data = hessian.copy()
         bend = np.zeros(size)
         bend[:p] = np.maximum(-gradient[:p] * [q.bend for q in free], 0.0)
@@ -257,8 +294,7 @@ class Matcher:
                 deviation = (inner[k] - q.inner(q.value)) / q.prior_sd
                 hessian[k, k] += 1.0 / q.prior_sd**2
                 gradient[k] -= deviation / q.prior_sd
-                objective += deviation**2
-        return NormalEquations(hessian, gradient, objective, data, bend)
+        return NormalEquations(hessian, gradient, self.objective(fits, inner), data, bend)
 
     def run(
         self,
@@ -283,10 +319,11 @@ class Matcher:
         fits = self.evaluate(self.parameters.values(inner), [(warm_starts or {}).get(t.name) for t in self.load_cases])
         now = self.normal_equations(fits, inner)
         history, damping, rough, status = [now.objective], 1e-3, True, Status.ITERATION_LIMIT
+        reach, disappointed = 1.0, 0
         try:
             for iteration in range(self.settings.max_iterations):
                 hessian = now.hessian + np.diag(now.bend)
-                step = _bounded_step(hessian + damping * np.diag(np.diag(hessian) + 1e-12), now.gradient, _limits(free, rough))
+                step = bounded_step(hessian + damping * np.diag(np.diag(hessian) + 1e-12), now.gradient, reach * step_limits(free, rough))
                 expected = float(2.0 * now.gradient @ step - step @ hessian @ step)
                 if rough and expected < ROUGH * now.objective:
                     rough = False
@@ -299,18 +336,20 @@ class Matcher:
                     if expected < UNEVEN * now.objective:
                         status = Status.CONVERGED
                         break
-                    damping = max(10.0 * damping, 0.05)
+                    damping, reach = max(10.0 * damping, 0.05), next_reach(reach, 0.0)
                     if damping > 1e6:
                         break
                     continue
                 gained = now.objective - found[2].objective
+                reach = next_reach(reach, gained / expected)
+                disappointed = disappointed + 1 if gained < min(0.5 * expected, UNEVEN * now.objective) else 0
                 inner, fits, now = found
                 damping = max(damping / 10.0, 1e-8)
                 history.append(now.objective)
                 if checkpoint is not None:
                     checkpoint(self.parameters.values(inner))
                 report_progress(progress, "calibration", done=iteration + 1, objective=now.objective)
-                if gained < 2.0 * self.settings.tolerance * max(1.0, 0.01 * now.objective):
+                if disappointed == ENOUGH or gained < 2.0 * self.settings.tolerance * max(1.0, 0.01 * now.objective):
                     status = Status.CONVERGED
                     break
         except KeyboardInterrupt:
@@ -327,11 +366,22 @@ class Matcher:
         here = self.parameters.with_values({q.name: old[q.name] for q in free})
         poses = [f.pose.moved(step[len(free) + 6 * t : len(free) + 6 * t + 6]) for t, f in enumerate(fits)]
         try:
-            found = self.evaluate(new, [SolvedLoadCase(f, here) for f in fits], poses)
+            found = self.evaluate(new, [SolvedLoadCase(f, here) for f in fits], poses, trial=True)
         except (ConvergenceError, InputError):  # InputError: a step that moves markers out of the object
             return None
-        equations = self.normal_equations(found, moved)
-        return (moved, found, equations) if equations.objective < objective else None
+        if self.objective(found, moved) >= objective:
+            return None
+        found = self.differentiated(found, new)
+        return moved, found, self.normal_equations(found, moved)
+
+    def objective(self, fits: Sequence[LoadCaseFit], inner: FloatArray) -> float:
+        """Return the robust sum of squares at some fits, priors at the free parameters on the optimiser's scale included."""
+        c, total = self.settings.huber, 0.0
+        for fit in fits:
+            r = np.abs(fit.residual / fit.sd)[np.isfinite(fit.residual)]
+            total += float(np.where(r <= c, r * r, 2.0 * c * r - c * c).sum())
+        free = [(q, x) for q, x in zip(self.parameters.free, inner, strict=True) if np.isfinite(q.prior_sd)]
+        return total + float(sum(((x - q.inner(q.value)) / q.prior_sd) ** 2 for q, x in free))
 
     def _match(self, inner: FloatArray, fits: list[LoadCaseFit], status: Status, history: list[float]) -> Match:
         free = self.parameters.free
@@ -356,32 +406,6 @@ class Matcher:
             status,
             tuple(history),
         )
-
-
-def _limits(free: Sequence[Parameter], rough: bool) -> FloatArray:
-    """Largest change of each free parameter in one step, on the optimiser's scale: values far from the prior are approached slowly.
-
-    While the search is `rough`, parameters with narrow priors (tilts, offsets) are fixed, lest they compensate a wrong height.
-    """
-    limits = np.array([{"log": 1.0, "incompressibility": 1.5}.get(q.scale, min(q.prior_sd, WIDEST_STEP)) for q in free])
-    nearly_known = np.array([q.scale == "linear" and q.prior_sd < WIDEST_STEP for q in free])
-    return np.where(nearly_known & rough, 0.0, limits)
-
-
-def _bounded_step(hessian: FloatArray, gradient: FloatArray, limits: FloatArray) -> FloatArray:
-    """Minimise the quadratic model with the first unknowns within +-`limits`: those that would go further stay at their limit."""
-    step = np.zeros(len(gradient))
-    loose = np.ones(len(gradient), dtype=bool)
-    bound = np.concatenate([limits, np.full(len(gradient) - len(limits), np.inf)])
-    while loose.any():
-        rest = gradient[loose] - hessian[np.ix_(loose, ~loose)] @ step[~loose]
-        step[loose] = np.linalg.solve(hessian[np.ix_(loose, loose)], rest)
-        over = loose & (np.abs(step) > bound)
-        if not over.any():
-            break
-        step[over] = np.sign(step[over]) * bound[over]
-        loose &= ~over
-    return step
 
 
 def _first_pose(specimen: Specimen, points: FloatArray, measured: FloatArray, lifted: FloatArray) -> RigidTransform:

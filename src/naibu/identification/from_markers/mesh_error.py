@@ -17,14 +17,15 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.parameters import ParameterSet
+from naibu.identification.from_markers.coarse_search import COARSER
 from naibu.identification.from_markers.gauss_newton import PATH, Match, Matcher
-from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase
+from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase, SolvedLoadCase
 from naibu.identification.from_markers.specimen.specimen_mesh import element_size
 from naibu.identification.from_markers.specimen.specimen_model import specimen
 from naibu.mechanics.finite_strain.statics import WarmStart, solve
 from naibu.meshing.point_location import interpolation_operator
 
-RATIO = 1.5  # of the element sizes of the two meshes
+RATIO = COARSER  # of the element sizes of the two meshes
 ORDER = 1.5  # of convergence: 1 beside singular edges, 2 for smooth solutions
 MOST_NODES = 1200  # of a finer mesh; its cost grows with the square of their number
 TRUSTED = 0.25  # change of the logarithm of a stiffness on a finer mesh from which on extrapolation is not trusted
@@ -55,7 +56,9 @@ class MeshError:
         return np.outer(self.step, self.step)
 
 
-def mesh_error(load_cases: Sequence[MarkerLoadCase], match: Match, priors: ParameterSet) -> MeshError | None:
+def mesh_error(
+    load_cases: Sequence[MarkerLoadCase], match: Match, priors: ParameterSet, coarse: Mapping[str, SolvedLoadCase] | None = None
+) -> MeshError | None:
     """Return the discretisation error of a finished search; None where a load case cannot be solved on the second mesh.
 
     Parameters
@@ -66,13 +69,17 @@ def mesh_error(load_cases: Sequence[MarkerLoadCase], match: Match, priors: Param
         The fit.
     priors : ParameterSet
         Parameters with their priors, as the search began.
+    coarse : mapping of str to SolvedLoadCase, optional
+        Solutions on larger elements with similar parameters, by the labels of their load cases; they save time.
     """
     values, free = match.parameters.values(), match.parameters.free
     finer = RATIO**3 * max(t.specimen.mesh.n_points for t in load_cases) <= MOST_NODES
     sizes = [element_size(t.specimen.experiment, t.specimen.settings.element_size_mm) for t in load_cases]
     try:
         changes = [
-            change_on_mesh(load_case, fit, values, size / RATIO if finer else size * RATIO)
+            change_on_mesh(load_case, fit, values, size / RATIO)
+            if finer
+            else change_on_mesh(load_case, fit, values, size * RATIO, coarse[load_case.name].warm_start(values) if coarse else None)
             for load_case, fit, size in zip(load_cases, match.fits, sizes, strict=True)
         ]
     except (ConvergenceError, InputError):
@@ -90,22 +97,38 @@ def mesh_error(load_cases: Sequence[MarkerLoadCase], match: Match, priors: Param
     return MeshError(max(sizes), abs(factor) * float(np.sqrt(squares.mean())), factor * step)
 
 
-def marker_error(load_case: MarkerLoadCase, fit: LoadCaseFit, values: Mapping[str, float]) -> FloatArray:
-    """Return how far vanishing elements would move the markers (k, 3) of a solved load case, mm, by a coarser mesh; 0 where it has none."""
+def marker_error(
+    load_case: MarkerLoadCase, fit: LoadCaseFit, values: Mapping[str, float], near: SolvedLoadCase | None = None
+) -> FloatArray:
+    """Return how far vanishing elements would move the markers (k, 3) of a solved load case, mm, by a coarser mesh; 0 where it has none.
+
+    A solution on the coarser mesh `near` these parameters saves time.
+    """
     size = element_size(load_case.specimen.experiment, load_case.specimen.settings.element_size_mm)
+    known = None if near is None else near.warm_start(values)
     try:
-        return np.asarray(-change_on_mesh(load_case, fit, values, size * RATIO) / (RATIO**ORDER - 1.0))
+        return np.asarray(-change_on_mesh(load_case, fit, values, size * RATIO, known) / (RATIO**ORDER - 1.0))
     except (ConvergenceError, InputError):
         return np.zeros_like(fit.predicted)
 
 
-def change_on_mesh(load_case: MarkerLoadCase, fit: LoadCaseFit, values: Mapping[str, float], element_size_mm: float) -> FloatArray:
-    """Return by how much the markers (k, 3) of a load case lie elsewhere, mm, on elements of another size at the same parameters."""
+def change_on_mesh(
+    load_case: MarkerLoadCase,
+    fit: LoadCaseFit,
+    values: Mapping[str, float],
+    element_size_mm: float,
+    known: Sequence[WarmStart] | None = None,
+) -> FloatArray:
+    """Return by how much the markers (k, 3) of a load case lie elsewhere, mm, on elements of another size at the same parameters.
+
+    The states there start from those `known`, or else from those of the fit.
+    """
     coarse = load_case.specimen
     body = specimen(coarse.experiment, replace(coarse.settings, element_size_mm=element_size_mm))
     problem = body.problem(values, load_case.state)
-    between = interpolation_operator(coarse.reshaped(values).mesh, problem.points, tolerance_mm=coarse.experiment.height_mm)
-    known: list[WarmStart] = [(s.load, np.asarray(between @ s.displacement)) for s in fit.solution.states[1:]]
+    if not known:
+        between = interpolation_operator(coarse.reshaped(values).mesh, problem.points, tolerance_mm=coarse.experiment.height_mm)
+        known = [(s.load, np.asarray(between @ s.displacement)) for s in fit.solution.states[1:]]
     solution = solve(problem, settings=PATH, warm_start=known)
     moved = body.reshaped(values)
     points = moved.marker_points + moved.observation @ solution.displacement

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
@@ -17,7 +18,7 @@ from naibu.identification.from_markers.specimen.specimen_model import Specimen
 from naibu.mechanics.finite_strain.statics import Solution, WarmStart
 
 WARM_START_SPACING = 0.05  # of the load, between states that the next evaluation starts from
-FAR_MM = 1.0
+FAR = 0.05  # of the extent of the object, by which nodes move with a change of the parameters that is not small
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,15 +128,27 @@ class LoadCaseFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolvedLoadCase:
-    """A solved load case to start other searches from: its fit and the parameters that gave it."""
+    """A solved load case to start other searches from.
+
+    Attributes
+    ----------
+    fit : LoadCaseFit
+        Its solution, with derivatives.
+    parameters : ParameterSet
+        The parameters that gave it.
+    between : csr_array, shape (m, n), optional
+        Interpolates its displacements at the nodes of another mesh, on which it is to start a search.
+    """
 
     fit: LoadCaseFit
     parameters: ParameterSet
+    between: sp.csr_array | None = None
 
     def warm_start(self, values: Mapping[str, float]) -> list[WarmStart]:
         """Return estimates of the states on its path at other `values`, to first order."""
         change = np.array([values.get(q.name, q.value) - q.value for q in self.parameters.free])
-        return _warm_start(self.fit, change)
+        estimates = _warm_start(self.fit, change)
+        return estimates if self.between is None else [(load, np.asarray(self.between @ u)) for load, u in estimates]
 
 
 def _warm_start(previous: LoadCaseFit, change: FloatArray) -> list[WarmStart]:
@@ -144,7 +157,7 @@ def _warm_start(previous: LoadCaseFit, change: FloatArray) -> list[WarmStart]:
     There is none after a large change: a poor estimate costs more iterations than none.
     """
     out: list[WarmStart] = []
-    if np.abs(previous.path[-1] @ change).max() > FAR_MM:
+    if np.abs(previous.path[-1] @ change).max() > FAR * np.ptp(previous.solution.problem.points, axis=0).max():
         return out
     states = previous.solution.states
     for state, derivative in zip(states[1:], previous.path[1:], strict=True):

@@ -150,9 +150,7 @@ def outermost_markers(body: Specimen, state: State, sd_mm: FloatArray) -> Gauge:
     return Gauge(low, high, None if sides else axis, distance, float(np.sqrt(variance)))
 
 
-def fitted_platen_position(
-    matcher: Matcher, fit: LoadCaseFit, name: str, gauge: Gauge, notes: list[str]
-) -> tuple[ParameterSet, LoadCaseFit]:
+def fitted_platen_position(matcher: Matcher, fit: LoadCaseFit, name: str, gauge: Gauge) -> tuple[ParameterSet, LoadCaseFit]:
     """Choose the platen position `name` with which the two groups of markers of a gauge are as far apart as measured.
 
     Raises
@@ -173,9 +171,11 @@ def fitted_platen_position(
             break
         before, parameters = parameters, parameters.with_values({name: parameters.values()[name] + change})
         fit = matcher.evaluate(parameters.values(), [SolvedLoadCase(fit, before)], [fit.pose])[0]
-    found = f"{parameters.values()[name]:.2f} mm"
-    if gauge.axis is None:
-        notes.append(f"the distance of the side plates of {found} follows from the distance of the outermost marker columns")
-    else:
-        notes.append(f"the height of {found} follows from the mean z of the lowest and the highest marker layer")
     return parameters, fit
+
+
+def source_of_platen_position(gauge: Gauge, position_mm: float) -> str:
+    """Return in words where a platen position that markers told comes from."""
+    if gauge.axis is None:
+        return f"the distance of the side plates of {position_mm:.2f} mm follows from the distance of the outermost marker columns"
+    return f"the height of {position_mm:.2f} mm follows from the mean z of the lowest and the highest marker layer"

@@ -9,18 +9,17 @@ import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.experiment import Experiment, State
-from naibu.core.parameters import Parameter, ParameterSet
+from naibu.core.parameters import Parameter
 from naibu.core.rigid_transform import registration
-from naibu.identification.from_markers.gauss_newton import Matcher
-from naibu.identification.from_markers.mesh_error import marker_error
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase, SolvedLoadCase
 from naibu.identification.from_markers.specimen.marker_grid import FILLED_SD_MM
 from naibu.identification.from_markers.specimen.parameter_names import platen_position
 from naibu.identification.from_markers.specimen.specimen_model import Specimen, specimen
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.interval import coordinate_uncertainty
-from naibu.identification.prediction.platen_position import Gauge, fitted_platen_position, outermost_markers, stated_platen_position
+from naibu.identification.prediction.platen_position import source_of_platen_position, stated_platen_position
 from naibu.identification.prediction.predictive_uncertainty import strain_at_markers, with_considered
+from naibu.identification.prediction.solved_state import SolvedState, solve_state
 from naibu.identification.prediction.target_parameters import target_parameters
 
 FURTHER = 1.15  # times the strain of the calibrating states from which a prediction is called an extrapolation
@@ -123,23 +122,12 @@ def predict_state(
     start, sd = stated_platen_position(model, experiment, target, platen_position_mm, notes)
     wanted = wanted.changed({name: Parameter(name, start, "mm", prior_sd=sd or 1.0)})
     load_case = _unmeasured(body, state, model)
-    matcher = Matcher([load_case], with_considered(body, wanted))
-    fit, parameters = matcher.evaluate(matcher.parameters.values(), [warm_start])[0], matcher.parameters
-    gauge = None
-    if heights_from_markers:
-        gauge = outermost_markers(body, target, fit.sd)
-        parameters, fit = fitted_platen_position(matcher, fit, name, gauge, notes)
-    sought = [p.name for p in wanted]
-    return _finished(model, load_case, target, parameters, fit, _PlatenPosition(name, sd, gauge), sought, notes)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _PlatenPosition:
-    """Parameter of the platen position, its standard deviation where the model does not know it, mm, and the markers that told it."""
-
-    name: str
-    sd_mm: float | None
-    gauge: Gauge | None
+    solved = solve_state(
+        load_case, with_considered(body, wanted), name, markers=target if heights_from_markers else None, warm_start=warm_start
+    )
+    if solved.gauge is not None:
+        notes.append(source_of_platen_position(solved.gauge, solved.parameters.values()[name]))
+    return _finished(model, target, solved, name, sd, [p.name for p in wanted], notes)
 
 
 def _unmeasured(body: Specimen, state: str, model: CalibratedModel) -> MarkerLoadCase:
@@ -150,15 +138,14 @@ def _unmeasured(body: Specimen, state: str, model: CalibratedModel) -> MarkerLoa
 
 def _finished(
     model: CalibratedModel,
-    load_case: MarkerLoadCase,
     state: State,
-    parameters: ParameterSet,
-    fit: LoadCaseFit,
-    platen: _PlatenPosition,
+    solved: SolvedState,
+    platen: str,
+    platen_sd_mm: float | None,
     sought: Sequence[str],
     notes: list[str],
 ) -> Prediction:
-    body = load_case.specimen
+    body, parameters, fit = solved.load_case.specimen, solved.parameters, solved.fit
     scale, values = body.placement.scale, {name: parameters.values()[name] for name in sought}
     measured = state.markers.aligned(body.marker_ids) * scale if state.markers is not None else np.full(fit.predicted.shape, np.nan)
     whole: BoolArray = np.asarray(np.isfinite(measured).all(axis=1))
@@ -167,13 +154,13 @@ def _finished(
     back = (pose.inverse().applied(measured) if pose is not None else measured) * body.enlargement(values)
     ratio = _strain_ratio(model, body, values, fit)
     sd = coordinate_uncertainty(
-        model, body, parameters, fit, strain_ratio=ratio, platen=platen.name, platen_sd_mm=platen.sd_mm, gauge=platen.gauge,
-        pose=pose, seen=whole, elements_mm=marker_error(load_case, fit, values) if model.uncertainty.mesh_step else None,
+        model, body, parameters, fit, strain_ratio=ratio, platen=platen, platen_sd_mm=platen_sd_mm, gauge=solved.gauge,
+        pose=pose, seen=whole, elements_mm=solved.error_of_elements() if model.uncertainty.mesh_step else None,
     )  # fmt: skip
     notes += _extrapolation(model, body, ratio)
     return Prediction(
         body, state.name, points / scale, sd.model, sd.measured, ratio, sd.sentence(), pose is not None, measured - points,
-        values[platen.name], values, fit.pose.inverse().applied(back), fit, tuple(notes),
+        values[platen], values, fit.pose.inverse().applied(back), fit, tuple(notes),
     )  # fmt: skip
 
 

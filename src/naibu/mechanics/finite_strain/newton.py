@@ -67,6 +67,8 @@ class Newton:
         Iterations so far.
     rigid_motion : bool
         Whether the last Newton step was so long that a rigid-body motion must be unconstrained.
+    continued : int
+        How often pseudo-transient continuation has found an equilibrium.
     restless : ndarray, shape (n, 3), or None
         By how much the body moved, mm, in the last pseudo-transient continuation, if it came to no rest.
     """
@@ -76,6 +78,7 @@ class Newton:
     solver: LinearSolver | None = None
     iterations: int = 0
     rigid_motion: bool = False
+    continued: int = 0
     restless: FloatArray | None = None
 
     def residual(self, u: FloatArray, anchors: tuple[FloatArray, ...], load: float) -> tuple[FloatArray, float, float]:
@@ -170,10 +173,12 @@ class Newton:
 
         A body that slips off a plate, folds at an edge or buckles snaps through to another equilibrium, on the way to which Newton's method
         cycles. Slowed down by a viscous drag it follows a path of which every step of implicit Euler has a solution if it is short enough;
-        the steps grow with success until the drag vanishes :cite:p:`kelley1998`.
+        the steps grow with success until the drag vanishes :cite:p:`kelley1998`. It is not tried where the settings forbid it.
         """
         drag, failed, calm, budget = FIRST_DRAG, 0.0, 0, self.iterations + PSEUDO_TRANSIENT_ITERATIONS
         before, self.restless = u, None
+        if not self.settings.pseudo_transient:
+            return None
         try:
             u = self._predicted(u, anchors, load)
             while self.iterations < budget and drag < MOST_DRAG:
@@ -184,6 +189,7 @@ class Newton:
                     continue
                 u, residual = found
                 if residual <= self.settings.tolerance:
+                    self.continued += 1
                     return u, residual
                 calm -= 1
                 if calm <= 0:

@@ -23,6 +23,11 @@ class SolverSettings:
         Newton's method has converged when the residual is below this fraction of the contact and support forces.
     max_iterations : int
         Most Newton iterations of one load step before it is halved.
+    max_total_iterations : int, optional
+        Newton iterations after which no further load step is begun; None for no limit.
+    pseudo_transient : bool
+        Whether pseudo-transient continuation, which costs as much as many load steps, is tried where Newton's method fails even for small
+        load steps: the body may snap through to another equilibrium.
     anchor_stiffness : float
         Stiffness of weak springs between every node and the ground, as a fraction of the mean diagonal of the tangent: they suppress
         rigid-body motions of a body that is not in contact yet.
@@ -37,6 +42,8 @@ class SolverSettings:
     smallest_step: float = 1e-3
     tolerance: float = 1e-7
     max_iterations: int = 16
+    max_total_iterations: int | None = None
+    pseudo_transient: bool = True
     anchor_stiffness: float = 1e-9
     penetration: float = 0.01
     linear_solver: SolverName = "automatic"

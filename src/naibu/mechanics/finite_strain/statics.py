@@ -68,6 +68,8 @@ class Solution:
         Deepest penetration of a rigid body at the last state.
     relative_penetration : float
         The same as a fraction of the edge of the element that is penetrated, where that is largest.
+    continued : int
+        How often pseudo-transient continuation was needed.
     linear_solver : str
         The solver that was used.
     problem : Problem
@@ -81,6 +83,7 @@ class Solution:
     residual: float
     penetration_mm: float
     relative_penetration: float
+    continued: int
     linear_solver: str
     problem: Problem
 
@@ -165,6 +168,9 @@ class _LoadPath:
             last, penalties = states[-1], self.newton.problem
             passed = next((h for h in reversed(self.warm_start) if h[0] <= last.load + 1e-9), None)
             ahead = next((h for h in self.warm_start if h[0] > last.load + 1e-9), None)
+            if settings.max_total_iterations is not None and self.newton.iterations >= settings.max_total_iterations:
+                self.status = Status.ITERATION_LIMIT
+                return None
             load = min(1.0, last.load + min(self.step, self.ceiling)) if ahead is None else min(ahead[0], last.load + self.step)
             found, iterations = self._solved(load, passed, ahead)
             penetrated = found is not None and (found := without_penetration(self.newton, found, last.anchors, load)) is None
@@ -300,4 +306,4 @@ def finished(newton: Newton, states: list[LoadState], residual: float, status: S
     constrained = problem.prescribed.constrained
     reactions["prescribed"] = np.where(constrained, internal - contact - problem.external_force, 0.0).sum(axis=0)
     name = newton.solver.name if newton.solver is not None else "none"
-    return Solution(tuple(states), status, reactions, newton.iterations, residual, penetration, relative, name, problem)
+    return Solution(tuple(states), status, reactions, newton.iterations, residual, penetration, relative, newton.continued, name, problem)
