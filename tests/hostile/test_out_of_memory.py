@@ -15,7 +15,10 @@ from naibu import cli
 from naibu.core import memory
 from naibu.core.volume import Volume
 from naibu.io.images import write_volume
+from naibu.io.vtk_files import write_vtu
 from naibu.mechanics.linear_algebra import direct
+from naibu.meshing.element_conversion import to_tetra
+from naibu.meshing.primitives import box
 
 LIMITED = """
 import resource, sys
@@ -80,12 +83,19 @@ def test_direct_solver_is_not_loaded_where_it_would_end_the_process(monkeypatch:
 
 
 @posix
-@pytest.mark.parametrize("megabytes", [100, 250, 500])
-def test_libraries_that_do_not_fit_are_not_loaded(megabytes: int) -> None:
+@pytest.mark.parametrize(
+    ("megabytes", "words"),
+    [
+        *((megabytes, ("simulate", "cube-pushing")) for megabytes in (100, 250, 500)),
+        (250, ("live", "--no-browser")),
+        (250, ("cut", "a.vtu", "--path", "b.csv")),
+    ],
+)
+def test_libraries_that_do_not_fit_are_not_loaded(megabytes: int, words: tuple[str, ...]) -> None:
     """OpenBLAS would wait for ever, NumPy and LLVM end in messages of their own."""
-    done = limited(megabytes, "simulate", "cube-pushing")
+    done = limited(megabytes, *words)
     assert done.returncode == 1, done.stderr
-    assert "naibu simulate needs more memory" in done.stderr and "coarser" in done.stderr
+    assert f"naibu {words[0]} needs more memory" in done.stderr and "coarser" in done.stderr
     assert "Traceback" not in done.stderr and ".log" not in done.stderr
 
 
@@ -116,6 +126,7 @@ def test_openblas_does_not_wait_for_memory_for_ever() -> None:
         ("identify", "ct_two_material_1", "--known", "hardness 5=222 kPa", "--element-size-mm", "12"),
         ("simulate", "cube-pushing"),
         ("sense", "a.mha", "b.mha"),
+        ("cut", "solid.vtu", "--path", "blade.csv", "--distance-mm", "0.1"),
     ],
     ids=lambda words: words[0],
 )
@@ -126,6 +137,10 @@ def test_a_limit_ends_in_words(tmp_path: Path, megabytes: int, words: tuple[str,
         for scan, shift in zip(scans, (0, 1), strict=True):
             write_volume(scan, Volume.from_array(np.roll(texture, shift, axis=0), spacing_mm=(1.0, 1.0, 1.0)))
         words = ("sense", *scans)
+    if words[0] == "cut":
+        write_vtu(tmp_path / "solid.vtu", to_tetra(box((20.0, 20.0, 10.0), (4, 4, 2))))
+        (tmp_path / "blade.csv").write_text("-12,-12,4.1,-12,12,4.3\n12,-12,4.1,12,12,4.3\n", encoding="utf-8")
+        words = tuple(str(tmp_path / word) if word.endswith((".vtu", ".csv")) else word for word in words)
     done = limited(megabytes, *words, "--out", str(tmp_path / "out"))
     assert done.returncode in (0, 1, 3), done.stderr[-2000:]
     assert "Traceback" not in done.stderr and "oneMKL" not in done.stderr.replace("PARDISO (oneMKL)", "") and ".log" not in done.stderr
