@@ -23,6 +23,8 @@ extensions = [
     "sphinx.ext.mathjax",
     "numpydoc",
     "sphinx_gallery.gen_gallery",
+    "sphinx_copybutton",
+    "sphinx_design",
     "sphinxcontrib.bibtex",
     "naibu_help",
     "public_names",
@@ -31,7 +33,7 @@ bibtex_bibfiles = ["references.bib"]
 bibtex_reference_style = "author_year"
 bibtex_default_style = "plain"
 default_role = "py:obj"
-exclude_patterns = ["_build", "_templates", "gallery_src", "sg_execution_times.rst"]
+exclude_patterns = ["_build", "_templates", "gallery_src", "tutorials_src", "sg_execution_times.rst"]
 templates_path = ["_templates"]
 
 autosummary_generate = True
@@ -42,8 +44,9 @@ numpydoc_show_class_members = False
 numpydoc_class_members_toctree = False
 
 sphinx_gallery_conf = {
-    "examples_dirs": "gallery_src",
-    "gallery_dirs": "gallery",
+    "examples_dirs": ["gallery_src", "tutorials_src"],
+    "gallery_dirs": ["gallery", "tutorials"],
+    "thumbnail_size": (480, 336),
     "filename_pattern": r"plot_",
     "within_subsection_order": "ExampleTitleSortKey",
     "download_all_examples": False,
@@ -56,17 +59,16 @@ sphinx_gallery_conf = {
 
 toc_object_entries = False
 
-html_theme = "alabaster"
+html_theme = "furo"
+html_title = f"naibu {release}"
 html_static_path = ["_static"]
 html_css_files = ["naibu.css"]
 html_theme_options = {
-    "description": "Mechanical parameters of soft objects from images of their inside, without a force sensor.",
-    "fixed_sidebar": True,
-    "page_width": "1240px",
-    "sidebar_width": "230px",
-    "show_powered_by": False,
+    "sidebar_hide_name": False,
+    "light_css_variables": {"color-brand-primary": "#0b5c8f", "color-brand-content": "#0b5c8f"},
+    "dark_css_variables": {"color-brand-primary": "#7cc0ee", "color-brand-content": "#7cc0ee"},
 }
-html_sidebars = {"**": ["about.html", "navigation.html", "searchbox.html"]}
+copybutton_prompt_text = "$ "
 
 
 def only_our_own(app: Sphinx, what: str, name: str, member: object, skip: bool, options: object) -> bool | None:

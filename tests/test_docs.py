@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import shlex
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
 import pytest
+from cyclopts import CycloptsError
 
+from naibu.cli import app
 from naibu.io.experiment_folder import schema
 from naibu.io.experiment_folder.reader import read_experiment
 from naibu.io.experiment_folder.state_csv import OPTIONAL, REQUIRED, STATUSES
@@ -87,6 +90,37 @@ def test_the_example_of_a_page_runs(page: str, capsys: pytest.CaptureFixture[str
     assert capsys.readouterr().out
 
 
+def test_every_verb_is_told() -> None:
+    page = (DOCS / "cli.rst").read_text(encoding="utf-8")
+    verbs = [name for name in app if not name.startswith("-")]
+    assert len(verbs) > 10
+    assert [verb for verb in verbs if f".. naibu-help:: {verb}\n" not in page] == []
+
+
+def test_commands_in_the_pages_can_be_parsed() -> None:
+    pages = [*DOCS.rglob("*.rst"), *(DOCS / "tutorials_src").glob("*.py"), DOCS.parent / "README.md"]
+    commands = []
+    for page in pages:
+        if {"gallery", "tutorials", "generated", "_build"} & set(page.relative_to(DOCS.parent).parts):
+            continue
+        text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+        commands += [(page.name, line) for line in re.findall(r"^ {0,8}(?:exec )?naibu ([a-z][^\n]*)$", text, re.MULTILINE)]
+    assert len(commands) > 25
+    for page_name, line in commands:
+        words = shlex.split(re.sub(r"\s#.*| [|>] .*|\|\|.*|&& .*", "", line))
+        if words[0] not in app or "…" in line:
+            assert words[0] not in ("identify", "sense", "track"), (page_name, line)
+            continue
+        app.meta.parse_args(words, exit_on_error=False, print_error=False)
+        own = [word for word in words if word not in ("--open", "--json", "--quiet")]
+        if "--log" in own:
+            del own[own.index("--log") : own.index("--log") + 2]
+        try:
+            app.parse_args(own, exit_on_error=False, print_error=False)
+        except CycloptsError as error:
+            raise AssertionError(f"{page_name}: naibu {line}: {error}") from error
+
+
 def test_entries_of_the_bibliography_are_whole() -> None:
     text = (DOCS / "references.bib").read_text(encoding="utf-8")
     broken = [entry.partition(",")[0] for entry in re.split(r"\n(?=@)", text) if entry.count("{") != entry.count("}")]
@@ -96,8 +130,8 @@ def test_entries_of_the_bibliography_are_whole() -> None:
 def test_citations_and_bibliography_agree() -> None:
     entries = re.findall(r"^@\w+\{(\w+),", (DOCS / "references.bib").read_text(encoding="utf-8"), re.MULTILINE)
     assert len(entries) == len(set(entries)), sorted(key for key in set(entries) if entries.count(key) > 1)
-    pages = [*DOCS.glob("*.rst"), *(DOCS / "applications").glob("*.rst")]
-    files = [*(DOCS.parent / "src").rglob("*.py"), *pages, *(DOCS / "gallery_src").glob("*")]
+    pages = [*DOCS.glob("*.rst"), *(DOCS / "applications").glob("*.rst"), *(DOCS / "theory").glob("*.rst")]
+    files = [*(DOCS.parent / "src").rglob("*.py"), *pages, *(DOCS / "gallery_src").glob("*"), *(DOCS / "tutorials_src").glob("*")]
     cited = {
         key.strip()
         for file in files

@@ -1,4 +1,4 @@
-"""The scripts of the gallery run as they stand, and draw figures whose axes say what they show."""
+"""The scripts of the gallery and of the tutorials run as they stand, and draw figures whose axes say what they show."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-SCRIPTS = sorted((Path(__file__).resolve().parent.parent / "docs" / "gallery_src").glob("plot_*.py"))
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+SCRIPTS = sorted((DOCS / "gallery_src").glob("plot_*.py"))
+TUTORIALS = sorted((DOCS / "tutorials_src").glob("plot_*.py"))
 
 
 @pytest.fixture(autouse=True)
@@ -27,6 +29,17 @@ def no_window():
 @pytest.mark.filterwarnings("ignore:.*non-interactive.*cannot be shown:UserWarning")
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
 def test_script_runs_and_labels_its_axes(script: Path) -> None:
+    runs_and_labels_its_axes(script)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*non-interactive.*cannot be shown:UserWarning")
+@pytest.mark.parametrize("script", TUTORIALS, ids=lambda path: path.stem)
+def test_tutorial_runs_and_labels_its_axes(script: Path) -> None:
+    runs_and_labels_its_axes(script)
+
+
+def runs_and_labels_its_axes(script: Path) -> None:
     from matplotlib import pyplot
 
     runpy.run_path(str(script), run_name="__main__")
@@ -39,4 +52,4 @@ def test_script_runs_and_labels_its_axes(script: Path) -> None:
 
 
 def test_there_is_a_gallery() -> None:
-    assert len(SCRIPTS) >= 3
+    assert len(SCRIPTS) >= 20 and len(TUTORIALS) >= 4

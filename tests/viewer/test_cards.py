@@ -27,6 +27,6 @@ def test_a_parameter_shows_its_interval_or_why_there_is_none() -> None:
     assert shown == [
         ("20.1 kPa", "95 %: 18.9 to 21.4"),
         ("0.490", "95 %: above 0.470"),
-        ("0.30", "not bounded by the data"),
+        ("0.300", "not bounded by the data"),
         ("200 kPa", "given"),
     ]
