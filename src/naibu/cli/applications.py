@@ -1,4 +1,4 @@
-"""Verbs of applications: ``mammography``."""
+"""Verbs of applications: ``mammography``, ``decode-forces``."""
 
 from __future__ import annotations
 
@@ -79,6 +79,41 @@ def mammography(
     for warning in run.warnings:
         say(warning, WARNING)
     say(f"Page: {run.files[0]}   numbers: {run.files[1]}")
+
+
+@app.command
+def decode_forces(
+    decoder: Path,
+    readings: Path,
+    *,
+    free_rows: Whole = 20,
+    noise_share: float = 1.0,
+    out: Path = Path("naibu-forces"),
+    overwrite: Flag = False,
+) -> None:
+    """Decode recorded readings of a soft fingertip into forces, directions and places with intervals.
+
+    Parameters
+    ----------
+    decoder
+        NAME-decoder.json, which naibu simulate writes of a fingertip.
+    readings
+        CSV table of time, s, and the readings of F_z, M_x and M_y, V.
+    free_rows
+        So many rows at the beginning are of a free fingertip: their mean is the first offset, which is recalibrated while nothing touches;
+        0 for readings without offset.
+    noise_share
+        Noise of the readings over that of the decoder's electronics: 1 unfiltered, 0.23 after a first-order filter with r = 0.1.
+    out
+        Folder for forces.html, forces.json and forces.csv.
+    overwrite
+        Replace results, or files of your own, that the folder already holds.
+    """
+    from naibu.workflows.applications.decode_forces import decode_forces as decoded
+
+    run = decoded(decoder, readings, out=out, free_rows=free_rows, noise_share=noise_share, overwrite=overwrite)
+    print_table("naibu decode-forces", ("quantity", "value"), run.rows, left=True)
+    say(f"Page: {run.files[0]}   numbers: {run.files[1]}   table: {run.files[2]}")
 
 
 def _numbers(name: str, text: str) -> tuple[float, ...]:

@@ -86,11 +86,12 @@ def simulate(
     Parameters
     ----------
     study
-        Name of a study, or your own file STUDY.toml of a mass-spring-dashpot lattice, a sensing chip, or layered skin.
+        Name of a study, or your own file STUDY.toml of a mass-spring-dashpot lattice, a sensing chip, a fingertip, or layered
+        skin.
     out
         Folder for the files.
     resume
-        Resume an interrupted or killed run of a lattice.
+        Resume an interrupted or killed run of a lattice or fingertip.
     overwrite
         Replace results, or files of your own, that the folder already holds.
     checkpoint_every
@@ -99,7 +100,7 @@ def simulate(
         Where a lattice is computed: cpu, cuda (an NVIDIA GPU; needs naibu[gpu]), or warp-cpu (the GPU's kernels on the CPU, for tests).
     example
         Print the file of a study as a template for your own: naibu simulate --example > my_study.toml, or, of a sensing chip,
-        naibu simulate chip --example > my_chip.toml; the same for ischemia
+        naibu simulate chip --example > my_chip.toml; the same for fingertip and ischemia
     """
     from naibu.workflows.studies.simulate import example_text, named_studies
     from naibu.workflows.studies.simulate import simulate as simulated
@@ -124,7 +125,7 @@ def simulate(
     wrote(*run.files)
     say(f"{time.perf_counter() - began:.0f} s. {', '.join(str(path) for path in run.files)}")
     if not run.finished:
-        errors.print(f"Interrupted: {run.frames} of {run.of} frames are kept. The same command with --resume goes on.", soft_wrap=True)
+        errors.print(f"Interrupted: {run.frames} of {run.of} {run.parts} are kept. The same command with --resume goes on.", soft_wrap=True)
         sys.exit(INTERRUPTED)
 
 

@@ -1,4 +1,4 @@
-"""Run a study by its name or from its file: lattices, sensing chips, layered skin, or the simulations of :cite:t:`hirai2008`."""
+"""Run a study by its name or from its file: lattices, chips, fingertips, layered skin, or the simulations of :cite:t:`hirai2008`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from dataclasses import dataclass
 
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress
+from naibu.workflows.applications.fingertip_study import FINGERTIP, FINGERTIP_TITLE, describes_fingertip, fingertip_text
 from naibu.workflows.applications.simulate_chip import CHIP, CHIP_TITLE, chip_text, describes_chip, simulate_chip
+from naibu.workflows.applications.simulate_fingertip import simulate_fingertip
 from naibu.workflows.applications.simulate_ischemia import ISCHEMIA, ISCHEMIA_TITLE, describes_ischemia, ischemia_text, simulate_ischemia
 from naibu.workflows.studies.lattice_study import NAMED, TEMPLATE, study_text
 from naibu.workflows.studies.simulate_lattice import CHECKPOINT_EVERY, SimulationRun, simulate_lattice
@@ -24,7 +26,7 @@ class NamedStudy:
     name : str
         What `simulate` takes.
     model : str
-        ``"finite elements"``, ``"mass-spring-dashpot lattice"``, ``"sensing chip"`` or ``"layered skin"``.
+        ``"finite elements"``, ``"mass-spring-dashpot lattice"``, ``"sensing chip"``, ``"fingertip"`` or ``"layered skin"``.
     title : str
         What is simulated.
     """
@@ -42,12 +44,13 @@ def named_studies() -> tuple[NamedStudy, ...]:
         *(NamedStudy(name, "finite elements", title) for name, title in elements),
         *(NamedStudy(name, "mass-spring-dashpot lattice", title) for name, title in lattices),
         NamedStudy(CHIP, "sensing chip", CHIP_TITLE),
+        NamedStudy(FINGERTIP, "fingertip", FINGERTIP_TITLE),
         NamedStudy(ISCHEMIA, "layered skin", ISCHEMIA_TITLE),
     )
 
 
 def example_text(study: str = "") -> str:
-    """Return the file of a study as a template: of a lattice, a sensing chip, or layered skin.
+    """Return the file of a study as a template: of a lattice, a sensing chip, a fingertip, or layered skin.
 
     Parameters
     ----------
@@ -59,7 +62,7 @@ def example_text(study: str = "") -> str:
     InputError
         There is no such study, or it has no file.
     """
-    of_name = {CHIP: chip_text, ISCHEMIA: ischemia_text}
+    of_name = {CHIP: chip_text, FINGERTIP: fingertip_text, ISCHEMIA: ischemia_text}
     return of_name[study]() if study in of_name else study_text(study or TEMPLATE)
 
 
@@ -75,17 +78,17 @@ def simulate(
 ) -> SimulationRun:
     """Simulate a study, and write its motion for ParaView, an animated page and the numbers.
 
-    Ctrl-C (KeyboardInterrupt) ends the run of a lattice: the frames computed so far are kept, and the run can be resumed.
+    Ctrl-C (KeyboardInterrupt) ends the run of a lattice or fingertip: the frames or presses so far are kept, and the run can be resumed.
 
     Parameters
     ----------
     study : str or path-like
-        Name of a study (see `named_studies`), or a TOML file that describes a lattice, its indenters and their motion, a sensing chip, or
-        layered skin.
+        Name of a study (see `named_studies`), or a TOML file that describes a lattice, its indenters and their motion, a sensing chip, a
+        fingertip, or layered skin.
     out : path-like
         Folder for the files.
     resume : bool
-        Whether an interrupted or killed run of a lattice is resumed; the result is the same as without an interruption.
+        Whether an interrupted or killed run of a lattice or fingertip is resumed; the result is the same as without an interruption.
     overwrite : bool
         Whether results that the folder holds are replaced.
     checkpoint_every : int
@@ -110,15 +113,17 @@ def simulate(
     """
 
     name = os.fspath(study)
-    of_chip, of_skin = describes_chip(study), describes_ischemia(study)
-    if not (of_chip or of_skin) and name != SQUARES_TOGETHER and name not in SLUGS:
+    of_chip, of_skin, of_finger = describes_chip(study), describes_ischemia(study), describes_fingertip(study)
+    if not (of_chip or of_skin or of_finger) and name != SQUARES_TOGETHER and name not in SLUGS:
         return simulate_lattice(
             study, out, resume=resume, overwrite=overwrite, checkpoint_every=checkpoint_every, device=device, progress=progress
         )
-    if resume:
+    if resume and not of_finger:
         raise InputError(f"{name} takes seconds and keeps nothing to resume from; run it without `resume`")
     if device != "cpu":
         raise InputError(f"device is {device!r}, and {name} is a study of finite elements, which run on 'cpu'; choose that, or a lattice")
+    if of_finger:
+        return simulate_fingertip(study, out, resume=resume, overwrite=overwrite, progress=progress)
     if of_chip:
         return SimulationRun(simulate_chip(study, out, overwrite=overwrite, progress=progress), 1, 1)
     if of_skin:

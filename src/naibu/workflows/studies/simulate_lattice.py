@@ -39,12 +39,15 @@ class SimulationRun:
     files : tuple of Path
         Page, series and numbers, and, where it was interrupted, the checkpoint from which it resumes.
     frames, of : int
-        Number of frames kept after the first, and number asked for; of finite elements, number of studies.
+        Number of frames kept after the first, and number asked for; of finite elements, number of studies or presses.
+    parts : str
+        What is counted.
     """
 
     files: tuple[Path, ...]
     frames: int
     of: int
+    parts: str = "frames"
 
     @property
     def finished(self) -> bool:

@@ -1,0 +1,171 @@
+"""Decode recorded readings of a fingertip into forces with intervals: a table of readings in, a table of forces and a page out."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from naibu.applications.fingertip.decoder import DecodedForces, ForceDecoder
+from naibu.applications.fingertip.offset import OffsetTracker
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import InputError
+from naibu.io.files.atomic import write_atomically
+from naibu.io.files.provenance import input_record
+from naibu.io.fingertip_schema import load_decoder
+from naibu.io.number_table import read_numbers
+from naibu.viewer.chapter import Chapter, Figure, Section
+from naibu.viewer.chapter_page import write_chapter
+from naibu.viewer.tables import Cell, Table
+from naibu.workflows.output_folder import output_folder
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
+
+_COLUMNS = (
+    "time_s", "force_N", "force_low_N", "force_high_N", "tilt_deg", "tilt_low_deg", "tilt_high_deg", "azimuth_deg", "cone_95_deg",
+    "x_mm", "y_mm", "z_mm", "position_95_mm",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DecodedRecord:
+    """What was decoded, and the files.
+
+    Attributes
+    ----------
+    files : tuple of Path
+        Page, numbers of the page, and the table of forces.
+    rows : tuple of tuple
+        Names and values for the console.
+    """
+
+    files: tuple[Path, ...]
+    rows: tuple[tuple[str, str], ...]
+
+
+def decode_forces(
+    decoder: str | os.PathLike[str],
+    readings: str | os.PathLike[str],
+    *,
+    out: str | os.PathLike[str],
+    free_rows: int = 20,
+    noise_share: float = 1.0,
+    overwrite: bool = False,
+) -> DecodedRecord:
+    """Decode a recording.
+
+    Parameters
+    ----------
+    decoder : path-like
+        ``NAME-decoder.json`` of `simulate`.
+    readings : path-like
+        CSV table of time, s, and the readings of F_z, M_x and M_y, V.
+    out : path-like
+        Folder for ``forces.html``, ``forces.json`` and ``forces.csv``.
+    free_rows : int
+        So many readings at the beginning are of a free fingertip: their mean is the first offset, which is recalibrated whenever nothing
+        touches. 0: the readings have no offset.
+    noise_share : float
+        Standard deviation of the noise in the readings over that of the decoder's electronics: 0.23 after the report's filter.
+    overwrite : bool
+        Whether results that the folder holds are replaced.
+
+    Raises
+    ------
+    InputError
+        Files that cannot be used, times that do not grow, fewer rows than `free_rows`, or a folder that cannot be written to.
+    """
+    if not 0.0 < noise_share <= 100.0:
+        raise InputError(f"noise_share is {noise_share:g}; give a number above 0, 1 for unfiltered readings")
+    source, table = Path(decoder), Path(readings)
+    stored = load_decoder(source)
+    chosen = ForceDecoder(
+        stored.radius_mm, np.array(stored.volts_per_load), np.array(stored.noise), np.array(stored.coefficients), np.array(stored.unit),
+        np.array(stored.spread), np.array(stored.limits), stored.model_error,
+    )  # fmt: skip
+    rows = read_numbers(table, ("time, s", "F_z, V", "M_x, V", "M_y, V"))
+    if (np.diff(rows[:, 0]) <= 0.0).any():
+        raise InputError(
+            f"{table}: row {int(np.flatnonzero(np.diff(rows[:, 0]) <= 0.0)[0]) + 2} is not later than the one before; sort them"
+        )
+    if not 0 <= free_rows <= len(rows):
+        raise InputError(
+            f"free_rows is {free_rows}, and {table} has {len(rows)} rows; give at most so many, or 0 for readings without offset"
+        )
+    folder = output_folder(out, ("forces.html", "forces.json", "forces.csv"), overwrite=overwrite)
+    volts, offsets = _without_offset(chosen, rows[:, 1:], free_rows, noise_share)
+    found = chosen.decode(volts, noise_share=noise_share)
+    csv = write_atomically(folder / "forces.csv", _csv(rows[:, 0], found))
+    settings: dict[str, Cell] = dict(input_record({"decoder": source, "readings": table}))
+    chapter = Chapter("forces", "Forces decoded from readings", (_section(rows[:, 0], found, offsets),), settings)
+    page, numbers = write_chapter(chapter, folder)
+    return DecodedRecord((page, numbers, csv), _summary(found))
+
+
+def _without_offset(decoder: ForceDecoder, volts: FloatArray, free_rows: int, noise_share: float) -> tuple[FloatArray, FloatArray]:
+    """Return readings less the offset, and the offset (n, 3), V, at every row."""
+    if free_rows == 0:
+        return volts, np.zeros_like(volts)
+    tracker = OffsetTracker(np.maximum(noise_share * decoder.noise * np.abs(decoder.volts_per_load), 1e-12))
+    tracker.restart(volts[:free_rows])
+    left, offsets = np.empty_like(volts), np.empty_like(volts)
+    for k, reading in enumerate(volts):
+        left[k] = tracker.without_offset(reading)
+        offsets[k] = tracker.offset_volts
+    return left, offsets
+
+
+def _csv(times: FloatArray, found: DecodedForces) -> str:
+    columns = [
+        times, 1e-3 * found.force_mn, *(1e-3 * found.force_95.T), found.tilt_deg, *found.tilt_95_deg.T, found.azimuth_deg,
+        found.cone_95_deg, *found.position_mm.T, found.position_95_mm,
+    ]  # fmt: skip
+    table = np.stack(columns, axis=1)
+    table[~found.answered, 1:] = np.nan
+    lines = [",".join("" if np.isnan(v) else f"{v:.6g}" for v in row) for row in table]
+    return "\n".join([",".join(_COLUMNS), *lines]) + "\n"
+
+
+def _summary(found: DecodedForces) -> tuple[tuple[str, str], ...]:
+    ok = found.answered
+    if not ok.any():
+        return (("readings answered", f"0 of {len(ok)}: all lie beyond the training"),)
+    top = int(np.nanargmax(found.force_mn))
+    low, high = 1e-3 * found.force_95[top]
+    return (
+        ("readings answered", f"{int(ok.sum())} of {len(ok)}"),
+        ("largest force, N", f"{1e-3 * found.force_mn[top]:.4g} ({low:.4g} to {high:.4g})"),
+        ("its tilt, degrees", f"{found.tilt_deg[top]:.3g} ({found.tilt_95_deg[top, 0]:.3g} to {found.tilt_95_deg[top, 1]:.3g})"),
+        ("its azimuth, degrees", f"{found.azimuth_deg[top]:.4g}"),
+    )
+
+
+def _section(times: FloatArray, found: DecodedForces, offsets: FloatArray) -> Section:
+    def draw(canvas: Canvas) -> None:
+        force, tilt, azimuth = canvas.subplots(1, 3)
+        force.fill_between(times, *(1e-3 * found.force_95.T), alpha=0.3, linewidth=0)
+        force.plot(times, 1e-3 * found.force_mn, linewidth=0.8)
+        tilt.fill_between(times, *found.tilt_95_deg.T, alpha=0.3, linewidth=0)
+        tilt.plot(times, found.tilt_deg, linewidth=0.8)
+        azimuth.plot(times, np.where(found.tilt_95_deg[:, 0] > 0.0, found.azimuth_deg, np.nan), ".", markersize=2)
+        for axes, name in ((force, "force (N)"), (tilt, "tilt (degrees)"), (azimuth, "azimuth (degrees)")):
+            axes.set(xlabel="time (s)", ylabel=name)
+        azimuth.set_ylim(-190, 190)
+
+    ok = found.answered
+    text = (
+        f"{int(ok.sum())} of {len(ok)} readings are answered; the others lie beyond the forces and tilts of the training, or nothing "
+        "touches. Intervals hold 95 %. The decoder supposes a contact that presses towards the centre of the hemisphere; sideways drag is "
+        "taken for another direction. An azimuth is shown where the tilt's interval excludes 0.",
+    )
+    summary = Table("Summary", ("quantity", "value"), _summary(found))
+    drift = Table(
+        "Offset", ("channel", "first, V", "last, V"),
+        tuple((n, float(a), float(b)) for n, a, b in zip(("F_z", "M_x", "M_y"), offsets[0], offsets[-1], strict=True)),
+        note="Recalibrated while nothing touches; a drift under a load cannot be told from the load.",
+    )  # fmt: skip
+    return Section("Forces", text, (summary, drift), (Figure("Forces", "With 95 % intervals.", draw, (11.0, 3.4)),))
