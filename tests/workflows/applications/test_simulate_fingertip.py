@@ -29,16 +29,16 @@ name = "tilted"
 tilt_deg = 15.0
 azimuth_deg = 90.0
 force_N = 1.5
-speed_mm_min = 30.0
+speed_mm_min = 3.0
 [decoder]
 tilts_deg = [0.0, 10.0, 20.0, 30.0]
 frictions = [0.5]
 young_modulus_kPa = [200.0, 240.0]
 force_N = [0.3, 1.7]
 [mesh]
-around = 2
+around = 3
 upwards = 2
-shells = 7
+shells = 8
 """
 CHIP = "[readings]\nchip_file = 'chip.toml'\n"
 
@@ -131,7 +131,7 @@ def test_a_jig_tilts_and_turns_every_press(tmp_path: Path) -> None:
         (("[0.0, 10.0, 20.0, 30.0]", "[5.0, 10.0, 20.0, 30.0]"), r"\[decoder\] tilts_deg are \[5.0, 10.0, 20.0, 30.0\]; begin with 0"),
         (("[0.0, 10.0, 20.0, 30.0]", "[0.0, 10.0, 10.0, 30.0]"), "must grow"),
         (("[mesh]", "[jig]\ntilt_error_deg = 44.0\n[mesh]"), "tilt_error_deg"),
-        (("around = 2", "around = 100"), r"\[mesh\] around = 100"),
+        (("around = 3", "around = 100"), r"\[mesh\] around = 100"),
     ],
 )
 def test_bad_studies_are_refused_and_nothing_is_written(change: tuple[str, str], what: str, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray
 
-LOG_POWERS, RATIO_POWERS = 4, 3  # powers of log(N) and of the squared ratio, from 0
+LOG_POWERS, RATIO_POWERS = 3, 3  # powers of log(N) and of the squared ratio, from 0
 TERMS = LOG_POWERS * RATIO_POWERS
 FORCE, TILT, POSITION = range(3)  # rows of the coefficients
 OUTPUTS = 8  # force, its sd over it, tilt, its sd, azimuth, sd of the direction across the tilt, angle of the contact, its sd

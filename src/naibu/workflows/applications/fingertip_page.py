@@ -21,6 +21,7 @@ from naibu.workflows.applications.fingertip_study import PreparedFingertip
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
+_POOR_PERCENT, _POOR_DEG = 5.0, 2.0
 _CHECKED = 12  # forces of every press that are decoded
 
 
@@ -142,7 +143,11 @@ def _decoding(results: FingertipResults, decoder: ForceDecoder) -> Section:
         fingertip_figures.decoded(canvas, found, forces, tilts)
 
     figure = Figure("Decoded", "Decoded over true values, with 95 % intervals.", draw, (10.0, 4.0))
-    return Section("Forces decoded from the readings", (), (table,), (figure,))
+    left, tilt_left = 100.0 * float(decoder.spread[0]), float(np.rad2deg(decoder.spread[1]))
+    fit = f"The decoder leaves {left:.2g} % of the force and {tilt_left:.2g} degrees of the training unexplained (standard deviations)."
+    if left > _POOR_PERCENT or tilt_left > _POOR_DEG:
+        fit += " That is much: refine the mesh, or add tilts to the training."
+    return Section("Forces decoded from the readings", (fit,), (table,), (figure,))
 
 
 def _angle(answer: DecodedForces, truth: FloatArray) -> FloatArray:
