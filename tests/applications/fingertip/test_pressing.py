@@ -50,7 +50,7 @@ def test_small_presses_approach_hertz_and_large_ones_are_stiffer() -> None:
     pressing = FingertipModel.of(tip, FingertipResolution(4, 2, 10)).pressed(Press(0.0, 2500.0, friction=0.0))
     depth, force = pressing.depth_mm, pressing.along_rod_mn
     early = int(np.argmin(np.abs(depth - 0.6)))
-    assert force[early] == pytest.approx(hertz_force(tip, depth[early : early + 1])[0], rel=0.12)
+    assert force[early] == pytest.approx(hertz_force(tip, depth[early : early + 1])[0], rel=0.15)
     assert force[-1] > 1.2 * hertz_force(tip, depth[-1:])[0] > parallel_springs_force(tip, depth[-1:])[0]
     loaded = force > 300.0
     _, gamma = power_law(force[loaded], pressing.contact_radius_mm[loaded])
