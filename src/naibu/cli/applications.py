@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from naibu.cli.console import WARNING, print_table, say
 from naibu.cli.described import Out, Overwrite, Whole
 from naibu.cli.run_record import wrote
-from naibu.cli.verbs import SCANS, verb
+from naibu.cli.verbs import SCANS, SIMULATE, verb
 from naibu.core.errors import InputError
 
 
@@ -81,15 +81,15 @@ def mammography(
     say(f"Page: {run.files[0]}   numbers: {run.files[1]}")
 
 
-@app.command
+@verb(SIMULATE, "decode-forces results/my_finger-decoder.json readings.csv --open")
 def decode_forces(
     decoder: Path,
     readings: Path,
     *,
     free_rows: Whole = 20,
     noise_share: float = 1.0,
-    out: Path = Path("naibu-forces"),
-    overwrite: Flag = False,
+    out: Out = Path("naibu-forces"),
+    overwrite: Overwrite = False,
 ) -> None:
     """Decode recorded readings of a soft fingertip into forces, directions and places with intervals.
 
@@ -113,6 +113,7 @@ def decode_forces(
 
     run = decoded(decoder, readings, out=out, free_rows=free_rows, noise_share=noise_share, overwrite=overwrite)
     print_table("naibu decode-forces", ("quantity", "value"), run.rows, left=True)
+    wrote(*run.files)
     say(f"Page: {run.files[0]}   numbers: {run.files[1]}   table: {run.files[2]}")
 
 
