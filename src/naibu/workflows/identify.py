@@ -103,7 +103,8 @@ def identify(
     overwrite : bool
         Whether results, or other files of these names, that `out` holds already are replaced.
     progress : callable, optional
-        Gets reports of the stages "calibration" and, with `cross_validate`, "without EXPERIMENT" (`naibu.core.progress`).
+        Gets reports of the stages "calibration on larger elements" (of large meshes), "calibration" and, with `cross_validate`, "without
+        EXPERIMENT" (`naibu.core.progress`).
 
     Returns
     -------

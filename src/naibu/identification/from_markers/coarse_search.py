@@ -76,7 +76,7 @@ def coarse_search(
     if max(t.specimen.mesh.n_points for t in load_cases) < WORTHWHILE:
         return None
     bodies = {t.specimen.experiment.name: t.specimen for t in load_cases}
-    rough = replace(search, tolerance=COARSE_TOLERANCE * search.tolerance)
+    rough, told = replace(search, tolerance=COARSE_TOLERANCE * search.tolerance), _on_larger_elements(progress)
     try:
         coarse = {name: coarsened(body) for name, body in bodies.items()}
         cases = tuple(MarkerLoadCase.of(coarse[t.specimen.experiment.name], t.state, noise) for t in load_cases)
@@ -84,12 +84,19 @@ def coarse_search(
         begin, warm_starts = (start, None) if coarser is None else (coarser.match.parameters.values(), coarser.warm_starts)
         if coarser is not None and coarser.match.status is Status.INTERRUPTED:
             return coarser
-        match = Matcher(cases, parameters, rough).run(progress=progress, checkpoint=checkpoint, start=begin, warm_starts=warm_starts)
+        match = Matcher(cases, parameters, rough).run(progress=told, checkpoint=checkpoint, start=begin, warm_starts=warm_starts)
     except (ConvergenceError, InputError):
         return None
     solutions = {t.name: SolvedLoadCase(fit, match.parameters) for t, fit in zip(cases, match.fits, strict=True)}
     finer = {t.name: on_finer_mesh(solutions[t.name], t.specimen, bodies[t.specimen.experiment.name]) for t in cases}
     return CoarseSearch(cases, match, finer, solutions)
+
+
+def _on_larger_elements(progress: Progress | None) -> Progress | None:
+    """Report the steps of a search as those of a stage of its own."""
+    if progress is None:
+        return None
+    return lambda report: progress(replace(report, stage=f"{report.stage} on larger elements"))
 
 
 def coarsened(body: Specimen) -> Specimen:
