@@ -3,30 +3,56 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import scipy.sparse as sp
 
+from naibu.core.arrays import FloatArray
 from naibu.mechanics.linear_algebra.direct import SuperLUSolver
-from naibu.mechanics.linear_algebra.updated_factors import BlockChange, UpdatedFactors
+from naibu.mechanics.linear_algebra.updated_factors import BlockChange, ChangedInverse, UpdatedFactors
+
+N = 12
 
 
-def test_the_changed_system_is_solved_also_where_nodes_come_later() -> None:
+@pytest.fixture
+def dense() -> FloatArray:
     random = np.random.default_rng(5)
-    n = 12
-    dense = random.standard_normal((3 * n, 3 * n)) + 20.0 * np.eye(3 * n)
-    updated = UpdatedFactors(SuperLUSolver().factorize(sp.bsr_matrix(dense, blocksize=(3, 3))), n)
-    b = random.standard_normal(3 * n)
-    for nodes in ([2, 7], [0, 2, 5], [2, 7]):
-        rows, columns = np.array([0, 0, 1]), np.array([0, 1, 0])
-        blocks = 10.0 * random.standard_normal((3, 3, 3))
-        changed = dense.copy()
-        for r, c, block in zip(rows, columns, blocks, strict=True):
-            changed[3 * nodes[r] : 3 * nodes[r] + 3, 3 * nodes[c] : 3 * nodes[c] + 3] += block
-        x = updated.solve(b, BlockChange(np.array(nodes), rows, columns, blocks))
-        np.testing.assert_allclose(x, np.linalg.solve(changed, b), atol=1e-4 * np.abs(x).max())
+    return np.asarray(random.standard_normal((3 * N, 3 * N)) + 20.0 * np.eye(3 * N))
 
 
-def test_without_a_change_the_factors_answer() -> None:
-    dense = np.diag(np.arange(1.0, 10.0))
-    updated = UpdatedFactors(SuperLUSolver().factorize(sp.bsr_matrix(dense, blocksize=(3, 3))), 3)
-    none = np.zeros(0, dtype=np.int64)
-    np.testing.assert_allclose(updated.solve(np.ones(9), BlockChange(none, none, none, np.zeros((0, 3, 3)))), 1.0 / np.arange(1.0, 10.0))
+def factors_of(matrix: FloatArray) -> UpdatedFactors:
+    return UpdatedFactors(SuperLUSolver().factorize(sp.bsr_matrix(matrix, blocksize=(3, 3))), len(matrix) // 3)
+
+
+def test_the_parts_of_the_inverse_are_those_of_the_matrix(dense: FloatArray) -> None:
+    made, inverse, x = factors_of(dense), np.linalg.inv(dense), np.ones(3 * N)
+    nodes, amounts = np.array([7, 2, 9]), np.random.default_rng(6).standard_normal((3, 3))
+    made.prepare(np.array([2, 5]))
+    rows = (3 * nodes[:, None] + np.arange(3)).ravel()
+    np.testing.assert_allclose(made.between(nodes), inverse[np.ix_(rows, rows)], atol=1e-6)
+    assert made.covered(np.array([[7, 3], [5, 2]])).tolist() == [[True, False], [True, True]]
+    made.add_columns(nodes, amounts, x)
+    np.testing.assert_allclose(x, 1.0 + inverse[:, rows] @ amounts.ravel(), atol=1e-6)
+
+
+@pytest.mark.parametrize("nodes", [[2, 7], [0, 2, 5], [7, 2]])
+def test_the_changed_system_is_solved(dense: FloatArray, nodes: list[int]) -> None:
+    random = np.random.default_rng(8)
+    some, made = np.array([0, 2, 5, 7, 11]), factors_of(dense)
+    rows, columns = np.array([0, 0, 1]), np.array([0, 1, 0])
+    blocks, b = 10.0 * random.standard_normal((3, 3, 3)), random.standard_normal((len(some), 3))
+    changed = np.eye(3 * len(some))
+    inverse = made.between(some).astype(float)
+    change = np.zeros_like(changed)
+    places = np.searchsorted(some, nodes)
+    for r, c, block in zip(places[rows], places[columns], blocks, strict=True):
+        change[3 * r : 3 * r + 3, 3 * c : 3 * c + 3] += block
+    found = ChangedInverse.of(made.between(some), BlockChange(places, rows, columns, blocks)).solve(b)
+    expected = np.linalg.solve(changed + inverse @ change, b.ravel())
+    np.testing.assert_allclose(found.ravel(), expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_without_a_change_nothing_happens(dense: FloatArray) -> None:
+    none, b = np.zeros(0, dtype=np.int64), np.ones((2, 3))
+    same = ChangedInverse.of(factors_of(dense).between(np.array([1, 4])), BlockChange(none, none, none, np.zeros((0, 3, 3))))
+    np.testing.assert_allclose(same.solve(b), b)
+    np.testing.assert_allclose(factors_of(np.diag(np.arange(1.0, 10.0))).solve(np.ones(9)), 1.0 / np.arange(1.0, 10.0))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import njit
-from naibu.mechanics.finite_elements.hyperelasticity import inverse_transpose, stress_and_tangent
+from naibu.mechanics.finite_elements.hyperelasticity import NEO_HOOKEAN, inverse_transpose, stress_and_tangent
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
 def forces_with_pressures(  # type: ignore[no-untyped-def]  # pragma: no cover
     start, connectivity, local, gradients, weights, cells, codes, parameters, bulk, u, pressure, force, mismatch
 ):
@@ -32,20 +32,24 @@ def forces_with_pressures(  # type: ignore[no-untyped-def]  # pragma: no cover
         if not smallest > 0.0:
             return smallest
         theta /= volume
-        mismatch[e] = bulk[e] * np.log(theta) - pressure[e]
+        log_theta = np.log(theta)
+        mismatch[e] = bulk[e] * log_theta - pressure[e]
         total = 0.0
         for q in range(count):
-            scale = np.cbrt(theta / det[q])
+            scale, w, cell = np.cbrt(theta / det[q]), weights[first + q], cells[first + q]
+            if codes[cell] == NEO_HOOKEAN:  # P = mu F + (lambda log(theta) - mu) F^-T, without another logarithm
+                s[q] = w * _neo_hookean(parameters[cell, 0], parameters[cell, 1], log_theta, scale, w, f[q], g[q], stress[q])
+                total += s[q]
+                continue
             for i in range(3):
                 for j in range(3):
                     fbar[i, j] = scale * f[q, i, j]
                     gbar[i, j] = g[q, i, j] / scale
-            cell = cells[first + q]
             stress_and_tangent(codes[cell], parameters[cell], fbar, gbar, theta, d, c, stress[q], none, False)
             s[q] = 0.0
             for i in range(3):
                 for j in range(3):
-                    stress[q, i, j] *= weights[first + q] * scale
+                    stress[q, i, j] *= w * scale
                     s[q] += stress[q, i, j] * f[q, i, j] / 3.0
             total += s[q]
         for q in range(count):
@@ -95,6 +99,17 @@ def along_group_derivatives(connectivity, derivative, step, out):  # type: ignor
             for i in range(3):
                 v += derivative[e, a, i] * step[connectivity[e, a], i]
         out[e] = v
+
+
+@njit(cache=True, inline="always", fastmath={"contract", "reassoc"})
+def _neo_hookean(mu, lame_lambda, log_theta, scale, weight, f, g, stress):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Put the stress of ``scale f``, times scale and weight, in place; returns a third of its product with f, by weight."""
+    a, b, norm = mu * scale * scale, lame_lambda * log_theta - mu, 0.0
+    for i in range(3):
+        for j in range(3):
+            stress[i, j] = weight * (a * f[i, j] + b * g[i, j])
+            norm += f[i, j] * f[i, j]
+    return a * norm / 3.0 + b
 
 
 @njit(cache=True, inline="always")

@@ -17,7 +17,7 @@ from naibu.mechanics.linear_algebra.direct import pardiso_library, use_threads
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
 from naibu.mechanics.linear_algebra.updated_factors import BlockChange, UpdatedFactors
 
-THRESHOLD = 5e-3  # of the largest stiffness of the contact: change of a block that is taken into account
+THRESHOLD = 5e-4  # of the largest stiffness of the contact: change of a block that is taken into account
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,23 +135,6 @@ class SolverPool:
     def put(self, solver: LinearSolver) -> None:
         """Take back a solver."""
         self._spare.append(solver)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ContactChange:
-    """A change of stiffness since a tangent, see `contact_change`, and what it was made from."""
-
-    tangent: EarlierTangent
-    blocks: FloatArray
-    gripped: IntArray
-    change: BlockChange
-
-    def serves(self, tangent: EarlierTangent, blocks: FloatArray, gripped: IntArray) -> bool:
-        """Whether it represents other contacts as well."""
-        if tangent is not self.tangent or not np.array_equal(gripped, self.gripped):
-            return False
-        largest = float(np.abs(self.blocks).max(initial=0.0))
-        return float(np.abs(blocks - self.blocks).max(initial=0.0)) <= THRESHOLD * largest
 
 
 def contact_change(pattern: BlockPattern, blocks: FloatArray, tangent: EarlierTangent, gripped: IntArray, hold: float) -> BlockChange:

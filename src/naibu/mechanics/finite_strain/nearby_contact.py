@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from naibu._numba.compilation import njit
-from naibu.core.arrays import FloatArray, Int32Array, IntArray
+from naibu.core.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from naibu.mechanics.contact._geometry_kernels import mesh_of, signed_distance
 from naibu.mechanics.contact.indenter_geometry import packed_geometry
 from naibu.mechanics.contact.penalty_contact import Contact, ContactResponse
@@ -35,20 +35,23 @@ class NearbyContact:
     points: IntArray
     response: ContactResponse = field(init=False)
 
+    def only(self, which: BoolArray) -> NearbyContact:
+        """Return the points that are marked (p,)."""
+        return self if which.all() else NearbyContact(_points(self.contact, which), self.anchors[which], self.points[which])
+
     @classmethod
     def of(cls, contact: Contact, anchors: FloatArray, gap: FloatArray, margin_mm: float) -> NearbyContact:
         """Return the points whose gaps (p,) are below a margin, mm."""
         near = np.flatnonzero(gap < margin_mm).astype(np.int64)
-        part = replace(
-            contact, nodes=contact.nodes[near], shape=contact.shape[near], rest=contact.rest[near], area=contact.area[near],
-            normal_stiffness=contact.normal_stiffness[near], tangential_stiffness=contact.tangential_stiffness[near],
-            friction_coefficient=contact.friction_coefficient[near], element_size=contact.element_size[near],
-        )  # fmt: skip
-        return cls(part, anchors[near], near)
+        return cls(_points(contact, near), anchors[near], near)
+
+    def evaluate(self, displacement: FloatArray) -> None:
+        """Evaluate the contact at a displacement (n, 3), mm."""
+        self.response = self.contact.evaluate(displacement, self.anchors, 1.0)
 
     def add_force(self, displacement: FloatArray, force: FloatArray) -> None:
         """Evaluate the contact at a displacement (n, 3), mm, and add its forces to `force` (n, 3), mN."""
-        self.response = self.contact.evaluate(displacement, self.anchors, 1.0)
+        self.evaluate(displacement)
         if len(self.points):
             _scatter_forces(self.contact.nodes, self.contact.shape, self.response.force @ self.response.orientation.T, force)
 
@@ -56,6 +59,24 @@ class NearbyContact:
         """Add the stiffness at the last evaluation; `positions` are those of all points in the pattern."""
         if len(self.points):
             self.contact.add_stiffness(self.response, pattern, positions[self.points], blocks)
+
+    def add_symmetric_stiffness(self, pattern: BlockPattern, positions: Int32Array, blocks: FloatArray) -> None:
+        """Add what `add_stiffness` adds, without the friction of points that slide, whose stiffness has no symmetry."""
+        if len(self.points):
+            r = self.response
+            slides = (r.slip_direction != 0.0).any(axis=1)
+            friction = self.contact.area[:, None, None] * r.tangential_stiffness
+            sticking = np.where(slides[:, None, None], 0.0, 0.5 * (friction + friction.transpose(0, 2, 1)))
+            symmetric = replace(r, stiffness=r.stiffness - friction + sticking)
+            self.contact.add_stiffness(symmetric, pattern, positions[self.points], blocks)
+
+
+def _points(contact: Contact, which: IntArray | BoolArray) -> Contact:
+    return replace(
+        contact, nodes=contact.nodes[which], shape=contact.shape[which], rest=contact.rest[which], area=contact.area[which],
+        normal_stiffness=contact.normal_stiffness[which], tangential_stiffness=contact.tangential_stiffness[which],
+        friction_coefficient=contact.friction_coefficient[which], element_size=contact.element_size[which],
+    )  # fmt: skip
 
 
 def local_positions(contact: Contact, displacement: FloatArray, load: float) -> tuple[FloatArray, FloatArray]:

@@ -9,6 +9,7 @@ of Woodbury. Anderson's acceleration does the rest. A step that these iterations
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -20,20 +21,25 @@ from naibu.core.arrays import FloatArray, Int32Array, IntArray
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.pressure_elements import PressureElements
+from naibu.mechanics.finite_strain.condensed_contact import CondensedContact, ContactBesideTangent
 from naibu.mechanics.finite_strain.dynamic_session import DynamicEngine, DynamicSession, DynamicState
-from naibu.mechanics.finite_strain.earlier_tangent import ContactChange, EarlierTangent, SolverPool, TangentThread, contact_change
+from naibu.mechanics.finite_strain.earlier_tangent import EarlierTangent, SolverPool, TangentThread
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact, local_positions
 from naibu.mechanics.linear_algebra.anderson import AndersonMixing
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern, block_pattern, with_dirichlet_rows
 from naibu.mechanics.linear_algebra.direct import PardisoSolver, SuperLUSolver, pardiso_library
-from naibu.mechanics.linear_algebra.updated_factors import BlockChange, UpdatedFactors
+from naibu.mechanics.linear_algebra.updated_factors import UpdatedFactors
 
-ITERATIONS = 12  # of a step at most
+ITERATIONS = 5  # of a step at most
+USUAL = 2  # of a step whose out-of-balance force is then below PASSABLE
 DEPTH = 4  # earlier iterations that are mixed
-FINISHED = 5e-3  # out-of-balance force, as a fraction of all forces, at which a step ends
+FINISHED = 1e-2  # out-of-balance force, as a fraction of all forces, at which a step ends
 SETTLED = 1e-3  # below which no iteration is worth while
-VOLUME_ERROR = 2e-4  # difference of the volume strain and that of its pressure
-ACCEPTED = 0.05  # out-of-balance force of a step that has used up its iterations
+PASSABLE = 5e-2
+VOLUME_ERROR = 3e-4  # difference of the volume strain and that of its pressure
+HOPELESS = 10.0  # as below, where time is short
+ACCEPTED = 0.6  # out-of-balance force of a step that has used up its iterations; the next steps take up what is left
+BUDGET_S = 0.02  # of a processor for a step, after which a passable balance is taken, and after twice as much the best there is
 DIVERGED = 1e6  # out-of-balance force from which a step is tried from another beginning
 JUMP = 10.0  # its growth from which earlier iterations are forgotten, as where contacts close
 AHEAD = 240  # nodes in contact, or about to be, for which the inverse is prepared
@@ -48,7 +54,8 @@ class RealTimeEngine(DynamicEngine):
     Attributes
     ----------
     background : bool
-        Whether a thread renews the factors; otherwise they are renewed before every tenth step, so that runs are repeatable.
+        Whether a thread renews the factors, and iterations end when the time of a step is over; otherwise factors are renewed before every
+        tenth step, and runs are repeatable.
     """
 
     background: bool = True
@@ -81,10 +88,10 @@ class RealTimeEngine(DynamicEngine):
 
 
 def _solver(pattern: BlockPattern) -> PardisoSolver | SuperLUSolver:
-    """A solver for unsymmetric matrices of a pattern, in single precision where that is possible."""
+    """A solver for symmetric matrices of a pattern, in single precision where that is possible."""
     if pardiso_library() is None:
         return SuperLUSolver()
-    return PardisoSolver(pattern.matrix(np.zeros((pattern.n_blocks, 3, 3))), symmetric=False, single_precision=True)
+    return PardisoSolver(pattern.matrix(np.zeros((pattern.n_blocks, 3, 3))), symmetric=True, single_precision=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +100,8 @@ class _Trial:
 
     displacement: FloatArray
     pressure: FloatArray
-    balance: FloatArray  # all forces, those on constrained nodes included
+    balance: FloatArray  # all forces but those of contact, those on constrained nodes included
+    contact: FloatArray
     mismatch: FloatArray
     error: float
 
@@ -111,19 +119,21 @@ class RealTimeSession(DynamicSession):
         Steps so far that Newton's method had to take.
     iterations : int
         Quasi-Newton iterations so far.
+    unbalanced : float
+        Out-of-balance force at the end of the last step, as a fraction of the sum of all forces; the next steps take it up.
     """
 
     newton_steps: int = field(init=False, default=0)
     iterations: int = field(init=False, default=0)
+    unbalanced: float = field(init=False, default=0.0)
     _earlier: EarlierTangent | None = field(init=False, default=None)
     _thread: TangentThread = field(init=False, default_factory=TangentThread)
     _near: tuple[NearbyContact, ...] = field(init=False, default=())
     _gaps: tuple[FloatArray, ...] = field(init=False, default=())
     _places: tuple[Int32Array, ...] = field(init=False, default=())
     _pressure: FloatArray | None = field(init=False, default=None)
+    _condensed: CondensedContact | None = field(init=False, default=None)
     _trial: _Trial | None = field(init=False, default=None)
-    _changed: ContactChange | None = field(init=False, default=None)
-    _motion: FloatArray = field(init=False, default_factory=lambda: np.zeros(0))
     _seen: FloatArray | None = field(init=False, default=None)
     _age: int = field(init=False, default=0)
 
@@ -131,7 +141,7 @@ class RealTimeSession(DynamicSession):
         """Bring these indenters, and no others, into play; see `DynamicSession.press`."""
         DynamicSession.press(self, indenters)
         self._places = tuple(self._engine._surface.positions(c.nodes) for c in self._templates)
-        self._near, self._gaps, self._trial, self._changed = (), (), None, None
+        self._near, self._gaps, self._trial = (), (), None
 
     def restore(self, state: DynamicState) -> None:
         """Go on from a state; see `DynamicSession.restore`."""
@@ -182,9 +192,6 @@ class RealTimeSession(DynamicSession):
             NearbyContact.of(c, a, gap, 2.0 * (fastest + way) + 0.01 * self._extent())
             for c, a, gap, way in zip(contacts, start.anchors, self._gaps, travel, strict=True)
         )
-        motion = np.concatenate([moving.ravel(), *[c.stop - c.start for c in contacts]])
-        changes = not np.array_equal(motion, self._motion)
-        self._motion = motion
         pressure = self._pressure
         if pressure is None:
             pressure = self._engine._elements.bulk * self._engine._elements.dilatation(start.displacement)[0]
@@ -195,30 +202,41 @@ class RealTimeSession(DynamicSession):
                 target[nodes] = start.displacement[nodes] + h * speed
             return self._tried(target, inertial, pressure)
 
-        first = begun(inertial)
-        if first is None or (changes and first.error > FINISHED):
-            other = begun(start.displacement)
-            first = other if first is None else first.better(other)
-        found = None if first is None else self._iterated(tangent, first, inertial)
-        if found is None and first is not None and first.displacement is not start.displacement:
-            again = begun(start.displacement)
-            found = None if again is None else self._iterated(tangent, again, inertial)
-        return found
+        deadline = time.thread_time() + BUDGET_S if self._engine.background else np.inf
+        best: _Trial | None = None
+        for guess in (inertial, start.displacement):
+            first = begun(guess)
+            if first is not None:
+                best = self._iterated(tangent, first, inertial, deadline).better(best)
+                if best.error <= ACCEPTED or time.thread_time() > deadline:
+                    break
+        if best is None or best.error > (HOPELESS if self._engine.background else ACCEPTED):
+            return None
+        for near in self._near:  # the responses are those of the last trial
+            near.evaluate(best.displacement)
+        self.unbalanced = best.error
+        return best
 
-    def _iterated(self, tangent: EarlierTangent, trial: _Trial, inertial: FloatArray) -> _Trial | None:
-        """Return the balance that the iterations find from a beginning, None where they diverge."""
-        mixing = AndersonMixing(DEPTH)
+    def _iterated(self, tangent: EarlierTangent, trial: _Trial, inertial: FloatArray, deadline: float) -> _Trial:
+        """Return the best that the iterations find from a beginning, in the time of a processor that there is."""
+        mixing, best = AndersonMixing(DEPTH), trial
         for k in range(ITERATIONS):
             wrong = float(np.abs(trial.mismatch / self._engine._elements.bulk).max())
+            passable = trial.error <= PASSABLE and wrong <= 10.0 * VOLUME_ERROR
             if trial.error <= (FINISHED if k else SETTLED) and wrong <= VOLUME_ERROR:
+                return trial
+            if passable and k and (k >= USUAL or time.thread_time() > deadline):
                 return trial
             after = self._improved(tangent, trial, inertial, mixing)
             if after is None or after.error > DIVERGED:
-                return None
+                break
             if after.error > JUMP * trial.error:
                 mixing = AndersonMixing(DEPTH)
             trial = after
-        return trial if trial.error <= ACCEPTED else None
+            best = trial.better(best if k else None)
+            if time.thread_time() > deadline + BUDGET_S:
+                break
+        return best
 
     def _improved(self, tangent: EarlierTangent, trial: _Trial, inertial: FloatArray, mixing: AndersonMixing) -> _Trial | None:
         """Return the end of one quasi-Newton iteration; None where it inverts an element."""
@@ -226,9 +244,7 @@ class RealTimeSession(DynamicSession):
         self.iterations += 1
         force = trial.balance.copy()
         elements.add_pressures(tangent.dilatation, trial.mismatch, force)
-        force[self._constrained] = 0.0
-        step = -tangent.factors.solve(force.ravel(), self._change(tangent)).reshape(-1, 3)
-        step[self._constrained] = 0.0
+        step = self._with_contact(tangent, trial, force, not mixing.steps)
         rise = elements.pressure_change(tangent.dilatation, step, trial.mismatch)
         scale = 1e-2 * self._extent() / float(self.engine.assembler.parameters[:, 0].max())  # mm/kPa
         now = np.concatenate([trial.displacement.ravel(), scale * trial.pressure])
@@ -250,22 +266,50 @@ class RealTimeSession(DynamicSession):
         for near in self._near:
             near.add_force(u, contact)
         residual, allowed = self._implicit_step(engine.step, ()).balance(u, balance, contact)
-        balance += (engine.mass / engine.step**2)[:, None] * (u - inertial) - self.external_force - contact
-        return _Trial(u, pressure, balance, mismatch, engine.tolerance * float(np.abs(residual).sum()) / allowed)
+        scale = float(allowed / engine.tolerance + np.abs(contact).sum())
+        balance += (engine.mass / engine.step**2)[:, None] * (u - inertial) - self.external_force
+        return _Trial(u, pressure, balance, contact, mismatch, float(np.abs(residual).sum()) / scale)
 
-    def _change(self, tangent: EarlierTangent) -> BlockChange:
-        """Return where contacts and grips differ from those of a tangent."""
-        surface = self._engine._surface
-        blocks = np.zeros((surface.n_blocks, 3, 3))
-        for near, places in zip(self._near, self._places, strict=True):
-            near.add_stiffness(surface, places, blocks)
+    def _with_contact(self, tangent: EarlierTangent, trial: _Trial, balance: FloatArray, first: bool) -> FloatArray:
+        """Return the step (n, 3), mm, that brings a balance (n, 3), mN, without contact to zero, with contacts as they then are."""
+        balance[self._constrained] = 0.0
+        x = -tangent.factors.solve(balance.ravel())
+        free = x.reshape(-1, 3)  # gripped nodes move as well: they are held by the law below
+        concerned = (tangent.contact != 0.0).any(axis=(1, 2))
+        marked = np.zeros(len(free), dtype=bool)
+        marked[self._engine._surface.indices[concerned]] = True
+        active = []
+        for near in self._near:
+            after = local_positions(near.contact, trial.displacement + free, 1.0)[1]
+            known = tangent.factors.covered(near.contact.nodes).all(axis=1)
+            touches = (near.response.gap < 0.0) | ((after < 0.0) & known) | marked[near.contact.nodes].any(axis=1)
+            active.append(near.only(touches))
+        for some in active:
+            marked[some.contact.nodes] = True
         gripped = np.concatenate([*self.bodies[1:], np.zeros(0, np.int64)])
-        last = self._changed
-        if last is None or not last.serves(tangent, blocks, gripped):
+        marked[gripped] = True
+        marked[tangent.held] = False
+        nodes = np.flatnonzero(marked).astype(np.int64)
+        if len(nodes):
+            condensed = self._condensed
+            if condensed is None or not condensed.serves(tangent, nodes):
+                condensed = self._condensed = CondensedContact(tangent, nodes)
+            nodes = condensed.nodes
             hold = 1e3 * float(self._engine._elements.bulk.max()) * self._extent()
-            last = ContactChange(tangent, blocks, gripped, contact_change(surface, blocks, tangent, gripped, hold))
-            self._changed = last
-        return last.change
+            law = ContactBesideTangent(nodes, trial.displacement, active, self._places, self._engine._surface, tangent, gripped, hold)
+            begin = self._carried(trial.displacement) - trial.displacement if first else np.zeros_like(free)
+            force = condensed.forces(free[nodes], law, begin[nodes], 1e-5 * self._extent(), 0.05 * self._extent())
+            tangent.factors.add_columns(nodes, force, x)
+        free[self._constrained] = 0.0
+        return free
+
+    def _carried(self, trial: FloatArray) -> FloatArray:
+        """Return the displacement (n, 3), mm, of a trial, with the nodes that indenters touch carried along by them."""
+        out = trial.copy()
+        for near, gaps in zip(self._near, self._gaps, strict=True):
+            nodes = near.contact.nodes[gaps[near.points] < 0.0]
+            out[nodes] = self.reached.displacement[nodes] + near.contact.stop - near.contact.start
+        return out
 
     def _accepted(self, h: float, u: FloatArray, contacts: tuple[Contact, ...], spin: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Keep the end of a step; returns the forces of the bodies and of the indenters, mN."""
@@ -282,18 +326,16 @@ class RealTimeSession(DynamicSession):
         self.reached = self._behind(h, u, contacts, spin, tuple(anchors))
         self._pressure, self._gaps = trial.pressure, tuple(gaps)
         self._renew(self._soon_touched(contacts, gaps))
-        return np.array([trial.balance[nodes].sum(axis=0) for nodes in self.bodies]).reshape(-1, 3), of_indenters
+        return np.array([(trial.balance - trial.contact)[nodes].sum(axis=0) for nodes in self.bodies]).reshape(-1, 3), of_indenters
 
     def _soon_touched(self, contacts: Sequence[Contact], gaps: Sequence[FloatArray]) -> IntArray:
-        """Nodes whose contact has changed, where it is about to begin, the nearest first, and those in contact, the least deep first."""
-        changed = np.zeros(0, np.int64) if self._changed is None else self._changed.change.nodes  # they will change again
-        nodes, order = [changed], [np.full(len(changed), -1.0)]
+        """Nodes in contact, and those about to be, the nearest first."""
+        nodes, order = [np.zeros(0, np.int64)], [np.zeros(0)]
         reach = REACH * self._extent()
         for contact, gap in zip(contacts, gaps, strict=True):
             near = np.flatnonzero(gap < reach)
-            distance = np.where(gap[near] >= 0.0, gap[near], reach - gap[near])
             nodes.append(contact.nodes[near].ravel())
-            order.append(np.repeat(distance, contact.nodes.shape[1]))
+            order.append(np.repeat(np.maximum(gap[near], 0.0), contact.nodes.shape[1]))
         ranked = np.concatenate(nodes)[np.argsort(np.concatenate(order), kind="stable")]
         return np.asarray(ranked[np.sort(np.unique(ranked, return_index=True)[1])][:AHEAD], dtype=np.int64)
 
@@ -302,7 +344,7 @@ class RealTimeSession(DynamicSession):
         done = self._thread.take()
         if done is not None:
             self._release(self._earlier)
-            self._earlier, self._age = done, 0
+            self._earlier, self._age, self._condensed = done, 0, None
         held = self.bodies[0] if self.bodies else np.zeros(0, np.int64)
         for known in (self._earlier, *self._engine._rest):
             if known is not None and np.array_equal(known.held, held):
@@ -318,7 +360,7 @@ class RealTimeSession(DynamicSession):
         """Have a tangent made of the state reached, if anything has changed since the last one."""
         u = self.reached.displacement
         still = self._seen is not None and float(np.abs(u - self._seen).max()) < 1e-4 * self._extent()
-        still &= self._earlier is not None and self._earlier.factors.covers(ahead[: len(ahead) // 3])
+        still &= self._earlier is not None and bool(self._earlier.factors.covered(ahead[: len(ahead) // 3]).all())
         self._age += 1
         if still or not self._thread.idle or (not self._engine.background and self._age < PERIOD):
             return
@@ -339,8 +381,8 @@ class RealTimeSession(DynamicSession):
         blocks = engine.assembler.evaluate(u)[2]
         contact = np.zeros((engine._surface.n_blocks, 3, 3))
         for some, place, all_places in zip(near, places, self._positions, strict=False):
-            some.add_stiffness(pattern, all_places, blocks)
-            some.add_stiffness(engine._surface, place, contact)
+            some.add_symmetric_stiffness(pattern, all_places, blocks)
+            some.add_symmetric_stiffness(engine._surface, place, contact)
         blocks[pattern.diagonal()] += (engine.mass / engine.step**2)[:, None, None] * np.eye(3)
         fixed = np.zeros(engine.points.shape, dtype=bool)
         fixed[held] = True

@@ -23,6 +23,11 @@ class AndersonMixing:
     _x: list[FloatArray] = field(init=False, default_factory=list)
     _d: list[FloatArray] = field(init=False, default_factory=list)
 
+    @property
+    def steps(self) -> int:
+        """Steps that are kept."""
+        return len(self._x)
+
     def step(self, x: FloatArray, d: FloatArray) -> FloatArray:
         """Return the step (n,) to take from x (n,), where the iteration itself would step by d (n,)."""
         mixed = d
