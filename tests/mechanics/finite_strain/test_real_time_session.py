@@ -26,6 +26,7 @@ from naibu.mechanics import (
 )
 from naibu.mechanics.contact.indenter_contacts import indenter_contacts
 from naibu.mechanics.finite_strain.dynamic_session import DynamicSession
+from naibu.mechanics.finite_strain.real_time_session import RealTimeSession
 from naibu.meshing import boundary_faces, box
 from naibu.meshing.element_conversion import to_tetra
 
@@ -81,6 +82,24 @@ def test_the_path_under_a_sphere_is_that_of_newtons_method(background: bool) -> 
     moved = np.abs(expected - made.points).max()
     assert np.abs(found - expected).max() < 0.02 * moved
     np.testing.assert_allclose(force, newton, atol=0.02 * np.abs(newton).max())
+
+
+def test_a_plate_that_stops_at_once_and_leaves_fast_needs_no_step_of_newtons_method() -> None:
+    paths = []
+    for made in (engine(background=False), engine(kind=DynamicEngine)):
+        plate = plane_indenter((0.0, 0.0, SIZE + 0.5), (0.0, 0.0, -1.0), static_friction=0.3, kinetic_friction=0.3)
+        with made.session(constrained=[lowest(made.points)], indenters=[plate]) as session:
+            path = []
+            for speed in [-24.0] * 10 + [0.0] * 3 + [200.0] * 6:
+                session.step(motions=[IndenterVelocity((0.0, 0.0, speed))])
+                path.append(session.positions())
+            paths.append(np.array(path))
+        if isinstance(session, RealTimeSession):
+            assert session.newton_steps == 0
+            assert session.unbalanced < 0.6
+    moved = np.abs(paths[1] - made.points).max()
+    assert np.abs(paths[0][:13] - paths[1][:13]).max() < 0.03 * moved
+    assert np.abs(paths[0] - paths[1]).max() < 0.15 * moved
 
 
 def test_gripped_nodes_follow_and_let_go() -> None:

@@ -22,7 +22,7 @@ from naibu.mechanics.finite_strain.nearby_contact import NearbyContact
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 from naibu.mechanics.linear_algebra.updated_factors import BlockChange, ChangedInverse
 
-EVALUATIONS = 16  # of the contact at most
+EVALUATIONS = 24  # of the contact at most
 USUAL = 6  # evaluations after which ten times the tolerance is enough
 HALVINGS = 5  # of a step that does not improve: points may stick and slip by turns
 FAST = 0.2  # of what was left: progress with which an earlier derivative of the contact goes on being used

@@ -61,13 +61,15 @@ class NearbyContact:
             self.contact.add_stiffness(self.response, pattern, positions[self.points], blocks)
 
     def add_symmetric_stiffness(self, pattern: BlockPattern, positions: Int32Array, blocks: FloatArray) -> None:
-        """Add what `add_stiffness` adds, without the friction of points that slide, whose stiffness has no symmetry."""
+        """Add what `add_stiffness` adds but the growth of friction with pressure, without which the stiffness is symmetric."""
         if len(self.points):
             r = self.response
-            slides = (r.slip_direction != 0.0).any(axis=1)
             friction = self.contact.area[:, None, None] * r.tangential_stiffness
-            sticking = np.where(slides[:, None, None], 0.0, 0.5 * (friction + friction.transpose(0, 2, 1)))
-            symmetric = replace(r, stiffness=r.stiffness - friction + sticking)
+            normal = r.stiffness - friction
+            size = np.trace(normal, axis1=1, axis2=2)[:, None, None]
+            along = normal / np.where(size == 0.0, 1.0, size)  # the projection on the normal, as far as the surface is flat
+            friction = friction - friction @ along
+            symmetric = replace(r, stiffness=normal + 0.5 * (friction + friction.transpose(0, 2, 1)))
             self.contact.add_stiffness(symmetric, pattern, positions[self.points], blocks)
 
 
