@@ -105,7 +105,8 @@ def test_momentum_balances_with_the_reactions():
     impulse = engine.step * motion.reaction.sum(axis=(0, 1))
     np.testing.assert_allclose(momentum, impulse, atol=2e-3 * np.abs(engine.step * motion.reaction).sum())
     assert motion.reaction[-1, 1, 2] < 0.0
-    assert bodies[1].gap(motion.state.position - (10.0 * 0.4, 0, -30.0 * 0.4)).min() > -1.0  # a tenth of a face
+    # 0.66 mm, the depth by which the solid between the nodes of faces as large as the ball yields under 0.8 N
+    assert bodies[1].gap(motion.state.position - (10.0 * 0.4, 0, -30.0 * 0.4)).min() > -0.7
 
 
 @pytest.mark.parametrize(("pull", "slides"), [(0.6, False), (1.1, True)])
@@ -217,9 +218,11 @@ def test_a_soft_block_slides_down_a_slope_as_coulomb_says(friction, slope):
     motion = push(engine, engine.rest(), floor, 0.0, steps=300, external_force=forces)
     speed = (lattice.node_mass @ motion.state.velocity[:, 0]) / lattice.total_mass
     assert speed == pytest.approx((slope - friction) * GRAVITY * 300 * engine.step, rel=0.03)
-    assert motion.unsettled <= 3  # of 300 steps; it bounces
+    assert motion.unsettled <= 2  # of 300 steps: impacts in which points alternate between stick and slip
     tangential, normal = np.hypot(motion.reaction[:, 0, 0], motion.reaction[:, 0, 1]), motion.reaction[:, 0, 2]
-    assert (tangential <= 1.1 * friction * normal + 1e-3 * normal.max())[1:].all()  # the first step is an impact
+    beyond = (tangential - friction * normal)[1:]  # the first step is an impact
+    assert (beyond > 0.002 * friction * normal[1:] + 2e-4 * normal.max()).sum() <= motion.unsettled
+    assert (beyond <= 0.02 * friction * normal[1:] + 1e-6 * normal.max()).all()
 
 
 def test_a_thrown_block_stops_and_stays():

@@ -100,7 +100,7 @@ def test_all_indenters_push_and_drag_with_what_they_exert(name: str) -> None:
     assert found[-1, 0] > 50.0
     assert np.abs(np.diff(found[3:60, 2])).max() < 0.15 * np.ptp(found[:60, 2])  # a lying cylinder meets whole rows of faces
     if name == "plane":
-        assert (np.hypot(found[:, 0], found[:, 1]) < 0.4 * 1.01 * -found[:, 2] + 1e-6).all()
+        assert (np.hypot(found[:, 0], found[:, 1]) <= 0.4 * 1.002 * -found[:, 2] + 1e-6).all()
 
 
 def test_a_frictionless_sphere_keeps_the_angular_momentum_about_its_centre() -> None:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import njit
-from naibu.mechanics.contact._geometry_kernels import mesh_of, signed_distance
+from naibu.mechanics.contact._geometry_kernels import SPHERE, mesh_of, signed_distance
 from naibu.mechanics.lattices.cpu._contact_operator import FACES
 
 FREE, STICK, SLIDE = range(3)
@@ -81,6 +81,11 @@ def near_faces(x, v, step, indenters, motion, surface, lists):  # type: ignore[n
 @njit(cache=True)
 def gap_of(geometry, mesh, axes, k, d, q, m, n, none):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return the gap of a point at d (3,) from the reference point of indenter k, and set its outward normal n; q and m are scratch."""
+    if geometry[0][k] == SPHERE:
+        r = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+        for a in range(3):
+            n[a] = d[a] / r if r > 0.0 else axes[k, 2, a]
+        return r - geometry[1][k, 0]
     for a in range(3):
         q[a] = axes[k, a, 0] * d[0] + axes[k, a, 1] * d[1] + axes[k, a, 2] * d[2]
     gap = signed_distance(geometry[0][k], geometry[1][k], mesh, q, m, none)
@@ -133,13 +138,18 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
         for g in range(each):
             p, shape = first[k] + f * each + g, shapes[rule[k] + g]
             own, result, weight = linear[p], found[p], weights[p]
-            stiff, spring = shape[4] * foundation[f, 0], shape[4] * foundation[f, 1]
             _combine(shape, at, d)
-            _combine(shape, speed, slip)
+            gap = gap_of(geometry, mesh, axes, k, d, q, m, n, none)
             if begins:
                 own[ACTIVE] = 0.0
+            if own[ACTIVE] == 0.0:
+                for c in range(RESULTS):
+                    result[c] = 0.0
+                if _is_far(gap, np.sqrt(weight), form[k, 0]):
+                    continue
+            _combine(shape, speed, slip)
             _exerted(own, slip, result)
-            gap = gap_of(geometry, mesh, axes, k, d, q, m, n, none)
+            stiff, spring = shape[4] * foundation[f, 0], shape[4] * foundation[f, 1]
             slope = _slope(n, across)
             carried = shape[0] * share[0] + shape[1] * share[1] + shape[2] * share[2] + shape[3] * share[3]
             _towards_face(n, across)
@@ -219,6 +229,12 @@ def _covered(depth, slope, width, curvature):  # type: ignore[no-untyped-def]  #
 
 
 @njit(cache=True)
+def _is_far(gap, width, curvature):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Tell whether an indenter covers nothing of a cell, whatever the slope of the gap."""
+    return gap >= 0.5 * width * (1.0 + 0.25 * width * curvature + LEAST_SLOPE)
+
+
+@njit(cache=True)
 def rest_at(x, indenters, surface, compression):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Set the compression of all foundations to what indenters cover at the positions x: a contact that begins there exerts nothing."""
     (geometry, axes), centres, _, _, form = indenters
@@ -258,9 +274,8 @@ def _open(own, n, motion, k, d, slip):  # type: ignore[no-untyped-def]  # pragma
 
 @njit(cache=True)
 def _exerted(own, slip, result):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Set what a linearized point exerts while it moves with the velocity `slip`."""
+    """Set what a linearized point exerts while it moves with the velocity `slip`; nothing, as before, where it is not in contact."""
     if own[ACTIVE] == 0.0:
-        result[:] = 0.0
         return
     away = 0.0
     for a in range(3):

@@ -19,7 +19,7 @@ from naibu._numba.compilation import njit
 from naibu._numba.simd import WIDTH, inverse_root, load, single, splat, store, total
 from naibu.mechanics.lattices.cpu._coarse_kernels import begin_with, follow
 from naibu.mechanics.lattices.cpu._contact_operator import FACES, add_contact
-from naibu.mechanics.lattices.cpu._pcg_kernels import dot, multiply, project, solve
+from naibu.mechanics.lattices.cpu._pcg_kernels import dot, multiply, project, residual_norm, solve
 
 _FAST = {"contract", "nsz"}
 
@@ -213,18 +213,27 @@ def new_velocity(blocks, tables, x, v, y, mass, right, work, inner, constrained,
 
     `tables` are a, b, E, g, K and h^2 a; `work` the arrays axes (3, 8 nb) and r, p, q (3 pad,); `inner` those of `conjugate_gradients`;
     `constrained` node, direction (h, 3), speed and body of every constrained component; `solver` the tolerance and the most iterations.
-    Leaves in r minus the impulses that hold the nodes; returns the number of iterations and the energy that the early end of the solver
-    dissipates, mN mm.
+    Leaves in r minus the impulses that hold the nodes; returns the number of iterations, the energy that the early end of the solver
+    dissipates, mN mm, and the square of the residual's norm at which it ended, for `improved_velocity`.
     """
     first, second, rows = blocks
-    axes, r, p, q = work
+    axes, r = work[0], work[1]
     constrain(constrained, v, len(mass))
     follow(inner[8], inner[3], constrained, False)
     r[:] = right
     add_momenta(mass, v, -1.0, r)
     add_contact(inner[9][0], inner[9][1], inner[9][5][FACES], -1.0, v, r)
     floor = prepare(first, second, rows, tables, x, y, v, axes, inner[1], r, step) * 1e-20 / mass.max()
-    count = solve(first, second, rows, tables[5], axes, mass, v, r, p, q, inner, constrained, floor, solver[0], solver[1])
+    goal = max(solver[0] ** 2 * residual_norm(r, inner[3], constrained), floor)
+    return *improved_velocity(blocks, tables, x, v, mass, work, inner, constrained, goal, solver[1]), goal
+
+
+@njit(cache=True, fastmath=_FAST)
+def improved_velocity(blocks, tables, x, v, mass, work, inner, constrained, goal, limit):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Improve v, whose residual is r, until the square of the residual's norm is below `goal`; see `new_velocity`."""
+    first, second, rows = blocks
+    axes, r, p, q = work
+    count = solve(first, second, rows, tables[5], axes, mass, v, r, p, q, inner, constrained, goal, limit)
     return count, settle(first, second, rows, tables[5], axes, mass, inner[9], constrained, x, v, r, p, q)
 
 
@@ -296,7 +305,7 @@ def implicit_steps(blocks, tables, state, mass, external, work, inner, constrain
             for a in range(3):
                 speed[h] += weight[h] * direction[h, a] * velocity[n, body[h], a]
         add_momenta(mass, v, 1.0, right)
-        count, lost = new_velocity(blocks, tables, x, v, y, mass, right, work, inner, now, step, solver)
+        count, lost, _ = new_velocity(blocks, tables, x, v, y, mass, right, work, inner, now, step, solver)
         add_reactions(now, work[1], len(mass), step, reaction[n])
         checked += advance(blocks, tables, x, v, before, y, lengths, mass, work[0], step, lost)
         iterations += count

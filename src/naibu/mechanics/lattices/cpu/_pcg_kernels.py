@@ -158,7 +158,7 @@ def conjugate_gradients(first, second, rows, inner, constrained, goal, limit, he
 
 
 @njit(cache=True, fastmath=_FAST)
-def _norm(r, smoother, constrained):  # type: ignore[no-untyped-def]  # pragma: no cover
+def residual_norm(r, smoother, constrained):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return the square of the norm of the free part of r, in double precision, times `smoother`, in single."""
     pad = len(smoother)
     s = splat(0.0)
@@ -176,14 +176,13 @@ def _norm(r, smoother, constrained):  # type: ignore[no-untyped-def]  # pragma: 
 
 
 @njit(cache=True, fastmath=_FAST)
-def solve(first, second, rows, stiff, axes, mass, v, r, p, q, inner, constrained, floor, tolerance, limit):  # type: ignore[no-untyped-def]  # pragma: no cover
+def solve(first, second, rows, stiff, axes, mass, v, r, p, q, inner, constrained, goal, limit):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Improve v, whose residual is r, by conjugate gradients in single precision, again while r in full precision asks for it.
 
-    It stops where the residual's norm fell to `tolerance` of its start or its square below `floor`. Returns the number of iterations.
+    It stops where the square of the residual's norm is below `goal`. Returns the number of iterations.
     """
     smoother, w, rough, coarse, touched = inner[3], inner[4], inner[5], inner[8], inner[9]
-    norm = _norm(r, smoother, constrained)
-    goal = max(tolerance**2 * norm, floor)
+    norm = residual_norm(r, smoother, constrained)
     count, helped = 0, len(coarse[5][2]) > 0
     for _ in range(8):
         if not norm > goal or count >= limit:
@@ -200,7 +199,7 @@ def solve(first, second, rows, stiff, axes, mass, v, r, p, q, inner, constrained
         add_contact(touched[0], touched[1], touched[5][FACES], 1.0, p, q)
         for i in range(len(r)):
             r[i] -= q[i]
-        norm = _norm(r, smoother, constrained)
+        norm = residual_norm(r, smoother, constrained)
     if len(coarse[5][2]):
         coarse[5][2][CREDIT] += count
     return count

@@ -317,7 +317,7 @@ def _driven_steps(  # type: ignore[no-untyped-def]  # pragma: no cover
         add_momenta(mass, v, 1.0, right)
         for h in range(len(constrained_node)):
             speed[h] = weight[h] * (direction[h] * velocity[n, constrained_by[h]]).sum()
-        _, lost = new_velocity(blocks, tables, x, v, y, mass, right, work, inner, now, step, (solver[0], solver[2]))
+        _, lost, _ = new_velocity(blocks, tables, x, v, y, mass, right, work, inner, now, step, (solver[0], solver[2]))
         add_reactions(now, r, pad, step, reaction[n])
         _answer(loads, force[n], v, before, mass, step, reaction[n])
         for p in range(len(xd)):
