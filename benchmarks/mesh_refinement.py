@@ -94,7 +94,7 @@ def forces(solve_on: StaticSolve, n: int, limit: int, **settings: float) -> tupl
     )
 
 
-def indentation(limit: int = 20_000, uniform_limit: int = 40_000) -> None:
+def indentation(limit: int = 20_000, uniform_limit: int = 100_000) -> None:
     law = material("linear_elastic", young_modulus=10.0, poisson_ratio=0.3)
     planes = tuple((lambda p, axis=axis: p[:, axis] < 1e-9, axis) for axis in range(2))
     sphere = spherical_indenter((0.0, 0.0, HEIGHT_MM + RADIUS_MM), RADIUS_MM)
@@ -102,7 +102,7 @@ def indentation(limit: int = 20_000, uniform_limit: int = 40_000) -> None:
     solve_on = hyperelastic_static(Conditions(lambda p: p[:, 2] < 1e-9, rollers=planes), [law], contacts=contacts)
     solve_on(block(4), None)
     adaptive = forces(solve_on, 4, limit, fraction=0.6)
-    uniform = forces(solve_on, 6, uniform_limit, fraction=1.0, bisections=3)
+    uniform = forces(solve_on, 9, uniform_limit, fraction=1.0, bisections=3)
     slope = np.polyfit(adaptive[0][-4:] ** (-2.0 / 3.0), adaptive[1][-4:], 1)
     print(f"force of the sphere, reference {slope[1]:.4f} N")
     print(f"{'mesh':>10s} {'unknowns':>9s} {'force, N':>9s} {'error, %':>9s} {'time, s':>8s}")

@@ -19,7 +19,7 @@ from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.mechanics.lattices.cpu._coarse_kernels import begin_with
 from naibu.mechanics.lattices.cpu._implicit_kernels import add_momenta, add_reactions, advance, constrain, new_velocity
-from naibu.mechanics.lattices.cpu._pcg_kernels import multiply, solve
+from naibu.mechanics.lattices.cpu._pcg_kernels import multiply, residual_norm, solve
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.coefficients import implicit_coefficients
 from naibu.mechanics.lattices.model.lattice import LatticeParameters
@@ -328,7 +328,8 @@ def _driven_steps(  # type: ignore[no-untyped-def]  # pragma: no cover
             old = vd[p].copy()
             multiply(first, second, rows, tables[5], axes, mass, vd[p], q)
             r[:] = right - q
-            solve(first, second, rows, tables[5], axes, mass, vd[p], r, aside, q, inner, still, 1e-300, solver[1], solver[2])
+            goal = max(solver[1] ** 2 * residual_norm(r, inner[3], still), 1e-300)
+            solve(first, second, rows, tables[5], axes, mass, vd[p], r, aside, q, inner, still, goal, solver[2])
             add_reactions(still, r, pad, step, reaction_change[p, n])
             _answer(loads, weightless, vd[p], old, mass, step, reaction_change[p, n])
             xd[p] += step * vd[p]
