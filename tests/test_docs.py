@@ -78,7 +78,17 @@ def test_every_linear_solver_is_told() -> None:
 
 @pytest.mark.parametrize(
     "page",
-    ["motion", "viscoelasticity", "fields", "sensing", "lattices", "adaptive", "applications/sensing_chip", "applications/mammography"],
+    [
+        "motion",
+        "viscoelasticity",
+        "fields",
+        "sensing",
+        "lattices",
+        "adaptive",
+        "applications/sensing_chip",
+        "applications/fingertip",
+        "applications/mammography",
+    ],
 )
 def test_the_example_of_a_page_runs(page: str, capsys: pytest.CaptureFixture[str]) -> None:
     text = (DOCS / f"{page}.rst").read_text(encoding="utf-8")

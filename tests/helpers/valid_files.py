@@ -33,6 +33,7 @@ from naibu.io.vtk_files import write_vtu
 from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.meshing.element_conversion import to_tetra
 from naibu.meshing.primitives import box
+from naibu.workflows.applications.fingertip_study import prepared_fingertip
 from naibu.workflows.applications.simulate_chip import prepared_chip
 from naibu.workflows.applications.simulate_ischemia import prepared_ischemia
 from naibu.workflows.identify_fields import _names, _object, block_mesh
@@ -312,6 +313,7 @@ def _records(folder: Path) -> list[ValidFile]:
         "outline.csv": outline,
         "record.csv": "".join(f"{0.1 * k:.2g},{0.01 * k:.3g}\n" for k in range(20)),
         "chip.toml": example_text("chip"),
+        "fingertip.toml": example_text("fingertip"),
         "ischemia.toml": example_text("ischemia"),
     }
     paths = {name: _written(folder / f"record-{name}" / name, text.encode()) for name, text in contents.items()}
@@ -321,6 +323,7 @@ def _records(folder: Path) -> list[ValidFile]:
         "outline.csv": lambda path: breast_outline(read_numbers(path, ("deep", "along"))),
         "record.csv": lambda path: read_numbers(path, ("s", "mm")),
         "chip.toml": prepared_chip,
+        "fingertip.toml": prepared_fingertip,
         "ischemia.toml": prepared_ischemia,
     }
     plane = np.zeros((1, 100, 60), dtype=np.uint8)

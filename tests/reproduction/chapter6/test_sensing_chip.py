@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from naibu import datasets
+from naibu.applications.fingertip.fingertip import FingertipResolution
 from naibu.applications.sensing_chip.chip_mesh import ChipResolution
 from naibu.reproduction.chapter6.tables import chapter6
 from naibu.viewer.chapter import Chapter
@@ -17,7 +18,8 @@ from naibu.viewer.tables import Table
 
 @pytest.fixture(scope="module")
 def chapter() -> Chapter:
-    return chapter6(resolution=ChipResolution(along=6, across=1, through=2, below=2, frame=3))
+    resolution = ChipResolution(along=6, across=1, through=2, below=2, frame=3)
+    return chapter6(resolution=resolution, fingertip_resolution=FingertipResolution(2, 2, 8))
 
 
 def table(chapter: Chapter, title: str) -> Table:
@@ -77,3 +79,20 @@ def test_every_figure_is_drawn(chapter: Chapter) -> None:
     page = chapter_html(chapter)
     assert page.count("data:image/svg+xml") == sum(len(section.figures) for section in chapter.sections) == 6
     assert all(np.isfinite(v) for row in table(chapter, "Designs").rows for v in row[1:])
+
+
+def test_a_tilted_press_moves_m_y_and_leaves_m_x_alone(chapter: Chapter) -> None:
+    rows = table(chapter, "Figures 6.9 and 6.11 at 3 N").rows
+    tilt, seconds, _, m_x, m_y, share, jig, m_x_jig = (np.array(column, dtype=float) for column in zip(*rows, strict=True))
+    assert tilt.tolist() == [0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0]
+    assert (m_x == 0.0).all() and m_y[0] == 0.0 and (np.diff(m_y) > 0.0).all()
+    # the misalignment turns the moment: M_x = M_y tan(error)
+    assert m_x_jig == pytest.approx(m_y * np.sin(np.deg2rad(jig)), rel=1e-6, abs=1e-9)
+    assert np.ptp(seconds) < 0.2 * seconds.mean() and share[-1] < 1.0
+
+
+def test_nothing_bends_with_everything_turned_off(chapter: Chapter) -> None:
+    rows = {str(row[0]): [float(v) for v in row[1:]] for row in table(chapter, "Geometry, contact and law turned off in turn").rows}
+    assert max(rows["none (dead load, small strains)"][3:]) < 4.0
+    # the dead load is the rod's: the same force reaches the chip in the same model
+    assert rows["geometry and law (dead load)"][:3] == pytest.approx(rows["all"][:3], rel=1e-3)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from naibu.applications.sensing_chip.analysis import ChipAnalysis, analysed_chip
-from naibu.applications.sensing_chip.chip_mesh import ChipResolution
+from naibu.applications.sensing_chip.analysis import ChipAnalysis
 from naibu.applications.sensing_chip.closed_forms import CrossBeam, orthotropic_torsion_stiffness
-from naibu.applications.sensing_chip.design import ChipDesign, assumed_chip, beam_points
+from naibu.applications.sensing_chip.design import ChipDesign, beam_points
 from naibu.applications.sensing_chip.design_study import DesignStudy, study_designs
 from naibu.applications.sensing_chip.electronics import report_readout
 from naibu.applications.sensing_chip.load_envelope import largest_stress, load_limits, surface_stress
@@ -27,18 +26,17 @@ from naibu.viewer.tables import Cell, Table
 SHARE = 0.1  # r of equation (6.1)
 
 
-def chip_sections(seed: int, resolution: ChipResolution | None = None) -> tuple[Section, ...]:
+def chip_sections(analysis: ChipAnalysis, seed: int) -> tuple[Section, ...]:
     """Return the sections on the chip.
 
     Parameters
     ----------
+    analysis : ChipAnalysis
+        Of the assumed chip.
     seed : int
         Of the noise.
-    resolution : ChipResolution, optional
-        Of the finite elements.
     """
-    design = assumed_chip()
-    analysis = analysed_chip(design, resolution)
+    design = analysis.design
     return (
         _assumptions(design),
         _equations(analysis),
@@ -81,7 +79,7 @@ def _assumptions(d: ChipDesign) -> Section:
         "table.",
         "The dimensions are chosen so that the closed forms give both printed sensitivities, with the same largest stress at either of the "
         "printed limits; the ratios c / L and w / t and the place of the moments' resistors remain free.",
-        "The soft fingertip around the chip (Figs. 6.4 to 6.9, 6.11 and 6.12) is not reproduced here.",
+        "Of the soft fingertip around the chip the report prints diameters and modulus; its package and the friction are assumed below.",
     )
     return Section("What is printed, and what is assumed", text, (Table("Assumptions", ("quantity", "value", "why"), rows),))
 

@@ -1,0 +1,108 @@
+"""How well the fingertip's finite elements and its decoder do: ``python benchmarks/fingertip.py`` (some five minutes of processor time).
+
+Prints, for ever finer meshes, nodes, processor time and the loads on the chip under a press of 3 N at 20 degrees; then the errors and
+intervals of forces that a decoder, trained on the default mesh, gives for presses on a finer mesh with other tilts, frictions and moduli;
+the time of a reading; and how much the sensitivity to slip differs between presses. ``--quick`` does the same on coarse meshes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import numpy as np
+
+from naibu.applications.fingertip.decoder import ForceDecoder, Training, directions, train_decoder, true_contact
+from naibu.applications.fingertip.fingertip import Fingertip, FingertipResolution
+from naibu.applications.fingertip.pressing import FingertipModel, Press, rotated_loads
+from naibu.applications.fingertip.readings import ReadingChain
+from naibu.applications.fingertip.slip import tangential_sensitivity
+from naibu.applications.sensing_chip.design import assumed_chip
+from naibu.applications.sensing_chip.electronics import report_readout
+from naibu.applications.sensing_chip.filters import noise_gain
+
+MESHES = ((2, 2, 8), (3, 2, 10), (4, 2, 12), (4, 3, 14), (5, 3, 16))
+TESTS = (Press(0.0, 3000.0, 0.5), Press(6.0, 3000.0, 0.35), Press(15.0, 3000.0, 0.8), Press(25.0, 3000.0, 0.3), Press(30.0, 3000.0, 0.6))
+SLIDES = (Press(15.0, 1000.0, 0.4, 2.0), Press(5.0, 600.0, 0.8, 2.0), Press(25.0, 2000.0, 0.6, -2.5))
+AZIMUTH = 37.0
+
+
+def convergence(meshes: tuple[tuple[int, int, int], ...]) -> None:
+    """Print one line a mesh."""
+    print("mesh          nodes  processor s   depth mm   F_x mN   F_z mN   M_y N um   (3 N at 20 degrees)")
+    for mesh in meshes:
+        model = FingertipModel.of(Fingertip(), FingertipResolution(*mesh))
+        began = time.process_time()
+        pressing = model.pressed(Press(20.0, 3000.0))
+        seconds = time.process_time() - began
+        at = pressing.at_force(np.array([3000.0]))[0]
+        depth = float(pressing.interpolated(pressing.depth_mm, np.array([3000.0]))[0])
+        print(f"{mesh!s:12} {model.mesh.n_points:6d} {seconds:12.1f} {depth:10.3f} {at[0]:8.2f} {at[2]:8.2f} {at[4]:10.3f}", flush=True)
+
+
+def decoding(training_mesh: FingertipResolution, test_mesh: FingertipResolution, chain: ReadingChain) -> ForceDecoder:
+    """Print errors and intervals of decoded presses, without noise and with that of filtered readings; return the decoder."""
+    tip, training = Fingertip(), Training()
+    model = FingertipModel.of(tip, training_mesh)
+    decoder = train_decoder(tip, chain, training, [model.pressed(press) for press in training.presses(tip)])
+    other = FingertipModel.of(tip, test_mesh)
+    rng, gain = np.random.default_rng(0), noise_gain(0.1)
+    for noise in (0.0, gain):
+        print(f"\nnoise {noise:.2f} of the electronics'; largest errors from 0.5 to 2.7 N, E = 200 and 240 kPa")
+        print("tilt  friction  force %  its 95 % +-  direction deg  95 % cone  place mm  95 %   inside: force, direction, place")
+        for press in TESTS:
+            pressing, rows = other.pressed(press), []
+            for modulus in (200.0, 240.0):
+                rows.append(_errors(decoder, chain, pressing.for_modulus(modulus), noise, rng))
+            e = np.concatenate(rows)
+            inside = [100.0 * float((e[:, k] <= e[:, k + 1]).mean()) for k in (0, 2, 4)]
+            most = e.max(axis=0)
+            print(
+                f"{press.tilt_deg:4.0f} {press.friction:9.2f} {most[0]:8.2f} {most[1]:11.2f} {most[2]:14.2f} {most[3]:10.2f} {most[4]:9.2f} "
+                f"{most[5]:5.2f}   {inside[0]:.0f} % {inside[1]:.0f} % {inside[2]:.0f} %",
+                flush=True,
+            )
+    return decoder
+
+
+def _errors(decoder: ForceDecoder, chain: ReadingChain, pressing, noise: float, rng: np.random.Generator) -> np.ndarray:  # type: ignore[no-untyped-def]
+    along = np.geomspace(500.0, 2700.0, 12)
+    force, tilt, place = true_contact(pressing, along)
+    volts = chain.volts(rotated_loads(pressing.at_force(along), AZIMUTH))
+    found = decoder.decode(volts + noise * chain.readout.noise_sd * rng.standard_normal(volts.shape), noise_share=max(noise, 1e-6))
+    turned = np.full(len(along), AZIMUTH)
+    angle = np.arccos(np.clip((found.direction * directions(np.rad2deg(tilt), turned)).sum(axis=1), -1.0, 1.0))
+    away = np.linalg.norm(found.position_mm - decoder.radius_mm * directions(np.rad2deg(place), turned), axis=1)
+    relative = np.abs(np.log(found.force_mn / force))
+    half = 0.5 * np.log(found.force_95[:, 1] / found.force_95[:, 0])
+    return np.stack([100 * relative, 100 * half, np.rad2deg(angle), found.cone_95_deg, away, found.position_95_mm], axis=1)
+
+
+def reading_time(decoder: ForceDecoder) -> None:
+    """Print the processor time of one reading in a loop."""
+    reading = np.array([[0.5 * decoder.limits[1], 0.4, -0.6]])
+    decoder.decode_loads(reading)
+    began = time.process_time()
+    for _ in range(20_000):
+        decoder.decode_loads(reading)
+    print(f"\none reading: {(time.process_time() - began) / 20_000 * 1e6:.1f} us")
+
+
+def main() -> None:
+    """Print all."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="coarse meshes")
+    quick = parser.parse_args().quick
+    convergence(MESHES[:2] if quick else MESHES)
+    chain = ReadingChain.of_chip(assumed_chip(), report_readout())
+    of_training, of_test = (MESHES[1], MESHES[2]) if quick else (MESHES[3], MESHES[4])
+    reading_time(decoding(FingertipResolution(*of_training), FingertipResolution(*of_test), chain))
+    print("\nchange of M over F_z per sideways share of the force, mm:")
+    model = FingertipModel.of(Fingertip(), FingertipResolution(*of_training))
+    for press in SLIDES:
+        value = tangential_sensitivity(model.pressed(press), chain)
+        print(f"{press.tilt_deg:4.0f} degrees, {press.force_mn:.0f} mN, friction {press.friction:g}: {value:.3f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
