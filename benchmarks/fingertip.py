@@ -14,12 +14,13 @@ import numpy as np
 
 from naibu.applications.fingertip.decoder import ForceDecoder, Training, directions, train_decoder, true_contact
 from naibu.applications.fingertip.fingertip import Fingertip, FingertipResolution
-from naibu.applications.fingertip.pressing import FingertipModel, Press, rotated_loads
+from naibu.applications.fingertip.pressing import FingertipModel, Press, Pressing, rotated_loads
 from naibu.applications.fingertip.readings import ReadingChain
 from naibu.applications.fingertip.slip import tangential_sensitivity
 from naibu.applications.sensing_chip.design import assumed_chip
 from naibu.applications.sensing_chip.electronics import report_readout
 from naibu.applications.sensing_chip.filters import noise_gain
+from naibu.core.arrays import FloatArray
 
 MESHES = ((2, 2, 8), (3, 2, 10), (4, 2, 12), (4, 3, 14), (5, 3, 16))
 TESTS = (Press(0.0, 3000.0, 0.5), Press(6.0, 3000.0, 0.35), Press(15.0, 3000.0, 0.8), Press(25.0, 3000.0, 0.3), Press(30.0, 3000.0, 0.6))
@@ -58,14 +59,14 @@ def decoding(training_mesh: FingertipResolution, test_mesh: FingertipResolution,
             inside = [100.0 * float((e[:, k] <= e[:, k + 1]).mean()) for k in (0, 2, 4)]
             most = e.max(axis=0)
             print(
-                f"{press.tilt_deg:4.0f} {press.friction:9.2f} {most[0]:8.2f} {most[1]:11.2f} {most[2]:14.2f} {most[3]:10.2f} {most[4]:9.2f} "
-                f"{most[5]:5.2f}   {inside[0]:.0f} % {inside[1]:.0f} % {inside[2]:.0f} %",
+                f"{press.tilt_deg:4.0f} {press.friction:9.2f} {most[0]:8.2f} {most[1]:11.2f} {most[2]:14.2f} {most[3]:10.2f} "
+                f"{most[4]:9.2f} {most[5]:5.2f}   {inside[0]:.0f} % {inside[1]:.0f} % {inside[2]:.0f} %",
                 flush=True,
             )
     return decoder
 
 
-def _errors(decoder: ForceDecoder, chain: ReadingChain, pressing, noise: float, rng: np.random.Generator) -> np.ndarray:  # type: ignore[no-untyped-def]
+def _errors(decoder: ForceDecoder, chain: ReadingChain, pressing: Pressing, noise: float, rng: np.random.Generator) -> FloatArray:
     along = np.geomspace(500.0, 2700.0, 12)
     force, tilt, place = true_contact(pressing, along)
     volts = chain.volts(rotated_loads(pressing.at_force(along), AZIMUTH))

@@ -40,5 +40,5 @@ PROCESSOR_S: dict[str, float] = {
     "ch4-cube": 60.0,
     "ch4-octree": 60.0,
     "ch5": 18.0,
-    "ch6": 15.0,
+    "ch6": 85.0,
 }
