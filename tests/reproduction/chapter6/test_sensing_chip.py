@@ -86,8 +86,8 @@ def test_a_tilted_press_moves_m_y_and_leaves_m_x_alone(chapter: Chapter) -> None
     tilt, seconds, _, m_x, m_y, share, jig, m_x_jig = (np.array(column, dtype=float) for column in zip(*rows, strict=True))
     assert tilt.tolist() == [0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0]
     assert (m_x == 0.0).all() and m_y[0] == 0.0 and (np.diff(m_y) > 0.0).all()
-    # the misalignment turns the moment: M_x = M_y tan(error)
-    assert m_x_jig == pytest.approx(m_y * np.sin(np.deg2rad(jig)), rel=1e-6, abs=1e-9)
+    # the misalignment turns the moment
+    assert m_x_jig == pytest.approx(-m_y * np.sin(np.deg2rad(jig)), rel=1e-6, abs=1e-9)
     assert np.ptp(seconds) < 0.2 * seconds.mean() and share[-1] < 1.0
 
 

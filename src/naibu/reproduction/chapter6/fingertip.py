@@ -78,7 +78,8 @@ def _basic(model: FingertipModel, pressings: Sequence[Pressing], chain: ReadingC
         f"Agrees: the load over time hardly depends on theta (the time to 3 N by {spread:.2g} %); M_y grows with theta, M_x does not, "
         "and the channels do not disturb each other. An error of the jig of 1 to 2 degrees lifts M_x as the report suspects.",
         f"Differs in part: F_z is called constant; here it falls by {drop:.2g} % from 0 to 30 degrees, "
-        "more than the force along the base's normal does, 1 - cos 30 degrees = 13 %. That a central load gives the same F_z at every angle does not follow from its "
+        "more than the force along the base's normal does, 1 - cos 30 degrees = 13 %. That a central load gives the same F_z at every "
+        "angle does not follow from its "
         "direction.",
         "Printed inconsistently: in chapter 6 a press at phi = 90 degrees gives M_y, in the papers one at 60 degrees from the x axis gives "
         "more M_x than M_y. A lateral force along y turns the chip about x; with the papers' angle chapter 6's phi counts from the y axis.",
@@ -127,7 +128,6 @@ def _moments(pressings: Sequence[Pressing], chain: ReadingChain, switched: Seque
     }
     loads, matrix = pressings[4].at_force(forces[-1:])[0], chain.sensitivities
     crosstalk = 100.0 * abs(float(matrix[2, 0] * loads[0] / (matrix[2, 4] * loads[4])))
-    bent = 100.0 * max(_distance_from_chord(values) for values in curves.values())
     rows: tuple[tuple[Cell, ...], ...] = tuple(
         (s.name, *(float(v) for v in s.chip_loads[-1, [0, 2, 4]]), *(100.0 * s.bow(k) for k in (0, 2, 4)), 100.0 * s.ratio_bow)
         for s in switched
@@ -141,15 +141,17 @@ def _moments(pressings: Sequence[Pressing], chain: ReadingChain, switched: Seque
         "1 % remains, as the elements average their change of volume, which is not linear in the displacement.",
     )  # fmt: skip
     text = (
-        "Agrees: no crosstalk. By the symmetry of finger and chip M_x is 0 when the tilt is in the plane of x; a lateral force enters only the "
+        "Agrees: no crosstalk. By the symmetry of finger and chip M_x is 0 when the tilt is in the plane of x; a lateral force enters "
+        "only the "
         f"moment of its own plane, by {crosstalk:.2g} % of it.",
-        "Does not agree: the report sees a slight S in M_y over M_x and suspects the nonlinear geometry and material. In a finger and "
-        "chip that "
-        "are symmetric about their axis, neither can turn the moment out of the plane of the tilt, whatever the strain, contact or law: an "
-        f"error of the jig gives a straight line through 0 (bent by {bent:.1g} % here). And in that plane the moments are nearly in "
-        "proportion to the force: the table tells by how much geometry, contact and law bend them. An S needs an asymmetry that "
-        "changes with "
-        "the load: a rod whose edge or axis is off the centre, a groove or cable beside the package, or mounts whose errors differ.",
+        "Does not agree: the report sees a slight S in M_y over M_x and suspects the nonlinear geometry and material. In a finger and chip "
+        "that are symmetric about their axis, neither can turn the moment out of the plane of the tilt, whatever the strain, contact "
+        "or law: "
+        "an error of the jig gives a straight line through 0. And in that plane the moments are nearly in proportion to the force: "
+        "the table "
+        "tells by how much geometry, contact and law bend them. An S needs an asymmetry that changes with the load: a rod whose edge "
+        "or axis "
+        "is off the centre, a groove or cable beside the package, or mounts whose errors differ.",
     )
     figure = Figure(
         "Figure 6.12",
@@ -158,12 +160,6 @@ def _moments(pressings: Sequence[Pressing], chain: ReadingChain, switched: Seque
         (7.5, 4.2),
     )
     return Section("Fingertip: M_x against M_y (Fig. 6.12)", text, (table,), (figure,))
-
-
-def _distance_from_chord(points: FloatArray) -> float:
-    """Return the largest distance of points (n, 2) from the line from the first, at 0, to the last, over its length."""
-    end = points[-1]
-    return float(np.abs(points[:, 0] * end[1] - points[:, 1] * end[0]).max() / (end @ end))
 
 
 def _to_60_newtons(strong: Sequence[Pressing], chain: ReadingChain) -> Section:
