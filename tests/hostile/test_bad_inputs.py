@@ -72,13 +72,15 @@ def views(root: Path) -> Files:
 
 
 def measured_field(root: Path) -> Files:
-    """A field at points, and two zones on a grid around them."""
+    """Fields at points, one of them of a shift and one without sense, and two zones on a grid around them."""
     labels = np.zeros((12, 12, 12), dtype=np.uint8)
     labels[1:6, 1:11, 1:11], labels[6:11, 1:11, 1:11] = 1, 2
     write_volume(root / "labels.mha", Volume.from_array(labels, spacing_mm=(2.0, 2.0, 2.0)))
     points = np.random.default_rng(0).uniform(3.0, 19.0, (400, 3))
-    write_field(root / "field.h5", DisplacementField.from_arrays(points, 0.02 * points, sd_mm=0.01))
-    return {"labels": root / "labels.mha", "field": root / "field.h5"}
+    fields = {"field": 0.02 * points, "shifted": np.full_like(points, 5.0), "torn": 40.0 * np.sin(9.0 * points)}
+    for name, vectors in fields.items():
+        write_field(root / f"{name}.h5", DisplacementField.from_arrays(points, vectors, sd_mm=0.01))
+    return {"labels": root / "labels.mha", **{name: root / f"{name}.h5" for name in fields}}
 
 
 @pytest.fixture

@@ -17,6 +17,7 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress
+from naibu.core.rigid_transform import registration
 from naibu.core.units import kilopascals
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.estimate import FieldEstimate, identify_field
@@ -39,6 +40,7 @@ BLURRED = 0.01  # part of the object that cubes may misrepresent without a word
 MOST_CELLS = 100_000  # of a mesh whose size is asked for: beyond, a factorization does not fit into memory
 MOST_LABEL = 65535
 HALF_FILLED = 0.5  # part of a cell that must lie in the object
+LEAST_DEFORMATION, LARGEST_DEFORMATION = 1e-6, 0.5  # RMS of what a rigid motion leaves, part of the extent of the object
 POISSON_RATIO, POISSON_RATIO_SD = 0.45, 0.03  # of a known material of which only Young's modulus is stated
 RIGID = 300.0  # stiffness of what is called rigid over that of the stiffest other known material
 LARGEST_POISSON_RATIO = 0.499  # of a known zone: beyond, elements of one pressure each lock
@@ -311,9 +313,25 @@ def _load_case(mesh: Mesh, cell_of_voxel: IntArray, inside: Volume, field: Displ
     chosen = np.random.default_rng(0).permutation(chosen)[: len(chosen) // every]
     covariance = None if at.covariance is None else at.covariance[chosen]
     some = DisplacementField.from_arrays(at.points[chosen], at.vectors[chosen], covariance=covariance)
+    _require_deformation(name, some)
     loaded: BoolArray = np.zeros(mesh.n_points, dtype=bool)
     loaded[boundary_nodes(mesh)] = True
     return FieldLoadCase.of(name, some, mesh, loaded=loaded)
+
+
+def _require_deformation(name: str, field: DisplacementField) -> None:
+    """Refuse a field in which the object moves as a rigid body, or is torn apart: nothing can be identified from either."""
+    points, vectors = field.points, field.vectors
+    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+    left = vectors - registration(points, points + vectors).displacement(points)
+    deformation = float(np.sqrt((left**2).sum(axis=1).mean()))
+    if deformation <= LEAST_DEFORMATION * extent:
+        raise InputError(f"{name}: the object moves by up to {np.abs(vectors).max():.3g} mm, but does not deform; is it the right field?")
+    if deformation > LARGEST_DEFORMATION * extent:
+        raise InputError(
+            f"{name}: the object, {extent:.3g} mm large, deforms by {deformation:.3g} mm RMS; is the field in mm, and are field and mask "
+            "from one reference scan?"
+        )
 
 
 def moduli_of_cells(found: FieldEstimate) -> tuple[FloatArray, FloatArray, FloatArray]:
