@@ -144,6 +144,13 @@ def _summary(found: DecodedForces) -> tuple[tuple[str, str], ...]:
     )
 
 
+def _without_wrap(azimuth_deg: FloatArray) -> FloatArray:
+    """Return azimuths (n,), degrees, within half a turn of their circular mean; NaN stay."""
+    turns = np.deg2rad(azimuth_deg)
+    mean = np.rad2deg(np.arctan2(np.nansum(np.sin(turns)), np.nansum(np.cos(turns))))
+    return np.asarray(mean + np.remainder(azimuth_deg - mean + 180.0, 360.0) - 180.0)
+
+
 def _section(times: FloatArray, found: DecodedForces, offsets: FloatArray) -> Section:
     def draw(canvas: Canvas) -> None:
         force, tilt, azimuth = canvas.subplots(1, 3)
@@ -151,10 +158,9 @@ def _section(times: FloatArray, found: DecodedForces, offsets: FloatArray) -> Se
         force.plot(times, 1e-3 * found.force_mn, linewidth=0.8)
         tilt.fill_between(times, *found.tilt_95_deg.T, alpha=0.3, linewidth=0)
         tilt.plot(times, found.tilt_deg, linewidth=0.8)
-        azimuth.plot(times, np.where(found.tilt_95_deg[:, 0] > 0.0, found.azimuth_deg, np.nan), ".", markersize=2)
+        azimuth.plot(times, _without_wrap(np.where(found.tilt_95_deg[:, 0] > 0.0, found.azimuth_deg, np.nan)), ".", markersize=2)
         for axes, name in ((force, "force (N)"), (tilt, "tilt (degrees)"), (azimuth, "azimuth (degrees)")):
             axes.set(xlabel="time (s)", ylabel=name)
-        azimuth.set_ylim(-190, 190)
 
     ok = found.answered
     text = (
