@@ -116,18 +116,28 @@ def step_parts(
 
     The parameters are those of `safe_fraction`.
     """
-    if not len(indenters):
+    if slow_enough(indenters, travel, turn, approach):
         return 1
-    allowed = np.array([SHARE * i.geometry.inradius for i in indenters])
-    ways = np.linalg.norm(travel, axis=1) + approach
-    if not turn.any() and (ways <= allowed).all():
-        return 1
+    allowed, ways = _allowed(indenters), np.maximum(np.linalg.norm(travel, axis=1), approach)
     if turn.any():
         arms = np.array([np.linalg.norm(points - centre, axis=1).max() for centre in centres])
         ways = ways + np.linalg.norm(turn, axis=1) * arms
     if (ways <= allowed).all() or safe_fraction(indenters, points, centres, axes, travel, turn, approach) >= 1.0:
         return 1
     return int(min(2 ** np.ceil(np.log2((ways / allowed).max())), MOST_PARTS))
+
+
+def slow_enough(indenters: Sequence[RigidIndenter], travel: FloatArray, turn: FloatArray, approach: float = 0.0) -> bool:
+    """Tell whether indenters that do not turn, and what they touch, move so little that none passes through anything.
+
+    Each may move by `SHARE` of the radius of the largest sphere in the indenter: together they stay below that radius.
+    """
+    return not turn.any() and bool((np.maximum(np.linalg.norm(travel, axis=1), approach) <= _allowed(indenters)).all())
+
+
+def _allowed(indenters: Sequence[RigidIndenter]) -> FloatArray:
+    """Return how far (k,), mm, indenters may move at once where they touch."""
+    return np.array([SHARE * i.geometry.inradius for i in indenters])
 
 
 Poses = dict[int, tuple[FloatArray, FloatArray]]

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import BoolArray, FloatArray, Int32Array, IntArray, require_positive, require_shape
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.mechanics.contact.indenter_contacts import moving_contacts, turned
-from naibu.mechanics.contact.indenter_motion import IndenterForce, IndenterMotion, step_parts
+from naibu.mechanics.contact.indenter_motion import IndenterForce, IndenterMotion, slow_enough, step_parts
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.assembly import Assembler
@@ -140,12 +140,7 @@ class DynamicEngine:
         It raises what `DynamicSession.constrain`, `press` and `restore` raise.
         """
         load = np.broadcast_to(np.asarray(0.0 if external_force is None else external_force, dtype=float), self.points.shape)
-        session = DynamicSession(self, load, self.rest())
-        session.constrain(constrained or ())
-        session.press(indenters)
-        if state is not None:
-            session.restore(state)
-        return session
+        return DynamicSession(self, load, self.rest()).begun(state, constrained, indenters)
 
 
 @dataclass(slots=True, eq=False)
@@ -212,6 +207,8 @@ class DynamicSession(IndenterSession[DynamicEngine, DynamicState]):
         h = self.engine.step
         own = float(np.sqrt((self.reached.velocity**2).sum(axis=1).max()))
         approach = h * max(own, float(np.linalg.norm(moving, axis=1).max(initial=0.0)))
+        if slow_enough(self.indenters, h * along, h * spin, approach):
+            return 1
         return step_parts(*self._places_of(self.reached), h * along, h * spin, approach)
 
     def _settled(self, h: float, moving: FloatArray, contacts: tuple[Contact, ...]) -> tuple[tuple[Contact, ...], FloatArray | None]:

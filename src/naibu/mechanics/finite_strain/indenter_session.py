@@ -99,6 +99,14 @@ class IndenterSession(ABC, Generic[Model, State]):
     _templates: tuple[Contact, ...] = ()
     _forces: StepForces = field(default_factory=lambda: StepForces(np.zeros((0, 0, 3))))
 
+    def begun(self, state: State | None, constrained: Sequence[ArrayLike] | None, indenters: Sequence[RigidIndenter]) -> Self:
+        """Return the session with nodes constrained, indenters in play, and at a state if one is given."""
+        self.constrain(constrained or ())
+        self.press(indenters)
+        if state is not None:
+            self.restore(state)
+        return self
+
     def constrain(self, constrained: Sequence[ArrayLike], bodies: int = 0) -> None:
         """Constrain these nodes, and no others, from the next step on.
 

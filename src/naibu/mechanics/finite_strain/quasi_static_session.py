@@ -119,12 +119,7 @@ class QuasiStaticEngine:
             As `QuasiStaticSession.constrain`, `press` and `restore`.
         """
         load = np.broadcast_to(np.asarray(0.0 if external_force is None else external_force, dtype=float), self.points.shape)
-        session = QuasiStaticSession(self, load, self.rest())
-        session.constrain(constrained or ())
-        session.press(indenters)
-        if state is not None:
-            session.restore(state)
-        return session
+        return QuasiStaticSession(self, load, self.rest()).begun(state, constrained, indenters)
 
 
 @dataclass(slots=True, eq=False)

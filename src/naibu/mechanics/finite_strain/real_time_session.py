@@ -79,12 +79,7 @@ class RealTimeEngine(DynamicEngine):
     ) -> RealTimeSession:
         """Begin a session; see `DynamicEngine.session`."""
         load = np.broadcast_to(np.asarray(0.0 if external_force is None else external_force, dtype=float), self.points.shape)
-        session = RealTimeSession(self, load, self.rest())
-        session.constrain(constrained or ())
-        session.press(indenters)
-        if state is not None:
-            session.restore(state)
-        return session
+        return RealTimeSession(self, load, self.rest()).begun(state, constrained, indenters)
 
 
 def _solver(pattern: BlockPattern) -> PardisoSolver | SuperLUSolver:

@@ -72,8 +72,12 @@ class ContactStepper:
     divided: Callable[[ImplicitStepper, int], ImplicitStepper]
     points: KernelTuple
     scratch: KernelTuple
+    _fastest: FloatArray = field(init=False)  # (k,), mm/s, at which no indenter passes through the surface in a step
     _finer: dict[int, ImplicitStepper] = field(default_factory=dict)
     _foundation: dict[int, FloatArray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._fastest = SHARE / self.base.step * np.array([p.geometry.inradius for p in self.indenters])
 
     @classmethod
     def of(
@@ -112,9 +116,7 @@ class ContactStepper:
         reactions : tuple of ndarray
             Of the bodies and of the indenters, mN, of the shapes of their velocities; filled.
         """
-        allowed = SHARE * np.array([p.geometry.inradius for p in self.indenters])
-        ways = self.base.step * np.linalg.norm(velocity, axis=2)
-        if not spin.any() and (ways <= allowed).all():
+        if not spin.any() and ((velocity * velocity).sum(axis=2) <= self._fastest**2).all():
             return self._taken(self.base, 1, held_velocity, velocity, spin, reactions)
         found = np.zeros(3, dtype=np.int64)
         for n in range(len(velocity)):

@@ -300,7 +300,7 @@ class LatticeSession:
         steps, contact = len(self._path), stepper.contact
         duration = steps * self.engine.step
         velocity, spin, poses = indenter_velocities(self.indenters, motions, contact.centres, contact.axes, duration)
-        path, spins = np.tile(velocity, (steps, 1, 1)), np.tile(spin, (steps, 1, 1))
+        path, spins = velocity[None].repeat(steps, axis=0), spin[None].repeat(steps, axis=0)
         driven = [k for k, motion in enumerate(motions) if isinstance(motion, IndenterForce)]
         if len(driven) > 1:
             raise InputError(f"motions of the indenters {', '.join(map(str, driven))} are forces; one indenter can be driven by a force")
