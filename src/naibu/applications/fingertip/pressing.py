@@ -297,13 +297,14 @@ class _Run:
             to_depth = float(PchipInterpolator(force[rising], depth[rising])((1.0 + 0.4 * _OVERSHOOT) * wanted))
             kept = int(np.flatnonzero(depth < to_depth)[-1]) + 1
             del self.rows[kept:], self.states[kept:]
-            self._move(float(depth[kept - 1]), to_depth, 0.0, 0.0)
+            short = replace(self.settings, first_step=1.0, largest_step=1.0)
+            self._move(float(depth[kept - 1]), to_depth, 0.0, 0.0, short)
 
     def slide(self) -> None:
         """Move the rod across its axis, at the depth that it has reached."""
         self._move(self.rows[-1][0], self.rows[-1][0], 0.0, self.press.slide_mm)
 
-    def _move(self, depth: float, to_depth: float, across: float, to_across: float) -> None:
+    def _move(self, depth: float, to_depth: float, across: float, to_across: float, settings: SolverSettings | None = None) -> None:
         mesh = self.model.mesh
         contact = self.contact(depth, to_depth, across, to_across)
         start = None
@@ -312,7 +313,7 @@ class _Run:
             start = LoadState(0.0, last.displacement, last.anchors)
             contact = replace(contact, normal_stiffness=last.normal_stiffness[0])
         problem = Problem(mesh.points, self.model.assembler, (contact,), self.model.support, np.zeros_like(mesh.points))
-        solution = solve(problem, settings=self.settings, start=start, callback=self.callback)
+        solution = solve(problem, settings=settings or self.settings, start=start, callback=self.callback)
         for k, state in enumerate(solution.states):
             if k or not self.states:
                 stiffness = state.normal_stiffness[0] if state.normal_stiffness else contact.normal_stiffness
