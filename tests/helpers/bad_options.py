@@ -55,6 +55,8 @@ NUMBERS: tuple[tuple[str, tuple[str, ...], str, tuple[str, ...]], ...] = (
     ("identify", ("{press}",), "--element-size-mm", tuple(v for v in LENGTH if v not in ("0", "-0.0"))),
     ("compare", ("{press}",), "--element-size-mm", tuple(v for v in LENGTH if v not in ("0", "-0.0"))),
     ("predict", ("{model}", "{press}", "--state", "pressed"), "--height-mm", LENGTH),
+    ("decode-forces", ("{table}", "{table2}"), "--noise-share", LENGTH),
+    ("decode-forces", ("{table}", "{table2}"), "--free-rows", tuple(v for v in NO_COUNTS if v != "0")),
     ("track", TRACK, "--diameter-mm", LENGTH),
     ("track", (*TRACK, *DIAMETER), "--thickness-mm", LENGTH),
     ("track", (*TRACK, *DIAMETER), "--count", NO_COUNTS),

@@ -79,8 +79,10 @@ def decode_forces(
     InputError
         Files that cannot be used, times that do not grow, fewer rows than `free_rows`, or a folder that cannot be written to.
     """
-    if not 0.0 < noise_share <= 100.0:
-        raise InputError(f"noise_share is {noise_share:g}; give a number above 0, 1 for unfiltered readings")
+    if not 1e-3 <= noise_share <= 100.0:
+        raise InputError(f"noise_share is {noise_share:g}; give a number from 0.001 to 100, 1 for unfiltered readings")
+    if free_rows < 0:
+        raise InputError(f"free_rows is {free_rows}; give a number of rows, or 0 where there is no offset")
     source, table = Path(decoder), Path(readings)
     stored = load_decoder(source)
     chosen = ForceDecoder(
@@ -92,7 +94,7 @@ def decode_forces(
         raise InputError(
             f"{table}: row {int(np.flatnonzero(np.diff(rows[:, 0]) <= 0.0)[0]) + 2} is not later than the one before; sort them"
         )
-    if not 0 <= free_rows <= len(rows):
+    if free_rows > len(rows):
         raise InputError(
             f"free_rows is {free_rows}, and {table} has {len(rows)} rows; give at most so many, or 0 for readings without offset"
         )
