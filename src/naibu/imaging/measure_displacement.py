@@ -81,6 +81,8 @@ class MeasuredDisplacement:
         Diagnostics of the method, by name; see `FACTS`.
     warnings : tuple of str
         What makes the result doubtful, in sentences for the user.
+    blocks : DisplacementField, optional
+        Displacement of small blocks of voxels with independent errors, to which models are fitted; the default method measures them.
     """
 
     method: Method
@@ -91,6 +93,7 @@ class MeasuredDisplacement:
     matches: PotentialMatches | None = None
     facts: dict[str, float | int | str] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    blocks: DisplacementField | None = None
 
 
 def measure_displacement(
@@ -288,7 +291,17 @@ def _correlated(
         y, x = np.nonzero(valid[z])
         covariance[z, y, x] = found.covariance_at(found.volume.to_physical(np.stack([x, y, np.full(len(x), z)], axis=1)))
     field = DisplacementField.on_grid(reference, vectors, covariance=covariance, valid=valid)
-    return MeasuredDisplacement("default", field, inside, gradient, facts=facts, warnings=_convergence_doubts(unconverged, cells))
+    blocks = None if found.blocks is None else _in_object(found.blocks, found.volume, valid)
+    doubts = _convergence_doubts(unconverged, cells)
+    return MeasuredDisplacement("default", field, inside, gradient, facts=facts, warnings=doubts, blocks=blocks)
+
+
+def _in_object(blocks: DisplacementField, grid: Volume, valid: BoolArray) -> DisplacementField:
+    """Return the blocks whose middle lies in a valid voxel."""
+    z, y, x = np.clip(np.rint(grid.to_index(blocks.points)).astype(int)[:, ::-1], 0, np.array(grid.shape) - 1).T
+    kept = valid[z, y, x]
+    covariance = None if blocks.covariance is None else blocks.covariance[kept]
+    return DisplacementField.from_arrays(blocks.points[kept], blocks.vectors[kept], covariance=covariance)
 
 
 def _convergence_doubts(unconverged: int, cells: int) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ the data :cite:p:`mackay1992`. Rigid inclusions have a rigid motion each. Coarse
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,6 +28,7 @@ from naibu.imaging.preprocessing.field_of_view import Box, fields_of_view, in_bo
 from naibu.imaging.preprocessing.object_mask import mask_in_view
 from naibu.imaging.preprocessing.resampling import require_mask
 from naibu.imaging.preprocessing.volume_pair import intensity_pair
+from naibu.imaging.volume_correlation.block_displacements import block_displacements
 from naibu.imaging.volume_correlation.common_content import common_content, refuse_unrelated
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit, Iterations, chosen_weights
 from naibu.imaging.volume_correlation.image_level import ImageLevel
@@ -321,7 +322,8 @@ class _Correlation:
             inclusion.draws.clear()
         noise = ResidualNoise(fit.level.mask, fit.residual * np.sqrt(fit.weight), _lost_to_robustness(fit))
         samples = fit.samples(self.c, self.bending, dilatation, self.settings.samples, noise, self.settings.seed + 1)
-        return collected(self.volume, fit, self.c, samples, self.bending, self.dilatation, content.matched)
+        found = collected(self.volume, fit, self.c, samples, self.bending, self.dilatation, content.matched)
+        return replace(found, blocks=block_displacements(self.volume, fit, noise, self.settings.seed + 2))
 
 
 def _check_shape(reference: Volume, deformed: Volume) -> None:

@@ -60,6 +60,8 @@ class CorrelationResult:
         Motions of the rigid inclusions: their voxels have this displacement, gradient and covariance, not those of the splines.
     status : str
         How the iterations ended, and where they did not.
+    blocks : DisplacementField or None
+        Displacement of small blocks of voxels with independent errors, without the penalties' bias: what models are fitted to.
     """
 
     displacement: DisplacementField
@@ -75,6 +77,7 @@ class CorrelationResult:
     inclusions: Int32Array
     motions: tuple[InclusionMotion, ...]
     status: str
+    blocks: DisplacementField | None = None
 
     @property
     def volume(self) -> Volume:

@@ -338,12 +338,14 @@ def _vtu(path: Path, grid: Volume, measured: MeasuredDisplacement) -> Path:
 
 
 def _field(path: Path, pair: Pair, measured: MeasuredDisplacement) -> Path:
-    """Write the field as the identification takes it (`naibu.io.read_field`)."""
+    """Write the field as the identification takes it (`naibu.io.read_field`): blocks with independent errors, or else some voxels."""
+    provenance = {"naibu": __version__, "method": measured.method, "inputs": pair.inputs}
+    if measured.blocks is not None and measured.blocks.valid.any():
+        return write_field(path, measured.blocks, provenance=provenance | {"points": "blocks of voxels with independent errors"})
     step = 1
     while (measured.mask & measured.displacement.valid)[::step, ::step, ::step].sum() > FIELD_POINTS:
         step += 1
-    provenance = {"naibu": __version__, "method": measured.method, "inputs": pair.inputs, "every_voxel": step}
-    return write_field(path, measured.displacement.at_points(step=step), provenance=provenance)
+    return write_field(path, measured.displacement.at_points(step=step), provenance=provenance | {"points": f"every voxel of {step}"})
 
 
 def _as_markers(measured: MeasuredDisplacement, grid: Volume) -> tuple[Markers, Markers]:
