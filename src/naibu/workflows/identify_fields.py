@@ -28,14 +28,16 @@ from naibu.io.displacement_fields import read_field
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
 from naibu.io.images import read_volume, write_volume
+from naibu.meshing.point_location import locate
 from naibu.meshing.primitives import grid_cells
 from naibu.meshing.surface import boundary_nodes
 from naibu.viewer.slices import Overlay, SliceView, slices_html
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.output_folder import output_folder
 
-FILES = ("report.html", "young_modulus.mha", "young_modulus_sd.mha", "poisson_ratio.mha", "identification.json")
-CELLS, MOST_POINTS = 1200, 6000  # cells of the model by default; measurements of a load case: neighbours in a field say the same
+FILES = ("report.html", "zones.mha", "young_modulus.mha", "young_modulus_sd.mha", "poisson_ratio.mha", "identification.json")
+CELLS, CELLS_OF_MAP = 1200, 2500  # of the model by default
+MOST_POINTS = 10_000  # measurements of a load case: neighbours in a field say the same
 BLURRED = 0.01  # part of the object that cubes may misrepresent without a word
 MOST_CELLS = 100_000  # of a mesh whose size is asked for: beyond, a factorization does not fit into memory
 MOST_LABEL = 65535
@@ -113,10 +115,11 @@ def identify_fields(
     law : {"neo_hookean", "linear"}
         Finite or small strain.
     element_size_mm : float
-        Edge length of the cubes; 0 chooses it so that there are about 1200.
+        Edge length of the cubes; 0 chooses it so that there are about 1200, or 2500 for a map.
     out : path-like, optional
         Folder for ``young_modulus.mha``, ``young_modulus_sd.mha`` and ``poisson_ratio.mha`` on the grid of the mask (0 outside; -1 where
-        there is no standard deviation), ``identification.json`` and ``report.html``.
+        there is no standard deviation), ``zones.mha`` (from 1 in the order of the table of moduli, 0 where they are known),
+        ``identification.json`` and ``report.html``.
     overwrite : bool
         Whether these files may be there already.
     progress : callable, optional
@@ -134,7 +137,9 @@ def identify_fields(
     inside, labels = _object(mask, zones)
     names = _names(labels, inside, zone_names or {})
     stated = parse_known_zones(known, list(names.values()))
-    mesh, cell_of_voxel = block_mesh(inside, labels, names, element_size_mm)
+    volume = float(inside.values.sum() * np.prod(inside.spacing_mm))
+    size = element_size_mm or (volume / (CELLS_OF_MAP if each_cell else CELLS)) ** (1.0 / 3.0)
+    mesh, cell_of_voxel = block_mesh(inside, labels, names, size)
     cases = [_load_case(mesh, cell_of_voxel, inside, read_field(p), Path(p).stem) for p in paths]
     found = identify_field(
         mesh, cases, Zones.of(mesh, known=stated.values, known_sd=stated.doubts, each_cell=each_cell), law=law, progress=progress
@@ -306,7 +311,8 @@ def _load_case(mesh: Mesh, cell_of_voxel: IntArray, inside: Volume, field: Displ
     index = np.round(inside.to_index(at.points)).astype(int)[:, ::-1]
     within = ((index >= 0) & (index < inside.shape)).all(axis=1) & at.valid
     within[within] = cell_of_voxel[tuple(index[within].T)] >= 0
-    chosen = np.flatnonzero(within)
+    near = np.flatnonzero(within)  # cells end inside of voxels
+    chosen = near[locate(mesh, at.points[near], tolerance_mm=np.inf).distance_mm <= 1e-6] if len(near) else near
     if len(chosen) < 20:
         raise InputError(f"{name}: {len(chosen)} measurements of the field lie in the object; are field and mask from one reference scan?")
     every = -(-len(chosen) // MOST_POINTS)
@@ -332,6 +338,15 @@ def _require_deformation(name: str, field: DisplacementField) -> None:
             f"{name}: the object, {extent:.3g} mm large, deforms by {deformation:.3g} mm RMS; is the field in mm, and are field and mask "
             "from one reference scan?"
         )
+
+
+def zones_of_voxels(found: FieldEstimate, inside: Volume, cells: IntArray) -> IntArray:
+    """Return the zone of every voxel (nz, ny, nx), -1 where its moduli are known and outside, with borders as fine as voxels."""
+    out = np.where(cells >= 0, found.zones.of_cell[cells], KNOWN)
+    if found.borders is not None:
+        where = out != KNOWN
+        out[where] = found.borders.region_at(inside.to_physical(np.argwhere(where)[:, ::-1]), out[where])
+    return out
 
 
 def moduli_of_cells(found: FieldEstimate) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -385,8 +400,15 @@ def _written(
 ) -> list[Path]:
     found = result.estimate
     young, sd, poisson = (np.where(cells >= 0, values[cells], 0.0) for values in moduli_of_cells(found))
+    regions = zones_of_voxels(found, inside, cells)
+    if found.borders is not None and found.uncertainty is not None:
+        there = regions != KNOWN
+        of_young = found.young_modulus * found.uncertainty.of_young_and_poisson(found.theta)[0]
+        for full, values in ((young, found.young_modulus), (sd, of_young), (poisson, found.poisson_ratio)):
+            full[there] = values[regions[there]]
     volumes = {"young_modulus": young, "young_modulus_sd": np.nan_to_num(sd, nan=-1.0, posinf=-1.0), "poisson_ratio": poisson}
     files = [write_volume(folder / f"{name}.mha", inside.with_values(v.astype(np.float32))) for name, v in volumes.items()]
+    files.append(write_volume(folder / "zones.mha", inside.with_values((regions + 1).astype(np.uint16))))
     outside = np.where(cells >= 0, 0.0, np.nan)
     unit = "multiples of the known zone" if result.relative else "kPa"
     view = SliceView(

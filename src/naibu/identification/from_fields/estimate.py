@@ -22,6 +22,7 @@ from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress, report_progress
 from naibu.core.status import Status
 from naibu.identification.from_fields.assumptions import Assumption, assumptions, covariance_of, effects
+from naibu.identification.from_fields.border_refinement import MOST_REGIONS, Borders, RefinedRegions, refined_regions
 from naibu.identification.from_fields.forward.field_laws import FieldElements, LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.sensitivities import (
@@ -46,7 +47,7 @@ from naibu.identification.from_fields.gauss_newton import (
 from naibu.identification.from_fields.mesh_error import COARSE, EXTRAPOLATED, changes_on_finer_mesh, doubt_of, refitted
 from naibu.identification.from_fields.regularization import Regularization, RegularizationName, ZoneGraph, regularization
 from naibu.identification.from_fields.regularization_weight import WeightChoice, WeightRule, WeightTrial, choose_weight
-from naibu.identification.from_fields.segmentation import EXPLICIT, Segmentation, segment
+from naibu.identification.from_fields.segmentation import EXPLICIT, Segmentation, segment, weight_of_borders
 from naibu.identification.from_fields.truncated_newton import truncated_step
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, report, resolution, resolution_report
 from naibu.identification.from_fields.verdict import inflation, verdict
@@ -101,6 +102,8 @@ class FieldEstimate:
         What extrapolation to vanishing element size added to the best theta on `mesh`; None where that error was not estimated.
     assumptions : tuple of Assumption
         What other moduli of the known regions, or another law, would do.
+    borders : Borders or None
+        Borders of regions that were found, which run through cells; None where regions are made of whole cells.
     """
 
     mesh: Mesh
@@ -121,6 +124,7 @@ class FieldEstimate:
     budget: ErrorBudget | None = None
     mesh_shift: FloatArray | None = None
     assumptions: tuple[Assumption, ...] = ()
+    borders: Borders | None = None
 
     @property
     def young_modulus(self) -> FloatArray:
@@ -283,14 +287,23 @@ class _Recipe:
         estimate = self._under_penalty(found, choice, resolved)
         if name != "total_variation" or not segmented:
             return estimate
+        natural = weight_of_borders(graph)
+        if weight == "discrepancy" and choice.met and choice.taken.weight > natural:  # regions are judged by probability: noise makes none
+            found = search(self.model, at.point, Objective(penalty, natural, self.bounds), SEARCH_AT_WEIGHT, rule=self._rule())
+            self.record(f"{penalty.name} of weight {natural:.3g}, for regions: misfit {found.point.misfit:.4g}")
+            choice = replace(choice, trials=(WeightTrial(natural, found, found.point.misfit, penalty.value(found.point.theta)),), chosen=0)
+            at = self.model.linearised(self.model.evaluate(found.point.theta, found.point.states))
         regions = segment(self.model, graph, at.point, choice.taken.weight, self.bounds, self.progress)
-        return self._with_regions(estimate, regions)
+        return self._with_regions(estimate, regions, graph)
+
+    def _rule(self) -> StepRule:
+        return exact_step if self._explicit() else truncated_step
 
     def _explicit(self) -> bool:
         return self.model.zones.count <= EXPLICIT
 
     def _weight(self, point: Point, penalty: Regularization, graph: ZoneGraph, rule: WeightRule | float) -> WeightChoice:
-        step: StepRule = exact_step if self._explicit() else truncated_step
+        step = self._rule()
 
         def solve(weight: float, start: Found | None) -> WeightTrial:
             at = point if start is None else start.point
@@ -323,7 +336,7 @@ class _Recipe:
             young_and_poisson(point.theta), resolved, None, found.status, tuple(self.steps), words,
         )  # fmt: skip
 
-    def _with_regions(self, field: FieldEstimate, regions: Segmentation) -> FieldEstimate:
+    def _with_regions(self, field: FieldEstimate, regions: Segmentation, graph: ZoneGraph) -> FieldEstimate:
         """Return the regions as the result if they explain the measurements, else the field under the penalty."""
         target = self.model.n_free
         limit = max(field.chi_squared, target) + UNEXPLAINED * float(np.sqrt(2.0 * target))
@@ -334,24 +347,36 @@ class _Recipe:
         if misfit > limit:
             self.record(f"the regions leave more unexplained than noise would ({limit:.4g}): the regularised field is the result")
             return replace(field, segmentation=regions, steps=tuple(self.steps))
-        sharp = self._sharp(regions)
+        sharp = self._with_borders(regions, graph)
         return replace(
             sharp, weights=field.weights, regularized=field.regularized, resolution=field.resolution, segmentation=regions,
             identifiability=(*sharp.identifiability, *field.identifiability),
         )  # fmt: skip
 
-    def _sharp(self, regions: Segmentation) -> FieldEstimate:
+    def _with_borders(self, regions: Segmentation, graph: ZoneGraph) -> FieldEstimate:
+        """Return the fit of regions whose borders run through cells, where there are few regions in a map of single cells."""
+        single = graph.count == int((self.model.zones.of_cell != KNOWN).sum()) and self.model.mesh.dimension == 3
+        if not single or not 1 < regions.zones.count <= MOST_REGIONS:
+            return self._sharp(regions.zones, regions.point, None)
+        refined = refined_regions(self.model, regions, graph, self.bounds)
+        self.record(f"borders of {refined.zones.count} regions within cells: misfit {refined.point.misfit:.4g}")
+        model = self.model.with_zones(refined.zones)
+        start = model.evaluate(refined.theta, refined.point.states)
+        fitted = search(model, start, Objective(bounds=self.bounds)).point
+        return self._sharp(refined.zones, fitted, refined)
+
+    def _sharp(self, zones: Zones, point: Point, refined: RefinedRegions | None) -> FieldEstimate:
         """Return the fit of regions, with accurate elements where those of the map were not and such a body is not too large."""
-        model, point = self.model.with_zones(regions.zones), regions.point
+        model = self.model.with_zones(zones)
         if self.elements == "accurate" and not model.averaged and model.mesh.dimension == 3:
-            accurate = FieldModel(model.mesh, self.load_cases, regions.zones, self.law, "accurate")
+            accurate = FieldModel(model.mesh, self.load_cases, zones, self.law, "accurate")
             if accurate.points.size <= MOST_UNKNOWNS:
                 found = search(accurate, first_point(accurate, point.theta), Objective(bounds=self.bounds))
-                self.record(f"fit of {regions.zones.count} regions with quadratic elements: misfit {found.point.misfit:.4g}")
-                return self._estimate(accurate, found.point, found.status)
-        return self._estimate(model, model.evaluate(point.theta, point.states), Status.CONVERGED)
+                self.record(f"fit of {zones.count} regions with quadratic elements: misfit {found.point.misfit:.4g}")
+                return self._estimate(accurate, found.point, found.status, refined)
+        return self._estimate(model, model.evaluate(point.theta, point.states), Status.CONVERGED, refined)
 
-    def _estimate(self, model: FieldModel, point: Point, status: Status) -> FieldEstimate:
+    def _estimate(self, model: FieldModel, point: Point, status: Status, refined: RefinedRegions | None = None) -> FieldEstimate:
         """Return moduli that were fitted without a penalty, with the errors of measurement, discretisation and knowledge."""
         at = model.linearised(point)
         quadratic = at.concentrated(np.eye(2 * model.zones.count))
@@ -361,6 +386,9 @@ class _Recipe:
         of_noise = Uncertainty.of(quadratic.hessian, factor)
         shared = inflation(model.observed, residuals, at.jacobians(quadratic), of_noise.covariance, freedom)
         of_noise = Uncertainty(of_noise.information / shared, of_noise.covariance * shared)
+        if refined is not None:
+            theta = Objective(bounds=self.bounds).clipped(theta + refined.theta - point.theta)
+            of_noise = of_noise.with_added(factor**2 * shared * (refined.covariance - refined.at_these_borders))
         others = assumptions(at, quadratic, self.law)
         of_known = covariance_of(others, len(theta))
         of_mesh, total, coarse = np.full(len(theta), np.nan), of_noise.with_added(of_known), False
@@ -381,7 +409,7 @@ class _Recipe:
         states = tuple(u[: model.mesh.n_points] for u in point.states)
         return FieldEstimate(
             model.mesh, model.zones, theta, states, misfit, freedom, total, None, None, None, None, status, tuple(self.steps), words,
-            judged, budget, shift, others,
+            judged, budget, shift, others, None if refined is None else refined.borders,
         )  # fmt: skip
 
     def _extrapolated(self, at: Linearised, quadratic: Concentrated) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray | None]:

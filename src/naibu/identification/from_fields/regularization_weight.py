@@ -16,6 +16,7 @@ SLACK = 1.05  # of the discrepancy principle: noise is hardly ever known better 
 FACTOR = 3.0  # between one weight and the next
 MOST_WEIGHTS = 24
 CLOSE = 0.1  # relative distance of the misfit from the target that needs no further weight
+UNCHANGED = 1e-4  # relative rise of the misfit from one weight to the next above which greater weights are worth trying
 FLAT = 0.02  # relative fall of the misfit from one weight to the next below which smaller weights only fit noise
 L_CURVE_WEIGHTS = 9
 
@@ -64,6 +65,11 @@ class WeightChoice:
     reason: str
 
     @property
+    def met(self) -> bool:
+        """Whether noise alone could leave the misfit that was taken."""
+        return self.taken.misfit <= (1.0 + CLOSE) * SLACK * self.target
+
+    @property
     def taken(self) -> WeightTrial:
         """The trial that was taken."""
         return self.trials[self.chosen]
@@ -110,6 +116,8 @@ def _by_discrepancy(solve: Solve, first: float, target: float) -> WeightChoice:
     trials = [solve(first, None)]
     while trials[0].misfit < limit / (1.0 + CLOSE) and len(trials) < MOST_WEIGHTS:
         trials.insert(0, solve(trials[0].weight * FACTOR, trials[0].found))
+        if trials[0].misfit < (1.0 + UNCHANGED) * trials[1].misfit:  # one modulus everywhere: a greater weight changes nothing
+            break
     flat = 0
     while trials[-1].misfit > limit and len(trials) < MOST_WEIGHTS and flat < 2:
         trials.append(solve(trials[-1].weight / FACTOR, trials[-1].found))

@@ -28,6 +28,8 @@ from naibu.identification.from_fields.regularization import BULK_WEIGHT, ZoneGra
 CLUSTERS = (20, 8)  # to begin with, one after the other: the better end counts
 LIKE = 0.005  # difference of logarithms of moduli between neighbours that belong together at once
 CLEAR = 0.25  # jump of logarithms beyond which a border counts no more when regions are merged: noise and errors of models seldom make such
+# half of chi squared that a face of a border costs: the number of closed surfaces of n faces on a cubic lattice grows about as 1.7^n
+FACE = 0.55
 PRIOR_SD = 1.0  # of the logarithms about the clusters' means while merging: of what the data do not determine
 ROUNDS = 8
 ROUGHLY = SearchSettings(max_iterations=12, tolerance=1e-5)  # while the regions may still change
@@ -66,6 +68,11 @@ def joined(zones: Zones, of_zone: IntArray) -> Zones:
     of_cell[unknown] = of_zone[of_cell[unknown]]
     names = tuple(f"segment {i + 1}" for i in range(int(of_zone.max()) + 1))
     return replace(zones, of_cell=of_cell, names=names)
+
+
+def weight_of_borders(graph: ZoneGraph) -> float:
+    """Return the weight of total variation, 1/mm^2, at which clear borders cost what it takes to tell where they run."""
+    return FACE / (CLEAR * float(graph.area.mean()))
 
 
 def clusters(graph: ZoneGraph, theta: FloatArray, most: int) -> IntArray:

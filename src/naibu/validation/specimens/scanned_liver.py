@@ -31,7 +31,7 @@ from naibu.validation.scanners.textures import Texture
 SIZE_MM, PAD_MM = np.array([52.0, 44.0, 26.0]), 6.0  # of the whole; height of the pad
 LUMP_MM, LUMP_RADIUS_MM = np.array([-3.0, 2.0, 16.0]), 5.0
 PAD, LIVER, LUMP = (10.0, 0.45), (5.0, 0.45), (15.0, 0.45)  # Young's modulus, kPa, and Poisson's ratio
-PATCH_MM, PUSH_MM = (np.array([4.0, -2.0]), 15.0), (0.8, -0.5, -2.6)  # middle and radius of the plate; its way
+PATCH_MM, PUSH_MM = (np.array([4.0, -2.0]), 15.0), (0.8, -0.5, -3.2)  # middle and radius of the plate; its way
 GREY, TEXTURE, GRAIN_MM = {"pad": 900.0, "liver": 1060.0}, 60.0, 1.1
 BOND_MM = 0.5  # half the thickness of the bond between liver and pad
 POSE_DEG, POSE_MM = 2.0, (0.6, -0.4, 0.3)  # of the scan after
@@ -102,7 +102,7 @@ def pressed(mesh: Mesh) -> FloatArray:
     return solve(problem, settings=SolverSettings(first_step=0.5, largest_step=0.5, tolerance=1e-8)).displacement
 
 
-def scanned_liver(*, voxel_mm: float = 0.5, element_size_mm: float = 1.5, noise: float = 12.0, seed: int = 0) -> ScannedLiver:
+def scanned_liver(*, voxel_mm: float = 0.5, element_size_mm: float = 1.5, noise: float = 8.0, seed: int = 0) -> ScannedLiver:
     """Return CT scans before and after the plate presses, in another pose, with their noise.
 
     Parameters
@@ -119,8 +119,8 @@ def scanned_liver(*, voxel_mm: float = 0.5, element_size_mm: float = 1.5, noise:
     mesh = liver_mesh(element_size_mm)
     displacement = pressed(mesh)
     apart = to_tetra(mesh)
-    half = np.array([*(0.5 * SIZE_MM[:2] + 4.0), 0.0])
-    grid = empty_grid(-half - [0.0, 0.0, 3.0], half + [0.0, 0.0, float(mesh.points[:, 2].max()) + 3.0], voxel_mm)
+    x, y = 0.5 * SIZE_MM[:2] + 4.0
+    grid = empty_grid((-x, -y, -3.0), (x, y, float(mesh.points[:, 2].max()) + 3.0), voxel_mm)
     texture = Texture.drawn(GRAIN_MM, seed=seed), Texture.drawn(2.5 * GRAIN_MM, seed=seed + 1)
 
     def intensity(material_points: FloatArray) -> FloatArray:
@@ -129,15 +129,15 @@ def scanned_liver(*, voxel_mm: float = 0.5, element_size_mm: float = 1.5, noise:
         return np.asarray(grey + TEXTURE * np.sqrt(0.5) * (texture[0](material_points) + texture[1](material_points)))
 
     shown = VirtualObject.of(intensity, np.empty((0, 3)), PLASTIC_BEAD)
-    rest = MeshMotion(apart, np.zeros_like(displacement))
-    moved = PosedMotion(MeshMotion(apart, displacement), RigidTransform.of(_turn(POSE_DEG), POSE_MM))
+    rest: Motion = MeshMotion(apart, np.zeros_like(displacement))
+    moved: Motion = PosedMotion(MeshMotion(apart, displacement), RigidTransform.of(_turn(POSE_DEG), POSE_MM))
     device = CTDevice(noise=noise)
-    scans = [scan(shown, motion, grid, device, seed=seed + k, samples=1).volume for k, motion in enumerate((rest, moved))]
+    before, after = (scan(shown, motion, grid, device, seed=seed + k, samples=1).volume for k, motion in enumerate((rest, moved)))
     where = grid.positions().reshape(-1, 3)
     inside = np.isfinite(rest.to_material(where)).all(axis=1).reshape(grid.shape)
     labels = np.where(inside, np.where(where[:, 2].reshape(grid.shape) < PAD_MM, 1, 2), 0)
     lump = in_lump(where).reshape(grid.shape)
-    return ScannedLiver(*scans, grid.with_values(labels.astype(np.uint8)), lump, mesh, displacement, moved)
+    return ScannedLiver(before, after, grid.with_values(labels.astype(np.uint8)), lump, mesh, displacement, moved)
 
 
 def _turn(degrees: float) -> FloatArray:
