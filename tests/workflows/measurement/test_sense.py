@@ -80,7 +80,7 @@ def test_files_are_what_other_programs_read(folder: Path, tmp_path: Path) -> Non
     assert np.allclose(vectors, run.measured.displacement.vectors, atol=1e-5, equal_nan=True)
     assert read_mesh(tmp_path / "displacement.vtu").n_cells > 1000
     field = read_field(tmp_path / "field.h5")
-    assert len(field.points) > 1000 and field.covariance is not None
+    assert len(field.points) > 500 and field.covariance is not None  # blocks of voxels
     before, after = (import_markers(tmp_path / f"{name}.csv") for name in ("initial", "pressed"))
     assert 100 < len(before) < 400
     assert np.abs(after.points - before.points - run.measured.displacement.vectors[at(pair.reference, before.points)]).max() < 1e-6
