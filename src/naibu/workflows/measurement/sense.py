@@ -6,7 +6,7 @@ import json
 import os
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -248,7 +248,7 @@ def sense_pair(
         pair.reference, pair.deformed, method=method, mask=pair.mask, deformed_mask=pair.deformed_mask, progress=progress
     )
     run = SenseRun(measured, time.perf_counter() - began, figures(pair, measured))
-    return run if folder is None else SenseRun(measured, run.seconds, run.figures, tuple(_written(pair, run, folder)))
+    return run if folder is None else replace(run, files=tuple(_written(pair, run, folder)))
 
 
 def figures(pair: Pair, measured: MeasuredDisplacement) -> dict[str, float | int | str | None]:
@@ -326,10 +326,9 @@ def _vtu(path: Path, grid: Volume, measured: MeasuredDisplacement) -> Path:
         raise InputError("the displacement is known at too few neighbouring voxels for a mesh; enlarge the mask")
     used, numbers = np.unique(cells, return_inverse=True)
     mesh = Mesh.from_arrays(grid.positions()[some].reshape(-1, 3)[used], numbers.reshape(cells.shape), "hexahedron")
-    strain = green_lagrange_strain_of(measured.gradient[some].reshape(-1, 3, 3)[used])
     data: dict[str, FloatArray] = {
         "displacement_mm": measured.displacement.vectors[some].reshape(-1, 3)[used],
-        "green_lagrange_strain": strain,
+        "green_lagrange_strain": green_lagrange_strain_of(measured.gradient[some].reshape(-1, 3, 3)[used]),
     }
     if (covariance := measured.displacement.covariance) is not None:
         data["displacement_covariance_mm2"] = covariance[some].reshape(-1, 3, 3)[used]
@@ -342,8 +341,8 @@ def _field(path: Path, pair: Pair, measured: MeasuredDisplacement) -> Path:
     provenance = {"naibu": __version__, "method": measured.method, "inputs": pair.inputs}
     if measured.blocks is not None and measured.blocks.valid.any():
         return write_field(path, measured.blocks, provenance=provenance | {"points": "blocks of voxels with independent errors"})
-    step = 1
-    while (measured.mask & measured.displacement.valid)[::step, ::step, ::step].sum() > FIELD_POINTS:
+    known, step = measured.mask & measured.displacement.valid, 1
+    while known[::step, ::step, ::step].sum() > FIELD_POINTS:
         step += 1
     return write_field(path, measured.displacement.at_points(step=step), provenance=provenance | {"points": f"every voxel of {step}"})
 
