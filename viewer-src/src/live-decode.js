@@ -1,6 +1,6 @@
 // The inverse of naibu/viewer/live/scene.py: the scene from JSON, frames from bytes.
 const FLAGS = { paused: 1, driving: 2, recording: 4, replaying: 8, failed: 16 };
-const HEADER_BYTES = 84;
+const HEADER_BYTES = 88;
 
 const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
 
@@ -41,6 +41,7 @@ export function decodeFrame(buffer) {
     penetration: float(72),
     stepsPerSecond: float(76),
     realTime: float(80),
+    unbalanced: float(84),
     positions: new Float32Array(buffer, HEADER_BYTES, 3 * nodes),
     values: valued ? new Float32Array(buffer, HEADER_BYTES + 12 * nodes, nodes) : null,
   };

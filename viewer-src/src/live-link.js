@@ -42,8 +42,8 @@ export class LiveLink {
   #received(frame) {
     const now = performance.now();
     this.arrivals = [...this.arrivals.filter((t) => now - t < 1000), now];
+    requestAnimationFrame(() => this.send({ type: "next" })); // before what draws this frame is called: the next one travels meanwhile
     this.listener.onFrame(frame);
-    requestAnimationFrame(() => this.send({ type: "next" }));
   }
 
   /** Frames received in the last second. */

@@ -17,6 +17,7 @@ const HINTS = {
 };
 const AXES = ["x", "y", "z"];
 const DEAD_ZONE = 0.15;
+const UNBALANCED = 0.05; // of all forces, above which the badge says so
 const digits = (value) => String(Number(value.toPrecision(3))).replace("-", "−");
 const newtons = (force) => Math.hypot(...force) / 1000;
 
@@ -238,6 +239,7 @@ class LivePage {
   #badge(frame) {
     const real = Math.round(100 * frame.realTime);
     let text = real >= 97 ? "real time" : `slower than real time: ${real} %`;
+    if (frame.unbalanced > UNBALANCED) text += `; forces out of balance by ${Math.round(100 * frame.unbalanced)} %`;
     if (frame.paused) text = "paused";
     if (frame.replaying) text = "replay";
     if (frame.failed) text = "the last step failed and was taken back";

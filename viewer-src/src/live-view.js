@@ -98,12 +98,19 @@ export class LiveView extends View {
     this.frame = frame;
     const { points } = this.scene;
     const moved = frame.positions;
-    this.position.array.set(moved);
+    this.position.array = moved; // that of the message, not a copy
     this.position.needsUpdate = true;
     const out = this.level.array;
     let largest = 0;
     for (let i = 0; i < out.length; i += 1) {
-      const value = frame.values ? frame.values[i] : Math.hypot(moved[3 * i] - points[3 * i], moved[3 * i + 1] - points[3 * i + 1], moved[3 * i + 2] - points[3 * i + 2]);
+      let value;
+      if (frame.values) value = frame.values[i];
+      else {
+        const x = moved[3 * i] - points[3 * i];
+        const y = moved[3 * i + 1] - points[3 * i + 1];
+        const z = moved[3 * i + 2] - points[3 * i + 2];
+        value = Math.sqrt(x * x + y * y + z * z); // Math.hypot guards against overflow, and is slow
+      }
       out[i] = value;
       if (value > largest) largest = value;
     }

@@ -57,7 +57,7 @@ class MotionPage {
       h("div", { class: "bar" }, views),
       this.stage,
       this.#timeControls(),
-      h("div", { class: "load shown" }, toggle("mesh", "voxel edges"), toggle("bodies", "indenters"), toggle("reference", "undeformed outline")),
+      h("div", { class: "load shown" }, toggle("mesh", "mesh"), ...(this.data.bodies.length ? [toggle("bodies", "indenters")] : []), toggle("reference", "undeformed outline")),
       h("div", { class: "bar" }, h("label", { for: "naibu-field" }, "Colour by"), this.choice),
       h("div", { class: "motion-scale" }, this.gradient, this.ticks),
       h("p", { class: "hint" }, "Drag to rotate, right-drag or drag with two fingers to pan. Click the view, then scroll to zoom."));

@@ -18,7 +18,7 @@ from naibu.mechanics.finite_elements.assembly import Assembler, body_force
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import material
 from naibu.mechanics.finite_strain.dynamic_session import DynamicEngine, DynamicState
-from naibu.mechanics.finite_strain.real_time_session import RealTimeEngine
+from naibu.mechanics.finite_strain.real_time_session import RealTimeEngine, RealTimeSession
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState
 from naibu.mechanics.lattices.model.surface import surface_triangles
@@ -72,6 +72,9 @@ class InteractiveBody(Protocol):
 
     def cut(self, state: Any, blade: SweptBlade, distance_mm: float | None = None) -> tuple[InteractiveBody, Any, VolumeCut | LatticeCut]:
         """Return the body and its state behind a cut; by default as near to the blade as the body's cells suggest."""
+
+    def unbalanced(self, session: AnySession) -> float:
+        """Return the out-of-balance force that the last step left to the next ones, as a fraction of all forces."""
 
     def strain(self, positions: FloatArray) -> FloatArray:
         """Return a scalar strain at the nodes (n,), %, at positions (n, 3), mm."""
@@ -165,6 +168,10 @@ class LatticeBody:
             cut_engine(self.engine, found), surface_triangles(found.lattice), cells, supported, self.fixtures, external_force=force
         )
         return body, found.state(state), found
+
+    def unbalanced(self, session: AnySession) -> float:
+        """Return 0: a step of a lattice leaves nothing out of balance."""
+        return 0.0
 
     def strain(self, positions: FloatArray) -> FloatArray:
         """Return the mean elongation of the elements at every node (n,), % of their length at rest."""
@@ -328,6 +335,10 @@ class FiniteElementBody:
         )  # fmt: skip
         body = replace(body, forest=found.forest)
         return body, DynamicState(found.nodal(state.displacement), found.nodal(state.velocity)), found
+
+    def unbalanced(self, session: AnySession) -> float:
+        """Return the out-of-balance force that the last step left to the next ones, as a fraction of all forces."""
+        return session.unbalanced if isinstance(session, RealTimeSession) else 0.0
 
     def strain(self, positions: FloatArray) -> FloatArray:
         """Return the von Mises equivalent of the Green-Lagrange strain at the nodes (n,), %, averaged over the tetrahedra around them."""

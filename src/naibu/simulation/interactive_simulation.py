@@ -61,6 +61,8 @@ class Frame:
         Why the last step was taken back; empty where none was.
     topology : int
         Counts the cuts, undone ones included.
+    unbalanced : float
+        Out-of-balance force that the next frames take up, as a fraction of all forces.
     """
 
     body: InteractiveBody
@@ -75,6 +77,7 @@ class Frame:
     gripped: int = -1
     failed: str = ""
     topology: int = 0
+    unbalanced: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -380,7 +383,19 @@ class InteractiveSimulation:
         if self._tool:
             depth = max(0.0, -float(_at(self.tools[self._tool], self._centre).gap(positions[self._surface]).min()))
         return Frame(
-            self.body, number, time_s, positions, self._tool, self._centre, force, pull, depth, self._gripped, failed, self._topology
+            self.body,
+            number,
+            time_s,
+            positions,
+            self._tool,
+            self._centre,
+            force,
+            pull,
+            depth,
+            self._gripped,
+            failed,
+            self._topology,
+            self.body.unbalanced(self._session),
         )
 
 

@@ -172,20 +172,27 @@ def test_trouble_is_told_to_the_page_that_drives(running: Running) -> None:
         assert json.loads(link.recv(timeout=20)) == {"trouble": "there is no tool 'hammer'"}
 
 
-def test_pages_that_come_and_go_leave_nothing_behind(running: Running) -> None:
+@pytest.mark.parametrize("visits", [100, pytest.param(1000, marks=pytest.mark.slow)])
+def test_pages_that_come_and_go_leave_nothing_behind(running: Running, visits: int) -> None:
     def visit() -> None:
         with running.session() as link:
             link.send('{"type": "next"}')
             link.recv(timeout=20)
 
     visit()
-    gc.collect()
-    tasks = threading.active_count()
-    for _ in range(200):
+    for _ in range(20):
         visit()
+    gc.collect()
+    objects = len(gc.get_objects())
+    tasks = threading.active_count()
+    for _ in range(visits):
+        visit()
+    gc.collect()
+    left = len(gc.get_objects()) - objects
     for _ in range(200):
         if not running.live.pages:
             break
         time.sleep(0.02)
     assert running.live.pages == []
     assert threading.active_count() <= tasks + 1
+    assert left < 5 * visits  # a page that was kept holds dozens of objects

@@ -163,6 +163,7 @@ class RealTimeSession(DynamicSession):
             if self._trial is not None:
                 return self._trial.displacement
             self.newton_steps += 1
+            self.unbalanced = 0.0
         self._pressure, self._trial, self._near, self._gaps = None, None, (), ()
         return DynamicSession._balanced(self, h, moving, contacts)
 

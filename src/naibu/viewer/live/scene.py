@@ -29,6 +29,7 @@ HEADER = np.dtype(
         ("penetration", "<f4"),
         ("steps_per_s", "<f4"),
         ("real_time", "<f4"),
+        ("unbalanced", "<f4"),
     ]
 )
 PAUSED, DRIVING, RECORDING, REPLAYING, FAILED = 1, 2, 4, 8, 16
@@ -131,6 +132,8 @@ class LiveFrame:
         Returns the strain at the nodes (n,), computed when it is asked for.
     topology : int
         Number of the scene that the nodes belong to.
+    unbalanced : float
+        Out-of-balance force that the next frames take up, as a fraction of all forces.
     """
 
     number: int
@@ -147,6 +150,7 @@ class LiveFrame:
     flags: int
     strain: Callable[[], FloatArray]
     topology: int = 0
+    unbalanced: float = 0.0
 
 
 def frame_bytes(frame: LiveFrame, driving: bool, values: FloatArray | None = None) -> bytes:
@@ -157,7 +161,7 @@ def frame_bytes(frame: LiveFrame, driving: bool, values: FloatArray | None = Non
         ("tool", frame.tool), ("gripped", frame.gripped), ("valued", int(values is not None)),
         ("topology", frame.topology), ("time_s", frame.time_s),
         ("force", frame.force), ("pull", frame.pull), ("centre", frame.centre), ("penetration", frame.penetration_mm),
-        ("steps_per_s", frame.steps_per_s), ("real_time", frame.real_time),
+        ("steps_per_s", frame.steps_per_s), ("real_time", frame.real_time), ("unbalanced", frame.unbalanced),
     ):  # fmt: skip
         header[name] = value
     parts: list[Float32Array] = [np.asarray(frame.positions, dtype="<f4")]

@@ -67,7 +67,7 @@ class LiveSimulation:
         return LiveFrame(
             frame.number, frame.time_s, frame.positions, tool, frame.gripped, frame.tool_centre, frame.force, frame.pull,
             frame.penetration_mm, pace.steps_per_s, pace.real_time, flags,
-            lambda: frame.body.strain(frame.positions), frame.topology,
+            lambda: frame.body.strain(frame.positions), frame.topology, frame.unbalanced,
         )  # fmt: skip
 
     def command(self, command: LiveCommand) -> None:
