@@ -80,7 +80,7 @@ def simulate_fingertip(
     study = prepared_fingertip(source)
     names = [f"{study.name}{ending}" for ending in (".html", ".json", ".vtkhdf", "-readings.csv")]
     names += [f"{study.name}-decoder.json"] if study.training else []
-    folder = output_folder(out, names, overwrite=overwrite)
+    folder = output_folder(out, () if resume else names, overwrite=overwrite)
     checkpoint = FingertipCheckpoint.of(folder, study.name, study.source, study.digest)
     trained = study.training.presses(study.fingertip) if study.training else ()
     run = _Computed((*trained, *study.presses), [])
