@@ -9,12 +9,15 @@ from .ischemia.layer_identification import LayerEstimate, LayerParameter, identi
 from .ischemia.layered_response import LayeredModes, SkinMotion, frequency_response, simulate_skin
 from .ischemia.response_times import ResponseTimes, response_times
 from .ischemia.skin import MeshedPatch, SkinLayer, SkinPatch, SurfaceLoad, meshed
+from .mammography.breast_from_mr import ScannedBreast, breast_in_scan
 from .mammography.breast_outline import BreastOutline, breast_outline, mask_outline
+from .mammography.breast_segmentation import breast_mask
 from .mammography.breast_shape import BreastShape, half_ellipsoid_shape, shape_from_widths
-from .mammography.epipolar import EpipolarCurve, LesionPosition, MammographicPair, ModelUncertainty, Projection, mammographic_pair
+from .mammography.epipolar import EpipolarCurve, LesionPosition, MammographicPair, ModelUncertainty, Projection
 from .mammography.geometric_model import Compression, CompressionParameters, compressed
 from .mammography.mechanical_model import MechanicalCompression, MechanicalParameters, mechanically_compressed
 from .mammography.mechanical_views import mechanical_views
+from .mammography.pair_construction import mammographic_pair, pair_of_shape
 from .mammography.pressed_view import PressedView
 from .mammography.two_views import TwoViews, two_views
 from .sensing_chip.bridge import closed_form_sensitivities, crosstalk, decoupled, half_bridge, sensitivity_matrix
@@ -64,6 +67,7 @@ __all__ = [
     "ReadingChain",
     "Readout",
     "ResponseTimes",
+    "ScannedBreast",
     "SkinLayer",
     "SkinMotion",
     "SkinPatch",
@@ -72,6 +76,8 @@ __all__ = [
     "Training",
     "TwoViews",
     "assumed_chip",
+    "breast_in_scan",
+    "breast_mask",
     "breast_outline",
     "chip_mesh",
     "closed_form_sensitivities",
@@ -100,6 +106,7 @@ __all__ = [
     "n_type_silicon",
     "orthotropic_torsion_stiffness",
     "p_type_silicon",
+    "pair_of_shape",
     "parallel_springs_force",
     "pareto_front",
     "power_law",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -17,45 +17,61 @@ from naibu.core.errors import InputError
 @verb(SCANS, "mammography --cc cc.csv --mlo mlo.csv --thickness-mm 52,55 --angle-deg 45 --point-cc 40,12 --open")
 def mammography(
     *,
-    cc: Path,
-    mlo: Path,
-    thickness_mm: str,
-    angle_deg: float,
+    cc: Path | None = None,
+    mlo: Path | None = None,
+    thickness_mm: str = "",
+    angle_deg: float | None = None,
     point_cc: Annotated[str, Parameter(allow_leading_hyphen=True)] = "",
     point_mlo: Annotated[str, Parameter(allow_leading_hyphen=True)] = "",
+    mr: Path | None = None,
+    side: Literal["left", "right"] | None = None,
+    point_mr: Annotated[str, Parameter(allow_leading_hyphen=True)] = "",
     pixel_mm: float | None = None,
+    model: Literal["geometric", "mechanical"] = "geometric",
+    unresolved_mm: float = 6.0,
     draws: Whole = 100,
     seed: Whole = 0,
     out: Out = Path("naibu-mammography"),
     overwrite: Overwrite = False,
 ) -> None:
-    """Predict where a point of one mammographic view lies in the other, or where a lesion that both show lies in the breast.
+    """Predict where a point of one mammographic view, or of an MR scan, lies in the other view, and where in the breast a lesion lies.
 
-    Research software, not a medical device. At least one point is needed; with both, the position of the lesion is estimated.
+    Research software, not a medical device. At least one point is needed; with one in both views, the position of the lesion is estimated.
 
     Parameters
     ----------
     cc
-        Outline of the breast in CC: a CSV table of points along the skin, in mm, perpendicular to the chest wall and along it, laterally;
-        or a mask (TIFF, MetaImage, NRRD, NIfTI), lateral side up, whose breast touches the side of the image that is the chest wall.
+        The breast in CC: a DICOM mammogram; or its outline, a CSV table of points along the skin, in mm, perpendicular to the chest
+        wall and along it, laterally; or a mask (PNG, TIFF, MetaImage, NRRD, NIfTI), lateral side up, whose breast touches the side of
+        the image that is the chest wall.
     mlo
         The same in MLO, upper side up.
     thickness_mm
-        Distance of the compression plates, mm: one number, or CC,MLO.
+        Distance of the compression plates, mm: one number, or CC,MLO. By default that of the mammograms' tags.
     angle_deg
-        Positioner angle of MLO against CC, degrees: 20 to 90.
+        Positioner angle of MLO against CC, degrees: 20 to 90. By default that of the tags.
     point_cc
-        Point X,Y in CC, mm, in the coordinates of the outline; of masks, from the lower left corner.
+        Point X,Y in CC, mm, in the coordinates of the outline; of images, from the lower left corner, hung as masks are.
     point_mlo
         Point X,Y in MLO.
+    mr
+        Mask of the breast in an MR volume (NIfTI, MetaImage, NRRD): its shape is used instead of the one that the outlines imply.
+    side
+        Which breast the MR mask holds.
+    point_mr
+        Point X,Y,Z in the MR volume, mm (LPS), to be shown in CC and MLO.
     pixel_mm
         Size of a pixel of the masks, mm, where the files do not state it.
+    model
+        Closed geometric maps (within a second), or equilibrium of finite elements (some ten seconds).
+    unresolved_mm
+        Standard deviation of displacements in a view that no parameter describes, mm: heterogeneous tissue, positioning.
     draws
         Number of models drawn from the uncertainty of the parameters.
     seed
         Seed of the random numbers.
     out
-        Folder for mammography.html and mammography.json.
+        Folder for mammography.html, mammography.json and breast.html.
     overwrite
         Replace results, or files of your own, that the folder already holds.
     """
@@ -64,11 +80,16 @@ def mammography(
     run = relate_views(
         cc,
         mlo,
-        thickness_mm=_numbers("thickness_mm", thickness_mm),
+        thickness_mm=_numbers("thickness_mm", thickness_mm) if thickness_mm else None,
         angle_deg=angle_deg,
         point_cc=_numbers("point_cc", point_cc) if point_cc else None,
         point_mlo=_numbers("point_mlo", point_mlo) if point_mlo else None,
+        mr=mr,
+        side=side,
+        point_mr=_numbers("point_mr", point_mr) if point_mr else None,
         pixel_mm=pixel_mm,
+        model=model,
+        unresolved_mm=unresolved_mm,
         draws=draws,
         seed=seed,
         out=out,
@@ -78,7 +99,7 @@ def mammography(
     wrote(*run.files)
     for warning in run.warnings:
         say(warning, WARNING)
-    say(f"Page: {run.files[0]}   numbers: {run.files[1]}")
+    say(f"Page: {run.files[0]}   in 3-D: {run.files[2]}   numbers: {run.files[1]}")
 
 
 @verb(SIMULATE, "decode-forces results/my_finger-decoder.json readings.csv --open")

@@ -20,7 +20,7 @@ from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.io.files.paths import require_usable_path
 from naibu.io.files.reading import guarded_reading
-from naibu.io.image_formats import dicom, hdf5, metaimage, nifti, nrrd, tiff, zarr_store
+from naibu.io.image_formats import dicom, hdf5, metaimage, nifti, nrrd, png, tiff, zarr_store
 from naibu.io.image_formats.geometry import ReadOptions
 
 _Handler = TypeVar("_Handler")
@@ -30,6 +30,7 @@ VOLUME_READERS: dict[str, Callable[[Path, ReadOptions], Volume]] = {
     **dict.fromkeys((".nrrd", ".nhdr"), nrrd.read),
     **dict.fromkeys((".tif", ".tiff"), tiff.read),
     **dict.fromkeys((".h5", ".hdf5"), hdf5.read),
+    ".png": png.read,
     ".zarr": zarr_store.read,
     **dict.fromkeys((".dcm", ".dicom", ".ima"), dicom.read),
 }

@@ -7,8 +7,9 @@ import pytest
 
 from naibu.applications.mammography.breast_outline import BreastOutline, breast_outline, inside_polygon
 from naibu.applications.mammography.breast_shape import half_ellipsoid_shape
-from naibu.applications.mammography.epipolar import MammographicPair, ModelUncertainty, mammographic_pair
+from naibu.applications.mammography.epipolar import MammographicPair, ModelUncertainty
 from naibu.applications.mammography.geometric_model import DEFAULT_PARAMETERS, Compression, CompressionParameters, compressed
+from naibu.applications.mammography.pair_construction import mammographic_pair
 from naibu.applications.mammography.two_views import two_views
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError

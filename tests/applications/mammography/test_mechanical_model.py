@@ -7,8 +7,8 @@ import pytest
 
 from naibu.applications.mammography.breast_outline import BreastOutline, breast_outline
 from naibu.applications.mammography.breast_shape import half_ellipsoid_shape
-from naibu.applications.mammography.epipolar import mammographic_pair
 from naibu.applications.mammography.mechanical_model import MechanicalParameters, mechanically_compressed
+from naibu.applications.mammography.pair_construction import mammographic_pair
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.meshing.quality import signed_volumes

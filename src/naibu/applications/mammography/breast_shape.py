@@ -127,3 +127,15 @@ def shape_from_widths(depths: FloatArray, first: FloatArray, second: FloatArray,
     middles = [0.5 * (w[:, 0] + w[:, 1]) for w in (first, second)]
     upwards = (middles[1] - np.cos(t) * middles[0]) / np.sin(t)
     return BreastShape(depths, np.column_stack([middles[0], upwards]), np.column_stack([mean + p, mean - p, r]))
+
+
+def opened_at(outline: FloatArray, hidden_mm: float) -> FloatArray:
+    """Return an outline (m, 2), from wall to wall, without its part nearer to the chest wall than `hidden_mm`, measured from there."""
+    if hidden_mm <= 0.0:
+        return outline - np.array([hidden_mm, 0.0])
+    kept = np.flatnonzero(outline[:, 0] > hidden_mm)
+    ends = []
+    for inner, outer in ((kept[0], kept[0] - 1), (kept[-1], kept[-1] + 1)):
+        a, b = outline[outer], outline[inner]
+        ends.append(a + (hidden_mm - a[0]) / (b[0] - a[0]) * (b - a))
+    return np.vstack([ends[0], outline[kept], ends[1]]) - np.array([hidden_mm, 0.0])

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -11,18 +10,14 @@ from numpy.typing import ArrayLike
 from scipy.special import fdtri, stdtrit
 
 from naibu.applications.mammography.breast_outline import BreastOutline, inside_polygon
-from naibu.applications.mammography.geometric_model import DEFAULT_PARAMETERS, CompressionParameters
-from naibu.applications.mammography.mechanical_views import mechanical_views
 from naibu.applications.mammography.pressed_view import PressedView
-from naibu.applications.mammography.two_views import LEAST_ANGLE, MOST_ANGLE, TwoViews, two_views
-from naibu.core.arrays import BoolArray, FloatArray, require_count, require_within
+from naibu.applications.mammography.two_views import TwoViews
+from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import InputError
 
 Model = Literal["geometric", "mechanical"]
 _COUNT = 101
 _TURN = np.linspace(0.0, 2.0 * np.pi, 61)
-_MOST_REFUSED = 0.5
-_MOST_DRAWS = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,96 +254,6 @@ class MammographicPair:
             hint = "; it lies inside of that of the other view: are the views swapped?" if swapped else ""
             raise InputError(f"point_{name.lower()} is ({shown[0]:.4g}, {shown[1]:.4g}) mm, outside of the outline of {name}{hint}")
         return p
-
-
-def mammographic_pair(
-    cc: BreastOutline,
-    mlo: BreastOutline,
-    thickness_mm: tuple[float, float],
-    angle_deg: float,
-    *,
-    model: Model = "geometric",
-    parameters: CompressionParameters = DEFAULT_PARAMETERS,
-    uncertainty: ModelUncertainty = DEFAULT_UNCERTAINTY,
-    draws: int = 100,
-    seed: int = 0,
-) -> MammographicPair:
-    """Build a model of a breast from both views, and geometric models drawn from the uncertainty.
-
-    Parameters
-    ----------
-    cc, mlo : BreastOutline
-        Outlines.
-    thickness_mm : (float, float)
-        Distances of the plates in CC and MLO.
-    angle_deg : float
-        Positioner angle of MLO against CC.
-    model : {"geometric", "mechanical"}
-        Closed maps, or equilibrium of finite elements with the default `MechanicalParameters`.
-    parameters : CompressionParameters
-        What the views leave open in the geometric model.
-    uncertainty : ModelUncertainty
-        Its standard deviations.
-    draws : int
-        Number of drawn models, 20 to 10 000.
-    seed : int
-        Of the random numbers.
-
-    Raises
-    ------
-    InputError
-        What `two_views` refuses, another model, too few or too many draws, or more than half of the draws giving no breast.
-    ConvergenceError
-        No equilibrium was found.
-    """
-    if model not in ("geometric", "mechanical"):
-        raise InputError(f"model is {model!r}: must be 'geometric' or 'mechanical'")
-    require_count("draws", draws, 20)
-    require_within("draws", draws, 20, _MOST_DRAWS)
-    require_count("seed", seed, 0)
-    centre = two_views(cc, mlo, thickness_mm, angle_deg, (parameters, parameters))
-    nominal = centre if model == "geometric" else mechanical_views(cc, mlo, thickness_mm, angle_deg)
-    random = np.random.default_rng(seed)
-    drawn, refused = [], 0
-    for pair, plates, angle in _draws(random, draws, parameters, uncertainty, thickness_mm, angle_deg):
-        try:
-            drawn.append(two_views(cc, mlo, plates, angle, pair))
-        except InputError:
-            refused += 1
-    if refused > _MOST_REFUSED * draws:
-        raise InputError(
-            f"{refused} of {draws} models drawn from the uncertainty give no breast: the outlines, thickness_mm and angle_deg hardly fit"
-        )
-    z = random.standard_normal((len(drawn), 4))
-    z -= z.mean(axis=0)
-    z = np.linalg.solve(np.linalg.cholesky(z.T @ z / len(z)), z.T).T  # so few draws would have another covariance than the stated one
-    noise = uncertainty.unresolved_mm * z.reshape(-1, 2, 2)
-    return MammographicPair((cc, mlo), nominal, centre, tuple(drawn), noise, refused)
-
-
-_Draw = tuple[tuple[CompressionParameters, CompressionParameters], tuple[float, float], float]
-
-
-def _draws(
-    random: np.random.Generator,
-    draws: int,
-    parameters: CompressionParameters,
-    sds: ModelUncertainty,
-    thickness_mm: tuple[float, float],
-    angle_deg: float,
-) -> Iterator[_Draw]:
-    for z in random.standard_normal((draws, 9)):
-        pair = [
-            replace(
-                parameters,
-                volume_ratio=float(np.clip(parameters.volume_ratio + sds.volume_ratio * a, 0.5, 1.5)),
-                along_share=float(np.clip(parameters.along_share + sds.along_share * b, -0.5, 1.5)),
-                bending=float(np.clip(parameters.bending + sds.bending * c, -1.0, 1.5)),
-            )
-            for a, b, c in z[:6].reshape(2, 3)
-        ]
-        plates = tuple(max(t + sds.thickness_mm * dz, 0.1 * t) for t, dz in zip(thickness_mm, z[6:8], strict=True))
-        yield (pair[0], pair[1]), (plates[0], plates[1]), float(np.clip(angle_deg + sds.angle_deg * z[8], LEAST_ANGLE, MOST_ANGLE))
 
 
 def _index(view: str) -> int:

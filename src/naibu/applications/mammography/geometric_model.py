@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from naibu.applications.mammography.breast_shape import BreastShape
+from naibu.applications.mammography.breast_shape import BreastShape, opened_at
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import InputError
 
@@ -98,6 +98,14 @@ class Compression:
     def silhouette(self) -> tuple[float, float]:
         """Stretches of the outline in the view: along the chest wall and away from it."""
         return 1.0 + (self.along - 1.0) * self.outermost, 1.0 + (self.away - 1.0) * self.outermost
+
+    def outline(self) -> FloatArray:
+        """Return the outline (m, 2) in the image, depth and position along the chest wall, mm, without what the image does not reach."""
+        centres, squares = self.shape.in_view(self.angle_deg, self.shape.depths)
+        along, away = self.silhouette
+        reach = np.sqrt(np.maximum(squares[:, 0], 0.0))
+        ends = [np.column_stack([away * self.shape.depths, along * (centres[:, 0] + sign * reach)]) for sign in (-1.0, 1.0)]
+        return opened_at(np.vstack([ends[0], ends[1][::-1]]), self.hidden_mm)
 
     def compress(self, points: ArrayLike) -> FloatArray:
         """Return positions in the compressed breast.

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from naibu.applications.mammography.breast_mesh import breast_nodes, free_and_wall_faces, unit_breast_mesh, young_moduli
-from naibu.applications.mammography.breast_shape import BreastShape
+from naibu.applications.mammography.breast_shape import BreastShape, opened_at
 from naibu.applications.mammography.geometric_model import require_thickness
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.errors import InputError
@@ -142,6 +142,14 @@ class MechanicalCompression:
         depth = float(seen[:, 0].max())
         low, high = level_extents(seen[edges[:, 0]], seen[edges[:, 1]], depth * compressed_levels())
         return low, high, depth
+
+    def outline(self) -> FloatArray:
+        """Return the outline (m, 2) in the image, depth and position along the chest wall, mm, without what the image does not reach."""
+        low, high, depth = self.extents()
+        depths = depth * compressed_levels()
+        scale, shift = self._correction(depths)
+        ends = [np.column_stack([self.stretch * depths, scale * end + shift]) for end in (low, high)]
+        return opened_at(np.vstack([ends[0], ends[1][::-1]]), self.hidden_mm)
 
     def compress(self, points: ArrayLike) -> FloatArray:
         """Return positions in the compressed breast of points (..., 3) of the unloaded one.

@@ -28,6 +28,10 @@ class PressedView(Protocol):
         """Tissue at the chest wall that the image does not reach."""
         ...
 
+    def outline(self) -> FloatArray:
+        """Return the outline (m, 2) in the image, depth and position along the chest wall, mm, without what the image does not reach."""
+        ...
+
     def compress(self, points: ArrayLike) -> FloatArray:
         """Return positions along the detector, along the compression and away from the chest wall of unloaded points (..., 3), mm."""
         ...

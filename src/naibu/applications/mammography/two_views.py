@@ -22,6 +22,7 @@ from naibu.core.errors import InputError
 _STEPS = 100
 _MOST_DEPTH_RATIO = 1.5
 _MOST_VOLUME_RATIO = 2.0
+_THINNEST_MM, _THICKEST_MM = 12.0, 250.0
 LEAST_ANGLE, MOST_ANGLE = 20.0, 90.0
 
 
@@ -80,6 +81,10 @@ def two_views(
     for value in thickness_mm:
         if not (np.isfinite(value) and value > 0.0):
             raise InputError(f"thickness_mm is {value:g}: must be greater than 0")
+        if not _THINNEST_MM <= value <= _THICKEST_MM:
+            raise InputError(
+                f"thickness_mm is {value:g}: plates press a breast to {_THINNEST_MM:g} to {_THICKEST_MM:g} mm. Is the distance in mm?"
+            )
     depth_ratio = mlo.depth_mm / cc.depth_mm
     if not 1.0 / _MOST_DEPTH_RATIO <= depth_ratio <= _MOST_DEPTH_RATIO:
         raise InputError(

@@ -12,23 +12,34 @@ from typing import Any
 import numpy as np
 
 from naibu._version import __version__
-from naibu.applications.mammography.breast_outline import BreastOutline, breast_outline, mask_outline
-from naibu.applications.mammography.epipolar import EpipolarCurve, LesionPosition, MammographicPair, ModelUncertainty, mammographic_pair
+from naibu.applications.mammography.breast_from_mr import ScannedBreast
+from naibu.applications.mammography.epipolar import (
+    DEFAULT_UNCERTAINTY,
+    EpipolarCurve,
+    LesionPosition,
+    MammographicPair,
+    Model,
+    ModelUncertainty,
+    Projection,
+)
 from naibu.applications.mammography.geometric_model import CompressionParameters
+from naibu.applications.mammography.mechanical_model import MechanicalParameters
+from naibu.applications.mammography.pair_construction import mammographic_pair, pair_of_shape
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.io.files.atomic import write_atomically
-from naibu.io.images import read_volume
-from naibu.io.number_table import read_numbers
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import chapter_html
 from naibu.viewer.tables import Cell, Table
+from naibu.workflows.applications.mammogram_inputs import place_in, plate_distances, positioner_angle, read_scan, read_views
 from naibu.workflows.applications.mammography_figures import draw_breast, draw_views
+from naibu.workflows.applications.mammography_motion import breast_page
 from naibu.workflows.output_folder import output_folder
 
 NOTICE = "Research software, not a medical device: not for diagnosis, biopsy or treatment."
 _NAME = "mammography"
-_MASKS = (".tif", ".tiff", ".mha", ".nrrd", ".nii")
+_BREAST = "breast.html"
+_SHOWN = 9  # points of a curve in the 3-D view
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,35 +62,51 @@ class MammographyRun:
 
 
 def relate_views(
-    cc: str | os.PathLike[str],
-    mlo: str | os.PathLike[str],
+    cc: str | os.PathLike[str] | None = None,
+    mlo: str | os.PathLike[str] | None = None,
     *,
-    thickness_mm: Sequence[float],
-    angle_deg: float,
     out: str | os.PathLike[str],
+    thickness_mm: Sequence[float] | None = None,
+    angle_deg: float | None = None,
     point_cc: Sequence[float] | None = None,
     point_mlo: Sequence[float] | None = None,
+    mr: str | os.PathLike[str] | None = None,
+    side: str | None = None,
+    point_mr: Sequence[float] | None = None,
     pixel_mm: float | None = None,
+    model: Model = "geometric",
+    unresolved_mm: float = DEFAULT_UNCERTAINTY.unresolved_mm,
     draws: int = 100,
     seed: int = 0,
     overwrite: bool = False,
 ) -> MammographyRun:
-    """Relate points of two views; write ``mammography.html`` and ``mammography.json``.
+    """Relate points of two views, or of a scan to both; write ``mammography.html``, ``mammography.json`` and ``breast.html``.
 
     Parameters
     ----------
-    cc, mlo : path-like
-        Outlines: tables of points in mm, perpendicular to the chest wall and along it (laterally in CC, upwards in MLO), or masks.
-    thickness_mm : sequence of float
-        Distance of the plates, or one for CC and one for MLO.
-    angle_deg : float
-        Positioner angle of MLO against CC.
+    cc, mlo : path-like, optional
+        Mammograms in DICOM files; outlines: tables of points in mm, perpendicular to the chest wall and along it (laterally in CC, upwards
+        in MLO); or masks. Both, or with `mr` none.
     out : path-like
         Folder of the files.
+    thickness_mm : sequence of float, optional
+        Distance of the plates, or one for CC and one for MLO; by default that of the tags.
+    angle_deg : float, optional
+        Positioner angle of MLO against CC; by default that of the tags.
     point_cc, point_mlo : sequence of float, optional
-        A point in each view, in the coordinates of the outlines: at least one.
+        A point in each view, in the coordinates of the outlines; of images, from the lower left corner as they are hung.
+    mr : path-like, optional
+        Mask of the breast in a magnetic resonance volume: the unloaded shape, instead of that which the outlines imply.
+    side : {"left", "right"}, optional
+        Which breast the mask holds.
+    point_mr : sequence of float, optional
+        A point in the scan, LPS, mm, to be shown in both views.
     pixel_mm : float, optional
         Size of a pixel of masks.
+    model : {"geometric", "mechanical"}
+        See `naibu.applications.mammographic_pair`.
+    unresolved_mm : float
+        See `naibu.applications.ModelUncertainty`.
     draws, seed : int
         Models drawn from the uncertainty, and the seed of the random numbers.
     overwrite : bool
@@ -88,32 +115,33 @@ def relate_views(
     Raises
     ------
     InputError
-        No point, files that are no outlines, values that cannot be, outlines or points that do not fit together, or a folder that cannot be
-        written to or holds results.
+        No point, files that are no outlines, values or tags that are missing or cannot be, outlines or points that do not fit together, or
+        a folder that cannot be written to or holds results.
+    ConvergenceError
+        The mechanical model found no equilibrium.
     """
-    if point_cc is None and point_mlo is None:
-        raise InputError("point_cc is missing: give a point in CC, in MLO, or in both")
-    if len(thickness_mm) not in (1, 2):
-        raise InputError(f"thickness_mm has {len(thickness_mm)} values: needs one, or one for CC and one for MLO")
-    folder = output_folder(out, [f"{_NAME}.html", f"{_NAME}.json"], overwrite=overwrite)
-    outlines = _outline(cc, pixel_mm), _outline(mlo, pixel_mm)
-    plates = float(thickness_mm[0]), float(thickness_mm[-1])
-    pair = mammographic_pair(*outlines, plates, angle_deg, draws=draws, seed=seed)
-    places = _place(outlines[0], "point_cc", point_cc), _place(outlines[1], "point_mlo", point_mlo)
-    curves = tuple(
-        None if place is None else pair.epipolar_curve(place, from_view=view) for view, place in zip(("CC", "MLO"), places, strict=True)
-    )
-    lesion = None if places[0] is None or places[1] is None else pair.lesion(places[0], places[1])
-    found = _Found(pair, places, (curves[0], curves[1]), lesion)
+    _require_points(cc, mlo, mr, (point_cc, point_mlo, point_mr))
+    folder = output_folder(out, [f"{_NAME}.html", f"{_NAME}.json", _BREAST], overwrite=overwrite)
+    views = None if cc is None or mlo is None else read_views(cc, mlo, pixel_mm)
+    plates, angle = plate_distances(views, thickness_mm), positioner_angle(views, angle_deg)
+    uncertainty = ModelUncertainty(unresolved_mm=unresolved_mm)
+    outlines = None if views is None else (views[0].outline, views[1].outline)
+    scan = None if mr is None else read_scan(mr, side, views)
+    if scan is not None:
+        pair = pair_of_shape(scan.shape, plates, angle, outlines=outlines, model=model, uncertainty=uncertainty, draws=draws, seed=seed)
+    else:
+        pair = mammographic_pair(*(outlines or ()), plates, angle, model=model, uncertainty=uncertainty, draws=draws, seed=seed)
+    found = _found(pair, (point_cc, point_mlo), None if scan is None else _scanned_point(scan, point_mr))
     settings: dict[str, Cell] = {
-        "CC": os.fspath(cc), "MLO": os.fspath(mlo), "thickness_mm": ", ".join(f"{t:g}" for t in plates), "angle_deg": angle_deg,
-        "draws": draws, "draws without a breast": pair.refused, "seed": seed,
+        "CC": str(cc), "MLO": str(mlo), "MR": str(mr), "model": model, "thickness_mm": ", ".join(f"{t:g}" for t in plates),
+        "angle_deg": angle, "unresolved_mm": unresolved_mm, "draws": draws, "draws without a breast": pair.refused, "seed": seed,
     }  # fmt: skip
-    chapter = Chapter(_NAME, "One point in two mammographic views", _sections(found), settings)
+    chapter = Chapter(_NAME, "One point in two mammographic views", _sections(found, model, uncertainty), settings)
     numbers = {"naibu": __version__, "notice": NOTICE, "settings": settings, **_numbers(found)}
     page = write_atomically(folder / f"{_NAME}.html", chapter_html(chapter))
     table = write_atomically(folder / f"{_NAME}.json", json.dumps(numbers, indent=1, allow_nan=False) + "\n")
-    return MammographyRun((page, table), tuple(_rows(found)), tuple(_warnings(found)))
+    breast = write_atomically(folder / _BREAST, breast_page(pair.nominal, angle, found.shown, NOTICE, dict(settings)))
+    return MammographyRun((page, table, breast), tuple(_rows(found)), tuple(_warnings(found)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,33 +150,48 @@ class _Found:
     places: tuple[FloatArray | None, FloatArray | None]
     curves: tuple[EpipolarCurve | None, EpipolarCurve | None]
     lesion: LesionPosition | None
+    scanned: FloatArray | None
+    projection: Projection | None
+
+    @property
+    def shown(self) -> FloatArray:
+        """Points (k, 3) of the unloaded breast for the 3-D view."""
+        if self.scanned is not None:
+            return self.scanned[None]
+        if self.lesion is not None:
+            return self.lesion.position[None]
+        curve = self.curves[0] or self.curves[1]
+        return np.zeros((0, 3)) if curve is None else curve.points[:: max(1, len(curve.points) // _SHOWN)]
 
 
-def _outline(source: str | os.PathLike[str], pixel_mm: float | None) -> BreastOutline:
-    path = Path(source)
-    if path.suffix.lower() == ".png":
-        raise InputError(f"{path}: PNG files are not read; save the mask as TIFF, or the outline as CSV in mm")
-    if path.suffix.lower() not in _MASKS:
-        return breast_outline(read_numbers(path, ("mm perpendicular to the chest wall", "mm along it")), what=str(path))
-    if pixel_mm is not None and not (np.isfinite(pixel_mm) and pixel_mm > 0.0):
-        raise InputError(f"pixel_mm is {pixel_mm:g}: must be greater than 0, the size of a pixel in mm")
-    if pixel_mm is None and path.suffix.lower() in _MASKS[:2]:
-        raise InputError(f"pixel_mm is missing: {path} is a TIFF mask, so its size of a pixel in mm is needed")
-    volume = read_volume(path, spacing_mm=None if pixel_mm is None else (pixel_mm, pixel_mm, 1.0))
-    if len(volume.values) != 1:
-        raise InputError(f"{path}: has {len(volume.values)} slices; a mask of a view has one")
-    x_mm, y_mm = (float(s) for s in volume.spacing_mm[:2])
-    if abs(x_mm - y_mm) > 1e-3 * x_mm:
-        raise InputError(f"{path}: its pixels are {x_mm:g} x {y_mm:g} mm; they must be square")
-    return mask_outline(volume.values[0], x_mm, what=str(path))
+def _require_points(cc: object, mlo: object, mr: object, points: tuple[object, object, object]) -> None:
+    if (cc is None) != (mlo is None):
+        raise InputError(f"{'cc' if cc is None else 'mlo'} is missing: give both views")
+    if cc is None and mr is None:
+        raise InputError("cc and mlo are missing: give both views, or the mask of a scan")
+    if all(point is None for point in points):
+        raise InputError("point_cc is missing: give a point in CC, in MLO, in both, or in a scan")
+    if points[2] is not None and mr is None:
+        raise InputError("point_mr is given without mr: give the mask of the breast in the scan")
+    if cc is None and (points[0] is not None or points[1] is not None):
+        raise InputError("point_cc or point_mlo is given without cc and mlo: give both views")
 
 
-def _place(outline: BreastOutline, name: str, point: Sequence[float] | None) -> FloatArray | None:
+def _scanned_point(scan: ScannedBreast, point: Sequence[float] | None) -> FloatArray | None:
     if point is None:
         return None
-    if len(point) != 2 or not np.isfinite(point).all():
-        raise InputError(f"{name} is {tuple(point)}: needs two finite coordinates, mm")
-    return outline.from_image(point)
+    if len(point) != 3 or not np.isfinite(point).all():
+        raise InputError(f"point_mr is {tuple(point)}: needs three finite coordinates, mm")
+    return scan.from_scan(point)
+
+
+def _found(pair: MammographicPair, points: tuple[Sequence[float] | None, Sequence[float] | None], scanned: FloatArray | None) -> _Found:
+    places = place_in(pair.outlines[0], "point_cc", points[0]), place_in(pair.outlines[1], "point_mlo", points[1])
+    curves = tuple(
+        None if place is None else pair.epipolar_curve(place, from_view=view) for view, place in zip(("CC", "MLO"), places, strict=True)
+    )
+    lesion = None if places[0] is None or places[1] is None else pair.lesion(places[0], places[1])
+    return _Found(pair, places, (curves[0], curves[1]), lesion, scanned, None if scanned is None else pair.project(scanned))
 
 
 def _rows(found: _Found) -> list[tuple[str, str]]:
@@ -169,6 +212,10 @@ def _rows(found: _Found) -> list[tuple[str, str]]:
         for axis, value, low, high in zip(axes, found.lesion.position, found.lesion.low, found.lesion.high, strict=True):
             rows.append((f"lesion in the unloaded breast, {axis}", f"{value:.1f} mm ({low:.1f} to {high:.1f})"))
         rows.append(("distance of the MLO point from the curve", f"{found.lesion.mismatch_mm:.1f} mm"))
+    if found.projection is not None:
+        for name, outline, place in zip(("CC", "MLO"), found.pair.outlines, found.projection.places, strict=True):
+            x, y = outline.to_image(place)
+            rows.append((f"point of the scan in {name}", f"({x:.1f}, {y:.1f}) mm"))
     return rows
 
 
@@ -197,19 +244,25 @@ def _numbers(found: _Found) -> dict[str, Any]:
             "mismatch_mm": found.lesion.mismatch_mm,
             "agrees": found.lesion.agrees,
         }
+    if found.projection is not None:
+        for name, outline, place, region in zip(
+            ("cc", "mlo"), found.pair.outlines, found.projection.places, found.projection.regions, strict=True
+        ):
+            numbers[f"point_of_scan_in_{name}_mm"] = outline.to_image(place).round(3).tolist()
+            numbers[f"region_in_{name}_mm"] = outline.to_image(region).round(3).tolist()
     return numbers
 
 
-def _sections(found: _Found) -> tuple[Section, ...]:
+def _sections(found: _Found, model: str, uncertainty: ModelUncertainty) -> tuple[Section, ...]:
     views = Figure(
         "Views",
         "Outlines, points, epipolar curves and the bands that hold the true place with 95 % probability, if the "
         "stated uncertainty is true.",
-        lambda canvas: draw_views(canvas, found.pair.outlines, found.places, found.curves),
+        lambda canvas: draw_views(canvas, found.pair.outlines, found.places, found.curves, found.projection),
         (9.0, 4.6),
     )
     curve = found.curves[0] or found.curves[1]
-    lesion = None if found.lesion is None else found.lesion.position
+    lesion = found.scanned if found.lesion is None else found.lesion.position
     breast = Figure(
         "Unloaded breast",
         "From the front and from the side, with the points that the curve stands for.",
@@ -219,23 +272,38 @@ def _sections(found: _Found) -> tuple[Section, ...]:
     results = Table("Results", ("quantity", "value"), tuple(_rows(found)), caption="Intervals are of 95 %.")
     return (
         Section("Notice", tuple(_warnings(found))),
-        Section("Both views", (), (results,), (views, breast)),
-        Section("Assumptions", _ASSUMPTIONS, (_assumed(),)),
+        Section(
+            "Both views",
+            ("The breast in 3-D, between the plates of both views: breast.html beside this page.",),
+            (results,),
+            (views, breast),
+        ),
+        Section("Assumptions", _ASSUMPTIONS[model], (_assumed(model, uncertainty),)),
     )
 
 
-_ASSUMPTIONS = (
-    "Sections perpendicular to the chest wall deform in their plane and bend outwards; the outline of the "
-    "compressed breast is scaled back so "
-    "that the volume keeps its stated ratio; sections of the unloaded breast parallel to the chest wall are "
-    "ellipses; x-rays are parallel; the "
-    "nipple is the deepest point of each outline and lies on the axis of rotation.",
-    "Tissue is not told apart: heterogeneity, gravity and positioning are in the unresolved displacement.",
+_COMMON = (
+    "Sections of the unloaded breast parallel to the chest wall are ellipses; x-rays are parallel; the nipple is the deepest point "
+    "of each outline and lies on the axis of rotation; the view in which the breast is deeper reaches the chest wall.",
+    "Kinds of tissue are not told apart: heterogeneity and positioning are in the unresolved displacement.",
 )
+_ASSUMPTIONS = {
+    "geometric": (
+        "Sections perpendicular to the chest wall deform in their plane and bend outwards; the outline of the compressed breast is scaled "
+        "back so that the volume keeps its stated ratio. Gravity, skin and friction are not modelled.",
+        *_COMMON,
+    ),
+    "mechanical": (
+        "Equilibrium of a nearly incompressible neo-Hookean solid with skin and weight between rubbing plates; the chest wall lets tissue "
+        "slide along it. The unloaded shape is the one whose equilibria have the outlines of both views. Bands and intervals come from the "
+        "geometric model's spread.",
+        *_COMMON,
+    ),
+}
 
 
-def _assumed() -> Table:
-    values, sds = CompressionParameters(), ModelUncertainty()
+def _assumed(model: str, sds: ModelUncertainty) -> Table:
+    values, solid = CompressionParameters(), MechanicalParameters()
     rows: tuple[tuple[Cell, ...], ...] = (
         ("volume, compressed / unloaded", values.volume_ratio, sds.volume_ratio),
         ("part of the growth along the chest wall", values.along_share, sds.along_share),
@@ -244,6 +312,16 @@ def _assumed() -> Table:
         ("distance of the plates, mm", None, sds.thickness_mm),
         ("unresolved displacement in each direction of a view, mm", 0.0, sds.unresolved_mm),
     )
+    if model == "mechanical":
+        rows += (
+            ("Young's modulus of the tissue, kPa", solid.tissue_kpa, None),
+            ("Poisson's ratio", solid.poisson_ratio, None),
+            ("Young's modulus of the skin, kPa", solid.skin_kpa, None),
+            ("thickness of the skin, mm", solid.skin_mm, None),
+            ("friction coefficient of the plates", solid.friction, None),
+            ("resistance of the chest wall to sliding, kPa/mm", solid.wall_kpa_per_mm, None),
+            ("density, kg/mm^3", solid.density, None),
+        )
     return Table(
         "Parameters", ("parameter", "value", "standard deviation"), rows, caption="Stated, not fitted; drawn for each view by itself."
     )

@@ -8,7 +8,7 @@ import numpy as np
 
 from naibu.applications.mammography.breast_outline import BreastOutline
 from naibu.applications.mammography.breast_shape import BreastShape
-from naibu.applications.mammography.epipolar import EpipolarCurve
+from naibu.applications.mammography.epipolar import EpipolarCurve, Projection
 from naibu.core.arrays import FloatArray
 
 if TYPE_CHECKING:
@@ -20,8 +20,9 @@ def draw_views(
     outlines: tuple[BreastOutline, BreastOutline],
     places: tuple[FloatArray | None, FloatArray | None],
     curves: tuple[EpipolarCurve | None, EpipolarCurve | None],
+    projection: Projection | None,
 ) -> None:
-    """Draw CC and MLO in image coordinates, mm, with the points and the curve and band of the point of the other view."""
+    """Draw CC and MLO in image coordinates, mm, with the points, the curve and band of the point of the other view, and a scan's point."""
     axis_names = ("along the chest wall, laterally (mm)", "along the chest wall, upwards (mm)")
     for k, (axes, name) in enumerate(zip(canvas.subplots(1, 2), ("CC", "MLO"), strict=True)):
         outline, curve, place = outlines[k], curves[1 - k], places[k]
@@ -32,6 +33,9 @@ def draw_views(
             axes.plot(*outline.to_image(curve.curve).T, color="C0", label="epipolar curve")
         if place is not None:
             axes.plot(*outline.to_image(place), "C3x", markersize=9, markeredgewidth=2, label="point")
+        if projection is not None:
+            axes.fill(*outline.to_image(projection.regions[k]).T, color="C2", alpha=0.2, linewidth=0, label="95 % region")
+            axes.plot(*outline.to_image(projection.places[k]), "C2+", markersize=10, markeredgewidth=2, label="point of the scan")
         axes.set(title=name, xlabel="perpendicular to the chest wall (mm)", ylabel=axis_names[k], aspect="equal")
         axes.legend(fontsize=7)
 
