@@ -39,6 +39,13 @@ class BreastShape:
         return float(self.depths[-1])
 
     @property
+    def nipple(self) -> FloatArray:
+        """Lateral and upward position (2,), mm, where the line of the centres ends; the deepest point of a blunt breast is less sure."""
+        part = self.depths / self.depth_mm
+        kept = (part > 0.6) & (part < 0.9)
+        return np.asarray(np.polyfit(part[kept] - 1.0, self.centres[kept], 1)[1])
+
+    @property
     def volume_mm3(self) -> float:
         """Volume between the chest wall and the nipple, with the areas of the ellipses interpolated linearly."""
         xx, yy, xy = self.squares.T
@@ -132,10 +139,10 @@ def shape_from_widths(depths: FloatArray, first: FloatArray, second: FloatArray,
 def opened_at(outline: FloatArray, hidden_mm: float) -> FloatArray:
     """Return an outline (m, 2), from wall to wall, without its part nearer to the chest wall than `hidden_mm`, measured from there."""
     if hidden_mm <= 0.0:
-        return outline - np.array([hidden_mm, 0.0])
+        return np.asarray(outline - np.array([hidden_mm, 0.0]))
     kept = np.flatnonzero(outline[:, 0] > hidden_mm)
     ends = []
     for inner, outer in ((kept[0], kept[0] - 1), (kept[-1], kept[-1] + 1)):
         a, b = outline[outer], outline[inner]
         ends.append(a + (hidden_mm - a[0]) / (b[0] - a[0]) * (b - a))
-    return np.vstack([ends[0], outline[kept], ends[1]]) - np.array([hidden_mm, 0.0])
+    return np.asarray(np.vstack([ends[0], outline[kept], ends[1]]) - np.array([hidden_mm, 0.0]))

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.special import fdtri, stdtrit
 
 from naibu.applications.mammography.breast_outline import BreastOutline, inside_polygon
@@ -17,6 +18,7 @@ from naibu.core.errors import InputError
 
 Model = Literal["geometric", "mechanical"]
 _COUNT = 101
+_SMOOTH = 8.0  # points of a curve: its bends over a mesh's cells would fold the band
 _TURN = np.linspace(0.0, 2.0 * np.pi, 61)
 
 
@@ -297,13 +299,13 @@ def _nearest(views: tuple[PressedView, PressedView], places: tuple[FloatArray, F
 
 def _band(curve: FloatArray, offsets: FloatArray, probability: float) -> FloatArray:
     """Return a polygon: Student quantiles times the root mean squares of offsets (k, n, 2) across the curve, and along it at its ends."""
-    tangent = np.gradient(curve, axis=0)
+    tangent = np.gradient(gaussian_filter1d(curve, _SMOOTH, axis=0, mode="nearest"), axis=0)
     tangent /= np.maximum(np.hypot(*tangent.T), 1e-12)[:, None]
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
     tail = 0.5 * (1.0 - probability)
     across = np.einsum("kni,ni->kn", offsets, normal)
     reach = float(stdtrit(len(offsets), 1.0 - tail))
-    half = reach * np.sqrt((across**2).mean(axis=0))
+    half = reach * maximum_filter1d(np.sqrt((across**2).mean(axis=0)), 2 * int(_SMOOTH) + 1, mode="nearest")
     shift = np.zeros_like(curve)
     for end, sign in ((0, -1.0), (-1, 1.0)):
         shift[end] = sign * reach * np.sqrt(np.mean((offsets[:, end] @ tangent[end]) ** 2)) * tangent[end]

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.ndimage import gaussian_filter1d
 
 from naibu.applications.mammography.breast_mesh import breast_nodes, free_and_wall_faces, unit_breast_mesh, young_moduli
 from naibu.applications.mammography.breast_shape import BreastShape, opened_at
@@ -35,6 +36,7 @@ from naibu.meshing.surface import level_extents
 
 _EDGE = 0.2  # of the elements, in a half ball of radius 1
 _LEVELS = 60
+_EDGE_LEVELS, _SMOOTH_LEVELS = 4, 4.0
 _NORMAL_STIFFNESS, _RUBBING_STIFFNESS = 60.0, 3.0  # kPa/mm
 _SETTINGS = SolverSettings(first_step=0.25, largest_step=0.5, tolerance=1e-3)
 _NEAR_MM = 1.0  # outside of the facets of the mesh still counts as in the breast
@@ -185,13 +187,13 @@ class MechanicalCompression:
         """Return the compression whose silhouette is an outline: its ends (l,) at the levels, and the nipple's distance."""
         own_low, own_high, depth = self.extents()
         scale = np.clip((high - low)[:-2] / (own_high - own_low)[:-2], 0.6, 1.6)
-        scale = np.append(scale, [scale[-1], scale[-1]])
-        shift = 0.5 * (low + high) - scale * 0.5 * (own_low + own_high)
+        scale = smoothed(np.append(scale, [scale[-1], scale[-1]]))
+        shift = smoothed(0.5 * (low + high) - scale * 0.5 * (own_low + own_high))
         return replace(self, levels=compressed_levels(), scale=scale, shift=shift, stretch=depth_mm / depth)
 
     def from_nipple(self) -> MechanicalCompression:
         """Return the same compression in coordinates whose origin lies on the axis through the unloaded nipple; the image stays."""
-        x, y = self.shape.centres[-1]
+        x, y = self.shape.nipple
         nipple = np.array([x, y, 0.0])
         along, press = view_axes(self.angle_deg)
         return replace(
@@ -350,6 +352,12 @@ def _table(points: FloatArray, base: IntArray, parameters: MechanicalParameters)
         "table", points, base, plane_geometry((0.0, 0.0, 1.0)), start=at, stop=at,
         friction=Friction(parameters.friction, _RUBBING_STIFFNESS), normal_stiffness=_NORMAL_STIFFNESS,
     )  # fmt: skip
+
+
+def smoothed(values: FloatArray) -> FloatArray:
+    """Return values (l,) at the levels without what a coarse mesh makes of them, straight near both ends."""
+    inner = np.pad(values[_EDGE_LEVELS:-_EDGE_LEVELS], _EDGE_LEVELS, mode="edge")
+    return np.asarray(gaussian_filter1d(inner, _SMOOTH_LEVELS, mode="nearest"))
 
 
 def compressed_levels() -> FloatArray:

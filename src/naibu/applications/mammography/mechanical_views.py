@@ -14,6 +14,7 @@ from naibu.applications.mammography.mechanical_model import (
     MechanicalParameters,
     compressed_levels,
     mechanically_compressed,
+    smoothed,
 )
 from naibu.applications.mammography.two_views import TwoViews, two_views
 from naibu.core.arrays import FloatArray
@@ -96,9 +97,10 @@ def _corrected(
         wanted_low, wanted_high = _seen(outline, whole * depth, compressed_levels())
         tip = int(np.searchsorted(compressed_levels(), _TIP))
         ratio = np.clip((wanted_high - wanted_low)[: tip + 1] / (high - low)[: tip + 1], 1.0 / _MOST_CHANGE, _MOST_CHANGE)
-        ratio = np.append(ratio, np.full(len(low) - tip - 1, ratio[-1]))
+        ratio = smoothed(np.append(ratio, np.full(len(low) - tip - 1, ratio[-1])))
         half = np.sqrt(squares[:, 0]) * np.interp(parts, compressed_levels(), ratio)
-        middle = centres[:, 0] + np.interp(parts, compressed_levels(), 0.5 * (wanted_low + wanted_high - low - high))
+        shift = smoothed(0.5 * (wanted_low + wanted_high - low - high))
+        middle = centres[:, 0] + np.interp(parts, compressed_levels(), shift)
         widths.append(np.column_stack([middle - half, middle + half]))
     return shape_from_widths(whole * shape.depths, widths[0], widths[1], angles[1])
 

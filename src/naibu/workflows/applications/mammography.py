@@ -130,7 +130,11 @@ def relate_views(
     if scan is not None:
         pair = pair_of_shape(scan.shape, plates, angle, outlines=outlines, model=model, uncertainty=uncertainty, draws=draws, seed=seed)
     else:
-        pair = mammographic_pair(*(outlines or ()), plates, angle, model=model, uncertainty=uncertainty, draws=draws, seed=seed)
+        if views is None:  # refused above
+            raise InputError("cc and mlo are missing: give both views, or the mask of a scan")
+        pair = mammographic_pair(
+            views[0].outline, views[1].outline, plates, angle, model=model, uncertainty=uncertainty, draws=draws, seed=seed
+        )
     found = _found(pair, (point_cc, point_mlo), None if scan is None else _scanned_point(scan, point_mr))
     settings: dict[str, Cell] = {
         "CC": str(cc), "MLO": str(mlo), "MR": str(mr), "model": model, "thickness_mm": ", ".join(f"{t:g}" for t in plates),

@@ -25,12 +25,14 @@ def breast_page(views: TwoViews, angle_deg: float, points: FloatArray, notice: s
     """
     ball = unit_breast_mesh(_EDGE)
     mesh = Mesh(breast_nodes(views.shape, ball.points), ball.cells, ball.cell_type, ball.regions, ball.region_names)
-    shown = mesh.points[mesh.cells].mean(axis=1)[:, 0] <= points[:, 0].mean()  # the other part would hide the points
+    lateral = bool(points[:, 0].mean() > 0.0) if len(points) else True
+    shown = (ball.points[ball.cells].mean(axis=1)[:, 0] < 0.0) == lateral  # the half with the points is cut away: it would hide them
     faces = triangles_of_faces(faces_of_cells(mesh.cells[shown], mesh.cell_type).faces)
     used, numbers = np.unique(faces, return_inverse=True)
     skin = mesh.points[used]
     way = np.concatenate([np.linspace(0.0, 1.0, _FRAMES), np.ones(2), np.linspace(1.0, 0.0, _FRAMES)])
-    skin_motion, point_motion = [], []
+    skin_motion: list[FloatArray] = []
+    point_motion: list[FloatArray] = []
     for view, angle in ((views.cc, 0.0), (views.mlo, angle_deg)):
         for start, motion in ((skin, skin_motion), (points, point_motion)):
             seen = view.compress(start)
@@ -42,8 +44,8 @@ def breast_page(views: TwoViews, angle_deg: float, points: FloatArray, notice: s
         title="Breast in both views",
         sentences=(
             notice,
-            "Unloaded, pressed in CC, released, pressed in MLO. x laterally, y upwards, z away from the chest wall. What lies laterally "
-            "of the points is cut away.",
+            "Unloaded, pressed in CC, released, pressed in MLO. x laterally, y upwards, z away from the chest wall. The half "
+            "with the points is cut away.",
         ),
         times=np.arange(len(displacement), dtype=float),
         faces=numbers.reshape(faces.shape),
