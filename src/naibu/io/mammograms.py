@@ -21,7 +21,7 @@ class Mammogram:
     Attributes
     ----------
     pixels : ndarray, shape (rows, columns)
-        Grey values, greater where more was absorbed or less, with the lateral (CC) or upper (MLO) side of the breast up.
+        Intensities, greater where more was absorbed or less, with the lateral (CC) or upper (MLO) side of the breast up.
     pixel_mm : float
         Size of a pixel in the breast: the detector's by the magnification, where the file states that.
     view : str
@@ -83,7 +83,7 @@ def _pixels(path: str | os.PathLike[str], data: Any, upside_down: bool) -> Float
     except Exception as error:  # pydicom raises what its decoders raise
         raise InputError(f"{path}: its pixels cannot be decoded ({error}); export it uncompressed") from error
     if stored.ndim != 2:
-        raise InputError(f"{path}: has pixels of shape {stored.shape}; a mammogram has one plane of grey values")
+        raise InputError(f"{path}: has pixels of shape {stored.shape}; a mammogram has one plane of intensities")
     return stored[::-1] if upside_down else stored
 
 

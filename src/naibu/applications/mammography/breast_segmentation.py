@@ -11,24 +11,24 @@ from naibu.core.errors import InputError
 _SMOOTH_MM = 0.8
 _EDGE_PART = 0.02  # of the columns, at each side
 _SIGMAS = 6.0
-_LEAST_CONTRAST = 0.04  # of the range of grey values
+_LEAST_CONTRAST = 0.04  # of the range of intensities
 _LEAST_PART, _MOST_PART = 0.02, 0.95
 
 
 def breast_mask(pixels: FloatArray, pixel_mm: float, *, wall_at_right: bool | None = None, what: str = "mammogram") -> BoolArray:
     """Return which pixels show the breast.
 
-    Grey values that differ from those of the air by more than its noise, smoothed; the largest region that touches the chest wall, without
+    Intensities that differ from those of the air by more than its noise, smoothed; the largest region that touches the chest wall, without
     holes. Labels beside the breast are other regions. The pectoral muscle counts as breast.
 
     Parameters
     ----------
     pixels : ndarray, shape (rows, columns)
-        Grey values; the breast may be brighter or darker than the air.
+        Intensities; the breast may be brighter or darker than the air.
     pixel_mm : float
         Size of a pixel.
     wall_at_right : bool, optional
-        On which side of the image the chest wall lies; by default where the grey values vary more.
+        On which side of the image the chest wall lies; by default where the intensities vary more.
     what : str
         Name of the image in messages.
 

@@ -1,4 +1,4 @@
-"""PNG images, read with Pillow as one plane of grey values: masks."""
+"""PNG images, read with Pillow as one plane of intensities: masks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from naibu.io.image_formats.geometry import ReadOptions, three_axes, volume_with
 
 
 def read(path: Path, options: ReadOptions) -> Volume:
-    """Read one plane of grey values (see `naibu.io.images.read_volume`); PNG states no size of pixels."""
+    """Read one plane of intensities (see `naibu.io.images.read_volume`); PNG states no size of pixels."""
     images = optional_package("PIL.Image", f"{path.name}: reading PNG files", "pillow")
     try:
         with images.open(path) as image:
