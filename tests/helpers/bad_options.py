@@ -74,7 +74,7 @@ NUMBERS: tuple[tuple[str, tuple[str, ...], str, tuple[str, ...]], ...] = (
     ("cut", SHEET, "--distance-mm", LENGTH),
     ("cut", SHEET, "--reach-mm", LENGTH),
     ("cut", SHEET, "--unit-mm", LENGTH),
-    ("mammography", (*VIEWS, "--angle-deg", "45"), "--thickness-mm", (*NO_NUMBERS, *NOT_FINITE, *NOT_POSITIVE, *EXTREME)),
+    ("mammography", (*VIEWS, "--angle-deg", "45"), "--thickness-mm", tuple(v for v in LENGTH if v != "1,5")),  # two plates
     ("mammography", (*VIEWS, "--thickness-mm", "50"), "--angle-deg", LENGTH),
     ("mammography", (*VIEWS, "--thickness-mm", "50", "--angle-deg", "45"), "--draws", NO_COUNTS),
     ("identify", FIELD, "--element-size-mm", tuple(v for v in LENGTH if v not in ("0", "-0.0"))),
