@@ -1,4 +1,4 @@
-"""Chapter 5 of the 2008 report :cite:p:`hirai2008`: active ischemia."""
+"""Chapter 5 of the 2008 report :cite:p:`hirai2008`: active ischemia, and mammography."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from naibu.applications.ischemia.layer_identification import LayerEstimate
 from naibu.mechanics.small_strain.rheology import Rheology
 from naibu.reproduction.chapter5 import figures, ischemia
 from naibu.reproduction.chapter5.ischemia import DURATION_S, JET_RADIUS_MM, LOWER, SAME, THRESHOLD_KPA, UPPER, Response
+from naibu.reproduction.chapter5.mammography import mammography_section
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.tables import Cell, Table
 
@@ -47,9 +48,10 @@ def chapter5(seed: int = 0) -> Chapter:
         _pale_area(),
         _frequencies(),
         _identification(seed),
+        mammography_section(),
     )
     settings: dict[str, Cell] = {"seed": seed, **ischemia.ASSUMED}
-    return Chapter("ch5", "Chapter 5: active ischemia of skin", sections, settings)
+    return Chapter("ch5", "Chapter 5: active ischemia of skin, and mammography", sections, settings)
 
 
 def _row(response: Response) -> tuple[Cell, ...]:
