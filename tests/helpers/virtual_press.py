@@ -52,11 +52,11 @@ def stop_at(patch: pytest.MonkeyPatch, call: int) -> None:
     evaluate = Matcher.evaluate
     calls: list[bool] = []
 
-    def interrupted(self: Matcher, *arguments: object) -> object:
+    def interrupted(self: Matcher, *arguments: object, **options: object) -> object:
         calls.append(self.load_cases[0].specimen.settings.element_size_mm == COARSE.element_size_mm)
         if calls[-1] and sum(calls) == call:
             raise KeyboardInterrupt
-        return evaluate(self, *arguments)  # type: ignore[arg-type]
+        return evaluate(self, *arguments, **options)  # type: ignore[arg-type]
 
     patch.setattr(Matcher, "evaluate", interrupted)
 
