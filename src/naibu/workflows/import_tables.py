@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.core.markers import Markers
 from naibu.imaging.markers.motion_coherence import require_coherent, strays_named
@@ -99,9 +100,15 @@ def _seen(name: str, markers: Markers, first: Markers) -> tuple[Cell, ...]:
     points = markers.points[np.isfinite(markers.points[:, :2]).all(axis=1)]
     moved = np.linalg.norm(np.nan_to_num(markers.points - first.aligned(markers.ids)), axis=1)
     common = np.isfinite(markers.points[:, :2] + first.aligned(markers.ids)[:, :2]).all(axis=1)
-    spacing = float(np.median(cKDTree(np.nan_to_num(points)).query(np.nan_to_num(points), k=2)[0][:, 1])) if len(points) > 1 else None
+    spacing = _nearest(np.nan_to_num(points)) if len(points) > 1 else None
     median = float(np.median(moved[common])) if common.any() else None
     return (name, len(markers.ids), int(common.sum()), *_span(markers), spacing, median)
+
+
+def _nearest(points: FloatArray) -> float:
+    """Median distance from a point (n, 3) to its nearest neighbour, mm."""
+    distance, _ = cKDTree(points).query(points, k=2)
+    return float(np.median(np.asarray(distance)[:, 1]))
 
 
 def _span(markers: Markers) -> tuple[float, float, float]:
