@@ -119,7 +119,9 @@ def _span(markers: Markers) -> tuple[float, float, float]:
 
 
 def _require_plausible_unit(first: Markers, size_mm: Sequence[float], name: str) -> None:
-    """Refuse positions that fill the object only in another unit."""
+    """Refuse positions that fill the object only in another unit; fewer markers than a deformation needs are refused elsewhere."""
+    if len(first.ids) < FEWEST_COMMON:
+        return
     share = np.nanmax(np.array(_span(first)) / np.array(size_mm, dtype=float))
     for unit in ("cm", "m", "inch"):
         if share < LEAST_SHARE and 2.0 * LEAST_SHARE < share * MM_PER_UNIT[unit] <= 1.05:
