@@ -76,7 +76,7 @@ def phantom_shape() -> BreastShape:
 def phantom_markers() -> tuple[FloatArray, FloatArray]:
     """Return markers (n, 3), mm, without load and at 100 mm, across and along the compression and above the base."""
     experiment = datasets.load("ct_half_ellipsoid")
-    tables = [experiment.state(name).markers for name in ("initial", "width_100")]
+    tables = [markers for name in ("initial", "width_100") if (markers := experiment.state(name).markers) is not None]
     before, after = (PIXEL_SCALE * table.points for table in tables)
     known = np.isfinite(before).all(axis=1)
     middle = before[known].mean(axis=0)
