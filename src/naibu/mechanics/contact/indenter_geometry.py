@@ -66,6 +66,11 @@ class IndenterGeometry:
         return self.kind == PLANE
 
     @property
+    def convex(self) -> bool:
+        """Whether the shape is known to be convex: all but meshes."""
+        return self.tree is None
+
+    @property
     def inradius(self) -> float:
         """Radius of the largest sphere inside, mm; of a mesh a bound from below, infinite for a half space."""
         if self.kind == PLANE:

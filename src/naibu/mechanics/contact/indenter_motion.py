@@ -127,6 +127,41 @@ def step_parts(
     return int(min(2 ** np.ceil(np.log2((ways / allowed).max())), MOST_PARTS))
 
 
+def parts_of_approach(
+    indenters: Sequence[RigidIndenter], points: FloatArray, moves: FloatArray, centres: FloatArray, axes: FloatArray, travel: FloatArray,
+    turn: FloatArray,
+) -> int:  # fmt: skip
+    """Return into how many parts, a power of two, a step is divided in each of which no point passes through an indenter.
+
+    It looks at every point by itself: only points that come nearer to an indenter, and that could reach it, count. The distance from a
+    convex shape grows for ever on a straight line on which it begins to grow.
+
+    Parameters
+    ----------
+    indenters : sequence of RigidIndenter
+        Their shapes.
+    points, moves : ndarray, shape (p, 3)
+        Of the object, mm, and how far each moves in the step, mm.
+    centres, axes, travel, turn
+        Of the indenters; see `safe_fraction`.
+    """
+    parts = 1.0
+    for indenter, centre, own, moved, turned in zip(indenters, centres, axes, travel, turn, strict=True):
+        arms = points - centre
+        relative = moves - moved - np.cross(turned, arms)
+        ways, allowed = np.linalg.norm(relative, axis=1), SHARE * indenter.geometry.inradius
+        fast = ways > allowed
+        if not fast.any():
+            continue
+        shape, arms, relative, ways = replace(indenter.geometry, axes=own), arms[fast], relative[fast], ways[fast]
+        gaps = shape.distance(arms)
+        reaching = gaps < ways
+        if indenter.geometry.convex:
+            reaching &= shape.distance(arms + 1e-3 * relative) < gaps
+        parts = max(parts, float((ways[reaching] / allowed).max(initial=1.0)))
+    return int(min(2 ** np.ceil(np.log2(parts)), MOST_PARTS))
+
+
 def slow_enough(indenters: Sequence[RigidIndenter], travel: FloatArray, turn: FloatArray, approach: float = 0.0) -> bool:
     """Tell whether indenters that do not turn, and what they touch, move so little that none passes through anything.
 

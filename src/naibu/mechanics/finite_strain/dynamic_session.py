@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import BoolArray, FloatArray, Int32Array, IntArray, require_positive, require_shape
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.mechanics.contact.indenter_contacts import moving_contacts, turned
-from naibu.mechanics.contact.indenter_motion import IndenterForce, IndenterMotion, slow_enough, step_parts
+from naibu.mechanics.contact.indenter_motion import IndenterForce, IndenterMotion, parts_of_approach, slow_enough
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.assembly import Assembler
@@ -204,12 +204,15 @@ class DynamicSession(IndenterSession[DynamicEngine, DynamicState]):
 
     def _parts(self, moving: FloatArray, along: FloatArray, spin: FloatArray) -> int:
         """Parts of a step, a power of two, in each of which no indenter passes through the body."""
-        h = self.engine.step
-        own = float(np.sqrt((self.reached.velocity**2).sum(axis=1).max()))
-        approach = h * max(own, float(np.linalg.norm(moving, axis=1).max(initial=0.0)))
-        if slow_enough(self.indenters, h * along, h * spin, approach):
+        h, at = self.engine.step, self.reached
+        moves = h * at.velocity
+        for nodes, speed in zip(self.bodies, moving, strict=True):
+            moves[nodes] = h * speed
+        if slow_enough(self.indenters, h * along, h * spin, float(np.sqrt((moves**2).sum(axis=1).max()))):
             return 1
-        return step_parts(*self._places_of(self.reached), h * along, h * spin, approach)
+        indenters, points, centres, axes = self._places_of(at)
+        carried = self._templates[0].positions(at.displacement + moves) - points
+        return parts_of_approach(indenters, points, carried, centres, axes, h * along, h * spin)
 
     def _settled(self, h: float, moving: FloatArray, contacts: tuple[Contact, ...]) -> tuple[tuple[Contact, ...], FloatArray | None]:
         """Return contacts stiff enough, and the displacement (n, 3) that balances momentum after a time `h`, or None."""

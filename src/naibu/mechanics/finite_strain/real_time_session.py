@@ -11,20 +11,22 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
+from naibu.mechanics.contact.indenter_motion import parts_of_approach, slow_enough
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.pressure_elements import PressureElements
 from naibu.mechanics.finite_strain.condensed_contact import CondensedContact, ContactBesideTangent
-from naibu.mechanics.finite_strain.dynamic_session import DynamicEngine, DynamicSession, DynamicState
+from naibu.mechanics.finite_strain.dynamic_session import PENETRATION, DynamicEngine, DynamicSession, DynamicState
 from naibu.mechanics.finite_strain.earlier_tangent import EarlierTangent, SolverPool, TangentThread
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact, local_positions
+from naibu.mechanics.finite_strain.penalties import with_less_penetration
 from naibu.mechanics.linear_algebra.anderson import AndersonMixing
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern, block_pattern, with_dirichlet_rows
 from naibu.mechanics.linear_algebra.direct import PardisoSolver, SuperLUSolver, pardiso_library
@@ -44,6 +46,7 @@ DIVERGED = 1e6  # out-of-balance force from which a step is tried from another b
 JUMP = 10.0  # its growth from which earlier iterations are forgotten, as where contacts close
 AHEAD = 240  # nodes in contact, or about to be, for which the inverse is prepared
 REACH = 0.2  # extents of the body around an indenter in which they are sought
+STIFFEST = 16.0  # times the penalty of the engine, to which penalties rise: stiffer ones need more iterations
 PERIOD = 10  # steps after which a tangent is renewed without a thread
 
 
@@ -156,6 +159,23 @@ class RealTimeSession(DynamicSession):
         assert isinstance(self.engine, RealTimeEngine)
         return self.engine
 
+    def _parts(self, moving: FloatArray, along: FloatArray, spin: FloatArray) -> int:
+        """Parts of a step in each of which no indenter goes through the body; the loop has no time to divide steps as the body swings."""
+        h, at = self.engine.step, self.reached
+        if slow_enough(self.indenters, h * along, h * spin):
+            return 1
+        indenters, points, centres, axes = self._places_of(at)
+        return parts_of_approach(indenters, points, np.zeros_like(points), centres, axes, h * along, h * spin)
+
+    def _settled(self, h: float, moving: FloatArray, contacts: tuple[Contact, ...]) -> tuple[tuple[Contact, ...], FloatArray | None]:
+        """Return contacts as the next step shall have them, stiffer where a balanced step went too deep, and the displacement."""
+        u = self._balanced(h, moving, contacts)
+        if u is None or self.unbalanced > PASSABLE:
+            return contacts, u
+        stiffer = with_less_penetration(contacts, self._depths(contacts, u), PENETRATION) or contacts
+        most = STIFFEST * self.engine.normal_stiffness
+        return tuple(replace(c, normal_stiffness=np.minimum(c.normal_stiffness, most)) for c in stiffer), u
+
     def _balanced(self, h: float, moving: FloatArray, contacts: tuple[Contact, ...]) -> FloatArray | None:
         """Return the displacement that balances momentum after a time `h`; by Newton's method where it is not found in real time."""
         if h == self.engine.step:
@@ -241,6 +261,11 @@ class RealTimeSession(DynamicSession):
         force = trial.balance.copy()
         elements.add_pressures(tangent.dilatation, trial.mismatch, force)
         step = self._with_contact(tangent, trial, force, not mixing.steps)
+        if not np.isfinite(step).all():  # a tangent that has no factors in single precision
+            if tangent is self._earlier:
+                self._release(tangent)
+                self._earlier, self._condensed = None, None
+            return None
         rise = elements.pressure_change(tangent.dilatation, step, trial.mismatch)
         scale = 1e-2 * self._extent() / float(self.engine.assembler.parameters[:, 0].max())  # mm/kPa
         now = np.concatenate([trial.displacement.ravel(), scale * trial.pressure])
