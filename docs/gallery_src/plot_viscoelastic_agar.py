@@ -28,7 +28,7 @@ for axes, step, title in ((panels[0], 60, "held, 3 s"), (panels[1], 120, "3 s af
     size = np.linalg.norm(series.displacement[step], axis=1)
     painted = axes.tripcolor(*moved.T, mesh.cells[:, :3], size, shading="gouraud", cmap="viridis", vmin=0.0, vmax=5.0)
     axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)", aspect="equal")
-figure.colorbar(painted, ax=panels[:2], label="displacement (mm)", shrink=0.7, location="bottom")
+figure.colorbar(painted, ax=panels[:2], label="displacement (mm)", shrink=0.8)
 panels[2].plot(series.times, -series.force("plate")[:, 1] / 1000.0)
 panels[2].set(xlabel="time (s)", ylabel="force of the plate (N)")
 plt.show()

@@ -214,7 +214,7 @@ def test_layers_are_found_without_being_told(every_element: tuple[PushedBody, Zo
     assert np.median(np.abs(young / told.young_modulus[layer] - 1.0)) < 0.003
     assert np.median(np.abs(poisson - told.poisson_ratio[layer])) < 0.001
     assert found.segmentation is not None and found.weights is not None and found.uncertainty is not None
-    assert len(found.steps) == len(found.weights.trials) + 3
+    assert len(found.steps) == len(found.weights.trials) + 5
     assert found.verdict is not None and found.verdict.sentence == found.identifiability[0] and "segment 1" in found.identifiability[1]
 
 

@@ -359,6 +359,9 @@ class _Recipe:
         if not single or not 1 < regions.zones.count <= MOST_REGIONS:
             return self._sharp(regions.zones, regions.point, None)
         refined = refined_regions(self.model, regions, graph, self.bounds)
+        if not refined.point.misfit < regions.point.misfit:
+            self.record("borders within cells explain no more than those on faces of cells, which are kept")
+            return self._sharp(regions.zones, regions.point, None)
         self.record(f"borders of {refined.zones.count} regions within cells: misfit {refined.point.misfit:.4g}")
         model = self.model.with_zones(refined.zones)
         start = model.evaluate(refined.theta, refined.point.states)

