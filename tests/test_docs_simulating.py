@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from naibu.io import lattice_study_schema
+from naibu.io.study_schemas import lattice_study_schema
 from naibu.workflows.studies.lattice_study import NAMED
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "simulating.rst").read_text(encoding="utf-8")

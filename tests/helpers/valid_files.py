@@ -25,10 +25,10 @@ from naibu.io.blade_table import read_blade_path, read_tip_path
 from naibu.io.displacement_fields import read_field, write_field
 from naibu.io.experiment_folder.reader import read_experiment
 from naibu.io.images import read_displacement, read_volume, write_displacement, write_volume
-from naibu.io.lattice_study_schema import load_study
 from naibu.io.marker_tables import import_markers
 from naibu.io.meshes import read_mesh, read_surface
 from naibu.io.number_table import read_numbers
+from naibu.io.study_schemas.lattice_study_schema import load_study
 from naibu.io.vtk_files import write_vtu
 from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.meshing.element_conversion import to_tetra
@@ -37,7 +37,7 @@ from naibu.workflows.applications.fingertip_study import prepared_fingertip
 from naibu.workflows.applications.simulate_chip import prepared_chip
 from naibu.workflows.applications.simulate_ischemia import prepared_ischemia
 from naibu.workflows.identify_fields import _names, _object, block_mesh
-from naibu.workflows.result_folder import read_model
+from naibu.workflows.results.result_folder import read_model
 from naibu.workflows.studies.simulate import example_text
 
 

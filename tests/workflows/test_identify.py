@@ -22,8 +22,8 @@ from naibu.io.files import atomic
 from naibu.viewer.result_page.payload import report_json
 from naibu.viewer.result_page.reading import report_from_json
 from naibu.workflows import identify, predict, report
-from naibu.workflows.report_content import load_case_scene, prediction_scene
-from naibu.workflows.result_folder import CHECKPOINT_FILE, MODEL_FILE, read_model
+from naibu.workflows.results.report_content import load_case_scene, prediction_scene
+from naibu.workflows.results.result_folder import CHECKPOINT_FILE, MODEL_FILE, read_model
 
 STATE = {"press": ["pressed"]}
 

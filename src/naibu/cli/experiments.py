@@ -231,10 +231,10 @@ def _identify(
 
 def _show(result: Identification) -> None:
     """Print the verdict, assumptions, residuals of the markers, and the parameters."""
-    from naibu.workflows.report_content import accuracy_table, parameter_rows, search_sentence, shared_names, undetermined, verdict_note
+    from naibu.workflows.results import report_content as content
 
     calibration, model = result.calibration, result.model
-    note = verdict_note(result.verdict)
+    note = content.verdict_note(result.verdict)
     say(note.sentence, "bold" if note.sound else GRAVE)
     found(verdict=note.sentence, usable=result.verdict.ok, noise_factor=model.noise_factor)
     for line in note.details:
@@ -243,14 +243,14 @@ def _show(result: Identification) -> None:
     for experiment in experiments.values():
         for line in experiment.loading.assumed:
             say(f"{experiment.name}: {line}", "dim")
-    table = accuracy_table(calibration, result.baselines, result.left_out)
+    table = content.accuracy_table(calibration, result.baselines, result.left_out)
     print_table(table.title, table.columns, table.rows)
-    names = shared_names(model)
-    rows = [(r.name, r.estimate, r.lower, r.upper, r.unit, r.note) for r in parameter_rows(model, names)]
+    names = content.shared_names(model)
+    rows = [(r.name, r.estimate, r.lower, r.upper, r.unit, r.note) for r in content.parameter_rows(model, names)]
     print_table("Parameters", ("parameter", "estimate", "95 % from", "to", "unit", "note"), rows, digits=4)
-    for line in undetermined(model, names, calibration.priors):
+    for line in content.undetermined(model, names, calibration.priors):
         say(line, "dim")
-    say(f"{search_sentence(calibration.match.status)} Residuals are {model.noise_factor:.2f} times the stated noise.")
+    say(f"{content.search_sentence(calibration.match.status)} Residuals are {model.noise_factor:.2f} times the stated noise.")
 
 
 @verb(
@@ -289,7 +289,7 @@ def predict(
         Replace results, or files of your own, that the folder already holds.
     """
     from naibu.workflows import predict as predict_workflow
-    from naibu.workflows.report_content import accuracy
+    from naibu.workflows.results.report_content import accuracy
 
     result = predict_workflow.predict(
         model, experiment, state=state, height_mm=height_mm, heights_from_markers=heights_from_markers, out=out, overwrite=overwrite
@@ -340,7 +340,7 @@ def compare(
     """
     from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
     from naibu.workflows import compare as compare_workflow
-    from naibu.workflows.report_content import comparison_table
+    from naibu.workflows.results.report_content import comparison_table
 
     laws: list[Law] = law or ["neo_hookean", "mooney_rivlin"]
     contacts: list[ContactModel] = contact or ["coulomb", "stick"]

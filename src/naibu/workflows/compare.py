@@ -13,8 +13,8 @@ from naibu.identification.from_markers.checks.marker_outliers import without_out
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.cross_validation import ModelRow, compare_models
 from naibu.workflows.experiments import Source, load_experiments, parse_known, provenance_of, require_element_size
-from naibu.workflows.output_folder import output_folder
-from naibu.workflows.result_folder import COMPARISON_FILE, read_comparison, write_comparison
+from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.result_folder import COMPARISON_FILE, read_comparison, write_comparison
 
 
 def compare(

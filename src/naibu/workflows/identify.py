@@ -25,8 +25,8 @@ from naibu.identification.prediction.cross_validation import LeftOut, leave_one_
 from naibu.identification.prediction.prediction import rms
 from naibu.identification.verdict import Verdict
 from naibu.workflows.experiments import Source, load_experiments, parse_known, provenance_of, require_element_size, require_loaded
-from naibu.workflows.output_folder import output_folder
-from naibu.workflows.result_folder import (
+from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.result_folder import (
     CHECKPOINT_FILE,
     IDENTIFICATION_FILES,
     read_checkpoint,

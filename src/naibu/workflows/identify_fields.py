@@ -33,7 +33,7 @@ from naibu.meshing.primitives import grid_cells
 from naibu.meshing.surface import boundary_nodes
 from naibu.viewer.slices import Overlay, SliceView, slices_html
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.output_folder import output_folder
+from naibu.workflows.results.output_folder import output_folder
 
 FILES = ("report.html", "zones.mha", "young_modulus.mha", "young_modulus_sd.mha", "poisson_ratio.mha", "identification.json")
 CELLS, CELLS_OF_MAP = 1200, 2500  # of the model by default

@@ -10,7 +10,7 @@ from naibu import datasets
 from naibu.core.errors import InputError
 from naibu.io.experiment_folder.reader import META_FILE
 from naibu.io.files.atomic import write_atomically
-from naibu.workflows.output_folder import output_folder
+from naibu.workflows.results.output_folder import output_folder
 from naibu.workflows.studies.simulate import example_text
 
 Kind = Literal["experiment", "lattice", "chip", "fingertip", "ischemia"]

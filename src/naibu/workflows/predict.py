@@ -10,8 +10,8 @@ from naibu.core.experiment import Experiment
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.prediction import Prediction, predict_state
 from naibu.workflows.experiments import Source, load_experiment, loaded_names, require_loaded
-from naibu.workflows.output_folder import output_folder
-from naibu.workflows.result_folder import PREDICTION_FILES, read_model, write_prediction
+from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.result_folder import PREDICTION_FILES, read_model, write_prediction
 
 
 def predict(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from naibu.workflows.result_folder import rewrite_reports
+from naibu.workflows.results.result_folder import rewrite_reports
 
 
 def report(folder: str | os.PathLike[str]) -> list[Path]:

@@ -19,7 +19,7 @@ from naibu.reproduction.chapters import CHAPTERS, PROCESSOR_S
 from naibu.viewer.chapter import Chapter
 from naibu.viewer.chapter_page import write_chapter
 from naibu.viewer.page_frame import page_html
-from naibu.workflows.output_folder import output_folder
+from naibu.workflows.results.output_folder import output_folder
 
 ALL = "all"
 

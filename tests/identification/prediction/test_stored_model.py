@@ -17,7 +17,7 @@ from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.calibrated_model import CalibratedModel
-from naibu.workflows.result_folder import read_model
+from naibu.workflows.results.result_folder import read_model
 
 COVARIANCE = np.array([[0.04, 0.01], [0.01, 0.09]])
 

@@ -17,7 +17,7 @@ from naibu.io.files.paths import require_usable_path
 from naibu.io.images import read_volume
 from naibu.io.marker_tables import import_markers, write_markers
 from naibu.io.meshes import read_surface
-from naibu.workflows.output_folder import output_folder
+from naibu.workflows.results.output_folder import output_folder
 
 NOT_TEXT = os.fsdecode(b"scan-\xff\xfe")
 MARKERS = Markers.from_arrays([1], np.zeros((1, 3)))

@@ -14,7 +14,7 @@ from lattice_studies import STUDY, study_file
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.io.images import write_volume
-from naibu.io.lattice_study_schema import load_study
+from naibu.io.study_schemas.lattice_study_schema import load_study
 from naibu.mechanics.lattices.model.hexahedra import lattice_mesh
 from naibu.mechanics.lattices.model.lattice import classic_lattice
 from naibu.mechanics.lattices.model.octree import octree_lattice

@@ -74,21 +74,29 @@ def solve_state(
     ConvergenceError
         The state cannot be solved.
     """
-    coarse, start = None, warm_start
     narrow = parameters.changed({p.name: replace(p, fixed=True) for p in parameters.free if p.name != platen})
+    coarse, start = None, warm_start
     if warm_start is None and load_case.specimen.mesh.n_points >= WORTHWHILE:
-        try:
-            body = coarsened(load_case.specimen)
-            found = _solved(replace(load_case, specimen=body), narrow, platen, markers, None)
-        except (ConvergenceError, InputError):
-            pass  # elements may be too large for what smaller ones can do
-        else:
-            narrow, coarse = found[0], SolvedLoadCase(found[1], found[0])
-            start = on_finer_mesh(coarse, body, load_case.specimen)
+        coarse, start = _solved_on_larger_elements(load_case, narrow, platen, markers)
+    if coarse is not None:
+        narrow = coarse.parameters
     narrow, fit, gauge = _solved(load_case, narrow, platen, markers, start)
     wide = parameters.with_values({platen: narrow.values()[platen]})
     fit = Matcher([load_case], wide).differentiated([fit], wide.values())[0]
     return SolvedState(load_case, wide, fit, gauge, coarse)
+
+
+def _solved_on_larger_elements(
+    load_case: MarkerLoadCase, parameters: ParameterSet, platen: str, markers: State | None
+) -> tuple[SolvedLoadCase | None, SolvedLoadCase | None]:
+    """Return the solution on larger elements, and the same on those of the load case; none where they cannot take the deformation."""
+    try:
+        body = coarsened(load_case.specimen)
+        found, fit, _ = _solved(replace(load_case, specimen=body), parameters, platen, markers, None)
+    except (ConvergenceError, InputError):  # nothing is lost: the elements of the load case are solved from rest, or say why not
+        return None, None
+    coarse = SolvedLoadCase(fit, found)
+    return coarse, on_finer_mesh(coarse, body, load_case.specimen)
 
 
 def _solved(

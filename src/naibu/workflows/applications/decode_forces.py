@@ -15,12 +15,12 @@ from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
-from naibu.io.fingertip_schema import load_decoder
 from naibu.io.number_table import read_numbers
+from naibu.io.study_schemas.fingertip_schema import load_decoder
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.output_folder import output_folder
+from naibu.workflows.results.output_folder import output_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas

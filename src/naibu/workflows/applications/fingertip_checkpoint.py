@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,30 +10,15 @@ import numpy as np
 
 from naibu._version import __version__
 from naibu.applications.fingertip.pressing import Press, Pressing
-from naibu.core.errors import InputError
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.reading import read_bytes
+from naibu.workflows.studies.checkpoint_file import CheckpointFile
 
 _ARRAYS = {"depth_mm": 1, "slide_mm": 1, "force_mn": 2, "chip_mn": 2, "chip_mn_mm": 2, "contact_mm": 2, "contact_radius_mm": 1}
 
 
-@dataclass(frozen=True, slots=True)
-class FingertipCheckpoint:
-    """Where computed presses are kept.
-
-    Attributes
-    ----------
-    path : Path
-        The file.
-    source : str
-        File or name of the study, for messages.
-    fingerprint : str
-        Of the study; a checkpoint of another one is refused.
-    """
-
-    path: Path
-    source: str
-    fingerprint: str
+class FingertipCheckpoint(CheckpointFile):
+    """The file ``NAME.checkpoint.json`` of a study of a fingertip."""
 
     @classmethod
     def of(cls, folder: Path, name: str, source: str, digest: str) -> FingertipCheckpoint:
@@ -60,24 +44,15 @@ class FingertipCheckpoint:
         InputError
             There is none, or it is damaged or of another study.
         """
-        if not self.path.is_file():
-            raise InputError(f"{self.path}: does not exist, so there is nothing to resume; run without `resume`")
+        self.require_present()
         try:
             data = json.loads(read_bytes(self.path))
-            same = data["fingerprint"] == self.fingerprint
+            fingerprint = str(data["fingerprint"])
             found = [_pressing(press, kept) for press, kept in zip(presses, data["presses"], strict=False)]
         except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise InputError(f"{self.path}: is damaged ({error}); run without `resume`, and with `overwrite`") from error
-        if not same:
-            raise InputError(
-                f"{self.path}: was kept with other settings, inputs or another version of naibu than {self.source} now; put them back, or "
-                "run without `resume`, and with `overwrite`"
-            )
+            raise self.damaged(error) from error
+        self.require_same(fingerprint)
         return found
-
-    def remove(self) -> None:
-        """Remove the file, where it is."""
-        self.path.unlink(missing_ok=True)
 
 
 def _pressing(press: Press, kept: dict[str, Any]) -> Pressing:

@@ -15,7 +15,7 @@ from naibu.applications.fingertip.pressing import Press
 from naibu.core.errors import InputError
 from naibu.io.files.parsing import parsed_toml
 from naibu.io.files.reading import read_bytes
-from naibu.io.fingertip_schema import FingertipFile, PressTable, load_fingertip
+from naibu.io.study_schemas.fingertip_schema import FingertipFile, PressTable, load_fingertip
 from naibu.workflows.applications.simulate_chip import CHIP, PreparedChip, prepared_chip
 
 FINGERTIP = "fingertip"  # name of the study that naibu brings along

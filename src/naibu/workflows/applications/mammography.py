@@ -34,7 +34,7 @@ from naibu.viewer.tables import Cell, Table
 from naibu.workflows.applications.mammogram_inputs import place_in, plate_distances, positioner_angle, read_scan, read_views
 from naibu.workflows.applications.mammography_figures import draw_breast, draw_views
 from naibu.workflows.applications.mammography_motion import breast_page
-from naibu.workflows.output_folder import output_folder
+from naibu.workflows.results.output_folder import output_folder
 
 NOTICE = "Research software, not a medical device: not for diagnosis, biopsy or treatment."
 _NAME = "mammography"

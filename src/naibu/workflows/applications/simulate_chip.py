@@ -23,7 +23,7 @@ from naibu.core.errors import InputError
 from naibu.core.progress import Progress
 from naibu.io.files.parsing import parsed_toml
 from naibu.io.files.reading import read_bytes
-from naibu.io.sensing_chip_schema import ChipFile, LoadTable, StudyTable, load_chip
+from naibu.io.study_schemas.sensing_chip_schema import ChipFile, LoadTable, StudyTable, load_chip
 from naibu.io.vtk_files import write_vtu
 from naibu.mechanics.small_strain.cubic_elasticity import miller_indices
 from naibu.reproduction.chapter6 import chip_figures
@@ -38,7 +38,7 @@ from naibu.reproduction.chapter6.chip_sections import (
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.output_folder import output_folder
+from naibu.workflows.results.output_folder import output_folder
 
 CHIP = "chip"  # name of the study that naibu brings along
 CHIP_TITLE = "silicon chip that senses a force and two moments"

@@ -21,7 +21,7 @@ from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress, report_progress
 from naibu.io.files.atomic import write_atomically
-from naibu.io.fingertip_schema import DECODER
+from naibu.io.study_schemas.fingertip_schema import DECODER
 from naibu.io.vtk_files import write_vtkhdf_series
 from naibu.viewer.chapter import Chapter
 from naibu.viewer.chapter_page import write_chapter
@@ -29,7 +29,7 @@ from naibu.viewer.tables import Cell
 from naibu.workflows.applications.fingertip_checkpoint import FingertipCheckpoint
 from naibu.workflows.applications.fingertip_page import FingertipResults, fingertip_sections
 from naibu.workflows.applications.fingertip_study import PreparedFingertip, in_keys, prepared_fingertip
-from naibu.workflows.output_folder import output_folder
+from naibu.workflows.results.output_folder import output_folder
 from naibu.workflows.studies.simulate_lattice import SimulationRun
 
 _FREE_S = 0.5  # before and after a press in the recorded readings

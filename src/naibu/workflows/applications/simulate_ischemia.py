@@ -20,15 +20,15 @@ from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress, report_progress
 from naibu.io.files.parsing import parsed_toml
 from naibu.io.files.reading import file_beside, read_bytes
-from naibu.io.ischemia_schema import IschemiaFile, RecordTable, load_ischemia
 from naibu.io.number_table import read_numbers
+from naibu.io.study_schemas.ischemia_schema import IschemiaFile, RecordTable, load_ischemia
 from naibu.io.vtk_files import write_vtkhdf_series
 from naibu.mechanics.small_strain.rheology import Rheology, three_element
 from naibu.reproduction.chapter5 import figures
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.output_folder import output_folder
+from naibu.workflows.results.output_folder import output_folder
 
 ISCHEMIA = "ischemia"  # name of the study that naibu brings along
 ISCHEMIA_TITLE = "skin that turns pale under an air jet"

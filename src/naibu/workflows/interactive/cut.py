@@ -31,7 +31,7 @@ from naibu.viewer.motion_page import ColourField, MotionPage, motion_html
 from naibu.viewer.tables import Table
 from naibu.workflows.experiments import Source
 from naibu.workflows.interactive.touchable_models import MeshMaterial, TouchableModel, touchable
-from naibu.workflows.output_folder import output_folder
+from naibu.workflows.results.output_folder import output_folder
 
 FILES = ("cut.html", "cut.vtu", "cut.vtkhdf", "cut.json")
 FRAME_S = 1.0 / 60.0

@@ -27,7 +27,7 @@ from naibu.meshing.cutting.surface_result import SurfaceCut, groove, triangle_ar
 from naibu.simulation.surface_opening import LARGEST_TENSION, opening
 from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, motion_html
 from naibu.viewer.tables import Table
-from naibu.workflows.output_folder import output_folder
+from naibu.workflows.results.output_folder import output_folder
 
 FILES = ("cut.html", "cut.vtu", "cut.vtkhdf", "cut.json")
 FRAMES, LARGE_FRAMES = 24, 8

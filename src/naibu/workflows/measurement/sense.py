@@ -33,7 +33,7 @@ from naibu.meshing.primitives import grid_cells
 from naibu.viewer.cards import Card
 from naibu.viewer.slices import Overlay, SliceView, slices_html
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.output_folder import output_folder
+from naibu.workflows.results.output_folder import output_folder
 
 # bounds of the size of files: hexahedra for ParaView, and points of the field for the identification
 MESH_CELLS, FIELD_POINTS = 60_000, 40_000

@@ -24,7 +24,7 @@ from naibu.io.marker_tables import write_experiment_folder, write_markers
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.output_folder import output_folder
+from naibu.workflows.results.output_folder import output_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

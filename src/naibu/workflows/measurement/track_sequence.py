@@ -23,7 +23,7 @@ from naibu.io.images import read_volume
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.output_folder import output_folder
+from naibu.workflows.results.output_folder import output_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas

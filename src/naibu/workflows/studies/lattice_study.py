@@ -24,7 +24,7 @@ from naibu.core.volume import Volume
 from naibu.io.files.provenance import sha256
 from naibu.io.files.reading import file_beside, guarded_reading, read_bytes, require_regular
 from naibu.io.images import read_volume
-from naibu.io.lattice_study_schema import FloorTable, IndenterTable, ObjectTable, StudyFile, load_study
+from naibu.io.study_schemas.lattice_study_schema import FloorTable, IndenterTable, ObjectTable, StudyFile, load_study
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter, box_indenter, cylindrical_indenter, plane_indenter, spherical_indenter
 from naibu.mechanics.lattices.model.contact_state import check_outside
 from naibu.mechanics.lattices.model.hexahedra import lattice_mesh

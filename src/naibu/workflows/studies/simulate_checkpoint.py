@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -15,28 +15,14 @@ from naibu.io.files.atomic import write_atomically, writer_of
 from naibu.mechanics.lattices.model.contact_state import ContactState
 from naibu.mechanics.lattices.model.state import LatticeState
 from naibu.mechanics.lattices.simulation.loading_history import StudyState
+from naibu.workflows.studies.checkpoint_file import CheckpointFile
 from naibu.workflows.studies.lattice_study import PreparedStudy
 
 CONTACT_ARRAYS = tuple(field.name for field in fields(ContactState))
 
 
-@dataclass(frozen=True, slots=True)
-class Checkpoint:
-    """The file ``NAME.checkpoint.npz`` of a study.
-
-    Attributes
-    ----------
-    path : Path
-        The file.
-    source : str
-        File or name of the study, for messages.
-    fingerprint : str
-        Of the study; a checkpoint of another one is refused.
-    """
-
-    path: Path
-    source: str
-    fingerprint: str
+class Checkpoint(CheckpointFile):
+    """The file ``NAME.checkpoint.npz`` of a study of a lattice."""
 
     @classmethod
     def of(cls, folder: Path, prepared: PreparedStudy) -> Checkpoint:
@@ -70,20 +56,15 @@ class Checkpoint:
         InputError
             There is none, it is damaged, of another study, or of a run that is still going on.
         """
-        if not self.path.is_file():
-            raise InputError(f"{self.path}: does not exist, so there is nothing to resume; run without `resume`")
+        self.require_present()
         try:
             with np.load(self.path, allow_pickle=False) as file:
                 data = {name: file[name] for name in file.files}
-            same = str(data["fingerprint"]) == self.fingerprint
+            fingerprint = str(data["fingerprint"])
             state = _unpacked(data)
         except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
-            raise InputError(f"{self.path}: is damaged ({error}); run without `resume`, and with `overwrite`") from error
-        if not same:
-            raise InputError(
-                f"{self.path}: was kept with other settings, inputs or another version of naibu than {self.source} now; put them back, or "
-                "run without `resume`, and with `overwrite`"
-            )
+            raise self.damaged(error) from error
+        self.require_same(fingerprint)
         for name in self.needed():
             if (process := writer_of(self.path.parent / name)) is not None:
                 raise InputError(f"{self.path}: belongs to a run that is still going on (process {process}); wait for its end, or end it")

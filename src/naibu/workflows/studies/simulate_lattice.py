@@ -20,7 +20,7 @@ from naibu.mechanics.lattices.model.surface import surface_of
 from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy, StudyFrame, StudyState, run_study
 from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, force_unit, motion_html
 from naibu.viewer.tables import Table
-from naibu.workflows.output_folder import output_folder
+from naibu.workflows.results.output_folder import output_folder
 from naibu.workflows.studies.lattice_study import PreparedStudy, prepared_study
 from naibu.workflows.studies.simulate_checkpoint import Checkpoint
 

@@ -16,7 +16,7 @@ from naibu.io.files.atomic import write_atomically
 from naibu.io.vtk_files import write_vtkhdf_series
 from naibu.reproduction.chapter2.simulations import NAMES, SQUARES, Study, run
 from naibu.viewer.animation import MovingBody, animation_html
-from naibu.workflows.output_folder import output_folder
+from naibu.workflows.results.output_folder import output_folder
 
 SLUGS = {name.replace(",", "").replace(" ", "-").lower(): name for name in NAMES}
 SQUARES_TOGETHER = "squares"

@@ -31,7 +31,7 @@ from naibu.viewer.json_values import jsonable
 from naibu.viewer.result_page.page import report_html
 from naibu.viewer.result_page.payload import Report, report_json
 from naibu.viewer.result_page.reading import report_from_json
-from naibu.workflows.report_content import Accuracy, accuracy, build_report, prediction_report, search_sentence
+from naibu.workflows.results.report_content import Accuracy, accuracy, build_report, prediction_report, search_sentence
 
 MODEL_FILE, CHECKPOINT_FILE, RESIDUALS_FILE = "model.json", "checkpoint.json", "residuals.csv"
 IDENTIFICATION_FILE, COMPARISON_FILE, REPORT_STEM = "identification.json", "comparison.json", "report"

@@ -12,7 +12,7 @@ import pytest
 
 from naibu.core.errors import InputError
 from naibu.io.files.atomic import new_aside, writer_of
-from naibu.workflows.output_folder import output_folder
+from naibu.workflows.results.output_folder import output_folder
 
 
 def test_a_folder_is_made_and_may_hold_other_files(tmp_path: Path) -> None:

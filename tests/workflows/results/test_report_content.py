@@ -11,7 +11,7 @@ from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.calibrated_model import CalibratedModel
-from naibu.workflows.report_content import parameter_label, parameter_rows, search_sentence, undetermined
+from naibu.workflows.results.report_content import parameter_label, parameter_rows, search_sentence, undetermined
 
 
 @pytest.mark.parametrize(
