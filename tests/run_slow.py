@@ -91,10 +91,13 @@ def note(files: Iterable[str], record: Mapping[str, str]) -> str:
 
 
 def commit() -> str:
-    """Return the commit that is checked out, with a mark where files differ from it."""
-    command = ["git", "describe", "--always", "--dirty=+changes", "--exclude=*"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    return done.stdout.strip() or "an unknown commit"
+    """Return the commit that is checked out, with a mark where files other than the record differ from it."""
+
+    def told_by_git(*arguments: str) -> str:
+        return subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip()
+
+    changed = told_by_git("status", "--porcelain", "--untracked-files=no", "--", ".", f":!{NOTE.relative_to(ROOT).as_posix()}")
+    return (told_by_git("rev-parse", "--short", "HEAD") or "an unknown commit") + "+changes" * bool(changed)
 
 
 if __name__ == "__main__":
