@@ -37,18 +37,21 @@ int main(int argc, char **argv)
     double seconds = argc > 2 ? atof(argv[2]) : 10.0, began = now(), due = began, heard = began;
     struct pose out = {.magic = "NHP1", .version = 1};
     struct force in, last = {.number = 0};
-    int line = socket(AF_INET, SOCK_DGRAM, 0), answers = 0;
+    static const double none[3];
+    uint32_t free_since = 0;                                                 /* first pose that said that no force acts */
+    int line = socket(AF_INET, SOCK_DGRAM, 0), answers = 0, acts = 0;
     to.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
     if (line < 0 || connect(line, (struct sockaddr *)&to, sizeof to)) { perror("naibu"); return 1; }
     while (due - began < seconds) {
         while (recv(line, &in, sizeof in, MSG_DONTWAIT) == (ssize_t)sizeof in)
-            if (!memcmp(in.magic, "NHF1", 4) && in.version == 1 && (last.number == 0 || (int32_t)(in.number - last.number) > 0)) {
-                last = in; heard = now(); answers++;                         /* answers that were overtaken are dropped */
+            if (!memcmp(in.magic, "NHF1", 4) && in.version == 1
+                && (acts ? (int32_t)(in.number - last.number) > 0 : (int32_t)(in.sequence - free_since) >= 0)) {
+                last = in; acts = 1; heard = now(); answers++;         /* dropped: overtaken answers, and those made before letting go */
             }
-        if (now() - heard > 0.1) memset(&last, 0, sizeof last);             /* no answer: let go */
-        set_force(last.force_mn);
+        if (acts && now() - heard > 0.02) { acts = 0; free_since = out.sequence + 1; }          /* no answer: let go */
+        set_force(acts ? last.force_mn : none);
         out.sequence++;
-        out.applied = last.number;                                          /* the answer whose force acts */
+        out.applied = acts ? last.number : 0;                                       /* the answer whose force acts */
         out.time_s = now() - began;
         read_device(out.time_s, &out);
         if (send(line, &out, sizeof out, 0) < 0 && errno != ECONNREFUSED) { perror("naibu"); return 1; }

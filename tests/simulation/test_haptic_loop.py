@@ -105,6 +105,33 @@ def test_the_force_fades_when_the_device_falls_silent_and_it_may_come_back() -> 
     assert channel.datagrams.device is None
 
 
+def test_a_device_that_gets_no_answers_lets_go_and_is_led_again_from_no_force() -> None:
+    """The computer is busy for 60 ms, and answers from before arrive after it: letting go is final until naibu knows of it."""
+    touched, channel = simulation(), LossyChannel(loss=0.0, late=0.0)
+    limits = replace(ForceLimits(), step_mn=20.0)
+    device, hand = pressing(10.0), HapticHand(channel, limits=limits)
+    step = touched.frame_s
+    held = felt(touched, hand, device, channel, 1.0).forces[-1]
+    late = device.applied
+    assert late is not None and held[2] > 3.0 * limits.step_mn
+    began, forces, work = device.time_s, [], device.work
+    while device.time_s < began + 0.06:
+        channel.up.send(pose_bytes(device.advance(step)))
+        forces.append(device.force)
+        if device.time_s > began + 0.04:
+            assert not device.hear(replace(late, number=late.number + 1))
+    acted = np.linalg.norm(forces, axis=1) > 0.0
+    assert acted[: round(0.018 / step)].all() and not acted[round(0.024 / step) :].any()
+    assert hand.passivity.absorbed < -work + limits.energy_mn_mm
+    run = felt(touched, hand, device, channel, 1.0)
+    steps = np.linalg.norm(np.diff(np.vstack([np.zeros(3), run.forces]), axis=0), axis=1)
+    assert steps.max() <= limits.step_mn * (1 + 1e-9)
+    force = run.forces[-1]
+    assert force[2] > 3.0 * limits.step_mn
+    np.testing.assert_allclose(device.stiffness * (device.position - device.path(9.0)), force, atol=0.02 * force[2])
+    np.testing.assert_allclose(hand.passivity.absorbed, -device.work, rtol=0.02)
+
+
 def test_the_button_moves_the_device_without_its_tool() -> None:
     touched, channel = simulation(), LossyChannel(loss=0.0, late=0.0)
     device, hand = pressing(10.0, 0.3), HapticHand(channel)

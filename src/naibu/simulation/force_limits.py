@@ -130,7 +130,12 @@ class StepLimiter:
         return self._open[-1][1]
 
     def confirmed(self, number: int) -> FloatArray:
-        """Take note that the device applies an answer, and return its force (3,), mN; of a number that is not open, the oldest open."""
+        """Take note that the device applies an answer, and return its force (3,), mN; of a number that is not open, the oldest open.
+
+        The number 0 is that of no force: a device that has let go takes no answer that was made before that is known here.
+        """
+        if number == 0 and self._open[0][0] != 0:
+            self._open = deque([(0, np.zeros(3))], maxlen=MOST_OPEN)
         if any(number == known for known, _ in self._open):
             while self._open[0][0] != number:
                 self._open.popleft()

@@ -10,7 +10,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.simulation.haptic_loop import DeviceForce, DevicePose
 
-SILENCE_S = 0.1  # without an answer for so long, the device applies no force
+SILENCE_S = 0.02  # without an answer for so long, the device lets go
 
 
 @dataclass(slots=True, eq=False)
@@ -18,7 +18,8 @@ class SimulatedDevice:
     """A handle of some mass, led by a hand: a spring and a dashpot to where the hand wants it.
 
     It does what a program for a real device does: it counts its packets, tells which answer it applies, drops answers that were overtaken,
-    and lets go when none comes. Beside that it keeps account of the energy that it gets.
+    and lets go when none comes; from then on it takes only answers to poses that said so. Beside that it keeps account of the energy that
+    it gets.
 
     Attributes
     ----------
@@ -50,6 +51,7 @@ class SimulatedDevice:
     time_s: float = 0.0
     _sequence: int = 0
     _heard: float = 0.0
+    _free: int = 0  # first pose that told that no force is applied
 
     def __post_init__(self) -> None:
         self.position = np.array(self.path(0.0), dtype=float)
@@ -60,16 +62,16 @@ class SimulatedDevice:
         return np.zeros(3) if self.applied is None else self.applied.force_mn
 
     def hear(self, answer: DeviceForce) -> bool:
-        """Apply an answer from now on, unless it was overtaken; False in that case."""
-        if self.applied is not None and answer.number <= self.applied.number:
+        """Apply an answer from now on, unless it was overtaken, or made before the device let go; False in that case."""
+        if answer.sequence < self._free if self.applied is None else answer.number <= self.applied.number:
             return False
         self.applied, self._heard = answer, self.time_s
         return True
 
     def advance(self, step_s: float) -> DevicePose:
         """Move for a step, and return what the device then sends."""
-        if self.time_s - self._heard > SILENCE_S:
-            self.applied = None
+        if self.applied is not None and self.time_s - self._heard > SILENCE_S:
+            self.applied, self._free = None, self._sequence + 1
         self.time_s += step_s
         goal = self.path(self.time_s)
         pull = self.stiffness * (goal - self.position) + self.force + self.mass_kg / step_s * self.velocity

@@ -16,7 +16,7 @@ from naibu.workflows.interactive.haptics.endpoint import LOOPBACK
 from naibu.workflows.interactive.haptics.packets import FORCE, pose_bytes, read_force
 
 STEP_S = 1e-3
-BEHIND_S = 0.02  # a delay that the device does not catch up with
+BEHIND_S = 0.01  # a delay that the device does not catch up with, shorter than after which it lets go
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,6 +29,8 @@ class DeviceRecord:
         When an answer was applied, s.
     forces : ndarray, shape (a, 3)
         Force of each of them, mN.
+    steps_mn : ndarray, shape (a,)
+        Magnitude of the change of the force that was applied by each of them, mN; a device that has let go applied none.
     delays_s : ndarray, shape (a,)
         From the pose that an answer is to until it was applied, s.
     flags : ndarray, shape (a,), int64
@@ -38,11 +40,12 @@ class DeviceRecord:
     most_work : float
         Most of it at any time, mN mm.
     sent, overtaken : int
-        Poses sent, and answers that were dropped because a later one had come.
+        Poses sent, and answers that were dropped: a later one had come, or the device had let go.
     """
 
     heard_s: FloatArray
     forces: FloatArray
+    steps_mn: FloatArray
     delays_s: FloatArray
     flags: IntArray
     work: float
@@ -54,11 +57,6 @@ class DeviceRecord:
     def gaps_s(self) -> FloatArray:
         """Times between answers (a - 1,), s."""
         return np.diff(self.heard_s)
-
-    @property
-    def steps_mn(self) -> FloatArray:
-        """Magnitudes of the changes of the force from answer to answer (a - 1,), mN."""
-        return np.asarray(np.linalg.norm(np.diff(self.forces, axis=0), axis=1))
 
     @property
     def stale(self) -> BoolArray:
@@ -112,7 +110,7 @@ def drive_live_simulation(
     require_within("loss", loss, 0.0, 1.0)
     require_within("reordering", reordering, 0.0, 1.0)
     up, down = (_Line(np.random.default_rng([seed, k]), loss, reordering) for k in range(2))
-    heard: list[tuple[float, float, int, FloatArray]] = []
+    heard: list[tuple[float, float, int, FloatArray, float]] = []
     sent, overtaken, most = 0, 0, 0.0
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
         line.connect((LOOPBACK, port))
@@ -130,15 +128,16 @@ def drive_live_simulation(
             while (packet := _received(line, due)) is not None:
                 for each in down.passed(packet):
                     answer = read_force(each)
-                    now = time.perf_counter()
+                    now, before = time.perf_counter(), device.force
                     if device.hear(answer):
-                        heard.append((now - began, now - left.get(answer.sequence, now), answer.flags, answer.force_mn))
+                        step = float(np.linalg.norm(answer.force_mn - before))
+                        heard.append((now - began, now - left.get(answer.sequence, now), answer.flags, answer.force_mn, step))
                     else:
                         overtaken += 1
     if not heard:
         raise InputError(f"no answer came from port {port}; start naibu live with that port for haptic devices first")
-    times, delays, flags, forces = (np.array(values) for values in zip(*heard, strict=True))
-    return DeviceRecord(times, forces, delays, flags, device.work, most, sent, overtaken)
+    times, delays, flags, forces, steps = (np.array(values) for values in zip(*heard, strict=True))
+    return DeviceRecord(times, forces, steps, delays, flags, device.work, most, sent, overtaken)
 
 
 def _sent(line: socket.socket, packet: bytes) -> None:
@@ -149,13 +148,15 @@ def _sent(line: socket.socket, packet: bytes) -> None:
 
 
 def _received(line: socket.socket, due: float) -> bytes | None:
-    """Return the next datagram that comes before a time, s, None when it is over."""
-    while (wait := due - time.perf_counter()) > 0.0:
+    """Return the next datagram that has come or comes before a time, s, None when there is none."""
+    while True:
+        wait = max(due - time.perf_counter(), 0.0)
         line.settimeout(wait)
         try:
             return line.recv(FORCE.size + 1)
-        except TimeoutError:
+        except (TimeoutError, BlockingIOError):
             return None
         except OSError:  # nobody listens yet
+            if wait == 0.0:
+                return None
             time.sleep(min(STEP_S, wait))
-    return None
