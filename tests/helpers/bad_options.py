@@ -113,7 +113,9 @@ NO_HEIGHTS = (
     "", "=", "45", "pressed", "pressed=", "=45", "pressed=x", "pressed=0", "pressed=-5", "pressed=nan", "pressed=inf", "pressed=1e308",
     "pressed=1e-300", "pressed=45mm", "nosuch=45",
 )  # fmt: skip
+NO_VERTICALS = ("", "w", "-", "--", "0,0,0", "0,1", "1,2,3,4", "nan,0,1", "inf,0,1", "0;0;1", "found?", "Found", "0.1,a,1", "<script>")
 TEXTS = (
+    ("import", (*TABLES, *SIZE), "--vertical", NO_VERTICALS),
     ("identify", ("{press}",), "--known", NO_KNOWN),
     ("compare", ("{press}",), "--known", NO_KNOWN),
     ("identify", ("{press}",), "--state", NO_STATES),

@@ -87,6 +87,9 @@ class ObjectOptions:
         A layer of one material, 'NAME=FROM..TO' with heights from the base in mm. May be repeated.
     stated_mm
         Height of the plate or bar in a state, or distance between the side plates, 'STATE=HEIGHT' in mm. May be repeated.
+    vertical
+        Direction away from the base in the axes of the tables or scans, if it is not z: 'y', '-z' (written --vertical=-z) or three numbers
+        such as '0.1,0.3,0.95'; or 'found', from the lattice of the markers or the direction of compression. Markers are turned accordingly.
     """
 
     shape: Literal["box", "half_ellipsoid", "cylinder", "hemisphere"] = "box"
@@ -94,14 +97,15 @@ class ObjectOptions:
     bar_width_mm: float | None = None
     layer: Annotated[list[str] | None, Parameter(name=("--layer", "-l"))] = None
     stated_mm: list[str] | None = None
+    vertical: str | None = None
 
     def described(self, size_mm: tuple[float, float, float]) -> dict[str, Any]:
-        """Return shape, loading, layers and stated_mm, as `naibu.io.marker_tables.write_experiment_folder` takes them.
+        """Return shape, loading, layers, stated_mm and vertical, as `naibu.workflows.import_tables.import_tables` takes them.
 
         Raises
         ------
         InputError
-            A layer or a height of another form.
+            A layer, a height or a direction of another form.
         """
         from naibu.core.experiment import Loading, Shape
 
@@ -110,6 +114,7 @@ class ObjectOptions:
             "loading": Loading(self.loading, self.bar_width_mm),
             "layers": layers_of(self.layer or ()),
             "stated_mm": heights_of(self.stated_mm or ()),
+            "vertical": direction_of(self.vertical),
         }
 
 
@@ -163,3 +168,25 @@ def heights_of(texts: Sequence[str]) -> dict[str, float]:
             raise InputError(f"--stated-mm {text!r} must be STATE=HEIGHT in mm, such as 'pressed=45'") from None
         heights[state.strip()] = require_within(f"--stated-mm {text!r}: the height", value, *LENGTHS_MM, "mm")
     return heights
+
+
+def direction_of(text: str | None) -> tuple[float, ...] | Literal["found"] | None:
+    """Return a direction from texts such as ``y``, ``-z`` or ``0.1,0.3,0.95``, or the word ``found``.
+
+    Raises
+    ------
+    InputError
+        A text of another form.
+    """
+    if text is None or text == "found":
+        return text
+    axis = text.lstrip("+-")
+    if axis in ("x", "y", "z"):
+        return tuple((-1.0 if text.startswith("-") else 1.0) * (axis == name) for name in "xyz")
+    try:
+        x, y, z = (float(part) for part in text.replace(" ", ",").split(",") if part)
+    except ValueError:
+        raise InputError(
+            f"--vertical {text!r} must be 'found', an axis such as 'y' or '-z', or three numbers such as '0.1,0.3,0.95'"
+        ) from None
+    return x, y, z

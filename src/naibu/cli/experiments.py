@@ -379,6 +379,7 @@ def report(folder: Path) -> None:
     MARKERS,
     "import free.csv pressed.csv --size-mm 60 60 60 -l 'gel=0..60' --stated-mm pressed=45 -o my_gel",
     "import positions.xlsx pressed.xlsx --size-mm 60 60 60 --unit cm --preview   # look, and write nothing",
+    "import free.csv pressed.csv --size-mm 60 60 60 --spacing-mm 10 --vertical found   # of a scan that is tilted",
     name="import",
 )
 def import_tables(
@@ -428,15 +429,15 @@ def import_tables(
     from naibu.workflows import import_tables as import_workflow
 
     about = (described or ObjectOptions()).described(size_mm)
-    seen = import_workflow.preview_tables(initial, loaded, unit=unit, size_mm=size_mm)
+    about["spacing_mm"] = spacing_mm
+    seen = import_workflow.preview_tables(initial, loaded, unit=unit, **about)
     print_table(seen.title, seen.columns, seen.rows)
     say(seen.note, "dim")
     if preview:
         return
     notes = import_workflow.import_tables(
-        initial, loaded, out=out, unit=unit, title=title, spacing_mm=spacing_mm, xy_step_mm=xy_step_mm, z_step_mm=z_step_mm,
-        overwrite=overwrite, **about,
-    )  # fmt: skip
+        initial, loaded, out=out, unit=unit, title=title, xy_step_mm=xy_step_mm, z_step_mm=z_step_mm, overwrite=overwrite, **about
+    )
     wrote(out)
     for note in notes:
         say(f"Warning: {note}", WARNING)

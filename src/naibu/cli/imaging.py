@@ -156,8 +156,8 @@ def track(
     description = None
     if size_mm is not None:
         description = tracking.ObjectDescription(**options.described(size_mm), title=title)
-    elif options.layer or options.stated_mm:
-        raise InputError("--layer and --stated-mm describe an object: give its dimensions too, --size-mm X Y Z")
+    elif options.layer or options.stated_mm or options.vertical:
+        raise InputError("--layer, --stated-mm and --vertical describe an object: give its dimensions too, --size-mm X Y Z")
     with progress_display() as progress:
         run = tracking.track(
             scans, out=out, diameter_mm=diameter_mm, thickness_mm=thickness_mm, polarity=polarity, count=count, mask=mask,
@@ -166,6 +166,8 @@ def track(
     wrote(run.page, out)
     print_table("Markers", run.columns, run.rows)
     say(f"Wrote {out}. Page: {run.page}")
+    for note in run.notes:
+        say(f"Note: {note}")
     if description is None:
         say("Give --size-mm X Y Z, --layer and --stated-mm to make an experiment folder that 'naibu identify' takes.", "dim")
     else:

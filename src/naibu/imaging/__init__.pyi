@@ -16,6 +16,7 @@ from .feature_matching.relaxation_labelling import PotentialMatches, relaxed
 from .feature_matching.scattered_interpolation import Triangulation, dense_from_sparse, sparse_displacement, triangulated
 from .markers.detection import DetectedMarkers, detect_markers
 from .markers.point_matching import Links, link_markers
+from .markers.scan_orientation import ScanOrientation, found_orientation, stated_orientation
 from .markers.sequence_tracking import TrackedSequence, track_sequence
 from .markers.settings import DetectionSettings, LinkSettings, SequenceSettings
 from .markers.tracking import TrackedMarkers, track_markers
@@ -43,6 +44,7 @@ __all__ = [
     "MeasuredDisplacement",
     "PotentialMatches",
     "RigidRegistration",
+    "ScanOrientation",
     "SequenceSettings",
     "TrackedMarkers",
     "TrackedSequence",
@@ -61,6 +63,7 @@ __all__ = [
     "displacement_gradient",
     "end_point_error",
     "forward_backward_error",
+    "found_orientation",
     "green_lagrange_strain",
     "horn_schunck",
     "hybrid_flow",
@@ -80,6 +83,7 @@ __all__ = [
     "rigid_from_points",
     "small_strain",
     "sparse_displacement",
+    "stated_orientation",
     "track_markers",
     "track_sequence",
     "triangulated",

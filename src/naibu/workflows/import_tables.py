@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +12,16 @@ from scipy.spatial import cKDTree
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
+from naibu.core.experiment import Loading, Shape
 from naibu.core.markers import Markers
 from naibu.imaging.markers.motion_coherence import require_coherent, strays_named
 from naibu.imaging.markers.tracking import FEWEST_COMMON
 from naibu.io.marker_tables import MM_PER_UNIT, import_markers, write_experiment_folder
 from naibu.viewer.tables import Cell, Table
+from naibu.workflows.tilted_tables import UprightTables, Vertical, upright_tables
 
 LEAST_SHARE = 0.15  # of the object's extent, which markers span; below, another unit is suspected
+INITIAL = "initial"
 MOST_STRAYS = 0.2  # fraction of stray markers from which on the labels are not believed
 
 
@@ -28,6 +31,7 @@ def import_tables(
     *,
     out: str | os.PathLike[str],
     unit: str | None = None,
+    vertical: Vertical = None,
     **description: Any,
 ) -> tuple[str, ...]:
     """Make an experiment folder from tables of marker positions.
@@ -42,6 +46,10 @@ def import_tables(
         Folder to make.
     unit : str, optional
         Unit of the coordinates, if the column names do not state it.
+    vertical : sequence of float or "found", optional
+        Direction away from the base in the axes of the tables, if it is not z; or that it is found from the lattice of the markers (where
+        `spacing_mm` is given) or the direction of compression (`naibu.imaging.found_orientation`). All tables are then turned into the axes
+        of the object.
     **description
         See `naibu.io.write_experiment_folder`.
 
@@ -53,47 +61,64 @@ def import_tables(
     Raises
     ------
     InputError
-        Two states of one name, tables that cannot be read, labels that do not correspond, states in other units or mirrored. No folder is
-        made then.
+        Two states of one name, tables that cannot be read, labels that do not correspond, states in other units or mirrored, an object that
+        stands tilted in its scan. No folder is made then.
     """
-    names = [Path(table).stem for table in loaded]
-    if len(set(names)) < len(names):
-        raise InputError(f"two tables would both be the state {max(names, key=names.count)!r}; rename one file")
-    first = import_markers(initial, unit=unit)
-    if unit is None:
-        _require_plausible_unit(first, description["shape"].size_mm, Path(initial).name)
-    states = {name: import_markers(table, unit=unit) for name, table in zip(names, loaded, strict=True)}
-    notes = [note for name, markers in states.items() if (note := _checked(first, markers, Path(initial).name, name))]
-    write_experiment_folder(out, first, states, **description)
-    return tuple(notes)
+    first, *others = tables = _read(initial, loaded, unit, description["shape"])
+    checked = (_checked(tables[first], tables[name], Path(initial).name, name) for name in others)
+    notes = [note for note in checked if note]
+    upright = _upright(tables, vertical, description)
+    if description.get("xy_step_mm") and description.get("z_step_mm"):
+        steps = upright.turned_lengths(description["xy_step_mm"], description["z_step_mm"])
+        description |= {"xy_step_mm": steps[0], "z_step_mm": steps[1]}
+    write_experiment_folder(out, upright.tables[first], {name: upright.tables[name] for name in others}, **description)
+    return (*notes, *upright.notes)
 
 
 def preview_tables(
-    initial: str | os.PathLike[str], loaded: Sequence[str | os.PathLike[str]], *, size_mm: Sequence[float], unit: str | None = None
+    initial: str | os.PathLike[str],
+    loaded: Sequence[str | os.PathLike[str]],
+    *,
+    unit: str | None = None,
+    vertical: Vertical = None,
+    **description: Any,
 ) -> Table:
     """Return what tables of marker positions hold, beside the size of the object: what to look at before they are imported.
 
     Parameters
     ----------
-    initial, loaded, unit
-        As of `import_tables`.
-    size_mm : sequence of float
-        Dimensions of the object along x, y, z, mm.
+    initial, loaded, unit, vertical, **description
+        As of `import_tables`; of the description ``shape`` is needed. What is shown is turned already.
 
     Raises
     ------
     InputError
-        Tables that cannot be read, or positions that are in another unit than they say.
+        Tables that cannot be read, positions that are in another unit than they say, or a vertical that cannot be found.
     """
+    tables = _read(initial, loaded, unit, description["shape"])
+    upright = _upright(tables, vertical, description)
+    size = " x ".join(f"{edge:g}" for edge in description["shape"].size_mm)
+    note = f"The object measures {size} mm. Spacing: median distance to the nearest marker. Rigid motion of the scan is part of 'moved'."
+    notes = [note, *(f"{text[:1].upper()}{text[1:]}." for text in (upright.told, *upright.notes) if text)]
+    rows = [_seen(name, markers, upright.tables[INITIAL]) for name, markers in upright.tables.items()]
+    columns = ("state", "markers", "in common", "span x, mm", "span y, mm", "span z, mm", "spacing, mm", "moved (median), mm")
+    return Table("Tables as they are read", columns, tuple(rows), note=" ".join(notes))
+
+
+def _read(initial: str | os.PathLike[str], loaded: Sequence[str | os.PathLike[str]], unit: str | None, shape: Shape) -> dict[str, Markers]:
+    """Return the markers of all states by name, the unloaded one first."""
+    names = [INITIAL, *(Path(table).stem for table in loaded)]
+    if len(set(names)) < len(names):
+        raise InputError(f"two tables would both be the state {max(names, key=names.count)!r}; rename one file")
     first = import_markers(initial, unit=unit)
     if unit is None:
-        _require_plausible_unit(first, size_mm, Path(initial).name)
-    rows = [_seen(Path(initial).stem, first, first)]
-    rows += [_seen(Path(table).stem, import_markers(table, unit=unit), first) for table in loaded]
-    columns = ("state", "markers", "in common", "span x, mm", "span y, mm", "span z, mm", "spacing, mm", "moved (median), mm")
-    size = " x ".join(f"{edge:g}" for edge in size_mm)
-    note = f"The object measures {size} mm. Spacing: median distance to the nearest marker. Rigid motion of the scan is part of 'moved'."
-    return Table("Tables as they are read", columns, tuple(rows), note=note)
+        _require_plausible_unit(first, shape.size_mm, Path(initial).name)
+    return {INITIAL: first} | {name: import_markers(table, unit=unit) for name, table in zip(names[1:], loaded, strict=True)}
+
+
+def _upright(tables: Mapping[str, Markers], vertical: Vertical, description: Mapping[str, Any]) -> UprightTables:
+    shape, loading, spacing_mm = description["shape"], description.get("loading", Loading("plate")), description.get("spacing_mm")
+    return upright_tables(tables, vertical, shape=shape, loading=loading, spacing_mm=spacing_mm)
 
 
 def _seen(name: str, markers: Markers, first: Markers) -> tuple[Cell, ...]:

@@ -25,6 +25,7 @@ from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.tilted_tables import Vertical, upright_tables
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,6 +48,8 @@ class ObjectDescription:
         Materials from the base up.
     stated_mm : mapping of str to float, optional
         Stated platen positions by name of the state, mm.
+    vertical : sequence of float or "found", optional
+        Direction away from the base in the axes of the scans, if it is not z, as of `naibu.workflows.import_tables.import_tables`.
     title : str
         Title of the experiment.
     """
@@ -55,6 +58,7 @@ class ObjectDescription:
     loading: Loading
     layers: tuple[Layer, ...] = ()
     stated_mm: Mapping[str, float] | None = None
+    vertical: Vertical = None
     title: str = "Markers tracked through scans"
 
 
@@ -74,6 +78,8 @@ class TrackRun:
         ``tracking.html``.
     files : tuple of Path
         All others.
+    notes : tuple of str
+        How the markers were turned, and whether the object seems to stand tilted.
     """
 
     tracked: TrackedMarkers
@@ -81,6 +87,7 @@ class TrackRun:
     rows: tuple[tuple[Cell, ...], ...]
     page: Path
     files: tuple[Path, ...]
+    notes: tuple[str, ...] = ()
 
 
 def track(
@@ -156,14 +163,14 @@ def track(
     )  # fmt: skip
     _require_trusted(tracked)
     report_progress(progress, "writing")
-    files = _written(target, tracked, description, overwrite)
+    files, notes = _written(target, tracked, description, overwrite)
     columns, rows = _table(tracked)
     settings: dict[str, Cell] = {"diameter, mm": diameter_mm, "thickness, mm": thickness_mm, "polarity": tracked.found[0].polarity}
     settings |= input_record({**{f"scan of {name}": scan for name, scan in zip(names, scans, strict=True)}, "mask": mask})
     page, numbers = write_chapter(
         Chapter("tracking", "Markers tracked through scans", (_section(tracked, columns, rows),), settings), target
     )
-    return TrackRun(tracked, columns, rows, page, (*files, numbers))
+    return TrackRun(tracked, columns, rows, page, (*files, numbers), notes)
 
 
 def _require_trusted(tracked: TrackedMarkers) -> None:
@@ -190,16 +197,25 @@ def _states(scans: Sequence[str | os.PathLike[str]]) -> list[str]:
     return names
 
 
-def _written(target: Path, tracked: TrackedMarkers, description: ObjectDescription | None, overwrite: bool) -> list[Path]:
+def _written(
+    target: Path, tracked: TrackedMarkers, description: ObjectDescription | None, overwrite: bool
+) -> tuple[list[Path], tuple[str, ...]]:
+    """Write the tables, or the experiment folder; return the files and what should be known of them."""
     if description is None:
         output_folder(target)
-        return [write_markers(target / f"{n}.csv", m) for n, m in zip(tracked.names, tracked.markers, strict=True)]
+        return [write_markers(target / f"{n}.csv", m) for n, m in zip(tracked.names, tracked.markers, strict=True)], ()
     d, (xy_sd, z_sd) = description, tracked.typical_sd_mm
+    upright = upright_tables(dict(zip(tracked.names, tracked.markers, strict=True)), d.vertical, shape=d.shape, loading=d.loading)
+    xy_sd, z_sd = upright.turned_lengths(xy_sd, z_sd)
+    first, *others = tracked.names
     write_experiment_folder(
-        target, tracked.markers[0], tracked.states, title=d.title, shape=d.shape, loading=d.loading, layers=d.layers, stated_mm=d.stated_mm,
-        xy_sd_mm=xy_sd, z_sd_mm=z_sd, overwrite=overwrite,
+        target, upright.tables[first], {n: upright.tables[n] for n in others}, title=d.title, shape=d.shape, loading=d.loading,
+        layers=d.layers, stated_mm=d.stated_mm, xy_sd_mm=xy_sd, z_sd_mm=z_sd, overwrite=overwrite,
     )  # fmt: skip
-    return [target / "meta.toml", *(target / f"{n}.csv" for n in tracked.names)]
+    return [target / "meta.toml", *(target / f"{n}.csv" for n in tracked.names)], (
+        *([upright.told] if upright.told else []),
+        *upright.notes,
+    )
 
 
 def _table(tracked: TrackedMarkers) -> tuple[tuple[str, ...], tuple[tuple[Cell, ...], ...]]:
