@@ -6,6 +6,7 @@ import csv
 import json
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,9 @@ from naibu.io.experiment_folder.state_csv import parse_state_csv
 from naibu.io.files import atomic
 from naibu.viewer.result_page.payload import report_json
 from naibu.viewer.result_page.reading import report_from_json
-from naibu.workflows import identify, predict, report
+from naibu.workflows import cross_validation, identify, predict, report
+from naibu.workflows.cross_validation import left_out_in_turn
+from naibu.workflows.parallel.worker_count import Workers
 from naibu.workflows.results.report_content import load_case_scene, prediction_scene
 from naibu.workflows.results.result_folder import CHECKPOINT_FILE, MODEL_FILE, read_model
 
@@ -176,6 +179,16 @@ def test_experiments_are_predicted_from_each_other(press: Press, experiment_fold
     found = identify.identify([press.folder, other], known=KNOWN, settings=COARSE, states=STATE, cross_validate=True)
     assert {(r.experiment, r.state) for r in found.left_out} == {("press", "pressed"), ("sister", "pressed"), ("sister", "pressed_more")}
     assert all(r.rms_mm < 0.6 for r in found.left_out)
+    used = {t.specimen.experiment.name: t.specimen.experiment for t in found.calibration.load_cases}
+    used["press"] = replace(used["press"], states=tuple(s for s in used["press"].states if s.name != "pressed_more"))
+    there, trouble = left_out_in_turn(list(used.values()), found.calibration, Workers(2), None)
+    assert trouble is None
+    here = {(r.experiment, r.state): r for r in found.left_out}
+    assert [(r.experiment, r.state) for r in there] == list(here)
+    for row in there:
+        np.testing.assert_allclose(row.prediction.residual, here[row.experiment, row.state].prediction.residual, atol=1e-9)
+    with pytest.raises(InputError, match="cross_validate"):
+        identify.identify(press.folder, workers=2)
 
 
 def test_an_interrupted_search_keeps_the_best_and_goes_on(press: Press, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -243,7 +256,7 @@ def test_an_experiment_left_out_that_cannot_be_predicted_loses_nothing(
     def failing(*arguments: object, **options: object) -> None:
         raise ConvergenceError("no way")
 
-    monkeypatch.setattr(identify, "leave_one_out", failing)
+    monkeypatch.setattr(cross_validation, "leave_one_out", failing)
     with pytest.raises(ConvergenceError, match="no way"):
         identified(press.folder, tmp_path, cross_validate=True)
     assert (tmp_path / MODEL_FILE).read_bytes() == (press.results / MODEL_FILE).read_bytes()

@@ -27,7 +27,7 @@ from naibu.cli.installation import doctor_rows, healthy
 from naibu.cli.option_names import in_options, usage_error
 from naibu.cli.run_record import RunRecord, current_run, recorded_run
 from naibu.cli.verbs import START, verb
-from naibu.core.errors import ConvergenceError, NaibuError
+from naibu.core.errors import ConvergenceError, NaibuError, WorkerLostError
 from naibu.core.memory import is_out_of_memory
 
 OUTPUT = Group("Output of every verb", sort_key=50)
@@ -164,7 +164,9 @@ def _ended() -> None:
     except CycloptsError as error:
         fail(usage_error(" ".join(str(error).split()), app, current_run().verb), BAD_INPUT)
     except NaibuError as error:
-        fail(in_options(str(error), app, current_run().verb), FAILED if isinstance(error, ConvergenceError) else BAD_INPUT)
+        fail(
+            in_options(str(error), app, current_run().verb), FAILED if isinstance(error, ConvergenceError | WorkerLostError) else BAD_INPUT
+        )
     except KeyboardInterrupt:
         errors.print("Interrupted; every file written is complete. The same command resumes an identification.", soft_wrap=True)
         sys.exit(INTERRUPTED)

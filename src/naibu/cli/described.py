@@ -72,6 +72,28 @@ class PairOptions:
 
 @Parameter(name="*")
 @dataclass(frozen=True)
+class WorkerOptions:
+    """Where independent parts of a computation run.
+
+    Parameters
+    ----------
+    workers
+        Processes that share the independent parts; 0 takes as many as cores and free memory allow. Results do not depend on it.
+    cluster
+        Address of the scheduler of a Dask cluster, such as tcp://host:8786, which computes them instead.
+    """
+
+    workers: Whole = 1
+    cluster: str | None = None
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """As workflows take them."""
+        return {"workers": self.workers, "cluster": self.cluster}
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
 class ObjectOptions:
     """Shape, layers and loading of an object.
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from naibu.cli.console import GRAVE, INTERRUPTED, NOT_EXPLAINED, WARNING, print_table, progress_display, say
-from naibu.cli.described import Flag, Known, ObjectOptions, Out, Overwrite
+from naibu.cli.described import Flag, Known, ObjectOptions, Out, Overwrite, WorkerOptions
 from naibu.cli.run_record import found, wrote
 from naibu.cli.verbs import MARKERS, START, verb
 from naibu.core.errors import InputError
@@ -32,7 +32,7 @@ Law = Literal["neo_hookean", "neo_hookean_isochoric", "mooney_rivlin", "yeoh", "
 
 
 @verb(START, "demo --open   # about a minute; opens the report")
-def demo(*, out: Out = Path("naibu-demo"), overwrite: Overwrite = False) -> None:
+def demo(*, out: Out = Path("naibu-demo"), overwrite: Overwrite = False, where: WorkerOptions | None = None) -> None:
     """Calibrate both gels of the bundled two-material experiments, predict each experiment from the others, and write a report.
 
     Parameters
@@ -43,7 +43,7 @@ def demo(*, out: Out = Path("naibu-demo"), overwrite: Overwrite = False) -> None
         Replace results, or files of your own, that the folder already holds.
     """
     say(f"Identifying both gels from {', '.join(DEMO)} (bundled CT measurements) ...")
-    _identify(DEMO, known=(DEMO_KNOWN,), out=out, cross_validate=True, overwrite=overwrite)
+    _identify(DEMO, known=(DEMO_KNOWN,), out=out, cross_validate=True, overwrite=overwrite, where=where)
 
 
 @verb(
@@ -70,6 +70,7 @@ def identify(
     zone_name: list[str] | None = None,
     cell_map: Annotated[bool, Parameter(name="--map", negative=())] = False,
     overwrite: Overwrite = False,
+    where: WorkerOptions | None = None,
 ) -> None:
     """Identify material parameters, friction and boundary conditions by finite element model updating (FEMU).
 
@@ -117,6 +118,7 @@ def identify(
         _require_left_out(
             "goes with markers, and these are displacement fields", states=bool(state), contact=contact != "coulomb",
             joined=joined != "tied", pixel_scale=pixel_scale != "given", cross_validate=cross_validate, resume=not resume,
+            workers=where is not None,
         )  # fmt: skip
         _identify_fields(
             experiments, mask=mask, zones=zones, zone_name=zone_name or [], known=known or (), law=law, each_cell=cell_map,
@@ -130,7 +132,7 @@ def identify(
     states = _states(experiments, state or [])
     _identify(
         experiments, known=known or (), states=states, settings=settings, out=out, cross_validate=cross_validate, resume=resume,
-        overwrite=overwrite,
+        overwrite=overwrite, where=where,
     )  # fmt: skip
 
 
@@ -209,6 +211,7 @@ def _identify(
     cross_validate: bool = False,
     resume: bool = True,
     overwrite: Overwrite = False,
+    where: WorkerOptions | None = None,
 ) -> None:
     from naibu.workflows import identify
 
@@ -216,7 +219,7 @@ def _identify(
     with progress_display() as progress:
         result = identify.identify(
             list(experiments), known=known, states=states, settings=settings, out=out, cross_validate=cross_validate, resume=resume,
-            overwrite=overwrite, progress=progress,
+            overwrite=overwrite, progress=progress, **(where or WorkerOptions()).arguments,
         )  # fmt: skip
     _show(result)
     wrote(*(out / name for name in ("report.html", "model.json", "identification.json", "residuals.csv")))
@@ -316,6 +319,7 @@ def compare(
     element_size_mm: float = 0.0,
     out: Out = Path("naibu-comparison"),
     overwrite: Overwrite = False,
+    where: WorkerOptions | None = None,
 ) -> None:
     """Compare material laws and contact models: calibrate each combination, and predict each experiment from the others.
 
@@ -351,8 +355,9 @@ def compare(
     ]
     with progress_display() as progress:
         rows = compare_workflow.compare(
-            experiments, candidates=candidates, known=known or (), out=out, overwrite=overwrite, progress=progress
-        )
+            experiments, candidates=candidates, known=known or (), out=out, overwrite=overwrite, progress=progress,
+            **(where or WorkerOptions()).arguments,
+        )  # fmt: skip
     wrote(out / "comparison.json")
     table = comparison_table(rows)
     print_table(table.title, table.columns, table.rows)

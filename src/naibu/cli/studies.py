@@ -11,16 +11,24 @@ from pathlib import Path
 from typing import Literal
 
 from naibu.cli.console import INTERRUPTED, errors, print_table, progress_display, say
-from naibu.cli.described import Flag, Out, Overwrite, Whole
+from naibu.cli.described import Flag, Out, Overwrite, Whole, WorkerOptions
 from naibu.cli.run_record import wrote
 from naibu.cli.verbs import REPRODUCE, SIMULATE, verb
+from naibu.core.errors import InputError
 from naibu.core.progress import ProgressReport
 
 ChapterName = Literal["ch1", "ch2", "ch3", "ch4-adaptive", "ch4-cut", "ch4-lattice", "ch4-cube", "ch4-octree", "ch5", "ch6", "all"]
 
 
-@verb(REPRODUCE, "reproduce ch3 --open", "reproduce all -o report   # every chapter that the folder does not hold yet")
-def reproduce(chapter: ChapterName, *, out: Out = Path("naibu-reproduction"), seed: Whole = 0, overwrite: Overwrite = False) -> None:
+@verb(REPRODUCE, "reproduce ch3 --open", "reproduce all -o report --workers 0   # every chapter that the folder does not hold yet")
+def reproduce(
+    chapter: ChapterName,
+    *,
+    out: Out = Path("naibu-reproduction"),
+    seed: Whole = 0,
+    overwrite: Overwrite = False,
+    where: WorkerOptions | None = None,
+) -> None:
     """Recompute the tables and figures of a chapter of the 2008 report, and compare them with the printed ones.
 
     With all, every chapter is computed that the folder does not hold yet, and an index page is written over them.
@@ -41,6 +49,8 @@ def reproduce(chapter: ChapterName, *, out: Out = Path("naibu-reproduction"), se
     from naibu.workflows.reproduce import reproduce as reproduced
 
     began = time.perf_counter()
+    if chapter != "all" and where is not None:
+        raise InputError(f"`workers` and `cluster` share out the chapters of `reproduce all`; {chapter} is one: leave them out")
     if chapter == "all":
         left = tuple(CHAPTERS) if overwrite else missing_chapters(out, seed)
         minutes = processor_seconds(left) / 60.0
@@ -48,7 +58,7 @@ def reproduce(chapter: ChapterName, *, out: Out = Path("naibu-reproduction"), se
             f"{len(left)} chapters are to be computed: about {minutes:.0f} minutes on one common core. Ctrl-C keeps those that are done."
         )
         with progress_display() as progress:
-            index, _ = reproduce_all(out, seed=seed, overwrite=overwrite, progress=progress)
+            index, _ = reproduce_all(out, seed=seed, overwrite=overwrite, progress=progress, **(where or WorkerOptions()).arguments)
         wrote(index)
         say(f"{time.perf_counter() - began:.0f} s. Index: {index}")
         return

@@ -1,5 +1,5 @@
 from .chunked_volume import ChunkedVolume
-from .errors import ConvergenceError, InputError, MissingDependencyError, NaibuError
+from .errors import ConvergenceError, InputError, MissingDependencyError, NaibuError, WorkerLostError
 from .experiment import Layer, Loading, Shape, State
 from .parameters import Parameter, ParameterSet
 from .progress import ProgressReport
@@ -21,5 +21,6 @@ __all__ = [
     "Shape",
     "State",
     "Status",
+    "WorkerLostError",
     "registration",
 ]

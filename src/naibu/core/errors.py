@@ -17,3 +17,12 @@ class MissingDependencyError(NaibuError, ImportError):
 
 class ConvergenceError(NaibuError, RuntimeError):
     """A solver stopped before it reached its tolerance."""
+
+
+class WorkerLostError(NaibuError, RuntimeError):
+    """The process that computed a task died, and so did the one that took the task over."""
+
+    @classmethod
+    def of(cls, task: str, how: str) -> WorkerLostError:
+        """Return the error of a task, with what is known of the end of its last worker."""
+        return cls(f"{task}: its worker died twice ({how}); too little memory is the usual cause: use fewer workers, or a smaller task")

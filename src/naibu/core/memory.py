@@ -31,6 +31,19 @@ def address_space() -> tuple[float, float]:
     return limit / MEGABYTE, taken / MEGABYTE
 
 
+def available_memory_mb() -> float:
+    """Return the memory that can be taken without swapping, MB: what is free, or what a container leaves; infinite where nothing tells."""
+    room = [address_space()[0] - address_space()[1]]
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        room += [float(line.split()[1]) / 1024.0 for line in lines if line.startswith("MemAvailable:")]
+        limit, used = (Path(f"/sys/fs/cgroup/memory.{name}").read_text(encoding="ascii").strip() for name in ("max", "current"))
+        room += [(float(limit) - float(used)) / MEGABYTE] if limit != "max" else []
+    except (OSError, ValueError):
+        pass  # another system, or no container
+    return min(room)
+
+
 def require_address_space(needed_mb: float, what: str) -> None:
     """Raise an error unless a limit of the address space leaves enough room.
 

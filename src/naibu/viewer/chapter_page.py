@@ -26,9 +26,12 @@ def write_chapter(chapter: Chapter, folder: Path) -> tuple[Path, Path]:
         The folder cannot be written.
     """
     page = write_atomically(folder / f"{chapter.name}.html", chapter_html(chapter))
-    return page, write_atomically(
-        folder / f"{chapter.name}.json", json.dumps(chapter_numbers(chapter), indent=1, ensure_ascii=False) + "\n"
-    )
+    return page, write_atomically(folder / f"{chapter.name}.json", chapter_numbers_text(chapter))
+
+
+def chapter_numbers_text(chapter: Chapter) -> str:
+    """Return the text of the JSON file of a chapter."""
+    return json.dumps(chapter_numbers(chapter), indent=1, ensure_ascii=False) + "\n"
 
 
 def chapter_numbers(chapter: Chapter) -> dict[str, Any]:

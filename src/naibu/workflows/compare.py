@@ -12,7 +12,11 @@ from naibu.identification.from_markers.checks.marker_checks import check_markers
 from naibu.identification.from_markers.checks.marker_outliers import without_outliers
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.cross_validation import ModelRow, compare_models
+from naibu.workflows.cross_validation import MEMORY_MB
 from naibu.workflows.experiments import Source, load_experiments, parse_known, provenance_of, require_element_size
+from naibu.workflows.parallel.run_tasks import run_tasks
+from naibu.workflows.parallel.task import Outcome, Task
+from naibu.workflows.parallel.worker_count import Workers
 from naibu.workflows.results.output_folder import output_folder
 from naibu.workflows.results.result_folder import COMPARISON_FILE, read_comparison, write_comparison
 
@@ -24,6 +28,8 @@ def compare(
     known: Sequence[str] = (),
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
+    workers: int = 1,
+    cluster: str | None = None,
     progress: Progress | None = None,
 ) -> list[ModelRow]:
     """Calibrate several models on the same experiments, and predict each experiment from the others with each of them.
@@ -41,8 +47,11 @@ def compare(
         repeated.
     overwrite : bool
         Whether what `out` holds is discarded and all is computed anew.
+    workers, cluster
+        Where candidates are computed, one a task (`naibu.workflows.parallel.worker_count.Workers`).
     progress : callable, optional
-        Gets reports whose stages name the candidate, and the experiment left out (`naibu.core.progress`).
+        Gets reports whose stages name the candidate, and the experiment left out (`naibu.core.progress`); "candidates" where workers
+        compute them.
 
     Returns
     -------
@@ -53,7 +62,10 @@ def compare(
     ------
     InputError
         Unusable input, or no candidate.
+    WorkerLostError
+        The worker of a candidate died twice; the rows of the others have been written.
     """
+    where = Workers(workers, cluster)
     if not candidates:
         raise InputError("candidates is empty; give at least one model to compare")
     loaded = load_experiments(experiments)
@@ -65,23 +77,37 @@ def compare(
     folder = None if out is None else output_folder(out)
     if folder is not None and overwrite:
         (folder / COMPARISON_FILE).unlink(missing_ok=True)
-    rows: list[ModelRow] = []
-    for settings in candidates:
-        provenance = provenance_of(loaded, known, {}, settings)
-        row = read_comparison(folder, provenance) if folder is not None else None
-        if row is None:
-            row = compare_models(loaded, [settings], known_materials=known_materials, progress=_of_candidate(progress, settings))[0]
+    provenance = [provenance_of(loaded, known, {}, settings) for settings in candidates]
+    rows = [None if folder is None else read_comparison(folder, each) for each in provenance]
+    missing = [k for k, row in enumerate(rows) if row is None]
+
+    def keep(index: int, outcome: Outcome) -> None:
+        if outcome.error is None:
+            rows[missing[index]] = row = outcome.result[0]
             if folder is not None:
-                write_comparison(folder, provenance, row)
-        rows.append(row)
-    return rows
+                write_comparison(folder, provenance[missing[index]], row)
+
+    given = {"experiments": loaded, "known_materials": known_materials}
+    tasks = [Task(_named(candidates[k]), compare_models, {**given, "candidates": [candidates[k]]}) for k in missing]
+    if where.elsewhere:
+        outcomes = run_tasks(tasks, workers=where, memory_mb=MEMORY_MB, stage="candidates", finished=keep, progress=progress)
+        for outcome in outcomes:
+            outcome.value()
+    else:
+        for index, task in enumerate(tasks):
+            keep(index, Outcome(compare_models(**task.arguments, progress=_of_candidate(progress, candidates[missing[index]]))))
+    return [row for row in rows if row is not None]
+
+
+def _named(settings: ModelSettings) -> str:
+    return f"{settings.law}, {settings.contact}, {settings.joined}"
 
 
 def _of_candidate(progress: Progress | None, settings: ModelSettings) -> Progress | None:
     """Report the steps of one candidate under its name."""
     if progress is None:
         return None
-    name = f"{settings.law}, {settings.contact}, {settings.joined}"
+    name = _named(settings)
 
     def passed_on(report: ProgressReport) -> None:
         stage = name if report.stage == "calibration" else f"{name} {report.stage}"

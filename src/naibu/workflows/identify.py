@@ -21,10 +21,12 @@ from naibu.identification.from_markers.observations import MarkerLoadCase
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.baselines import affine, baselines, equilibrium_gap_baseline
 from naibu.identification.prediction.calibrated_model import CalibratedModel
-from naibu.identification.prediction.cross_validation import LeftOut, leave_one_out
+from naibu.identification.prediction.cross_validation import LeftOut
 from naibu.identification.prediction.prediction import rms
 from naibu.identification.verdict import Verdict
+from naibu.workflows.cross_validation import left_out_in_turn
 from naibu.workflows.experiments import Source, load_experiments, parse_known, provenance_of, require_element_size, require_loaded
+from naibu.workflows.parallel.worker_count import Workers
 from naibu.workflows.results.output_folder import output_folder
 from naibu.workflows.results.result_folder import (
     CHECKPOINT_FILE,
@@ -74,6 +76,8 @@ def identify(
     cross_validate: bool = False,
     resume: bool = True,
     overwrite: bool = False,
+    workers: int = 1,
+    cluster: str | None = None,
     progress: Progress | None = None,
 ) -> Identification:
     """Identify materials, friction and boundary conditions from experiments, and write model, tables and report.
@@ -102,9 +106,11 @@ def identify(
         Continue from the checkpoint of an interrupted search with the same inputs and settings in `out`.
     overwrite : bool
         Whether results, or other files of these names, that `out` holds already are replaced.
+    workers, cluster
+        Where experiments are predicted from the others, one a task (`naibu.workflows.parallel.worker_count.Workers`).
     progress : callable, optional
         Gets reports of the stages "calibration on larger elements" (of large meshes), "calibration" and, with `cross_validate`, "without
-        EXPERIMENT" (`naibu.core.progress`).
+        EXPERIMENT" (`naibu.core.progress`); "experiments left out" where workers compute them.
 
     Returns
     -------
@@ -118,7 +124,14 @@ def identify(
     ConvergenceError
         A state cannot be solved at the starting values, or, with `cross_validate`, with an experiment left out; in the latter case the
         model has been written.
+    WorkerLostError
+        The worker that predicted an experiment died twice; the model has been written.
     """
+    where = Workers(workers, cluster)
+    if where.elsewhere and not cross_validate:
+        raise InputError(
+            "`workers` and `cluster` share out the experiments that `cross_validate` leaves out; ask for that, or leave them out"
+        )
     loaded = load_experiments(experiments)
     known_materials, chosen = parse_known(known), settings or ModelSettings()
     require_element_size(loaded, chosen.element_size_mm)
@@ -146,7 +159,7 @@ def identify(
     verdict = verdict_of(calibration, doubts, outliers)
     model = replace(CalibratedModel.of(calibration, provenance), reservation=verdict.reservation)
     left_in_turn = [_with_states(e, states or {}) for e in loaded] if cross_validate else []
-    result, trouble = _compared(calibration, model, verdict, left_in_turn, progress)
+    result, trouble = _compared(calibration, model, verdict, left_in_turn, where, progress)
     if folder is not None:
         write_identification(folder, calibration, model, verdict, result.baselines, result.left_out)
         if result.interrupted:
@@ -194,12 +207,18 @@ def _with_states(experiment: Experiment, states: Mapping[str, Sequence[str]]) ->
 
 
 def _compared(
-    calibration: Calibration, model: CalibratedModel, verdict: Verdict, left_in_turn: Sequence[Experiment], progress: Progress | None
+    calibration: Calibration,
+    model: CalibratedModel,
+    verdict: Verdict,
+    left_in_turn: Sequence[Experiment],
+    where: Workers,
+    progress: Progress | None,
 ) -> tuple[Identification, NaibuError | None]:
     """Compute what the calibration is compared with; what goes wrong here is returned, so that the model is written first."""
     compared: dict[str, dict[str, float]] = {}
     left_out: tuple[LeftOut, ...] = ()
-    interrupted, trouble = calibration.match.status is Status.INTERRUPTED, None
+    interrupted = calibration.match.status is Status.INTERRUPTED
+    trouble: NaibuError | None = None
     values = model.parameters.values()
 
     try:
@@ -208,14 +227,7 @@ def _compared(
             for label, distance in equilibrium_gap_baseline(calibration).items():
                 compared[label]["equilibrium gap"] = distance
         if not interrupted and left_in_turn:
-            found = leave_one_out(
-                left_in_turn,
-                known_materials=calibration.known_materials,
-                settings=calibration.settings,
-                reference=calibration,
-                progress=progress,
-            )
-            left_out = tuple(found)
+            left_out, trouble = left_out_in_turn(left_in_turn, calibration, where, progress)
     except KeyboardInterrupt:
         interrupted = True
     except NaibuError as error:

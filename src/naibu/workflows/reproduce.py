@@ -13,15 +13,18 @@ from typing import Any
 from naibu._version import __version__
 from naibu.core.arrays import require_count
 from naibu.core.errors import InputError
-from naibu.core.progress import Progress, report_progress
+from naibu.core.progress import Progress
 from naibu.io.files.atomic import write_atomically
 from naibu.reproduction.chapters import CHAPTERS, PROCESSOR_S
 from naibu.viewer.chapter import Chapter
-from naibu.viewer.chapter_page import write_chapter
+from naibu.viewer.chapter_page import chapter_html, chapter_numbers_text, write_chapter
 from naibu.viewer.page_frame import page_html
+from naibu.workflows.parallel.run_tasks import run_tasks
+from naibu.workflows.parallel.task import Outcome, Task
+from naibu.workflows.parallel.worker_count import Workers
 from naibu.workflows.results.output_folder import output_folder
 
-ALL = "all"
+MEMORY_MB = 1500.0  # of the largest chapter
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +101,13 @@ def processor_seconds(chapters: tuple[str, ...]) -> float:
 
 
 def reproduce_all(
-    out: str | os.PathLike[str], *, seed: int = 0, overwrite: bool = False, progress: Progress | None = None
+    out: str | os.PathLike[str],
+    *,
+    seed: int = 0,
+    overwrite: bool = False,
+    workers: int = 1,
+    cluster: str | None = None,
+    progress: Progress | None = None,
 ) -> tuple[Path, tuple[ReproducedChapter, ...]]:
     """Recompute all chapters, and write ``index.html`` over them: what each has, and what its notes say of agreement and misprints.
 
@@ -112,8 +121,10 @@ def reproduce_all(
         Seed of the random numbers.
     overwrite : bool
         Whether all chapters are computed again.
+    workers, cluster
+        Where chapters are computed, one a task (`naibu.workflows.parallel.worker_count.Workers`); the folder is written here.
     progress : callable, optional
-        Called with a `ProgressReport` before every chapter.
+        Called with a `ProgressReport` after every chapter.
 
     Returns
     -------
@@ -124,7 +135,10 @@ def reproduce_all(
     ------
     InputError
         A negative seed, a folder that cannot be written to, or one that holds other results, as of another seed.
+    WorkerLostError
+        The worker of a chapter died twice; the other chapters have been written.
     """
+    where = Workers(workers, cluster)
     require_count("seed", seed, 0)
     folder = Path(out)
     left = tuple(CHAPTERS) if overwrite else missing_chapters(folder, seed)
@@ -133,16 +147,31 @@ def reproduce_all(
     if overwrite or len(left) == len(CHAPTERS):  # else the index is that of an earlier run
         written.append("index.html")
     output_folder(folder, written, overwrite=overwrite)
-    done: list[ReproducedChapter] = []
+    seconds: dict[str, float] = {}
+
+    def write(index: int, outcome: Outcome) -> None:
+        if outcome.error is None:
+            page, numbers, seconds[left[index]] = outcome.result
+            write_atomically(folder / f"{left[index]}.html", page)
+            write_atomically(folder / f"{left[index]}.json", numbers)
+
+    tasks = [Task(f"chapter {name}", _computed, {"name": name, "seed": seed}) for name in left]
+    outcomes = run_tasks(tasks, workers=where, memory_mb=MEMORY_MB, stage="chapters", finished=write, progress=progress)
+    for outcome in outcomes:
+        outcome.value()
+    done = []
     for name in CHAPTERS:
-        report_progress(progress, f"reproduce {name}", done=len(done), total=len(CHAPTERS))
         files = folder / f"{name}.html", folder / f"{name}.json"
-        kept = None if name in left else _finished(folder, name, seed)
-        began = time.perf_counter()
-        title = str(kept["title"]) if kept is not None else reproduce(name, out=folder, seed=seed, overwrite=True)[0].title
-        seconds = float("nan") if kept is not None else time.perf_counter() - began
-        done.append(ReproducedChapter(name, title, *files, kept is not None, seconds))
+        title = str(json.loads(files[1].read_text(encoding="utf-8"))["title"])
+        done.append(ReproducedChapter(name, title, *files, name not in seconds, seconds.get(name, float("nan"))))
     return write_atomically(folder / "index.html", _index(done, seed)), tuple(done)
+
+
+def _computed(name: str, seed: int, progress: Progress | None) -> tuple[str, str, float]:
+    """Return page and numbers of a chapter as texts, which any worker can send, and how long that took, s."""
+    began = time.perf_counter()
+    content = CHAPTERS[name](seed)
+    return chapter_html(content), chapter_numbers_text(content), time.perf_counter() - began
 
 
 def _finished(folder: Path, name: str, seed: int) -> dict[str, Any] | None:

@@ -8,7 +8,6 @@ are estimated together, so that the covariance of the material parameters includ
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -16,6 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from naibu.core.arrays import FloatArray
+from naibu.core.cores import usable_cores
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.parameters import ParameterSet
 from naibu.core.progress import Progress, report_progress
@@ -167,7 +167,7 @@ class Matcher:
 
         if len(self.load_cases) == 1:
             return [one(0)]
-        with ThreadPoolExecutor(min(len(self.load_cases), os.cpu_count() or 1), initializer=use_one_thread) as pool:
+        with ThreadPoolExecutor(min(len(self.load_cases), usable_cores()), initializer=use_one_thread) as pool:
             return list(pool.map(one, range(len(self.load_cases))))
 
     def _evaluate_one(

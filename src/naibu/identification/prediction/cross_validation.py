@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from naibu.core.cores import usable_cores
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.experiment import Experiment
 from naibu.core.progress import Progress, ProgressReport
@@ -17,7 +17,7 @@ from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration, calibrate
 from naibu.identification.from_markers.gauss_newton import MatchingSettings
 from naibu.identification.from_markers.known_materials import KnownMaterials
-from naibu.identification.from_markers.observations import NoiseModel
+from naibu.identification.from_markers.observations import NoiseModel, SolvedLoadCase
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.prediction import Prediction, predict_state, rms
@@ -121,28 +121,19 @@ def leave_one_out(
     stop = threading.Event()
 
     def without(left: Experiment) -> list[LeftOut]:
-        others = [e for e in experiments if e is not left]
-        found = calibrate(
-            others,
-            known_materials=_applicable(known_materials, others),
+        return predicted_from_others(
+            experiments,
+            left.name,
+            known_materials=known_materials,
             settings=settings,
             noise=noise,
             search=search,
             start=start,
             warm_starts=warm_starts,
-            progress=_under_stage(progress, f"without {left.name}", stop),
+            progress=_until(progress, stop),
         )
-        if found.match.status is Status.INTERRUPTED:
-            raise KeyboardInterrupt
-        model = CalibratedModel.of(found)
-        return [
-            _left_out(
-                predict_state(model, left, state.name, heights_from_markers=True, warm_start=warm_starts.get(f"{left.name}/{state.name}"))
-            )
-            for state in left.loaded_states
-        ]
 
-    with ThreadPoolExecutor(min(len(experiments), os.cpu_count() or 1), initializer=use_one_thread) as pool:
+    with ThreadPoolExecutor(min(len(experiments), usable_cores()), initializer=use_one_thread) as pool:
         turns = [pool.submit(without, left) for left in experiments]
         try:
             return [row for turn in turns for row in turn.result()]
@@ -150,6 +141,62 @@ def leave_one_out(
             stop.set()
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def predicted_from_others(
+    experiments: Sequence[Experiment],
+    left_out: str,
+    *,
+    known_materials: KnownMaterials | None = None,
+    settings: ModelSettings | None = None,
+    noise: NoiseModel | None = None,
+    search: MatchingSettings | None = None,
+    start: Mapping[str, float] | None = None,
+    warm_starts: Mapping[str, SolvedLoadCase] | None = None,
+    progress: Progress | None = None,
+) -> list[LeftOut]:
+    """Predict all loaded states of one experiment with a model calibrated on the others: a part of `leave_one_out`.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+        Two at least.
+    left_out : str
+        Name of the one that is predicted.
+    known_materials, settings, noise, search, start, warm_starts : optional
+        As for `calibrate`.
+    progress : callable, optional
+        Gets a report after every step of the calibration, its stage "without EXPERIMENT".
+
+    Raises
+    ------
+    InputError
+        The others do not contain a material which the one left out needs.
+    ConvergenceError
+        A load case cannot be solved.
+    KeyboardInterrupt
+        The user stopped the calibration.
+    """
+    left = next(e for e in experiments if e.name == left_out)
+    others = [e for e in experiments if e is not left]
+    near = {} if warm_starts is None else warm_starts
+    found = calibrate(
+        others,
+        known_materials=_applicable(known_materials, others),
+        settings=settings,
+        noise=noise,
+        search=search,
+        start=start,
+        warm_starts=near,
+        progress=_under_stage(progress, f"without {left.name}"),
+    )
+    if found.match.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt
+    model = CalibratedModel.of(found)
+    return [
+        _left_out(predict_state(model, left, state.name, heights_from_markers=True, warm_start=near.get(f"{left.name}/{state.name}")))
+        for state in left.loaded_states
+    ]
 
 
 def _applicable(known_materials: KnownMaterials | None, experiments: Sequence[Experiment]) -> KnownMaterials | None:
@@ -161,14 +208,19 @@ def _applicable(known_materials: KnownMaterials | None, experiments: Sequence[Ex
     return KnownMaterials(known, known_materials.scale_is_absolute) if known else None
 
 
-def _under_stage(progress: Progress | None, stage: str, stop: threading.Event) -> Progress:
-    """Report the steps of a calibration as a stage of another name, and end it where it was stopped from another thread."""
+def _under_stage(progress: Progress | None, stage: str) -> Progress | None:
+    """Report the steps of a calibration as a stage of another name."""
+    return None if progress is None else lambda report: progress(replace(report, stage=stage))
+
+
+def _until(progress: Progress | None, stop: threading.Event) -> Progress:
+    """Pass reports on, and end the calibration where it was stopped from another thread."""
 
     def passed_on(report: ProgressReport) -> None:
         if stop.is_set():
             raise KeyboardInterrupt
         if progress is not None:
-            progress(replace(report, stage=stage))
+            progress(report)
 
     return passed_on
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,6 +11,7 @@ import numpy as np
 
 from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.cores import usable_cores
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 from naibu.mechanics.linear_algebra.direct import pardiso_library, use_threads
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
@@ -104,7 +104,7 @@ class TangentThread:
 
     def _run(self) -> None:
         if pardiso_library() is not None:
-            use_threads(max(1, (os.cpu_count() or 2) - 1))
+            use_threads(max(1, usable_cores() - 1))
         while True:
             with self._wake:
                 while self._work is None and not self._closed:

@@ -1,0 +1,54 @@
+"""Leave-one-out cross-validation of a calibration, in this process or on workers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from naibu.core.errors import NaibuError
+from naibu.core.experiment import Experiment
+from naibu.core.progress import Progress
+from naibu.identification.from_markers.calibration import Calibration
+from naibu.identification.prediction.cross_validation import LeftOut, leave_one_out, predicted_from_others
+from naibu.workflows.parallel.run_tasks import run_tasks
+from naibu.workflows.parallel.task import Task
+from naibu.workflows.parallel.worker_count import Workers
+
+MEMORY_MB = 900.0  # of a calibration of one of the bundled experiments with its libraries
+
+
+def left_out_in_turn(
+    experiments: Sequence[Experiment], reference: Calibration, where: Workers, progress: Progress | None
+) -> tuple[tuple[LeftOut, ...], NaibuError | None]:
+    """Predict every experiment from the others; return what was found, and the error of an experiment that could not be predicted.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+        Those of the calibration.
+    reference : Calibration
+        The calibration on all of them, from whose solutions the others start.
+    where : Workers
+        Where they are computed, one experiment a task.
+    progress : callable, optional
+        Gets the reports of `leave_one_out`, or of the stage "experiments left out" where workers compute.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        The user stopped it.
+    """
+    common: dict[str, Any] = {"known_materials": reference.known_materials, "settings": reference.settings}
+    if not where.elsewhere or len(experiments) < 2:
+        try:
+            return tuple(leave_one_out(experiments, **common, reference=reference, progress=progress)), None
+        except NaibuError as error:
+            return (), error
+    given = {"experiments": experiments, **common, "start": reference.match.parameters.values(), "warm_starts": reference.warm_starts}
+    tasks = [Task(f"without {e.name}", predicted_from_others, {**given, "left_out": e.name}) for e in experiments]
+    outcomes = run_tasks(tasks, workers=where, memory_mb=MEMORY_MB, stage="experiments left out", progress=progress)
+    errors = [outcome.error for outcome in outcomes if outcome.error is not None]
+    if unexpected := next((error for error in errors if not isinstance(error, NaibuError)), None):
+        raise unexpected
+    rows = tuple(row for outcome in outcomes if outcome.error is None for row in outcome.result)
+    return rows, next((error for error in errors if isinstance(error, NaibuError)), None)

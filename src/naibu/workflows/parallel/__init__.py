@@ -1,0 +1,1 @@
+"""Independent tasks on this computer's processes or on a Dask cluster."""

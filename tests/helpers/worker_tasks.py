@@ -1,0 +1,41 @@
+"""Tasks that worker processes compute in tests."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+from naibu.core.errors import ConvergenceError
+from naibu.core.progress import Progress, report_progress
+
+
+def square(number: float, progress: Progress | None) -> float:
+    report_progress(progress, "squaring", done=1, total=2)
+    return number * number
+
+
+def threads_seen(progress: Progress | None) -> tuple[int, str]:
+    import numba
+
+    print("noise on standard output")
+    return numba.get_num_threads(), os.environ["OMP_NUM_THREADS"]
+
+
+def failing(progress: Progress | None) -> None:
+    raise ConvergenceError("cannot be solved")
+
+
+def dying(times: int, counter: str, progress: Progress | None) -> int:
+    """Kill its own process the first `times` times; return how often it was begun."""
+    begun = Path(counter)
+    with begun.open("a") as file:
+        file.write("x")
+    count = len(begun.read_text())
+    if count <= times:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return count
+
+
+def sleeping(seconds: float, pid_file: str, progress: Progress | None) -> None:
+    Path(pid_file).write_text(str(os.getpid()))
+    time.sleep(seconds)

@@ -1,0 +1,147 @@
+"""Tasks on worker processes: results, deaths, failures, interruption."""
+
+import os
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+import worker_tasks
+
+from naibu.core.cores import usable_cores
+from naibu.core.errors import ConvergenceError, InputError, WorkerLostError
+from naibu.core.progress import ProgressReport
+from naibu.workflows.parallel.run_tasks import run_tasks
+from naibu.workflows.parallel.task import Outcome, Task
+from naibu.workflows.parallel.worker_count import Workers
+
+TWO = Workers(2)
+
+
+def squares(count: int) -> list[Task]:
+    return [Task(f"square {k}", worker_tasks.square, {"number": float(k)}, measured=True) for k in range(count)]
+
+
+def note(indices: list[int], index: int, outcome: Outcome) -> None:
+    indices.append(index)
+
+
+def gone(pid: int, within_s: float = 10.0) -> bool:
+    end = time.monotonic() + within_s
+    while time.monotonic() < end:
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+def test_results_come_in_order_whatever_the_number_of_workers() -> None:
+    expected = [k * k for k in range(7)]
+    for workers in (Workers(1), TWO):
+        finished: list[int] = []
+        reports: list[ProgressReport] = []
+        outcomes = run_tasks(squares(7), workers=workers, finished=partial(note, finished), progress=reports.append, stage="squares")
+        assert [o.value() for o in outcomes] == expected
+        assert sorted(finished) == list(range(7))
+        assert reports[0].done == 0 and reports[-1].done == 7
+        assert {(r.stage, r.total) for r in reports} == {("squares", 7)}
+        assert any(r.done % 1 == 0.5 for r in reports if r.done is not None) or workers is TWO  # workers leave out what comes too often
+
+
+def test_a_killed_worker_costs_its_task_only_which_is_begun_again(tmp_path: Path) -> None:
+    once = Task("once", worker_tasks.dying, {"times": 1, "counter": str(tmp_path / "once")})
+    always = Task("always", worker_tasks.dying, {"times": 99, "counter": str(tmp_path / "always")})
+    outcomes = run_tasks([once, *squares(3), always, *squares(3)], workers=TWO)
+    assert outcomes[0].value() == 2 and outcomes[0].attempts == 2
+    assert [o.value() for o in outcomes[1:4]] == [o.value() for o in outcomes[5:]] == [0, 1, 4]
+    with pytest.raises(WorkerLostError, match=r"always: its worker died twice \(killed by SIGKILL\)"):
+        outcomes[4].value()
+    assert (tmp_path / "always").read_text() == "xx"
+
+
+def test_an_exception_is_that_of_its_task_and_is_not_tried_again() -> None:
+    for workers in (Workers(1), TWO):
+        outcomes = run_tasks([Task("failing", worker_tasks.failing), *squares(2)], workers=workers)
+        assert isinstance(outcomes[0].error, ConvergenceError) and outcomes[0].attempts == 1
+        assert str(outcomes[0].error) == "cannot be solved"
+        assert [o.value() for o in outcomes[1:]] == [0, 1]
+
+
+def test_workers_share_the_cores() -> None:
+    outcomes = run_tasks([Task("threads", worker_tasks.threads_seen)] * 2, workers=TWO)
+    each = max(1, usable_cores() // 2)
+    assert [o.value() for o in outcomes] == [(each, str(each))] * 2
+
+
+def test_an_interruption_ends_the_workers_and_keeps_what_is_finished(tmp_path: Path) -> None:
+    pid_file = tmp_path / "pid"
+    kept: list[int] = []
+
+    def progress(report: ProgressReport) -> None:
+        if kept and pid_file.is_file():
+            raise KeyboardInterrupt
+
+    tasks = [Task("sleeping", worker_tasks.sleeping, {"seconds": 600.0, "pid_file": str(pid_file)}), *squares(2)]
+    with pytest.raises(KeyboardInterrupt):
+        run_tasks(tasks, workers=TWO, finished=lambda k, _: kept.append(k), progress=progress)
+    assert set(kept) <= {1, 2} and kept
+    assert gone(int(pid_file.read_text()))
+
+
+def test_workers_end_with_the_process_that_wanted_them(tmp_path: Path) -> None:
+    pid_file = tmp_path / "pid"
+    program = (
+        "import worker_tasks; from naibu.workflows.parallel.run_tasks import run_tasks; from naibu.workflows.parallel.task import Task\n"
+        "from naibu.workflows.parallel.worker_count import Workers\n"
+        f"run_tasks([Task('s', worker_tasks.sleeping, dict(seconds=600.0, pid_file={str(pid_file)!r}))] * 2, workers=Workers(2))"
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    parent = subprocess.Popen([sys.executable, "-c", program], env=environment)
+    try:
+        end = time.monotonic() + 60.0
+        while not (pid_file.is_file() and pid_file.read_text()) and time.monotonic() < end:
+            time.sleep(0.05)
+    finally:
+        parent.kill()
+        parent.wait()
+    assert gone(int(pid_file.read_text()))
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"workers": -1}, "workers is -1"),
+        ({"workers": 10_000}, "workers is 10000"),
+        ({"workers": 2, "cluster": "tcp://a:1"}, "one of the two"),
+        ({"cluster": "somewhere"}, "address"),
+    ],
+)
+def test_numbers_of_workers_that_cannot_be(given: dict, told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        Workers(**given)
+
+
+def test_as_many_workers_as_cores_memory_and_tasks_allow() -> None:
+    assert Workers(0).processes(1, 1.0) == 1
+    assert Workers(0).processes(1000, 1.0) == usable_cores()
+    assert Workers(0).processes(1000, 1e12) == 1
+    assert Workers(3).processes(2, 1e12) == 2
+
+
+def test_a_cluster_computes_the_same_and_an_absent_one_is_told() -> None:
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, protocol="tcp") as cluster:
+        outcomes = run_tasks([Task("failing", worker_tasks.failing), *squares(3)], workers=Workers(cluster=cluster.scheduler_address))
+    assert isinstance(outcomes[0].error, ConvergenceError)
+    assert [o.value() for o in outcomes[1:]] == [0, 1, 4]
+
+
+def test_an_absent_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("naibu.workflows.parallel.cluster.ANSWER_S", 0.5)
+    with pytest.raises(InputError, match="no Dask scheduler answers there"):
+        run_tasks(squares(1), workers=Workers(cluster="tcp://127.0.0.1:9"))
