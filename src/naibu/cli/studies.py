@@ -45,6 +45,7 @@ def reproduce(
         Replace results, or files of your own, that the folder already holds.
     """
     from naibu.reproduction.chapters import CHAPTERS
+    from naibu.workflows.parallel.worker_count import Workers
     from naibu.workflows.reproduce import missing_chapters, processor_seconds, reproduce_all
     from naibu.workflows.reproduce import reproduce as reproduced
 
@@ -52,6 +53,7 @@ def reproduce(
     if chapter != "all" and where is not None:
         raise InputError(f"`workers` and `cluster` share out the chapters of `reproduce all`; {chapter} is one: leave them out")
     if chapter == "all":
+        Workers(**(where or WorkerOptions()).arguments)  # what cannot be is refused before anything is said
         left = tuple(CHAPTERS) if overwrite else missing_chapters(out, seed)
         minutes = processor_seconds(left) / 60.0
         errors.print(
