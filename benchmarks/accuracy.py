@@ -1,19 +1,18 @@
-"""How well the bundled measurements are matched and predicted, with default settings: ``python benchmarks/accuracy.py [OUT.json]``.
+"""How well the bundled measurements are matched and predicted, with default settings: ``python benchmarks/accuracy.py``.
 
 Prints one line for each claim: RMS distance (3-D, mm) over the markers that were measured completely in both states; and for every
 predicted state how many of its coordinates lie within 1.96 of their standard deviations (``sd_mm`` of ``predicted.csv``).
-``--only left-out``, ``plate`` or ``single`` runs a part.
+``--only left-out``, ``plate`` or ``single`` runs a part, ``--record`` writes ``results/accuracy.json``.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
+from records import ResultTable, write_record
 
 import naibu
 from naibu.identification.from_markers.calibration import Calibration
@@ -34,16 +33,17 @@ def fitted(calibration: Calibration) -> dict[str, float]:
 
 @dataclass(slots=True)
 class Rows:
-    """Lines of the table, printed as they come, and the coordinates that lay within their bounds."""
+    """Lines of the tables, printed as they come, and the coordinates that lay within their bounds."""
 
-    lines: list[tuple[str, str, float, float]] = field(default_factory=list)
+    distances: list[tuple[str, str, float, float]] = field(default_factory=list)
+    bounds: list[tuple[str, str, float, int]] = field(default_factory=list)
     inside: list[np.ndarray] = field(default_factory=list)
     start: float = field(default_factory=time.perf_counter)
 
     def add(self, what: str, values: dict[str, float], goal: float) -> None:
         """Print distances."""
         for label, value in values.items():
-            self.lines.append((what, label, value, goal))
+            self.distances.append((label, what, round(value, 3), goal))
             seconds = time.perf_counter() - self.start
             print(f"{what:28s} {label:36s} {value:6.3f} mm   goal {goal:.2f}   {seconds:6.1f} s", flush=True)
 
@@ -55,7 +55,17 @@ class Rows:
         self.inside.append(inside.ravel())
         sd = f"sd_model_mm {np.median(per_axis(p.sd_model_mm)):.2f}, sd_mm {np.median(per_axis(p.sd_mm)):.2f}"
         print(f"{what:28s} {label:36s} {100 * inside.mean():5.1f} % within, {100 * along.mean():5.1f} % by axis; {sd}", flush=True)
-        self.lines.append((f"{what}, within 95 % bounds", label, float(inside.mean()), 0.95))
+        self.bounds.append((label, what, round(100.0 * float(inside.mean()), 1), inside.size))
+
+    @property
+    def tables(self) -> tuple[ResultTable, ResultTable]:
+        """Distances and bounds, as a record holds them."""
+        every = np.concatenate(self.inside)
+        total = ("all", "", round(100.0 * float(every.mean()), 1), every.size)
+        return (
+            ResultTable("distances", ("experiment", "evaluation", "distance, mm", "goal, mm"), tuple(self.distances)),
+            ResultTable("bounds", ("experiment", "prediction", "within 95 % bounds, %", "coordinates"), (*self.bounds, total)),
+        )
 
 
 def left_out(rows: Rows) -> None:
@@ -87,8 +97,9 @@ def plate(rows: Rows) -> None:
 def main() -> None:
     """Run all cases and print a table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("out", nargs="?", type=Path, help="also write the rows to this JSON file")
-    parser.add_argument("--only", choices=("left-out", "plate", "single"), help="run one part")
+    part = parser.add_mutually_exclusive_group()
+    part.add_argument("--only", choices=("left-out", "plate", "single"), help="run one part")
+    part.add_argument("--record", action="store_true", help="write results/accuracy.json")
     options = parser.parse_args()
     rows = Rows()
     if options.only in (None, "left-out"):
@@ -101,8 +112,8 @@ def main() -> None:
     if rows.inside:
         inside = np.concatenate(rows.inside)
         print(f"{100 * inside.mean():.1f} % of {len(inside)} predicted coordinates lie within their bounds of 95 %")
-    if options.out:
-        options.out.write_text(json.dumps([list(r) for r in rows.lines], indent=1))
+    if options.record:
+        write_record("accuracy", rows.tables)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ Noise is normal, independent at every point, and given as a fraction of the larg
 `unseen` measure the nodes of the mesh that made the data and use its elements as given, as the report does: they show what noise does, and
 nothing of the errors of elements. `inclusion` and `large` measure a grid of points in a body that was solved on a finer mesh; `coverage`,
 random points in bodies that were solved by other code. Every row ends with the goal and whether it was met.
+`coverage --record` writes ``results/field_identification.json``.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from records import ResultTable, write_record
 
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.mesh import Mesh
@@ -233,17 +235,21 @@ def large(seeds: int, repetitions: int) -> None:
     timed_ball(26, 36, np.inf)
 
 
-def coverage(seeds: int, repetitions: int) -> None:
+def coverage(seeds: int, repetitions: int) -> ResultTable:
     """Errors and intervals on three bodies of quadratic hexahedra with other code, 400 points, noise 1 %, one push."""
     print(f"\n(f) bodies solved by other code (27-node hexahedra), 400 points, noise 1 %; {repetitions} draws of points and noise")
     print("cells  a side  body      mean error   RMS error   stated SD   95 % intervals that hold E   nu         seconds each")
+    rows = []
     for cell_type, cells, draws in (("hexahedron", 10, repetitions), ("tetra", 6, repetitions), ("tetra", 10, max(1, repetitions // 10))):
-        for name in SHAPES:
-            covered(name, cell_type, cells, draws)
+        rows += [covered(name, cell_type, cells, draws) for name in SHAPES]
+    columns = (
+        "body", "cells", "a side", "mean error of E, %", "RMS error, %", "stated SD, %", "95 % intervals that hold E", "and nu"
+    )  # fmt: skip
+    return ResultTable("coverage", columns, tuple(rows))
 
 
-def covered(name: str, cell_type: str, cells: int, draws: int) -> None:
-    """Print a row of `coverage`."""
+def covered(name: str, cell_type: str, cells: int, draws: int) -> tuple[str | float | int, ...]:
+    """Print and return a row of `coverage`."""
     body = QuadraticBody(name)
     solved = body.solved((0.0, 0.0, -4.0))
     mesh, loaded = body.model(cells, cell_type)
@@ -265,9 +271,11 @@ def covered(name: str, cell_type: str, cells: int, draws: int) -> None:
         f"{int(of_young.sum()):4d} of {draws} {int(of_poisson.sum()):12d} of {draws} {(time.process_time() - start) / draws:10.1f}",
         bool(abs(bias) <= 0.02 and inside),
     )
+    errors = (round(100 * float(value), 2) for value in (bias, rms, stated.mean()))
+    return (name, cell_type, cells, *errors, f"{int(of_young.sum())} of {draws}", f"{int(of_poisson.sum())} of {draws}")
 
 
-STUDIES: dict[str, Callable[[int, int], None]] = {
+STUDIES: dict[str, Callable[[int, int], ResultTable | None]] = {
     "elements": elements, "regions": regions, "unseen": unseen, "inclusion": inclusion, "large": large, "coverage": coverage,
 }  # fmt: skip
 
@@ -278,9 +286,13 @@ def main() -> None:
     parser.add_argument("studies", nargs="*", help=f"any of {', '.join(STUDIES)}; all by default")
     parser.add_argument("--seeds", type=int, default=20, help="draws of noise in `elements` and `unseen`")
     parser.add_argument("--repetitions", type=int, default=100, help="draws of noise in `regions`")
+    parser.add_argument("--record", action="store_true", help="write results/field_identification.json, with `coverage`")
     chosen = parser.parse_args()
-    for name in chosen.studies or STUDIES:
-        STUDIES[name](chosen.seeds, chosen.repetitions)
+    if chosen.record and "coverage" not in chosen.studies:
+        parser.error("--record goes with the study `coverage`")
+    tables = [STUDIES[name](chosen.seeds, chosen.repetitions) for name in chosen.studies or STUDIES]
+    if chosen.record:
+        write_record("field_identification", [table for table in tables if table is not None])
 
 
 if __name__ == "__main__":

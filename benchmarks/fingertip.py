@@ -2,7 +2,8 @@
 
 Prints, for ever finer meshes, nodes, processor time and the loads on the chip under a press of 3 N at 20 degrees; then the errors and
 intervals of forces that a decoder, trained on the default mesh, gives for presses on a finer mesh with other tilts, frictions and moduli;
-the time of a reading; and how much the sensitivity to slip differs between presses. ``--quick`` does the same on coarse meshes.
+the time of a reading; and how much the sensitivity to slip differs between presses.
+``--quick`` does the same on coarse meshes, ``--record`` writes ``results/fingertip.json``.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import argparse
 import time
 
 import numpy as np
+from records import ResultTable, write_record
 
 from naibu.applications.fingertip.decoder import ForceDecoder, Training, directions, train_decoder, true_contact
 from naibu.applications.fingertip.fingertip import Fingertip, FingertipResolution
@@ -28,8 +30,9 @@ SLIDES = (Press(15.0, 1000.0, 0.4, 2.0), Press(5.0, 600.0, 0.8, 2.0), Press(25.0
 AZIMUTH = 37.0
 
 
-def convergence(meshes: tuple[tuple[int, int, int], ...]) -> None:
+def convergence(meshes: tuple[tuple[int, int, int], ...]) -> ResultTable:
     """Print one line a mesh."""
+    rows = []
     print("mesh          nodes  processor s   depth mm   F_x mN   F_z mN   M_y N um   (3 N at 20 degrees)")
     for mesh in meshes:
         model = FingertipModel.of(Fingertip(), FingertipResolution(*mesh))
@@ -39,10 +42,13 @@ def convergence(meshes: tuple[tuple[int, int, int], ...]) -> None:
         at = pressing.at_force(np.array([3000.0]))[0]
         depth = float(pressing.interpolated(pressing.depth_mm, np.array([3000.0]))[0])
         print(f"{mesh!s:12} {model.mesh.n_points:6d} {seconds:12.1f} {depth:10.3f} {at[0]:8.2f} {at[2]:8.2f} {at[4]:10.3f}", flush=True)
+        rows.append((" x ".join(map(str, mesh)), model.mesh.n_points, *(round(float(v), 3) for v in (depth, at[0], at[2], at[4]))))
+    return ResultTable("convergence", ("mesh", "nodes", "depth, mm", "F_x, mN", "F_z, mN", "M_y, N um"), tuple(rows))
 
 
-def decoding(training_mesh: FingertipResolution, test_mesh: FingertipResolution, chain: ReadingChain) -> ForceDecoder:
-    """Print errors and intervals of decoded presses, without noise and with that of filtered readings; return the decoder."""
+def decoding(training_mesh: FingertipResolution, test_mesh: FingertipResolution, chain: ReadingChain) -> tuple[ForceDecoder, ResultTable]:
+    """Print errors and intervals of decoded presses, without noise and with that of filtered readings; return the decoder and them."""
+    table: list[tuple[float, ...]] = []
     tip, training = Fingertip(), Training()
     model = FingertipModel.of(tip, training_mesh)
     decoder = train_decoder(tip, chain, training, [model.pressed(press) for press in training.presses(tip)])
@@ -63,7 +69,13 @@ def decoding(training_mesh: FingertipResolution, test_mesh: FingertipResolution,
                 f"{most[4]:9.2f} {most[5]:5.2f}   {inside[0]:.0f} % {inside[1]:.0f} % {inside[2]:.0f} %",
                 flush=True,
             )
-    return decoder
+            shown = (noise, press.tilt_deg, press.friction, *most, min(inside))
+            table.append(tuple(round(float(value), 3) for value in shown))
+    columns = (
+        "noise", "tilt, degrees", "friction", "force, %", "its 95 %", "direction, degrees", "its 95 %", "place, mm", "its 95 %",
+        "least share inside, %",
+    )  # fmt: skip
+    return decoder, ResultTable("decoding", columns, tuple(table))
 
 
 def _errors(decoder: ForceDecoder, chain: ReadingChain, pressing: Pressing, noise: float, rng: np.random.Generator) -> FloatArray:
@@ -79,30 +91,39 @@ def _errors(decoder: ForceDecoder, chain: ReadingChain, pressing: Pressing, nois
     return np.stack([100 * relative, 100 * half, np.rad2deg(angle), found.cone_95_deg, away, found.position_95_mm], axis=1)
 
 
-def reading_time(decoder: ForceDecoder) -> None:
-    """Print the processor time of one reading in a loop."""
+def reading_time(decoder: ForceDecoder) -> float:
+    """Print and return the processor time of one reading in a loop, us."""
     reading = np.array([[0.5 * decoder.limits[1], 0.4, -0.6]])
     decoder.decode_loads(reading)
     began = time.process_time()
     for _ in range(20_000):
         decoder.decode_loads(reading)
-    print(f"\none reading: {(time.process_time() - began) / 20_000 * 1e6:.1f} us")
+    took = (time.process_time() - began) / 20_000 * 1e6
+    print(f"\none reading: {took:.1f} us")
+    return took
 
 
 def main() -> None:
     """Print all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="coarse meshes")
-    quick = parser.parse_args().quick
-    convergence(MESHES[:2] if quick else MESHES)
+    part = parser.add_mutually_exclusive_group()
+    part.add_argument("--quick", action="store_true", help="coarse meshes")
+    part.add_argument("--record", action="store_true", help="write results/fingertip.json")
+    options = parser.parse_args()
+    converged = convergence(MESHES[:2] if options.quick else MESHES)
     chain = ReadingChain.of_chip(assumed_chip(), report_readout())
-    of_training, of_test = (MESHES[1], MESHES[2]) if quick else (MESHES[3], MESHES[4])
-    reading_time(decoding(FingertipResolution(*of_training), FingertipResolution(*of_test), chain))
+    of_training, of_test = (MESHES[1], MESHES[2]) if options.quick else (MESHES[3], MESHES[4])
+    decoder, decoded = decoding(FingertipResolution(*of_training), FingertipResolution(*of_test), chain)
+    rows: list[tuple[str, float]] = [("processor time of a reading, us", round(reading_time(decoder), 1))]
     print("\nchange of M over F_z per sideways share of the force, mm:")
     model = FingertipModel.of(Fingertip(), FingertipResolution(*of_training))
     for press in SLIDES:
         value = tangential_sensitivity(model.pressed(press), chain)
-        print(f"{press.tilt_deg:4.0f} degrees, {press.force_mn:.0f} mN, friction {press.friction:g}: {value:.3f}", flush=True)
+        shown = f"{press.tilt_deg:.0f} degrees, {press.force_mn:.0f} mN, friction {press.friction:g}"
+        print(f"{shown}: {value:.3f}", flush=True)
+        rows.append((f"change of the moment over F_z per sideways share, mm ({shown})", round(float(value), 3)))
+    if options.record:
+        write_record("fingertip", (converged, decoded, ResultTable("readings", ("figure", "value"), tuple(rows))))
 
 
 if __name__ == "__main__":

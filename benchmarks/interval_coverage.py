@@ -6,7 +6,7 @@ Poisson's ratio, and the share of 95 % intervals that hold the truth.
 Predictions (``--predict``): gels under a plate, under a bar and between side plates in turn, of three laws in turn, with friction,
 Poisson's ratio, stiffness and errors of the stated platen positions of their own; calibrated at one compression, with a neo-Hookean law,
 and predicted at 1.4 to 2 times that. Prints the share of measured coordinates within 1.96 ``sd_mm``, with the platen position from the
-markers and as stated.
+markers and as stated. ``--record`` writes ``results/interval_coverage.json``, or ``results/prediction_coverage.json``.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import time
 from dataclasses import replace
 
 import numpy as np
+from records import ResultTable, write_record
 
 from naibu.core.experiment import Experiment, Loading
 from naibu.identification.from_markers.calibration import calibrate
@@ -57,7 +58,7 @@ def unseen(seed: int) -> tuple[str, Experiment]:
     return kind, replace(seen, states=(seen.states[0], *states))
 
 
-def predictions(draws: int, first: int) -> None:
+def predictions(draws: int, first: int) -> tuple[ResultTable, ...]:
     """Calibrate and predict every draw and print the summary."""
     start = time.perf_counter()
     inside: dict[bool, list[np.ndarray]] = {True: [], False: []}
@@ -72,11 +73,15 @@ def predictions(draws: int, first: int) -> None:
             share, sd = 100 * within(p).mean(), np.median(per_axis(p.sd_mm))
             line.append(f"{'from markers' if by_markers else 'stated'}: RMS {rms(p.residual):.2f} mm, sd_mm {sd:.2f}, {share:.1f} % within")
         print(f"draw {seed}, {experiment.name}: {'; '.join(line)}, {time.perf_counter() - start:.0f} s", flush=True)
+    rows = []
     for by_markers, name in ((True, "from markers"), (False, "as stated")):
         every = np.concatenate(inside[by_markers])
         least = 100 * min(w.mean() for w in inside[by_markers])
         share = f"{100 * every.mean():.1f} % of {len(every)} coordinates within their 95 % bounds"
         print(f"platen position {name}: {share}, {least:.1f} % in the worst draw")
+        rows.append((name, round(100 * float(every.mean()), 1), round(float(least), 1), len(every)))
+    columns = ("platen position", "within 95 % bounds, %", "in the worst draw, %", "coordinates")
+    return (ResultTable("predictions", columns, tuple(rows)),)
 
 
 def within(p: Prediction) -> np.ndarray:
@@ -84,17 +89,8 @@ def within(p: Prediction) -> np.ndarray:
     return np.asarray(np.abs(p.residual) < 1.96 * per_axis(p.sd_mm)[:, None]).ravel()
 
 
-def main() -> None:
+def parameters(draws: int) -> tuple[ResultTable, ...]:
     """Identify every draw and print the summary."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("draws", nargs="?", type=int, default=20, help="noisy scans to identify")
-    parser.add_argument("--predict", action="store_true", help="predictions rather than parameters")
-    parser.add_argument("--first", type=int, default=0, help="the first draw of predictions")
-    options = parser.parse_args()
-    if options.predict:
-        predictions(options.draws, options.first)
-        return
-    draws = options.draws
     template, truth = two_gels(44.0)
     virtual = virtual_specimen(template, truth, settings=ModelSettings(element_size_mm=6.0))
     inside, ratio, nu, start = [], [], [], time.perf_counter()
@@ -116,8 +112,29 @@ def main() -> None:
         print(f"draw {seed}: {errors}, intervals hold {sum(inside[-1])}/{len(names)}, {time.perf_counter() - start:.0f} s", flush=True)
     print(f"modulus ratio: mean error {100 * np.mean(ratio):+.2f} %, RMS {100 * np.sqrt(np.mean(np.square(ratio))):.2f} %")
     print(f"Poisson's ratio: RMS error {np.sqrt(np.mean(np.square(nu))):.4f}")
-    share = 100 * np.mean(inside)
-    print(f"95 % intervals hold the truth in {share:.1f} % of {np.size(inside)} cases; by parameter {np.mean(inside, axis=0).round(2)}")
+    share, each = 100 * np.mean(inside), np.mean(inside, axis=0)
+    print(f"95 % intervals hold the truth in {share:.1f} % of {np.size(inside)} cases; by parameter {each.round(2)}")
+    rows = (
+        ("mean error of the ratio of moduli, %", round(100 * float(np.mean(ratio)), 1)),
+        ("RMS error of the ratio of moduli, %", round(100 * float(np.sqrt(np.mean(np.square(ratio)))), 1)),
+        ("RMS error of Poisson's ratio", round(float(np.sqrt(np.mean(np.square(nu)))), 4)),
+        (f"of {np.size(inside)} intervals of 95 % held the truth, %", round(float(share), 1)),
+        (f"least covered, {names[int(np.argmin(each))]}, %", round(100 * float(each.min()), 1)),
+    )
+    return (ResultTable("parameters", (f"{draws} virtual specimens", "value"), rows),)
+
+
+def main() -> None:
+    """Run what is asked for, and record it."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("draws", nargs="?", type=int, default=20, help="noisy scans to identify")
+    parser.add_argument("--predict", action="store_true", help="predictions rather than parameters")
+    parser.add_argument("--first", type=int, default=0, help="the first draw of predictions")
+    parser.add_argument("--record", action="store_true", help="write the record of this run")
+    options = parser.parse_args()
+    tables = predictions(options.draws, options.first) if options.predict else parameters(options.draws)
+    if options.record:
+        write_record("prediction_coverage" if options.predict else "interval_coverage", tables)
 
 
 if __name__ == "__main__":

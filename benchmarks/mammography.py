@@ -6,15 +6,17 @@ used. Only the body's frame comes from the markers: its axes in the unloaded sta
 ellipsoid of
 110 x 130 x 50 mm, as the rows of markers show, on a straight part of 20 mm, which makes up the printed height of 70 mm. Distances are
 root mean
-squares in 3-D.
+squares in 3-D. ``--record`` writes ``results/mammography.json``.
 """
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from records import ResultTable, write_record
 
 from naibu import datasets
 from naibu.applications.mammography.breast_shape import BreastShape, half_ellipsoid_shape
@@ -120,12 +122,19 @@ def _rms(residuals: FloatArray) -> float:
 
 def main() -> None:
     """Print one line for each model."""
-    print("model                                   markers  3-D, rigid motion removed  along x, y  3-D, on the table  without a model   mm")
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--record", action="store_true", help="write results/mammography.json")
+    record = parser.parse_args().record
+    columns = ("model", "markers", "rigid motion removed, mm", "along x and y, mm", "on the table, mm", "without a model, mm")
+    print("  ".join(columns))
+    rows = []
     for name in MODELS:
         e = phantom_errors(name)
-        print(
-            f"{name:40s}{e.markers:7d}{e.rigid_rms_mm:28.2f}{e.in_plane_rms_mm:13.2f}{e.fixed_base_rms_mm:19.2f}{e.without_model_mm:17.2f}"
-        )
+        distances = (e.rigid_rms_mm, e.in_plane_rms_mm, e.fixed_base_rms_mm, e.without_model_mm)
+        rows.append((name, e.markers, *(round(value, 2) for value in distances)))
+        print(f"{name:40s}{e.markers:7d}" + "".join(f"{value:14.2f}" for value in distances), flush=True)
+    if record:
+        write_record("mammography", (ResultTable("phantom", columns, tuple(rows)),))
 
 
 if __name__ == "__main__":

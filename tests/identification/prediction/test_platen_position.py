@@ -78,3 +78,10 @@ def test_the_derivative_of_a_distance_is_its_finite_difference(axis: int | None)
     step = 1e-5
     difference = (gauge.distance(points + step * direction) - gauge.distance(points - step * direction)) / (2.0 * step)
     assert gauge.derivatives(points, direction[:, :, None])[0] == pytest.approx(difference, rel=1e-6)
+
+
+def test_markers_of_another_load_are_said_to_be_no_measure_of_the_error(squeezed: Experiment) -> None:
+    model = model_of(squeezed)
+    other = predict_state(model, squeezed, "pressed", platen_position_mm=60.0)
+    assert any("stated 52 mm, not at 60 mm" in note and "two loads" in note for note in other.notes)
+    assert not any("two loads" in note for note in predict_state(model, squeezed, "pressed", platen_position_mm=WIDTH_MM).notes)

@@ -75,6 +75,11 @@ def stated_platen_position(
         full = experiment.full_platen_position_mm
         if not 0.3 * full < given <= full:
             raise InputError(f"platen_position_mm is {given:g} mm, which is not between 30 % and 100 % of the object's {full:g} mm")
+        if state.markers is not None and state.stated_mm is not None and abs(given - state.stated_mm) > 2.0 * SD_MM["stated"]:
+            notes.append(
+                f"the markers of {state.name} were measured at a stated {state.stated_mm:g} mm, not at {given:g} mm: their distance from "
+                "the prediction is that between two loads, not its error"
+            )
         return given, SD_MM["given"]
     values = model.parameters.values()
     name = platen_position(experiment, state.name)
