@@ -11,12 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from naibu import datasets
 from naibu.applications.mammography.breast_outline import breast_outline, mask_outline
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.core.volume import Volume
+from naibu.identification.from_fields.forward.load_cases import KnownRegion
+from naibu.identification.from_fields.identified_body import IdentifiedBody
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
@@ -36,8 +39,8 @@ from naibu.meshing.primitives import box
 from naibu.workflows.applications.fingertip_study import prepared_fingertip
 from naibu.workflows.applications.simulate_chip import prepared_chip
 from naibu.workflows.applications.simulate_ischemia import prepared_ischemia
-from naibu.workflows.identify_fields import _names, _object, block_mesh
-from naibu.workflows.results.result_folder import read_model
+from naibu.workflows.fields.block_mesh import block_mesh, labelled_object, names_of_labels
+from naibu.workflows.results.result_folder import read_any_model, read_model
 from naibu.workflows.studies.simulate import example_text
 
 
@@ -280,9 +283,11 @@ def _tables(folder: Path) -> list[ValidFile]:
 def _texts(folder: Path) -> list[ValidFile]:
     study = _written(folder / "study" / "mine.toml", _study().encode())
     model = _written(folder / "model" / "model.json", json.dumps(_model()).encode())
+    body = _written(folder / "body" / "model.json", json.dumps(_identified_body()).encode())
     return [
         ValidFile("lattice study", study, lambda: load_study(study, study.read_bytes())),
         ValidFile("model.json", model, lambda: read_model(model)),
+        ValidFile("model.json of fields", body, lambda: read_any_model(body)),
     ]
 
 
@@ -342,14 +347,26 @@ def _records(folder: Path) -> list[ValidFile]:
 
 def meshed_zones(zones: Path) -> object:
     """Read a volume of labels, and mesh the object as `naibu identify` does with displacement fields."""
-    inside, labels = _object(None, zones)
-    return block_mesh(inside, labels, _names(labels, inside, {}), 0.0)
+    inside, labels = labelled_object(None, zones)
+    return block_mesh(inside, labels, names_of_labels(labels, inside, {}), 0.0)
 
 
 def _study() -> str:
     from lattice_studies import STUDY
 
     return STUDY
+
+
+def _identified_body() -> dict[str, object]:
+    """A body of two cells as it is stored, one of them known."""
+    mesh = box((2.0, 1.0, 1.0), (2, 1, 1))
+    zones = csr_matrix(([1.0], ([0], [0])), shape=(2, 1))
+    known, of_cell = (KnownRegion("pad", 10.0, 0.4, 0.0, 0.03),), np.array([-1, 0])
+    theta, covariance = np.array([0.5, 2.0]), np.diag([0.01, 0.04])
+    body = IdentifiedBody(
+        mesh, np.eye(3), ("gel",), zones, theta, covariance, known, of_cell, "neo_hookean", False, 0.01, 1.1, 0.02, ("field",)
+    )
+    return body.to_dict()
 
 
 def _model() -> dict[str, object]:

@@ -1,4 +1,4 @@
-"""Verbs for experiments with markers: ``demo``, ``identify``, ``predict``, ``compare``, ``report``, ``import``."""
+"""Verbs for experiments: ``demo``, ``identify``, ``compare``, ``report``, ``import``."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def _identify_fields(
     out: Path,
     overwrite: bool,
 ) -> None:
-    from naibu.workflows.identify_fields import identify_fields, table_of_assumptions, table_of_zones
+    from naibu.workflows.fields.identify_fields import identify_fields, table_of_assumptions, table_of_zones
 
     if law != "neo_hookean":
         raise InputError(f"law={law!r} is not known for fields; use 'neo_hookean'")
@@ -180,9 +180,9 @@ def _identify_fields(
     for table in (table_of_zones(result), table_of_assumptions(result)):
         if table.rows:
             print_table(table.title, table.columns, table.rows, digits=4)
-    wrote(out / "report.html")
+    wrote(*result.files)
     found(usable=usable)
-    say(f"{time.perf_counter() - began:.0f} s. Results in {out}: open report.html.")
+    say(f"{time.perf_counter() - began:.0f} s. Results in {out}: open report.html; naibu predict, live and cut take model.json.")
     if not usable:
         say("The model does not explain the data: the results are marked as not to be used.", GRAVE)
         sys.exit(NOT_EXPLAINED)
@@ -254,58 +254,6 @@ def _show(result: Identification) -> None:
     for line in content.undetermined(model, names, calibration.priors):
         say(line, "dim")
     say(f"{content.search_sentence(calibration.match.status)} Residuals are {model.noise_factor:.2f} times the stated noise.")
-
-
-@verb(
-    MARKERS,
-    "predict naibu-results my_gel -s pressed --height-mm 42",
-    "predict naibu-demo ct_two_material_1 --heights-from-markers",
-)
-def predict(
-    model: Path,
-    experiment: str,
-    *,
-    state: Annotated[str | None, Parameter(name=("--state", "-s"))] = None,
-    height_mm: float | None = None,
-    heights_from_markers: Flag = False,
-    out: Out = Path("naibu-prediction"),
-    overwrite: Overwrite = False,
-) -> None:
-    """Predict the markers of a state with a calibrated model.
-
-    Parameters
-    ----------
-    model
-        The model.json that 'naibu identify' wrote, or its folder.
-    experiment
-        Folder or name of a bundled dataset; its unloaded state is needed, the loaded one may be missing.
-    state
-        Name of the loaded state; required if there are several.
-    height_mm
-        Height of the plate or bar above the base, or distance between the side plates.
-    heights_from_markers
-        Take the height from the mean z of the lowest and the highest marker layer of the measured state, or the distance of side
-        plates from that of its outermost marker columns: the only data used of it.
-    out
-        Folder for predicted.csv, summary.json, predicted.html and files for ParaView; may be that of the model.
-    overwrite
-        Replace results, or files of your own, that the folder already holds.
-    """
-    from naibu.workflows import predict as predict_workflow
-    from naibu.workflows.results.report_content import accuracy
-
-    result = predict_workflow.predict(
-        model, experiment, state=state, height_mm=height_mm, heights_from_markers=heights_from_markers, out=out, overwrite=overwrite
-    )
-    for note in (*result.specimen.experiment.loading.assumed, *result.notes):
-        say(note, "dim")
-    if result.registered:
-        a = accuracy(result.specimen, result.fit, result.residual)
-        rms = f"RMS x {a.x:.3f}, y {a.y:.3f}, z {a.z:.3f}, 3-D {a.total:.3f} mm"
-        say(f"{a.markers} markers: {rms} ({a.noise_units:.2f} times the noise)")
-    say(result.interval)
-    wrote(*(out / name for name in ("predicted.html", "predicted.csv", "summary.json")))
-    say(f"Predicted at {result.platen_position_mm:.2f} mm: {out / 'predicted.csv'}   page: {out / 'predicted.html'}")
 
 
 @verb(MARKERS, "compare my_gel -k gel --law neo_hookean --law yeoh   # which law explains the markers best")

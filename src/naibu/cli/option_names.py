@@ -10,7 +10,7 @@ from cyclopts import App
 # arguments of library functions that a verb offers under another name
 OTHER_NAMES: Mapping[str, Mapping[str, str]] = {
     "identify": {"states": "state", "zone_names": "zone_name", "each_cell": "cell_map"},
-    "predict": {"platen_position_mm": "height_mm"},
+    "predict": {"platen_position_mm": "height_mm", "held": "hold", "moved": "move", "field": "experiment"},
     "compare": {"candidates": "law"},
     "compare-methods": {"methods": "method"},
     "import": {"source": "initial"},

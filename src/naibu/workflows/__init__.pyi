@@ -1,5 +1,6 @@
+from .fields.identify_fields import FieldIdentification, identify_fields
+from .fields.predict_field import Comparison, FieldPredictionRun, predict_field
 from .identify import Identification
-from .identify_fields import FieldIdentification, identify_fields
 from .interactive.cut import CutRun, cut
 from .interactive.cut_surface import SurfaceCutRun, cut_surface_file
 from .interactive.haptics.device import DeviceRecord, drive_live_simulation
@@ -14,9 +15,11 @@ from .studies.simulate import NamedStudy, named_studies
 from .studies.simulate_lattice import SimulationRun
 
 __all__ = [
+    "Comparison",
     "CutRun",
     "DeviceRecord",
     "FieldIdentification",
+    "FieldPredictionRun",
     "Identification",
     "MeshMaterial",
     "MethodComparison",
@@ -37,6 +40,7 @@ __all__ = [
     "identify_fields",
     "live",
     "named_studies",
+    "predict_field",
     "read_pair",
     "reproduce",
     "reproduce_all",

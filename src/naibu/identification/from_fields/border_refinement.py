@@ -127,6 +127,8 @@ class RefinedRegions:
         Of theta, for independent noise: with the borders unknown, and as if they were known.
     objective : float
         Half of chi squared and priors.
+    parts : ndarray, shape (m, regions)
+        Part of every cell in each region, without parts where moduli are known: logarithms of moduli are mixed by them.
     """
 
     zones: Zones
@@ -136,6 +138,7 @@ class RefinedRegions:
     covariance: FloatArray
     at_these_borders: FloatArray
     objective: float
+    parts: FloatArray
 
 
 def refined_regions(model: FieldModel, regions: Segmentation, graph: ZoneGraph, bounds: Bounds) -> RefinedRegions:
@@ -270,7 +273,9 @@ def _with_covariance(model: FieldModel, mixing: _Mixing, found: _Trial) -> Refin
             of_zone[share[:, region - 1].argmax()] = region
     of_cell[unknown] = of_zone[of_cell[unknown]]
     zones = replace(joined(model.zones, of_zone), of_cell=of_cell)
-    return RefinedRegions(zones, borders, theta, point, whole, part, found.value)
+    parts = np.zeros((len(of_cell), share.shape[1] + 1))
+    parts[unknown] = np.column_stack([1.0 - share.sum(axis=1), share])[model.zones.of_cell[unknown]]
+    return RefinedRegions(zones, borders, theta, point, whole, part, found.value, parts)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -104,6 +104,8 @@ class FieldEstimate:
         What other moduli of the known regions, or another law, would do.
     borders : Borders or None
         Borders of regions that were found, which run through cells; None where regions are made of whole cells.
+    parts : ndarray, shape (m, count), or None
+        With such borders: part of every cell in each region, by which logarithms of moduli are mixed.
     """
 
     mesh: Mesh
@@ -125,6 +127,7 @@ class FieldEstimate:
     mesh_shift: FloatArray | None = None
     assumptions: tuple[Assumption, ...] = ()
     borders: Borders | None = None
+    parts: FloatArray | None = None
 
     @property
     def young_modulus(self) -> FloatArray:
@@ -413,6 +416,7 @@ class _Recipe:
         return FieldEstimate(
             model.mesh, model.zones, theta, states, misfit, freedom, total, None, None, None, None, status, tuple(self.steps), words,
             judged, budget, shift, others, None if refined is None else refined.borders,
+            None if refined is None else refined.parts,
         )  # fmt: skip
 
     def _extrapolated(self, at: Linearised, quadratic: Concentrated) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray | None]:

@@ -13,6 +13,8 @@ from naibu.core.arrays import FloatArray, IntArray, require_positive, require_wi
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.units import MODULI_KPA
+from naibu.identification.from_fields.forward.field_laws import NeoHookean
+from naibu.identification.from_fields.identified_body import IdentifiedBody
 from naibu.identification.from_markers.specimen.specimen_model import GRAVITY, Specimen, specimen
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.io.meshes import MESH_READERS, read_mesh
@@ -32,12 +34,13 @@ from naibu.meshing.element_conversion import to_tetra
 from naibu.meshing.point_location import interpolation_operator
 from naibu.simulation.interactive_bodies import FiniteElementBody, InteractiveBody, LatticeBody, nodes_touching
 from naibu.workflows.experiments import Source, load_experiment
-from naibu.workflows.results.result_folder import MODEL_FILE, read_model
+from naibu.workflows.results.result_folder import MODEL_FILE, read_any_model
 from naibu.workflows.studies.lattice_study import NAMED, PreparedStudy, prepared_study
 
 LATTICE_STEP_S = 1e-3
 BASE_FRACTION = 1e-3  # of the height of a mesh: nodes this near to its lowest one are held
 TOOL_FRICTION = 0.3
+MOST_LISTED = 8  # zones whose moduli a heading lists
 STICKING = 100.0  # friction coefficients above are those of surfaces that never slip
 
 
@@ -123,7 +126,12 @@ def touchable(source: str | os.PathLike[str], *, experiment: Source | None = Non
     if material is not None and not is_mesh:
         raise InputError(f"material goes with a mesh, and {source} is none; leave it out, or name one of {', '.join(MESH_READERS)}")
     if is_model:
-        return _identified(read_model(path), experiment)
+        model = read_any_model(path)
+        if isinstance(model, CalibratedModel):
+            return _identified(model, experiment)
+        if experiment is not None:
+            raise InputError(f"`experiment` goes with a model of markers; {source} was identified from displacement fields; leave it out")
+        return _identified_from_fields(path, model)
     if is_mesh:
         return _meshed(path, read_mesh(path), material or MeshMaterial())
     if str(source) in NAMED or path.suffix == ".toml":
@@ -196,6 +204,22 @@ def _identified(model: CalibratedModel, source: Source | None) -> TouchableModel
         f"It stands on its table with friction {min(coefficient, STICKING):.2g}; {1.0 / touched.step_s:.0f} steps a second.",
     )
     return TouchableModel(f"{experiment.name}, touched", said, touched, "equivalent strain, %", nodes, weights)
+
+
+def _identified_from_fields(path: Path, model: IdentifiedBody) -> TouchableModel:
+    """The body of displacement fields with the moduli of its zones, or of a map, cell by cell; its lowest nodes are held."""
+    law = NeoHookean(model.mesh, averaged=True)
+    body = FiniteElementBody.of(model.mesh, law.assembler(*model.lame_of_cells()), supported=_lowest(model.mesh.points))
+    zones = [f"{name} {young:.3g}" for name, young, _ in model.moduli()]
+    listed = f": {', '.join(zones)}" if len(zones) <= MOST_LISTED else f" of {len(zones)} zones"
+    unit = "multiples of the known zone; forces are in the same measure" if model.relative else "kPa"
+    said = (
+        f"Finite elements of the identified moduli, neo-Hookean: {model.mesh.n_cells} cells; Young's modulus{listed} ({unit}).",
+        "The nodes of least z are held.",
+        *([f"The model is doubtful: {model.reservation}"] if model.reservation else []),
+    )
+    name = path.name if path.is_dir() else path.resolve().parent.name
+    return TouchableModel(f"{name}, touched", said, body, "equivalent strain, %")
 
 
 def _table_friction(body: Specimen, values: dict[str, float]) -> float:

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 
 from naibu.core.errors import InputError
+from naibu.identification.from_fields.identified_body import FORMAT as FORMAT_OF_FIELDS
+from naibu.identification.from_fields.identified_body import IdentifiedBody
 from naibu.identification.from_markers.calibration import Calibration
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.calibrated_model import CalibratedModel
@@ -43,7 +45,21 @@ Baselines = Mapping[str, Mapping[str, float]]
 
 
 def read_model(path: str | os.PathLike[str]) -> CalibratedModel:
-    """Read a ``model.json``, or the one in a folder.
+    """Read a ``model.json`` of markers, or the one in a folder.
+
+    Raises
+    ------
+    InputError
+        No such file, or not a model of markers.
+    """
+    found = read_any_model(path)
+    if isinstance(found, IdentifiedBody):
+        raise InputError(f"{path}: was identified from displacement fields; this takes a model identified from markers")
+    return found
+
+
+def read_any_model(path: str | os.PathLike[str]) -> CalibratedModel | IdentifiedBody:
+    """Read a ``model.json`` of markers or of displacement fields, or the one in a folder.
 
     Raises
     ------
@@ -61,7 +77,7 @@ def read_model(path: str | os.PathLike[str]) -> CalibratedModel:
         raise InputError(f"{file}: holds a {type(data).__name__}, not a model; {mend}")
     try:
         with guarded_reading(file, "a model"):
-            return CalibratedModel.from_dict(data)
+            return IdentifiedBody.from_dict(data) if data.get("format") == FORMAT_OF_FIELDS else CalibratedModel.from_dict(data)
     except InputError as error:
         raise InputError(f"{file}: {str(error).removeprefix(f'{file}: ')}; {mend}") from error
 

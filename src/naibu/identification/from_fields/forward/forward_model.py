@@ -85,7 +85,7 @@ class Observed:
         """
         field, d = load_case.field, mesh.dimension
         valid = field.valid
-        whiten, noise, exact = _whitening(field, load_case.name)
+        whiten, noise, exact = whitening(field, load_case.name)
         where = interpolation_operator(computed, field.points[valid]) if d == 3 else _at_nodes(mesh, field.points[valid], load_case.name)
         operator = (sp.block_diag(list(whiten), format="csr") @ sp.kron(where, sp.identity(d), format="csr")).tocsr()
         data = np.einsum("nij,nj->ni", whiten, field.vectors[valid]).ravel()
@@ -113,7 +113,7 @@ class Observed:
         return np.asarray(self.operator @ u.ravel() - self.data)
 
 
-def _whitening(field: DisplacementField, name: str) -> tuple[FloatArray, float, bool]:
+def whitening(field: DisplacementField, name: str) -> tuple[FloatArray, float, bool]:
     """Return the inverse square roots (k, d, d) of the covariances of the valid points, the RMS noise, mm, and whether it is nominal."""
     k, d = field.vectors[field.valid].shape
     covariance = np.zeros((k, d, d)) if field.covariance is None else field.covariance[field.valid]

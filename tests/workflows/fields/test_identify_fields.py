@@ -17,7 +17,9 @@ from naibu.core.volume import Volume
 from naibu.io.displacement_fields import write_field
 from naibu.io.images import read_volume, write_volume
 from naibu.validation.specimens.quadratic_body import QuadraticBody, Solved
-from naibu.workflows.identify_fields import block_mesh, blurred, identify_fields, parse_known_zones, table_of_assumptions
+from naibu.workflows.fields.block_mesh import block_mesh, blurred
+from naibu.workflows.fields.identify_fields import identify_fields, table_of_assumptions
+from naibu.workflows.fields.known_zones import parse_known_zones
 
 SD_MM = 0.04
 

@@ -1,0 +1,217 @@
+"""A body whose moduli were identified from displacement fields: its mesh, zones, moduli with their covariance, and how well they fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.errors import InputError
+from naibu.core.mesh import Mesh
+from naibu.identification.from_fields.estimate import FieldEstimate
+from naibu.identification.from_fields.forward.field_laws import LawName
+from naibu.identification.from_fields.forward.forward_model import whitening
+from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, KnownRegion, Zones
+from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
+from naibu.identification.from_fields.stored_body import check_stored_body
+from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
+
+FORMAT = "naibu field model 1"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class IdentifiedBody:
+    """What an identification from displacement fields hands on.
+
+    Attributes
+    ----------
+    mesh : Mesh
+        Cells of the body, in the frame of the scan.
+    axes : ndarray, shape (3, 3)
+        Axes of the grid of cells in the frame of the scan, in columns.
+    zones : tuple of str
+        Names of the zones that were identified.
+    parts : csr_matrix, shape (m, k)
+        Part of every cell in each of these zones, by which logarithms of moduli are mixed; an empty row where moduli are known.
+    theta : ndarray, shape (2 k,)
+        ln mu, then ln(kappa / mu), of the zones; kPa.
+    covariance : ndarray, shape (2 k, 2 k), or None
+        Of theta; None where the zones were too many.
+    known : tuple of KnownRegion
+        Regions whose moduli were known.
+    known_of_cell : ndarray, shape (m,), int64
+        Index into `known` of every cell, -1 where its moduli were identified.
+    law : {"linear", "neo_hookean"}
+        Small strain, or compressible neo-Hookean at finite strain.
+    relative : bool
+        Whether moduli are multiples of that of a zone whose modulus was not stated.
+    noise_mm, noise_factor : float
+        Root mean square standard deviation of the measurements, mm, and residuals in units of it.
+    strain : float
+        Largest part of its extent by which a load case deformed the body.
+    load_cases : tuple of str
+        Names of the fields.
+    reservation : str
+        What speaks against using the model; empty where nothing does.
+    provenance : mapping
+        Version, settings, hashes of the inputs.
+    """
+
+    mesh: Mesh
+    axes: FloatArray
+    zones: tuple[str, ...]
+    parts: sp.csr_matrix
+    theta: FloatArray
+    covariance: FloatArray | None
+    known: tuple[KnownRegion, ...]
+    known_of_cell: IntArray
+    law: LawName
+    relative: bool
+    noise_mm: float
+    noise_factor: float
+    strain: float
+    load_cases: tuple[str, ...]
+    reservation: str = ""
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        found: FieldEstimate,
+        *,
+        axes: FloatArray,
+        law: LawName,
+        relative: bool,
+        strain: float,
+        load_cases: Sequence[FieldLoadCase],
+        provenance: Mapping[str, Any],
+    ) -> IdentifiedBody:
+        """Take the body from an estimate on a mesh in three dimensions."""
+        zones, covariance = found.zones, None if found.uncertainty is None else found.uncertainty.covariance
+        parts = zones_of_cells(zones) if found.parts is None else sp.csr_matrix(found.parts)
+        known_of_cell = np.full(found.mesh.n_cells, KNOWN, dtype=np.int64) if zones.region_of_cell is None else zones.region_of_cell
+        doubtful = found.verdict is not None and not found.verdict.ok
+        noise = float(np.sqrt(np.mean([whitening(case.field, case.name)[1] ** 2 for case in load_cases])))
+        return cls(
+            found.mesh, axes, zones.names, parts, found.theta,
+            covariance if covariance is not None and np.isfinite(covariance).all() else None, zones.known, known_of_cell, law, relative,
+            noise, found.noise_factor, strain, tuple(case.name for case in load_cases),
+            found.verdict.sentence if found.verdict is not None and doubtful else "", provenance,
+        )  # fmt: skip
+
+    @property
+    def cell_zones(self) -> Zones:
+        """The cells as zones of their own, those of known moduli left out."""
+        unknown = self.known_of_cell == KNOWN
+        of_cell = np.full(self.mesh.n_cells, KNOWN, dtype=np.int64)
+        of_cell[unknown] = np.arange(int(unknown.sum()))
+        lame, shear = np.full(self.mesh.n_cells, np.nan), np.full(self.mesh.n_cells, np.nan)
+        for number, region in enumerate(self.known):
+            there = self.known_of_cell == number
+            lame[there], shear[there] = lame_parameters(region.young_modulus, region.poisson_ratio)
+        names = tuple(f"cell {c}" for c in np.flatnonzero(unknown))
+        return Zones(of_cell, names, lame, shear, self.known, self.known_of_cell)
+
+    @property
+    def mixing(self) -> sp.csr_matrix:
+        """Matrix (2 cells, 2 k) from theta of the zones to that of the cells that are not known, as `cell_zones` numbers them."""
+        return sp.csr_matrix(sp.kron(sp.identity(2), self.parts[self.known_of_cell == KNOWN]))
+
+    @property
+    def theta_of_cells(self) -> FloatArray:
+        """Ln mu, then ln(kappa / mu), of the cells that are not known; kPa."""
+        return np.asarray(self.mixing @ self.theta)
+
+    @property
+    def spread(self) -> FloatArray:
+        """Factor S (2 k, 2 k) of the covariance of theta, which is S S'; without columns where there is none."""
+        if self.covariance is None:
+            return np.zeros((len(self.theta), 0))
+        values, vectors = np.linalg.eigh(self.covariance)
+        return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+    @property
+    def discrepancy_mm(self) -> float:
+        """Root mean square of what the model leaves of a displacement beyond the noise of its measurement, mm a component."""
+        return self.noise_mm * float(np.sqrt(max(self.noise_factor**2 - 1.0, 0.0)))
+
+    def lame_of_cells(self) -> tuple[FloatArray, FloatArray]:
+        """Return lambda and mu of every cell (m,), kPa, known ones included."""
+        shear, ratio = np.exp(self.theta_of_cells.reshape(2, -1))
+        return self.cell_zones.per_cell(shear * (ratio - 2.0 / 3.0), shear)
+
+    def moduli(self) -> list[tuple[str, float, float]]:
+        """Return name, Young's modulus, kPa, and Poisson's ratio of every zone, known ones last."""
+        young, poisson = young_and_poisson(self.theta)
+        found = [(name, float(e), float(nu)) for name, e, nu in zip(self.zones, young, poisson, strict=True)]
+        return [*found, *((region.name, region.young_modulus, region.poisson_ratio) for region in self.known)]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the body as plain numbers and strings, for JSON."""
+        parts = self.parts.tocoo()
+        return {
+            "format": FORMAT,
+            "units": "mm, kg, s, mN, kPa",
+            "law": self.law,
+            "relative": self.relative,
+            "zones": [{"name": name} for name in self.zones],
+            "theta": self.theta.tolist(),
+            "covariance": None if self.covariance is None else self.covariance.tolist(),
+            "known": [
+                {
+                    "name": r.name, "young_modulus": r.young_modulus, "poisson_ratio": r.poisson_ratio,
+                    "young_modulus_sd": r.young_modulus_sd, "poisson_ratio_sd": r.poisson_ratio_sd,
+                }
+                for r in self.known
+            ],
+            "noise_mm": self.noise_mm,
+            "noise_factor": self.noise_factor,
+            "strain": self.strain,
+            "load_cases": list(self.load_cases),
+            "reservation": self.reservation,
+            "provenance": dict(self.provenance),
+            "axes": self.axes.tolist(),
+            "cell_type": self.mesh.cell_type,
+            "points": self.mesh.points.tolist(),
+            "cells": self.mesh.cells.tolist(),
+            "known_of_cell": self.known_of_cell.tolist(),
+            "parts": [[int(c), int(z), float(v)] for c, z, v in zip(parts.row, parts.col, parts.data, strict=True)],
+        }  # fmt: skip
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> IdentifiedBody:
+        """Return the body that `to_dict` wrote.
+
+        Raises
+        ------
+        InputError
+            Another format, or a missing or unusable entry.
+        """
+        if data.get("format") != FORMAT:
+            raise InputError(f"this is not a naibu model of displacement fields: its format is {data.get('format')!r}, not {FORMAT!r}")
+        check_stored_body(data)
+        names = tuple(row["name"] for row in data["zones"])
+        regions, known_of_cell = tuple(KnownRegion(**row) for row in data["known"]), np.array(data["known_of_cell"], dtype=np.int64)
+        rows, columns, values = np.array(data["parts"], dtype=float).reshape(-1, 3).T
+        shape = len(data["cells"]), len(names)
+        parts = sp.csr_matrix((values, (rows.astype(np.int64), columns.astype(np.int64))), shape=shape)
+        place = np.where(known_of_cell == KNOWN, np.asarray(parts.argmax(axis=1)).ravel(), len(names) + known_of_cell)
+        mesh = Mesh.from_arrays(
+            data["points"], data["cells"], data["cell_type"], regions=place, region_names=(*names, *(r.name for r in regions))
+        )
+        covariance = None if data["covariance"] is None else np.array(data["covariance"], dtype=float)
+        return cls(
+            mesh, np.array(data["axes"], dtype=float), names, parts, np.array(data["theta"], dtype=float), covariance, regions,
+            known_of_cell, data["law"], data["relative"], float(data["noise_mm"]), float(data["noise_factor"]), float(data["strain"]),
+            tuple(data["load_cases"]), data["reservation"], data["provenance"],
+        )  # fmt: skip
+
+
+def zones_of_cells(zones: Zones) -> sp.csr_matrix:
+    """Return the part of every cell in each zone (m, k): one zone a cell, none where moduli are known."""
+    cells = np.flatnonzero(zones.of_cell != KNOWN)
+    return sp.csr_matrix((np.ones(len(cells)), (cells, zones.of_cell[cells])), shape=(len(zones.of_cell), zones.count))

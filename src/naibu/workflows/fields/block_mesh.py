@@ -1,0 +1,136 @@
+"""The object in a scan as hexahedra that fill it, one zone a label."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+
+import numpy as np
+from scipy import ndimage
+
+from naibu.core.arrays import AnyArray, IntArray, require_lengths
+from naibu.core.errors import InputError
+from naibu.core.mesh import Mesh
+from naibu.core.volume import Volume
+from naibu.io.images import read_volume
+from naibu.meshing.primitives import grid_cells
+
+CELLS = 1200  # by default
+BLURRED = 0.01  # part of the object that cubes may misrepresent without a word
+MOST_CELLS = 100_000  # of a mesh whose size is asked for: beyond, a factorization does not fit into memory
+MOST_LABEL = 65535
+HALF_FILLED = 0.5  # part of a cell that must lie in the object
+
+
+def labelled_object(mask: str | os.PathLike[str] | None, zones: str | os.PathLike[str] | None) -> tuple[Volume, IntArray]:
+    """Return the object as a volume of ones and zeros, and the label of every voxel."""
+    read = [None if path is None else read_volume(path) for path in (mask, zones)]
+    first = next((v for v in read if v is not None), None)
+    if first is None:
+        raise InputError("give `mask`, the voxels of the object, or `zones`, a label for each material")
+    if read[0] is not None and read[1] is not None and not read[0].same_grid(read[1]):
+        raise InputError("mask and zones lie on different grids; resample one of them")
+    labels = np.ones(first.shape, dtype=np.int64) if read[1] is None else _whole(read[1].values)
+    inside = (labels > 0) & (True if read[0] is None else read[0].values != 0)
+    if not inside.any():
+        raise InputError("mask and zones have no voxel in common: there is no object")
+    return first.with_values(inside.astype(np.uint8)), labels
+
+
+def _whole(values: AnyArray) -> IntArray:
+    """Return labels as whole numbers."""
+    wrong = ~(np.abs(values) <= MOST_LABEL) | (values != np.round(values))  # also what is not a number
+    if wrong.any():
+        at = tuple(int(i) for i in np.argwhere(wrong)[0])
+        raise InputError(
+            f"zones has the value {values[at]:g} at voxel {at[::-1]} (x, y, z): labels are whole numbers up to {MOST_LABEL}; "
+            "is it a scan, or was it interpolated?"
+        )
+    return values.astype(np.int64)
+
+
+def names_of_labels(labels: IntArray, inside: Volume, given: Mapping[int, str]) -> dict[int, str]:
+    """Return the names of the labels that occur in the object.
+
+    Raises
+    ------
+    InputError
+        A name of a label that does not occur.
+    """
+    there = np.unique(labels[inside.values != 0]).tolist()
+    if unknown := sorted(set(given) - set(there)):
+        raise InputError(f"zone_names names label {unknown[0]}, which no voxel of the object has; there are {', '.join(map(str, there))}")
+    return {label: given.get(label, f"label {label}" if len(there) > 1 else "body") for label in there}
+
+
+def block_mesh(inside: Volume, labels: IntArray, names: Mapping[int, str], element_size_mm: float) -> tuple[Mesh, IntArray]:
+    """Return hexahedra that fill the object, and the cell of every voxel (nz, ny, nx), -1 outside.
+
+    Parameters
+    ----------
+    inside : Volume
+        Not zero in the object.
+    labels : ndarray, shape (nz, ny, nx), int64
+        Zone of every voxel.
+    names : mapping
+        Names of the labels.
+    element_size_mm : float
+        Edge length, at least that of a voxel; 0 for about 1200 cells.
+
+    Raises
+    ------
+    InputError
+        A size that is no length, or so small or large that there are too many cells or too few.
+    """
+    if element_size_mm:
+        require_lengths(element_size_mm=element_size_mm)
+    voxels = np.argwhere(inside.values != 0)[:, ::-1]
+    volume = len(voxels) * float(np.prod(inside.spacing_mm))
+    size = element_size_mm or (volume / CELLS) ** (1.0 / 3.0)
+    low, high = voxels.min(axis=0), voxels.max(axis=0) + 1
+    counts = np.clip(np.round((high - low) * inside.spacing_mm / size).astype(int), 1, high - low)
+    if volume / size**3 > MOST_CELLS and np.prod(counts) > MOST_CELLS:
+        least = (volume / MOST_CELLS) ** (1.0 / 3.0)
+        raise InputError(f"element_size_mm is {size:.3g} mm, which makes more than {MOST_CELLS} cells; choose at least {least:.2g} mm")
+    width = (high - low) / counts  # of a cell, in voxels
+    block = np.minimum(((voxels + 0.5 - low) / width).astype(int), counts - 1)
+    number = block @ np.array([1, counts[0], counts[0] * counts[1]])
+    total = int(np.prod(counts))
+    sides = zip(high - low, width, counts, strict=True)
+    per_axis = [np.bincount(np.minimum(((np.arange(n) + 0.5) / w).astype(int), c - 1)) for n, w, c in sides]
+    room = (per_axis[2][:, None, None] * per_axis[1][:, None] * per_axis[0]).ravel()  # voxels of a full cell
+    share = np.bincount(number, minlength=total) / room
+    parts, _ = ndimage.label((share >= HALF_FILLED).reshape(counts[::-1]))
+    largest = int(np.argmax(np.bincount(parts.ravel())[1:])) + 1 if parts.any() else 1
+    kept = np.flatnonzero(parts.ravel() == largest)
+    if len(kept) < 8:
+        raise InputError(f"the object has room for {len(kept)} cells of {size:.3g} mm; choose a smaller element_size_mm")
+    order = sorted(names)
+    votes = np.stack([np.bincount(number[labels[tuple(voxels.T[::-1])] == label], minlength=total) for label in order])
+    corners = grid_cells(*(counts + 1))[kept]
+    used, cells = np.unique(corners, return_inverse=True)
+    axes = np.stack(np.unravel_index(used, tuple(counts[::-1] + 1))[::-1], axis=1)
+    points = inside.to_physical(low - 0.5 + axes * width)
+    regions = votes[:, kept].argmax(axis=0)
+    mesh = Mesh.from_arrays(points, cells.reshape(corners.shape), "hexahedron", regions=regions, region_names=[names[k] for k in order])
+    if np.linalg.det(inside.direction) < 0.0:
+        mesh = Mesh(mesh.points, mesh.cells[:, [4, 5, 6, 7, 0, 1, 2, 3]], "hexahedron", mesh.regions, mesh.region_names)
+    cell = np.full(total, -1, dtype=np.int64)
+    cell[kept] = np.arange(len(kept))
+    of_voxel = np.full(inside.shape, -1, dtype=np.int64)
+    of_voxel[tuple(voxels.T[::-1])] = cell[number]
+    return mesh, of_voxel
+
+
+def blurred(mesh: Mesh, cell_of_voxel: IntArray, inside: Volume, labels: IntArray, names: Mapping[int, str]) -> tuple[str, ...]:
+    """Say how much of the object the cubes assign to the wrong zone or leave out; nothing where that is less than one per cent."""
+    there = inside.values != 0
+    cells = cell_of_voxel[there]
+    wrong = np.array(sorted(names))[mesh.regions[cells]] != labels[there]
+    share = float(np.mean((cells < 0) | wrong))
+    if share < BLURRED:
+        return ()
+    return (
+        f"The cubes leave out, or assign to another zone, {100 * share:.2g} % of the object, because zones end inside of them: what "
+        "this costs is not in the intervals; compare with other sizes of elements.",
+    )

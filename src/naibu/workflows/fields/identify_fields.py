@@ -1,0 +1,237 @@
+"""Identify moduli from displacement fields, from files to files: volumes of moduli on the grid of the scan, numbers, and a page."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from naibu._version import __version__
+from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.progress import Progress
+from naibu.core.volume import Volume
+from naibu.identification.from_fields.estimate import FieldEstimate, identify_field
+from naibu.identification.from_fields.forward.field_laws import LawName
+from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
+from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
+from naibu.identification.from_fields.identified_body import IdentifiedBody
+from naibu.io.displacement_fields import read_field
+from naibu.io.files.atomic import write_atomically
+from naibu.io.files.provenance import input_record
+from naibu.io.images import write_volume
+from naibu.viewer.slices import Overlay, SliceView, slices_html
+from naibu.viewer.tables import Cell, Table
+from naibu.workflows.fields.block_mesh import CELLS, block_mesh, blurred, labelled_object, names_of_labels
+from naibu.workflows.fields.known_zones import parse_known_zones
+from naibu.workflows.fields.measured_load_case import measured_load_case, relative_deformation
+from naibu.workflows.results.output_folder import output_folder
+
+FILES = ("model.json", "report.html", "zones.mha", "young_modulus.mha", "young_modulus_sd.mha", "poisson_ratio.mha", "identification.json")
+CELLS_OF_MAP = 2500  # of the model by default
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FieldIdentification:
+    """What `identify_fields` returns.
+
+    Attributes
+    ----------
+    estimate : FieldEstimate
+        Moduli, intervals and verdict.
+    body : IdentifiedBody
+        The model, as ``model.json`` holds it.
+    relative : bool
+        Whether moduli are multiples of that of a zone whose modulus was not stated.
+    notes : tuple of str
+        Verdict, intervals and what limits them, in words.
+    files : tuple of Path
+        What was written.
+    """
+
+    estimate: FieldEstimate
+    body: IdentifiedBody
+    relative: bool
+    notes: tuple[str, ...]
+    files: tuple[Path, ...] = ()
+
+
+def identify_fields(
+    fields: Sequence[str | os.PathLike[str]] | str | os.PathLike[str],
+    *,
+    mask: str | os.PathLike[str] | None = None,
+    zones: str | os.PathLike[str] | None = None,
+    zone_names: Mapping[int, str] | None = None,
+    known: Sequence[str] = (),
+    each_cell: bool = False,
+    law: LawName = "neo_hookean",
+    element_size_mm: float = 0.0,
+    out: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> FieldIdentification:
+    """Identify moduli from measured displacement fields of one body, and write volumes of moduli, numbers and a page.
+
+    The model is made of cubes that fill the object. Forces on its surface are not known: the displacement of the surface is identified
+    along with the moduli, and the balance of forces inside determines these up to a factor, which known zones set.
+
+    Parameters
+    ----------
+    fields : path-like, or sequence of them
+        One file for each load case (see `naibu.io.read_field`), such as the ``field.h5`` of ``naibu sense``, all from one reference scan.
+    mask : path-like, optional
+        Volume that is not zero in the object; by default where `zones` has labels.
+    zones : path-like, optional
+        Volume of whole numbers on the same grid, one for each zone; 0 outside. Without it the object is one zone.
+    zone_names : mapping, optional
+        Names of labels; by default ``"label 1"`` and so on.
+    known : sequence of str
+        ``"gel=12 kPa"``, ``"gel=12 kPa, 0.45"`` with Poisson's ratio, ``"bone=rigid"``; or only a name, of which the others are multiples.
+    each_cell : bool
+        Map the moduli of unknown zones cell by cell, and make regions of the map.
+    law : {"neo_hookean", "linear"}
+        Finite or small strain.
+    element_size_mm : float
+        Edge length of the cubes; 0 chooses it so that there are about 1200, or 2500 for a map.
+    out : path-like, optional
+        Folder for ``model.json``, which predicts and can be touched; ``young_modulus.mha``, ``young_modulus_sd.mha`` and
+        ``poisson_ratio.mha`` on the grid of the mask (0 outside; -1 where there is no standard deviation); ``zones.mha`` (from 1 in the
+        order of the table of moduli, 0 where they are known); ``identification.json`` and ``report.html``.
+    overwrite : bool
+        Whether these files may be there already.
+    progress : callable, optional
+        Gets a report after every step.
+
+    Raises
+    ------
+    InputError
+        Files that cannot be read or do not fit together, a known zone that does not exist, or nothing that sets the scale.
+    ConvergenceError
+        The fields do not fix how the surface moves, or there is no equilibrium.
+    """
+    paths = [fields] if isinstance(fields, str | os.PathLike) else list(fields)
+    folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
+    inside, labels = labelled_object(mask, zones)
+    names = names_of_labels(labels, inside, zone_names or {})
+    stated = parse_known_zones(known, list(names.values()))
+    volume = float(inside.values.sum() * np.prod(inside.spacing_mm))
+    size = element_size_mm or (volume / (CELLS_OF_MAP if each_cell else CELLS)) ** (1.0 / 3.0)
+    mesh, cell_of_voxel = block_mesh(inside, labels, names, size)
+    cases = [measured_load_case(mesh, cell_of_voxel, inside, read_field(p), Path(p).stem) for p in paths]
+    found = identify_field(
+        mesh, cases, Zones.of(mesh, known=stated.values, known_sd=stated.doubts, each_cell=each_cell), law=law, progress=progress
+    )
+    inputs = input_record({"mask": mask, "zones": zones} | {f"field {k + 1}": p for k, p in enumerate(paths)})
+    body = IdentifiedBody.of(
+        found, axes=inside.direction, law=law, relative=stated.relative, strain=max(relative_deformation(c.field) for c in cases),
+        load_cases=cases, provenance={"naibu": __version__, "known": list(known), "inputs": dict(inputs)},
+    )  # fmt: skip
+    notes = (*found.identifiability, *blurred(mesh, cell_of_voxel, inside, labels, names))
+    result = FieldIdentification(found, body, stated.relative, notes)
+    return result if folder is None else replace(result, files=tuple(_written(folder, result, inside, cell_of_voxel)))
+
+
+def zones_of_voxels(found: FieldEstimate, inside: Volume, cells: IntArray) -> IntArray:
+    """Return the zone of every voxel (nz, ny, nx), -1 where its moduli are known and outside, with borders as fine as voxels."""
+    out = np.where(cells >= 0, found.zones.of_cell[cells], KNOWN)
+    if found.borders is not None:
+        where = out != KNOWN
+        out[where] = found.borders.region_at(inside.to_physical(np.argwhere(where)[:, ::-1]), out[where])
+    return out
+
+
+def moduli_of_cells(found: FieldEstimate) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return Young's modulus, kPa, its standard deviation, kPa (NaN where none is known), and Poisson's ratio of every cell (m,)."""
+    lame, shear = found.lame_of_cells()
+    young, poisson = shear * (3.0 * lame + 2.0 * shear) / (lame + shear), lame / (2.0 * (lame + shear))
+    sd = np.full(len(young), np.nan)
+    unknown = found.zones.of_cell != KNOWN
+    if found.uncertainty is not None:
+        sd[unknown] = (young[unknown]) * found.uncertainty.of_young_and_poisson(found.theta)[0][found.zones.of_cell[unknown]]
+    for number, region in enumerate(found.zones.known):
+        sd[found.zones.region_of_cell == number] = region.young_modulus * region.young_modulus_sd
+    return young, sd, poisson
+
+
+def table_of_zones(result: FieldIdentification) -> Table:
+    """Return the table of moduli with their intervals, which take the law as given."""
+    found = result.estimate
+    rows: list[tuple[Cell, ...]] = []
+    unit = "multiples of the known zone" if result.relative else "kPa"
+    if found.uncertainty is not None:
+        young, poisson = found.intervals()
+        for i, name in enumerate(found.zones.names):
+            e, nu = (float(values[i]) for values in (found.young_modulus, found.poisson_ratio))
+            rows.append((name, e, *map(float, young[i]), nu, *map(float, poisson[i])))
+    columns = ("zone", f"Young's modulus, {unit}", "95 % from", "to", "Poisson's ratio", "of which 95 % from", "up to")
+    return Table("Moduli", columns, tuple(rows))
+
+
+def table_of_assumptions(result: FieldIdentification) -> Table:
+    """Return what Young's modulus and Poisson's ratio would be under other assumptions: other known values, the other law."""
+    found = result.estimate
+    rows: list[tuple[Cell, ...]] = []
+    if found.uncertainty is not None:
+        inside = found.intervals()[0]
+        for one in found.assumptions:
+            young, poisson = young_and_poisson(found.theta + one.theta)
+            for name, e, nu, (low, high) in zip(found.zones.names, young, poisson, inside, strict=True):
+                rows.append((one.text, name, float(e), float(nu), "yes" if low <= e <= high else "no"))
+    unit = "multiples of the known zone" if result.relative else "kPa"
+    columns = ("other assumption", "zone", f"Young's modulus, {unit}", "Poisson's ratio", "modulus within the interval above")
+    return Table("Moduli under other assumptions", columns, tuple(rows))
+
+
+def _as_records(table: Table) -> list[dict[str, Cell]]:
+    return [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+
+
+def _written(folder: Path, result: FieldIdentification, inside: Volume, cells: IntArray) -> list[Path]:
+    """Write the model first, then numbers and volumes, and the page."""
+    found, body = result.estimate, result.body
+    young, sd, poisson = (np.where(cells >= 0, values[cells], 0.0) for values in moduli_of_cells(found))
+    regions = zones_of_voxels(found, inside, cells)
+    if found.borders is not None and found.uncertainty is not None:
+        there = regions != KNOWN
+        of_young = found.young_modulus * found.uncertainty.of_young_and_poisson(found.theta)[0]
+        for full, values in ((young, found.young_modulus), (sd, of_young), (poisson, found.poisson_ratio)):
+            full[there] = values[regions[there]]
+    volumes = {"young_modulus": young, "young_modulus_sd": np.nan_to_num(sd, nan=-1.0, posinf=-1.0), "poisson_ratio": poisson}
+    files = [write_atomically(folder / "model.json", json.dumps(body.to_dict(), ensure_ascii=False, allow_nan=False) + "\n")]
+    files += [write_volume(folder / f"{name}.mha", inside.with_values(v.astype(np.float32))) for name, v in volumes.items()]
+    files.append(write_volume(folder / "zones.mha", inside.with_values((regions + 1).astype(np.uint16))))
+    outside = np.where(cells >= 0, 0.0, np.nan)
+    unit = "multiples of the known zone" if result.relative else "kPa"
+    view = SliceView(
+        title="Moduli from displacement fields",
+        sentences=[*result.notes, *found.steps],
+        spacing_mm=inside.spacing_mm,
+        images=[("object", inside.values.astype(np.float32))],
+        displacement=np.full((*inside.shape, 3), np.nan),
+        overlays=[
+            Overlay(f"Young's modulus, {unit}", young + outside),
+            Overlay(f"standard deviation of Young's modulus, {unit}", np.where(sd > 0.0, sd, np.nan) + outside),
+            Overlay("Poisson's ratio", poisson + outside),
+        ],
+        tables=[t for t in (table_of_zones(result), table_of_assumptions(result)) if t.rows],
+        origin_mm=inside.origin_mm @ inside.direction,
+    )
+    verdict = found.verdict
+    numbers = {
+        "naibu": __version__,
+        "verdict": None if verdict is None else verdict.to_dict(),
+        "zones": _as_records(table_of_zones(result)),
+        "other_assumptions": _as_records(table_of_assumptions(result)),
+        "noise_factor": found.noise_factor,
+        "in_words": list(result.notes),
+        "steps": list(found.steps),
+        "known": body.provenance["known"],
+        "law": body.law,
+        "cells": found.mesh.n_cells,
+        "inputs": body.provenance["inputs"],
+    }
+    files.append(write_atomically(folder / "identification.json", json.dumps(numbers, indent=1, ensure_ascii=False) + "\n"))
+    return [write_atomically(folder / "report.html", slices_html(view)), *files]

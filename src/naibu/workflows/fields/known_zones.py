@@ -1,0 +1,69 @@
+"""What the user states of zones: moduli that are known, or a zone of which the others are multiples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from naibu.core.errors import InputError
+from naibu.core.units import kilopascals
+
+POISSON_RATIO, POISSON_RATIO_SD = 0.45, 0.03  # of a known material of which only Young's modulus is stated
+RIGID = 300.0  # stiffness of what is called rigid over that of the stiffest other known material
+LARGEST_POISSON_RATIO = 0.499  # of a known zone: beyond, elements of one pressure each lock
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownZones:
+    """Known zones: Young's modulus, kPa, and Poisson's ratio by name, their standard deviations, and whether moduli are only ratios."""
+
+    values: Mapping[str, tuple[float, float]]
+    doubts: Mapping[str, tuple[float, float]]
+    relative: bool
+
+
+def parse_known_zones(known: Sequence[str], names: Sequence[str]) -> KnownZones:
+    """Read ``"gel=12 kPa"``, ``"gel=12 kPa, 0.45"``, ``"bone=rigid"`` or ``"gel"``.
+
+    Raises
+    ------
+    InputError
+        A text that is none of these, a zone that does not exist, or nothing that sets the scale.
+    """
+    values: dict[str, tuple[float, float]] = {}
+    doubts: dict[str, tuple[float, float]] = {}
+    rigid: list[str] = []
+    relative = False
+    for text in known:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        if name not in names:
+            raise InputError(f"known={text!r}: there is no zone {name!r}; the zones are {', '.join(map(repr, names))}")
+        if equals and value == "rigid":
+            rigid.append(name)
+        elif equals:
+            values[name], doubts[name] = _stated_moduli(text, value)
+        else:
+            relative, values[name], doubts[name] = True, (1.0, POISSON_RATIO), (0.0, POISSON_RATIO_SD)
+    if not values:
+        raise InputError(
+            f"known names no zone with a modulus, so that nothing sets the scale; name one of {', '.join(map(repr, names))}, "
+            "with its Young's modulus, or without it for ratios"
+        )
+    if relative and len(values) > 1:
+        raise InputError("known states the modulus of some zones and leaves that of another open; state all, or name one")
+    stiff = RIGID * max(young for young, _ in values.values())
+    return KnownZones(values | dict.fromkeys(rigid, (stiff, 0.3)), doubts, relative)
+
+
+def _stated_moduli(text: str, value: str) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return Young's modulus, kPa, and Poisson's ratio, and their standard deviations, of ``12 kPa`` or ``12 kPa, 0.45``."""
+    modulus, comma, ratio = (part.strip() for part in value.partition(","))
+    try:
+        young, poisson = kilopascals(modulus), float(ratio) if comma else POISSON_RATIO
+    except ValueError as error:  # an InputError is one
+        said = f" ({error})" if isinstance(error, InputError) else ""
+        ways = "write 'gel=12 kPa', 'gel=12 kPa, 0.45' with Poisson's ratio, 'bone=rigid', or 'gel'"
+        raise InputError(f"known={text!r}: {ways}{said}") from error
+    if not 0.0 <= poisson <= LARGEST_POISSON_RATIO:
+        raise InputError(f"known={text!r}: Poisson's ratio must lie between 0 and {LARGEST_POISSON_RATIO:g}, not {poisson:g}")
+    return (young, poisson), (0.0, 0.0 if comma else POISSON_RATIO_SD)

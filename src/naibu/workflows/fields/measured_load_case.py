@@ -1,0 +1,59 @@
+"""Load cases from measured displacement fields: the measurements inside the cells, and whether they say anything."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from naibu.core.arrays import BoolArray, IntArray
+from naibu.core.displacement_field import DisplacementField
+from naibu.core.errors import InputError
+from naibu.core.mesh import Mesh
+from naibu.core.rigid_transform import registration
+from naibu.core.volume import Volume
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
+from naibu.meshing.point_location import locate
+from naibu.meshing.surface import boundary_nodes
+
+MOST_POINTS = 10_000  # measurements of a load case: neighbours in a field say the same
+LEAST_DEFORMATION, LARGEST_DEFORMATION = 1e-6, 0.5  # RMS of what a rigid motion leaves, part of the extent of the object
+
+
+def measured_load_case(mesh: Mesh, cell_of_voxel: IntArray, inside: Volume, field: DisplacementField, name: str) -> FieldLoadCase:
+    """Return the load case of the measurements inside the cells; all nodes of the surface carry unknown forces."""
+    at = field.at_points()
+    index = np.round(inside.to_index(at.points)).astype(int)[:, ::-1]
+    within = ((index >= 0) & (index < inside.shape)).all(axis=1) & at.valid
+    within[within] = cell_of_voxel[tuple(index[within].T)] >= 0
+    near = np.flatnonzero(within)  # cells end inside of voxels
+    chosen = near[locate(mesh, at.points[near], tolerance_mm=np.inf).distance_mm <= 1e-6] if len(near) else near
+    if len(chosen) < 20:
+        raise InputError(f"{name}: {len(chosen)} measurements of the field lie in the object; are field and mask from one reference scan?")
+    every = -(-len(chosen) // MOST_POINTS)
+    chosen = np.random.default_rng(0).permutation(chosen)[: len(chosen) // every]
+    covariance = None if at.covariance is None else at.covariance[chosen]
+    some = DisplacementField.from_arrays(at.points[chosen], at.vectors[chosen], covariance=covariance)
+    _require_deformation(name, some)
+    loaded: BoolArray = np.zeros(mesh.n_points, dtype=bool)
+    loaded[boundary_nodes(mesh)] = True
+    return FieldLoadCase.of(name, some, mesh, loaded=loaded)
+
+
+def relative_deformation(field: DisplacementField) -> float:
+    """Return the root mean square displacement that a rigid motion leaves, as part of the extent of a field at points."""
+    points, vectors = field.points[field.valid], field.vectors[field.valid]
+    left = vectors - registration(points, points + vectors).displacement(points)
+    return float(np.sqrt((left**2).sum(axis=1).mean()) / np.linalg.norm(np.ptp(points, axis=0)))
+
+
+def _require_deformation(name: str, field: DisplacementField) -> None:
+    """Refuse a field in which the object moves as a rigid body, or is torn apart: nothing can be identified from either."""
+    deformation, extent = relative_deformation(field), float(np.linalg.norm(np.ptp(field.points, axis=0)))
+    if deformation <= LEAST_DEFORMATION:
+        raise InputError(
+            f"{name}: the object moves by up to {np.abs(field.vectors).max():.3g} mm, but does not deform; is it the right field?"
+        )
+    if deformation > LARGEST_DEFORMATION:
+        raise InputError(
+            f"{name}: the object, {extent:.3g} mm large, deforms by {deformation * extent:.3g} mm RMS; is the field in mm, and are field "
+            "and mask from one reference scan?"
+        )

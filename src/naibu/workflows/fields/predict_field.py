@@ -1,0 +1,325 @@
+"""Predict the displacement of a body that was identified from displacement fields, compare it with a measured one, and write both."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from naibu._version import __version__
+from naibu.core.arrays import LENGTHS_MM, FloatArray
+from naibu.core.displacement_field import DisplacementField
+from naibu.core.errors import InputError
+from naibu.core.volume import Volume
+from naibu.identification.from_fields.field_prediction import FieldPrediction, predict_inside, predict_moved_sides
+from naibu.identification.from_fields.identified_body import IdentifiedBody
+from naibu.io.displacement_fields import read_field, write_field
+from naibu.io.files.atomic import write_atomically
+from naibu.io.files.provenance import input_record
+from naibu.io.vtk_files import write_vtu
+from naibu.meshing.point_location import locate
+from naibu.viewer.cards import Card
+from naibu.viewer.slices import Overlay, SliceView, slices_html
+from naibu.viewer.tables import Table
+from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.result_folder import read_any_model
+
+FILES = ("predicted.html", "field.h5", "predicted.vtu", "summary.json")
+VOXELS = 60_000  # of the grid on which a prediction is written
+WIDTH = 1.959964  # standard deviations to either side that hold 95 %
+EXTRAPOLATED = 1.5  # times the deformation of the identification, from which a prediction is an extrapolation
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """A prediction against a measured field, at points that it did not use.
+
+    Attributes
+    ----------
+    points : ndarray, shape (k, 3)
+        mm.
+    difference : ndarray, shape (k, 3)
+        Predicted less measured displacement, mm.
+    rms_mm : ndarray, shape (3,)
+        Root mean square difference along x, y and z.
+    rms_sd : float or None
+        Root mean square difference in units of its standard deviation, that of the measurement included; None where that is not known.
+    within : float or None
+        Part of the components within 1.96 standard deviations.
+    """
+
+    points: FloatArray
+    difference: FloatArray
+    rms_mm: FloatArray
+    rms_sd: float | None
+    within: float | None
+
+    @classmethod
+    def of(cls, prediction: FieldPrediction, field: DisplacementField) -> Comparison:
+        """Compare at all points of a field."""
+        predicted, covariance = prediction.at(field.points)
+        difference = predicted - field.vectors
+        rms = np.sqrt((difference**2).mean(axis=0))
+        if field.covariance is None:
+            return cls(field.points, difference, rms, None, None)
+        sd = np.sqrt(np.einsum("kii->ki", covariance + field.covariance))
+        return cls(
+            field.points, difference, rms, float(np.sqrt(((difference / sd) ** 2).mean())), float((np.abs(difference) < WIDTH * sd).mean())
+        )
+
+    def sentence(self) -> str:
+        """Return the comparison in words."""
+        x, y, z = self.rms_mm
+        text = f"At {len(self.points)} measured points that were not used: RMS difference x {x:.3g}, y {y:.3g}, z {z:.3g} mm"
+        if self.rms_sd is None or self.within is None:
+            return f"{text}; the measured field states no standard deviation."
+        return f"{text}, {self.rms_sd:.2f} standard deviations; {100 * self.within:.0f} % of the components lie within the 95 % interval."
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FieldPredictionRun:
+    """What `predict_field` returns.
+
+    Attributes
+    ----------
+    body : IdentifiedBody
+        The model.
+    prediction : FieldPrediction
+        Displacement and its covariance.
+    comparison : Comparison or None
+        With the measured field, where one was given.
+    notes : tuple of str
+        What the prediction rests on, in words.
+    files : tuple of Path
+        What was written.
+    """
+
+    body: IdentifiedBody
+    prediction: FieldPrediction
+    comparison: Comparison | None
+    notes: tuple[str, ...]
+    files: tuple[Path, ...] = ()
+
+
+def predict_field(
+    model: IdentifiedBody | str | os.PathLike[str],
+    field: str | os.PathLike[str] | None = None,
+    *,
+    held: Sequence[str] = (),
+    moved: Sequence[str] = (),
+    out: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
+) -> FieldPredictionRun:
+    """Predict the displacement of an identified body under another loading, and compare it with a measured one.
+
+    Either sides of the body are held and moved by plates to which they stick, its other surface being free; or the displacement of the
+    surface follows from `field` near there, and that inside is predicted.
+
+    Parameters
+    ----------
+    model : IdentifiedBody or path-like
+        ``model.json`` of an identification from displacement fields, or its folder.
+    field : path-like, optional
+        Measured displacement in the frame of the scan that the model was identified from (see `naibu.io.read_field`).
+    held : sequence of str
+        Sides that do not move: ``x-``, ``x+``, ``y-``, ``y+``, ``z-``, ``z+`` in the frame of the scan.
+    moved : sequence of str
+        Sides and their displacement, mm: ``"z+=0,0,-5"``.
+    out : path-like, optional
+        Folder for ``field.h5``, ``predicted.html``, ``predicted.vtu`` and ``summary.json``.
+    overwrite : bool
+        Whether these files may be there already.
+
+    Raises
+    ------
+    InputError
+        A model or a field that cannot be used, sides that do not exist, or neither a field nor sides.
+    ConvergenceError
+        There is no equilibrium.
+    """
+    body = model if isinstance(model, IdentifiedBody) else read_any_model(model)
+    if not isinstance(body, IdentifiedBody):
+        raise InputError(f"{model}: was identified from markers; `held` and `moved` go with models of displacement fields")
+    motions = parsed_sides(held, moved)
+    measured = None if field is None else read_field(field).at_points()
+    if measured is None and not motions:
+        raise InputError("give `moved`, a side of the body and its displacement, or a measured field, whose surface moves the body")
+    folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
+    if motions:
+        prediction = predict_moved_sides(body, motions)
+        compared = None if measured is None else _inside_of(prediction, measured)
+    else:
+        assert measured is not None
+        prediction, inner = predict_inside(body, measured)
+        compared = _part(measured, inner)
+    comparison = None if compared is None or not len(compared.points) else Comparison.of(prediction, compared)
+    notes = _notes(body, prediction, motions, comparison, measured is not None)
+    run = FieldPredictionRun(body, prediction, comparison, notes)
+    if folder is None:
+        return run
+    inputs = input_record({"model": None if isinstance(model, IdentifiedBody) else _file_of(model), "field": field})
+    return replace(run, files=tuple(_written(folder, run, motions, dict(inputs))))
+
+
+def parsed_sides(held: Sequence[str], moved: Sequence[str]) -> dict[str, tuple[float, float, float]]:
+    """Read ``z-`` and ``z+=0,0,-5``.
+
+    Raises
+    ------
+    InputError
+        A text of another form, or a side that is named twice.
+    """
+    out: dict[str, tuple[float, float, float]] = {}
+    for side, motion in [(text.strip(), (0.0, 0.0, 0.0)) for text in held] + [_motion(text) for text in moved]:
+        if side in out:
+            raise InputError(f"side {side!r} is named twice; hold it, or move it once")
+        out[side] = motion
+    return out
+
+
+def _motion(text: str) -> tuple[str, tuple[float, float, float]]:
+    side, _, numbers = text.partition("=")
+    try:
+        x, y, z = (float(part) for part in numbers.split(","))
+    except ValueError as error:
+        raise InputError(f"moved={text!r} must name a side and its displacement along x, y and z in mm, such as 'z+=0,0,-5'") from error
+    if not np.abs([x, y, z]).max() <= LENGTHS_MM[1]:
+        raise InputError(f"moved={text!r}: a displacement must be at most {LENGTHS_MM[1]:g} mm")
+    return side.strip(), (x, y, z)
+
+
+def _file_of(model: str | os.PathLike[str]) -> Path:
+    return Path(model) / "model.json" if Path(model).is_dir() else Path(model)
+
+
+def _part(field: DisplacementField, some: Any) -> DisplacementField:
+    covariance = None if field.covariance is None else field.covariance[some]
+    return DisplacementField.from_arrays(field.points[some], field.vectors[some], covariance=covariance)
+
+
+def _inside_of(prediction: FieldPrediction, field: DisplacementField) -> DisplacementField:
+    """Return the valid measurements that lie in the body."""
+    low, high = prediction.mesh.points.min(axis=0), prediction.mesh.points.max(axis=0)
+    near = np.flatnonzero(field.valid & ((field.points >= low) & (field.points <= high)).all(axis=1))
+    if len(near):
+        near = near[locate(prediction.mesh, field.points[near], tolerance_mm=np.inf).distance_mm <= 1e-6]
+    if not len(near):
+        raise InputError("no measurement of the field lies in the body; are field and model from one reference scan?")
+    return _part(field, near)
+
+
+def _notes(
+    body: IdentifiedBody,
+    prediction: FieldPrediction,
+    motions: dict[str, tuple[float, float, float]],
+    comparison: Comparison | None,
+    measured: bool,
+) -> tuple[str, ...]:
+    notes = [f"the model is doubtful: {body.reservation}"] if body.reservation else []
+    if motions:
+        said = [f"{side} {'held' if not any(u) else f'moved by ({u[0]:g}, {u[1]:g}, {u[2]:g}) mm'}" for side, u in motions.items()]
+        notes.append(f"Loading: {', '.join(said)}; these sides stick to their plates, and all other surface is free.")
+    else:
+        notes.append("Loading: the surface moves as the measured field does in the cells there; nothing measured farther inside was used.")
+    if comparison is not None:
+        notes.append(comparison.sentence())
+    elif measured:
+        notes.append("The field has no point farther inside than the cells at the surface: nothing to compare with.")
+    sd = float(np.median(prediction.standard_deviation))
+    parts = "moduli, surface, elements and model misfit" if body.covariance is not None else "surface, elements and model misfit"
+    notes.append(f"A predicted component is known to {sd:.2g} mm (standard deviation, median: {parts}).")
+    if body.covariance is None:
+        notes.append("The model is a map of moduli cell by cell without a covariance: what its errors do to the prediction is not known.")
+    if prediction.strain > EXTRAPOLATED * body.strain:
+        ratio = prediction.strain / max(body.strain, 1e-300)
+        notes.append(f"This is an extrapolation: the body is deformed {ratio:.2g} times as much as in the identification.")
+    return tuple(notes)
+
+
+def _written(folder: Path, run: FieldPredictionRun, motions: dict[str, tuple[float, float, float]], inputs: dict[str, str]) -> list[Path]:
+    """Write field and numbers first, and the page."""
+    body, prediction, c = run.body, run.prediction, run.comparison
+    field = on_grid(body, prediction)
+    provenance = {"naibu": __version__, "verb": "predict", "inputs": inputs}
+    files = [write_field(folder / "field.h5", field, provenance=provenance)]
+    sd = prediction.standard_deviation
+    write_vtu(folder / "predicted.vtu", body.mesh, {"displacement_mm": prediction.displacement, "standard_deviation_mm": sd})
+    numbers = {
+        "naibu": __version__,
+        "loading": {side: list(u) for side, u in motions.items()} or "surface of the field",
+        "largest_displacement_mm": float(np.linalg.norm(prediction.displacement, axis=1).max()),
+        "median_sd_mm": float(np.median(sd)),
+        "deformation": prediction.strain,
+        "deformation_in_identification": body.strain,
+        "comparison": None
+        if c is None
+        else {"points": len(c.points), "rms_mm": c.rms_mm.tolist(), "rms_in_standard_deviations": c.rms_sd, "within_95_percent": c.within},
+        "notes": list(run.notes),
+        "inputs": inputs,
+        "provenance": dict(body.provenance),
+    }
+    files.append(write_atomically(folder / "summary.json", json.dumps(numbers, indent=1, ensure_ascii=False) + "\n"))
+    return [write_atomically(folder / "predicted.html", slices_html(_page(run, field))), *files, folder / "predicted.vtu"]
+
+
+def on_grid(body: IdentifiedBody, prediction: FieldPrediction) -> DisplacementField:
+    """Return the prediction at the voxels of a grid along the axes of the body's cells, with no vector outside of them."""
+    along = body.mesh.points @ body.axes
+    low, extent = along.min(axis=0), np.ptp(along, axis=0)
+    edge = float((extent.prod() / VOXELS) ** (1.0 / 3.0))
+    counts = np.maximum(np.round(extent / edge).astype(int), 1)
+    spacing = extent / counts
+    grid = Volume.from_array(
+        np.zeros(counts[::-1], dtype=bool), spacing_mm=spacing, origin_mm=body.axes @ (low + 0.5 * spacing), direction=body.axes
+    )
+    points = grid.positions().reshape(-1, 3)
+    inside = locate(body.mesh, points, tolerance_mm=np.inf).distance_mm <= 1e-6
+    vectors, covariance = np.full((len(points), 3), np.nan), np.full((len(points), 3, 3), np.nan)
+    vectors[inside], covariance[inside] = prediction.at(points[inside])
+    shape = grid.shape
+    return DisplacementField.on_grid(grid, vectors.reshape(*shape, 3), covariance=covariance.reshape(*shape, 3, 3))
+
+
+def _page(run: FieldPredictionRun, field: DisplacementField) -> SliceView:
+    grid, c = field.grid, run.comparison
+    size, sd = np.linalg.norm(field.vectors, axis=-1), field.largest_sd_mm
+    assert sd is not None
+    overlays = [Overlay("displacement, mm", size), Overlay("standard deviation, mm", sd)]
+    cards = [
+        Card("Largest displacement", f"{np.nanmax(size):.3g} mm"),
+        Card("Standard deviation of a displacement", f"{np.nanmedian(sd):.2g} mm", "median, along the least certain direction"),
+    ]
+    if c is not None:
+        overlays.append(Overlay("distance of predicted from measured, mm", _of_voxels(grid, c)))
+        rms = float(np.linalg.norm(c.rms_mm))
+        said = "" if c.rms_sd is None else f"{c.rms_sd:.2f} standard deviations, at points that were not used"
+        cards.append(Card("Predicted less measured, RMS", f"{rms:.2g} mm", said))
+    rows = tuple((name, e, nu) for name, e, nu in run.body.moduli()) if len(run.body.zones) <= 20 else ()
+    unit = "multiples of the known zone" if run.body.relative else "kPa"
+    return SliceView(
+        title="Predicted displacement",
+        sentences=run.notes,
+        spacing_mm=grid.spacing_mm,
+        images=[("body", np.where(np.isfinite(size), 1.0, 0.0))],
+        displacement=np.asarray(field.vectors @ grid.direction),
+        overlays=overlays,
+        tables=[Table("Moduli of the model", ("zone", f"Young's modulus, {unit}", "Poisson's ratio"), rows)] if rows else [],
+        origin_mm=grid.origin_mm @ grid.direction,
+        direction=grid.direction,
+        cards=cards,
+    )
+
+
+def _of_voxels(grid: Volume, compared: Comparison) -> FloatArray:
+    """Return the root mean square distance (nz, ny, nx), mm, of the points in every voxel; NaN where there are none."""
+    index = np.round(grid.to_index(compared.points)).astype(int)[:, ::-1]
+    index = np.clip(index, 0, np.array(grid.shape) - 1)
+    flat = np.ravel_multi_index(tuple(index.T), grid.shape)
+    total = int(np.prod(grid.shape))
+    counts, sums = np.bincount(flat, minlength=total), np.bincount(flat, (compared.difference**2).sum(axis=1), minlength=total)
+    return np.asarray(np.where(counts > 0, np.sqrt(sums / np.maximum(counts, 1)), np.nan).reshape(grid.shape))
