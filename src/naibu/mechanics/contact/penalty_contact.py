@@ -185,6 +185,18 @@ class ContactResponse:
     anchor_stiffness: FloatArray
 
 
+@njit(cache=True, inline="always")
+def normal_pressure(g, k_n, tied):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return the pressure of a point with the gap g and its derivative by the gap, both zero where the point does not touch."""
+    if tied:
+        return -k_n * g, -k_n
+    if g >= 0.0:
+        return 0.0, 0.0
+    if g > -RAMP_MM:
+        return 0.5 * k_n * g * g / RAMP_MM, k_n * g / RAMP_MM
+    return -k_n * (g + 0.5 * RAMP_MM), -k_n
+
+
 @njit(cache=True, nogil=True)
 def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
     geometry, axes, y, anchors, k_n, k_t, mu, tied, curvature, gap, force, friction, slip, stiffness, friction_stiffness, anchor_stiffness
@@ -195,14 +207,9 @@ def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
     for q in range(len(y)):
         g = distance_with_derivatives(geometry, axes, y[q], n, h)
         gap[q] = g
-        if tied:
-            p, dp = -k_n[q] * g, -k_n[q]
-        elif g >= 0.0:
+        p, dp = normal_pressure(g, k_n[q], tied)
+        if dp == 0.0:
             continue
-        elif g > -RAMP_MM:
-            p, dp = 0.5 * k_n[q] * g * g / RAMP_MM, k_n[q] * g / RAMP_MM
-        else:
-            p, dp = -k_n[q] * (g + 0.5 * RAMP_MM), -k_n[q]
         along = 0.0
         for i in range(3):
             along += n[i] * (y[q, i] - anchors[q, i])

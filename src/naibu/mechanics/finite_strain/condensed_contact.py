@@ -9,20 +9,19 @@ size of the body. Contacts that open, close, stick or slip cost no iteration of 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
-from naibu.mechanics.finite_strain.earlier_tangent import EarlierTangent, contact_change
+from naibu.mechanics.finite_strain.earlier_tangent import EarlierTangent, add_earlier_forces, contact_change
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 from naibu.mechanics.linear_algebra.updated_factors import BlockChange, ChangedInverse
 
-EVALUATIONS = 24  # of the contact at most
+EVALUATIONS = 16  # of the contact at most
 USUAL = 6  # evaluations after which ten times the tolerance is enough
 HALVINGS = 5  # of a step that does not improve: points may stick and slip by turns
 FAST = 0.2  # of what was left: progress with which an earlier derivative of the contact goes on being used
@@ -136,21 +135,19 @@ class ContactBesideTangent:
     tangent: EarlierTangent
     gripped: IntArray
     hold: float
-    _earlier: sp.bsr_matrix = field(init=False)
     _place: IntArray = field(init=False)
 
     def __post_init__(self) -> None:
-        self._earlier = self.pattern.matrix(self.tangent.contact)
         self._place = np.full(len(self.displacement), -1, dtype=np.int64)
         self._place[self.nodes] = np.arange(len(self.nodes))
 
     def __call__(self, motion: FloatArray) -> FloatArray:
         """Return the forces (k, 3), mN, at a motion (k, 3), mm."""
-        moved = np.zeros_like(self.displacement)
-        moved[self.nodes] = motion
-        force = np.asarray(self._earlier @ moved.ravel()).reshape(-1, 3)
-        force[self.gripped] -= self.hold * moved[self.gripped]
-        moved += self.displacement
+        moved, force = self.displacement.copy(), np.zeros_like(self.displacement)
+        moved[self.nodes] += motion
+        pattern = self.pattern
+        add_earlier_forces(pattern.indptr, pattern.indices, self.tangent.contact, self.nodes, self._place, motion, force)
+        force[self.gripped] -= self.hold * (moved - self.displacement)[self.gripped]
         for contact in self.contacts:
             contact.add_force(moved, force)
         return np.asarray(force[self.nodes])
@@ -159,6 +156,5 @@ class ContactBesideTangent:
         """Return minus the derivative of the forces at the last motion; its nodes are places among the k."""
         blocks = np.zeros((self.pattern.n_blocks, 3, 3))
         for contact, places in zip(self.contacts, self.places, strict=True):
-            contact.add_stiffness(self.pattern, places, blocks)
-        change = contact_change(self.pattern, blocks, self.tangent, self.gripped, self.hold)
-        return replace(change, nodes=self._place[change.nodes])
+            contact.touching().add_stiffness(self.pattern, places, blocks)
+        return contact_change(self.pattern, blocks, self.tangent, self.nodes, self._place, self.gripped, self.hold)

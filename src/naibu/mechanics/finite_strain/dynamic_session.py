@@ -100,6 +100,8 @@ class DynamicEngine:
     tangential_stiffness: float = 200.0
     iterations: int = 10
     tolerance: float = 1e-3
+    _extent: float = field(init=False)
+    _modulus: float = field(init=False)
 
     def __post_init__(self) -> None:
         require_shape("mass", self.mass, (len(self.points),))
@@ -107,6 +109,8 @@ class DynamicEngine:
             require_positive(name, float(getattr(self, name)))
         if not self.mass.min() > 0.0:
             raise InputError(f"mass must be positive at every node, not {self.mass.min():g} kg; remove nodes that no element uses")
+        object.__setattr__(self, "_extent", float(np.ptp(self.points, axis=0).max()))
+        object.__setattr__(self, "_modulus", float(self.assembler.parameters[:, 0].max()))
 
     def rest(self) -> DynamicState:
         """Return the body in the reference configuration, at rest."""
@@ -248,7 +252,7 @@ class DynamicSession(IndenterSession[DynamicEngine, DynamicState]):
     def _implicit_step(self, h: float, contacts: tuple[Contact, ...]) -> ImplicitStep:
         engine, start = self.engine, self.reached
         # the floor is a force that would strain the body by 1e-5
-        floor = 1e-5 * float(engine.assembler.parameters[:, 0].max()) * float(np.ptp(engine.points, axis=0).max()) ** 2
+        floor = 1e-5 * engine._modulus * engine._extent**2
         return ImplicitStep(
             engine.assembler, engine.mass, h, start.displacement, start.velocity, self.external_force, self._constrained, contacts,
             start.anchors, self._positions, engine.tolerance, floor, engine.iterations,

@@ -34,6 +34,8 @@ class EarlierTangent:
         Stiffness of the contacts of then, mN/mm, in the pattern of the surface.
     held : ndarray, shape (h,), int64
         Nodes that do not move in it.
+    touched : ndarray, shape (t,), int64
+        Nodes that these contacts concern.
     solver : LinearSolver
         What the factors belong to; they end when it factorizes another matrix.
     """
@@ -42,6 +44,7 @@ class EarlierTangent:
     dilatation: FloatArray
     contact: FloatArray
     held: IntArray
+    touched: IntArray
     solver: LinearSolver
 
 
@@ -137,7 +140,9 @@ class SolverPool:
         self._spare.append(solver)
 
 
-def contact_change(pattern: BlockPattern, blocks: FloatArray, tangent: EarlierTangent, gripped: IntArray, hold: float) -> BlockChange:
+def contact_change(
+    pattern: BlockPattern, blocks: FloatArray, tangent: EarlierTangent, nodes: IntArray, place: IntArray, gripped: IntArray, hold: float
+) -> BlockChange:
     """Return where, and by how much, the stiffness of contacts and grips differs from that of a tangent, mN/mm.
 
     Parameters
@@ -148,37 +153,61 @@ def contact_change(pattern: BlockPattern, blocks: FloatArray, tangent: EarlierTa
         Stiffness of the contacts now, mN/mm.
     tangent : EarlierTangent
         With that of then.
+    nodes : ndarray, shape (k,), int64
+        The nodes concerned, of which the change is sought.
+    place : ndarray, shape (n,), int64
+        Of every node among them, or -1.
     gripped : ndarray, shape (g,), int64
         Nodes that move as they are told, beside those that the tangent holds.
     hold : float
         Stiffness that represents this, mN/mm.
     """
-    change = blocks - tangent.contact
-    largest = max(float(np.abs(blocks).max(initial=0.0)), float(np.abs(tangent.contact).max(initial=0.0)))
-    marked = np.zeros(pattern.n_points, dtype=bool)
-    marked[gripped] = True
-    taken = _changed_blocks(pattern.indptr, pattern.indices, change, THRESHOLD * largest, marked)
-    marked[tangent.held] = False
-    nodes, place = np.flatnonzero(marked).astype(np.int64), np.cumsum(marked) - 1
-    rows = np.repeat(np.arange(pattern.n_points), np.diff(pattern.indptr))
-    kept = np.flatnonzero(taken & marked[rows] & marked[pattern.indices])
-    own = place[gripped[marked[gripped]]]
+    count, at, rows, columns = _changed_blocks(pattern.indptr, pattern.indices, blocks, tangent.contact, nodes, place, THRESHOLD)
+    at, rows, columns = at[:count], rows[:count], columns[:count]
+    own = place[gripped]
+    own = own[own >= 0]
+    marked = np.zeros(len(nodes), dtype=bool)
+    for some in (rows, columns, own):
+        marked[some] = True
+    number = np.cumsum(marked) - 1
     return BlockChange(
-        nodes, np.concatenate([place[rows[kept]], own]), np.concatenate([place[pattern.indices[kept]], own]),
-        np.concatenate([change[kept], np.tile(hold * np.eye(3), (len(own), 1, 1))]),
+        np.flatnonzero(marked).astype(np.int64), np.concatenate([number[rows], number[own]]),
+        np.concatenate([number[columns], number[own]]),
+        np.concatenate([blocks[at] - tangent.contact[at], np.tile(hold * np.eye(3), (len(own), 1, 1))]),
     )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
-def _changed_blocks(indptr, indices, change, threshold, marked):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Mark the nodes of blocks with an entry above a threshold; returns which blocks have one."""
-    taken = np.zeros(len(indices), np.bool_)
-    for i in range(len(indptr) - 1):
+def _changed_blocks(indptr, indices, blocks, earlier, nodes, place, fraction):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return how many blocks between these nodes changed by more than a fraction of the largest entry, and which: number, row, column."""
+    largest, most = 0.0, 0
+    for i in nodes:
+        most += indptr[i + 1] - indptr[i]
         for at in range(indptr[i], indptr[i + 1]):
             for a in range(9):
-                if abs(change[at, a // 3, a % 3]) > threshold:
-                    taken[at] = True
-                    marked[i] = True
-                    marked[indices[at]] = True
+                largest = max(largest, abs(blocks[at, a // 3, a % 3]), abs(earlier[at, a // 3, a % 3]))
+    found, rows, columns, count = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64), 0
+    for k in range(len(nodes)):
+        for at in range(indptr[nodes[k]], indptr[nodes[k] + 1]):
+            column = place[indices[at]]
+            if column < 0:
+                continue
+            for a in range(9):
+                if abs(blocks[at, a // 3, a % 3] - earlier[at, a // 3, a % 3]) > fraction * largest:
+                    found[count], rows[count], columns[count] = at, k, column
+                    count += 1
                     break
-    return taken
+    return count, found, rows, columns
+
+
+@njit(cache=True, nogil=True)
+def add_earlier_forces(indptr, indices, blocks, nodes, place, motion, force):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add the product of blocks between these nodes and their motion (k, 3) to `force` (n, 3)."""
+    for k in range(len(nodes)):
+        for at in range(indptr[nodes[k]], indptr[nodes[k] + 1]):
+            column = place[indices[at]]
+            if column >= 0:
+                for i in range(3):
+                    force[nodes[k], i] += (
+                        blocks[at, i, 0] * motion[column, 0] + blocks[at, i, 1] * motion[column, 1] + blocks[at, i, 2] * motion[column, 2]
+                    )

@@ -6,11 +6,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from naibu._numba.compilation import njit
 from naibu.core.arrays import BoolArray, FloatArray, Int32Array, IntArray
-from naibu.mechanics.contact._geometry_kernels import mesh_of, signed_distance
 from naibu.mechanics.contact.indenter_geometry import packed_geometry
 from naibu.mechanics.contact.penalty_contact import Contact, ContactResponse
+from naibu.mechanics.finite_strain._nearby_kernels import add_forces, local
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 
 
@@ -26,14 +25,16 @@ class NearbyContact:
         Their anchors.
     points : ndarray, shape (p,), int64
         Their numbers.
-    response : ContactResponse
-        At the last evaluation.
+    gap : ndarray, shape (p,)
+        At the last evaluation, mm.
     """
 
     contact: Contact
     anchors: FloatArray
     points: IntArray
-    response: ContactResponse = field(init=False)
+    gap: FloatArray = field(init=False)
+    _displacement: FloatArray = field(init=False)
+    _response: ContactResponse | None = field(init=False, default=None)
 
     def only(self, which: BoolArray) -> NearbyContact:
         """Return the points that are marked (p,)."""
@@ -45,15 +46,27 @@ class NearbyContact:
         near = np.flatnonzero(gap < margin_mm).astype(np.int64)
         return cls(_points(contact, near), anchors[near], near)
 
-    def evaluate(self, displacement: FloatArray) -> None:
-        """Evaluate the contact at a displacement (n, 3), mm."""
-        self.response = self.contact.evaluate(displacement, self.anchors, 1.0)
+    @property
+    def response(self) -> ContactResponse:
+        """Tractions and their derivatives at the last evaluation."""
+        if self._response is None:
+            self._response = self.contact.evaluate(self._displacement, self.anchors, 1.0)
+        return self._response
 
     def add_force(self, displacement: FloatArray, force: FloatArray) -> None:
-        """Evaluate the contact at a displacement (n, 3), mm, and add its forces to `force` (n, 3), mN."""
-        self.evaluate(displacement)
-        if len(self.points):
-            _scatter_forces(self.contact.nodes, self.contact.shape, self.response.force @ self.response.orientation.T, force)
+        """Evaluate the contact at a displacement (n, 3), mm, which must not change afterwards, and add its forces to `force` (n, 3), mN."""
+        c = self.contact
+        self.gap, self._displacement, self._response = np.empty(len(self.points)), displacement, None
+        add_forces(
+            packed_geometry(c.surface), c.surface.axes, c.nodes, c.shape, c.rest, c.area, c.normal_stiffness, c.tangential_stiffness,
+            c.friction_coefficient, c.tied, displacement, c.stop, c.orientation(1.0), self.anchors, self.gap, force,
+        )  # fmt: skip
+
+    def touching(self) -> NearbyContact:
+        """Return the points that touch, at the last evaluation."""
+        some = self.only(self.gap < 0.0)
+        some.gap, some._displacement = self.gap[self.gap < 0.0], self._displacement
+        return some
 
     def add_stiffness(self, pattern: BlockPattern, positions: Int32Array, blocks: FloatArray) -> None:
         """Add the stiffness at the last evaluation; `positions` are those of all points in the pattern."""
@@ -84,33 +97,8 @@ def _points(contact: Contact, which: IntArray | BoolArray) -> Contact:
 def local_positions(contact: Contact, displacement: FloatArray, load: float) -> tuple[FloatArray, FloatArray]:
     """Return the positions (p, 3) of all points in the frame of the body at a fraction of its path, and their gaps (p,), mm."""
     y, gap = np.empty((len(contact.nodes), 3)), np.empty(len(contact.nodes))
-    _local(
+    local(
         packed_geometry(contact.surface), contact.surface.axes, contact.nodes, contact.shape, contact.rest, displacement,
         contact.start + load * (contact.stop - contact.start), contact.orientation(load), y, gap,
     )  # fmt: skip
     return y, gap
-
-
-@njit(cache=True, nogil=True)
-def _local(geometry, axes, nodes, shape, rest, u, centre, orientation, y, gap):  # type: ignore[no-untyped-def]  # pragma: no cover
-    kinds, sizes, _ = geometry
-    mesh = mesh_of(geometry, 0)
-    d, q, n, none = np.empty(3), np.empty(3), np.empty(3), np.empty((0, 0))
-    for p in range(len(nodes)):
-        for i in range(3):
-            d[i] = rest[p, i] - centre[i]
-            for a in range(shape.shape[1]):
-                d[i] += shape[p, a] * u[nodes[p, a], i]
-        for i in range(3):
-            y[p, i] = d[0] * orientation[0, i] + d[1] * orientation[1, i] + d[2] * orientation[2, i]
-        for i in range(3):
-            q[i] = y[p, 0] * axes[i, 0] + y[p, 1] * axes[i, 1] + y[p, 2] * axes[i, 2]
-        gap[p] = signed_distance(kinds[0], sizes[0], mesh, q, n, none)
-
-
-@njit(cache=True, nogil=True)
-def _scatter_forces(nodes, shape, point_force, force):  # type: ignore[no-untyped-def]  # pragma: no cover
-    for p in range(len(nodes)):
-        for a in range(shape.shape[1]):
-            for i in range(3):
-                force[nodes[p, a], i] += shape[p, a] * point_force[p, i]

@@ -39,9 +39,8 @@ FINISHED = 1e-2  # out-of-balance force, as a fraction of all forces, at which a
 SETTLED = 1e-3  # below which no iteration is worth while
 PASSABLE = 5e-2
 VOLUME_ERROR = 3e-4  # difference of the volume strain and that of its pressure
-HOPELESS = 10.0  # as below, where time is short
-ACCEPTED = 0.6  # out-of-balance force of a step that has used up its iterations; the next steps take up what is left
-BUDGET_S = 0.02  # of a processor for a step, after which a passable balance is taken, and after twice as much the best there is
+ACCEPTED = 0.2  # out-of-balance force of a step that has used up its iterations; the next steps take up what is left
+BUDGET_S = 0.01  # of a processor for a step, after which a passable balance is taken; one that is worse goes on, and real time is lost
 DIVERGED = 1e6  # out-of-balance force from which a step is tried from another beginning
 JUMP = 10.0  # its growth from which earlier iterations are forgotten, as where contacts close
 AHEAD = 240  # nodes in contact, or about to be, for which the inverse is prepared
@@ -115,6 +114,8 @@ class RealTimeSession(DynamicSession):
     ----------
     newton_steps : int
         Steps so far that Newton's method had to take.
+    waits : int
+        Steps so far that had to wait for a tangent of their own.
     iterations : int
         Quasi-Newton iterations so far.
     unbalanced : float
@@ -122,6 +123,7 @@ class RealTimeSession(DynamicSession):
     """
 
     newton_steps: int = field(init=False, default=0)
+    waits: int = field(init=False, default=0)
     iterations: int = field(init=False, default=0)
     unbalanced: float = field(init=False, default=0.0)
     _earlier: EarlierTangent | None = field(init=False, default=None)
@@ -193,7 +195,7 @@ class RealTimeSession(DynamicSession):
             return DynamicSession._depths(self, contacts, u)
         depths = [np.zeros(len(c.nodes)) for c in contacts]
         for depth, near in zip(depths, self._near, strict=True):
-            depth[near.points] = -near.response.gap / near.contact.element_size
+            depth[near.points] = -near.gap / near.contact.element_size
         return depths
 
     def _quasi_newton(self, moving: FloatArray, contacts: tuple[Contact, ...]) -> _Trial | None:
@@ -205,32 +207,39 @@ class RealTimeSession(DynamicSession):
         if len(self._gaps) != len(contacts):
             self._gaps = tuple(local_positions(c, start.displacement, 0.0)[1] for c in contacts)
         self._near = tuple(
-            NearbyContact.of(c, a, gap, 2.0 * (fastest + way) + 0.01 * self._extent())
+            NearbyContact.of(c, a, gap, 2.0 * (fastest + way) + 0.01 * self.engine._extent)
             for c, a, gap, way in zip(contacts, start.anchors, self._gaps, travel, strict=True)
         )
         pressure = self._pressure
         if pressure is None:
             pressure = self._engine._elements.bulk * self._engine._elements.dilatation(start.displacement)[0]
 
-        def begun(guess: FloatArray) -> _Trial | None:
+        deadline = time.thread_time() + BUDGET_S if self._engine.background else np.inf
+        best = self._from_guesses(tangent, moving, inertial, pressure, deadline)
+        if best is None or best.error > ACCEPTED:
+            self.waits += 1
+            best = self._from_guesses(self._renewed(), moving, inertial, pressure, np.inf)
+        if best is None or best.error > ACCEPTED:
+            return None
+        for near in self._near:  # gaps and responses are those of the last trial
+            near.add_force(best.displacement, np.zeros_like(best.displacement))
+        self.unbalanced = best.error
+        return best
+
+    def _from_guesses(
+        self, tangent: EarlierTangent, moving: FloatArray, inertial: FloatArray, pressure: FloatArray, deadline: float
+    ) -> _Trial | None:
+        """Return the best that is found from where the motion leads, or else from where the body is."""
+        start, best = self.reached, None
+        for guess in (inertial, start.displacement):
             target = np.where(self._constrained, start.displacement, guess)
             for nodes, speed in zip(self.bodies, moving, strict=True):
-                target[nodes] = start.displacement[nodes] + h * speed
-            return self._tried(target, inertial, pressure)
-
-        deadline = time.thread_time() + BUDGET_S if self._engine.background else np.inf
-        best: _Trial | None = None
-        for guess in (inertial, start.displacement):
-            first = begun(guess)
+                target[nodes] = start.displacement[nodes] + self.engine.step * speed
+            first = self._tried(target, inertial, pressure)
             if first is not None:
                 best = self._iterated(tangent, first, inertial, deadline).better(best)
-                if best.error <= ACCEPTED or time.thread_time() > deadline:
+                if best.error <= ACCEPTED:
                     break
-        if best is None or best.error > (HOPELESS if self._engine.background else ACCEPTED):
-            return None
-        for near in self._near:  # the responses are those of the last trial
-            near.evaluate(best.displacement)
-        self.unbalanced = best.error
         return best
 
     def _iterated(self, tangent: EarlierTangent, trial: _Trial, inertial: FloatArray, deadline: float) -> _Trial:
@@ -250,8 +259,6 @@ class RealTimeSession(DynamicSession):
                 mixing = AndersonMixing(DEPTH)
             trial = after
             best = trial.better(best if k else None)
-            if time.thread_time() > deadline + BUDGET_S:
-                break
         return best
 
     def _improved(self, tangent: EarlierTangent, trial: _Trial, inertial: FloatArray, mixing: AndersonMixing) -> _Trial | None:
@@ -267,7 +274,7 @@ class RealTimeSession(DynamicSession):
                 self._earlier, self._condensed = None, None
             return None
         rise = elements.pressure_change(tangent.dilatation, step, trial.mismatch)
-        scale = 1e-2 * self._extent() / float(self.engine.assembler.parameters[:, 0].max())  # mm/kPa
+        scale = 1e-2 * self.engine._extent / self.engine._modulus  # mm/kPa
         now = np.concatenate([trial.displacement.ravel(), scale * trial.pressure])
         mixed = mixing.step(now, np.concatenate([step.ravel(), scale * rise]))
         step, rise = mixed[: step.size].reshape(-1, 3), mixed[step.size :] / scale
@@ -296,14 +303,13 @@ class RealTimeSession(DynamicSession):
         balance[self._constrained] = 0.0
         x = -tangent.factors.solve(balance.ravel())
         free = x.reshape(-1, 3)  # gripped nodes move as well: they are held by the law below
-        concerned = (tangent.contact != 0.0).any(axis=(1, 2))
         marked = np.zeros(len(free), dtype=bool)
-        marked[self._engine._surface.indices[concerned]] = True
+        marked[tangent.touched] = True
         active = []
         for near in self._near:
             after = local_positions(near.contact, trial.displacement + free, 1.0)[1]
             known = tangent.factors.covered(near.contact.nodes).all(axis=1)
-            touches = (near.response.gap < 0.0) | ((after < 0.0) & known) | marked[near.contact.nodes].any(axis=1)
+            touches = (near.gap < 0.0) | ((after < 0.0) & known) | marked[near.contact.nodes].any(axis=1)
             active.append(near.only(touches))
         for some in active:
             marked[some.contact.nodes] = True
@@ -316,10 +322,10 @@ class RealTimeSession(DynamicSession):
             if condensed is None or not condensed.serves(tangent, nodes):
                 condensed = self._condensed = CondensedContact(tangent, nodes)
             nodes = condensed.nodes
-            hold = 1e3 * float(self._engine._elements.bulk.max()) * self._extent()
+            hold = 1e3 * float(self._engine._elements.bulk.max()) * self.engine._extent
             law = ContactBesideTangent(nodes, trial.displacement, active, self._places, self._engine._surface, tangent, gripped, hold)
             begin = self._carried(trial.displacement) - trial.displacement if first else np.zeros_like(free)
-            force = condensed.forces(free[nodes], law, begin[nodes], 1e-5 * self._extent(), 0.05 * self._extent())
+            force = condensed.forces(free[nodes], law, begin[nodes], 1e-5 * self.engine._extent, 0.05 * self.engine._extent)
             tangent.factors.add_columns(nodes, force, x)
         free[self._constrained] = 0.0
         return free
@@ -352,7 +358,7 @@ class RealTimeSession(DynamicSession):
     def _soon_touched(self, contacts: Sequence[Contact], gaps: Sequence[FloatArray]) -> IntArray:
         """Nodes in contact, and those about to be, the nearest first."""
         nodes, order = [np.zeros(0, np.int64)], [np.zeros(0)]
-        reach = REACH * self._extent()
+        reach = REACH * self.engine._extent
         for contact, gap in zip(contacts, gaps, strict=True):
             near = np.flatnonzero(gap < reach)
             nodes.append(contact.nodes[near].ravel())
@@ -364,9 +370,8 @@ class RealTimeSession(DynamicSession):
         """Return the newest tangent; where there is none for these supports, it is made now."""
         done = self._thread.take()
         if done is not None:
-            self._release(self._earlier)
-            self._earlier, self._age, self._condensed = done, 0, None
-        held = self.bodies[0] if self.bodies else np.zeros(0, np.int64)
+            self._take(done)
+        held = self._held()
         for known in (self._earlier, *self._engine._rest):
             if known is not None and np.array_equal(known.held, held):
                 self._earlier = known
@@ -380,19 +385,39 @@ class RealTimeSession(DynamicSession):
     def _renew(self, ahead: IntArray) -> None:
         """Have a tangent made of the state reached, if anything has changed since the last one."""
         u = self.reached.displacement
-        still = self._seen is not None and float(np.abs(u - self._seen).max()) < 1e-4 * self._extent()
-        still &= self._earlier is not None and bool(self._earlier.factors.covered(ahead[: len(ahead) // 3]).all())
+        still = self._seen is not None and float(np.abs(u - self._seen).max()) < 1e-4 * self.engine._extent
+        still &= (
+            self._earlier is not None
+            and self.unbalanced <= PASSABLE
+            and bool(self._earlier.factors.covered(ahead[: len(ahead) // 3]).all())
+        )
         self._age += 1
         if still or not self._thread.idle or (not self._engine.background and self._age < PERIOD):
             return
-        held = self.bodies[0] if self.bodies else np.zeros(0, np.int64)
-        make = partial(self._made, u, self._near, self._places, held, ahead)
         self._seen = u
         if self._engine.background:
-            self._thread.submit(make)
+            self._thread.submit(partial(self._made, u, self._near, self._places, self._held(), ahead))
         else:
-            self._release(self._earlier)
-            self._earlier, self._age = make(), 0
+            self._take(self._made(u, self._near, self._places, self._held(), ahead))
+
+    def _renewed(self) -> EarlierTangent:
+        """Return the tangent of the state reached, which the step waits for."""
+        u = self.reached.displacement
+        gaps = []
+        for near, contact in zip(self._near, self._templates, strict=True):
+            near.add_force(u, np.zeros_like(u))
+            gaps.append(np.full(len(contact.nodes), np.inf))
+            gaps[-1][near.points] = near.gap
+        return self._take(self._made(u, self._near, self._places, self._held(), self._soon_touched(self._templates, gaps)))
+
+    def _take(self, tangent: EarlierTangent) -> EarlierTangent:
+        """Use a tangent from now on."""
+        self._release(self._earlier)
+        self._earlier, self._age, self._condensed = tangent, 0, None
+        return tangent
+
+    def _held(self) -> IntArray:
+        return self.bodies[0] if self.bodies else np.zeros(0, np.int64)
 
     def _made(
         self, u: FloatArray, near: tuple[NearbyContact, ...], places: tuple[Int32Array, ...], held: IntArray, ahead: IntArray
@@ -410,12 +435,10 @@ class RealTimeSession(DynamicSession):
         solver = engine._solvers.get()
         factors = UpdatedFactors(solver.factorize(with_dirichlet_rows(pattern.matrix(blocks), fixed)), len(u))
         factors.prepare(ahead)
-        return EarlierTangent(factors, engine._elements.dilatation(u)[1], contact, held, solver)
+        touched = np.unique(engine._surface.indices[(contact != 0.0).any(axis=(1, 2))]).astype(np.int64)
+        return EarlierTangent(factors, engine._elements.dilatation(u)[1], contact, held, touched, solver)
 
     def _release(self, tangent: EarlierTangent | None) -> None:
         """Let the solver of a tangent factorize again, unless the tangent is kept for the next session."""
         if tangent is not None and not any(tangent is kept for kept in self._engine._rest):
             self._engine._solvers.put(tangent.solver)
-
-    def _extent(self) -> float:
-        return float(np.ptp(self.engine.points, axis=0).max())

@@ -10,6 +10,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from naibu.core.errors import InputError
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
@@ -167,6 +168,7 @@ def touched_loop(model: TouchableModel, haptics_port: int | None = None) -> Iter
     """
     body = model.body
     with ExitStack() as stack:
+        stack.enter_context(threadpool_limits(1, user_api="blas"))  # threads of small matrices wait for one another where cores are busy
         hand = None
         if haptics_port is not None:
             hand = HapticHand(stack.enter_context(HapticEndpoint(haptics_port)))

@@ -1,0 +1,65 @@
+"""Kernels of the contact points near a rigid body: forces without their derivatives, and positions."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from naibu._numba.compilation import njit
+from naibu.mechanics.contact._geometry_kernels import mesh_of, signed_distance
+from naibu.mechanics.contact.penalty_contact import normal_pressure
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_forces(  # type: ignore[no-untyped-def]  # pragma: no cover
+    geometry, axes, nodes, shape, rest, area, k_n, k_t, mu, tied, u, centre, orientation, anchors, gap, force
+):
+    """Put the gaps of all points in place, and add the forces of those that touch to `force` (n, 3)."""
+    kinds, sizes, _ = geometry
+    mesh = mesh_of(geometry, 0)
+    d, y, q, m, n, e, none = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty((0, 0))
+    for p in range(len(nodes)):
+        _place(nodes[p], shape[p], rest[p], u, centre, orientation, axes, d, y, q)
+        gap[p] = signed_distance(kinds[0], sizes[0], mesh, q, m, none)
+        pressure = normal_pressure(gap[p], k_n[p], tied)[0]
+        if pressure == 0.0:
+            continue
+        along = 0.0
+        for i in range(3):
+            n[i] = axes[0, i] * m[0] + axes[1, i] * m[1] + axes[2, i] * m[2]
+            along += n[i] * (y[i] - anchors[p, i])
+        size = 0.0
+        for i in range(3):
+            e[i] = k_t[p] * (y[i] - anchors[p, i] - along * n[i])
+            size += e[i] * e[i]
+        size = np.sqrt(size)
+        ratio = mu[p] * pressure / size if not tied and size > mu[p] * pressure else 1.0
+        for i in range(3):
+            d[i] = area[p] * (pressure * n[i] - ratio * e[i])
+        for i in range(3):
+            f = orientation[i, 0] * d[0] + orientation[i, 1] * d[1] + orientation[i, 2] * d[2]
+            for a in range(shape.shape[1]):
+                force[nodes[p, a], i] += shape[p, a] * f
+
+
+@njit(cache=True, nogil=True)
+def local(geometry, axes, nodes, shape, rest, u, centre, orientation, y, gap):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Put the positions (p, 3) of all points in the frame of the body, and their gaps (p,), in place."""
+    kinds, sizes, _ = geometry
+    mesh = mesh_of(geometry, 0)
+    d, q, n, none = np.empty(3), np.empty(3), np.empty(3), np.empty((0, 0))
+    for p in range(len(nodes)):
+        _place(nodes[p], shape[p], rest[p], u, centre, orientation, axes, d, y[p], q)
+        gap[p] = signed_distance(kinds[0], sizes[0], mesh, q, n, none)
+
+
+@njit(cache=True, inline="always")
+def _place(nodes, shape, rest, u, centre, orientation, axes, d, y, q):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Put the position of a point in the frame of the body, y (3,), and in that of its shape, q (3,), in place; d (3,) is scratch."""
+    for i in range(3):
+        d[i] = rest[i] - centre[i]
+        for a in range(len(shape)):
+            d[i] += shape[a] * u[nodes[a], i]
+    for i in range(3):
+        y[i] = d[0] * orientation[0, i] + d[1] * orientation[1, i] + d[2] * orientation[2, i]
+    for i in range(3):
+        q[i] = y[0] * axes[i, 0] + y[1] * axes[i, 1] + y[2] * axes[i, 2]
