@@ -67,7 +67,7 @@ def animation_page() -> str:
     points = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]])
     moved = np.stack([np.zeros((3, 2)), np.ones((3, 2))])
     body = MovingBody(HOSTILE, points, np.array([[0, 1, 2]]), moved, np.array([[0.0, 1, 2], [1, 2, 3]]), ((HOSTILE, np.ones((2, 2))),))
-    return animation_html(HOSTILE, np.array([0.0, 1.0]), (body,), HOSTILE, HOSTILE)
+    return animation_html(HOSTILE, np.array([0.0, 1.0]), (body,), HOSTILE, [HOSTILE])
 
 
 def slices_page() -> str:

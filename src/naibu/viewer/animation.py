@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
@@ -44,7 +45,7 @@ class MovingBody:
     marks: tuple[tuple[str, FloatArray], ...] = ()
 
 
-def animation_html(title: str, times_s: FloatArray, bodies: tuple[MovingBody, ...], value_name: str, note: str = "") -> str:
+def animation_html(title: str, times_s: FloatArray, bodies: tuple[MovingBody, ...], value_name: str, sentences: Sequence[str] = ()) -> str:
     """Return the page.
 
     Parameters
@@ -57,8 +58,8 @@ def animation_html(title: str, times_s: FloatArray, bodies: tuple[MovingBody, ..
         Bodies, shown side by side at one scale of length and colour.
     value_name : str
         Quantity shown as colours, with its unit.
-    note : str
-        Text below the title.
+    sentences : sequence of str
+        Paragraphs below the title.
 
     Raises
     ------
@@ -79,7 +80,8 @@ def animation_html(title: str, times_s: FloatArray, bodies: tuple[MovingBody, ..
         "high": high if high > low else low + 1.0,
         "bodies": [_packed(body, low, high) for body in bodies],
     }
-    return filled_template("animation.html", {"TITLE": escape(title), "NOTE": escape(note), "DATA": embedded_json(payload)})
+    words = "".join(f"<p>{escape(s)}</p>" for s in sentences)
+    return filled_template("animation.html", {"TITLE": escape(title), "NOTE": words, "DATA": embedded_json(payload)})
 
 
 def _packed(body: MovingBody, low: float, high: float) -> dict[str, object]:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from naibu.viewer.cards import Card
 from naibu.viewer.tables import Cell, Table
 
 if TYPE_CHECKING:
@@ -58,9 +59,12 @@ class Chapter:
         In reading order.
     settings : dict
         Seeds and sizes that the numbers depend on, shown at the end of the page.
+    cards : tuple of Card
+        What to know first.
     """
 
     name: str
     title: str
     sections: tuple[Section, ...]
     settings: dict[str, Cell] = field(default_factory=dict)
+    cards: tuple[Card, ...] = ()

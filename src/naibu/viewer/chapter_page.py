@@ -12,6 +12,7 @@ from typing import Any
 
 from naibu._version import __version__
 from naibu.io.files.atomic import write_atomically
+from naibu.viewer.cards import cards_html
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.page_frame import page_html
 from naibu.viewer.tables import Cell, provenance_section, table_html
@@ -56,8 +57,10 @@ def chapter_html(chapter: Chapter) -> str:
     links = "".join(f'<li><a href="#s{i}">{escape(section.title)}</a></li>' for i, section in enumerate(chapter.sections))
     sections = "\n".join(_section(i, section) for i, section in enumerate(chapter.sections))
     sections += provenance_section({"naibu": __version__, **chapter.settings})
-    contents = f'<nav aria-label="Contents"><ul>{links}</ul></nav>'
-    return page_html(chapter.title, contents, sections, "This page is self-contained: it loads nothing from the network.")
+    contents = f'<nav aria-label="Contents"><ul>{links}</ul></nav>' if len(chapter.sections) > 1 else ""
+    return page_html(
+        chapter.title, cards_html(chapter.cards) + contents, sections, "This page is self-contained: it loads nothing from the network."
+    )
 
 
 def _section(index: int, section: Section) -> str:

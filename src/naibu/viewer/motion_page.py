@@ -10,6 +10,7 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray, Int16Array, IntArray, require_shape
 from naibu.core.errors import InputError
+from naibu.viewer.cards import Card, cards_html
 from naibu.viewer.embedding import embedded_bytes, embedded_json
 from naibu.viewer.page_frame import page_html
 from naibu.viewer.tables import Table, provenance_section, table_html
@@ -94,6 +95,8 @@ class MotionPage:
         Tables below the view.
     provenance : mapping
         How the motion was computed.
+    cards : sequence of Card
+        What to know first.
     """
 
     title: str
@@ -109,6 +112,7 @@ class MotionPage:
     force: FloatArray
     tables: Sequence[Table] = ()
     provenance: Mapping[str, object] = field(default_factory=dict)
+    cards: Sequence[Card] = ()
 
     def __post_init__(self) -> None:
         s, n, b = len(self.times), len(self.reference), len(self.bodies)
@@ -154,7 +158,7 @@ def _thinned(page: MotionPage) -> MotionPage:
 
 def _html(page: MotionPage) -> str:
     data = embedded_json(_packed(page))
-    lead = "".join(f"<p>{escape(s)}</p>" for s in page.sentences)
+    lead = cards_html(page.cards) + "".join(f"<p>{escape(s)}</p>" for s in page.sentences)
     tables = "".join(table_html(t) for t in page.tables)
     curves = f'<div class="curves">{force_curves(page)}</div>' if len(page.force_times) and len(page.bodies) else ""
     provenance = provenance_section(page.provenance) if page.provenance else ""
@@ -163,7 +167,8 @@ def _html(page: MotionPage) -> str:
         '<noscript><p class="no-3d">The 3-D view needs JavaScript; curves and tables are complete without it.</p></noscript>'
         f"{curves}</section>{f'<section>{tables}</section>' if tables else ''}{provenance}"
     )
-    footer = "Lengths in mm, forces in mN or N, as stated at the curves. This page is self-contained: it loads nothing from the network."
+    forces = ", forces in mN or N, as stated at the curves" if curves else ""
+    footer = f"Lengths in mm{forces}. This page is self-contained: it loads nothing from the network."
     frames = f'<script type="application/json" id="naibu-frames">{data}</script>'
     return page_html(page.title, lead, main, footer, data=frames, script="report.js")
 

@@ -11,6 +11,7 @@ from naibu.core.errors import InputError
 from naibu.viewer.json_values import jsonable
 
 Cell = str | float | int | None
+UNITS = {"mm": "mm", "mm2": "mm²", "mm3": "mm³", "deg": "degrees", "percent": "%"}  # by the last word of a key
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,9 +111,16 @@ def _number(value: float, shortest: bool) -> str:
     return text.replace("-", "−")
 
 
+def quantity_of(key: str) -> str:
+    """Return the quantity that a key of a JSON file names, with its unit: ``"volume_before_mm3"`` gives ``"volume before, mm³"``."""
+    words = key.split("_")
+    unit = UNITS.get(words[-1])
+    return " ".join(words) if unit is None else f"{' '.join(words[:-1])}, {unit}"
+
+
 def scrollable(label: str, inner: str, kind: str = "") -> str:
     """Wrap wide content so that it scrolls horizontally, by touch and by keyboard."""
-    return f'<div class="scroll {kind}" role="region" tabindex="0" aria-label="{escape(label, quote=True)}">{inner}</div>'
+    return f'<div class="scroll {kind}" role="group" tabindex="0" aria-label="{escape(label, quote=True)}">{inner}</div>'
 
 
 def _is_numeric(table: Table, column: int) -> bool:

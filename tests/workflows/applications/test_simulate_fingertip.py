@@ -91,7 +91,7 @@ def test_page_and_numbers_tell_what_was_pressed_and_decoded(folder: Path) -> Non
     tilted = dict(zip(tables["Presses"]["columns"], tables["Presses"]["rows"][1], strict=True))
     assert tilted["force along the rod, N"] == pytest.approx(1.5, rel=0.01) and tilted["saturated"] == "none"
     # pressed from y: the lateral force turns the chip about x only
-    assert tilted["M_x, N um"] > 0.5 and tilted["M_y, N um"] == 0.0
+    assert tilted["M_x, N µm"] > 0.5 and tilted["M_y, N µm"] == 0.0
     decoded = tables["Decoded presses"]["rows"]
     assert [row[0] for row in decoded] == ["first", "tilted"]
     page = (folder / "out" / "my_finger.html").read_text(encoding="utf-8")

@@ -22,7 +22,8 @@ from naibu.io.marker_tables import import_markers
 from naibu.io.meshes import read_mesh
 from naibu.validation.specimens.textured_sphere import squeezed_ball
 from naibu.workflows.measurement.compare_methods import compare_methods
-from naibu.workflows.measurement.sense import Pair, read_pair, sense_pair, slice_view
+from naibu.workflows.measurement.sense import Pair, read_pair, sense_pair
+from naibu.workflows.measurement.sense_page import slice_view
 
 Array = np.ndarray
 

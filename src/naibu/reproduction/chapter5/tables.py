@@ -160,8 +160,8 @@ def _pale_area() -> Section:
                 at = [float(area[int(np.argmin(np.abs(response.times - t)))]) for t in (0.001, 0.05, 0.46, 0.475, 0.55)]
                 rows.append((response.name, threshold, *at))
     table = Table(
-        "Pale area", ("lower layer", "threshold, kPa", *(f"at {t:g} s, mm^2" for t in (0.001, 0.05, 0.46, 0.475, 0.55))), tuple(rows),
-        caption="Area in which the pressure in the tissue exceeds that of capillaries; round jet of 0.79 mm^2, axisymmetric.",
+        "Pale area", ("lower layer", "threshold, kPa", *(f"at {t:g} s, mm²" for t in (0.001, 0.05, 0.46, 0.475, 0.55))), tuple(rows),
+        caption="Area in which the pressure in the tissue exceeds that of capillaries; round jet of 0.79 mm², axisymmetric.",
         note="A pressure follows the load at once where the layers relax alike; where they do not, it is redistributed at the "
         "rates of the layers. What "
         "is slow in a pale area that is seen is then either this, or the blood that returns, which is not modelled.",

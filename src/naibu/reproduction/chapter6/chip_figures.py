@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 MODELS = ("finite elements, rigid block and clamps", "finite elements, whole chip")
 _MPA = 1e-3  # kPa in MPa
 _UM = 1e3  # mm in um
-_WORK = (("F_z", 2, 5000.0, "mN"), ("M_y", 4, 800.0, "N um"))
+_WORK = (("F_z", 2, 5000.0, "mN"), ("M_y", 4, 800.0, "N µm"))
 
 
 def stress_along_beam(canvas: Canvas, analysis: ChipAnalysis) -> None:
@@ -40,7 +40,7 @@ def stress_along_beam(canvas: Canvas, analysis: ChipAnalysis) -> None:
         for centre in (place, design.beam_length_mm - place):
             axes.axvspan(*(_UM * (centre + s * 0.5 * design.resistor_length_mm) for s in (-1, 1)), color="0.85", linewidth=0)
         axes.axhline(0.0, color="k", linewidth=0.5)
-        axes.set(title=f"{name} = {size:g} {unit}", xlabel="distance from the clamp (um)", ylabel="stress along the beam (MPa)")
+        axes.set(title=f"{name} = {size:g} {unit}", xlabel="distance from the clamp (µm)", ylabel="stress along the beam (MPa)")
     canvas.axes[0].legend(fontsize=7)
 
 
@@ -55,17 +55,17 @@ def placement(canvas: Canvas, analysis: ChipAnalysis) -> None:
     found = [sensitivity_by_place(response, x) for response in (analysis.beams, analysis.whole)]
     own = (analysis.of_whole[0, 2], analysis.of_whole[2, 4])
     places = (design.force_resistor_mm, design.moment_resistor_mm)
-    for k, (axes, name, unit) in enumerate(zip(canvas.subplots(1, 2), ("F_z", "M_y"), ("mV/mN", "mV/(N um)"), strict=True)):
+    for k, (axes, name, unit) in enumerate(zip(canvas.subplots(1, 2), ("F_z", "M_y"), ("mV/mN", "mV/(N µm)"), strict=True)):
         axes.plot(_UM * x, closed[k], "k--", label="closed form")
         for values, label in zip(found, MODELS, strict=True):
             axes.plot(_UM * x, values[k], label=label)
         axes.plot(_UM * places[k], own[k], "k*", markersize=8, label="resistors of this chip, with their length")
-        axes.set(xlabel="distance from the ends (um)", ylabel=f"sensitivity to {name} ({unit})", ylim=(0.0, None))
+        axes.set(xlabel="distance from the ends (µm)", ylabel=f"sensitivity to {name} ({unit})", ylim=(0.0, None))
     canvas.axes[0].legend(fontsize=7)
 
 
 def envelope(canvas: Canvas, design: ChipDesign, loads: Sequence[tuple[float, float]] = (), *, marked: str = "loads") -> None:
-    """Draw the largest force and moment for several strengths, and loads (mN, N um) as points."""
+    """Draw the largest force and moment for several strengths, and loads (mN, N µm) as points."""
     axes = canvas.add_subplot()
     reached = load_envelope(design)
     for factor, style in ((0.5, "C0:"), (1.0, "C0-"), (2.0, "C0--")):
@@ -75,7 +75,7 @@ def envelope(canvas: Canvas, design: ChipDesign, loads: Sequence[tuple[float, fl
     axes.plot(*diagonal, "C1-", label=f"strength {design.strength_kpa * 1e-6:g} GPa, moment about a diagonal")
     if loads:
         axes.plot(*np.array(loads).T, "kx", label=marked)
-    axes.set(xlabel="F_z (mN)", ylabel="moment (N um)", xlim=(0, None), ylim=(0, None))
+    axes.set(xlabel="F_z (mN)", ylabel="moment (N µm)", xlim=(0, None), ylim=(0, None))
     axes.legend(fontsize=8)
 
 
@@ -137,5 +137,5 @@ def designs(canvas: Canvas, study: DesignStudy, own: DesignStudy) -> None:
     left.legend(fontsize=8)
     for name, values in (("length", study.length_mm), ("width", study.width_mm), ("thickness", study.thickness_mm)):
         right.plot(study.force_sensitivity[front], _UM * values[front], ".-", linewidth=0.8, label=name)
-    right.set(xscale="log", xlabel="sensitivity to F_z (mV/mN)", ylabel="of the beams on the front (um)")
+    right.set(xscale="log", xlabel="sensitivity to F_z (mV/mN)", ylabel="of the beams on the front (µm)")
     right.legend(fontsize=8)

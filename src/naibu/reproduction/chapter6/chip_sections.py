@@ -22,7 +22,7 @@ from naibu.reproduction.chapter6 import chip_figures
 from naibu.viewer.chapter import Figure, Section
 from naibu.viewer.tables import Cell, Table
 
-UNITS = ("mN", "mN", "mN", "N um", "N um", "N um")
+UNITS = ("mN", "mN", "mN", "N µm", "N µm", "N µm")
 _CHECKED = 3  # designs of the front that finite elements check
 
 
@@ -63,7 +63,7 @@ def sensitivity_table(analysis: ChipAnalysis, paper: Sequence[float] | None = No
     ]
     rows: list[tuple[Cell, ...]] = []
     for k, name in enumerate(BRIDGES):
-        unit = "mV/mN" if k == 0 else "mV/(N um)"
+        unit = "mV/mN" if k == 0 else "mV/(N µm)"
         printed: tuple[Cell, ...] = (float(paper[k]),) if paper else ()
         values = (analysis.closed[k], analysis.of_beams[k, 2 + k], analysis.of_whole[k, 2 + k])
         rows.append((f"{name}, {unit}", *printed, *(float(v) for v in values)))
@@ -89,7 +89,7 @@ def crosstalk_tables(analysis: ChipAnalysis, full_scale: Sequence[float]) -> tup
     dx, dy = (1e3 * s for s in analysis.shift_mm)
     for title, matrix, caption in (
         ("Crosstalk", analysis.of_whole, "Resistors on the beams' axes, whole chip, %."),
-        ("Crosstalk, shifted mask", analysis.misaligned, f"All resistors shifted by {dx:g} um along x and {dy:g} um along y, %."),
+        ("Crosstalk, shifted mask", analysis.misaligned, f"All resistors shifted by {dx:g} µm along x and {dy:g} µm along y, %."),
     ):
         share = 100.0 * crosstalk(matrix, full_scale)
         rows: tuple[tuple[Cell, ...], ...] = tuple(
@@ -105,7 +105,7 @@ def readout_section(analysis: ChipAnalysis, readout: Readout, share: float, seed
     measurable, noise = readout.measurable(sensitivities), readout.load_noise(sensitivities)
     rows = tuple(
         (
-            f"{name}, {'mN' if k == 0 else 'N um'}",
+            f"{name}, {'mN' if k == 0 else 'N µm'}",
             readout.gains[k],
             float(measurable[k]),
             float(limits[k]),
@@ -119,7 +119,7 @@ def readout_section(analysis: ChipAnalysis, readout: Readout, share: float, seed
         "Readout",
         ("channel", "gain", "measurable", "borne by the beams", "noise SD", "noise SD, filtered", "step of the converter"),
         rows,
-        caption=f"Converter of {readout.adc_bits} bits, +-{readout.adc_limit:g} V; sensitivities of the whole chip.",
+        caption=f"Converter of {readout.adc_bits} bits, ±{readout.adc_limit:g} V; sensitivities of the whole chip.",
         note="Widths of noise from peak to peak are taken as six standard deviations (assumed).",
     )
     compared = compare_filters(readout, share, seed=seed)
@@ -167,7 +167,7 @@ def study_section(design: ChipDesign, study: DesignStudy, *, check: bool = True)
     rows = [("this chip", *_figures(own, 0, design, check=check))]
     rows += [("on the front", *_figures(study, int(k), design, check=check)) for k in chosen]
     units = (
-        "L, um", "w, um", "t, um", "F_z, mV/mN", "M_y, mV/(N um)", "largest F_z, mN", "largest M_y, N um", "stiffness along z, N/mm",
+        "L, µm", "w, µm", "t, µm", "F_z, mV/mN", "M_y, mV/(N µm)", "largest F_z, mN", "largest M_y, N µm", "stiffness along z, N/mm",
         "resonance, kHz", "stiffness, finite elements over closed form", "F_z sensitivity, finite elements over closed form",
     )  # fmt: skip
     product = float(np.median(study.force_sensitivity * study.force_limit))

@@ -134,7 +134,7 @@ def _moments(pressings: Sequence[Pressing], chain: ReadingChain, switched: Seque
     )
     table = Table(
         "Geometry, contact and law turned off in turn",
-        ("what counts", "F_x, mN", "F_z, mN", "M_y, N um", "bend of F_x over F, %", "of F_z, %", "of M_y, %", "of M_y over F_x, %"),
+        ("what counts", "F_x, mN", "F_z, mN", "M_y, N µm", "bend of F_x over F, %", "of F_z, %", "of M_y, %", "of M_y over F_x, %"),
         rows, caption="20 degrees, 3 N. Bend: largest distance from proportion, over the largest value.",
         note="Another law: Saint Venant-Kirchhoff. Dead load: the rod's final traction, in proportion from 0. With nothing that bends, "
         "about "

@@ -60,16 +60,16 @@ def designs_around(design: ChipDesign, count: int = 21) -> DesignStudy:
 def _assumptions(d: ChipDesign) -> Section:
     um = 1e3
     rows: tuple[tuple[Cell, ...], ...] = (
-        ("beams L x w x t, um", f"{um * d.beam_length_mm:g} x {um * d.beam_width_mm:g} x {um * d.beam_thickness_mm:g}", "sensitivities"),
-        ("block half width c, um", um * d.block_half_width_mm, "c = L / 2"),
-        ("resistors of F_z, of M_x and M_y: distance from the clamp, um", f"{um * d.force_resistor_mm:g}, {um * d.moment_resistor_mm:g}",
+        ("beams L x w x t, µm", f"{um * d.beam_length_mm:g} x {um * d.beam_width_mm:g} x {um * d.beam_thickness_mm:g}", "sensitivities"),
+        ("block half width c, µm", um * d.block_half_width_mm, "c = L / 2"),
+        ("resistors of F_z, of M_x and M_y: distance from the clamp, µm", f"{um * d.force_resistor_mm:g}, {um * d.moment_resistor_mm:g}",
          "sensitivities; both printed limits stress the beams alike"),
         ("supply, V", d.supply_voltage, "usual"),
         ("piezoresistance of <110>, along and across, 1/TPa", "718, -663", "lightly doped p-type silicon (Smith 1954)"),
         ("Young's modulus of <110>, shear modulus, GPa", "169, 50.9", "silicon (Wortman and Evans 1965)"),
         ("strength, GPa", 1e-6 * d.strength_kpa, "etched silicon beams bear 1 to 8 GPa"),
-        ("block height, frame, pillar, um", f"{um * d.block_height_mm:g}, {um * d.frame_width_mm:g}, {um * d.pillar_width_mm:g}",
-         "chip of 2 x 2 mm^2"),
+        ("block height, frame, pillar, µm", f"{um * d.block_height_mm:g}, {um * d.frame_width_mm:g}, {um * d.pillar_width_mm:g}",
+         "chip of 2 x 2 mm²"),
         ("layout of the bridges of M_x and M_y", "four resistors each", "Fig. 7(b) names no places"),
         ("converter's range, V; readings a second", "+-10; 100", "AD12-16(PCI)EV has 12 bits"),
     )  # fmt: skip
@@ -115,7 +115,7 @@ def _misprints(forms: CrossBeam, moment: float) -> Table:
     x0 = float(forms.stress_free_point(theta))
     printed_x0 = length / (2 * c + length) * ((length + 3 * c) / 3 + length * c * theta / (3 * t))
     rows: tuple[tuple[Cell, ...], ...] = (
-        ("(8)", "dx = c theta^2", "dx = c theta^2 / 2", "dx, um", 1e3 * c * theta**2, 0.5e3 * c * theta**2),
+        ("(8)", "dx = c theta^2", "dx = c theta^2 / 2", "dx, µm", 1e3 * c * theta**2, 0.5e3 * c * theta**2),
         (
             "(11)",
             "F_RX = w t E c theta^2 / I",
@@ -127,11 +127,11 @@ def _misprints(forms: CrossBeam, moment: float) -> Table:
         ("(18)", "E c theta^2 / L", "E c theta^2 / (2 L)", "stress, MPa", 2e-3 * edge, 1e-3 * edge),
         ("(20)", "... + E c theta^2 / L", "... + E c theta^2 / (2 L)", "stress at x = 0, MPa", 1e-3 * (smallest + edge), 1e-3 * smallest),
         ("(21)", "... + E c theta^2 / L", "... + E c theta^2 / (2 L)", "stress at x = L, MPa", 1e-3 * (largest + edge), 1e-3 * largest),
-        ("(22)", "... + L c theta / (3 t)", "... - L c theta / (6 t)", "stress-free point, um", 1e3 * printed_x0, 1e3 * x0),
+        ("(22)", "... + L c theta / (3 t)", "... - L c theta / (6 t)", "stress-free point, µm", 1e3 * printed_x0, 1e3 * x0),
     )
     return Table(
         "Misprints",
-        ("equation", "printed", "corrected", "quantity at M_y = 800 N um", "printed", "corrected"),
+        ("equation", "printed", "corrected", "quantity at M_y = 800 N µm", "printed", "corrected"),
         rows,
         note="F_RX is in mN. The corrected (8) still neglects that a bent beam is shorter, by (3 c^2 / (5 L) + c / 10 + L / 15) theta^2: "
         f"with it the stretch adds {1e-3 * whole:.3g} MPa rather than {1e-3 * edge:.3g}, "
@@ -161,19 +161,19 @@ def _checked(analysis: ChipAnalysis) -> Table:
     rows: list[tuple[Cell, ...]] = [
         ("(1) stress at 0.3 L, MPa/N", closed_force[0], *of_force[0]),
         ("(1) stress at 0.7 L, MPa/N", closed_force[1], *of_force[1]),
-        ("(4) deflection, um/N", *(1e6 / float(k) for k in (forms.force_stiffness, beams.force_stiffness, whole.force_stiffness))),
+        ("(4) deflection, µm/N", *(1e6 / float(k) for k in (forms.force_stiffness, beams.force_stiffness, whole.force_stiffness))),
         ("(9) F_RZ, N per rad", 1e-3 * float(forms.end_force), 1e-3 * abs(a[2]) / rotation, None),
         ("(10) M_RY, mN m per rad", 1e-3 * float(forms.end_moment), 1e-3 * abs(moment_at_block) / rotation, None),
         ("(12), (13) T_RY, mN m per rad", 1e-3 * float(forms.end_torque), 1e-3 * abs(d[4]) / rotation, None),
         ("(12) with both shear moduli", 1e-3 * torsion / design.beam_length_mm, 1e-3 * abs(d[4]) / rotation, None),
         (
-            "(15) theta, mrad at 800 N um",
+            "(15) theta, mrad at 800 N µm",
             *(8e5 / float(k) for k in (forms.moment_stiffness, beams.moment_stiffness, whole.moment_stiffness)),
         ),
-        ("(19) stress at 0.3 L, MPa at 800 N um", closed_moment[0], *of_moment[0]),
-        ("(19) stress at 0.7 L, MPa at 800 N um", closed_moment[1], *of_moment[1]),
+        ("(19) stress at 0.3 L, MPa at 800 N µm", closed_moment[0], *of_moment[0]),
+        ("(19) stress at 0.7 L, MPa at 800 N µm", closed_moment[1], *of_moment[1]),
         (
-            "(22) stress-free point, um",
+            "(22) stress-free point, µm",
             1e3 * float(forms.stress_free_point()),
             _stress_free(analysis, "beams"),
             _stress_free(analysis, "whole"),
@@ -257,19 +257,19 @@ def _specification(analysis: ChipAnalysis) -> Section:
         ),
         (
             ("F_z, mN", force, at[0], needed[0], *surface[0], float(limits[0])),
-            ("M_x or M_y, N um", moment, at[1], needed[1], *surface[1], float(limits[1])),
+            ("M_x or M_y, N µm", moment, at[1], needed[1], *surface[1], float(limits[1])),
             ("both together", None, at[2], None, *surface[2], None),
         ),
         note="The stress at the resistors follows from the printed sensitivity, the supply and the piezoresistance alone, whatever the "
         "dimensions: V = pi sigma V_in / 2. It is a lower bound of the largest stress. Finite elements: largest tension on the beams up to "
         "a quarter of the thickness from their ends, where it is below the nominal stress; nearer to the sharp corners it rises without "
         "bound, so that they must be rounded. Either limit is nominally borne by good etched silicon, both together are not trusted: "
-        f"{at[2]:.2g} GPa. A combined load must stay below the line F_z / {limits[0]:.0f} mN + M / {limits[1]:.0f} N um = 1.",
+        f"{at[2]:.2g} GPa. A combined load must stay below the line F_z / {limits[0]:.0f} mN + M / {limits[1]:.0f} N µm = 1.",
     )
     figure = Figure(
         "Safe loads",
         "Largest force and moment together; the cross is the corner of the printed limits.",
-        lambda canvas: chip_figures.envelope(canvas, design, [(force, moment)], marked="5000 mN and 800 N um"),
+        lambda canvas: chip_figures.envelope(canvas, design, [(force, moment)], marked="5000 mN and 800 N µm"),
         (7.0, 4.2),
     )
     text = (
@@ -277,7 +277,7 @@ def _specification(analysis: ChipAnalysis) -> Section:
         "whose "
         "resistors lie away from the ends, and lower those to moments, whose resistors lie where frame and block yield.",
         "By the symmetry of the chip no bridge reads the load of another. Lateral forces, which it does not measure, tilt the block on its "
-        "elastic frame and enter the moments by 1.5 % of full scale. A mask that is off by 2 um adds twist and lateral force by less.",
+        "elastic frame and enter the moments by 1.5 % of full scale. A mask that is off by 2 µm adds twist and lateral force by less.",
     )
     tables = (sensitivity_table(analysis, (s_f, s_m, s_m)), strength_table, *crosstalk_tables(analysis, (5e3, 5e3, 5e3, 8e2, 8e2, 8e2)))
     return Section("Specification (Table 6.1)", text, tables, (placement_figure(analysis), figure))

@@ -17,6 +17,7 @@ from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
 from naibu.io.number_table import read_numbers
 from naibu.io.study_schemas.fingertip_schema import load_decoder
+from naibu.viewer.cards import Card
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
@@ -103,7 +104,7 @@ def decode_forces(
     found = chosen.decode(volts, noise_share=noise_share)
     csv = write_atomically(folder / "forces.csv", _csv(rows[:, 0], found))
     settings: dict[str, Cell] = dict(input_record({"decoder": source, "readings": table}))
-    chapter = Chapter("forces", "Forces decoded from readings", (_section(rows[:, 0], found, offsets),), settings)
+    chapter = Chapter("forces", "Forces decoded from readings", (_section(rows[:, 0], found, offsets),), settings, _cards(found))
     page, numbers = write_chapter(chapter, folder)
     return DecodedRecord((page, numbers, csv), _summary(found))
 
@@ -143,6 +144,23 @@ def _summary(found: DecodedForces) -> tuple[tuple[str, str], ...]:
         ("largest force, N", f"{1e-3 * found.force_mn[top]:.4g} ({low:.4g} to {high:.4g})"),
         ("its tilt, degrees", f"{found.tilt_deg[top]:.3g} ({found.tilt_95_deg[top, 0]:.3g} to {found.tilt_95_deg[top, 1]:.3g})"),
         ("its azimuth, degrees", f"{found.azimuth_deg[top]:.4g}"),
+    )
+
+
+def _cards(found: DecodedForces) -> tuple[Card, ...]:
+    ok = found.answered
+    answered = Card("Readings answered", f"{np.mean(ok):.0%}", f"{int(ok.sum())} of {len(ok)}; the others lie beyond the training")
+    if not ok.any():
+        return (answered,)
+    top = int(np.nanargmax(found.force_mn))
+    (low, high), tilt = 1e-3 * found.force_95[top], found.tilt_95_deg[top]
+    return (
+        Card("Largest force", f"{1e-3 * found.force_mn[top]:.3g} N", f"95 % interval {low:.3g} to {high:.3g} N"),
+        Card("Its tilt", f"{found.tilt_deg[top]:.3g}°", f"95 % interval {tilt[0]:.3g} to {tilt[1]:.3g}°"),
+        Card(
+            "Its azimuth", f"{found.azimuth_deg[top]:.3g}°" if tilt[0] > 0.0 else "not known", "" if tilt[0] > 0.0 else "the tilt may be 0"
+        ),
+        answered,
     )
 
 

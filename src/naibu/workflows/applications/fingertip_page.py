@@ -77,7 +77,7 @@ def _presses(study: PreparedFingertip, results: FingertipResults) -> Section:
         )  # fmt: skip
     columns = (
         "press", "tilt, degrees", "azimuth, degrees", "friction", "force along the rod, N", "depth, mm", "contact radius, mm",
-        "F_z on the chip, mN", "M_x, N um", "M_y, N um", "reading F_z, V", "reading M_x, V", "reading M_y, V", "saturated",
+        "F_z on the chip, mN", "M_x, N µm", "M_y, N µm", "reading F_z, V", "reading M_x, V", "reading M_y, V", "saturated",
     )  # fmt: skip
     note = "At the end of each press, without noise. A saturated channel exceeds the converter's range: its reading is not to be used."
     table = Table("Presses", columns, tuple(rows), caption=f"{study.fingertip.diameter_mm:g} mm fingertip.", note=note)
@@ -102,7 +102,7 @@ def _curve(results: FingertipResults, k: int) -> Table:
         (float(d), float(s), 1e-3 * float(f), *(float(v) for v in load[[2, 3, 4]]), *(float(v) for v in volt))
         for d, s, f, load, volt in zip(pressing.depth_mm, pressing.slide_mm, pressing.along_rod_mn, loads, volts, strict=True)
     )
-    columns = ("depth, mm", "slide, mm", "force, N", "F_z, mN", "M_x, N um", "M_y, N um", "F_z, V", "M_x, V", "M_y, V")
+    columns = ("depth, mm", "slide, mm", "force, N", "F_z, mN", "M_x, N µm", "M_y, N µm", "F_z, V", "M_x, V", "M_y, V")
     return Table(f"Curve of {results.names[k]}", columns, rows)
 
 

@@ -201,7 +201,7 @@ def _found(pair: MammographicPair, points: tuple[Sequence[float] | None, Sequenc
 def _rows(found: _Found) -> list[tuple[str, str]]:
     nominal = found.pair.nominal
     rows = [
-        ("volume of the breast", f"{1e-3 * nominal.shape.volume_mm3:.0f} cm^3"),
+        ("volume of the breast", f"{1e-3 * nominal.shape.volume_mm3:.0f} cm³"),
         *((f"stretch of the outline in {name}, along the chest wall and away from it", f"{s.silhouette[0]:.3f}, {s.silhouette[1]:.3f}")
           for name, s in (("CC", nominal.cc), ("MLO", nominal.mlo))),
     ]  # fmt: skip
@@ -324,7 +324,7 @@ def _assumed(model: str, sds: ModelUncertainty) -> Table:
             ("thickness of the skin, mm", solid.skin_mm, None),
             ("friction coefficient of the plates", solid.friction, None),
             ("resistance of the chest wall to sliding, kPa/mm", solid.wall_kpa_per_mm, None),
-            ("density, kg/mm^3", solid.density, None),
+            ("density, kg/mm³", solid.density, None),
         )
     return Table(
         "Parameters", ("parameter", "value", "standard deviation"), rows, caption="Stated, not fitted; drawn for each view by itself."

@@ -35,6 +35,7 @@ from naibu.reproduction.chapter6.chip_sections import (
     sensitivity_table,
     study_section,
 )
+from naibu.viewer.cards import Card
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
@@ -208,7 +209,7 @@ def simulate_chip(
     resolution = ChipResolution(mesh.along, mesh.across, mesh.through, mesh.below, mesh.frame)
     analysis = analysed_chip(chip.design, resolution, shift_mm=(_MM * shift[0], _MM * shift[1]), progress=progress)
     settings: dict[str, Cell] = {"study": chip.source, "sha256": chip.digest, "nodes": analysis.whole.chip.mesh.n_points}
-    page, numbers = write_chapter(Chapter(chip.name, chip.title, _sections(chip, analysis), settings), folder)
+    page, numbers = write_chapter(Chapter(chip.name, chip.title, _sections(chip, analysis), settings, _cards(chip, analysis)), folder)
     solution = folder / f"{chip.name}.vtu"
     values: dict[str, FloatArray] = {}
     for name, load in _shown_loads(chip).items():
@@ -233,10 +234,26 @@ def _six(load: LoadTable) -> FloatArray:
     return np.array([0.0, 0.0, load.force_z_mN, load.moment_x_Num, load.moment_y_Num, 0.0])
 
 
+def _cards(chip: PreparedChip, analysis: ChipAnalysis) -> tuple[Card, ...]:
+    limits, found = load_limits(chip.design), analysis.sensitivities
+    measurable, noise = chip.readout.measurable(found), chip.readout.load_noise(found)
+    return (
+        Card("Sensitivity to F_z", f"{found[0]:.3g} mV/mN", "finite elements of the whole chip"),
+        Card("Sensitivity to M_x, M_y", f"{found[1]:.3g}, {found[2]:.3g} mV/(N µm)", "finite elements of the whole chip"),
+        Card("Largest force, moment borne", f"{1e-3 * limits[0]:.3g} N, {limits[1]:.3g} N µm", "each alone, nominal stress"),
+        Card(
+            "Force that is read",
+            f"{noise[0]:.2g} to {measurable[0]:.3g} mN",
+            "from the standard deviation of the noise to the converter's end",
+        ),
+        Card("Lowest resonance", f"{1e-3 * float(np.min(analysis.whole.resonances_hz)):.3g} kHz", "upper bound of finite elements"),
+    )
+
+
 def _sections(chip: PreparedChip, analysis: ChipAnalysis) -> tuple[Section, ...]:
     design, limits = chip.design, load_limits(chip.design)
     text = (
-        f"Each load alone is borne up to {limits[0]:.4g} mN, or {limits[1]:.4g} N um. The stresses are nominal; the strength of "
+        f"Each load alone is borne up to {1e-3 * limits[0]:.3g} N, or {limits[1]:.4g} N µm. The stresses are nominal; the strength of "
         f"{1e-6 * design.strength_kpa:g} GPa is that of the file.",
     )
     points = [(abs(v.force_z_mN), float(np.hypot(v.moment_x_Num, v.moment_y_Num))) for v in chip.settings.load]
@@ -273,7 +290,7 @@ def _loads_table(chip: PreparedChip, analysis: ChipAnalysis) -> Table:
              *(float(v) for v in bridge), *(float(v) for v in volts), ", ".join(over) or "none")
         )  # fmt: skip
     columns = (
-        "load", "F_z, mN", "M_x, N um", "M_y, N um", "nominal, % of strength", "near corners, % of strength",
+        "load", "F_z, mN", "M_x, N µm", "M_y, N µm", "nominal, % of strength", "near corners, % of strength",
         *(f"bridge {name}, mV" for name in ("F_z", "M_x", "M_y")), *(f"amplified {name}, V" for name in ("F_z", "M_x", "M_y")), "saturated",
     )  # fmt: skip
     return Table(

@@ -25,6 +25,7 @@ from naibu.io.study_schemas.ischemia_schema import IschemiaFile, RecordTable, lo
 from naibu.io.vtk_files import write_vtkhdf_series
 from naibu.mechanics.small_strain.rheology import Rheology, three_element
 from naibu.reproduction.chapter5 import figures
+from naibu.viewer.cards import Card
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
@@ -196,7 +197,7 @@ def simulate_ischemia(
     if estimate is not None:
         sections.insert(0, _layers_section(study, estimate))
     settings: dict[str, Cell] = {"study": study.source, "sha256": study.digest, "nodes": len(modes.meshed.grid.points)}
-    page, numbers = write_chapter(Chapter(study.name, study.title, tuple(sections), settings), folder)
+    page, numbers = write_chapter(Chapter(study.name, study.title, tuple(sections), settings, _cards(study, motion, estimate)), folder)
     series = folder / f"{study.name}.vtkhdf"
     times = np.linspace(0.0, min(end, 3.0 * duration), FRAMES)
     moved = skin_displacements(modes, materials, study.load, times)
@@ -231,10 +232,26 @@ def _in_keys(message: str) -> str:
     return message
 
 
+def _cards(study: PreparedIschemia, motion: SkinMotion, estimate: LayerEstimate | None) -> tuple[Card, ...]:
+    area = motion.pale_area(study.settings.pale.threshold_kPa)
+    white = motion.times[area > 0.0]
+    cards = [
+        Card("Largest indentation", f"{motion.indentation.max():.3g} mm", f"{study.load.force_mn:g} mN for {study.load.duration_s:g} s"),
+        Card("Largest pale area", f"{area.max():.3g} mm²", f"pressure above {study.settings.pale.threshold_kPa:g} kPa"),
+    ]
+    if len(white) and white[-1] > study.load.duration_s:
+        cards.append(Card("Pale after the release", f"{white[-1] - study.load.duration_s:.2g} s", "the blood that returns is not modelled"))
+    if estimate is not None:
+        cards.append(
+            Card("Layers explain the record", "yes" if estimate.explained else "no", f"residuals {estimate.residual_mm:.2g} mm RMS")
+        )
+    return tuple(cards)
+
+
 def _motion_section(study: PreparedIschemia, motion: SkinMotion) -> Section:
     threshold = study.settings.pale.threshold_kPa
     area = motion.pale_area(threshold)
-    measured = {"indentation, mm": motion.indentation, "pale area, mm^2": area}
+    measured = {"indentation, mm": motion.indentation, "pale area, mm²": area}
     rows = tuple((name, *_row(response_times(motion.times, values, study.load.duration_s))) for name, values in measured.items())
     columns = (
         "quantity",

@@ -27,8 +27,9 @@ from naibu.meshing.cutting.volume import VolumeCut
 from naibu.meshing.quality import mean_edge_length, signed_volumes
 from naibu.simulation.interactive_bodies import AnySession, FiniteElementBody, InteractiveBody, LatticeBody
 from naibu.simulation.lattice_cut import LatticeCut
+from naibu.viewer.cards import Card
 from naibu.viewer.motion_page import ColourField, MotionPage, motion_html
-from naibu.viewer.tables import Table
+from naibu.viewer.tables import Table, quantity_of
 from naibu.workflows.experiments import Source
 from naibu.workflows.interactive.touchable_models import MeshMaterial, TouchableModel, touchable
 from naibu.workflows.results.output_folder import output_folder
@@ -237,18 +238,28 @@ def _written(
     return (write_atomically(folder / "cut.html", text), *(folder / name for name in FILES[1:]))
 
 
+def _cards(numbers: Mapping[str, Any]) -> tuple[Card, ...]:
+    volumes = [f"{1e-3 * v:.3g}" for v in numbers["volumes_mm3"]]
+    return (
+        Card("Pieces", str(numbers["pieces"]), f"{', '.join(volumes[:4])}{', ...' if len(volumes) > 4 else ''} cm³"),
+        Card("Area of the cut", f"{1e-2 * numbers['area_of_the_cut_mm2']:.3g} cm²"),
+        Card("Largest distance from the blade", f"{numbers['largest_distance_from_the_blade_mm']:.2g} mm"),
+        Card("Largest opening", f"{numbers['largest_opening_mm']:.3g} mm", f"ends pulled apart by {numbers['pull_percent']:g} %"),
+    )
+
+
 def _page(
     model: TouchableModel, shown: IntArray, found: VolumeCut | LatticeCut, numbers: Mapping[str, Any], times: FloatArray, moved: FloatArray
 ) -> MotionPage:
     nodes, faces = np.unique(shown, return_inverse=True)
-    sizes = ", ".join(f"{v:.4g}" for v in numbers["volumes_mm3"][:6])
+    sizes = ", ".join(f"{1e-3 * v:.4g}" for v in numbers["volumes_mm3"][:6])
     said = (
-        f"The cut leaves {found.n_pieces} {'piece' if found.n_pieces == 1 else 'pieces'} of {sizes} mm³. It deviates from the blade by "
+        f"The cut leaves {found.n_pieces} {'piece' if found.n_pieces == 1 else 'pieces'} of {sizes} cm³. It deviates from the blade by "
         f"{found.deviation_mm:.2g} mm at most and opens by {numbers['largest_opening_mm']:.3g} mm where its ends along "
         f"{numbers['pulled_along']} are pulled apart by {numbers['pull_percent']:g} %.",
         model.sentences[0],
     )
-    rows = [(name.replace("_", " "), value) for name, value in numbers.items() if isinstance(value, int | float)]
+    rows = [(quantity_of(name), value) for name, value in numbers.items() if isinstance(value, int | float)]
     piece = np.zeros(found.mesh.n_points)
     piece[found.mesh.cells] = found.piece[:, None]
     fields = [ColourField("displacement, mm", np.linalg.norm(moved[:, nodes], axis=2))]
@@ -260,4 +271,5 @@ def _page(
     return MotionPage(
         title, said, times, faces.reshape(-1, 3), found.mesh.points[nodes], moved[:, nodes], fields, [], np.zeros((len(times), 0, 3)),
         np.zeros(0), none, [Table("Numbers", ("quantity", "value"), tuple(rows))], provenance,
+        _cards(numbers),
     )  # fmt: skip

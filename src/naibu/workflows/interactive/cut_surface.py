@@ -25,8 +25,9 @@ from naibu.io.vtk_files import write_vtkhdf_series, write_vtu
 from naibu.meshing.cutting.surface import cut_surface as cut_along
 from naibu.meshing.cutting.surface_result import SurfaceCut, groove, triangle_areas
 from naibu.simulation.surface_opening import LARGEST_TENSION, opening
+from naibu.viewer.cards import Card
 from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, motion_html
-from naibu.viewer.tables import Table
+from naibu.viewer.tables import Table, quantity_of
 from naibu.workflows.results.output_folder import output_folder
 
 FILES = ("cut.html", "cut.vtu", "cut.vtkhdf", "cut.json")
@@ -223,6 +224,15 @@ def _shown(found: SurfaceCut, points: FloatArray, triangles: IntArray) -> IntArr
     return triangles[np.sort(np.argsort(away, kind="stable")[:PAGE_TRIANGLES])]
 
 
+def _cards(found: SurfaceCut, numbers: Mapping[str, Any]) -> tuple[Card, ...]:
+    return (
+        Card("Pieces", str(found.n_pieces), f"{areas_text(found)} mm²"),
+        Card("Length of the cut", f"{found.length_mm:.3g} mm"),
+        Card("Largest distance from the path", f"{found.deviation_mm:.2g} mm", f"{numbers['allowed_distance_mm']:.2g} mm are allowed"),
+        Card("Largest opening", f"{numbers['largest_opening_mm']:.3g} mm", f"under a tension of {numbers['tension_percent']:g} %"),
+    )
+
+
 def _page(
     found: SurfaceCut, points: FloatArray, triangles: IntArray, numbers: Mapping[str, Any], times: FloatArray, moved: FloatArray
 ) -> MotionPage:
@@ -242,7 +252,7 @@ def _page(
         said.append(f"The page shows the {len(triangles)} triangles nearest to the cut; cut.vtkhdf has all of them.")
     nodes, faces = np.unique(triangles, return_inverse=True)
     moved = moved[:, nodes]
-    rows = [(name.replace("_", " "), v) for name, v in numbers.items() if isinstance(v, int | float) and not isinstance(v, bool)]
+    rows = [(quantity_of(name), v) for name, v in numbers.items() if isinstance(v, int | float) and not isinstance(v, bool)]
     fields = [ColourField("displacement, mm", np.linalg.norm(moved, axis=2))]
     if found.n_pieces > 1:
         piece = np.zeros(len(points))
@@ -256,4 +266,5 @@ def _page(
     return MotionPage(
         f"{Path(numbers['source']).name}, cut", said, times, faces.reshape(-1, 3), points[nodes], moved, fields, [tool], at, np.zeros(0),
         np.zeros((0, 1, 3)), [Table("Numbers", ("quantity", "value"), tuple(rows))], provenance,
+        _cards(found, numbers),
     )  # fmt: skip

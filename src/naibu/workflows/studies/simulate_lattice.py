@@ -18,6 +18,7 @@ from naibu.io.files.atomic import write_atomically
 from naibu.io.vtkhdf_series import SeriesFile
 from naibu.mechanics.lattices.model.surface import surface_of
 from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy, StudyFrame, StudyState, run_study
+from naibu.viewer.cards import Card
 from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, force_unit, motion_html
 from naibu.viewer.tables import Table
 from naibu.workflows.results.output_folder import output_folder
@@ -277,6 +278,7 @@ def _page(prepared: PreparedStudy, series: SeriesFile, state: StudyState) -> Mot
     return MotionPage(
         prepared.title, _sentences(prepared, state, force), times, faces.reshape(-1, 3), study.lattice.points[nodes], moved, fields, bodies,
         positions, series.rows("force_time_s")[:count], force, _tables(prepared, force, moved, times), provenance,
+        _cards(prepared, force, moved),
     )  # fmt: skip
 
 
@@ -293,6 +295,19 @@ def _sentences(prepared: PreparedStudy, state: StudyState, force: FloatArray) ->
     if idle and state.frame == study.frames:
         found.append(f"Never touched the object: {', '.join(idle)}.")
     return found
+
+
+def _cards(prepared: PreparedStudy, force: FloatArray, moved: FloatArray) -> tuple[Card, ...]:
+    size = np.linalg.norm(moved, axis=2).max(axis=1)
+    cards = [
+        Card("Largest displacement", f"{size.max():.3g} mm", "of the surface"),
+        Card("Left at the end", f"{size[-1]:.3g} mm", "largest displacement of the surface"),
+    ]
+    unit, factor = force_unit(float(np.abs(force).max(initial=0.0)))
+    for k, body in enumerate(prepared.study.bodies[:4]):
+        largest = factor * float(np.linalg.norm(force[:, k], axis=1).max(initial=0.0))
+        cards.append(Card(f"Largest force of {body.name}", f"{largest:.3g} {unit}" if largest else "no contact"))
+    return tuple(cards)
 
 
 def _tables(prepared: PreparedStudy, force: FloatArray, moved: FloatArray, times: FloatArray) -> list[Table]:

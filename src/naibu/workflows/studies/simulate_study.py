@@ -94,8 +94,8 @@ def _page(studies: list[Study]) -> str:
         for s in studies
     )
     title = "Squares, pushed and released" if len(studies) > 1 else studies[0].name.capitalize()
-    note = "; ".join(f"{s.name}: {_described(s)}" for s in studies) + "."
-    return animation_html(title, studies[0].series.times, bodies, "displacement, mm", note)
+    sentences = [f"{s.name.capitalize()}: {_described(s)}." for s in studies]
+    return animation_html(title, studies[0].series.times, bodies, "displacement, mm", sentences)
 
 
 def _described(study: Study) -> str:

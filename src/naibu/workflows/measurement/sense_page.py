@@ -1,0 +1,108 @@
+"""The page of a measured displacement: what to know first, slices with overlays, and figures."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from naibu.core.arrays import BoolArray, FloatArray
+from naibu.imaging.displacement.strain import green_lagrange_strain_of
+from naibu.imaging.preprocessing.resampling import warped
+from naibu.viewer.cards import Card
+from naibu.viewer.slices import Overlay, SliceView
+from naibu.viewer.tables import Table
+
+if TYPE_CHECKING:
+    from naibu.workflows.measurement.sense import Pair, SenseRun
+
+
+def slice_view(pair: Pair, run: SenseRun) -> SliceView:
+    """Return the slices of the page of a run."""
+    measured, grid = run.measured, pair.reference
+    box = _box(measured.mask)
+    u = measured.displacement.vectors
+    back = warped(pair.deformed, np.nan_to_num(u), grid)
+    inside = measured.mask & np.isfinite(measured.gradient).all(axis=(-2, -1))
+    principal = np.full((*grid.shape, 3), np.nan)
+    principal[inside] = np.linalg.eigvalsh(green_lagrange_strain_of(measured.gradient[inside]))
+    ratio = np.full(grid.shape, np.nan)
+    ratio[inside] = np.linalg.det(np.eye(3) + measured.gradient[inside])
+    overlays = [
+        Overlay("displacement, mm", np.linalg.norm(u, axis=-1)[box]),
+        Overlay("largest principal Green-Lagrange strain", principal[..., 2][box]),
+        Overlay("smallest principal Green-Lagrange strain", principal[..., 0][box]),
+        Overlay("volume ratio J", ratio[box], middle=1.0),
+    ]
+    if (sd := measured.displacement.largest_sd_mm) is not None:
+        overlays.append(Overlay("standard deviation of the displacement, mm", np.where(measured.mask, sd, np.nan)[box]))
+    images = [("reference", pair.reference.values), ("deformed", pair.deformed.values), ("deformed, warped back", back)]
+    return SliceView(
+        title=f"Displacement from {pair.names[0]} to {pair.names[1]}",
+        sentences=_sentences(run),
+        spacing_mm=grid.spacing_mm,
+        images=[(name, np.asarray(v, dtype=np.float32)[box]) for name, v in images],
+        displacement=(u @ grid.direction)[box],
+        overlays=overlays,
+        tables=[_table(run)],
+        origin_mm=grid.to_physical([b.start for b in box[::-1]]) @ grid.direction,
+        difference=(("reference minus deformed", 0, 1), ("reference minus deformed, warped back", 0, 2)),
+        direction=grid.direction,
+        cards=_cards(run, principal[inside]),
+    )
+
+
+def _cards(run: SenseRun, principal: FloatArray) -> tuple[Card, ...]:
+    """Return what to know first; `principal` are the principal Green-Lagrange strains (n, 3) inside the object, in increasing order."""
+    f = run.figures
+    sd = f["median_sd_mm"]
+    cards = [
+        Card("Displacement, median", f"{f['median_displacement_mm']:.3g} mm", f"at most {f['largest_displacement_mm']:.3g} mm"),
+        Card("Standard deviation of it", "not stated" if sd is None else f"{sd:.2g} mm", "median, along the least certain direction"),
+    ]
+    if len(principal):
+        low, high = np.median(principal[:, 0]), np.median(principal[:, 2])
+        cards.append(Card("Principal strains, median", f"{low:+.1%} and {high:+.1%}", "smallest and largest, Green-Lagrange"))
+    share = f["measured_fraction"]
+    rest = "the rest is left unanswered" if isinstance(share, float) and share < 1.0 else "all of it"
+    cards.append(Card("Part of the object measured", f"{share:.1%}", rest))
+    before, after = f["initial_residual_rms"], f["residual_rms"]
+    if isinstance(before, float) and isinstance(after, float) and before > 0.0:
+        cards.append(
+            Card("Difference of the scans explained", f"{1.0 - (after / before) ** 2:.0%}", "of its mean square, inside the object")
+        )
+    if (error := f.get("p95_error_mm", f.get("p95_check_point_error_mm"))) is not None:
+        cards.append(Card("Error against the truth, 95th percentile", f"{error:.3g} mm"))
+    return tuple(cards)
+
+
+def _box(mask: BoolArray, margin: int = 4) -> tuple[slice, ...]:
+    inside = np.argwhere(mask)
+    return tuple(slice(max(0, int(a) - margin), int(b) + 1 + margin) for a, b in zip(inside.min(axis=0), inside.max(axis=0), strict=True))
+
+
+def _sentences(run: SenseRun) -> list[str]:
+    f = run.figures
+    sentences = [
+        f"Method {run.measured.method}, {run.seconds:.1f} s. The object moved by {f['median_displacement_mm']:.2f} mm (median), at most "
+        f"{f['largest_displacement_mm']:.2f} mm; the intensity residual inside it fell from {f['initial_residual_rms']:.4g} to "
+        f"{f['residual_rms']:.4g} (root mean square)."
+    ]
+    if f["median_sd_mm"] is not None:
+        sentences.append(
+            f"The standard deviation of the displacement is {f['median_sd_mm']:.3f} mm (along the least certain direction, median)."
+        )
+    else:
+        sentences.append("This method states no uncertainty.")
+    if isinstance(f["measured_fraction"], float) and f["measured_fraction"] < 0.995:
+        sentences.append(
+            f"The displacement of {1.0 - f['measured_fraction']:.1%} of the object was not measured: that part lies outside one of the "
+            "scans, or in its padding, or the scans show no common texture there."
+        )
+    if isinstance(f["folded_fraction"], float) and f["folded_fraction"] > 0.0:
+        sentences.append(f"The field folds at {f['folded_fraction']:.2%} of the voxels: it is wrong there.")
+    return sentences + [text.replace("`", "") for text in run.measured.warnings]
+
+
+def _table(run: SenseRun) -> Table:
+    return Table("Figures", ("quantity", "value"), tuple(run.rows()))
