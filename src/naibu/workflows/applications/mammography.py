@@ -28,6 +28,7 @@ from naibu.applications.mammography.pair_construction import mammographic_pair, 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.io.files.atomic import write_atomically
+from naibu.viewer.cards import Card
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import chapter_html
 from naibu.viewer.tables import Cell, Table
@@ -140,7 +141,7 @@ def relate_views(
         "CC": str(cc), "MLO": str(mlo), "MR": str(mr), "model": model, "thickness_mm": ", ".join(f"{t:g}" for t in plates),
         "angle_deg": angle, "unresolved_mm": unresolved_mm, "draws": draws, "draws without a breast": pair.refused, "seed": seed,
     }  # fmt: skip
-    chapter = Chapter(_NAME, "One point in two mammographic views", _sections(found, model, uncertainty), settings)
+    chapter = Chapter(_NAME, "One point in two mammographic views", _sections(found, model, uncertainty), settings, _cards(found))
     numbers = {"naibu": __version__, "notice": NOTICE, "settings": settings, **_numbers(found)}
     page = write_atomically(folder / f"{_NAME}.html", chapter_html(chapter))
     table = write_atomically(folder / f"{_NAME}.json", json.dumps(numbers, indent=1, allow_nan=False) + "\n")
@@ -212,8 +213,7 @@ def _rows(found: _Found) -> list[tuple[str, str]]:
             told = " to ".join(f"({e[0]:.1f}, {e[1]:.1f})" for e in ends)
             rows.append((f"epipolar curve in {other}", f"from {told} mm"))
     if found.lesion is not None:
-        axes = ("laterally from the nipple", "upwards from the nipple", "from the chest wall")
-        for axis, value, low, high in zip(axes, found.lesion.position, found.lesion.low, found.lesion.high, strict=True):
+        for axis, value, low, high in zip(_AXES, found.lesion.position, found.lesion.low, found.lesion.high, strict=True):
             rows.append((f"lesion in the unloaded breast, {axis}", f"{value:.1f} mm ({low:.1f} to {high:.1f})"))
         rows.append(("distance of the MLO point from the curve", f"{found.lesion.mismatch_mm:.1f} mm"))
     if found.projection is not None:
@@ -221,6 +221,20 @@ def _rows(found: _Found) -> list[tuple[str, str]]:
             x, y = outline.to_image(place)
             rows.append((f"point of the scan in {name}", f"({x:.1f}, {y:.1f}) mm"))
     return rows
+
+
+def _cards(found: _Found) -> tuple[Card, ...]:
+    cards = []
+    if found.lesion is not None:
+        for axis, value, low, high in zip(_AXES, found.lesion.position, found.lesion.low, found.lesion.high, strict=True):
+            cards.append(Card(f"Lesion, {axis}", f"{value:.0f} mm".replace("-", "−"), f"95 % interval {low:.0f} to {high:.0f} mm"))
+        agrees = "inside the band: may be one lesion" if found.lesion.agrees else "outside the band: may not be one lesion"
+        cards.append(Card("MLO point from the curve", f"{found.lesion.mismatch_mm:.1f} mm", agrees))
+    if found.projection is not None:
+        for name, outline, place in zip(("CC", "MLO"), found.pair.outlines, found.projection.places, strict=True):
+            x, y = outline.to_image(place)
+            cards.append(Card(f"Point of the scan in {name}", f"({x:.0f}, {y:.0f}) mm"))
+    return (*cards, Card("Volume of the breast", f"{1e-3 * found.pair.nominal.shape.volume_mm3:.0f} cm³"))
 
 
 def _warnings(found: _Found) -> list[str]:
@@ -291,6 +305,7 @@ _COMMON = (
     "of each outline and lies on the axis of rotation; the view in which the breast is deeper reaches the chest wall.",
     "Kinds of tissue are not told apart: heterogeneity and positioning are in the unresolved displacement.",
 )
+_AXES = ("laterally from the nipple", "upwards from the nipple", "from the chest wall")
 _ASSUMPTIONS = {
     "geometric": (
         "Sections perpendicular to the chest wall deform in their plane and bend outwards; the outline of the compressed breast is scaled "

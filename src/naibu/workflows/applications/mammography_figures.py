@@ -12,6 +12,7 @@ from naibu.applications.mammography.epipolar import EpipolarCurve, Projection
 from naibu.core.arrays import FloatArray
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.figure import Figure as Canvas
 
 
@@ -37,7 +38,11 @@ def draw_views(
             axes.fill(*outline.to_image(projection.regions[k]).T, color="C2", alpha=0.2, linewidth=0, label="95 % region")
             axes.plot(*outline.to_image(projection.places[k]), "C2+", markersize=10, markeredgewidth=2, label="point of the scan")
         axes.set(title=name, xlabel="perpendicular to the chest wall (mm)", ylabel=axis_names[k], aspect="equal")
-        axes.legend(fontsize=7)
+    labels: dict[str, Artist] = {}
+    for axes in canvas.axes:  # what is in one view may be missing in the other
+        handles, names = axes.get_legend_handles_labels()
+        labels = dict(zip(names, handles, strict=True)) | labels
+    canvas.legend(list(labels.values()), list(labels), loc="outside lower center", ncols=4, frameon=False)
 
 
 def draw_breast(canvas: Canvas, shape: BreastShape, curve: EpipolarCurve | None, lesion: FloatArray | None) -> None:
