@@ -15,6 +15,7 @@ from .feature_matching.harris import InterestPoints, interest_points
 from .feature_matching.relaxation_labelling import PotentialMatches, relaxed
 from .feature_matching.scattered_interpolation import Triangulation, dense_from_sparse, sparse_displacement, triangulated
 from .markers.detection import DetectedMarkers, detect_markers
+from .markers.particle_motion import ParticleMotion, particle_motion
 from .markers.point_matching import Links, link_markers
 from .markers.scan_orientation import ScanOrientation, found_orientation, stated_orientation
 from .markers.sequence_tracking import TrackedSequence, track_sequence
@@ -42,6 +43,7 @@ __all__ = [
     "LinkSettings",
     "Links",
     "MeasuredDisplacement",
+    "ParticleMotion",
     "PotentialMatches",
     "RigidRegistration",
     "ScanOrientation",
@@ -76,6 +78,7 @@ __all__ = [
     "masked",
     "measure_displacement",
     "object_mask",
+    "particle_motion",
     "register_rigid",
     "relaxed",
     "resampled_to_grid",

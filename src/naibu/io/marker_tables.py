@@ -11,32 +11,30 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from naibu.core.arrays import LENGTHS_MM, require_lengths
-from naibu.core.errors import InputError, MissingDependencyError
+from naibu.core.arrays import require_lengths
+from naibu.core.errors import InputError
 from naibu.core.experiment import Axis, Layer, Loading, Shape
 from naibu.core.markers import Markers
 from naibu.io.experiment_folder.reader import META_FILE, read_experiment
 from naibu.io.experiment_folder.state_csv import COORDINATES, OPTIONAL, REQUIRED, STATUSES, is_trusted
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.paths import require_usable_path
-from naibu.io.files.reading import guarded_reading, read_bytes, require_regular
-
-MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "in": 25.4, "inch": 25.4}
-_UNIT = re.compile(r"(?:[\s_,/]+|[\s_]*[\[(]\s*)(mm|cm|m|um|µm|μm|inch|in)\s*[\])]?$", re.IGNORECASE)
-_PLACE = r"(?:pos(?:ition)?|coord(?:inate)?|centroid|cent(?:er|re))?"
-_NAMES = {
-    "marker": re.compile(r"(?=.)(?:marker|point|bead|particle|track)?[\s_]*(?:no\.?|nr\.?|number|id|label|index|#)?", re.IGNORECASE),
-    **{f"{a}_mm": re.compile(rf"{_PLACE}[\s_.-]*{a}[\s_.-]*{_PLACE}", re.IGNORECASE) for a in "xyz"},
-    "status": re.compile("status"),
-    "note": re.compile("note"),
-}
-_ABSENT = ("", "nan", "na", "n/a", "-", "--", "none", "null")
-_HEADER_WITHIN = 20
+from naibu.io.files.reading import guarded_reading
+from naibu.io.table_cells import (
+    HEADER_WITHIN,
+    decimal_mark,
+    excel_rows,
+    guessed_columns,
+    number,
+    text_rows,
+    unit_factor,
+    within_reach,
+)  # fmt: skip
 
 
 def import_markers(
@@ -78,19 +76,19 @@ def import_markers(
     """
     source = Path(path)
     with guarded_reading(source, "a table"):
-        rows = _excel_rows(source, sheet) if source.suffix.lower() == ".xlsx" else _text_rows(source, delimiter)
+        rows = excel_rows(source, sheet) if source.suffix.lower() == ".xlsx" else text_rows(source, delimiter)
     start, where = _located(source, rows, columns)
     header = rows[start][1]
     body = [(line, row + [""] * (len(header) - len(row))) for line, row in rows[start + 1 :]]
     if not body:
         raise InputError(f"{source}: no rows follow the header {', '.join(header)}; a table needs one row per marker")
-    factors = {name: _factor(source, header[at], unit) for name, at in where.items() if name in COORDINATES}
-    mark = _decimal_mark(row[where[name]] for _, row in body for name in factors)
+    factors = {name: unit_factor(source, header[at], unit) for name, at in where.items() if name in COORDINATES}
+    mark = decimal_mark(row[where[name]] for _, row in body for name in factors)
     ids = [_label(f"{source}: line {line}, column {header[where['marker']]!r}", row[where["marker"]]) for line, row in body]
     points = np.full((len(body), 3), math.nan)
     for name, factor in factors.items():
         cells = [(f"{source}: line {line}, column {header[where[name]]!r}", row[where[name]]) for line, row in body]
-        values = [_within_reach(_number(place, cell, mark), factor, place) for place, cell in cells]
+        values = [within_reach(number(place, cell, mark), factor, place) for place, cell in cells]
         # rounding removes the floating-point error of the conversion (1.1 cm would be 11.000000000000002 mm)
         points[:, COORDINATES.index(name)] = np.round(np.array(values) * factor, 9)
     trusted = [_trusted(source, line, row, where) for line, row in body]
@@ -248,82 +246,14 @@ def _place_checked(target: Path, meta: str, states: Mapping[str, Markers]) -> No
         shutil.rmtree(aside, ignore_errors=True)
 
 
-def _text_rows(path: Path, delimiter: str | None) -> list[tuple[int, list[str]]]:
-    content = read_bytes(path)
-    if b"\0" in content[:4096] and not content.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise InputError(f"{path}: is not a text table; save it as CSV, or as .xlsx")
-    text = _decoded(path, content)
-    if delimiter is not None and len(delimiter) != 1:
-        raise InputError(f"delimiter = {delimiter!r} must be one character, for example ';'")
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter or _delimiter(text))
-    try:
-        return _filled(path, ((reader.line_num, row) for row in reader))
-    except csv.Error as error:
-        raise InputError(f"{path}: line {reader.line_num} is not readable ({error}); look for an unclosed quotation mark") from error
-
-
-def _delimiter(text: str) -> str:
-    """Return the separator that gives most of the first lines the same number of cells; of equals, the one rarer within cells."""
-    lines = text.splitlines()[:_HEADER_WITHIN]
-
-    def agreement(mark: str) -> int:
-        counts = [len(row) for row in csv.reader(lines, delimiter=mark)]
-        return max((counts.count(n) for n in set(counts) if n > 1), default=0)
-
-    return max("\t;,", key=agreement)
-
-
-def _decoded(path: Path, content: bytes) -> str:
-    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
-        try:
-            return content.decode("utf-16")
-        except UnicodeDecodeError as error:
-            raise InputError(f"{path}: byte {error.start} is not UTF-16 text; the file was truncated, or save it as UTF-8") from error
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        # older Western spreadsheets; only column names and notes can contain such letters
-        return content.decode("latin-1")
-
-
-def _excel_rows(path: Path, sheet: str | None) -> list[tuple[int, list[str]]]:
-    try:
-        import openpyxl
-    except ImportError as error:
-        raise MissingDependencyError(f'{path}: reading Excel files needs openpyxl; run: pip install "naibu[excel]"') from error
-    require_regular(path)
-    try:
-        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
-    # openpyxl's zip and XML readers raise exceptions of many types
-    except Exception as error:
-        raise InputError(
-            f"{path}: cannot be read as .xlsx ({error}); open it in a spreadsheet program and save it again, or as CSV"
-        ) from error
-    try:
-        if sheet is not None and sheet not in book.sheetnames:
-            raise InputError(f"{path}: there is no sheet {sheet!r}; it has {', '.join(book.sheetnames)}")
-        page = book[sheet] if sheet is not None else book.active
-        cells = ((n, ["" if v is None else str(v) for v in row]) for n, row in enumerate(page.iter_rows(values_only=True), start=1))
-        return _filled(path, cells)
-    finally:
-        book.close()
-
-
-def _filled(path: Path, rows: Iterable[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
-    kept = [(line, [cell.strip() for cell in row]) for line, row in rows if any(cell.strip() for cell in row)]
-    if not kept:
-        raise InputError(f"{path}: the table is empty; it needs a header and one row per marker")
-    return kept
-
-
 def _located(path: Path, rows: list[tuple[int, list[str]]], columns: Mapping[str, str] | None) -> tuple[int, dict[str, int]]:
     """Return the index of the header among `rows`, and the cell index of each of naibu's columns."""
     for name in columns or {}:
         if name not in REQUIRED + OPTIONAL:
             raise InputError(f"columns names {name!r}; use {', '.join(REQUIRED + OPTIONAL)}")
     wanted = REQUIRED if columns is None else ("marker", "x_mm", "y_mm", *columns)
-    for at, (_, row) in enumerate(rows[:_HEADER_WITHIN]):
-        where = _guessed(path, row) if columns is None else {n: row.index(c) for n, c in columns.items() if c in row}
+    for at, (_, row) in enumerate(rows[:HEADER_WITHIN]):
+        where = guessed_columns(path, row) if columns is None else {n: row.index(c) for n, c in columns.items() if c in row}
         if all(name in where for name in wanted):
             return at, where
     header = rows[0][1]
@@ -339,58 +269,6 @@ def _located(path: Path, rows: list[tuple[int, list[str]]], columns: Mapping[str
     close = difflib.get_close_matches(lost, header, n=1)
     mend = f"did you mean {close[0]!r}?" if close else f"it has {', '.join(header)}"
     raise InputError(f"{path}: there is no column {lost!r}; {mend}")
-
-
-def _guessed(path: Path, header: list[str]) -> dict[str, int]:
-    found: dict[str, int] = {}
-    for at, cell in enumerate(header):
-        plain = _UNIT.sub("", cell).strip()
-        for name, pattern in _NAMES.items():
-            if not pattern.fullmatch(cell if name == "marker" else plain):
-                continue
-            if name in found:
-                raise InputError(
-                    f"{path}: both {header[found[name]]!r} and {cell!r} may be {name!r}; say which: columns={{{name!r}: {cell!r}, ...}}"
-                )
-            found[name] = at
-    return found
-
-
-def _factor(path: Path, column: str, unit: str | None) -> float:
-    found = _UNIT.search(column)
-    named = found[1].lower() if found else None
-    if unit is not None and unit not in MM_PER_UNIT:
-        raise InputError(f"unit = {unit!r} is not known; use one of {', '.join(dict.fromkeys(MM_PER_UNIT))}")
-    if unit and named and MM_PER_UNIT[unit] != MM_PER_UNIT[named]:
-        raise InputError(f"{path}: column {column!r} says {named}, but unit = {unit!r}; leave unit out, or correct the column's name")
-    return MM_PER_UNIT[unit or named or "mm"]
-
-
-def _decimal_mark(cells: Iterable[str]) -> str:
-    """Return the decimal mark: a comma where commas occur and points occur only as thousands separators."""
-    seen = [c for c in cells if "," in c or "." in c]
-    return "," if any("," in c for c in seen) and all(c.rfind(",") > c.rfind(".") for c in seen) else "."
-
-
-def _number(where: str, text: str, mark: str) -> float:
-    if text.lower() in _ABSENT:
-        return math.nan
-    # typographic minus sign, and spaces between thousands
-    plain = re.sub(r"[\s\u00a0\u202f]", "", text).replace("\u2212", "-")
-    other = "." if mark == "," else ","
-    if re.fullmatch(rf"[+-]?\d{{1,3}}(\{other}\d{{3}})+(\{mark}\d*)?", plain):
-        plain = plain.replace(other, "")
-    plain = plain.replace(mark, ".")
-    if not re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", plain):
-        raise InputError(f"{where} = {text!r} is not a number (the table's decimal mark is {mark!r}); correct it, or leave the cell blank")
-    return float(plain)
-
-
-def _within_reach(value: float, factor: float, where: str) -> float:
-    """Return a coordinate that a scanner can hold; `factor` is the length of its unit, mm."""
-    if abs(value) * factor > LENGTHS_MM[1]:
-        raise InputError(f"{where} = {value:g} is more than {LENGTHS_MM[1] / factor:g}: no object is so large; correct it, or the unit")
-    return value
 
 
 def _label(where: str, text: str) -> int:

@@ -16,7 +16,8 @@ from naibu.core.experiment import Loading, Shape
 from naibu.core.markers import Markers
 from naibu.imaging.markers.motion_coherence import require_coherent, strays_named
 from naibu.imaging.markers.tracking import FEWEST_COMMON
-from naibu.io.marker_tables import MM_PER_UNIT, import_markers, write_experiment_folder
+from naibu.io.marker_tables import import_markers, write_experiment_folder
+from naibu.io.table_cells import MM_PER_UNIT
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.tilted_tables import UprightTables, Vertical, upright_tables
 

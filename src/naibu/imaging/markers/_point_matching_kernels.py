@@ -62,6 +62,27 @@ def _nearest(
 
 
 @njit(cache=True)
+def _solve(matrix: FloatArray, right: FloatArray) -> None:
+    """Solve for the columns of `right` in place by Cholesky factorization; of `matrix` the lower triangle is used, and overwritten."""
+    n = len(matrix)
+    for j in range(n):
+        for i in range(j, n):
+            left = matrix[i, j]
+            for k in range(j):
+                left -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = np.sqrt(max(left, 1e-300)) if i == j else left / matrix[j, j]
+    for c in range(right.shape[1]):
+        for i in range(n):
+            for k in range(i):
+                right[i, c] -= matrix[i, k] * right[k, c]
+            right[i, c] /= matrix[i, i]
+        for i in range(n - 1, -1, -1):
+            for k in range(i + 1, n):
+                right[i, c] -= matrix[k, i] * right[k, c]
+            right[i, c] /= matrix[i, i]
+
+
+@njit(cache=True)
 def _affine(
     x: FloatArray, y: FloatArray, w: FloatArray, count: int, expected: FloatArray, scale: float, value: FloatArray, gradient: FloatArray
 ) -> None:
@@ -71,7 +92,7 @@ def _affine(
     for c in range(count):
         for a in range(d + 1):
             xa = w[c] * (1.0 if a == 0 else x[c, a - 1])
-            for b in range(d + 1):
+            for b in range(a + 1):
                 matrix[a, b] += xa * (1.0 if b == 0 else x[c, b - 1])
             for b in range(d):
                 right[a, b] += xa * y[c, b]
@@ -81,11 +102,11 @@ def _affine(
         for b in range(d):
             right[a + 1, b] += hold * expected[b, a]
     matrix[0, 0] += 1e-12
-    solution = np.linalg.solve(matrix, right)
+    _solve(matrix, right)
     for a in range(d):
-        value[a] = solution[0, a]
+        value[a] = right[0, a]
         for b in range(d):
-            gradient[a, b] = solution[b + 1, a]
+            gradient[a, b] = right[b + 1, a]
 
 
 @njit(cache=True)

@@ -17,34 +17,32 @@ from scipy.spatial import cKDTree
 
 from naibu.core.arrays import FloatArray, IntArray, as_points, require_finite, require_shape
 from naibu.core.errors import InputError
-from naibu.imaging.markers._point_matching_kernels import fill_grid, frontier, propose, propose_few, settle, try_guesses
+from naibu.imaging.markers._point_matching_kernels import frontier, settle, try_guesses
+from naibu.imaging.markers.link_refinement import RefinedLinks, probability, refined
 from naibu.imaging.markers.motion_coherence import coherence_of_links
+from naibu.imaging.markers.point_clouds import FEW, Cloud, State, local_spacing, prepared, proposed
 from naibu.imaging.markers.settings import LinkSettings
 from naibu.imaging.markers.thin_plate_assignment import ENOUGH, assigned, exchanged, residuals
 
 # Empirical values, judged by tests/imaging/markers/test_point_matching.py and benchmarks/sense_markers.py, unless said otherwise.
 FEWEST = 3  # points that have an arrangement
-# points up to which a wave of growth is too small for threads
-FEW = 600
 # where all are assigned at once: seeds, and targets near each of them for which the translation is tried
 SHIFT_SEEDS, SHIFTS = 3, 30
-# neighbours that are used, in two and three dimensions
-NEIGHBOURS = {2: 12, 3: 20}
-# a spacing, the unit of all distances, in mean distances of nearest neighbours
-SPACING = 1.15
 # spacings within which a neighbour counts as found again, and within which a link may grow
 TIGHT, GROWING = 0.25, 0.45
 # fraction of the neighbours found again beyond which guesses of several seeds grow together
 SURE = 0.75
-SEEDS = 8  # reference points from which guesses start
+SEEDS = 8  # reference points from which guesses start; as many again where the deformed points are densest
 GUESSES_AT_ONCE = 200_000  # bounds the memory of a search
 # guesses that grow before the best is taken; fraction of the points that ends the search; waves after which growth ends with fewer links
 GROWN, NEARLY_ALL, PROBATION = 30, 0.985, (5, 24)
-# bounds of the time: failed proposals of a point, waves of growth, and rounds of refinement
-MOST_TRIES, MOST_WAVES, REFINEMENTS = 4, 400, 6
+# bounds of the time: failed proposals of a point, and waves of growth
+MOST_TRIES, MOST_WAVES = 4, 400
 
 # links from which on their mean probability is judged; of fewer, this fraction of the markers must be linked
 FEW_LINKS, FEW_LINKED = 8, 0.5
+UNEVEN = 3.0  # degrees of freedom of residuals that are compared with those of all links, not with those around
+LIKELY = 0.33  # probability, which errs on the safe side, below which a link that has grown is dropped
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,37 +70,6 @@ class Links:
 
     def __len__(self) -> int:
         return len(self.pairs)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Cloud:
-    """Reference points with their neighbours, deformed points in a grid, and the spacings of both."""
-
-    reference: FloatArray
-    neighbours: IntArray
-    reference_scale: FloatArray
-    deformed: FloatArray
-    deformed_scale: FloatArray
-    grid: tuple[FloatArray, float, IntArray, IntArray, IntArray]  # origin, width, dims, starts, members
-    growth: float  # spacing of the deformed points by that of the reference points
-
-    @property
-    def dimensions(self) -> int:
-        return int(self.reference.shape[1])
-
-
-@dataclass(slots=True, eq=False)
-class _State:
-    """Links while they grow: deformed point of every reference point and the reverse (-1: none), residuals, local gradients."""
-
-    link: IntArray
-    owner: IntArray
-    residual: FloatArray
-    gradients: FloatArray
-
-    @property
-    def count(self) -> int:
-        return int((self.link >= 0).sum())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,15 +128,16 @@ def link_markers(
     stretch = np.eye(reference.shape[1]) if predicted is not None else _overall_stretch(reference, deformed)
     # the deformed points are stretched back as a whole, so that neighbours are about as far apart along every axis
     moved_back = (deformed - deformed.mean(axis=0)) @ np.linalg.inv(stretch).T + reference.mean(axis=0) if predicted is None else deformed
-    cloud = _prepared(reference, np.ascontiguousarray(moved_back))
+    cloud = prepared(reference, np.ascontiguousarray(moved_back))
     rng = np.random.default_rng(seed)
-    if max(len(reference), len(deformed)) <= how.assign_up_to:
+    whole = max(len(reference), len(deformed)) <= how.assign_up_to
+    if whole:
         link = _assigned(cloud, rng, stretch, how)
-        residual = residuals(reference, deformed, link)
+        found = _of_assignment(link, residuals(reference, deformed, link), deformed)
     else:
-        state = _best_grown(cloud, rng, stretch, how)
-        link, residual = state.link, _refined(cloud, state, how) * float(np.linalg.det(stretch)) ** (1.0 / reference.shape[1])
-    links = _reported(_spacing(deformed), link, residual, reference.shape[1])
+        grown = refined(cloud, _best_grown(cloud, rng, stretch, how), how)
+        found = replace(grown, vectors=grown.vectors @ stretch.T, volume=grown.volume * float(np.linalg.det(stretch)))
+    links = _reported(found, reference, deformed)
     right = coherence_of_links(reference[links.pairs[:, 0]], deformed[links.pairs[:, 1]])
     links = replace(links, confidence=right * links.confidence)
     smaller, sure = min(len(reference), len(deformed)), float(links.confidence.mean()) if len(links) else 0.0
@@ -178,7 +146,7 @@ def link_markers(
             f"no common structure in {len(reference)} and {len(deformed)} markers: {len(links)} fit one smooth motion, with a mean "
             f"probability of {sure:.2f}, as by chance. Check that both are in mm and of one object, or give `predicted`"
         )
-    return links
+    return links if whole else _likely(links)
 
 
 def _checked(points: ArrayLike, name: str) -> FloatArray:
@@ -188,33 +156,7 @@ def _checked(points: ArrayLike, name: str) -> FloatArray:
     return p
 
 
-def _prepared(reference: FloatArray, deformed: FloatArray) -> _Cloud:
-    d = reference.shape[1]
-    k = min(NEIGHBOURS[d], len(reference) - 1)
-    tree = cKDTree(reference)
-    neighbours = np.ascontiguousarray(np.asarray(tree.query(reference, k=k + 1, workers=-1)[1])[:, 1:], dtype=np.int64)
-    reference_scale, deformed_scale = _spacing(reference), _spacing(deformed)
-    width = 0.6 * float(np.mean(deformed_scale))
-    low, extent = deformed.min(axis=0), np.ptp(deformed, axis=0)
-    width = max(width, float((np.maximum(extent, width).prod() / (4.0 * len(deformed) + 64.0)) ** (1.0 / d)))
-    dims = (extent / width).astype(np.int64) + 1
-    starts, members = np.zeros(int(dims.prod()) + 2, dtype=np.int64), np.empty(len(deformed), dtype=np.int64)
-    fill_grid(deformed, low, width, dims, starts, members)
-    grid = (low, width, dims, starts, members)
-    return _Cloud(
-        reference, neighbours, reference_scale, deformed, deformed_scale, grid, float(np.mean(deformed_scale) / np.mean(reference_scale))
-    )
-
-
-def _spacing(points: FloatArray) -> FloatArray:
-    """Return the typical distance of neighbours around every point (n,), mm."""
-    distance, index = cKDTree(points).query(points, k=min(9, len(points)), workers=-1)
-    nearest = np.asarray(distance)[:, 1]
-    local = SPACING * nearest[index].mean(axis=1)
-    return np.asarray(np.maximum(local, 0.2 * SPACING * nearest.mean() + 1e-12))
-
-
-def _assigned(cloud: _Cloud, rng: np.random.Generator, stretch: FloatArray, how: LinkSettings) -> IntArray:
+def _assigned(cloud: Cloud, rng: np.random.Generator, stretch: FloatArray, how: LinkSettings) -> IntArray:
     """Assign few markers: from translations of the whole cloud, and if these do not suffice, from links that have grown."""
     best = assigned(cloud.reference, cloud.deformed, _shifted(cloud, rng, stretch), cloud.deformed_scale, how)
     if best.quality < ENOUGH * min(len(cloud.reference), len(cloud.deformed)):
@@ -233,7 +175,7 @@ def _assigned(cloud: _Cloud, rng: np.random.Generator, stretch: FloatArray, how:
     return best.link
 
 
-def _shifted(cloud: _Cloud, rng: np.random.Generator, stretch: FloatArray) -> list[FloatArray]:
+def _shifted(cloud: Cloud, rng: np.random.Generator, stretch: FloatArray) -> list[FloatArray]:
     """Return predicted positions of all reference points: as they are, and by translations that map a seed to a deformed point."""
     starts = [cloud.reference]
     for chosen in _seeds(cloud, rng)[:SHIFT_SEEDS]:
@@ -244,15 +186,15 @@ def _shifted(cloud: _Cloud, rng: np.random.Generator, stretch: FloatArray) -> li
     return starts
 
 
-def _best_grown(cloud: _Cloud, rng: np.random.Generator, stretch: FloatArray, how: LinkSettings) -> _State:
+def _best_grown(cloud: Cloud, rng: np.random.Generator, stretch: FloatArray, how: LinkSettings) -> State:
     """Grow links from the best guesses until one links nearly all points; return the one that links most."""
     smaller = min(len(cloud.reference), len(cloud.deformed))
-    best: tuple[float, _State] | None = None
+    best: tuple[float, State] | None = None
     most_seen = 0.0
     seeds = _seeds(cloud, rng)
     # near their expected position, at first from few deformation gradients
     for radius, wide in [(r, w) for r in how.search_radii for w in (False, True) if np.isfinite(r) or not w]:
-        guesses = _guesses(cloud, seeds[: SEEDS // 2] if wide else seeds, stretch, radius, how, wide=wide)
+        guesses = _guesses(cloud, seeds[::2] if wide else seeds, stretch, radius, how, wide=wide)
         most_seen = max([most_seen, *(g.score for g in guesses)])
         families = _families(guesses)
         for together in families[:GROWN]:
@@ -272,7 +214,7 @@ def _best_grown(cloud: _Cloud, rng: np.random.Generator, stretch: FloatArray, ho
     return best[1]
 
 
-def _guesses(cloud: _Cloud, seeds: IntArray, stretch: FloatArray, radius: float, how: LinkSettings, *, wide: bool) -> list[_Guess]:
+def _guesses(cloud: Cloud, seeds: IntArray, stretch: FloatArray, radius: float, how: LinkSettings, *, wide: bool) -> list[_Guess]:
     """Try seeds against targets within `radius` spacings of their expected position; return the accepted ones, best first."""
     tree, typical = cKDTree(cloud.deformed), float(np.mean(cloud.deformed_scale))
     starts, kept = _starts(stretch, wide=wide), []
@@ -285,8 +227,12 @@ def _guesses(cloud: _Cloud, seeds: IntArray, stretch: FloatArray, radius: float,
     return sorted((g for g in kept if g.score >= how.min_agreement), key=lambda g: (-round(g.score, 1), g.away))
 
 
-def _seeds(cloud: _Cloud, rng: np.random.Generator) -> IntArray:
-    """Choose reference points with neighbours all around, half of them near the centre, where a rotation of the whole moves least."""
+def _seeds(cloud: Cloud, rng: np.random.Generator) -> IntArray:
+    """Choose reference points with neighbours all around.
+
+    Some lie near the centre, where a rotation of the whole moves least, some anywhere, and some where most points seem to be found again,
+    since loss may depend on the place.
+    """
     n = len(cloud.reference)
     drawn = rng.choice(n, size=min(n, 20 * SEEDS), replace=False)
     around = cloud.reference[cloud.neighbours[drawn]]
@@ -295,7 +241,12 @@ def _seeds(cloud: _Cloud, rng: np.random.Generator) -> IntArray:
     inner = drawn[np.argsort(off_centre / np.maximum(far, 1e-300), kind="stable")[: 5 * SEEDS]]
     middle = inner[np.argsort(np.linalg.norm(cloud.reference[inner] - cloud.reference.mean(axis=0), axis=1), kind="stable")]
     others = [i for i in inner if i not in set(middle[: SEEDS // 2])]
-    return np.asarray([*middle[: SEEDS // 2], *others[: SEEDS - SEEDS // 2]], dtype=np.int64)
+    chosen = [*middle[: SEEDS // 2], *others[: SEEDS - SEEDS // 2]]
+    amid = drawn[np.argsort(off_centre / np.maximum(far, 1e-300), kind="stable")[: len(drawn) // 2]]
+    there = np.asarray(cKDTree(cloud.deformed).query(cloud.reference[amid])[1])
+    thinned = cloud.deformed_scale[there] / cloud.reference_scale[amid]
+    dense = [i for i in amid[np.argsort(thinned, kind="stable")] if i not in set(chosen)]
+    return np.asarray([*chosen, *dense[:SEEDS]], dtype=np.int64)
 
 
 def _overall_stretch(reference: FloatArray, deformed: FloatArray) -> FloatArray:
@@ -337,7 +288,7 @@ def _starts(stretch: FloatArray, *, wide: bool) -> FloatArray:
 
 
 def _tried(
-    cloud: _Cloud, chosen: int, targets: IntArray, starts: FloatArray, expected: FloatArray, typical: float, least: float
+    cloud: Cloud, chosen: int, targets: IntArray, starts: FloatArray, expected: FloatArray, typical: float, least: float
 ) -> list[_Guess]:
     """Return the best start for every target of one seed."""
     f = len(starts)
@@ -366,11 +317,11 @@ def _families(guesses: list[_Guess]) -> list[list[_Guess]]:
     return ([sure] if len(sure) > 1 else []) + [[g] for g in guesses]
 
 
-def _grown(cloud: _Cloud, guesses: list[_Guess]) -> _State:
+def _grown(cloud: Cloud, guesses: list[_Guess]) -> State:
     """Grow links from guesses, wave by wave."""
     n, d = cloud.reference.shape
     link, owner = np.full(n, -1, dtype=np.int64), np.full(len(cloud.deformed), -1, dtype=np.int64)
-    state = _State(link, owner, np.full(n, np.inf), np.tile(np.eye(d), (n, 1, 1)))
+    state = State(link, owner, np.full(n, np.inf), np.tile(np.eye(d), (n, 1, 1)))
     for g in guesses:
         if owner[g.target] < 0:
             link[g.seed], owner[g.target], state.residual[g.seed] = g.target, g.seed, 0.0
@@ -385,61 +336,37 @@ def _grown(cloud: _Cloud, guesses: list[_Guess]) -> _State:
             break
         some = active[:count].copy()
         tries[some] += 1
-        _, proposal, distance, fitted = _proposed(cloud, state, some, reach, robust=False)
+        _, proposal, distance, fitted = proposed(cloud, state, some, reach, robust=False)
         settle(some, proposal, distance, link, owner, state.residual, fitted, state.gradients)
     return state
 
 
-def _proposed(
-    cloud: _Cloud, state: _State, active: IntArray, reach: FloatArray, *, robust: bool
-) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
-    """Return predictions, proposals, distances and local gradients of active reference points."""
-    d, count = cloud.dimensions, len(active)
-    predicted, proposal, distance = np.empty((count, d)), np.empty(count, dtype=np.int64), np.empty(count)
-    fitted = np.zeros((count, d, d))
-    (propose if count > FEW else propose_few)(
-        cloud.reference, cloud.neighbours, cloud.deformed, *cloud.grid, cloud.reference_scale, active, state.link, state.gradients, reach,
-        NEIGHBOURS[d], robust, predicted, proposal, distance, fitted,
-    )  # fmt: skip
-    return predicted, proposal, distance, fitted
+def _of_assignment(link: IntArray, residual: FloatArray, deformed: FloatArray) -> RefinedLinks:
+    """Return the links of an assignment, whose residuals (n,), mm, are compared with those of all links."""
+    linked = link >= 0
+    typical = float(np.median(residual[linked])) / np.sqrt(deformed.shape[1]) if linked.any() else 0.0
+    sd = np.maximum(typical, 0.01 * local_spacing(deformed)[link])
+    return RefinedLinks(link, np.where(linked, residual, np.nan)[:, None], residual / sd, sd ** deformed.shape[1], UNEVEN)
 
 
-def _refined(cloud: _Cloud, state: _State, how: LinkSettings) -> FloatArray:
-    """Predict every point from its neighbours, drop links of large residual and add those that fit, in turn; return the residuals."""
-    everyone = np.arange(len(cloud.reference))
-    spacing = cloud.growth * cloud.reference_scale
-    residual = np.full(len(everyone), np.inf)
-    for _ in range(REFINEMENTS):
-        predicted, _, _, _ = _proposed(cloud, state, everyone, np.zeros(len(everyone)), robust=True)
-        residual = _residuals(cloud, state, predicted)
-        linked = state.link >= 0
-        typical = float(np.median(residual[linked & np.isfinite(residual)])) if (linked & np.isfinite(residual)).any() else 0.0
-        limit = np.clip(how.residual_factor * typical, how.residual_bounds[0] * spacing, how.residual_bounds[1] * spacing)
-        wrong = linked & ~(residual <= limit)
-        state.owner[state.link[wrong]] = -1
-        state.link[wrong], state.residual[wrong] = -1, np.inf
-        state.residual[state.link >= 0] = residual[state.link >= 0]
-        predicted, proposal, distance, fitted = _proposed(cloud, state, everyone, limit, robust=True)
-        changed = settle(everyone, proposal, distance, state.link, state.owner, state.residual, fitted, state.gradients)
-        residual = _residuals(cloud, state, predicted)
-        if not changed and not wrong.any():
-            break
-    return residual
+def _reported(found: RefinedLinks, reference_points: FloatArray, deformed: FloatArray) -> Links:
+    """Return the links with the probability that each is right."""
+    reference = np.flatnonzero(found.link >= 0)
+    partner = found.link[reference]
+    confidence = probability(found, reference_points, deformed)[reference]
+    residual = np.linalg.norm(found.vectors[reference], axis=1)
+    free = np.setdiff1d(np.arange(len(deformed)), partner)
+    return Links(np.stack([reference, partner], axis=1), confidence, residual, np.flatnonzero(found.link < 0), free)
 
 
-def _residuals(cloud: _Cloud, state: _State, predicted: FloatArray) -> FloatArray:
-    return np.asarray(np.where(state.link >= 0, np.linalg.norm(cloud.deformed[np.maximum(state.link, 0)] - predicted, axis=1), np.inf))
-
-
-def _reported(spacing: FloatArray, link: IntArray, residual: FloatArray, d: int) -> Links:
-    """Return the links with the probability that each is right; `spacing` (m,) is that of the deformed points, mm."""
-    reference = np.flatnonzero(link >= 0)
-    deformed = link[reference]
-    left, free = residual[reference], np.setdiff1d(np.arange(len(spacing)), deformed)
-    sd = np.maximum(float(np.median(left)) / np.sqrt(d) if len(left) else 0.0, 0.01 * spacing[deformed])
-    # probability density of unlinked points: a point has a volume of about (spacing / 0.63)^d
-    by_chance = (len(free) + 1.0) / (len(spacing) + 1.0) * (0.63 / spacing[deformed]) ** d
-    # residuals have longer tails than a normal variable: Student's t, three degrees of freedom
-    right = (1.0 + (left / sd) ** 2 / 3.0) ** (-0.5 * (3.0 + d)) / (4.0 * sd) ** d
-    confidence = right / np.maximum(right + by_chance, 1e-300)
-    return Links(np.stack([reference, deformed], axis=1), confidence, left, np.flatnonzero(link < 0), free)
+def _likely(links: Links) -> Links:
+    """Return the links that are not more likely wrong than right."""
+    kept = links.confidence >= LIKELY
+    reference, deformed = links.pairs[~kept].T
+    return Links(
+        links.pairs[kept],
+        links.confidence[kept],
+        links.residual_mm[kept],
+        np.union1d(links.unmatched_reference, reference),
+        np.union1d(links.unmatched_deformed, deformed),
+    )

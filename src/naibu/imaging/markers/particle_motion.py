@@ -1,0 +1,186 @@
+"""Motion of particles between two states: links, displacement with its covariance, and strain, from the particles around each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
+
+from naibu.core.arrays import BoolArray, FloatArray, IntArray, require_shape
+from naibu.core.displacement_field import DisplacementField
+from naibu.core.errors import InputError
+from naibu.imaging.displacement.strain import green_lagrange_strain_of
+from naibu.imaging.markers.link_refinement import MEDIAN
+from naibu.imaging.markers.point_clouds import NEIGHBOURS
+from naibu.imaging.markers.point_matching import Links, link_markers
+from naibu.imaging.markers.settings import LinkSettings, require_between
+
+# Empirical values, judged by tests/imaging/markers/test_particle_motion.py.
+FLAT = 0.05  # ratio of the extents of neighbours below which they lie in a plane or on a line, and tell no strain across it
+ROUNDS = 3  # of the robust fit
+CORE = 3.0  # medians within which residuals tell the noise
+AT_ONCE = 50_000  # particles fitted together, which bounds the memory
+LEAST_SD = 1e-6  # of the distance between neighbours: positions are written with as many digits
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ParticleMotion:
+    """Displacement and strain of linked particles.
+
+    Attributes
+    ----------
+    field : DisplacementField
+        At the reference positions of the k linked particles, with the covariance of each displacement, mm^2; valid where the link is
+        trusted. ``quality`` is the probability that the link is right.
+    links : Links
+        Pairs of particles, in the order of the field.
+    gradient : ndarray, shape (k, d, d)
+        Displacement gradient ``du_a / dx_b`` of the affine motion of the particles around; NaN along the normal of particles in a plane.
+    gradient_sd : ndarray, shape (k, d, d)
+        Its standard deviation from the noise of the displacements around. What a strain varies within the neighbourhood is not part of it.
+    """
+
+    field: DisplacementField
+    links: Links
+    gradient: FloatArray
+    gradient_sd: FloatArray
+
+    @property
+    def strain(self) -> FloatArray:
+        """Green-Lagrange strain (k, d, d)."""
+        d = self.gradient.shape[1]
+        full = np.zeros((len(self.gradient), 3, 3))
+        full[:, :d, :d] = self.gradient
+        return np.asarray(green_lagrange_strain_of(full)[:, :d, :d])
+
+
+def particle_motion(
+    reference_points: ArrayLike,
+    deformed_points: ArrayLike,
+    *,
+    reference_sd_mm: ArrayLike | None = None,
+    deformed_sd_mm: ArrayLike | None = None,
+    min_confidence: float = 0.5,
+    seed: int = 0,
+    settings: LinkSettings | None = None,
+) -> ParticleMotion:
+    """Link the particles of two states, and return their displacement with its covariance, and the strain.
+
+    Parameters
+    ----------
+    reference_points, deformed_points : array_like, shape (n, d), (m, d)
+        Particles of the two states, mm, in any order, in two or three dimensions.
+    reference_sd_mm, deformed_sd_mm : array_like, shape (n, d), (m, d), optional
+        Standard deviations of their coordinates, mm. Without both, the covariance of the displacements follows from how far each is from the
+        affine motion of those around, which includes what the motion varies there: standard deviations are rather too large than too
+        small. With both, they are raised by a common factor where these residuals are larger.
+    min_confidence : float
+        Probability below which a link is not valid in the field, 0 to 1.
+    seed, settings
+        See `link_markers`.
+
+    Returns
+    -------
+    ParticleMotion
+        Field, links and gradients.
+
+    Raises
+    ------
+    InputError
+        Clouds that `link_markers` refuses, or fewer trusted links than a displacement gradient needs.
+    """
+    require_between("min_confidence", min_confidence, 0.0, 1.0)
+    x, y = np.asarray(reference_points, dtype=float), np.asarray(deformed_points, dtype=float)
+    links = link_markers(x, y, seed=seed, settings=settings)
+    here, there = links.pairs.T
+    at, moved = x[here], y[there] - x[here]
+    d = x.shape[1]
+    trusted = links.confidence >= min_confidence
+    if trusted.sum() < d + 3:
+        raise InputError(f"only {int(trusted.sum())} of {len(links)} links are trusted; a displacement gradient needs {d + 3} particles")
+    neighbours = _neighbours(at, trusted)
+    parts = [_fitted(at, moved, neighbours, some) for some in np.array_split(np.arange(len(at)), len(at) // AT_ONCE + 1)]
+    residual, gradient, inverse = (np.concatenate(part) for part in zip(*parts, strict=True))
+    covariance = _noise(residual, trusted, neighbours, at)
+    stated = _stated(x.shape, y.shape, reference_sd_mm, deformed_sd_mm)
+    if stated is not None:
+        covariance = _raised(stated[0][here] ** 2 + stated[1][there] ** 2, residual, trusted)
+    gradient_sd = np.sqrt(np.einsum("naa,nbb->nab", covariance, inverse))
+    field = DisplacementField.from_arrays(at, moved, covariance=covariance, valid=trusted)
+    field = DisplacementField(field.support, moved, covariance, trusted, links.confidence)
+    return ParticleMotion(field, links, gradient, gradient_sd)
+
+
+def _neighbours(at: FloatArray, trusted: BoolArray) -> IntArray:
+    """Return the nearest trusted particles (k, c) of every one, itself left out."""
+    known = np.flatnonzero(trusted)
+    count = min(NEIGHBOURS[at.shape[1]], len(known) - 1)
+    near = known[np.asarray(cKDTree(at[known]).query(at, k=count + 1, workers=-1)[1])]
+    left_out = near == np.arange(len(at))[:, None]
+    left_out[~left_out.any(axis=1), -1] = True
+    return near[~left_out].reshape(len(at), count)
+
+
+def _fitted(at: FloatArray, moved: FloatArray, neighbours: IntArray, some: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Fit an affine motion to the neighbours of some particles.
+
+    Returns the difference (s, d) of each displacement from the fit, scaled to the standard deviation of a displacement, the gradients
+    (s, d, d), and the covariance (s, d, d) of a gradient's row for displacements of unit variance.
+    """
+    near, d = neighbours[some], at.shape[1]
+    offset, values = at[near] - at[some][:, None], moved[near]
+    scale = np.sqrt(np.mean(offset**2, axis=(1, 2)))[:, None, None] + 1e-300
+    rows = np.concatenate([np.ones((*near.shape, 1)), offset / scale], axis=2)
+    weight = np.ones(near.shape)
+    inverse, fit = np.zeros((len(some), d + 1, d + 1)), np.zeros((len(some), d + 1, d))
+    for _ in range(ROUNDS):
+        weighted = np.swapaxes(rows * weight[:, :, None], 1, 2)
+        inverse = np.linalg.inv(weighted @ rows + 1e-9 * np.eye(d + 1))
+        fit = inverse @ (weighted @ values)
+        off = np.linalg.norm(values - rows @ fit, axis=2)
+        weight = 1.0 / np.maximum(off / (CORE * np.median(off, axis=1, keepdims=True) + 1e-12 * scale[:, :, 0]), 1.0) ** 2
+    residual = (moved[some] - fit[:, 0]) / np.sqrt(1.0 + inverse[:, 0, 0])[:, None]
+    extents = np.linalg.svd(rows[:, :, 1:] - rows[:, :, 1:].mean(axis=1, keepdims=True), compute_uv=False)
+    gradient = np.swapaxes(fit[:, 1:], 1, 2) / scale
+    gradient[extents[:, -1] < FLAT * extents[:, 0]] = np.nan
+    return residual, gradient, inverse[:, 1:, 1:] / scale**2
+
+
+def _noise(residual: FloatArray, trusted: BoolArray, neighbours: IntArray, at: FloatArray) -> FloatArray:
+    """Return the covariance (k, d, d) of displacements: one ellipsoid, scaled by the residuals around each."""
+    d = residual.shape[1]
+    known = residual[trusted]
+    length = np.linalg.norm(known, axis=1)
+    least = (LEAST_SD * float(np.sqrt(np.median(np.sum((at[neighbours[:, 0]] - at) ** 2, axis=1))))) ** 2
+    shape = np.eye(d) * max(float(np.median(length)) ** 2, least)
+    for _ in range(2 * ROUNDS):
+        length = np.sqrt(np.einsum("na,ab,nb->n", known, np.linalg.inv(shape), known))
+        core = known[length <= CORE * np.median(length)]
+        shape = core.T @ core / len(core) + least * np.eye(d)
+    length = np.sqrt(np.einsum("na,ab,nb->n", residual, np.linalg.inv(shape), residual))
+    ratio = np.median(length[neighbours], axis=1) / MEDIAN[d]
+    return np.asarray(np.maximum(ratio, 0.1)[:, None, None] ** 2 * shape)
+
+
+def _stated(
+    n: tuple[int, ...], m: tuple[int, ...], reference: ArrayLike | None, deformed: ArrayLike | None
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return the stated standard deviations of both states, or None unless both are there."""
+    if reference is None or deformed is None:
+        return None
+    sd = np.asarray(reference, dtype=float), np.asarray(deformed, dtype=float)
+    for name, values, shape in zip(("reference_sd_mm", "deformed_sd_mm"), sd, (n, m), strict=True):
+        require_shape(name, values, shape)
+        if not (values >= 0.0).all():
+            raise InputError(f"{name} must hold standard deviations >= 0, mm")
+    return sd
+
+
+def _raised(variance: FloatArray, residual: FloatArray, trusted: BoolArray) -> FloatArray:
+    """Return stated variances (k, d) as covariances (k, d, d), raised where residuals are larger."""
+    d = variance.shape[1]
+    ratio = np.sqrt(np.sum(residual[trusted] ** 2 / np.maximum(variance[trusted], 1e-300), axis=1))
+    factor = max(float(np.median(ratio)) / MEDIAN[d], 1.0) ** 2
+    return np.asarray(factor * variance[:, :, None] * np.eye(d))

@@ -1,0 +1,138 @@
+"""Tables of points with displacements and standard deviations where they have them; columns are recognised by their names."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import InputError
+from naibu.io.table_cells import HEADER_WITHIN, decimal_mark, excel_rows, number, text_rows, unit_factor, without_unit
+
+TEXT, EXCEL = (".csv", ".tsv", ".txt"), (".xlsx",)
+_PLACE = r"(?:pos(?:ition)?|coord(?:inate)?s?|centroid|cent(?:er|re)|points?)?"
+_MOVED = r"(?:disp(?:l|lacement)?s?|u|d|v)"
+_SD = r"(?:sd|std|sigma|stdev|uncertainty)"
+_GAP = r"[\s_.:-]*"
+
+
+def _patterns(axis: str, component: str) -> dict[str, re.Pattern[str]]:
+    texts = {
+        "points": rf"{_PLACE}{_GAP}{axis}{_GAP}{_PLACE}",
+        "vectors": rf"{component}|{_MOVED}{_GAP}{axis}|{axis}{_GAP}(?:disp(?:l|lacement)?s?)",
+        "sd": rf"{_SD}{_GAP}[ud]?{_GAP}(?:{axis}|(?<=[\s_.:-]){component})|(?:{axis}|{component}){_GAP}{_SD}",
+    }
+    return {name: re.compile(text, re.IGNORECASE) for name, text in texts.items()}
+
+
+COLUMNS = {axis: _patterns(axis, component) for axis, component in zip("xyz", "uvw", strict=True)}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointTable:
+    """Positions (n, d), displacements (n, d) and standard deviations (n, d), mm; None where the table has none; NaN for blank cells."""
+
+    points: FloatArray
+    vectors: FloatArray | None
+    sd: FloatArray | None
+
+
+def read_point_table(path: Path, *, unit: str | None = None) -> PointTable:
+    """Read a table of points in two or three dimensions.
+
+    Parameters
+    ----------
+    path : Path
+        ``.csv``, ``.tsv``, ``.txt`` or ``.xlsx``. Columns of position, displacement and standard deviation are recognised by their
+        names, in any order; two or three columns of numbers without names are x, y and z.
+    unit : str, optional
+        Unit of lengths: mm, cm, m, um or inch. By default the unit in the column name, else mm.
+
+    Raises
+    ------
+    InputError
+        A table without positions, a column that two names fit, or a cell that is no number.
+    """
+    rows = excel_rows(path, None) if path.suffix.lower() in EXCEL else text_rows(path, None)
+    if _is_numeric(rows[0][1]):
+        columns = len(rows[0][1])
+        if columns not in (2, 3):
+            raise InputError(f"{path}: has no names of columns, and {columns} of them; name them in the first line: x_mm, y_mm, z_mm")
+        rows = [(0, [f"{axis}" for axis in "xyz"[:columns]]), *rows]
+    start, where = _header(path, rows)
+    header, body = rows[start][1], rows[start + 1 :]
+    if not body:
+        raise InputError(f"{path}: no rows follow the header {', '.join(header)}")
+    d = len(where["points"])
+    parts = {}
+    for name, columns in where.items():
+        if len(columns) not in (0, d):
+            raise InputError(f"{path}: has {d} coordinates, but {len(columns)} columns of {_WORDS[name]}; give one for each coordinate")
+        parts[name] = np.column_stack([_column(path, header, body, c, unit) for c in columns]) if columns else None
+    points = parts["points"]
+    assert points is not None
+    return PointTable(points, parts["vectors"], parts["sd"])
+
+
+_WORDS = {"points": "positions", "vectors": "displacements", "sd": "standard deviations"}
+
+
+def columns_of(names: list[str], what: str) -> dict[str, list[int]]:
+    """Return the columns of positions, displacements and standard deviations, along x, y and z, among names of columns.
+
+    Parameters
+    ----------
+    names : list of str
+        Names of the columns.
+    what : str
+        The file, for messages.
+
+    Raises
+    ------
+    InputError
+        Two columns may be the same quantity.
+    """
+    found: dict[str, list[int]] = {name: [] for name in _WORDS}
+    for name, columns in found.items():
+        for axis, patterns in COLUMNS.items():
+            fitting = [at for at, cell in enumerate(names) if patterns[name].fullmatch(without_unit(cell).strip())]
+            if len(fitting) > 1:
+                both = " and ".join(repr(names[at]) for at in fitting[:2])
+                raise InputError(f"{what}: both {both} may be the {axis} of {_WORDS[name]}; rename one of them")
+            columns += fitting
+    return found
+
+
+def _header(path: Path, rows: list[tuple[int, list[str]]]) -> tuple[int, dict[str, list[int]]]:
+    for at, (_, row) in enumerate(rows[:HEADER_WITHIN]):
+        where = columns_of(row, str(path))
+        if len(where["points"]) in (2, 3):
+            return at, where
+    raise InputError(f"{path}: cannot recognise the columns of x, y and z among {', '.join(rows[0][1])[:200]}; name them x_mm, y_mm, z_mm")
+
+
+def _is_numeric(cells: list[str]) -> bool:
+    try:
+        [float(cell) for cell in cells]
+    except ValueError:
+        return False
+    return True
+
+
+def _column(path: Path, header: list[str], body: list[tuple[int, list[str]]], at: int, unit: str | None) -> FloatArray:
+    """Return a column in mm."""
+    cells = [row[at] if at < len(row) else "" for _, row in body]
+    try:
+        values = np.array(cells, dtype=float)
+    except ValueError:
+        mark = decimal_mark(cells)
+        values = np.array(
+            [number(f"{path}: line {line}, column {header[at]!r}", cell, mark) for (line, _), cell in zip(body, cells, strict=True)]
+        )
+    if np.isinf(values).any():
+        line = body[int(np.flatnonzero(np.isinf(values))[0])][0]
+        raise InputError(f"{path}: line {line}, column {header[at]!r} is not finite; correct it, or leave the cell blank")
+    return np.asarray(values * unit_factor(path, header[at], unit))

@@ -1,0 +1,87 @@
+"""Displacement, its stated deviation, and strain of particles whose motion is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from particle_gels import particle_gel
+
+from naibu.core.errors import InputError
+from naibu.imaging.markers.particle_motion import particle_motion
+
+GRADIENT = np.array([[0.05, 0.1, 0.0], [0.0, 0.02, -0.05], [0.03, 0.0, -0.12]])
+
+
+def affine(n: int, seed: int, sd: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Particles under an affine motion, shuffled, and their true displacement."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(0.0, 10.0, (n, 3))
+    u = x @ GRADIENT.T + (0.4, -0.2, 0.1)
+    noise = np.array(sd) / np.sqrt(2.0)
+    y = x + u + noise * rng.standard_normal(x.shape)
+    return x + noise * rng.standard_normal(x.shape), y[rng.permutation(n)], u
+
+
+@pytest.mark.parametrize("n", [400, 3000])
+def test_displacement_strain_and_their_deviations(n: int) -> None:
+    spacing = 10.0 / n ** (1.0 / 3.0)
+    sd = (0.01 * spacing, 0.01 * spacing, 0.05 * spacing)
+    x, y, u = affine(n, 1, sd)
+    found = particle_motion(x, y)
+    here = found.links.pairs[:, 0]
+    assert found.field.valid.mean() > 0.97
+    error = (found.field.vectors - u[here])[found.field.valid]
+    stated = found.field.standard_deviation
+    assert stated is not None
+    ratio = np.sqrt(np.mean(error**2, axis=0)) / np.sqrt(np.mean(stated[found.field.valid] ** 2, axis=0))
+    assert (ratio > 0.8).all() and (ratio < 1.1).all(), ratio
+    slope = (found.gradient - GRADIENT) / found.gradient_sd
+    assert 0.8 < np.sqrt(np.nanmedian(slope**2) / 0.455) < 1.2  # the median of chi squared with one degree of freedom
+    f = np.eye(3) + GRADIENT
+    truth = 0.5 * (f.T @ f - np.eye(3))
+    np.testing.assert_allclose(np.nanmedian(found.strain, axis=0), truth, atol=0.004)
+
+
+def test_deviations_follow_the_noise_from_place_to_place() -> None:
+    cloud = particle_gel(6000, 3, loss=0.3, press_px=6.0)
+    found = particle_motion(cloud.reference, cloud.deformed)
+    sd = found.field.standard_deviation
+    assert sd is not None
+    depth = cloud.reference[found.links.pairs[:, 0], 2]
+    top, floor = depth > np.percentile(depth, 80), depth < np.percentile(depth, 20)
+    # noise of both states: 0.2, 0.2, 0.8 px, from 0.5 to 1.5 times that, of which the outer fifths have 0.6 and 1.4
+    for part, factor in ((top, 0.6), (floor, 1.4)):
+        expected = factor * np.sqrt(2.0) * np.array([0.2, 0.2, 0.8])
+        ratio = np.median(sd[part], axis=0) / expected
+        assert (ratio > 0.8).all() and (ratio < 1.35).all(), ratio
+
+
+def test_stated_deviations_are_raised_where_residuals_are_larger() -> None:
+    x, y, _ = affine(800, 2, (0.02, 0.02, 0.02))
+    honest = np.full(x.shape, 0.02 / np.sqrt(2.0))
+    kept = particle_motion(x, y, reference_sd_mm=honest, deformed_sd_mm=honest)
+    raised = particle_motion(x, y, reference_sd_mm=0.1 * honest, deformed_sd_mm=0.1 * honest)
+    for found in (kept, raised):
+        assert found.field.standard_deviation is not None
+        assert np.median(found.field.standard_deviation) == pytest.approx(0.02, rel=0.12)
+    with pytest.raises(InputError, match="deformed_sd_mm"):
+        particle_motion(x, y, reference_sd_mm=honest, deformed_sd_mm=honest[:5])
+
+
+def test_particles_in_a_plane_tell_no_strain_across_it() -> None:
+    x, y, _ = affine(400, 4, (0.0, 0.0, 0.0))
+    x[:, 2] = 0.0
+    rng = np.random.default_rng(0)
+    y = (x @ (np.eye(3) + np.diag([0.1, -0.05, 0.0])))[rng.permutation(len(x))]
+    assert np.isnan(particle_motion(x, y).gradient).all()
+    flat = particle_motion(x[:, :2], y[:, :2])
+    np.testing.assert_allclose(np.median(flat.gradient, axis=0), np.diag([0.1, -0.05]), atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_clouds_of_two_bodies_other_units_and_mirror_images_are_refused(seed: int) -> None:
+    cloud = particle_gel(1500, seed)
+    other = particle_gel(1500, seed + 10)
+    for second in (other.deformed, 10.0 * cloud.deformed, cloud.deformed * (1.0, 1.0, -1.0)):
+        with pytest.raises(InputError, match="no common structure|no soft body|mirror image"):
+            particle_motion(cloud.reference, second)
