@@ -83,5 +83,5 @@ def test_clouds_of_two_bodies_other_units_and_mirror_images_are_refused(seed: in
     cloud = particle_gel(1500, seed)
     other = particle_gel(1500, seed + 10)
     for second in (other.deformed, 10.0 * cloud.deformed, cloud.deformed * (1.0, 1.0, -1.0)):
-        with pytest.raises(InputError, match="no common structure|no soft body|mirror image"):
+        with pytest.raises(InputError, match=r"no common structure|no soft body|mirror image"):
             particle_motion(cloud.reference, second)

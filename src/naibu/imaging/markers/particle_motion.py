@@ -73,8 +73,8 @@ def particle_motion(
     reference_points, deformed_points : array_like, shape (n, d), (m, d)
         Particles of the two states, mm, in any order, in two or three dimensions.
     reference_sd_mm, deformed_sd_mm : array_like, shape (n, d), (m, d), optional
-        Standard deviations of their coordinates, mm. Without both, the covariance of the displacements follows from how far each is from the
-        affine motion of those around, which includes what the motion varies there: standard deviations are rather too large than too
+        Standard deviations of their coordinates, mm. Without both, the covariance of the displacements follows from how far each is from
+        the affine motion of those around, which includes what the motion varies there: standard deviations are rather too large than too
         small. With both, they are raised by a common factor where these residuals are larger.
     min_confidence : float
         Probability below which a link is not valid in the field, 0 to 1.
