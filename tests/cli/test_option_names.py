@@ -56,7 +56,7 @@ def test_other_names_stand_for_options_there_are() -> None:
     ("tokens", "shown"),
     [
         (["sense", "a.mha"], "naibu sense needs DEFORMED. See naibu sense --help."),
-        (["track", "a.mha"], "naibu track needs --diameter-mm. See naibu track --help."),
+        (["track-sequence", "a.tif", "--pixel-mm", "1"], "naibu track-sequence needs --diameter-mm. See naibu track-sequence --help."),
         (["identify", "--law"], "--law needs a value. See naibu identify --help."),
         (["sense", "a.mha", "b.mha", "--methode"], "Unknown option: --methode. Did you mean --method? See naibu sense --help."),
     ],

@@ -212,3 +212,10 @@ def direction_of(text: str | None) -> tuple[float, ...] | Literal["found"] | Non
             f"--vertical {text!r} must be 'found', an axis such as 'y' or '-z', or three numbers such as '0.1,0.3,0.95'"
         ) from None
     return x, y, z
+
+
+def require_left_out(reason: str, **given: bool) -> None:
+    """Refuse options that do not belong to the kind of data: they would be ignored without a word."""
+    for name, there in given.items():
+        if there:
+            raise InputError(f"`{name}` {reason}; leave it out")

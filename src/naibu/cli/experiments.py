@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from naibu.cli.console import GRAVE, INTERRUPTED, NOT_EXPLAINED, WARNING, print_table, progress_display, say
-from naibu.cli.described import Flag, Known, ObjectOptions, Out, Overwrite, WorkerOptions
+from naibu.cli.described import Flag, Known, ObjectOptions, Out, Overwrite, WorkerOptions, require_left_out
 from naibu.cli.run_record import found, wrote
 from naibu.cli.verbs import MARKERS, START, verb
 from naibu.core.errors import InputError
@@ -115,7 +115,7 @@ def identify(
         Replace results, or files of your own, that the folder already holds.
     """
     if mask is not None or zones is not None or all(Path(name).suffix.lower() in FIELD_FILES for name in experiments):
-        _require_left_out(
+        require_left_out(
             "goes with markers, and these are displacement fields", states=bool(state), contact=contact != "coulomb",
             joined=joined != "tied", pixel_scale=pixel_scale != "given", cross_validate=cross_validate, resume=not resume,
             workers=where is not None,
@@ -125,7 +125,7 @@ def identify(
             element_size_mm=element_size_mm, out=out, overwrite=overwrite,
         )  # fmt: skip
         return
-    _require_left_out("goes with displacement fields, and these are markers", zone_names=bool(zone_name), each_cell=cell_map)
+    require_left_out("goes with displacement fields, and these are markers", zone_names=bool(zone_name), each_cell=cell_map)
     from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 
     settings = ModelSettings(law=law, contact=contact, joined=joined, element_size_mm=element_size_mm, pixel_scale=pixel_scale)
@@ -134,13 +134,6 @@ def identify(
         experiments, known=known or (), states=states, settings=settings, out=out, cross_validate=cross_validate, resume=resume,
         overwrite=overwrite, where=where,
     )  # fmt: skip
-
-
-def _require_left_out(reason: str, **given: bool) -> None:
-    """Refuse options that do not belong to the kind of data: they would be ignored without a word."""
-    for name, there in given.items():
-        if there:
-            raise InputError(f"`{name}` {reason}; leave it out")
 
 
 def _identify_fields(

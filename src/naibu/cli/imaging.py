@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from naibu.cli.console import WARNING, print_table, progress_display, say
-from naibu.cli.described import ObjectOptions, Out, Overwrite, PairOptions, Whole
+from naibu.cli.described import ObjectOptions, Out, Overwrite, PairOptions, Whole, require_left_out
 from naibu.cli.run_record import wrote
 from naibu.cli.verbs import MARKERS, SCANS, verb
 from naibu.core.errors import InputError
@@ -17,6 +17,7 @@ from naibu.core.errors import InputError
 Method = Literal["default", "features", "sad-blocks", "ssd-blocks", "ncc-blocks", "horn-schunck", "lucas-kanade", "hybrid", "rigid"]
 Polarity = Literal["auto", "bright", "dark"]
 Spacing = tuple[float, float, float]
+Unit = Literal["mm", "cm", "m", "um", "inch"]
 
 
 @verb(
@@ -107,14 +108,17 @@ def compare_methods(
     MARKERS,
     "track free.mha pressed.mha --diameter-mm 2.5 --size-mm 60 60 60 -l 'gel=0..60' -o my_gel",
     "track free.mha pressed.mha --diameter-mm 2.8 --thickness-mm 0.3   # washers; only the tables",
+    "track free.csv pressed.csv --unit um -o moved   # particles that another program has found",
 )
 def track(
     scans: list[Path],
     *,
-    diameter_mm: float,
+    diameter_mm: float | None = None,
     thickness_mm: float | None = None,
     polarity: Polarity = "auto",
     count: Whole | None = None,
+    unit: Unit | None = None,
+    variable: str | None = None,
     mask: Annotated[Path | None, Parameter(name=("--mask", "-m"))] = None,
     spacing_mm: Spacing | None = None,
     size_mm: tuple[float, float, float] | None = None,
@@ -123,36 +127,56 @@ def track(
     out: Out = Path("naibu-markers"),
     overwrite: Overwrite = False,
 ) -> None:
-    """Detect markers in scans of several states, match them between the states, and make an experiment folder for 'naibu identify'.
+    """Match markers between states: of scans, in which they are detected, or two clouds of particles.
+
+    Scans give an experiment folder for 'naibu identify'. Two files of positions (.csv, .tsv, .txt, .xlsx, .mat, .npy, .npz) give the
+    displacement field with its standard deviations, which 'naibu identify' takes, and the strain.
 
     Parameters
     ----------
     scans
-        Scans of the states, the unloaded one first, then in the order in which they were reached.
+        Scans of the states, the unloaded one first, then in the order in which they were reached; or two files of positions.
     diameter_mm
-        Diameter of the markers.
+        With scans: diameter of the markers.
     thickness_mm
         Thickness of washers or discs; omit it for beads.
     polarity
         Whether markers are brighter or darker than their surroundings; by default whichever has more contrast.
     count
         Number of markers, if known.
+    unit
+        With positions: their unit; by default that in the names of columns, else mm.
+    variable
+        With positions in .mat or .npz: name of the array.
     mask
         Volume on the grid of the scans, nonzero where markers may lie.
     spacing_mm
-        Voxel spacing along x, y, z, mm, for files that do not state it.
+        Voxel spacing along x, y, z, mm, for files that do not state it, and for positions in voxels.
     size_mm
         Dimensions of the object along x, y, z; without them only the tables of markers are written.
     title
         Title of the experiment.
     out
-        Folder to make: the experiment, with tracking.html and tracking.json beside its tables.
+        Folder to make: the experiment, with tracking.html and tracking.json beside its tables; with positions field.h5, links.csv and
+        mask.mha.
     overwrite
         Use the folder even if it is not empty, and replace files of the same names.
     """
     from naibu.workflows.measurement import track as tracking
+    from naibu.workflows.measurement.track_clouds import is_point_file
 
     options = described or ObjectOptions()
+    if any(is_point_file(scan) for scan in scans):
+        require_left_out(
+            "goes with scans, and these are positions", diameter_mm=diameter_mm is not None, thickness_mm=thickness_mm is not None,
+            polarity=polarity != "auto", count=count is not None, mask=mask is not None, size_mm=size_mm is not None,
+            layer=bool(options.layer), stated_mm=bool(options.stated_mm),
+        )  # fmt: skip
+        _track_clouds(scans, unit=unit, spacing_mm=spacing_mm, variable=variable, out=out, overwrite=overwrite)
+        return
+    require_left_out("goes with positions, and these are scans", unit=unit is not None, variable=variable is not None)
+    if diameter_mm is None:
+        raise InputError("diameter_mm is needed, the diameter of the markers in the scans")
     description = None
     if size_mm is not None:
         description = tracking.ObjectDescription(**options.described(size_mm), title=title)
@@ -172,6 +196,23 @@ def track(
         say("Give --size-mm X Y Z, --layer and --stated-mm to make an experiment folder that 'naibu identify' takes.", "dim")
     else:
         say(f"{'Run' if description.layers else 'Describe layers and materials in its meta.toml, then run'}: naibu identify {out}")
+
+
+def _track_clouds(
+    clouds: list[Path], *, unit: Unit | None, spacing_mm: Spacing | None, variable: str | None, out: Path, overwrite: bool
+) -> None:
+    from naibu.workflows.measurement.track_clouds import is_point_file, track_clouds
+
+    if len(clouds) != 2 or not all(map(is_point_file, clouds)):
+        raise InputError(f"scans must be two files of positions, or all scans, not {', '.join(path.name for path in clouds)}")
+    with progress_display() as progress:
+        run = track_clouds(
+            *clouds, out=out, unit=unit, spacing_mm=spacing_mm, variable=variable, overwrite=overwrite, progress=progress
+        )  # fmt: skip
+    wrote(run.page, *run.files)
+    print_table(f"{clouds[0].name} -> {clouds[1].name}", ("quantity", "value"), run.rows)
+    say(f"Page: {run.page}   field: {out / 'field.h5'}   links: {out / 'links.csv'}")
+    say(f"With a volume of zones: naibu identify {out / 'field.h5'} --zones labels.nii.gz --known 'gel=12 kPa'", "dim")
 
 
 @verb(MARKERS, "track-sequence ultrasound.tif --pixel-mm 0.1 --diameter-mm 1 --frame-rate-hz 30")

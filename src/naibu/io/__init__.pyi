@@ -3,10 +3,12 @@ from .experiment_folder.reader import read_experiment
 from .images import open_volume, read_displacement, read_volume_box, write_displacement, write_volume
 from .marker_tables import import_markers, write_experiment_folder, write_markers
 from .meshes import Surface, read_mesh, read_surface
+from .point_clouds import PointCloud, read_point_cloud
 from .vtk_files import write_vtkhdf_series, write_vtu
 from .vtkhdf_series import SeriesFile
 
 __all__ = [
+    "PointCloud",
     "SeriesFile",
     "Surface",
     "import_markers",
@@ -15,6 +17,7 @@ __all__ = [
     "read_experiment",
     "read_field",
     "read_mesh",
+    "read_point_cloud",
     "read_surface",
     "read_volume_box",
     "write_displacement",

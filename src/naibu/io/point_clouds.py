@@ -11,7 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from naibu.core.arrays import LENGTHS_MM, AnyArray, FloatArray
+from naibu.core.arrays import LENGTHS_MM, AnyArray, FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.io.files.reading import guarded_reading, require_plausible, require_regular
 from naibu.io.point_tables import EXCEL, TEXT, read_point_table
@@ -23,10 +23,11 @@ POINT_FILES = (*TEXT, *EXCEL, *ARRAYS)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointCloud:
-    """Points (n, d) and, where the file states them, standard deviations of their coordinates (n, d), mm."""
+    """Points (n, d) and, where the file states them, standard deviations of their coordinates (n, d), mm; rows in the file (n,), from 1."""
 
     points: FloatArray
-    sd: FloatArray | None = None
+    sd: FloatArray | None
+    rows: IntArray
 
     def __len__(self) -> int:
         return len(self.points)
@@ -64,7 +65,7 @@ def read_point_cloud(
     if unit is not None and unit not in MM_PER_UNIT:
         raise InputError(f"unit = {unit!r} is not known; use one of {', '.join(dict.fromkeys(MM_PER_UNIT))}")
     if unit is not None and spacing_mm is not None:
-        raise InputError("unit and spacing_mm both say what a coordinate is; give one of them")
+        raise InputError("`unit` and spacing_mm both say what a coordinate is; give one of them")
     if ending not in POINT_FILES:
         raise InputError(f"{source.name}: is no file of points; supported are {', '.join(POINT_FILES)}")
     if variable is not None and ending not in (".npz", ".mat"):
@@ -74,7 +75,7 @@ def read_point_cloud(
         if ending in ARRAYS:
             found, sd = _array(source, ending, variable) * MM_PER_UNIT[unit or "mm"], None
         else:
-            table = read_point_table(source, unit=unit)
+            table = read_point_table(source, unit=unit, displacements=False)
             found, sd = table.points, table.sd
     if spacing_mm is not None:
         voxel = np.asarray(spacing_mm, dtype=float)[: found.shape[1]]
@@ -85,7 +86,7 @@ def read_point_cloud(
     points = np.ascontiguousarray(found[known])
     if np.abs(points).max() > LENGTHS_MM[1]:
         raise InputError(f"{source}: has a coordinate of {np.abs(points).max():.3g} mm: no object is so large; give the `unit`")
-    return PointCloud(points, None if sd is None else sd[known])
+    return PointCloud(points, None if sd is None else sd[known], np.flatnonzero(known) + 1)
 
 
 def _array(source: Path, ending: str, variable: str | None) -> FloatArray:

@@ -40,7 +40,7 @@ class PointTable:
     sd: FloatArray | None
 
 
-def read_point_table(path: Path, *, unit: str | None = None) -> PointTable:
+def read_point_table(path: Path, *, unit: str | None = None, displacements: bool = True) -> PointTable:
     """Read a table of points in two or three dimensions.
 
     Parameters
@@ -50,6 +50,8 @@ def read_point_table(path: Path, *, unit: str | None = None) -> PointTable:
         names, in any order; two or three columns of numbers without names are x, y and z.
     unit : str, optional
         Unit of lengths: mm, cm, m, um or inch. By default the unit in the column name, else mm.
+    displacements : bool
+        Whether to read them; otherwise columns that look like them are passed over.
 
     Raises
     ------
@@ -61,17 +63,18 @@ def read_point_table(path: Path, *, unit: str | None = None) -> PointTable:
         columns = len(rows[0][1])
         if columns not in (2, 3):
             raise InputError(f"{path}: has no names of columns, and {columns} of them; name them in the first line: x_mm, y_mm, z_mm")
-        rows = [(0, [f"{axis}" for axis in "xyz"[:columns]]), *rows]
+        rows = [(0, list("xyz"[:columns])), *rows]
     start, where = _header(path, rows)
     header, body = rows[start][1], rows[start + 1 :]
+    where["vectors"] = where["vectors"] if displacements else []
     if not body:
         raise InputError(f"{path}: no rows follow the header {', '.join(header)}")
     d = len(where["points"])
     parts = {}
-    for name, columns in where.items():
-        if len(columns) not in (0, d):
-            raise InputError(f"{path}: has {d} coordinates, but {len(columns)} columns of {_WORDS[name]}; give one for each coordinate")
-        parts[name] = np.column_stack([_column(path, header, body, c, unit) for c in columns]) if columns else None
+    for name, some in where.items():
+        if len(some) not in (0, d):
+            raise InputError(f"{path}: has {d} coordinates, but {len(some)} columns of {_WORDS[name]}; give one for each coordinate")
+        parts[name] = np.column_stack([_column(path, header, body, c, unit) for c in some]) if some else None
     points = parts["points"]
     assert points is not None
     return PointTable(points, parts["vectors"], parts["sd"])

@@ -9,12 +9,14 @@ from .interactive.touchable_models import MeshMaterial, TouchableModel, tools_fo
 from .measurement.compare_methods import MethodComparison, compare_methods
 from .measurement.sense import Pair, SenseRun, read_pair, sense_pair
 from .measurement.track import ObjectDescription, TrackRun
+from .measurement.track_clouds import CloudRun, track_clouds
 from .measurement.track_sequence import SequenceRun, track_sequence_file
 from .reproduce import ReproducedChapter, reproduce, reproduce_all
 from .studies.simulate import NamedStudy, named_studies
 from .studies.simulate_lattice import SimulationRun
 
 __all__ = [
+    "CloudRun",
     "Comparison",
     "CutRun",
     "DeviceRecord",
@@ -48,5 +50,6 @@ __all__ = [
     "tools_for",
     "touchable",
     "touched_loop",
+    "track_clouds",
     "track_sequence_file",
 ]

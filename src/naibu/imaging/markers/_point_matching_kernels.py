@@ -111,22 +111,9 @@ def _affine(
 
 @njit(cache=True)
 def _aligned_once(
-    x: FloatArray,
-    deformed: FloatArray,
-    origin: FloatArray,
-    width: float,
-    dims: IntArray,
-    starts: IntArray,
-    members: IntArray,
-    k: int,
-    reach: float,
-    scale: float,
-    start: FloatArray,
-    anchor: FloatArray,
-    value: FloatArray,
-    gradient: FloatArray,
-    seen: FloatArray,
-) -> int:
+    x: FloatArray, deformed: FloatArray, origin: FloatArray, width: float, dims: IntArray, starts: IntArray, members: IntArray,
+    k: int, reach: float, scale: float, start: FloatArray, anchor: FloatArray, value: FloatArray, gradient: FloatArray, seen: FloatArray,
+) -> int:  # fmt: skip
     """Pair the first k offsets x with the nearest deformed points within reach and refit; return the number of pairs; fill distances."""
     d = x.shape[1]
     offsets, targets, weights, at = np.empty((k + 1, d)), np.empty((k + 1, d)), np.ones(k + 1), np.empty(d)

@@ -120,7 +120,7 @@ def _neighbours(at: FloatArray, trusted: BoolArray) -> IntArray:
     near = known[np.asarray(cKDTree(at[known]).query(at, k=count + 1, workers=-1)[1])]
     left_out = near == np.arange(len(at))[:, None]
     left_out[~left_out.any(axis=1), -1] = True
-    return near[~left_out].reshape(len(at), count)
+    return np.asarray(near[~left_out].reshape(len(at), count))
 
 
 def _fitted(at: FloatArray, moved: FloatArray, neighbours: IntArray, some: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:

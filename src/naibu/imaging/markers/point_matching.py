@@ -144,7 +144,7 @@ def link_markers(
     if sure < how.min_mean_confidence if len(links) >= FEW_LINKS else len(links) < FEW_LINKED * smaller:
         raise InputError(
             f"no common structure in {len(reference)} and {len(deformed)} markers: {len(links)} fit one smooth motion, with a mean "
-            f"probability of {sure:.2f}, as by chance. Check that both are in mm and of one object, or give `predicted`"
+            f"probability of {sure:.2f}, as by chance. Check that both are in mm and of one object"
         )
     return links if whole else _likely(links)
 
@@ -209,7 +209,7 @@ def _best_grown(cloud: Cloud, rng: np.random.Generator, stretch: FloatArray, how
     if best is None or best[1].count < max(FEWEST, 0.1 * smaller):
         raise InputError(
             f"no common structure in {len(cloud.reference)} and {len(cloud.deformed)} markers: at best {most_seen:.0%} of the neighbours "
-            "of a marker are found again under one affine motion. Check that both are in mm and of one object, or give `predicted`"
+            "of a marker are found again under one affine motion. Check that both are in mm and of one object"
         )
     return best[1]
 
