@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import math
 import re
 import shutil
@@ -25,6 +26,7 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.volume import Volume
 from naibu.io.displacement_fields import write_field
 from naibu.io.images import write_volume
+from naibu.io.study_schemas.fingertip_schema import DECODER
 from naibu.io.vtk_files import write_vtu
 from naibu.meshing.element_conversion import to_tetra
 from naibu.meshing.primitives import box
@@ -43,8 +45,12 @@ def files(press: Press, tmp_path_factory: pytest.TempPathFactory) -> Files:
     rng = np.random.default_rng(0)
     for name, shape in (("scan", (10, 12, 14)), ("scan2", (10, 12, 14)), ("frames", (5, 20, 24))):
         write_volume(root / f"{name}.mha", Volume.from_array(rng.random(shape).astype(np.float32), spacing_mm=(1.0, 1.0, 1.0)))
-    named = {**touched_bodies(root), **views(root), **measured_field(root)}
-    scans = {name: root / f"{name}.mha" for name in ("scan", "scan2", "frames")}
+    for name, shape, ones in (("scan3", (10, 12, 13), 0), ("zero", (10, 12, 14), 0), ("voxel", (10, 12, 14), 1)):
+        values = np.zeros(shape, dtype=np.uint8)
+        values.flat[:ones] = 1
+        write_volume(root / f"{name}.mha", Volume.from_array(values, spacing_mm=(1.0, 1.0, 1.0)))
+    named = {**touched_bodies(root), **views(root), **measured_field(root), **recorded_readings(root)}
+    scans = {name: root / f"{name}.mha" for name in ("scan", "scan2", "scan3", "frames", "zero", "voxel")}
     tables = {"table": press.folder / "initial.csv", "table2": press.folder / "pressed.csv"}
     return {**named, **scans, **tables, "press": press.folder, "model": press.results / "model.json", "study": study_file(root)}
 
@@ -81,6 +87,19 @@ def measured_field(root: Path) -> Files:
     for name, vectors in fields.items():
         write_field(root / f"{name}.h5", DisplacementField.from_arrays(points, vectors, sd_mm=0.01))
     return {"labels": root / "labels.mha", **{name: root / f"{name}.h5" for name in fields}}
+
+
+def recorded_readings(root: Path) -> Files:
+    """A decoder of forces and readings that it decodes."""
+    coefficients = [[6.3, *8 * [0.0]], [1.0, *8 * [0.0]], [1.0, *8 * [0.0]]]
+    stored = {
+        "kind": DECODER, "naibu": "0.2.0", "study": "finger.toml", "radius_mm": 10.0, "volts_per_load": [0.4, 1.2, 1.2],
+        "noise": [0.16, 0.014, 0.014], "coefficients": coefficients, "unit": [3.3, 0.9], "spread": [0.04, 0.03, 0.04],
+        "limits": [1.2, 8.4, 0.6], "model_error": 0.02,
+    }  # fmt: skip
+    (root / "decoder.json").write_text(json.dumps(stored), encoding="utf-8")
+    (root / "readings.csv").write_text("".join(f"{0.01 * k},{2.0 * (k > 20)},0.1,0\n" for k in range(40)), encoding="utf-8")
+    return {"decoder": root / "decoder.json", "readings": root / "readings.csv"}
 
 
 @pytest.fixture
@@ -155,6 +174,27 @@ def test_inputs_written_by_hand(run: Run, files: Files, tmp_path: Path, row: dic
         words += ["--out", "out"]
     assert not faults(run, words, row["expected"])
     assert "file" not in row or (folder / row["file"][0]).read_text(encoding="utf-8") == row["file"][1]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("kind", "x"), ("radius_mm", -5.0), ("radius_mm", 1e300), ("volts_per_load", [0.0, 1.0, 1.0]), ("volts_per_load", [1.0, 1.0]),
+        ("noise", [-1.0, 1.0, 1.0]), ("noise", [0.0, 0.0, 0.0]), ("coefficients", [[1.0], [1.0], [1.0]]), ("coefficients", []),
+        ("coefficients", [9 * [1e308]] * 3), ("unit", [0.0, 1.0]), ("spread", [-1.0, 0.0, 0.0]), ("limits", [5.0, 1.0, 1.0]),
+        ("limits", [1.0, 5.0, -1.0]), ("model_error", 0.9), ("more", 5),
+    ],
+)  # fmt: skip
+def test_decoders_that_cannot_be_are_refused(run: Run, files: Files, tmp_path: Path, key: str, value: object) -> None:
+    stored = json.loads(files["decoder"].read_text(encoding="utf-8"))
+    (tmp_path / "decoder.json").write_text(json.dumps(stored | {key: value}), encoding="utf-8")
+    words = ["decode-forces", str(tmp_path / "decoder.json"), str(files["readings"])]
+    assert not faults(run, [*words, "--out", "out"], ["decoder" if key == "kind" else key, "simulate"])
+
+
+def test_the_decoder_that_they_spoil_decodes(run: Run, files: Files) -> None:
+    code, message = run(["decode-forces", str(files["decoder"]), str(files["readings"]), "--out", "out"])
+    assert code == 0, message
 
 
 def check_options(run: Run, files: Files, part: slice) -> int:

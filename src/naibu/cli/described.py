@@ -131,6 +131,8 @@ class ObjectOptions:
         """
         from naibu.core.experiment import Loading, Shape
 
+        if self.bar_width_mm is not None and self.loading != "bar":
+            raise InputError(f"--bar-width-mm is given, but --loading is {self.loading}; give --loading bar, or leave the width out")
         return {
             "shape": Shape(self.shape, size_mm),
             "loading": Loading(self.loading, self.bar_width_mm),
@@ -188,6 +190,8 @@ def heights_of(texts: Sequence[str]) -> dict[str, float]:
             value = float(height)
         except ValueError:
             raise InputError(f"--stated-mm {text!r} must be STATE=HEIGHT in mm, such as 'pressed=45'") from None
+        if state.strip() in heights:
+            raise InputError(f"--stated-mm names the state {state.strip()!r} twice; give one height for each state")
         heights[state.strip()] = require_within(f"--stated-mm {text!r}: the height", value, *LENGTHS_MM, "mm")
     return heights
 

@@ -366,7 +366,7 @@ def import_tables(
     z_step_mm
         Resolution of the heights, such as the slice spacing.
     preview
-        Only show what the tables hold; nothing is written.
+        Only show what the tables hold, and what would be refused or warned of; nothing is written.
     out
         Folder to make.
     overwrite
@@ -379,13 +379,12 @@ def import_tables(
     seen = import_workflow.preview_tables(initial, loaded, unit=unit, **about)
     print_table(seen.title, seen.columns, seen.rows)
     say(seen.note, "dim")
-    if preview:
-        return
-    notes = import_workflow.import_tables(
-        initial, loaded, out=out, unit=unit, title=title, xy_step_mm=xy_step_mm, z_step_mm=z_step_mm, overwrite=overwrite, **about
-    )
-    wrote(out)
+    run = import_workflow.rehearsed_import if preview else import_workflow.import_tables
+    notes = run(initial, loaded, out=out, unit=unit, title=title, xy_step_mm=xy_step_mm, z_step_mm=z_step_mm, overwrite=overwrite, **about)
     for note in notes:
         say(f"Warning: {note}", WARNING)
+    if preview:
+        return
+    wrote(out)
     before = "" if about["layers"] else "Describe layers and materials in its meta.toml, then run"
     say(f"Wrote {out}. {before or 'Run'}: naibu identify {out}")

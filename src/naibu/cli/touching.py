@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from naibu.cli.console import errors, progress_display, say
-from naibu.cli.described import Out, Overwrite
+from naibu.cli.described import Out, Overwrite, Whole
 from naibu.cli.run_record import wrote
 from naibu.cli.verbs import TOUCH, verb
 from naibu.core.errors import InputError
@@ -28,8 +28,8 @@ def live(
     experiment: str | None = None,
     young_modulus_kpa: float | None = None,
     poisson_ratio: float | None = None,
-    port: int = 8765,
-    haptics_port: int | None = None,
+    port: Whole = 8765,
+    haptics_port: Whole | None = None,
     browser: bool = True,
 ) -> None:
     """Touch a simulated body in the browser: push it, pull it, look inside and read the force.

@@ -36,6 +36,8 @@ from naibu.io.table_cells import (
     within_reach,
 )  # fmt: skip
 
+HIGHEST = 2.0  # of the longest edge of the object, that a plate may stand high
+
 
 def import_markers(
     path: str | os.PathLike[str],
@@ -175,6 +177,9 @@ def write_experiment_folder(
     require_lengths(
         size_mm=shape.size_mm, bar_width_mm=loading.bar_width_mm, spacing_mm=spacing_mm, xy_step_mm=xy_step_mm, z_step_mm=z_step_mm
     )
+    for name, step in (("xy_step_mm", xy_step_mm), ("z_step_mm", z_step_mm), ("spacing_mm", spacing_mm)):
+        if step is not None and step > max(shape.size_mm):
+            raise InputError(f"{name} is {step:g}, more than the object's {max(shape.size_mm):g} mm; check the number and its unit, mm")
     target = require_usable_path(folder, written=True)
     if target.exists() and (not target.is_dir() or (not overwrite and any(target.iterdir()))):
         raise InputError(f"folder {target} exists and is not empty; choose a new name, or allow it to be used with `overwrite`")
@@ -184,6 +189,12 @@ def write_experiment_folder(
         if name not in states:
             raise InputError(
                 f"stated_mm names the state {name!r}, but the loaded states are {', '.join(states) or 'none'}; correct the name"
+            )
+    for name, height in heights.items():
+        if height > HIGHEST * max(shape.size_mm):
+            raise InputError(
+                f"stated_mm of the state {name!r} is {height:g}, and the object measures {max(shape.size_mm):g} mm; "
+                "check the number and its unit, mm"
             )
     size: dict[str, object] = {"shape": shape.kind, "size_mm": list(shape.size_mm)}
     text = _document(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 from collections.abc import Sequence
 from io import StringIO
 from pathlib import Path
@@ -17,7 +18,7 @@ from naibu.io.files.reading import read_bytes
 MOST_ROWS = 100_000
 
 
-def read_numbers(path: str | os.PathLike[str], columns: Sequence[str]) -> FloatArray:
+def read_numbers(path: str | os.PathLike[str], columns: Sequence[str], *, units: Sequence[str] | None = None) -> FloatArray:
     """Read a table of comma-separated numbers with given columns.
 
     Parameters
@@ -26,6 +27,8 @@ def read_numbers(path: str | os.PathLike[str], columns: Sequence[str]) -> FloatA
         Rows of numbers. Rows that begin with ``#``, and a first row of names, are passed over.
     columns : sequence of str
         What the columns hold, for messages.
+    units : sequence of str, optional
+        Of the columns, such as ``V``: names of columns must not tell others, as ``F_z_mV`` or ``F_z (mV)`` do.
 
     Returns
     -------
@@ -35,9 +38,11 @@ def read_numbers(path: str | os.PathLike[str], columns: Sequence[str]) -> FloatA
     Raises
     ------
     InputError
-        Not a readable text, a cell that is no finite number, no rows, or another number of columns.
+        Not a readable text, a cell that is no finite number, no rows, another number of columns, or a name that tells another unit.
     """
     rows = read_number_rows(path)
+    if units is not None:
+        _require_units(Path(path), units)
     if len(rows) == 0 or rows.shape[1] != len(columns):
         raise InputError(f"{path}: has {len(rows)} rows of {rows.shape[1]} numbers; it needs rows of {len(columns)}: {'; '.join(columns)}")
     return rows
@@ -79,6 +84,15 @@ def read_number_rows(path: str | os.PathLike[str]) -> FloatArray:
     except csv.Error as error:
         raise InputError(f"{file}: is no table of comma-separated values ({error}); save it as CSV") from error
     return np.array(rows).reshape(len(rows), -1 if rows else 0)
+
+
+def _require_units(file: Path, units: Sequence[str]) -> None:
+    names = next(csv.reader(StringIO(read_bytes(file).decode("utf-8-sig"))), [])
+    for name, unit in zip(names, units, strict=False):
+        others = "|min|h" if unit == "s" else ""
+        told = re.search(rf"(?:^|[_\W])([a-zA-Zµμ]?{re.escape(unit)}{others})\W*$", name)
+        if told is not None and told[1] != unit:
+            raise InputError(f"{file}: column {name.strip()[:40]!r} is in {told[1]}; convert it to {unit}, and name it so")
 
 
 def _names(cells: list[str]) -> bool:

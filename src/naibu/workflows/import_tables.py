@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import FloatArray, require_lengths
 from naibu.core.errors import InputError
 from naibu.core.experiment import Loading, Shape
 from naibu.core.markers import Markers
@@ -76,6 +77,28 @@ def import_tables(
     return (*notes, *upright.notes)
 
 
+def rehearsed_import(
+    initial: str | os.PathLike[str], loaded: Sequence[str | os.PathLike[str]], *, out: str | os.PathLike[str], **options: Any
+) -> tuple[str, ...]:
+    """Return what `import_tables` would, or refuse what it would; the folder is made elsewhere, and removed again.
+
+    Parameters
+    ----------
+    initial, loaded, out, **options
+        As of `import_tables`; of `out` only the name is used.
+
+    Raises
+    ------
+    InputError
+        As of `import_tables`.
+    """
+    with TemporaryDirectory() as place:
+        try:
+            return import_tables(initial, loaded, out=Path(place) / (Path(out).name or "experiment"), **options)
+        except InputError as error:
+            raise InputError(str(error).replace(f"{place}{os.sep}", "")) from error
+
+
 def preview_tables(
     initial: str | os.PathLike[str],
     loaded: Sequence[str | os.PathLike[str]],
@@ -111,6 +134,7 @@ def _read(initial: str | os.PathLike[str], loaded: Sequence[str | os.PathLike[st
     names = [INITIAL, *(Path(table).stem for table in loaded)]
     if len(set(names)) < len(names):
         raise InputError(f"two tables would both be the state {max(names, key=names.count)!r}; rename one file")
+    require_lengths(size_mm=shape.size_mm)
     first = import_markers(initial, unit=unit)
     if unit is None:
         _require_plausible_unit(first, shape.size_mm, Path(initial).name)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
@@ -124,7 +123,9 @@ def load_fingertip(path: Path | str, content: bytes) -> FingertipFile:
 
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
+Term = Annotated[float, Field(ge=-1e3, le=1e3)]  # of the logarithm of a force, or an angle over a ratio
 Three = Annotated[list[Number], Field(min_length=3, max_length=3)]
+Deviations = Annotated[list[Annotated[float, Field(ge=0.0, le=1e6)]], Field(min_length=3, max_length=3)]
 
 
 class StoredDecoder(CheckedTable):
@@ -133,13 +134,13 @@ class StoredDecoder(CheckedTable):
     kind: str
     naibu: str
     study: str
-    radius_mm: Positive
+    radius_mm: Millimetres
     volts_per_load: Three
-    noise: Three
-    coefficients: Annotated[list[Annotated[list[Number], Field(min_length=1, max_length=100)]], Field(min_length=3, max_length=3)]
+    noise: Deviations
+    coefficients: Annotated[list[Annotated[list[Term], Field(min_length=9, max_length=9)]], Field(min_length=3, max_length=3)]
     unit: Annotated[list[Positive], Field(min_length=2, max_length=2)]
-    spread: Three
-    limits: Three
+    spread: Deviations
+    limits: Annotated[list[Positive], Field(min_length=3, max_length=3)]
     model_error: Annotated[float, Field(ge=0.0, le=0.5)]
 
 
@@ -163,6 +164,8 @@ def load_decoder(path: Path) -> StoredDecoder:
         first = error.errors(include_url=False)[0]
         place = ".".join(str(part) for part in first["loc"])
         raise InputError(f"{path}: {place} cannot be used ({first['msg']}); simulate the fingertip again") from error
-    if len({len(row) for row in stored.coefficients}) != 1 or not all(math.isfinite(v) and v != 0.0 for v in stored.volts_per_load):
-        raise InputError(f"{path}: coefficients or volts_per_load cannot be used; simulate the fingertip again")
+    if 0.0 in stored.volts_per_load or 0.0 in stored.noise:
+        raise InputError(f"{path}: volts_per_load or noise holds 0; simulate the fingertip again")
+    if not stored.limits[0] < stored.limits[1]:
+        raise InputError(f"{path}: limits are {stored.limits}: the first must be less than the second; simulate the fingertip again")
     return stored

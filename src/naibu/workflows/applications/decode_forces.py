@@ -90,7 +90,7 @@ def decode_forces(
         stored.radius_mm, np.array(stored.volts_per_load), np.array(stored.noise), np.array(stored.coefficients), np.array(stored.unit),
         np.array(stored.spread), np.array(stored.limits), stored.model_error,
     )  # fmt: skip
-    rows = read_numbers(table, ("time, s", "F_z, V", "M_x, V", "M_y, V"))
+    rows = read_numbers(table, ("time, s", "F_z, V", "M_x, V", "M_y, V"), units=("s", "V", "V", "V"))
     if (np.diff(rows[:, 0]) <= 0.0).any():
         raise InputError(
             f"{table}: row {int(np.flatnonzero(np.diff(rows[:, 0]) <= 0.0)[0]) + 2} is not later than the one before; sort them"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import re
 from dataclasses import dataclass
@@ -115,6 +116,15 @@ def prepared_fingertip(source: str | os.PathLike[str]) -> PreparedFingertip:
         fingertip = Fingertip(f.diameter_mm, f.young_modulus_kPa, f.poisson_ratio, f.law, f.package_diameter_mm, f.package_height_mm)
         mesh = settings.mesh
         resolution = FingertipResolution(mesh.around, mesh.upwards, mesh.shells)
+        for table in settings.press:
+            _require_bearable("[[press]] force_N", table.force_N, fingertip)
+            if abs(table.slide_mm) > fingertip.diameter_mm:
+                raise InputError(f"[[press]] slide_mm is {table.slide_mm:g}, more than the diameter of the fingertip; make it shorter")
+        names = [table.name for table in settings.press if table.name]
+        if len(set(names)) < len(names):
+            raise InputError(f"two [[press]] tables have the name {max(names, key=names.count)!r}; rename one")
+        if settings.decoder is not None:
+            _require_bearable("[decoder] force_N", settings.decoder.force_N[1], fingertip)
         presses = tuple(_press(table, settings.jig.tilt_error_deg) for table in settings.press)
         training = _training(settings)
     except InputError as error:
@@ -126,6 +136,16 @@ def prepared_fingertip(source: str | os.PathLike[str]) -> PreparedFingertip:
     return PreparedFingertip(
         name, settings.title or name, told, digest, settings, fingertip, resolution, presses, training, chip
     )  # fmt: skip
+
+
+def _require_bearable(name: str, newtons: float, fingertip: Fingertip) -> None:
+    """Refuse a force that would take a mean strain of one over the whole base."""
+    most = 1e-3 * fingertip.young_modulus_kpa * math.pi * (0.5 * fingertip.diameter_mm) ** 2
+    if newtons > most:
+        raise InputError(
+            f"{name} is {newtons:g}, more than {most:.3g} N, Young's modulus times the area of the base: the gel would be flattened; "
+            "check the number and its unit"
+        )
 
 
 def _press(table: PressTable, tilt_error: float) -> Press:

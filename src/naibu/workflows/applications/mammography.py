@@ -122,6 +122,8 @@ def relate_views(
         The mechanical model found no equilibrium.
     """
     _require_points(cc, mlo, mr, (point_cc, point_mlo, point_mr))
+    if side is not None and mr is None:
+        raise InputError(f"side is {side!r}, but there is no scan: give its mask as `mr`, or leave `side` out")
     folder = output_folder(out, [f"{_NAME}.html", f"{_NAME}.json", _BREAST], overwrite=overwrite)
     views = None if cc is None or mlo is None else read_views(cc, mlo, pixel_mm)
     plates, angle = plate_distances(views, thickness_mm), positioner_angle(views, angle_deg)
