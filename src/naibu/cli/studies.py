@@ -80,6 +80,7 @@ def reproduce(
     "simulate                        # lists the studies that come with naibu",
     "simulate dough-pressed-by-sphere --open",
     "simulate --example > my_study.toml && naibu simulate my_study.toml",
+    "simulate sweep --example > my_sweep.toml && naibu simulate my_sweep.toml --workers 0",
 )
 def simulate(
     study: str = "",
@@ -90,20 +91,21 @@ def simulate(
     checkpoint_every: Whole = 10,
     device: str = "cpu",
     example: Flag = False,
+    where: WorkerOptions | None = None,
 ) -> None:
-    """Simulate a study, and write its motion for ParaView, an animated page and the numbers.
+    """Simulate a study, and write its motion for ParaView, an animated page and the numbers; or all runs of a sweep, and one table.
 
     Without STUDY, the studies that come with naibu are listed. Ctrl-C keeps what has been computed.
 
     Parameters
     ----------
     study
-        Name of a study, or your own file STUDY.toml of a mass-spring-dashpot lattice, a sensing chip, a fingertip, or layered
-        skin.
+        Name of a study, or your own file STUDY.toml of a mass-spring-dashpot lattice, a sensing chip, a fingertip, layered
+        skin, or a sweep: many runs of a lattice's study with some numbers changed.
     out
         Folder for the files.
     resume
-        Resume an interrupted or killed run of a lattice or fingertip.
+        Resume an interrupted or killed run of a lattice, fingertip or sweep.
     overwrite
         Replace results, or files of your own, that the folder already holds.
     checkpoint_every
@@ -112,7 +114,7 @@ def simulate(
         Where a lattice is computed: cpu, cuda (an NVIDIA GPU; needs naibu[gpu]), or warp-cpu (the GPU's kernels on the CPU, for tests).
     example
         Print the file of a study as a template for your own: naibu simulate --example > my_study.toml, or, of a sensing chip,
-        naibu simulate chip --example > my_chip.toml; the same for fingertip and ischemia
+        naibu simulate chip --example > my_chip.toml; the same for fingertip, ischemia and sweep
     """
     from naibu.workflows.studies.simulate import example_text, named_studies
     from naibu.workflows.studies.simulate import simulate as simulated
@@ -132,8 +134,9 @@ def simulate(
                 raise KeyboardInterrupt
 
         run = simulated(
-            study, out=out, resume=resume, overwrite=overwrite, checkpoint_every=checkpoint_every, device=device, progress=progress
-        )
+            study, out=out, resume=resume, overwrite=overwrite, checkpoint_every=checkpoint_every, device=device, progress=progress,
+            **(where or WorkerOptions()).arguments,
+        )  # fmt: skip
     wrote(*run.files)
     say(f"{time.perf_counter() - began:.0f} s. {', '.join(str(path) for path in run.files)}")
     if not run.finished:

@@ -87,15 +87,15 @@ def compare(
             if folder is not None:
                 write_comparison(folder, provenance[missing[index]], row)
 
-    given = {"experiments": loaded, "known_materials": known_materials}
-    tasks = [Task(_named(candidates[k]), compare_models, {**given, "candidates": [candidates[k]]}) for k in missing]
     if where.elsewhere:
-        outcomes = run_tasks(tasks, workers=where, memory_mb=MEMORY_MB, stage="candidates", finished=keep, progress=progress)
-        for outcome in outcomes:
+        given = {"experiments": loaded, "known_materials": known_materials}
+        tasks = [Task(_named(candidates[k]), compare_models, {**given, "candidates": [candidates[k]]}) for k in missing]
+        for outcome in run_tasks(tasks, workers=where, memory_mb=MEMORY_MB, stage="candidates", finished=keep, progress=progress):
             outcome.value()
     else:
-        for index, task in enumerate(tasks):
-            keep(index, Outcome(compare_models(**task.arguments, progress=_of_candidate(progress, candidates[missing[index]]))))
+        for index, k in enumerate(missing):
+            told = _of_candidate(progress, candidates[k])
+            keep(index, Outcome(compare_models(loaded, [candidates[k]], known_materials=known_materials, progress=told)))
     return [row for row in rows if row is not None]
 
 

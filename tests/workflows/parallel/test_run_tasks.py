@@ -114,8 +114,8 @@ def test_workers_end_with_the_process_that_wanted_them(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ({"workers": -1}, "workers is -1"),
-        ({"workers": 10_000}, "workers is 10000"),
+        ({"workers": -1}, "`workers` is -1"),
+        ({"workers": 10_000}, "`workers` is 10000"),
         ({"workers": 2, "cluster": "tcp://a:1"}, "one of the two"),
         ({"cluster": "somewhere"}, "address"),
     ],

@@ -56,6 +56,8 @@ def checked_file(
 def _told(fault: dict[str, Any], contents: type[CheckedTable], tables: Mapping[str, type[CheckedTable]], study: str) -> str:
     """One fault of the check, in words that name the field, its value and the mend."""
     loc = [part for part in fault["loc"] if not isinstance(part, int)]
+    if not loc:  # a check of the whole file
+        return str(fault["msg"]).removeprefix("Value error, ")
     name, key = str(loc[0]), str(loc[-1])
     listed = isinstance(contents.model_fields[name].default, list) if name in contents.model_fields else False
     number = next((f" number {part + 1}" for part in fault["loc"][1:2] if isinstance(part, int) and listed), "")

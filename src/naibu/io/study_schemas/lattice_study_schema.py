@@ -333,8 +333,18 @@ def load_study(path: Path | str, content: bytes) -> StudyFile:
     InputError
         The text is not UTF-8 or not TOML (the line is shown), or a key is unknown, missing or holds a value that cannot be.
     """
+    return checked_study(path, parsed_toml(path, content))
+
+
+def checked_study(path: Path | str, data: Mapping[str, Any]) -> StudyFile:
+    """Check the tables of a study; `path` is only named in errors.
+
+    Raises
+    ------
+    InputError
+        A key is unknown, missing or holds a value that cannot be.
+    """
     source = Path(path)
-    data = parsed_toml(source, content)
     try:
         return StudyFile.model_validate(data)
     except ValidationError as error:

@@ -39,7 +39,9 @@ def submitted(tasks: Sequence[Task], address: str) -> Iterator[SimpleQueue[Any]]
         client = distributed.Client(address, timeout=ANSWER_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         told = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"cluster {address!r}: no Dask scheduler answers there ({told[:200]}); start one with `dask scheduler`") from error
+        raise InputError(
+            f"`cluster` {address!r}: no Dask scheduler answers there ({told[:200]}); start one with `dask scheduler`"
+        ) from error
     messages: SimpleQueue[Any] = SimpleQueue()
     with client:
         futures = [client.submit(_called, task.function, dict(task.arguments), pure=False) for task in tasks]

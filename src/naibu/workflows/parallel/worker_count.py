@@ -36,12 +36,12 @@ class Workers:
         most = max(MOST_PER_CORE * (os.cpu_count() or 1), 8)
         if isinstance(self.workers, bool) or not isinstance(self.workers, int) or not 0 <= self.workers <= most:
             raise InputError(
-                f"workers is {self.workers!r}; give a number of processes from 1 to {most}, or 0 for what cores and memory allow"
+                f"`workers` is {self.workers!r}; give a number of processes from 1 to {most}, or 0 for what cores and memory allow"
             )
         if self.cluster is not None and self.workers != 1:
-            raise InputError(f"workers is {self.workers} and cluster {self.cluster!r}; give one of the two")
+            raise InputError(f"`workers` is {self.workers} and `cluster` {self.cluster!r}; give one of the two")
         if self.cluster is not None and "://" not in self.cluster:
-            raise InputError(f"cluster is {self.cluster!r}; give the address of a Dask scheduler, such as tcp://localhost:8786")
+            raise InputError(f"`cluster` is {self.cluster!r}; give the address of a Dask scheduler, such as tcp://localhost:8786")
 
     @property
     def elsewhere(self) -> bool:

@@ -21,10 +21,11 @@ from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.rigid_transform import RigidTransform
 from naibu.core.volume import Volume
+from naibu.io.files.parsing import parsed_toml
 from naibu.io.files.provenance import sha256
 from naibu.io.files.reading import file_beside, guarded_reading, read_bytes, require_regular
 from naibu.io.images import read_volume
-from naibu.io.study_schemas.lattice_study_schema import FloorTable, IndenterTable, ObjectTable, StudyFile, load_study
+from naibu.io.study_schemas.lattice_study_schema import FloorTable, IndenterTable, ObjectTable, StudyFile, checked_study, load_study
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter, box_indenter, cylindrical_indenter, plane_indenter, spherical_indenter
 from naibu.mechanics.lattices.model.contact_state import check_outside
 from naibu.mechanics.lattices.model.hexahedra import lattice_mesh
@@ -108,20 +109,51 @@ def prepared_study(source: str | os.PathLike[str]) -> PreparedStudy:
         No such study or file; a key or value that cannot be; an empty mask, or one in pieces; an indenter that starts inside the object.
         The message names the file, the field, its value and the mend.
     """
+    content, path, name = _read(source)
+    return _prepared(source, path, name, load_study(path, content), hashlib.sha256(content).hexdigest())
+
+
+def study_tables(source: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return the tables of a study, as its file has them.
+
+    Raises
+    ------
+    InputError
+        No such study or file, or text that is not TOML.
+    """
+    content, path, _ = _read(source)
+    return parsed_toml(path, content)
+
+
+def prepared_document(source: str | os.PathLike[str], document: Mapping[str, Any]) -> PreparedStudy:
+    """Check and prepare a study whose tables are given; `source` says where files that it names lie.
+
+    Raises
+    ------
+    InputError
+        As `prepared_study`.
+    """
+    path = Path() / str(source) if str(source) in NAMED else Path(source)
+    text = json.dumps(document, sort_keys=True).encode()
+    return _prepared(source, path, path.stem, checked_study(path, document), hashlib.sha256(text).hexdigest())
+
+
+def _read(source: str | os.PathLike[str]) -> tuple[bytes, Path, str]:
+    """Return the file of a study, its path, and the name of its results."""
     path = Path(source)
     if str(source) in NAMED:
-        content, folder, name = study_text(str(source)).encode(), Path(), str(source)
-    else:
-        try:
-            content = read_bytes(path)
-        except InputError as error:
-            raise InputError(f"{error}; give a file STUDY.toml, or one of the studies {', '.join(NAMED)}") from error
-        folder, name = path.parent, path.stem
-    settings = load_study(path, content)
-    mask, frame, inputs = _mask(path, folder, settings)
+        return study_text(str(source)).encode(), Path() / str(source), str(source)
+    try:
+        return read_bytes(path), path, path.stem
+    except InputError as error:
+        raise InputError(f"{error}; give a file STUDY.toml, or one of the studies {', '.join(NAMED)}") from error
+
+
+def _prepared(source: str | os.PathLike[str], path: Path, name: str, settings: StudyFile, digest: str) -> PreparedStudy:
+    mask, frame, inputs = _mask(path, path.parent, settings)
     study = _study(path, settings, mask, frame)
     said = json.dumps([settings.model_dump(mode="json"), inputs, __version__], sort_keys=True)
-    inputs = {path.name: hashlib.sha256(content).hexdigest(), **inputs}
+    inputs = {path.name: digest, **inputs}
     fingerprint = hashlib.sha256(said.encode()).hexdigest()
     title = settings.title or name.replace("-", " ").replace("_", " ").capitalize()
     return PreparedStudy(name, title, str(source), settings, study, lattice_mesh(study.lattice), inputs, fingerprint)

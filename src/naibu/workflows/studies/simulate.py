@@ -12,9 +12,11 @@ from naibu.workflows.applications.fingertip_study import FINGERTIP, FINGERTIP_TI
 from naibu.workflows.applications.simulate_chip import CHIP, CHIP_TITLE, chip_text, describes_chip, simulate_chip
 from naibu.workflows.applications.simulate_fingertip import simulate_fingertip
 from naibu.workflows.applications.simulate_ischemia import ISCHEMIA, ISCHEMIA_TITLE, describes_ischemia, ischemia_text, simulate_ischemia
+from naibu.workflows.parallel.worker_count import Workers
 from naibu.workflows.studies.lattice_study import NAMED, TEMPLATE, study_text
 from naibu.workflows.studies.simulate_lattice import CHECKPOINT_EVERY, SimulationRun, simulate_lattice
 from naibu.workflows.studies.simulate_study import SLUGS, SQUARES_TOGETHER, simulate_study
+from naibu.workflows.studies.simulate_sweep import SWEEP, describes_sweep, simulate_sweep, sweep_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +52,7 @@ def named_studies() -> tuple[NamedStudy, ...]:
 
 
 def example_text(study: str = "") -> str:
-    """Return the file of a study as a template: of a lattice, a sensing chip, a fingertip, or layered skin.
+    """Return the file of a study as a template: of a lattice, a sensing chip, a fingertip, layered skin, or a sweep.
 
     Parameters
     ----------
@@ -62,7 +64,7 @@ def example_text(study: str = "") -> str:
     InputError
         There is no such study, or it has no file.
     """
-    of_name = {CHIP: chip_text, FINGERTIP: fingertip_text, ISCHEMIA: ischemia_text}
+    of_name = {CHIP: chip_text, FINGERTIP: fingertip_text, ISCHEMIA: ischemia_text, SWEEP: sweep_text}
     return of_name[study]() if study in of_name else study_text(study or TEMPLATE)
 
 
@@ -74,9 +76,11 @@ def simulate(
     overwrite: bool = False,
     checkpoint_every: int = CHECKPOINT_EVERY,
     device: str = "cpu",
+    workers: int = 1,
+    cluster: str | None = None,
     progress: Progress | None = None,
 ) -> SimulationRun:
-    """Simulate a study, and write its motion for ParaView, an animated page and the numbers.
+    """Simulate a study, and write its motion for ParaView, an animated page and the numbers; or all runs of a sweep, and one table.
 
     Ctrl-C (KeyboardInterrupt) ends the run of a lattice or fingertip: the frames or presses so far are kept, and the run can be resumed.
 
@@ -84,11 +88,11 @@ def simulate(
     ----------
     study : str or path-like
         Name of a study (see `named_studies`), or a TOML file that describes a lattice, its indenters and their motion, a sensing chip, a
-        fingertip, or layered skin.
+        fingertip, layered skin, or a sweep of parameters of a lattice's study.
     out : path-like
         Folder for the files.
     resume : bool
-        Whether an interrupted or killed run of a lattice or fingertip is resumed; the result is the same as without an interruption.
+        Whether an interrupted or killed run of a lattice, fingertip or sweep is resumed; the result is the same as without an interruption.
     overwrite : bool
         Whether results that the folder holds are replaced.
     checkpoint_every : int
@@ -96,6 +100,8 @@ def simulate(
     device : str
         Where a lattice is computed: ``"cpu"``, ``"cuda"`` (an NVIDIA GPU; ``"cuda:1"`` for the second), or ``"warp-cpu"`` (the kernels of
         the GPU on the processor, for tests). Contact with friction is computed on the CPU only.
+    workers, cluster
+        Where the runs of a sweep are computed (`naibu.workflows.parallel.worker_count.Workers`).
     progress : callable, optional
         Called with a `ProgressReport` after every frame of a lattice, and after every study of finite elements.
 
@@ -111,8 +117,13 @@ def simulate(
     ConvergenceError
         An explicit method became unstable; the frames before are kept.
     """
-
     name = os.fspath(study)
+    if describes_sweep(study):
+        if device != "cpu":
+            raise InputError(f"device is {device!r}, and {name} is a sweep, whose runs are computed on 'cpu'; choose that")
+        return simulate_sweep(study, out, resume=resume, overwrite=overwrite, workers=workers, cluster=cluster, progress=progress)
+    if Workers(workers, cluster).elsewhere:
+        raise InputError(f"`workers` and `cluster` share out the runs of a sweep, and {name} is one run; leave them out")
     of_chip, of_skin, of_finger = describes_chip(study), describes_ischemia(study), describes_fingertip(study)
     if not (of_chip or of_skin or of_finger) and name != SQUARES_TOGETHER and name not in SLUGS:
         return simulate_lattice(
