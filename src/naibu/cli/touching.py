@@ -50,7 +50,7 @@ def live(
     port
         Port of this computer; 0 takes a free one.
     haptics_port
-        UDP port of this computer at which a haptic device leads the tool, such as 8766; the body must be a lattice.
+        UDP port of this computer at which a haptic device leads the tool, such as 8766.
     browser
         Open the page in the browser.
     """

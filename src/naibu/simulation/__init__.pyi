@@ -9,9 +9,11 @@ from .adaptive.spring_levels import level_spring
 from .adaptive.statics import AdaptiveSolution, StaticResult, hyperelastic_static, linear_static, pressed_by, solve_adaptively
 from .force_limits import ForceLimits
 from .haptic_loop import DeviceChannel, DeviceForce, DevicePose, HapticHand
+from .haptic_thread import HapticThread
 from .interactive_bodies import FiniteElementBody, InteractiveBody, LatticeBody
 from .interactive_simulation import Frame, InteractiveSimulation
 from .lattice_cut import LatticeCut, cut_engine, cut_lattice, cut_session
+from .local_contact import LocalContact
 from .real_time_loop import RealTimeLoop
 from .simulated_device import SimulatedDevice
 from .surface_opening import opened, opening
@@ -31,12 +33,14 @@ __all__ = [
     "ForceLimits",
     "Frame",
     "HapticHand",
+    "HapticThread",
     "HyperelasticDynamics",
     "InteractiveBody",
     "InteractiveSimulation",
     "LatticeBody",
     "LatticeCut",
     "LinearDynamics",
+    "LocalContact",
     "RealTimeLoop",
     "SimulatedDevice",
     "SpringMaterial",

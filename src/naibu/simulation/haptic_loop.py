@@ -5,16 +5,18 @@ Time is counted in steps of the simulation, and packets come through a channel; 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
+from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.simulation.force_limits import ForceLimits, PassivityController, StepLimiter
-from naibu.simulation.interactive_simulation import Frame, InteractiveSimulation
+from naibu.simulation.interactive_simulation import InteractiveSimulation
 from naibu.simulation.virtual_coupling import CoupledTool, VirtualCoupling
 
 LONGEST_STEP_S = 2e-3
@@ -91,6 +93,44 @@ class DeviceChannel(Protocol):
         """Let another device come."""
 
 
+class LedFrame(Protocol):
+    """A tool, and its force on the body, at the end of a step."""
+
+    @property
+    def tool(self) -> str:
+        """Its name, or an empty string."""
+
+    @property
+    def tool_centre(self) -> FloatArray:
+        """Where it is (3,), mm."""
+
+    @property
+    def force(self) -> FloatArray:
+        """Its force on the body (3,), mN."""
+
+
+class LedSimulation(Protocol):
+    """A simulation whose tool is led step by step: one of the body, or of the contact alone."""
+
+    @property
+    def frame_s(self) -> float:
+        """Length of a step, s."""
+
+    @property
+    def tools(self) -> Mapping[str, RigidIndenter]:
+        """Tools by name."""
+
+    @property
+    def last(self) -> LedFrame:
+        """The end of the last step."""
+
+    def take(self, tool: str) -> None:
+        """Bring a tool into play."""
+
+    def move(self, centre: ArrayLike) -> None:
+        """Lead it to a position (3,), mm."""
+
+
 @dataclass(slots=True, eq=False)
 class HapticHand:
     """A device that leads the tool through a virtual coupling.
@@ -131,7 +171,7 @@ class HapticHand:
         """Whether a device is there."""
         return self._pose is not None
 
-    def before(self, simulation: InteractiveSimulation) -> None:
+    def before(self, simulation: LedSimulation) -> None:
         """Read the poses that have come, and lead the tool, before a step of the simulation."""
         if not self._listen(simulation.frame_s) or self._pose is None:
             return
@@ -143,7 +183,7 @@ class HapticHand:
         if self._tool is not None and self._silence <= self.limits.silence_s and not self._pose.buttons & HOLDS:
             simulation.move(self._tool.next_position(self._place(), self._velocity, simulation.frame_s))
 
-    def after(self, frame: Frame, step_s: float) -> None:
+    def after(self, frame: LedFrame, step_s: float) -> None:
         """Answer with the force on the device, after a step."""
         if self._pose is None or self._tool is None:
             return
@@ -200,7 +240,7 @@ class HapticHand:
                 self._velocity = self._velocity + share * (moved / took - self._velocity)
         self._silence = 0.0
 
-    def _anchor(self, simulation: InteractiveSimulation) -> None:
+    def _anchor(self, simulation: LedSimulation) -> None:
         """Begin to lead the tool in play from where it is."""
         frame = simulation.last
         self._tool, self._name = None, frame.tool
@@ -231,7 +271,7 @@ def require_haptic_steps(simulation: InteractiveSimulation) -> None:
     if simulation.body.step_s > LONGEST_STEP_S:
         raise InputError(
             f"a haptic device needs steps of at most {1e3 * LONGEST_STEP_S:g} ms, and those of this body take "
-            f"{1e3 * simulation.body.step_s:.3g} ms; touch a lattice, such as dough-pressed-by-sphere"
+            f"{1e3 * simulation.body.step_s:.3g} ms; let a `HapticThread` serve it beside the loop"
         )
     if simulation.steps != 1:
         raise InputError(f"frame_s is {simulation.frame_s:g} s, {simulation.steps} steps; make it {simulation.body.step_s:g} s, one step")

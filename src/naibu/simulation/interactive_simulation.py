@@ -142,6 +142,11 @@ class InteractiveSimulation:
         return float(np.ptp(self.body.points, axis=0).max())
 
     @property
+    def fastest_mm_s(self) -> float:
+        """Speed at which tool and grip move at most, mm/s."""
+        return SPEED * self.extent_mm
+
+    @property
     def last(self) -> Frame:
         """The last frame."""
         return self._last
@@ -296,7 +301,7 @@ class InteractiveSimulation:
         """Take the steps of one frame, and return it; a step that fails is taken back, and the frame says why."""
         before = self._session.state()
         duration = self.steps * self.body.step_s
-        reach = SPEED * self.extent_mm * duration
+        reach = self.fastest_mm_s * duration
         centre = _towards(self._centre, self._target, min(reach, self._thin() * self.steps))
         motions = self._motions((centre - self._centre) / duration)
         gripped = _towards(self._grip_position(), self._pull_target, reach) - self._grip_position()

@@ -14,9 +14,11 @@ from threadpoolctl import threadpool_limits
 
 from naibu.core.errors import InputError
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
-from naibu.simulation.haptic_loop import HapticHand
+from naibu.simulation.haptic_loop import LONGEST_STEP_S, HapticHand
+from naibu.simulation.haptic_thread import HapticThread
 from naibu.simulation.interactive_bodies import FiniteElementBody, InteractiveBody
 from naibu.simulation.interactive_simulation import FRAME_S, Frame, InteractiveSimulation
+from naibu.simulation.local_contact import LocalContact
 from naibu.simulation.real_time_loop import RealTimeLoop
 from naibu.viewer.live.commands import LiveCommand
 from naibu.viewer.live.scene import FAILED, PAUSED, RECORDING, REPLAYING, LiveFrame, LiveScene
@@ -139,14 +141,14 @@ def live(
     port : int
         Of the loopback interface; 0 takes a free one.
     haptics_port : int, optional
-        UDP port of the loopback interface for a haptic device, which then leads the tool; the body is a lattice.
+        UDP port of the loopback interface for a haptic device, which then leads the tool.
     ready : callable
         Called with the address of the page once it can be opened.
 
     Raises
     ------
     InputError
-        A source that cannot be used or, with a device, has steps of more than 2 ms; or a port that is taken.
+        A source that cannot be used, or a port that is taken.
     """
     if not 0 <= port <= 65535:
         raise InputError(f"port must lie between 0 and 65535, not {port}")
@@ -164,7 +166,7 @@ def touched_loop(model: TouchableModel, haptics_port: int | None = None) -> Iter
     Raises
     ------
     InputError
-        A port that is taken, or a body that is not stepped finely enough for a device.
+        A port that is taken.
     """
     body = model.body
     with ExitStack() as stack:
@@ -177,10 +179,14 @@ def touched_loop(model: TouchableModel, haptics_port: int | None = None) -> Iter
             stack.callback(gc.unfreeze)
             gc.collect()
             gc.freeze()  # a collection over all that was imported takes more than 5 ms
-        frame_s = FRAME_S if hand is None else body.step_s
-        simulation = InteractiveSimulation(body, tools_for(body), frame_s)
+        single = hand is not None and body.step_s <= LONGEST_STEP_S
+        simulation = InteractiveSimulation(body, tools_for(body), body.step_s if single else FRAME_S)
         _warm(simulation)
-        yield stack.enter_context(RealTimeLoop(simulation, hand=hand))
+        loop = stack.enter_context(RealTimeLoop(simulation, hand=hand if single else None))
+        if hand is not None and not single:
+            contact = LocalContact(simulation.tools, simulation.fastest_mm_s, body_step_s=simulation.frame_s)
+            stack.enter_context(HapticThread(loop, hand, contact))
+        yield loop
 
 
 def _warm(simulation: InteractiveSimulation) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -12,9 +13,9 @@ import pytest
 from touched_lattice import TOP, touched_lattice
 
 from naibu.core.errors import InputError
-from naibu.io.vtk_files import write_vtu
+from naibu.mechanics import Assembler, elements, material
 from naibu.meshing import box
-from naibu.simulation import SimulatedDevice
+from naibu.simulation import FiniteElementBody, ForceLimits, SimulatedDevice
 from naibu.simulation.simulated_device import SILENCE_S
 from naibu.workflows import TouchableModel, drive_live_simulation, live, touched_loop
 from naibu.workflows.interactive.haptics.device import STEP_S
@@ -57,10 +58,26 @@ def test_a_device_drives_a_lattice_for_a_while() -> None:
     driven(10.0)
 
 
-def test_what_cannot_be_felt_is_refused(tmp_path: Path) -> None:
-    write_vtu(tmp_path / "gel.vtu", box((30.0, 30.0, 30.0), (2, 2, 2), cell_type="tetra"))
-    with pytest.raises(InputError, match="steps of at most 2 ms"):
-        live(tmp_path / "gel.vtu", port=0, haptics_port=48766, ready=lambda _: None)
+def test_a_device_feels_finite_elements_between_their_steps() -> None:
+    mesh = box((40.0, 40.0, 40.0), (4, 4, 4))
+    assembler = Assembler.from_materials(
+        elements(mesh, "mean_dilatation"), mesh.regions, [material(young_modulus=10.0, poisson_ratio=0.45)]
+    )
+    body = FiniteElementBody.of(mesh, assembler, supported=np.flatnonzero(mesh.points[:, 2] < 1e-9).astype(np.int64))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    limits = ForceLimits()
+    with touched_loop(TouchableModel("Gel", (), body, "strain, %"), port) as loop:
+        assert loop.hand is None  # beside the loop
+        record = drive_live_simulation(SimulatedDevice(lambda t: np.array([0.0, 0.0, -24.0 * min(t, 1.0)])), port, 2.0, loss=0.01, seed=1)
+        frame = loop.latest()[0]
+    assert frame.force[2] < -50.0
+    assert np.linalg.norm(record.forces, axis=1).max() > 50.0
+    assert record.steps_mn.max() <= limits.step_mn * (1 + 1e-9)
+
+
+def test_what_cannot_be_served_is_refused() -> None:
     with pytest.raises(InputError, match="haptics_port must lie between 1 and 65535"):
         live("cube-pushing", port=0, haptics_port=0, ready=lambda _: None)
     with pytest.raises(InputError, match="no answer came"):
