@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.sparse import csr_matrix
+from valid_point_files import cloud_files, foreign_fields, read_cloud, read_foreign
 
 from naibu import datasets
 from naibu.applications.mammography.breast_outline import breast_outline, mask_outline
@@ -75,6 +76,11 @@ def valid_files(folder: Path) -> list[ValidFile]:
         *_texts(folder),
         *_fields(folder),
         *_records(folder),
+        *(ValidFile(f"cloud {path.name}", path, lambda path=path: read_cloud(path)) for path in cloud_files(folder / "clouds")),
+        *(
+            ValidFile(f"foreign field {path.name}", path, lambda path=path: read_foreign(path))
+            for path in foreign_fields(folder / "foreign")
+        ),
     ]
 
 

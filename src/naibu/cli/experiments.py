@@ -24,7 +24,12 @@ if TYPE_CHECKING:
 
 DEMO = ("ct_two_material_1", "ct_two_material_2", "ct_two_material_3")
 DEMO_KNOWN = "hardness 5=222 kPa"  # mean of the report's compression tests, Table 3.4
-FIELD_FILES = (".h5", ".hdf5")  # operands of identify that can only be displacement fields
+# operands of identify that can only be displacement fields
+FIELD_FILES = (
+    *(".h5", ".hdf5", ".tfm", ".mha", ".mhd", ".nrrd", ".nhdr", ".nii", ".gz"),
+    *(".vtu", ".mat", ".csv", ".tsv", ".txt", ".xlsx", ".dat"),
+)
+Unit = Literal["mm", "cm", "m", "um", "inch"]
 ContactModel = Literal["coulomb", "stick", "springs"]
 PixelScale = Literal["given", "sought"]
 Joined = Literal["tied", "sliding"]
@@ -69,6 +74,8 @@ def identify(
     zones: Path | None = None,
     zone_name: list[str] | None = None,
     cell_map: Annotated[bool, Parameter(name="--map", negative=())] = False,
+    unit: Unit | None = None,
+    spacing_mm: tuple[float, float, float] | None = None,
     overwrite: Overwrite = False,
     where: WorkerOptions | None = None,
 ) -> None:
@@ -111,6 +118,10 @@ def identify(
         With fields: name of a label, 'gel=1'. May be repeated.
     cell_map
         With fields: map the unknown moduli cell by cell, and make regions of the map.
+    unit
+        With fields in tables and meshes: their unit, where they do not state it; by default mm.
+    spacing_mm
+        With fields in voxels (SPAM, ALDVC): size of a voxel along x, y, z.
     overwrite
         Replace results, or files of your own, that the folder already holds.
     """
@@ -122,10 +133,13 @@ def identify(
         )  # fmt: skip
         _identify_fields(
             experiments, mask=mask, zones=zones, zone_name=zone_name or [], known=known or (), law=law, each_cell=cell_map,
-            element_size_mm=element_size_mm, out=out, overwrite=overwrite,
+            element_size_mm=element_size_mm, unit=unit, spacing_mm=spacing_mm, out=out, overwrite=overwrite,
         )  # fmt: skip
         return
-    require_left_out("goes with displacement fields, and these are markers", zone_names=bool(zone_name), each_cell=cell_map)
+    require_left_out(
+        "goes with displacement fields, and these are markers", zone_names=bool(zone_name), each_cell=cell_map, unit=unit is not None,
+        spacing_mm=spacing_mm is not None,
+    )  # fmt: skip
     from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 
     settings = ModelSettings(law=law, contact=contact, joined=joined, element_size_mm=element_size_mm, pixel_scale=pixel_scale)
@@ -146,6 +160,8 @@ def _identify_fields(
     law: Law,
     each_cell: bool,
     element_size_mm: float,
+    unit: Unit | None,
+    spacing_mm: tuple[float, float, float] | None,
     out: Path,
     overwrite: bool,
 ) -> None:
@@ -165,7 +181,7 @@ def _identify_fields(
     with progress_display() as progress:
         result = identify_fields(
             fields, mask=mask, zones=zones, zone_names=names, known=known, each_cell=each_cell, element_size_mm=element_size_mm, out=out,
-            overwrite=overwrite, progress=progress,
+            unit=unit, spacing_mm=spacing_mm, overwrite=overwrite, progress=progress,
         )  # fmt: skip
     usable = result.estimate.verdict is None or result.estimate.verdict.ok
     for number, line in enumerate(result.notes):

@@ -9,25 +9,30 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import FloatArray, require_lengths
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
+from naibu.io.field_formats import aldvc, field_tables, itk_transforms
 from naibu.io.files.atomic import new_aside, put_in_place
 from naibu.io.files.hdf5_stream import Hdf5File
-from naibu.io.files.reading import guarded_reading, require_plausible, require_regular
+from naibu.io.files.reading import guarded_reading, read_bytes, require_plausible, require_regular
 from naibu.io.images import read_displacement
+from naibu.io.mesh_formats import vtu
+from naibu.io.point_tables import EXCEL, TEXT
+from naibu.io.table_cells import MM_PER_UNIT
 
 FORMAT = "naibu displacement field 1"
 FRAME = "LPS, mm; the material at x in the reference configuration is found at x + vector"
-_COLUMNS = (("x_mm", "y_mm", "z_mm"), ("ux_mm", "uy_mm", "uz_mm"), ("sd_x_mm", "sd_y_mm", "sd_z_mm"))
+TABLES = (*TEXT, *EXCEL, ".dat")
 
 
 def write_field(path: str | os.PathLike[str], field: DisplacementField, *, provenance: Mapping[str, Any] | None = None) -> Path:
@@ -78,14 +83,20 @@ def _store(root: Any, field: DisplacementField, provenance: str) -> None:
             root.create_dataset(name, data=values, compression="gzip", compression_opts=4, shuffle=True, track_times=False)
 
 
-def read_field(path: str | os.PathLike[str]) -> DisplacementField:
-    """Read a displacement field.
+def read_field(path: str | os.PathLike[str], *, unit: str | None = None, spacing_mm: Sequence[float] | None = None) -> DisplacementField:
+    """Read a displacement field; what other programs mean by their vectors is told in the page on displacement fields.
 
     Parameters
     ----------
     path : path-like
-        ``.h5`` as `write_field` and ``naibu sense`` write it; an image of vectors (``.mha``, ``.mhd``, ``.nrrd``; no covariance); or a
-        table (``.csv``) with the columns x_mm, y_mm, z_mm, ux_mm, uy_mm, uz_mm and, where they are known, sd_x_mm, sd_y_mm, sd_z_mm.
+        ``.h5`` as `write_field`, ``naibu sense`` and ``naibu track`` write it, or a transform of ITK, ANTs or 3D Slicer (also ``.tfm``); an
+        image of vectors (``.mha``, ``.mhd``, ``.nrrd``, ``.nii``, ``.nii.gz``); a mesh with displacements at its points (``.vtu``); a
+        result of ALDVC (``.mat``); or a table (``.csv``, ``.tsv``, ``.txt``, ``.xlsx``, Tecplot ``.dat``) with columns such as x_mm,
+        y_mm, z_mm, ux_mm, uy_mm, uz_mm and, where they are known, sd_x_mm, sd_y_mm, sd_z_mm.
+    unit : str, optional
+        Unit of tables and meshes, mm, cm, m, um or inch, where they do not state it; by default mm.
+    spacing_mm : sequence of float, optional
+        Size of a voxel along x, y, z, mm, where lengths are in voxels: in tables of SPAM and results of ALDVC.
 
     Raises
     ------
@@ -94,18 +105,61 @@ def read_field(path: str | os.PathLike[str]) -> DisplacementField:
     """
     source = Path(path)
     ending = source.suffix.lower()
+    require_lengths(spacing_mm=spacing_mm)
+    _require_fitting(source, ending, unit, spacing_mm)
     with guarded_reading(path, "displacement field"):
         if ending in (".h5", ".hdf5"):
             return _stored(source)
-        if ending == ".csv":
-            return _table(source)
-        vectors, grid = read_displacement(source)
+        if ending in TABLES:
+            require_regular(source)
+            return field_tables.read(source, unit=unit, spacing_mm=spacing_mm)
+        if ending == ".vtu":
+            return _mesh(source, MM_PER_UNIT[unit or "mm"])
+        if ending == ".mat":
+            require_regular(source)
+            return _in_voxels(source, *aldvc.read(source), spacing_mm)
+        vectors, grid = itk_transforms.read_tfm(source) if ending == ".tfm" else read_displacement(source)
         return DisplacementField.on_grid(grid, vectors)
+
+
+def _require_fitting(source: Path, ending: str, unit: str | None, spacing_mm: Sequence[float] | None) -> None:
+    """Refuse a unit or a size of voxels where the file states its own."""
+    if unit is not None and unit not in MM_PER_UNIT:
+        raise InputError(f"unit = {unit!r} is not known; use one of {', '.join(dict.fromkeys(MM_PER_UNIT))}")
+    if unit is not None and ending not in (*TABLES, ".vtu"):
+        raise InputError(f"unit = {unit!r} goes with tables and meshes; {source.name} states its own: leave it out")
+    if spacing_mm is not None and ending not in (*TABLES, ".mat"):
+        raise InputError(f"spacing_mm goes with fields in voxels; {source.name} states its own: leave it out")
+    if unit is not None and spacing_mm is not None:
+        raise InputError("`unit` and spacing_mm both say what a coordinate is; give one of them")
+    if ending in (".tif", ".tiff"):
+        raise InputError(f"{source.name}: TIFF files of SPAM do not say where their nodes lie; take the table beside them (.tsv)")
+
+
+def _mesh(source: Path, unit_mm: float) -> DisplacementField:
+    """Return the field at the points of a mesh: that of its array of three components, or that whose name says displacement."""
+    points, arrays = vtu.read_point_arrays(source.name, read_bytes(source))
+    fitting = {name: values for name, values in arrays.items() if values.shape[1] == 3}
+    named = {name: values for name, values in fitting.items() if re.match(r"disp|u$|deformation$", name.lower())}
+    chosen = named or fitting
+    if len(chosen) != 1:
+        there = ", ".join(arrays) or "none"
+        raise InputError(f"{source.name}: needs one array of three components at its points, called displacement; it has {there}")
+    return DisplacementField.from_arrays(unit_mm * points, unit_mm * next(iter(chosen.values())))
+
+
+def _in_voxels(source: Path, points: FloatArray, vectors: FloatArray, spacing_mm: Sequence[float] | None) -> DisplacementField:
+    if spacing_mm is None:
+        raise InputError(f"{source.name}: is a result of ALDVC, in voxels; give spacing_mm, the size of a voxel along x, y, z")
+    return DisplacementField.from_arrays(points * np.asarray(spacing_mm), vectors * np.asarray(spacing_mm))
 
 
 def _stored(source: Path) -> DisplacementField:
     require_regular(source)
     with h5py.File(source, "r") as root:
+        if itk_transforms.is_transform(root):
+            vectors, grid = itk_transforms.read_h5(source, root)
+            return DisplacementField.on_grid(grid, vectors)
         if root.attrs.get("format") != FORMAT:
             raise InputError(f"{source.name}: contains no displacement field: its attribute 'format' is not {FORMAT!r}")
         vectors = _array(source, root, "vectors")
@@ -134,17 +188,3 @@ def _array(source: Path, root: Any, name: str) -> FloatArray | None:
         raise InputError(f"{source.name}: {name} stands in another file; copy it into this one")
     require_plausible(source.name, stored.nbytes, stored.id.get_storage_size(), compressed=stored.chunks is not None)
     return np.asarray(stored[()], dtype=float)
-
-
-def _table(source: Path) -> DisplacementField:
-    require_regular(source)
-    values = np.atleast_1d(np.genfromtxt(source, delimiter=",", names=True, deletechars="", dtype=float, encoding="utf-8"))
-    names = values.dtype.names or ()
-    missing = [name for part in _COLUMNS[:2] for name in part if name not in names]
-    if missing or not len(values):
-        needed = ", ".join((*_COLUMNS[0], *_COLUMNS[1]))
-        raise InputError(f"{source.name}: a table of a field needs rows and the columns {needed}; it has {', '.join(names)}")
-    points, vectors = (np.stack([values[name] for name in part], axis=1) for part in _COLUMNS[:2])
-    known = all(name in names for name in _COLUMNS[2])
-    sd = np.stack([values[name] for name in _COLUMNS[2]], axis=1) if known else None
-    return DisplacementField.from_arrays(points, vectors, sd_mm=sd)

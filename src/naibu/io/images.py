@@ -44,6 +44,7 @@ VOLUME_WRITERS: dict[str, Callable[..., Path]] = {
 }
 _VECTOR_READERS: dict[str, Callable[[Path, ReadOptions], tuple[FloatArray, Volume]]] = {
     **dict.fromkeys((".mha", ".mhd"), metaimage.read_vectors),
+    **dict.fromkeys((".nii", ".nii.gz"), nifti.read_vectors),
     **dict.fromkeys((".nrrd", ".nhdr"), nrrd.read_vectors),
 }
 _BOX_READERS: dict[str, Callable[[Path, ArrayLike, ArrayLike, ReadOptions], Volume]] = {
@@ -138,7 +139,8 @@ def read_displacement(path: str | os.PathLike[str]) -> tuple[FloatArray, Volume]
     Parameters
     ----------
     path : path-like
-        ``.mha``, ``.mhd`` or ``.nrrd`` with three components per voxel, as ITK and 3D Slicer write them.
+        ``.mha``, ``.mhd`` or ``.nrrd`` with three components per voxel, as ITK, elastix and 3D Slicer write them, or ``.nii`` and
+        ``.nii.gz`` of five axes, as ANTs writes them.
 
     Returns
     -------

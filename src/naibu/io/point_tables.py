@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import InputError
 from naibu.io.table_cells import HEADER_WITHIN, decimal_mark, excel_rows, number, text_rows, unit_factor, without_unit
 
@@ -28,16 +29,26 @@ def _patterns(axis: str, component: str) -> dict[str, re.Pattern[str]]:
     return {name: re.compile(text, re.IGNORECASE) for name, text in texts.items()}
 
 
+# columns that say which points were measured: SPAM's (2: converged), DaVis's
+_STATUS: tuple[tuple[re.Pattern[str], Callable[[FloatArray], BoolArray]], ...] = (
+    (re.compile(r"returnStatus|(?:SubPix)?ReturnStat", re.IGNORECASE), lambda status: status == 2),
+    (re.compile(r"is[\s_]?valid", re.IGNORECASE), lambda status: status > 0.5),
+)
 COLUMNS = {axis: _patterns(axis, component) for axis, component in zip("xyz", "uvw", strict=True)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointTable:
-    """Positions (n, d), displacements (n, d) and standard deviations (n, d), mm; None where the table has none; NaN for blank cells."""
+    """Positions (n, d), displacements (n, d), standard deviations (n, d), mm, and which points were measured (n,).
+
+    None where the table has no such columns; NaN for blank cells. `in_voxels` says that lengths are in voxels, as SPAM writes them.
+    """
 
     points: FloatArray
     vectors: FloatArray | None
     sd: FloatArray | None
+    valid: BoolArray | None = None
+    in_voxels: bool = False
 
 
 def read_point_table(path: Path, *, unit: str | None = None, displacements: bool = True) -> PointTable:
@@ -69,15 +80,43 @@ def read_point_table(path: Path, *, unit: str | None = None, displacements: bool
     where["vectors"] = where["vectors"] if displacements else []
     if not body:
         raise InputError(f"{path}: no rows follow the header {', '.join(header)}")
+    return assembled(path, header, where, lambda at, unit: _column(path, header, body, at, unit), unit)
+
+
+def assembled(
+    path: Path, names: list[str], where: dict[str, list[int]], column: Callable[[int, str | None], FloatArray], unit: str | None
+) -> PointTable:
+    """Return a table of points from its columns.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for messages.
+    names : list of str
+        Names of the columns.
+    where : dict
+        From `columns_of`.
+    column : callable
+        Returns the column of an index, in mm for a unit, or as it stands for None.
+    unit : str, optional
+        Unit of lengths where the names state none.
+
+    Raises
+    ------
+    InputError
+        Columns for some of the coordinates only.
+    """
     d = len(where["points"])
     parts = {}
     for name, some in where.items():
         if len(some) not in (0, d):
             raise InputError(f"{path}: has {d} coordinates, but {len(some)} columns of {_WORDS[name]}; give one for each coordinate")
-        parts[name] = np.column_stack([_column(path, header, body, c, unit) for c in some]) if some else None
+        parts[name] = np.column_stack([column(c, unit) for c in some]) if some else None
+    status = next(((at, test) for at, name in enumerate(names) for pattern, test in _STATUS if pattern.fullmatch(name.strip())), None)
+    valid = None if status is None else np.asarray(status[1](column(status[0], None)))
     points = parts["points"]
     assert points is not None
-    return PointTable(points, parts["vectors"], parts["sd"])
+    return PointTable(points, parts["vectors"], parts["sd"], valid, {"zpos", "zdisp"} <= {name.strip().lower() for name in names})
 
 
 _WORDS = {"points": "positions", "vectors": "displacements", "sd": "standard deviations"}

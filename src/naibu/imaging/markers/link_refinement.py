@@ -28,7 +28,7 @@ ALIKE = 1.2  # ratio of standard deviations up to which axes are alike
 LEAST = 0.01  # least noise, in spacings
 CORE = 3.0  # medians within which residuals tell the metric
 AROUND, PRIOR = 24, 6.0  # deformed points around that tell how many are unlinked there, and weight of those everywhere, in points
-CAUTION = 4.0  # how much more often chance is assumed to link than the densities say
+CAUTION = 6.0  # how much more often chance is assumed to link than the densities say
 MEDIAN = {2: 1.1774, 3: 1.5382}  # of the length of a vector of standard normal components
 
 

@@ -42,7 +42,7 @@ MOST_TRIES, MOST_WAVES = 4, 400
 # links from which on their mean probability is judged; of fewer, this fraction of the markers must be linked
 FEW_LINKS, FEW_LINKED = 8, 0.5
 UNEVEN = 3.0  # degrees of freedom of residuals that are compared with those of all links, not with those around
-LIKELY = 0.33  # probability, which errs on the safe side, below which a link that has grown is dropped
+LIKELY = 0.5  # probability, which errs on the safe side, below which a link that has grown is dropped
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from naibu.core.arrays import AnyArray
+from naibu.core.arrays import AnyArray, FloatArray
 from naibu.core.errors import InputError
 from naibu.core.optional_packages import optional_package
 from naibu.core.volume import Volume
@@ -16,6 +16,9 @@ from naibu.io.files.atomic import write_atomically
 from naibu.io.files.reading import require_plausible, require_regular
 from naibu.io.image_formats.geometry import FLIP_RAS, ReadOptions, three_axes, unit_length, volume_with_axes
 
+# codes of the header: vectors, and displacement vectors, whose components are along the axes of the file (nifti1.h)
+_VECTOR, _DISPLACEMENT = 1007, 1006
+_FSL = range(2006, 2019)  # codes that FSL gives to its warps
 _STORED = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 
 
@@ -43,6 +46,41 @@ def read(path: Path, options: ReadOptions) -> Volume:
     named = image.header.get_xyzt_units()[0] if hasattr(image.header, "get_xyzt_units") else "unknown"
     unit = options.unit_mm or (1.0 if named == "unknown" else unit_length(path.name, named))
     return volume_with_axes(path.name, values, FLIP_RAS @ affine[:3, 3], FLIP_RAS @ affine[:3, :3], unit)
+
+
+def read_vectors(path: Path, options: ReadOptions) -> tuple[FloatArray, Volume]:
+    """Read vectors (nz, ny, nx, 3), LPS, and their grid, whose values are true where all components are finite.
+
+    Vectors of the intent "vector" are in LPS, as ITK and ANTs write them; those of "displacement vector" in RAS, as the standard has it.
+
+    Raises
+    ------
+    InputError
+        No vectors of three components along the fifth axis, or a warp whose vectors mean something else.
+    """
+    nibabel = optional_package("nibabel", f"{path.name}: reading NIfTI files")
+    require_regular(path)
+    image = nibabel.load(path)
+    announced = math.prod(image.shape) * image.header.get_data_dtype().itemsize
+    require_plausible(path.name, announced, _stored_bytes(path), compressed=path.name.lower().endswith(".gz"))
+    intent, name = int(image.header["intent_code"]), bytes(image.header["intent_name"].item()).decode("latin-1").strip("\0 ")
+    if intent in _FSL or name.startswith(("NREG", "FSL")):
+        raise InputError(
+            f"{path.name}: is a warp of {'NiftyReg' if name.startswith('NREG') else 'FSL'} (intent {intent} {name!r}), whose vectors are "
+            "not displacements in mm along the axes of the scan; convert it to an ITK displacement field first"
+        )
+    if len(image.shape) != 5 or image.shape[3:] != (1, 3) or intent not in (_VECTOR, _DISPLACEMENT):
+        raise InputError(
+            f"{path.name}: has shape {image.shape} and intent {intent}; a displacement field has (nx, ny, nz, 1, 3) and the intent 1007 "
+            "(vector, LPS, as ANTs writes it) or 1006 (displacement vector, RAS)"
+        )
+    vectors = np.asarray(image.dataobj, dtype=float)[:, :, :, 0].transpose(2, 1, 0, 3)
+    affine = np.asarray(image.affine, dtype=float)
+    named = image.header.get_xyzt_units()[0]
+    unit = options.unit_mm or (1.0 if named == "unknown" else unit_length(path.name, named))
+    vectors = unit * (vectors @ FLIP_RAS if intent == _DISPLACEMENT else vectors)
+    known = np.isfinite(vectors).all(axis=3)
+    return vectors, volume_with_axes(path.name, known, FLIP_RAS @ affine[:3, 3], FLIP_RAS @ affine[:3, :3], unit)
 
 
 def _stored_bytes(path: Path) -> int:

@@ -74,6 +74,38 @@ def read(source: str, data: bytes) -> Mesh:
     return volume_mesh(source, np.concatenate(points), blocks, _names(file))
 
 
+def read_point_arrays(source: str, data: bytes) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Return the points (n, 3) of a .vtu file in its unit, and its point data (n, components) by name.
+
+    Parameters
+    ----------
+    source : str
+        Name of the file, for errors.
+    data : bytes
+        Its content.
+
+    Raises
+    ------
+    InputError
+        Not an unstructured grid, a truncated file, or arrays that do not fit the points.
+    """
+    file = _opened(source, data)
+    points: list[FloatArray] = []
+    parts: dict[str, list[FloatArray]] = {}
+    for piece in file.root.iter("Piece"):
+        points.append(_array(file, piece.find("Points/DataArray"), "Points").reshape(-1, 3).astype(np.float64))
+        for element in piece.iterfind("PointData/DataArray"):
+            name, components = element.get("Name", ""), int(element.get("NumberOfComponents", "1"))
+            values = _array(file, element, f"PointData/{name}")
+            if components < 1 or values.size != components * len(points[-1]):
+                raise InputError(f"{source}: PointData/{name} has {values.size} values for {len(points[-1])} points; write the file again")
+            parts.setdefault(name, []).append(values.reshape(-1, components).astype(np.float64))
+    if not points:
+        raise InputError(f"{source}: contains no piece of an unstructured grid; write it again")
+    whole = {name: values for name, values in parts.items() if len(values) == len(points)}
+    return np.concatenate(points), {name: np.concatenate(values) for name, values in whole.items()}
+
+
 def _opened(source: str, data: bytes) -> _File:
     """Split off the appended bytes, which are not XML, and parse the rest."""
     appended, raw = b"", False

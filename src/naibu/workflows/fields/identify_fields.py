@@ -69,6 +69,8 @@ def identify_fields(
     each_cell: bool = False,
     law: LawName = "neo_hookean",
     element_size_mm: float = 0.0,
+    unit: str | None = None,
+    spacing_mm: Sequence[float] | None = None,
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
@@ -96,6 +98,8 @@ def identify_fields(
         Finite or small strain.
     element_size_mm : float
         Edge length of the cubes; 0 chooses it so that there are about 1200, or 2500 for a map.
+    unit, spacing_mm : str, sequence of float, optional
+        Unit of fields that do not state theirs, or the size of a voxel along x, y, z, mm, of fields in voxels (see `naibu.io.read_field`).
     out : path-like, optional
         Folder for ``model.json``, which predicts and can be touched; ``young_modulus.mha``, ``young_modulus_sd.mha`` and
         ``poisson_ratio.mha`` on the grid of the mask (0 outside; -1 where there is no standard deviation); ``zones.mha`` (from 1 in the
@@ -114,13 +118,14 @@ def identify_fields(
     """
     paths = [fields] if isinstance(fields, str | os.PathLike) else list(fields)
     folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
+    read = [read_field(path, unit=unit, spacing_mm=spacing_mm) for path in paths]
     inside, labels = labelled_object(mask, zones)
     names = names_of_labels(labels, inside, zone_names or {})
     stated = parse_known_zones(known, list(names.values()))
     volume = float(inside.values.sum() * np.prod(inside.spacing_mm))
     size = element_size_mm or (volume / (CELLS_OF_MAP if each_cell else CELLS)) ** (1.0 / 3.0)
     mesh, cell_of_voxel = block_mesh(inside, labels, names, size)
-    cases = [measured_load_case(mesh, cell_of_voxel, inside, read_field(p), Path(p).stem) for p in paths]
+    cases = [measured_load_case(mesh, cell_of_voxel, inside, field, Path(p).stem) for p, field in zip(paths, read, strict=True)]
     found = identify_field(
         mesh, cases, Zones.of(mesh, known=stated.values, known_sd=stated.doubts, each_cell=each_cell), law=law, progress=progress
     )

@@ -1,0 +1,1 @@
+"""Displacement fields in the files of other programs, one format a module."""

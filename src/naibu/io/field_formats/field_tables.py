@@ -1,0 +1,72 @@
+"""Tables of points with displacements: text, Excel, Tecplot, and those of SPAM :cite:p:`stamati2020`, which are in voxels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from naibu.core.arrays import BoolArray, FloatArray
+from naibu.core.displacement_field import DisplacementField
+from naibu.core.errors import InputError
+from naibu.io.field_formats import tecplot
+from naibu.io.point_tables import PointTable, assembled, columns_of, read_point_table
+from naibu.io.table_cells import unit_factor
+
+NEEDED = "x_mm, y_mm, z_mm, ux_mm, uy_mm, uz_mm"
+
+
+def read(source: Path, *, unit: str | None = None, spacing_mm: Sequence[float] | None = None) -> DisplacementField:
+    """Return the field of a table.
+
+    Parameters
+    ----------
+    source : Path
+        ``.csv``, ``.tsv``, ``.txt``, ``.xlsx`` or ``.dat``.
+    unit : str, optional
+        Unit of lengths where the names of columns state none.
+    spacing_mm : sequence of float, optional
+        Size of a voxel along x, y, z, mm, where lengths are in voxels.
+
+    Raises
+    ------
+    InputError
+        A table without positions or displacements, or in voxels of unknown size.
+    """
+    table = _tecplot(source, unit) if source.suffix.lower() == ".dat" else read_point_table(source, unit=unit)
+    if table.vectors is None:
+        raise InputError(f"{source.name}: has no columns of displacements; it needs {NEEDED}, or names like them")
+    d = table.points.shape[1]
+    if table.in_voxels and spacing_mm is None:
+        raise InputError(f"{source.name}: is a table of SPAM, in voxels; give spacing_mm, the size of a voxel along x, y, z")
+    scale = np.ones(d) if spacing_mm is None else np.asarray(spacing_mm, dtype=float)[:d]
+    known = np.isfinite(table.points).all(axis=1)
+    if not known.any():
+        raise InputError(f"{source.name}: has no point whose coordinates are all known")
+    points, vectors = table.points[known] * scale, table.vectors[known] * scale
+    valid = np.isfinite(vectors).all(axis=1) & (True if table.valid is None else table.valid[known])
+    return DisplacementField.from_arrays(points, vectors, sd_mm=_sd(source, table, known, scale, valid), valid=valid)
+
+
+def _sd(source: Path, table: PointTable, known: BoolArray, scale: FloatArray, valid: BoolArray) -> FloatArray | None:
+    if table.sd is None:
+        return None
+    sd = table.sd[known] * scale
+    wrong = valid & ~(sd >= 0.0).all(axis=1)
+    if wrong.any():
+        row = int(np.flatnonzero(known)[np.flatnonzero(wrong)[0]]) + 1
+        raise InputError(f"{source.name}: row {row} of the points has standard deviations {sd[wrong][0].tolist()}; they must be 0 or more")
+    return np.where(valid[:, None], sd, 0.0)
+
+
+def _tecplot(source: Path, unit: str | None) -> PointTable:
+    names, values = tecplot.read_columns(source)
+    where = columns_of(names, source.name)
+    if len(where["points"]) not in (2, 3):
+        raise InputError(f"{source.name}: cannot recognise x, y and z among its variables {', '.join(names)[:200]}")
+
+    def column(at: int, unit: str | None) -> FloatArray:
+        return np.asarray(values[:, at] * unit_factor(source, names[at], unit))
+
+    return assembled(source, names, where, column, unit)

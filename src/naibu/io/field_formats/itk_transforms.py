@@ -1,0 +1,137 @@
+"""Displacement field transforms of ITK: ``.h5`` (also of ANTs and 3D Slicer, with linear transforms after them) and text (``.tfm``).
+
+A transform maps points of the fixed image to the moving one, in LPS and mm: x to x + d(x). Fixed parameters of a displacement field
+transform are size, origin, spacing and direction (row by row); its parameters are the vectors, voxel by voxel, with x fastest. A composite
+transform applies its last member first. The formats are described in the ITK Software Guide, https://itk.org/ItkSoftwareGuide.pdf.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import numpy as np
+
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import InputError
+from naibu.core.volume import Volume
+from naibu.io.files.reading import read_bytes, require_plausible
+from naibu.io.image_formats.geometry import volume_with_axes
+
+GROUP = "TransformGroup"
+_LINEAR = ("AffineTransform", "MatrixOffsetTransformBase")
+_TYPO = ("Transform", "Tranform")  # names of datasets before ITK 4.13 lack a letter
+
+
+class _Transform(NamedTuple):
+    kind: str
+    parameters: FloatArray
+    fixed: FloatArray
+
+
+def is_transform(root: Any) -> bool:
+    """Return whether an open HDF5 file holds ITK transforms."""
+    return GROUP in root
+
+
+def read_h5(source: Path, root: Any) -> tuple[FloatArray, Volume]:
+    """Return vectors (nz, ny, nx, 3), mm, and their grid, of a file that is open.
+
+    Raises
+    ------
+    InputError
+        Transforms that are not one displacement field, followed by linear ones at most.
+    """
+    group = root[GROUP]
+    found = []
+    for number in sorted(group, key=lambda name: int(name) if name.isdigit() else -1):
+        entry = group[number]
+        kind = entry["TransformType"][()]
+        kind = kind[0] if isinstance(kind, np.ndarray) else kind
+        kind = kind.decode("utf-8", "replace") if isinstance(kind, bytes) else str(kind)
+        if not kind.startswith("CompositeTransform"):
+            found.append(_Transform(kind, _dataset(source, entry, "Parameters"), _dataset(source, entry, "FixedParameters")))
+    return _field(source, found)
+
+
+def read_tfm(source: Path) -> tuple[FloatArray, Volume]:
+    """Return vectors (nz, ny, nx, 3), mm, and their grid, of a text file.
+
+    Raises
+    ------
+    InputError
+        No ITK transform, or transforms that are not one displacement field, followed by linear ones at most.
+    """
+    text = read_bytes(source).decode("utf-8", "replace")
+    if not text.startswith("#Insight Transform File"):
+        raise InputError(f"{source.name}: is no text file of ITK transforms: its first line is not '#Insight Transform File V1.0'")
+    found: list[_Transform] = []
+    for line in text.splitlines():
+        name, colon, value = line.partition(":")
+        if not colon or line.startswith("#"):
+            continue
+        if name.strip() == "Transform":
+            found.append(_Transform(value.strip(), np.zeros(0), np.zeros(0)))
+        elif found and name.strip() in ("Parameters", "FixedParameters"):
+            numbers = _numbers(source, name.strip(), value)
+            last = found.pop()
+            found.append(last._replace(parameters=numbers) if name.strip() == "Parameters" else last._replace(fixed=numbers))
+    return _field(source, [t for t in found if not t.kind.startswith("CompositeTransform")])
+
+
+def _dataset(source: Path, entry: Any, name: str) -> FloatArray:
+    stored = next((entry[f"{start}{name}"] for start in _TYPO if f"{start}{name}" in entry), None)
+    if not isinstance(stored, h5py.Dataset) or stored.external or stored.is_virtual:
+        raise InputError(f"{source.name}: a transform has no {name} of its own; write the file again")
+    require_plausible(source.name, stored.nbytes, stored.id.get_storage_size(), compressed=stored.chunks is not None)
+    return np.asarray(stored[()], dtype=float).ravel()
+
+
+def _numbers(source: Path, name: str, text: str) -> FloatArray:
+    try:
+        return np.array(text.split(), dtype=float)
+    except ValueError as error:
+        raise InputError(f"{source.name}: {name} holds what is no number ({error}); write the file again") from error
+
+
+def _field(source: Path, found: list[_Transform]) -> tuple[FloatArray, Volume]:
+    kinds = [t.kind for t in found]
+    fields = [t for t in found if t.kind.startswith("DisplacementFieldTransform")]
+    if len(fields) != 1 or found[-1] is not fields[0]:
+        raise InputError(
+            f"{source.name}: holds {', '.join(kinds) or 'no transform'}; naibu reads one DisplacementFieldTransform that is applied first, "
+            "with linear transforms after it: convert the whole to one displacement field (TransformToDisplacementField)"
+        )
+    vectors, grid = _of_field(source, fields[0])
+    moved = grid.positions() + vectors
+    for transform in reversed(found[:-1]):
+        moved = _linear(source, transform, moved)
+    return moved - grid.positions() if len(found) > 1 else vectors, grid
+
+
+def _of_field(source: Path, transform: _Transform) -> tuple[FloatArray, Volume]:
+    fixed, values = transform.fixed, transform.parameters
+    if "_3_3" not in transform.kind or len(fixed) != 18:
+        raise InputError(f"{source.name}: {transform.kind} has {len(fixed)} fixed parameters; one of three dimensions has 18")
+    size = fixed[:3]
+    if not (np.isfinite(fixed).all() and (size >= 1).all() and (size == np.round(size)).all() and size.prod() * 3 == len(values)):
+        raise InputError(f"{source.name}: states {size.tolist()} voxels, but has {len(values)} parameters, not three a voxel")
+    shape = tuple(int(n) for n in size[::-1])
+    axes = fixed[9:].reshape(3, 3) * fixed[6:9]
+    grid = volume_with_axes(source.name, np.zeros(shape, dtype=bool), fixed[3:6], axes)
+    return values.reshape(*shape, 3), grid
+
+
+def _linear(source: Path, transform: _Transform, points: FloatArray) -> FloatArray:
+    """Apply a linear transform: y = M (x - c) + c + t."""
+    p, centre = transform.parameters, transform.fixed
+    if transform.kind.startswith("IdentityTransform"):
+        return points
+    if transform.kind.startswith("TranslationTransform") and len(p) == 3:
+        return np.asarray(points + p)
+    if not transform.kind.startswith(_LINEAR) or len(p) != 12 or len(centre) < 3:
+        raise InputError(
+            f"{source.name}: the field is followed by a {transform.kind}; naibu reads affine transforms, translations and identities there"
+        )
+    return np.asarray((points - centre[:3]) @ p[:9].reshape(3, 3).T + centre[:3] + p[9:])

@@ -1,0 +1,233 @@
+"""Displacement fields of other programs, from small files made by hand after their documentation: the same vectors at the same places."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import nibabel
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from naibu.core.errors import InputError
+from naibu.io.displacement_fields import read_field
+
+SHAPE = (3, 4, 5)  # z, y, x
+SPACING, ORIGIN = np.array([1.0, 1.5, 2.0]), np.array([10.0, -20.0, 30.0])
+DIRECTION = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+VECTORS = np.random.default_rng(0).normal(size=(*SHAPE, 3)).round(3)
+LAST = (2, 3, 4)  # a voxel: index 4 along x, 3 along y, 2 along z
+# its place: each axis by itself
+PLACE = ORIGIN + DIRECTION @ (SPACING * np.array([4.0, 3.0, 2.0]))
+AFFINE_RAS = np.diag([-1.0, -1.0, 1.0, 1.0]) @ np.block([[DIRECTION * SPACING, ORIGIN[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+FIXED = [*SHAPE[::-1], *ORIGIN, *SPACING, *DIRECTION.ravel()]
+POINTS = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 7.0], [0.5, 8.0, 2.0]])
+MOVED = np.array([[0.1, 0.2, -0.3], [0.4, -0.5, 0.6], [0.0, 0.25, 0.75]])
+
+
+def check_grid(path: Path, vectors: np.ndarray = VECTORS) -> None:
+    """All vectors are those of LPS, and the last voxel lies where it should."""
+    field = read_field(path)
+    np.testing.assert_allclose(field.vectors, vectors, atol=1e-6)
+    np.testing.assert_allclose(field.points.reshape(*SHAPE, 3)[LAST], PLACE, atol=1e-5)
+
+
+def nifti(path: Path, vectors: np.ndarray, intent: int, name: str = "") -> Path:
+    """Write vectors (nz, ny, nx, 3) along the fifth axis, as they stand."""
+    image = nibabel.Nifti1Image(vectors.transpose(2, 1, 0, 3)[:, :, :, None], AFFINE_RAS)
+    image.header["intent_code"], image.header["intent_name"] = intent, name
+    nibabel.save(image, path)
+    return path
+
+
+def test_ants_writes_lps_vectors_and_the_standard_ras(tmp_path: Path) -> None:
+    check_grid(nifti(tmp_path / "1Warp.nii.gz", VECTORS, 1007))
+    check_grid(nifti(tmp_path / "ras.nii", VECTORS * (-1.0, -1.0, 1.0), 1006))
+
+
+def test_warps_that_mean_something_else_are_refused(tmp_path: Path) -> None:
+    for intent, name, words in ((2006, "", "a warp of FSL"), (1007, "NREG_TRANS", "a warp of NiftyReg"), (0, "", "intent 0")):
+        with pytest.raises(InputError, match=words):
+            read_field(nifti(tmp_path / "other.nii", VECTORS, intent, name))
+    with pytest.raises(InputError, match=r"\(nx, ny, nz, 1, 3\)"):
+        read_field(nifti(tmp_path / "two.nii", VECTORS[..., :2], 1007))
+
+
+def test_elastix_writes_vectors_of_a_metaimage(tmp_path: Path) -> None:
+    header = (
+        "ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\nCompressedData = False\n"
+        "TransformMatrix = 0 1 0 -1 0 0 0 0 1\nOffset = 10 -20 30\nCenterOfRotation = 0 0 0\nAnatomicalOrientation = RAI\n"
+        "ElementSpacing = 1 1.5 2\nDimSize = 5 4 3\nElementNumberOfChannels = 3\nElementType = MET_FLOAT\n"
+        "ElementDataFile = deformationField.raw\n"
+    )
+    (tmp_path / "deformationField.mhd").write_text(header)
+    (tmp_path / "deformationField.raw").write_bytes(VECTORS.astype("<f4").tobytes())
+    check_grid(tmp_path / "deformationField.mhd")
+
+
+def store(group: h5py.Group, number: int, kind: str, parameters: object, fixed: object, typo: str = "Transform") -> None:
+    own = group.create_group(str(number))
+    own.create_dataset("TransformType", data=np.array([kind.encode()]))
+    if parameters is not None:
+        own.create_dataset(f"{typo}Parameters", data=np.asarray(parameters, dtype=float))
+        own.create_dataset(f"{typo}FixedParameters", data=np.asarray(fixed, dtype=float))
+
+
+@pytest.mark.parametrize("typo", ["Transform", "Tranform"])
+def test_a_transform_of_itk_alone_and_before_an_affine_one(tmp_path: Path, typo: str) -> None:
+    with h5py.File(tmp_path / "alone.h5", "w") as root:
+        group = root.create_group("TransformGroup")
+        store(group, 0, "DisplacementFieldTransform_double_3_3", VECTORS.ravel(), FIXED, typo)
+    check_grid(tmp_path / "alone.h5")
+    matrix, centre, shift = (
+        np.array([[1.1, 0.1, 0.0], [0.0, 0.9, 0.0], [0.0, -0.2, 1.0]]),
+        np.array([5.0, 6.0, 7.0]),
+        np.array([1.0, 2.0, 3.0]),
+    )
+    with h5py.File(tmp_path / "Composite.h5", "w") as root:
+        group = root.create_group("TransformGroup")
+        store(group, 0, "CompositeTransform_double_3_3", None, None)
+        store(group, 1, "AffineTransform_double_3_3", [*matrix.ravel(), *shift], centre, typo)
+        store(group, 2, "DisplacementFieldTransform_double_3_3", VECTORS.ravel(), FIXED, typo)
+    at = read_field(tmp_path / "alone.h5").points.reshape(*SHAPE, 3)
+    expected = (at + VECTORS - centre) @ matrix.T + centre + shift - at
+    check_grid(tmp_path / "Composite.h5", expected)
+
+
+def test_a_transform_as_text(tmp_path: Path) -> None:
+    numbers = " ".join(map(str, VECTORS.ravel()))
+    fixed = " ".join(map(str, FIXED))
+    head = "#Insight Transform File V1.0\n#Transform 0\n"
+    path = tmp_path / "field.tfm"
+    path.write_text(f"{head}Transform: DisplacementFieldTransform_double_3_3\nParameters: {numbers}\nFixedParameters: {fixed}\n")
+    check_grid(path)
+    path.write_text(f"{head}Transform: AffineTransform_double_3_3\nParameters: 1 0 0 0 1 0 0 0 1 0 0 0\nFixedParameters: 0 0 0\n")
+    with pytest.raises(InputError, match=r"field\.tfm: holds AffineTransform_double_3_3; naibu reads one DisplacementFieldTransform"):
+        read_field(path)
+    path.write_text(f"{head}Transform: DisplacementFieldTransform_double_3_3\nParameters: 1 2 3\nFixedParameters: {fixed}\n")
+    with pytest.raises(InputError, match=r"states \[5.0, 4.0, 3.0\] voxels, but has 3 parameters"):
+        read_field(path)
+
+
+def test_spam_counts_in_voxels_and_marks_what_converged(tmp_path: Path) -> None:
+    names = "NodeNumber Zpos Ypos Xpos Fzz Fzy Fzx Zdisp Fyz Fyy Fyx Ydisp Fxz Fxy Fxx Xdisp error iterations returnStatus deltaPhiNorm"
+    header = names.replace(" ", "\t")
+    rows = [
+        [k, *p[::-1], 1, 0, 0, u[2], 0, 1, 0, u[1], 0, 0, 1, u[0], 0.1, 5, status, 0.01]
+        for k, (p, u, status) in enumerate(zip(POINTS.tolist(), MOVED.tolist(), (2, 2, -1), strict=True))
+    ]
+    path = tmp_path / "01-02-ldic.tsv"
+    path.write_text("\n".join([header, *("\t".join(f"{v:.7f}" for v in row) for row in rows)]) + "\n")
+    with pytest.raises(InputError, match="a table of SPAM, in voxels; give spacing_mm"):
+        read_field(path)
+    field = read_field(path, spacing_mm=(0.1, 0.1, 0.4))
+    np.testing.assert_allclose(field.points, POINTS * (0.1, 0.1, 0.4))
+    np.testing.assert_allclose(field.vectors[:2], MOVED[:2] * (0.1, 0.1, 0.4))
+    assert field.valid.tolist() == [True, True, False]
+    with pytest.raises(InputError, match=r"take the table beside them \(\.tsv\)"):
+        read_field(tmp_path / "01-02-ldic-Zdisp.tif")
+
+
+def test_aldvc_counts_from_one_node_after_the_other(tmp_path: Path) -> None:
+    result = np.empty((1, 1), dtype=object)
+    result[0, 0] = {"U": MOVED.reshape(-1, 1), "ULocalICGN": MOVED.reshape(-1, 1)}
+    savemat(tmp_path / "results.mat", {"ResultDisp": result, "DVCmesh": {"coordinatesFEM": POINTS + 1.0, "elementsFEM": np.ones((1, 8))}})
+    field = read_field(tmp_path / "results.mat", spacing_mm=(0.5, 0.5, 2.0))
+    np.testing.assert_allclose(field.points, POINTS * (0.5, 0.5, 2.0))
+    np.testing.assert_allclose(field.vectors, MOVED * (0.5, 0.5, 2.0))
+    with pytest.raises(InputError, match="a result of ALDVC, in voxels"):
+        read_field(tmp_path / "results.mat")
+    several = np.empty((2, 1), dtype=object)
+    several[0, 0] = several[1, 0] = result[0, 0]
+    for stored, words in (
+        ({"x": POINTS}, "lacks ResultDisp, and has x"),
+        ({"ResultDisp": result}, "lacks DVCmesh"),
+        ({"ResultDisp": several, "DVCmesh": {"coordinatesFEM": POINTS}}, "of 2 states"),
+        ({"ResultDisp": result, "DVCmesh": {"coordinatesFEM": POINTS[:2]}}, r"shape \(2, 3\) and U \(9, 1\)"),
+        ({"ResultDisp": result, "DVCmesh": {"nodes": POINTS}}, "no coordinatesFEM"),
+    ):
+        savemat(tmp_path / "bad.mat", stored)
+        with pytest.raises(InputError, match=words):
+            read_field(tmp_path / "bad.mat", spacing_mm=(1.0, 1.0, 1.0))
+
+
+def test_davis_names_units_and_marks_what_is_valid(tmp_path: Path) -> None:
+    rows = "\n".join(f"{x} {y} {z} {u} {v} {w} {k != 1:d}" for k, ((x, y, z), (u, v, w)) in enumerate(zip(POINTS, MOVED, strict=True)))
+    path = tmp_path / "B00001.dat"
+    names = 'VARIABLES = "x[mm]" "y[mm]" "z[mm]" "Vx[mm]" "Vy[mm]" "Vz[mm]" "isValid"'
+    head = f'TITLE = "B00001"\n{names}\nZONE T="Snapshot 0000"\nI=3, J=1, K=1, ZONETYPE = Ordered\nDATAPACKING = POINT\n'
+    path.write_text(head + rows + "\n")
+    field = read_field(path)
+    np.testing.assert_allclose(field.points, POINTS)
+    np.testing.assert_allclose(field.vectors[[0, 2]], MOVED[[0, 2]])
+    assert field.valid.tolist() == [True, False, True]
+    for text, words in (
+        (head.replace("Vx[mm]", "Vx[m/s]") + rows, "2 columns of displacements"),
+        (head.replace("POINT", "BLOCK") + rows, "by blocks"),
+        (head + rows + "\nZONE T=2\n" + rows, "line 9: a second zone begins"),
+        (head + "1 2 3\n", "line 6 holds no 7 numbers"),
+        ("1 2 3\n", "is no Tecplot text file"),
+    ):
+        path.write_text(text)
+        with pytest.raises(InputError, match=words):
+            read_field(path)
+
+
+def test_points_of_a_mesh_and_their_displacement(tmp_path: Path) -> None:
+    path = tmp_path / "solution.vtu"
+
+    def text(name: str, more: str = "") -> str:
+        numbers = [" ".join(map(str, a.ravel())) for a in (POINTS, MOVED)]
+        array = '<DataArray type="Float64" Name="{}" NumberOfComponents="3" format="ascii">{}</DataArray>'
+        return (
+            '<VTKFile type="UnstructuredGrid" version="1.0" byte_order="LittleEndian"><UnstructuredGrid>'
+            '<Piece NumberOfPoints="3" NumberOfCells="0">'
+            f"<PointData>{array.format(name, numbers[1])}{more}</PointData><Points>{array.format('Points', numbers[0])}</Points>"
+            "</Piece></UnstructuredGrid></VTKFile>"
+        )
+
+    other = text("v").split("<PointData>")[1].split("</PointData>")[0]
+    for written in (text("displacement"), text("U"), text("Displacement", other), text("anything")):
+        path.write_text(written)
+        np.testing.assert_allclose(read_field(path).vectors, MOVED)
+    np.testing.assert_allclose(read_field(path, unit="cm").points, 10.0 * POINTS)
+    path.write_text(text("a", other))
+    with pytest.raises(InputError, match="needs one array of three components at its points, called displacement; it has a, v"):
+        read_field(path)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "x_mm,y_mm,z_mm,ux_mm,uy_mm,uz_mm,sd_x_mm,sd_y_mm,sd_z_mm",
+        "X [mm],Y [mm],Z [mm],Displacement X [mm],Displacement Y [mm],Displacement Z [mm],sigma_x [mm],sigma_y [mm],sigma_z [mm]",
+        "x,y,z,u,v,w,sd_u,sd_v,sd_w",
+    ],
+)
+def test_tables_with_standard_deviations(tmp_path: Path, header: str) -> None:
+    sd = np.array([[0.01, 0.01, 0.04], [0.02, 0.01, 0.03], [0.01, 0.02, 0.05]])
+    rows = "\n".join(",".join(map(str, row)) for row in np.hstack([POINTS, MOVED, sd]).tolist())
+    (tmp_path / "field.csv").write_text(f"{header}\n{rows}\n")
+    field = read_field(tmp_path / "field.csv")
+    np.testing.assert_allclose(field.points, POINTS)
+    np.testing.assert_allclose(field.vectors, MOVED)
+    assert field.standard_deviation is not None
+    np.testing.assert_allclose(field.standard_deviation, sd)
+
+
+def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "field.csv"
+    for text, arguments, words in (
+        ("x,y,z\n1,2,3\n", {}, "no columns of displacements"),
+        ("x,y,z,ux,uy\n1,2,3,4,5\n", {}, "3 coordinates, but 2 columns of displacements"),
+        ("x,y,z,ux,uy,uz,u\n1,2,3,4,5,6,7\n", {}, "both 'ux' and 'u' may be the x of displacements"),
+        ("x,y,z,ux,uy,uz,sd_x,sd_y,sd_z\n1,2,3,4,5,6,1,-1,1\n", {}, r"row 1 of the points has standard deviations \[1.0, -1.0, 1.0\]"),
+        ("x,y,z,ux,uy,uz\n1,2,3,4,5,6\n", {"unit": "px"}, "unit = 'px' is not known"),
+        ("x,y,z,ux,uy,uz\n1,2,3,4,5,6\n", {"unit": "mm", "spacing_mm": (1.0, 1.0, 1.0)}, "give one of them"),
+    ):
+        path.write_text(text)
+        with pytest.raises(InputError, match=words):
+            read_field(path, **arguments)
+    with pytest.raises(InputError, match="states its own: leave it out"):
+        read_field(tmp_path / "field.mha", spacing_mm=(1.0, 1.0, 1.0))
