@@ -59,7 +59,8 @@ def foreign_fields(folder: Path) -> list[Path]:
     array = '<DataArray type="Float64" Name="{}" NumberOfComponents="3" format="ascii">{}</DataArray>'
     text = " ".join(map(str, POINTS.ravel()))
     (folder / "solution.vtu").write_text(
-        '<VTKFile type="UnstructuredGrid" version="1.0" byte_order="LittleEndian"><UnstructuredGrid><Piece NumberOfPoints="20" NumberOfCells="0">'
+        '<VTKFile type="UnstructuredGrid" version="1.0" byte_order="LittleEndian"><UnstructuredGrid>'
+        '<Piece NumberOfPoints="20" NumberOfCells="0">'
         f"<PointData>{array.format('displacement', text)}</PointData><Points>{array.format('Points', text)}</Points>"
         "</Piece></UnstructuredGrid></VTKFile>"
     )

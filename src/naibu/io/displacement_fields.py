@@ -158,8 +158,8 @@ def _stored(source: Path) -> DisplacementField:
     require_regular(source)
     with h5py.File(source, "r") as root:
         if itk_transforms.is_transform(root):
-            vectors, grid = itk_transforms.read_h5(source, root)
-            return DisplacementField.on_grid(grid, vectors)
+            moved, frame = itk_transforms.read_h5(source, root)
+            return DisplacementField.on_grid(frame, moved)
         if root.attrs.get("format") != FORMAT:
             raise InputError(f"{source.name}: contains no displacement field: its attribute 'format' is not {FORMAT!r}")
         vectors = _array(source, root, "vectors")

@@ -41,11 +41,11 @@ def read(source: Path, *, unit: str | None = None, spacing_mm: Sequence[float] |
     if table.in_voxels and spacing_mm is None:
         raise InputError(f"{source.name}: is a table of SPAM, in voxels; give spacing_mm, the size of a voxel along x, y, z")
     scale = np.ones(d) if spacing_mm is None else np.asarray(spacing_mm, dtype=float)[:d]
-    known = np.isfinite(table.points).all(axis=1)
+    known = np.asarray(np.isfinite(table.points).all(axis=1))
     if not known.any():
         raise InputError(f"{source.name}: has no point whose coordinates are all known")
     points, vectors = table.points[known] * scale, table.vectors[known] * scale
-    valid = np.isfinite(vectors).all(axis=1) & (True if table.valid is None else table.valid[known])
+    valid = np.asarray(np.isfinite(vectors).all(axis=1) & (True if table.valid is None else table.valid[known]))
     return DisplacementField.from_arrays(points, vectors, sd_mm=_sd(source, table, known, scale, valid), valid=valid)
 
 
