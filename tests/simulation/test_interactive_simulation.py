@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from touched_lattice import SPACING, TOP, touched_lattice
 
 from naibu.core.errors import ConvergenceError, InputError
-from naibu.mechanics import Assembler, elements, material, spherical_indenter
+from naibu.core.rigid_transform import rotation_matrix
+from naibu.mechanics import Assembler, box_indenter, elements, material, spherical_indenter
 from naibu.meshing import box
-from naibu.simulation import FiniteElementBody, InteractiveSimulation, RealTimeLoop
+from naibu.simulation import FiniteElementBody, InteractiveBody, InteractiveSimulation, RealTimeLoop
 
 
 def simulation() -> InteractiveSimulation:
@@ -40,6 +45,47 @@ def test_the_tool_is_never_faster_than_its_limit() -> None:
     centres = np.array([touched.advance().tool_centre for _ in range(12)])
     steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     assert steps.max() <= 3.0 * touched.extent_mm * touched.steps * touched.body.step_s * (1 + 1e-9)
+
+
+def lattice_or_gel(kind: str) -> InteractiveBody:
+    if kind == "lattice":
+        return touched_lattice()
+    mesh = box((TOP, TOP, TOP), (4, 4, 4))
+    mesh = replace(mesh, points=mesh.points - mesh.points.min(axis=0))
+    law = material(young_modulus=20.0, poisson_ratio=0.45)
+    assembler = Assembler.from_materials(elements(mesh, "mean_dilatation"), mesh.regions, [law])
+    return FiniteElementBody.of(mesh, assembler, supported=np.flatnonzero(mesh.points[:, 2] < 1e-9).astype(np.int64))
+
+
+@pytest.mark.parametrize("kind", ["lattice", "gel"])
+def test_a_tool_that_was_turned_presses_like_one_that_was_made_so(kind: str) -> None:
+    """Half a right angle about the vertical and a third of one about its own long axis, in steps; no faster than its limit."""
+    about = (np.array([0.0, 0.0, 0.25 * np.pi]), np.array([0.3, 0.3, 0.0]))
+    turned = rotation_matrix(about[1]) @ rotation_matrix(about[0])
+    plain = box_indenter((20.0, 18.0, 60.0), (30.0, 10.0, 6.0), static_friction=0.3, kinetic_friction=0.3)
+    made = replace(plain, geometry=replace(plain.geometry, axes=plain.geometry.axes @ turned.T))
+    rests = []
+    for tool in (plain, made):
+        touched = InteractiveSimulation(lattice_or_gel(kind), {"box": tool})
+        touched.take("box")
+        rotations = [touched.advance().tool_rotation]
+        if tool is plain:
+            for part in about:
+                touched.turn(part)
+        for _ in range(30):
+            rotations.append(touched.advance().tool_rotation)
+        angles = [np.linalg.norm(Rotation.from_matrix(b @ a.T).as_rotvec()) for a, b in itertools.pairwise(rotations)]
+        assert max(angles) <= 3.0 * touched.frame_s * (1 + 1e-9)
+        np.testing.assert_allclose(rotations[-1], turned if tool is plain else np.eye(3), atol=1e-9)
+        touched.move((20.0, 18.0, TOP + 2.0))
+        for _ in range(60):
+            frame = touched.advance()
+        assert frame.force[2] < -20.0 and not frame.failed
+        rests.append(frame)
+    moved = np.abs(rests[1].positions - touched.body.points).max()
+    np.testing.assert_allclose(rests[0].positions, rests[1].positions, atol=0.01 * moved)
+    np.testing.assert_allclose(rests[0].force, rests[1].force, atol=0.01 * np.linalg.norm(rests[1].force))
+    assert rests[0].penetration_mm == pytest.approx(rests[1].penetration_mm, abs=0.02)
 
 
 def test_a_gripped_node_follows_the_hand() -> None:

@@ -1,6 +1,6 @@
 // The inverse of naibu/viewer/live/scene.py: the scene from JSON, frames from bytes.
 const FLAGS = { paused: 1, driving: 2, recording: 4, replaying: 8, failed: 16 };
-const HEADER_BYTES = 88;
+const HEADER_BYTES = 104;
 
 const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
 
@@ -22,7 +22,7 @@ export function decodeScene(payload) {
 export function decodeFrame(buffer) {
   const view = new DataView(buffer);
   const magic = String.fromCharCode(...new Uint8Array(buffer, 0, 4));
-  if (magic !== "NLV1") throw new Error(`this is no frame of naibu: ${magic}`);
+  if (magic !== "NLV2") throw new Error(`this is no frame of naibu: ${magic}`);
   const nodes = view.getUint32(8, true);
   const float = (at) => view.getFloat32(at, true);
   const vector = (at) => [float(at), float(at + 4), float(at + 8)];
@@ -42,6 +42,7 @@ export function decodeFrame(buffer) {
     stepsPerSecond: float(76),
     realTime: float(80),
     unbalanced: float(84),
+    rotation: [...vector(88), float(100)],
     positions: new Float32Array(buffer, HEADER_BYTES, 3 * nodes),
     values: valued ? new Float32Array(buffer, HEADER_BYTES + 12 * nodes, nodes) : null,
   };

@@ -10,13 +10,16 @@ import { LiveView } from "./live-view.js";
 const MODES = { push: "Push", pull: "Pull", cut: "Cut", probe: "Probe" };
 const STROKE_PX = 6; // between two positions of the blade
 const HINTS = {
-  push: "Drag the tool, or use the keys W A S D (up, left, down, right) and Q E (away, towards). Drag elsewhere to rotate.",
+  push: "Drag the tool, or use the keys W A S D (up, left, down, right) and Q E (away, towards). Z X, C V, F G or Alt and the wheel turn it. Drag elsewhere to rotate.",
   pull: "Drag a point of the surface; it is released when you let go. Drag elsewhere to rotate.",
   cut: "Draw a line across the object: the blade cuts through it, away from you. Begin beside it to cut in from its rim.",
   probe: "Click a point of the surface to follow its displacement.",
 };
 const AXES = ["x", "y", "z"];
 const DEAD_ZONE = 0.15;
+const TURN = 0.1; // rad, of a key
+const PAD_TURN = 0.03; // rad, of a frame in which the stick is held
+const WHEEL_TURN = 0.001; // rad, of a pixel
 const UNBALANCED = 0.05; // of all forces, above which the badge says so
 const digits = (value) => String(Number(value.toPrecision(3))).replace("-", "−");
 const newtons = (force) => Math.hypot(...force) / 1000;
@@ -47,7 +50,7 @@ class LivePage {
   }
 
   #build(root) {
-    this.stage = h("div", { class: "stage", tabindex: 0, role: "application", "aria-label": "3-D view of the simulation. Arrow keys rotate, plus and minus zoom, W A S D Q E move the tool." });
+    this.stage = h("div", { class: "stage", tabindex: 0, role: "application", "aria-label": "3-D view of the simulation. Arrow keys rotate, plus and minus zoom, W A S D Q E move the tool, Z X, C V and F G turn it." });
     this.modes = Object.entries(MODES).filter(([mode]) => mode !== "cut" || this.scene.cuttable).map(([mode, text]) => this.#button(text, () => this.setMode(mode), { "data-mode": mode, "aria-pressed": "false" }));
     this.toolChoice = h("select", { id: "naibu-tool", onchange: () => this.take(this.toolChoice.value) },
       ...this.scene.tools.map((t) => h("option", { value: t.name }, t.name)), h("option", { value: "" }, "no tool"));
@@ -96,6 +99,8 @@ class LivePage {
   #keys() {
     const moves = { w: ["up", 1], s: ["up", -1], d: ["right", 1], a: ["right", -1], q: ["away", 1], e: ["away", -1] };
     const keys = Object.fromEntries(Object.entries(moves).map(([key, [axis, sign]]) => [key, () => this.nudge(axis, sign * 0.02)]));
+    const turns = { z: ["away", -1], x: ["away", 1], c: ["right", -1], v: ["right", 1], f: ["up", -1], g: ["up", 1] };
+    Object.entries(turns).forEach(([key, [axis, sign]]) => { keys[key] = () => this.turn(axis, sign * TURN); });
     return { ...keys, " ": () => this.command("pause", { on: !this.frame?.paused }), u: () => this.command("undo") };
   }
 
@@ -128,8 +133,20 @@ class LivePage {
     this.command("move", { at: this.lead });
   }
 
+  /** Turn the tool about an axis of the screen by an angle, rad. */
+  turn(axis, angle) {
+    if (!this.frame || this.frame.tool < 0) return;
+    this.command("turn", { by: this.view.screenAxes()[axis].map((v) => angle * v) });
+  }
+
   #listen() {
     const { stage, view } = this;
+    stage.addEventListener("wheel", (e) => {
+      if (!e.altKey) return;
+      e.preventDefault();
+      e.stopPropagation();
+      this.turn("away", WHEEL_TURN * Math.max(-200, Math.min(200, e.deltaY)));
+    }, { capture: true, passive: false });
     stage.addEventListener("pointerdown", (e) => {
       if (!this.frame || e.button !== 0) return;
       if (this.mode === "push" && (view.onTool(e.clientX, e.clientY) || e.shiftKey)) this.#drag(e, "move", this.frame.centre);
@@ -198,6 +215,9 @@ class LivePage {
     if (!pad) return;
     const axes = [["right", pad.axes[0]], ["up", -pad.axes[1]], ["away", -(pad.axes[3] ?? 0)]];
     axes.filter(([, value]) => Math.abs(value) > DEAD_ZONE).forEach(([axis, value]) => this.nudge(axis, 0.01 * value));
+    const held = (k) => Number(pad.buttons?.[k]?.pressed ?? false);
+    const turns = [["away", pad.axes[2] ?? 0], ["right", held(5) - held(4)], ["up", held(7) - held(6)]];
+    turns.filter(([, value]) => Math.abs(value) > DEAD_ZONE).forEach(([axis, value]) => this.turn(axis, PAD_TURN * value));
   }
 
   #show(frame) {

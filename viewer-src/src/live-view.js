@@ -33,6 +33,7 @@ export class LiveView extends View {
     this.fixtures = scene.fixtures.filter((f) => f.kind !== "plane").map((f) => this.#fixture(f));
     this.tools = scene.tools.map((t) => rigidBody(t));
     this.tools.forEach((t) => { t.visible = false; });
+    this.made = this.tools.map((t) => t.quaternion.clone());
     this.world.add(this.grid, this.skin, this.cap, this.markers, ...this.fixtures, ...this.tools, new HemisphereLight(0xffffff, 0x8a8a8a, 2.0), this.sun);
     this.applyTheme();
     this.#colours();
@@ -120,7 +121,9 @@ export class LiveView extends View {
     this.level.needsUpdate = true;
     this.tools.forEach((tool, k) => {
       tool.visible = k === frame.tool;
-      if (tool.visible) tool.position.set(...frame.centre);
+      if (!tool.visible) return;
+      tool.position.set(...frame.centre);
+      tool.quaternion.set(...frame.rotation).multiply(this.made[k]);
     });
     this.#placeMarkers();
     this.#cut();

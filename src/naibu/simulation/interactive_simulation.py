@@ -8,14 +8,16 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray, as_vector, require_positive
 from naibu.core.errors import ConvergenceError, InputError
+from naibu.core.rigid_transform import rotation_matrix
 from naibu.mechanics.contact.indenter_motion import IndenterVelocity
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.meshing.cutting.swept_blade import swept_blade
@@ -27,6 +29,8 @@ from naibu.simulation.lattice_cut import LatticeCut
 FRAME_S = 1.0 / 60.0
 REACH = 2.0  # extents of the body around its centre in which the tool stays
 SPEED = 3.0  # extents of the body a second that tool and grip move at most
+TURNING = 3.0  # rad/s that the tool turns at most
+LEAST_TURN = 1e-6  # rad
 UNDO = 20  # states kept
 THROUGH = 0.5  # of the thinnest half extent of a tool: how far it moves in a step at most, so that nothing passes through its middle
 
@@ -49,6 +53,8 @@ class Frame:
         Name of the tool in play, or an empty string.
     tool_centre : ndarray, shape (3,)
         Its position, mm.
+    tool_rotation : ndarray, shape (3, 3)
+        Its rotation since it was made.
     force : ndarray, shape (3,)
         Mean force of the tool on the body during the frame, mN.
     pull : ndarray, shape (3,)
@@ -71,6 +77,7 @@ class Frame:
     positions: FloatArray
     tool: str
     tool_centre: FloatArray
+    tool_rotation: FloatArray
     force: FloatArray
     pull: FloatArray
     penetration_mm: float
@@ -110,6 +117,8 @@ class InteractiveSimulation:
     _tool: str = field(init=False, default="")
     _centre: FloatArray = field(init=False)
     _target: FloatArray = field(init=False)
+    _rotation: FloatArray = field(init=False, default_factory=lambda: np.eye(3))
+    _rotation_target: FloatArray = field(init=False, default_factory=lambda: np.eye(3))
     _nodes: IntArray = field(init=False, default_factory=lambda: NO_NODES)
     _gripped: int = field(init=False, default=-1)
     _pull_target: FloatArray = field(init=False)
@@ -173,6 +182,16 @@ class InteractiveSimulation:
             A position that is no vector of finite numbers.
         """
         self._target = self._within(as_vector("centre", centre))
+
+    def turn(self, rotation: ArrayLike) -> None:
+        """Turn the tool further, about its centre, by a rotation vector (3,), rad.
+
+        Raises
+        ------
+        InputError
+            A rotation that is no vector of finite numbers.
+        """
+        self._rotation_target = rotation_matrix(as_vector("rotation", rotation)) @ self._rotation_target
 
     def grip(self, node: int, radius_mm: float = 0.0) -> None:
         """Grip a node of the surface, and those around it within a radius at rest, mm, to pull them.
@@ -303,17 +322,18 @@ class InteractiveSimulation:
         duration = self.steps * self.body.step_s
         reach = self.fastest_mm_s * duration
         centre = _towards(self._centre, self._target, min(reach, self._thin() * self.steps))
-        motions = self._motions((centre - self._centre) / duration)
+        spin = self._spin(duration)
+        motions = self._motions((centre - self._centre) / duration, spin)
         gripped = _towards(self._grip_position(), self._pull_target, reach) - self._grip_position()
         try:
             forces = self._session.step(self.body.grip_velocity(gripped / duration), motions, steps=self.steps)
         except ConvergenceError as error:
             self._session.restore(before)
-            self._target = self._centre
+            self._target, self._rotation_target = self._centre, self._rotation
             self._pull_target = self._grip_position()
             self._last = self._frame(self._last.number + 1, self._last.time_s, self._last.force, self._last.pull, str(error))
             return self._last
-        self._centre = centre
+        self._centre, self._rotation = centre, rotation_matrix(duration * spin) @ self._rotation
         force = forces.indenters[:, -1].mean(axis=0) if self._tool else np.zeros(3)
         pull = forces.bodies[:, 1].mean(axis=0) if self._gripped >= 0 else np.zeros(3)
         self._last = self._frame(self._last.number + 1, self._last.time_s + duration, force, pull, "")
@@ -336,9 +356,15 @@ class InteractiveSimulation:
             self._session.press(())
             self._session.restore(state)
 
-    def _motions(self, velocity: FloatArray) -> list[IndenterVelocity]:
+    def _motions(self, velocity: FloatArray, spin: FloatArray) -> list[IndenterVelocity]:
         still = [IndenterVelocity() for _ in self.body.fixtures]
-        return [*still, IndenterVelocity(velocity)] if self._tool else still
+        return [*still, IndenterVelocity(velocity, spin)] if self._tool else still
+
+    def _spin(self, duration: float) -> FloatArray:
+        """Return the angular velocity (3,), rad/s, of the tool in a frame."""
+        left = Rotation.from_matrix(self._rotation_target @ self._rotation.T).as_rotvec()
+        angle = float(np.linalg.norm(left))
+        return np.asarray(left / max(duration, angle / TURNING)) if angle > LEAST_TURN else np.zeros(3)
 
     def _press(self, tool: str) -> None:
         """Bring the fixtures and a tool, where it waits, into play."""
@@ -346,17 +372,18 @@ class InteractiveSimulation:
         self._session.press(())
         self._session.restore(self.body.without_contact(state))
         self._tool = tool
+        self._rotation = self._rotation_target = np.eye(3)
         if tool:
             self._centre = self._target = self._outside(self.tools[tool])
-        placed = [] if not tool else [_at(self.tools[tool], self._centre)]
-        self._session.press((*self.body.fixtures, *placed))
+        own = [] if not tool else [placed(self.tools[tool], self._centre)]
+        self._session.press((*self.body.fixtures, *own))
 
     def _outside(self, tool: RigidIndenter) -> FloatArray:
         """Where a tool waits, mm; raised until it is clear of the deformed body."""
         centre = np.array(tool.centre, dtype=float)
         positions = self._session.positions(self._surface)
         for _ in range(40):
-            if _at(tool, centre).gap(positions).min() > 0.0:
+            if placed(tool, centre).gap(positions).min() > 0.0:
                 break
             centre[2] += 0.1 * self.extent_mm
         return centre
@@ -386,7 +413,7 @@ class InteractiveSimulation:
         positions = self._session.positions()
         depth = 0.0
         if self._tool:
-            depth = max(0.0, -float(_at(self.tools[self._tool], self._centre).gap(positions[self._surface]).min()))
+            depth = max(0.0, -float(placed(self.tools[self._tool], self._centre, self._rotation).gap(positions[self._surface]).min()))
         return Frame(
             self.body,
             number,
@@ -394,6 +421,7 @@ class InteractiveSimulation:
             positions,
             self._tool,
             self._centre,
+            self._rotation,
             force,
             pull,
             depth,
@@ -404,10 +432,10 @@ class InteractiveSimulation:
         )
 
 
-def _at(tool: RigidIndenter, centre: FloatArray) -> RigidIndenter:
-    return RigidIndenter(
-        tool.geometry, centre, tool.static_friction, tool.kinetic_friction, tool.pull_stiffness, tool.pull_damping, tool.pull_speed
-    )
+def placed(tool: RigidIndenter, centre: FloatArray, rotation: FloatArray | None = None) -> RigidIndenter:
+    """Return a tool at another place (3,), mm, rotated (3, 3) since it was made."""
+    turned = tool.geometry if rotation is None else replace(tool.geometry, axes=tool.geometry.axes @ rotation.T)
+    return replace(tool, geometry=turned, centre=centre)
 
 
 def _towards(start: FloatArray, target: FloatArray, reach: float) -> FloatArray:

@@ -10,14 +10,14 @@ is that of a step, inertia included, and the largest of the last while: too much
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from naibu.core.arrays import FloatArray, require_positive
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
-from naibu.simulation.interactive_simulation import FRAME_S, Frame, InteractiveSimulation
+from naibu.simulation.interactive_simulation import FRAME_S, Frame, InteractiveSimulation, placed
 
 STIFFEST = 2e4  # mN/mm, of the continuation
 MEMORY_S = 0.25  # in which a stiffness that a step showed is forgotten: too much makes the tool slow, too little makes it bounce
@@ -174,6 +174,7 @@ class LocalContact:
                 shown = (push - max(before.push, 0.0) * float(before.direction @ direction)) / moved
                 stiffness = max(stiffness, min(shown, STIFFEST))
         elif stiffness > 0.0:
-            push = -stiffness * max(float(replace(tool, centre=place).gap(frame.positions[np.unique(frame.body.faces)]).min()), 0.0)
+            surface = frame.positions[np.unique(frame.body.faces)]
+            push = -stiffness * max(float(placed(tool, place, frame.tool_rotation).gap(surface).min()), 0.0)
         new = LocalReaction(place, direction, push, stiffness, tool.static_friction)
         self._old, self._new, self._since = before, new, 0.0

@@ -15,6 +15,7 @@ from naibu.viewer.live.commands import LARGEST, VOCABULARY, LiveCommand, read_co
 def test_commands_are_read() -> None:
     assert read_command('{"type": "next"}') == LiveCommand("next")
     assert read_command('{"type": "move", "at": [1, 2.5, -3]}').vector == (1.0, 2.5, -3.0)
+    assert read_command('{"type": "turn", "by": [0, 0.5, -3]}').vector == (0.0, 0.5, -3.0)
     assert len(read_command('{"type": "cut", "edges": [[[0, 0, 0], [1, 0, 0]], [[0, 1, 0], [1, 1, 0]]]}').edges) == 2
     assert read_command('{"type": "grip", "node": 7}').number == 7
     assert read_command('{"type": "pause", "on": true}').switch
@@ -35,6 +36,8 @@ def test_commands_are_read() -> None:
         ('{"type": "move", "at": [1, 2, 1e400]}', "finite"),
         ('{"type": "move", "at": [1, 2, true]}', "finite"),
         ('{"type": "pull", "at": [1, 2, 1e9]}', "at most"),
+        ('{"type": "turn", "by": [0, 4, 0]}', "at most 3 rad"),
+        ('{"type": "turn", "at": [0, 1, 0]}', "three numbers"),
         ('{"type": "grip", "node": -1}', "not negative"),
         ('{"type": "grip", "node": 1.5}', "whole number"),
         ('{"type": "grip", "node": true}', "whole number"),

@@ -79,6 +79,38 @@ def test_a_person_pushes_pulls_looks_inside_and_saves(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
+def test_keys_wheel_and_gamepad_move_and_turn_the_tool(tmp_path: Path) -> None:
+    turned = "2 * Math.acos(Math.min(1, Math.abs(naibuLive.frame.rotation[3])))"
+    with served() as (address, simulation), opened_browser() as page:
+        page.open(address)
+        page.wait("document.querySelector('.stage[data-ready]') !== null && naibuLive.frame.tool === 0", 60)
+        page.value("naibuLive.take('plate')")
+        page.wait("naibuLive.frame.tool === 1", 30)
+        page.value("document.querySelector('.stage').focus()")
+        page.key("z")
+        page.wait(f"Math.abs({turned} - 0.1) < 1e-3", 30)
+        wheel = "new WheelEvent('wheel', {deltaY: 200, altKey: true, bubbles: true, cancelable: true})"
+        page.value(f"document.querySelector('.stage canvas').dispatchEvent({wheel})")  # the other way, twice as far
+        page.wait(f"Math.abs({turned} - 0.1) < 1e-3 && naibuLive.view.tools[1].quaternion.angleTo(naibuLive.view.made[1]) > 0.09", 30)
+        height = page.value("naibuLive.frame.centre[2]")
+        buttons = "Array.from({length: 8}, () => ({pressed: false}))"
+        page.value(f"window.pad = {{axes: [0, -1, 0, 0], buttons: {buttons}}}; navigator.getGamepads = () => [null, pad]")
+        page.wait(f"naibuLive.frame.centre[2] > {height} + 1", 30)
+        page.value("pad.axes = [0, 0, 1, 0]")
+        page.wait(f"{turned} > 0.3", 30)
+        page.value("pad.axes = [0, 0, 0, 0]; pad.buttons[5].pressed = true")
+        before = page.value("naibuLive.frame.rotation")
+        page.wait(f"Math.hypot(...naibuLive.frame.rotation.map((v, k) => v - {before}[k])) > 0.1", 30)
+        page.value("pad.buttons[5].pressed = false; pad.axes = [0.05, 0.1, 0, 0]")  # a stick at rest
+        still = page.value("new Promise((done) => setTimeout(() => done(naibuLive.frame.centre), 1500))")
+        assert page.value("new Promise((done) => setTimeout(() => done(naibuLive.frame.centre), 500))") == still
+        page.picture(tmp_path / "turned.png")
+        assert page.console == []
+        rotation = simulation.loop.latest()[0].tool_rotation
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
 @pytest.mark.parametrize("kind", ["mesh", "lattice"])
 def test_a_person_cuts_a_body_and_takes_it_back(tmp_path: Path, kind: str) -> None:
     write_vtu(tmp_path / "gel.vtu", box((30.0, 30.0, 30.0), (4, 4, 4), cell_type="tetra"))

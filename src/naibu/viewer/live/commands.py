@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from naibu.core.errors import InputError
 
 LARGEST = 1e6  # mm; of a coordinate
+MOST_TURN = 3.0  # rad; of a command
 LONGEST_NAME = 40
 MOST_EDGES = 200  # of a cut
 
@@ -18,6 +19,7 @@ VOCABULARY: Mapping[str, str] = {
     "next": "",
     "tool": "name",
     "move": "vector",
+    "turn": "rotation",
     "grip": "number",
     "pull": "vector",
     "release": "",
@@ -43,7 +45,7 @@ class LiveCommand:
     kind : str
         A word of `VOCABULARY`.
     vector : tuple of float
-        Position, mm, of ``move`` and ``pull``.
+        Position, mm, of ``move`` and ``pull``; rotation vector, rad, of ``turn``.
     number : int
         Node, of ``grip``.
     name : str
@@ -80,6 +82,8 @@ def read_command(text: str) -> LiveCommand:
     match VOCABULARY[kind]:
         case "vector":
             return LiveCommand(kind, vector=_vector(f"{kind}: at", data.get("at")))
+        case "rotation":
+            return LiveCommand(kind, vector=_vector(f"{kind}: by", data.get("by"), MOST_TURN, "rad"))
         case "edges":
             return LiveCommand(kind, edges=_edges(kind, data.get("edges")))
         case "number":
@@ -111,11 +115,11 @@ def _edges(kind: str, value: object) -> tuple[tuple[Vector, ...], ...]:
     return tuple(tuple(_vector(f"{kind}: edges", vertex) for vertex in edge) for edge in value)
 
 
-def _vector(what: str, value: object) -> Vector:
+def _vector(what: str, value: object, largest: float = LARGEST, unit: str = "mm") -> Vector:
     if not isinstance(value, list) or len(value) != 3:
         raise InputError(f"{what} must be three numbers")
     for number in value:
-        if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number) or abs(number) > LARGEST:
-            raise InputError(f"{what} must be three finite numbers of at most {LARGEST:g} mm")
+        if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number) or abs(number) > largest:
+            raise InputError(f"{what} must be three finite numbers of at most {largest:g} {unit}")
     x, y, z = (float(v) for v in value)
     return x, y, z

@@ -11,7 +11,7 @@ import numpy as np
 from naibu.core.arrays import AnyArray, Float32Array, FloatArray, IntArray
 from naibu.viewer.motion_page import RigidShape
 
-MAGIC = b"NLV1"
+MAGIC = b"NLV2"
 HEADER = np.dtype(
     [
         ("magic", "S4"),
@@ -30,6 +30,7 @@ HEADER = np.dtype(
         ("steps_per_s", "<f4"),
         ("real_time", "<f4"),
         ("unbalanced", "<f4"),
+        ("rotation", "<f4", 4),
     ]
 )
 PAUSED, DRIVING, RECORDING, REPLAYING, FAILED = 1, 2, 4, 8, 16
@@ -134,6 +135,8 @@ class LiveFrame:
         Number of the scene that the nodes belong to.
     unbalanced : float
         Out-of-balance force that the next frames take up, as a fraction of all forces.
+    rotation : tuple of float
+        Of the tool since it was made, as a quaternion, scalar last.
     """
 
     number: int
@@ -151,6 +154,7 @@ class LiveFrame:
     strain: Callable[[], FloatArray]
     topology: int = 0
     unbalanced: float = 0.0
+    rotation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
 
 
 def frame_bytes(frame: LiveFrame, driving: bool, values: FloatArray | None = None) -> bytes:
@@ -162,6 +166,7 @@ def frame_bytes(frame: LiveFrame, driving: bool, values: FloatArray | None = Non
         ("topology", frame.topology), ("time_s", frame.time_s),
         ("force", frame.force), ("pull", frame.pull), ("centre", frame.centre), ("penetration", frame.penetration_mm),
         ("steps_per_s", frame.steps_per_s), ("real_time", frame.real_time), ("unbalanced", frame.unbalanced),
+        ("rotation", frame.rotation),
     ):  # fmt: skip
         header[name] = value
     parts: list[Float32Array] = [np.asarray(frame.positions, dtype="<f4")]

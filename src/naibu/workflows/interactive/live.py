@@ -10,6 +10,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
 from naibu.core.errors import InputError
@@ -17,7 +18,7 @@ from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.simulation.haptic_loop import LONGEST_STEP_S, HapticHand
 from naibu.simulation.haptic_thread import HapticThread
 from naibu.simulation.interactive_bodies import FiniteElementBody, InteractiveBody
-from naibu.simulation.interactive_simulation import FRAME_S, Frame, InteractiveSimulation
+from naibu.simulation.interactive_simulation import FRAME_S, Frame, InteractiveSimulation, placed
 from naibu.simulation.local_contact import LocalContact
 from naibu.simulation.real_time_loop import RealTimeLoop
 from naibu.viewer.live.commands import LiveCommand
@@ -71,6 +72,7 @@ class LiveSimulation:
             frame.number, frame.time_s, frame.positions, tool, frame.gripped, frame.tool_centre, frame.force, frame.pull,
             frame.penetration_mm, pace.steps_per_s, pace.real_time, flags,
             lambda: frame.body.strain(frame.positions), frame.topology, frame.unbalanced,
+            tuple(Rotation.from_matrix(frame.tool_rotation).as_quat().tolist()),
         )  # fmt: skip
 
     def command(self, command: LiveCommand) -> None:
@@ -110,11 +112,14 @@ class LiveSimulation:
         moved = np.stack([frame.positions[nodes] for frame in frames]) - body.points[nodes]
         times = np.array([frame.time_s for frame in frames]) - frames[0].time_s
         last = next((frame.tool for frame in reversed(frames) if frame.tool), "")
-        shapes = [_shape(last, self.loop.simulation.tools[last])] if last else []
+        turn = next((frame.tool_rotation for frame in reversed(frames) if frame.tool), np.eye(3))
+        shapes = [_shape(last, placed(self.loop.simulation.tools[last], np.zeros(3), turn))] if last else []
+        turned = any(frame.tool and not np.allclose(frame.tool_rotation, turn) for frame in frames)
+        told = ("Recorded from the live page.", *(["The tool is drawn as it was turned at the end."] if turned else []))
         centres = np.array([[frame.tool_centre] if last else [] for frame in frames]).reshape(len(frames), len(shapes), 3)
         force = np.array([[frame.force] if last else [] for frame in frames]).reshape(len(frames), len(shapes), 3)
         return MotionPage(
-            self.model.title, [*self.model.sentences, "Recorded from the live page."], times, faces.reshape(-1, 3), body.points[nodes],
+            self.model.title, [*self.model.sentences, *told], times, faces.reshape(-1, 3), body.points[nodes],
             moved, [ColourField("displacement, mm", np.linalg.norm(moved, axis=2))], shapes, centres, times, force,
         )  # fmt: skip
 
@@ -205,6 +210,8 @@ def _order(kind: str, command: LiveCommand) -> Callable[[InteractiveSimulation],
                 simulation.take(command.name)
             case "move":
                 simulation.move(command.vector)
+            case "turn":
+                simulation.turn(command.vector)
             case "grip":
                 simulation.grip(command.number, GRIP_RADIUS * simulation.extent_mm)
             case "pull":
