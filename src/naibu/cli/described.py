@@ -20,6 +20,7 @@ Flag = Annotated[bool, Parameter(negative=())]
 Out = Annotated[Path, Parameter(name=("--out", "-o"))]
 Overwrite = Annotated[bool, Parameter(name=("--overwrite", "-f"), negative=())]
 Known = Annotated[list[str] | None, Parameter(name=("--known", "-k"))]
+Layers = Annotated[list[str] | None, Parameter(name=("--layer", "-l"))]
 
 
 def _whole(hint: object, tokens: Sequence[Token]) -> int:
@@ -117,7 +118,7 @@ class ObjectOptions:
     shape: Literal["box", "half_ellipsoid", "cylinder", "hemisphere"] = "box"
     loading: Literal["plate", "bar", "side_plates"] = "plate"
     bar_width_mm: float | None = None
-    layer: Annotated[list[str] | None, Parameter(name=("--layer", "-l"))] = None
+    layer: Layers = None
     stated_mm: list[str] | None = None
     vertical: str | None = None
 
@@ -169,6 +170,25 @@ def layers_of(texts: Sequence[str]) -> tuple[Layer, ...]:
             ) from None
         layers.append(slab)
     return tuple(layers)
+
+
+def labels_of(texts: Sequence[str]) -> dict[int, str]:
+    """Return names by label from texts such as ``gel=1``.
+
+    Raises
+    ------
+    InputError
+        A text of another form, or a name or label twice.
+    """
+    names: dict[int, str] = {}
+    for text in texts:
+        name, _, label = text.rpartition("=")
+        if not name.strip() or not label.strip().isdecimal() or len(label) > 9:
+            raise InputError(f"zone_name {text!r} must give a name and a label, such as 'gel=1'")
+        if int(label) in names or name.strip() in names.values():
+            raise InputError(f"zone_name {text!r} names a label, or has a name, that another zone_name has; give each label one name")
+        names[int(label)] = name.strip()
+    return names
 
 
 def heights_of(texts: Sequence[str]) -> dict[str, float]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from naibu.cli.console import GRAVE, INTERRUPTED, NOT_EXPLAINED, WARNING, print_table, progress_display, say
-from naibu.cli.described import Flag, Known, ObjectOptions, Out, Overwrite, WorkerOptions, require_left_out
+from naibu.cli.described import Flag, Known, ObjectOptions, Out, Overwrite, WorkerOptions, labels_of, require_left_out
 from naibu.cli.run_record import found, wrote
 from naibu.cli.verbs import MARKERS, START, verb
 from naibu.core.errors import InputError
@@ -73,6 +73,7 @@ def identify(
     mask: Path | None = None,
     zones: Path | None = None,
     zone_name: list[str] | None = None,
+    loaded: list[str] | None = None,
     cell_map: Annotated[bool, Parameter(name="--map", negative=())] = False,
     unit: Unit | None = None,
     spacing_mm: tuple[float, float, float] | None = None,
@@ -116,6 +117,8 @@ def identify(
         With fields: volume of labels, one for each material, 0 outside.
     zone_name
         With fields: name of a label, 'gel=1'. May be repeated.
+    loaded
+        With fields: a side where forces act, x-, x+, y-, y+, z- or z+, if they act at no other. May be repeated.
     cell_map
         With fields: map the unknown moduli cell by cell, and make regions of the map.
     unit
@@ -133,12 +136,12 @@ def identify(
         )  # fmt: skip
         _identify_fields(
             experiments, mask=mask, zones=zones, zone_name=zone_name or [], known=known or (), law=law, each_cell=cell_map,
-            element_size_mm=element_size_mm, unit=unit, spacing_mm=spacing_mm, out=out, overwrite=overwrite,
+            loaded=loaded or (), element_size_mm=element_size_mm, unit=unit, spacing_mm=spacing_mm, out=out, overwrite=overwrite,
         )  # fmt: skip
         return
     require_left_out(
         "goes with displacement fields, and these are markers", zone_names=bool(zone_name), each_cell=cell_map, unit=unit is not None,
-        spacing_mm=spacing_mm is not None,
+        spacing_mm=spacing_mm is not None, loaded=bool(loaded),
     )  # fmt: skip
     from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 
@@ -159,6 +162,7 @@ def _identify_fields(
     known: Sequence[str],
     law: Law,
     each_cell: bool,
+    loaded: Sequence[str],
     element_size_mm: float,
     unit: Unit | None,
     spacing_mm: tuple[float, float, float] | None,
@@ -169,19 +173,11 @@ def _identify_fields(
 
     if law != "neo_hookean":
         raise InputError(f"law={law!r} is not known for fields; use 'neo_hookean'")
-    names: dict[int, str] = {}
-    for text in zone_name:
-        name, _, label = text.rpartition("=")
-        if not name.strip() or not label.strip().isdecimal() or len(label) > 9:
-            raise InputError(f"zone_name {text!r} must give a name and a label, such as 'gel=1'")
-        if int(label) in names or name.strip() in names.values():
-            raise InputError(f"zone_name {text!r} names a label, or has a name, that another zone_name has; give each label one name")
-        names[int(label)] = name.strip()
     began = time.perf_counter()
     with progress_display() as progress:
         result = identify_fields(
-            fields, mask=mask, zones=zones, zone_names=names, known=known, each_cell=each_cell, element_size_mm=element_size_mm, out=out,
-            unit=unit, spacing_mm=spacing_mm, overwrite=overwrite, progress=progress,
+            fields, mask=mask, zones=zones, zone_names=labels_of(zone_name), known=known, loaded=loaded, each_cell=each_cell,
+            element_size_mm=element_size_mm, unit=unit, spacing_mm=spacing_mm, out=out, overwrite=overwrite, progress=progress,
         )  # fmt: skip
     usable = result.estimate.verdict is None or result.estimate.verdict.ok
     for number, line in enumerate(result.notes):

@@ -11,6 +11,7 @@ from cyclopts import App
 OTHER_NAMES: Mapping[str, Mapping[str, str]] = {
     "identify": {"states": "state", "zone_names": "zone_name", "each_cell": "cell_map"},
     "predict": {"platen_position_mm": "height_mm", "held": "hold", "moved": "move", "field": "experiment"},
+    "design": {"zone_names": "zone_name", "layers": "layer", "expected": "expect", "pushes": "push"},
     "compare": {"candidates": "law"},
     "compare-methods": {"methods": "method"},
     "import": {"source": "initial"},

@@ -1,3 +1,4 @@
+from .fields.design import Design, Planned, design
 from .fields.identify_fields import FieldIdentification, identify_fields
 from .fields.predict_field import Comparison, FieldPredictionRun, predict_field
 from .identify import Identification
@@ -19,6 +20,7 @@ __all__ = [
     "CloudRun",
     "Comparison",
     "CutRun",
+    "Design",
     "DeviceRecord",
     "FieldIdentification",
     "FieldPredictionRun",
@@ -28,6 +30,7 @@ __all__ = [
     "NamedStudy",
     "ObjectDescription",
     "Pair",
+    "Planned",
     "ReproducedChapter",
     "SenseRun",
     "SequenceRun",
@@ -38,6 +41,7 @@ __all__ = [
     "compare_methods",
     "cut",
     "cut_surface_file",
+    "design",
     "drive_live_simulation",
     "identify_fields",
     "live",

@@ -20,22 +20,21 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.rigid_transform import registration
-from naibu.identification.from_fields.forward.field_laws import computed_mesh, field_law
+from naibu.identification.from_fields.forward.field_laws import field_law
 from naibu.identification.from_fields.forward.forward_model import Solvers, equilibrium, loaded_from_rest
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
 from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, modulus_columns
 from naibu.identification.from_fields.gauss_newton import first_point
 from naibu.identification.from_fields.identified_body import IdentifiedBody
+from naibu.identification.from_fields.sides import nodes_of_side
 from naibu.mechanics.linear_algebra.protocols import Factorization
 from naibu.meshing.point_location import interpolation_operator, locate
 from naibu.meshing.surface import boundary_nodes
 
 SAMPLES = 48  # of the measurement's noise: standard deviations are known to 10 %
 EXTRAPOLATED = 1.4  # whole error of a displacement over its change to half the element size, as for moduli
-SIDE = 0.25  # of the edge of a cell: nodes this near to an end of the body are on that side
 LEAST_POINTS = 20  # near the surface
-SIDES = ("x-", "x+", "y-", "y+", "z-", "z+")
 STEPS = 6  # Gauss-Newton steps for the displacement of the surface
 STILL = 1e-3  # of the largest displacement: a step that changes it less is the last one
 
@@ -78,25 +77,6 @@ class FieldPrediction:
         return np.asarray(np.sqrt((self.factor**2).sum(axis=2) + self.discrepancy_mm**2))
 
 
-def nodes_of_side(body: IdentifiedBody, side: str) -> BoolArray:
-    """Return the nodes (n,) at one end of a body, along the axis of its cells that is nearest to x, y or z of the scan.
-
-    Raises
-    ------
-    InputError
-        A side that is none of x-, x+, y-, y+, z-, z+.
-    """
-    if side not in SIDES:
-        raise InputError(f"side {side!r} is not known; use one of {', '.join(SIDES)}")
-    world = np.eye(3)["xyz".index(side[0])] * (1.0 if side[1] == "+" else -1.0)
-    along = body.axes.T @ world
-    axis = int(np.argmax(np.abs(along)))
-    height = body.mesh.points @ (body.axes[:, axis] * np.sign(along[axis]))
-    corners = body.mesh.points[body.mesh.cells[0]]
-    edge = float(np.ptp(corners @ body.axes[:, axis]))
-    return np.asarray(height > height.max() - SIDE * edge)
-
-
 def predict_moved_sides(body: IdentifiedBody, moved: Mapping[str, tuple[float, float, float]]) -> FieldPrediction:
     """Predict the displacement of a body some sides of which are held or moved by plates to which they stick.
 
@@ -114,17 +94,8 @@ def predict_moved_sides(body: IdentifiedBody, moved: Mapping[str, tuple[float, f
     ConvergenceError
         There is no equilibrium.
     """
-    fixed, values = np.zeros(body.mesh.n_points, dtype=bool), np.zeros_like(body.mesh.points)
-    for side, motion in moved.items():
-        nodes = nodes_of_side(body, side)
-        if (nodes & fixed).any() and not np.allclose(values[nodes & fixed], motion):
-            raise InputError(f"side {side} shares nodes with another side that moves otherwise; move opposite sides")
-        fixed |= nodes
-        values[nodes] = motion
-    if not np.ptp(values[fixed], axis=0).any():
-        raise InputError("no side moves against another, so that nothing deforms; hold one side and move another")
-    mask = np.repeat(fixed[:, None], 3, axis=1)
-    u, factor = _solved(body, body.mesh, mask, values)
+    mask, values = _motion_of_sides(body, moved)
+    u, factor = _solved(body, mask, values)
     zones = body.cell_zones
     law = field_law(body.mesh, body.law, averaged=True)
     lame, shear = body.lame_of_cells()
@@ -134,6 +105,33 @@ def predict_moved_sides(body: IdentifiedBody, moved: Mapping[str, tuple[float, f
     coarse = _change_on_finer_mesh(body, mask, values)
     spread = np.concatenate([moving.reshape(*u.shape, -1), EXTRAPOLATED * _diagonal(coarse)], axis=2)
     return FieldPrediction(body.mesh, u, spread, body.discrepancy_mm, _strain(body.mesh, u))
+
+
+def displacement_under_moved_sides(body: IdentifiedBody, moved: Mapping[str, tuple[float, float, float]]) -> FloatArray:
+    """Return the displacement (n, 3), mm, of a body as `predict_moved_sides` finds it, without its covariance.
+
+    Raises
+    ------
+    InputError
+        See `predict_moved_sides`.
+    ConvergenceError
+        There is no equilibrium.
+    """
+    return _solved(body, *_motion_of_sides(body, moved))[0]
+
+
+def _motion_of_sides(body: IdentifiedBody, moved: Mapping[str, tuple[float, float, float]]) -> tuple[BoolArray, FloatArray]:
+    """Return which components (n, 3) are held or moved, and their displacement (n, 3), mm."""
+    fixed, values = np.zeros(body.mesh.n_points, dtype=bool), np.zeros_like(body.mesh.points)
+    for side, motion in moved.items():
+        nodes = nodes_of_side(body.mesh, body.axes, side)
+        if (nodes & fixed).any() and not np.allclose(values[nodes & fixed], motion):
+            raise InputError(f"side {side} shares nodes with another side that moves otherwise; move opposite sides")
+        fixed |= nodes
+        values[nodes] = motion
+    if not np.ptp(values[fixed], axis=0).any():
+        raise InputError("no side moves against another, so that nothing deforms; hold one side and move another")
+    return np.repeat(fixed[:, None], 3, axis=1), values
 
 
 def predict_inside(body: IdentifiedBody, field: DisplacementField) -> tuple[FieldPrediction, BoolArray]:
@@ -229,9 +227,9 @@ def _noise(at: Linearised) -> FloatArray:
     return out
 
 
-def _solved(body: IdentifiedBody, mesh: Mesh, fixed: BoolArray, values: FloatArray) -> tuple[FloatArray, Factorization]:
+def _solved(body: IdentifiedBody, fixed: BoolArray, values: FloatArray) -> tuple[FloatArray, Factorization]:
     """Return the displacement (n, 3), mm, in equilibrium where some components (n, 3) have these values, and the factorized tangent."""
-    law = field_law(computed_mesh(mesh, "accurate")[0], body.law, averaged=True)
+    mesh, law = body.mesh, field_law(body.mesh, body.law, averaged=True)
     lame, shear = body.lame_of_cells()
     case = FieldLoadCase("prediction", _NOWHERE, fixed, np.zeros_like(values))
     start = loaded_from_rest(law, mesh.points, lame, shear, case, values)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,8 @@ from naibu.identification.from_fields.estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.from_fields.forward.forward_model import whitening
 from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, KnownRegion, Zones
-from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
+from naibu.identification.from_fields.forward.refinement import Refinement
+from naibu.identification.from_fields.forward.sensitivities import logarithms, young_and_poisson
 from naibu.identification.from_fields.stored_body import check_stored_body
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
@@ -102,6 +103,25 @@ class IdentifiedBody:
             noise, found.noise_factor, strain, tuple(case.name for case in load_cases),
             found.verdict.sentence if found.verdict is not None and doubtful else "", provenance,
         )  # fmt: skip
+
+    @classmethod
+    def stated(
+        cls, mesh: Mesh, zones: Zones, young_modulus: FloatArray, poisson_ratio: FloatArray, *, axes: FloatArray, law: LawName
+    ) -> IdentifiedBody:
+        """Return a body of stated moduli of its zones (k,), kPa, that are exactly known, as a truth to plan with."""
+        lame, shear = np.array([lame_parameters(e, nu) for e, nu in zip(young_modulus, poisson_ratio, strict=True)]).T
+        known_of_cell = np.full(mesh.n_cells, KNOWN, dtype=np.int64) if zones.region_of_cell is None else zones.region_of_cell
+        return cls(
+            mesh, axes, zones.names, zones_of_cells(zones), logarithms(lame, shear), None, zones.known, known_of_cell, law, False, 0.0, 1.0,
+            0.0, (),
+        )  # fmt: skip
+
+    def refined(self) -> IdentifiedBody:
+        """Return the body on a mesh of half the element size."""
+        every = np.repeat(np.arange(self.mesh.n_cells), 8)
+        return replace(
+            self, mesh=Refinement.of(self.mesh).mesh, parts=sp.csr_matrix(self.parts[every]), known_of_cell=self.known_of_cell[every]
+        )
 
     @property
     def cell_zones(self) -> Zones:

@@ -66,6 +66,7 @@ def identify_fields(
     zones: str | os.PathLike[str] | None = None,
     zone_names: Mapping[int, str] | None = None,
     known: Sequence[str] = (),
+    loaded: Sequence[str] = (),
     each_cell: bool = False,
     law: LawName = "neo_hookean",
     element_size_mm: float = 0.0,
@@ -92,6 +93,9 @@ def identify_fields(
         Names of labels; by default ``"label 1"`` and so on.
     known : sequence of str
         ``"gel=12 kPa"``, ``"gel=12 kPa, 0.45"`` with Poisson's ratio, ``"bone=rigid"``; or only a name, of which the others are multiples.
+    loaded : sequence of str
+        Sides of the object at which forces act, where they act at no other: ``x-``, ``x+``, ``y-``, ``y+``, ``z-``, ``z+`` in the frame of
+        the scan. By default they may act on the whole surface. A surface that is known to be free tells much of the moduli.
     each_cell : bool
         Map the moduli of unknown zones cell by cell, and make regions of the map.
     law : {"neo_hookean", "linear"}
@@ -125,14 +129,14 @@ def identify_fields(
     volume = float(inside.values.sum() * np.prod(inside.spacing_mm))
     size = element_size_mm or (volume / (CELLS_OF_MAP if each_cell else CELLS)) ** (1.0 / 3.0)
     mesh, cell_of_voxel = block_mesh(inside, labels, names, size)
-    cases = [measured_load_case(mesh, cell_of_voxel, inside, field, Path(p).stem) for p, field in zip(paths, read, strict=True)]
+    cases = [measured_load_case(mesh, cell_of_voxel, inside, field, Path(p).stem, loaded) for p, field in zip(paths, read, strict=True)]
     found = identify_field(
         mesh, cases, Zones.of(mesh, known=stated.values, known_sd=stated.doubts, each_cell=each_cell), law=law, progress=progress
     )
     inputs = input_record({"mask": mask, "zones": zones} | {f"field {k + 1}": p for k, p in enumerate(paths)})
     body = IdentifiedBody.of(
         found, axes=inside.direction, law=law, relative=stated.relative, strain=max(relative_deformation(c.field) for c in cases),
-        load_cases=cases, provenance={"naibu": __version__, "known": list(known), "inputs": dict(inputs)},
+        load_cases=cases, provenance={"naibu": __version__, "known": list(known), "loaded": list(loaded), "inputs": dict(inputs)},
     )  # fmt: skip
     notes = (*found.identifiability, *blurred(mesh, cell_of_voxel, inside, labels, names))
     result = FieldIdentification(found, body, stated.relative, notes)
@@ -234,6 +238,7 @@ def _written(folder: Path, result: FieldIdentification, inside: Volume, cells: I
         "in_words": list(result.notes),
         "steps": list(found.steps),
         "known": body.provenance["known"],
+        "loaded": body.provenance["loaded"],
         "law": body.law,
         "cells": found.mesh.n_cells,
         "inputs": body.provenance["inputs"],

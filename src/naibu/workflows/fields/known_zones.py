@@ -41,7 +41,7 @@ def parse_known_zones(known: Sequence[str], names: Sequence[str]) -> KnownZones:
         if equals and value == "rigid":
             rigid.append(name)
         elif equals:
-            values[name], doubts[name] = _stated_moduli(text, value)
+            values[name], doubts[name] = stated_moduli("known", text, value)
         else:
             relative, values[name], doubts[name] = True, (1.0, POISSON_RATIO), (0.0, POISSON_RATIO_SD)
     if not values:
@@ -55,15 +55,22 @@ def parse_known_zones(known: Sequence[str], names: Sequence[str]) -> KnownZones:
     return KnownZones(values | dict.fromkeys(rigid, (stiff, 0.3)), doubts, relative)
 
 
-def _stated_moduli(text: str, value: str) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return Young's modulus, kPa, and Poisson's ratio, and their standard deviations, of ``12 kPa`` or ``12 kPa, 0.45``."""
+def stated_moduli(argument: str, text: str, value: str) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return Young's modulus, kPa, and Poisson's ratio, and their standard deviations, of ``12 kPa`` or ``12 kPa, 0.45``.
+
+    Raises
+    ------
+    InputError
+        Another text, in the words of an argument.
+    """
     modulus, comma, ratio = (part.strip() for part in value.partition(","))
     try:
         young, poisson = kilopascals(modulus), float(ratio) if comma else POISSON_RATIO
     except ValueError as error:  # an InputError is one
         said = f" ({error})" if isinstance(error, InputError) else ""
-        ways = "write 'gel=12 kPa', 'gel=12 kPa, 0.45' with Poisson's ratio, 'bone=rigid', or 'gel'"
-        raise InputError(f"known={text!r}: {ways}{said}") from error
+        other = ", 'bone=rigid', or 'gel'" if argument == "known" else ""
+        ways = f"write 'gel=12 kPa', 'gel=12 kPa, 0.45' with Poisson's ratio{other}"
+        raise InputError(f"{argument}={text!r}: {ways}{said}") from error
     if not 0.0 <= poisson <= LARGEST_POISSON_RATIO:
-        raise InputError(f"known={text!r}: Poisson's ratio must lie between 0 and {LARGEST_POISSON_RATIO:g}, not {poisson:g}")
+        raise InputError(f"{argument}={text!r}: Poisson's ratio must lie between 0 and {LARGEST_POISSON_RATIO:g}, not {poisson:g}")
     return (young, poisson), (0.0, 0.0 if comma else POISSON_RATIO_SD)

@@ -2,24 +2,49 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from naibu.core.arrays import BoolArray, IntArray
+from naibu.core.arrays import IntArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.rigid_transform import registration
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
+from naibu.identification.from_fields.sides import loaded_nodes
 from naibu.meshing.point_location import locate
-from naibu.meshing.surface import boundary_nodes
 
 MOST_POINTS = 10_000  # measurements of a load case: neighbours in a field say the same
 LEAST_DEFORMATION, LARGEST_DEFORMATION = 1e-6, 0.5  # RMS of what a rigid motion leaves, part of the extent of the object
 
 
-def measured_load_case(mesh: Mesh, cell_of_voxel: IntArray, inside: Volume, field: DisplacementField, name: str) -> FieldLoadCase:
-    """Return the load case of the measurements inside the cells; all nodes of the surface carry unknown forces."""
+def measured_load_case(
+    mesh: Mesh, cell_of_voxel: IntArray, inside: Volume, field: DisplacementField, name: str, sides: Sequence[str] = ()
+) -> FieldLoadCase:
+    """Return the load case of the measurements inside the cells.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        The object.
+    cell_of_voxel : ndarray, shape (nz, ny, nx), int64
+        Cell of every voxel, -1 outside.
+    inside : Volume
+        The grid.
+    field : DisplacementField
+        What was measured.
+    name : str
+        For messages.
+    sides : sequence of str
+        Sides at which unknown forces act; the whole surface where none is named.
+
+    Raises
+    ------
+    InputError
+        Hardly a measurement in the object, one that does not deform, or a side that does not exist.
+    """
     at = field.at_points()
     index = np.round(inside.to_index(at.points)).astype(int)[:, ::-1]
     within = ((index >= 0) & (index < inside.shape)).all(axis=1) & at.valid
@@ -33,9 +58,7 @@ def measured_load_case(mesh: Mesh, cell_of_voxel: IntArray, inside: Volume, fiel
     covariance = None if at.covariance is None else at.covariance[chosen]
     some = DisplacementField.from_arrays(at.points[chosen], at.vectors[chosen], covariance=covariance)
     _require_deformation(name, some)
-    loaded: BoolArray = np.zeros(mesh.n_points, dtype=bool)
-    loaded[boundary_nodes(mesh)] = True
-    return FieldLoadCase.of(name, some, mesh, loaded=loaded)
+    return FieldLoadCase.of(name, some, mesh, loaded=loaded_nodes(mesh, inside.direction, sides))
 
 
 def relative_deformation(field: DisplacementField) -> float:

@@ -166,7 +166,7 @@ def predict_field(
     return replace(run, files=tuple(_written(folder, run, motions, dict(inputs))))
 
 
-def parsed_sides(held: Sequence[str], moved: Sequence[str]) -> dict[str, tuple[float, float, float]]:
+def parsed_sides(held: Sequence[str], moved: Sequence[str], *, argument: str = "moved") -> dict[str, tuple[float, float, float]]:
     """Read ``z-`` and ``z+=0,0,-5``.
 
     Raises
@@ -175,21 +175,23 @@ def parsed_sides(held: Sequence[str], moved: Sequence[str]) -> dict[str, tuple[f
         A text of another form, or a side that is named twice.
     """
     out: dict[str, tuple[float, float, float]] = {}
-    for side, motion in [(text.strip(), (0.0, 0.0, 0.0)) for text in held] + [_motion(text) for text in moved]:
+    for side, motion in [(text.strip(), (0.0, 0.0, 0.0)) for text in held] + [_motion(argument, text) for text in moved]:
         if side in out:
             raise InputError(f"side {side!r} is named twice; hold it, or move it once")
         out[side] = motion
     return out
 
 
-def _motion(text: str) -> tuple[str, tuple[float, float, float]]:
+def _motion(argument: str, text: str) -> tuple[str, tuple[float, float, float]]:
     side, _, numbers = text.partition("=")
     try:
         x, y, z = (float(part) for part in numbers.split(","))
     except ValueError as error:
-        raise InputError(f"moved={text!r} must name a side and its displacement along x, y and z in mm, such as 'z+=0,0,-5'") from error
+        raise InputError(
+            f"{argument}={text!r} must name a side and its displacement along x, y and z in mm, such as 'z+=0,0,-5'"
+        ) from error
     if not np.abs([x, y, z]).max() <= LENGTHS_MM[1]:
-        raise InputError(f"moved={text!r}: a displacement must be at most {LENGTHS_MM[1]:g} mm")
+        raise InputError(f"{argument}={text!r}: a displacement must be at most {LENGTHS_MM[1]:g} mm")
     return side.strip(), (x, y, z)
 
 
