@@ -18,6 +18,7 @@ from naibu.core.errors import InputError
 from naibu.core.experiment import Layer
 from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
+from naibu.identification.from_fields.estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.identified_body import IdentifiedBody
@@ -190,35 +191,31 @@ def design(
     model = Zones.of(mesh, known=stated.values, known_sd=stated.doubts)
     young, poisson = np.array([sought[name] for name in model.names]).T
     truth = IdentifiedBody.stated(mesh, model, young, poisson, axes=inside.direction, law=law)
-    loads = _loads(pushes)
+    plans = list(product(_loads(pushes).items(), points, noise_mm))
     rows: list[Planned] = []
-    plans = list(product(loads.items(), points, noise_mm))
     for done, ((push, cases), count, noise) in enumerate(plans, start=1):
         found = planned_identification(truth, model, cases, points=count, noise_mm=noise, plates_only=plates_only)
-        assert found.uncertainty is not None and found.budget is not None
-        bounds, (of_young, of_poisson) = found.intervals()[0], found.uncertainty.of_young_and_poisson(found.theta)
-        for i, name in enumerate(model.names):
-            rows.append(
-                Planned(
-                    push,
-                    count,
-                    noise,
-                    name,
-                    float(young[i]),
-                    float(of_young[i]),
-                    float(found.budget.noise[i]),
-                    (float(bounds[i, 0]), float(bounds[i, 1])),
-                    float(found.young_modulus[i] / young[i] - 1.0),
-                    float(poisson[i]),
-                    float(of_poisson[i]),
-                )
-            )
+        rows += _rows(found, truth, push, count, noise)
         report_progress(progress, f"{push}, {count} points, {noise:g} mm", done=done, total=len(plans))
     result = Design(tuple(rows), _notes(rows, plates_only))
     if folder is None:
         return result
     inputs = dict(input_record({"zones": zones}))
     return replace(result, files=tuple(_written(folder, result, {"known": list(known), "expected": list(expected), "inputs": inputs})))
+
+
+def _rows(found: FieldEstimate, truth: IdentifiedBody, push: str, points: int, noise_mm: float) -> list[Planned]:
+    """Return a row for every zone that is sought."""
+    assert found.uncertainty is not None and found.budget is not None
+    bounds, (of_young, of_poisson) = found.intervals()[0], found.uncertainty.of_young_and_poisson(found.theta)
+    rows = []
+    for i, (name, young, poisson) in enumerate(truth.moduli()[: len(truth.zones)]):
+        of_noise, bias = float(found.budget.noise[i]), float(found.young_modulus[i] / young - 1.0)
+        interval = float(bounds[i, 0]), float(bounds[i, 1])
+        rows.append(
+            Planned(push, points, noise_mm, name, young, float(of_young[i]), of_noise, interval, bias, poisson, float(of_poisson[i]))
+        )
+    return rows
 
 
 def _require_plans(points: Sequence[int], noise_mm: Sequence[float], pushes: Sequence[str]) -> None:
