@@ -9,11 +9,18 @@ const PLAY_SECONDS = 3;
 
 const mm = (value) => (Number.isFinite(value) ? value.toFixed(2) : "–");
 const signed = (value) => (Number.isFinite(value) ? `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(2)}` : "–");
+const WORDS = {
+  choice: "Experiment and state", measured: "measured marker (loaded)", predicted: "predicted marker", arrow: "residual arrow", difference: "residual",
+  bar: "Residual, measured → predicted (mm)", part: "Residuals are shown at full load only, where markers were measured.",
+  none: "No marker of this state was measured; only the prediction is shown.", lacking: "not measured in this state",
+  missing: "markers lack a measured coordinate in this state.", load: "Load", from: "none", to: "full",
+};
 const sceneLabel = (s) => [s.experiment, s.state].filter(Boolean).join(" · ") || s.name;
 
 class ViewerPage {
   constructor(root, packed) {
     this.root = root;
+    this.words = { ...WORDS, ...JSON.parse(root.dataset.words ?? "{}") };
     this.packed = packed;
     this.decoded = new Map();
     this.#build();
@@ -34,11 +41,11 @@ class ViewerPage {
       h("button", { type: "button", "aria-label": "Zoom in", onclick: () => this.view.zoomBy(1.25) }, "+"),
       h("button", { type: "button", "aria-label": "Zoom out", onclick: () => this.view.zoomBy(0.8) }, "−"),
       h("button", { type: "button", onclick: () => this.view.look("oblique") }, "Reset view"));
-    this.stage = h("div", { class: "stage", tabindex: 0, role: "application", "aria-label": "3-D view. Arrow keys rotate, plus and minus zoom, R resets, N and P step through the markers by residual." });
+    this.stage = h("div", { class: "stage", tabindex: 0, role: "application", "aria-label": `3-D view. Arrow keys rotate, plus and minus zoom, R resets, N and P step through the markers by ${this.words.difference}.` });
     this.tip = h("div", { class: "tip", hidden: true });
     this.live = h("p", { class: "visually-hidden", "aria-live": "polite" });
     this.root.replaceChildren(
-      h("div", { class: "bar" }, h("label", { for: "naibu-scene" }, "Experiment and state"), this.choice, views),
+      h("div", { class: "bar" }, h("label", { for: "naibu-scene" }, this.words.choice), this.choice, views),
       this.stage,
       h("p", { class: "hint" }, "Drag to rotate, right-drag or drag with two fingers to pan. Click the view, then scroll to zoom. Point at a marker for its values."),
       this.#loadControls(), this.#legend(), this.#worst(), this.live);
@@ -55,8 +62,8 @@ class ViewerPage {
     });
     this.play = h("button", { type: "button", class: "play", onclick: () => (this.timer ? this.stop() : this.start()) }, "▶ Play");
     this.stepLabel = h("output", { for: "naibu-load", class: "steplabel" });
-    return h("div", { class: "load" }, this.play, h("div", { class: "slide" }, h("label", { for: "naibu-load" }, "Load"),
-      h("span", { class: "end" }, "none"), this.slider, h("span", { class: "end" }, "full")), this.stepLabel);
+    return h("div", { class: "load" }, this.play, h("div", { class: "slide" }, h("label", { for: "naibu-load" }, this.words.load),
+      h("span", { class: "end" }, this.words.from), this.slider, h("span", { class: "end" }, this.words.to)), this.stepLabel);
   }
 
   #toggle(what, icon, ...text) {
@@ -73,14 +80,14 @@ class ViewerPage {
     this.ticks = h("div", { class: "ticks" });
     this.arrowNote = h("p", { class: "arrow-note" });
     const toggles = h("fieldset", { class: "toggles" }, h("legend", {}, "Shown"),
-      this.#toggle("measured", '<circle cx="10" cy="10" r="5" class="g-measured"/>', "measured marker (loaded)"),
-      this.#toggle("predicted", '<path d="M10 2 18 10 10 18 2 10Z" class="g-predicted"/>', "predicted marker"),
-      this.#toggle("arrows", '<path d="M3 17 15 5M8 4.5H15.5V12" class="g-arrow"/>', "residual arrow"),
-      this.#toggle("skin", '<rect x="3" y="5" width="14" height="11" class="g-skin"/>', "predicted surface"),
-      this.#toggle("reference", '<rect x="3" y="4" width="14" height="13" class="g-reference"/>', "undeformed outline"),
-      this.#toggle("boxes", '<rect x="2" y="8" width="16" height="5" class="g-box"/>', "indenters"));
+      this.#toggle("measured", '<circle cx="10" cy="10" r="5" class="g-measured"/>', this.words.measured),
+      this.#toggle("predicted", '<path d="M10 2 18 10 10 18 2 10Z" class="g-predicted"/>', this.words.predicted),
+      this.#toggle("arrows", '<path d="M3 17 15 5M8 4.5H15.5V12" class="g-arrow"/>', this.words.arrow),
+      ...(this.packed.some((s) => s.faces.length) ? [this.#toggle("skin", '<rect x="3" y="5" width="14" height="11" class="g-skin"/>', "predicted surface"),
+      this.#toggle("reference", '<rect x="3" y="4" width="14" height="13" class="g-reference"/>', "undeformed outline")] : []),
+      ...(this.packed.some((s) => s.steps.some((t) => t.boxes.length)) ? [this.#toggle("boxes", '<rect x="2" y="8" width="16" height="5" class="g-box"/>', "indenters")] : []));
     return h("div", { class: "legend" }, toggles, h("div", { class: "colourbar" },
-      h("p", { class: "barlabel" }, "Residual, measured → predicted (mm)"), this.gradient, this.ticks,
+      h("p", { class: "barlabel" }, this.words.bar), this.gradient, this.ticks,
       h("div", { class: "factor" }, h("label", { for: "naibu-factor" }, "Arrow scale"), this.factor, this.factorLabel), this.arrowNote));
   }
 
@@ -110,10 +117,10 @@ class ViewerPage {
   #listWorst() {
     const known = this.ranked.length > 0;
     const missing = this.scene.ids.length - this.ranked.length;
-    this.worst.replaceChildren(...(known ? [h("span", {}, "Largest residuals:"),
+    this.worst.replaceChildren(...(known ? [h("span", {}, `Largest ${this.words.difference}s:`),
       ...this.ranked.slice(0, 5).map((i) => h("button", { type: "button", onclick: () => this.#showMarker(i) },
-        `marker ${this.scene.ids[i]}: ${mm(this.scene.residualLength[i])} mm`))] : [h("span", {}, "No marker of this state was measured; only the prediction is shown.")]),
-    ...(known && missing ? [h("span", {}, `${missing} of ${this.scene.ids.length} markers lack a measured coordinate in this state.`)] : []));
+        `marker ${this.scene.ids[i]}: ${mm(this.scene.residualLength[i])} mm`))] : [h("span", {}, this.words.none)]),
+    ...(known && missing ? [h("span", {}, `${missing} of ${this.scene.ids.length} ${this.words.missing}`)] : []));
   }
 
   #showMarker(i) {
@@ -142,7 +149,7 @@ class ViewerPage {
   }
 
   #noteArrows() {
-    this.arrowNote.textContent = this.view.atFullLoad ? "" : "Residuals are shown at full load only, where markers were measured.";
+    this.arrowNote.textContent = this.view.atFullLoad ? "" : this.words.part;
   }
 
   #theme() {
@@ -177,10 +184,10 @@ class ViewerPage {
     const { scene } = this;
     const length = scene.residualLength[i];
     const r = [0, 1, 2].map((k) => scene.residual[3 * i + k]);
-    const head = `Marker ${scene.ids[i]}, layer ${scene.layers[i] + 1}`;
+    const head = `Marker ${scene.ids[i]}, ${this.words.groups?.[scene.layers[i]] ?? `layer ${scene.layers[i] + 1}`}`;
     const lines = Number.isFinite(length)
-      ? [`residual ${mm(length)} mm`, `x ${signed(r[0])}  y ${signed(r[1])}  z ${signed(r[2])} mm`, `noise SD ${mm(scene.sd[i])} mm along each axis`]
-      : ["not measured in this state", ...(r.some(Number.isFinite) ? [`x ${signed(r[0])}  y ${signed(r[1])}  z ${signed(r[2])} mm`] : [])];
+      ? [`${this.words.difference} ${mm(length)} mm`, `x ${signed(r[0])}  y ${signed(r[1])}  z ${signed(r[2])} mm`, `noise SD ${mm(scene.sd[i])} mm along each axis`]
+      : [this.words.lacking, ...(r.some(Number.isFinite) ? [`x ${signed(r[0])}  y ${signed(r[1])}  z ${signed(r[2])} mm`] : [])];
     this.tip.replaceChildren(h("strong", {}, head), ...lines.map((line) => h("span", {}, line)));
     this.live.textContent = [head, ...lines].join(", ");
     this.#putTip(at);

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from naibu.viewer.cards import Card
+from naibu.viewer.marker_view import MarkerView
 from naibu.viewer.tables import Cell, Table
 
 if TYPE_CHECKING:
@@ -61,6 +62,8 @@ class Chapter:
         Seeds and sizes that the numbers depend on, shown at the end of the page.
     cards : tuple of Card
         What to know first.
+    view : MarkerView, optional
+        Shown in 3-D above the sections.
     """
 
     name: str
@@ -68,3 +71,4 @@ class Chapter:
     sections: tuple[Section, ...]
     settings: dict[str, Cell] = field(default_factory=dict)
     cards: tuple[Card, ...] = ()
+    view: MarkerView | None = None

@@ -14,6 +14,7 @@ from naibu._version import __version__
 from naibu.io.files.atomic import write_atomically
 from naibu.viewer.cards import cards_html
 from naibu.viewer.chapter import Chapter, Figure, Section
+from naibu.viewer.marker_view import SCRIPT
 from naibu.viewer.page_frame import page_html
 from naibu.viewer.tables import Cell, provenance_section, table_html
 
@@ -58,9 +59,10 @@ def chapter_html(chapter: Chapter) -> str:
     sections = "\n".join(_section(i, section) for i, section in enumerate(chapter.sections))
     sections += provenance_section({"naibu": __version__, **chapter.settings})
     contents = f'<nav aria-label="Contents"><ul>{links}</ul></nav>' if len(chapter.sections) > 1 else ""
-    return page_html(
-        chapter.title, cards_html(chapter.cards) + contents, sections, "This page is self-contained: it loads nothing from the network."
-    )
+    header, footer = cards_html(chapter.cards) + contents, "This page is self-contained: it loads nothing from the network."
+    if chapter.view is None or not chapter.view.scenes:
+        return page_html(chapter.title, header, sections, footer)
+    return page_html(chapter.title, header, chapter.view.html() + sections, footer, data=chapter.view.data(), script=SCRIPT)
 
 
 def _section(index: int, section: Section) -> str:

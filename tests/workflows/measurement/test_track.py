@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -72,6 +75,19 @@ def test_an_experiment_folder_comes_out(scans: list[Path], tmp_path: Path) -> No
     ratio = np.sqrt(np.mean(error**2, axis=(0, 1))) / experiment.sd_mm
     assert (ratio > 1 / 1.5).all() and (ratio < 1.5).all(), ratio
     np.testing.assert_allclose(NoiseModel(model_mm=0.0).of_experiment(experiment), experiment.sd_mm)
+
+
+def test_the_page_shows_markers_in_3_d_and_over_the_scans(scans: list[Path], tmp_path: Path) -> None:
+    run = track(scans, out=tmp_path / "page", diameter_mm=DIAMETER)
+    page = run.page.read_text(encoding="utf-8")
+    found = re.search(r'id="naibu-scenes">([^<]*)</script>', page)
+    assert found
+    (scene,) = json.loads(gzip.decompress(base64.b64decode(found[1])))["scenes"]
+    shift = np.array(scene["markers"][1]).reshape(-1, 3) * scene["quantum_mm"]["marker"]
+    before = np.array(scene["measured"]).reshape(-1, 3) * scene["quantum_mm"]["marker"]
+    # the arrows are the known motion of the beads
+    assert np.abs(before + shift - before @ SQUEEZE).max() < 0.2
+    assert f"{len(LATTICE)} of {len(LATTICE)}" in page and page.count("<figure>") == 2
 
 
 def test_tables_alone_where_the_object_is_not_described(scans: list[Path], tmp_path: Path) -> None:

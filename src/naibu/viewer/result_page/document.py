@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from html import escape
 
 from naibu.viewer.cards import cards_html
+from naibu.viewer.marker_view import SCRIPT, MarkerView
 from naibu.viewer.page_frame import page_html
 from naibu.viewer.result_page.estimates import correlation_table, parameter_cards, parameter_table
 from naibu.viewer.result_page.figures import residual_panels, rms_bars
-from naibu.viewer.result_page.packing import packed_scenes
 from naibu.viewer.result_page.payload import Report, ResidualSet, Scene, VerdictNote
 from naibu.viewer.tables import provenance_section, table_html
 
@@ -24,11 +24,9 @@ def document(report: Report, scenes: Sequence[Scene]) -> str:
         body += provenance_section(report.provenance)
     header = f'{_headline(report)}<nav aria-label="Contents"><ul>{links}</ul></nav>'
     footer = "Lengths in mm, pressures and moduli in kPa. This page is self-contained: it loads nothing from the network."
-    return page_html(report.title, header, body, footer, data=_scene_data(scenes) if scenes else "", script="report.js" if scenes else "")
-
-
-def _scene_data(scenes: Sequence[Scene]) -> str:
-    return f'<script type="application/gzip+base64" id="naibu-scenes">{packed_scenes(scenes)}</script>'
+    return page_html(
+        report.title, header, body, footer, data=MarkerView(tuple(scenes)).data() if scenes else "", script=SCRIPT if scenes else ""
+    )
 
 
 def _headline(report: Report) -> str:
@@ -52,7 +50,7 @@ def _section(key: str, title: str, inner: str) -> str:
 def _sections(report: Report) -> list[tuple[str, str, str]]:
     """Return key, title and inner HTML of the sections that the report has, in reading order."""
     found = [
-        ("view", "Predicted and measured markers in 3-D", _viewer() if report.scenes else ""),
+        ("view", "Predicted and measured markers in 3-D", MarkerView(report.scenes).html() if report.scenes else ""),
         ("accuracy", "Accuracy", table_html(report.accuracy) if report.accuracy else ""),
         ("residuals", "Residuals by marker layer", _residuals(report.residuals)),
         ("parameters", "Parameters", _parameters(report)),
@@ -60,13 +58,6 @@ def _sections(report: Report) -> list[tuple[str, str, str]]:
         ("tables", "Further tables", "".join(table_html(t) for t in report.tables)),
     ]
     return [entry for entry in found if entry[2]]
-
-
-def _viewer() -> str:
-    return (
-        '<div id="naibu-viewer"></div>'
-        '<noscript><p class="no-3d">The 3-D view needs JavaScript; everything else on this page is complete without it.</p></noscript>'
-    )
 
 
 def _residuals(sets: Sequence[ResidualSet]) -> str:

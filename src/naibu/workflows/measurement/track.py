@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-import numpy as np
 
 from naibu.core.arrays import require_count, require_lengths
 from naibu.core.errors import InputError
@@ -21,15 +17,11 @@ from naibu.io.files.paths import require_usable_path
 from naibu.io.files.provenance import input_record
 from naibu.io.images import read_volume
 from naibu.io.marker_tables import write_experiment_folder, write_markers
-from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
+from naibu.workflows.measurement.track_page import track_chapter, track_rows
 from naibu.workflows.results.output_folder import output_folder
 from naibu.workflows.tilted_tables import Vertical, upright_tables
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure as Canvas
 
 ENDINGS = (".nii.gz", ".ome.tif", ".ome.tiff")
 
@@ -164,12 +156,11 @@ def track(
     _require_trusted(tracked)
     report_progress(progress, "writing")
     files, notes = _written(target, tracked, description, overwrite)
-    columns, rows = _table(tracked)
+    columns, rows = track_rows(tracked)
     settings: dict[str, Cell] = {"diameter, mm": diameter_mm, "thickness, mm": thickness_mm, "polarity": tracked.found[0].polarity}
     settings |= input_record({**{f"scan of {name}": scan for name, scan in zip(names, scans, strict=True)}, "mask": mask})
-    page, numbers = write_chapter(
-        Chapter("tracking", "Markers tracked through scans", (_section(tracked, columns, rows),), settings), target
-    )
+    table = Table("Markers", columns, rows, caption="found in every scan, and linked to the reference state")
+    page, numbers = write_chapter(track_chapter(tracked, volumes, diameter_mm, table, settings), target)
     return TrackRun(tracked, columns, rows, page, (*files, numbers), notes)
 
 
@@ -216,58 +207,3 @@ def _written(
         *([upright.told] if upright.told else []),
         *upright.notes,
     )
-
-
-def _table(tracked: TrackedMarkers) -> tuple[tuple[str, ...], tuple[tuple[Cell, ...], ...]]:
-    columns = ("state", "found", "linked", "of these suspect", "missing", "rejected", "standard deviation x, y, z (median), mm")
-    rows: list[tuple[Cell, ...]] = []
-    for s, name in enumerate(tracked.names):
-        flags, found = tracked.flags[s], tracked.found[s]
-        known = flags != "missing"
-        sd = np.nanmedian(tracked.sd_mm[s][known], axis=0)
-        rejected = "; ".join(f"{n} {why}" for why, n in Counter(r.reason for r in found.rejected).most_common(3))
-        summary = f"{len(found.rejected)}: {rejected}" if rejected else "0"
-        doubtful, missing = int((flags == "suspect").sum()), int((~known).sum())
-        rows.append((name, len(found), int(known.sum()), doubtful, missing, summary, ", ".join(f"{v:.3f}" for v in sd)))
-    return columns, tuple(rows)
-
-
-def _section(tracked: TrackedMarkers, columns: tuple[str, ...], rows: tuple[tuple[Cell, ...], ...]) -> Section:
-    words = (
-        f"{len(tracked.ids)} markers of the reference state were found again in at least one other state. A link is suspect where its "
-        "probability is below one half, or where the marker is an outlier to the smooth motion of its neighbours; suspect markers are not "
-        "used by an identification.",
-    )
-    table = Table("Markers", columns, rows, caption="found in every scan, and linked to the reference state")
-    return Section("Markers", words, (table,), tuple(_figure(tracked, s) for s in range(1, len(tracked.names))))
-
-
-def _figure(tracked: TrackedMarkers, s: int) -> Figure:
-    before, after, flags = tracked.points[0], tracked.points[s], tracked.flags[s]
-
-    def draw(canvas: Canvas) -> None:
-        for axis, (a, b) in zip(canvas.subplots(1, 3), ((0, 2), (1, 2), (0, 1)), strict=True):
-            _projection(axis, before, after, flags, a, b)
-        handles, names = canvas.axes[0].get_legend_handles_labels()
-        canvas.legend(handles, names, loc="outside lower left", ncols=4, frameon=False)
-
-    caption = "Displacement of the markers from the reference state, seen along y, x and z."
-    return Figure(f"State {tracked.names[s]}", caption, draw, (10.5, 4.2))
-
-
-def _projection(axis: Axes, before: np.ndarray, after: np.ndarray, flags: np.ndarray, a: int, b: int) -> None:
-    for flag, colour, label in (("ok", "#2a788e", "linked"), ("suspect", "#d95f02", "suspect")):
-        some = flags == flag
-        if not some.any():
-            continue
-        p, q = before[some], after[some]
-        axis.quiver(
-            p[:, a], p[:, b], (q - p)[:, a], (q - p)[:, b], angles="xy", scale_units="xy", scale=1.0, width=0.004, color=colour, label=label
-        )
-    lost = flags == "missing"
-    if lost.any():
-        axis.plot(before[lost, a], before[lost, b], "x", color="#7f7f7f", ms=4, label="not found")
-    # arrows do not widen the axes
-    both = np.concatenate([before, after])
-    axis.plot(both[:, a], both[:, b], ".", ms=0.1, alpha=0.0)
-    axis.set(xlabel=f"{'xyz'[a]}, mm", ylabel=f"{'xyz'[b]}, mm", aspect="equal")
