@@ -23,8 +23,8 @@ class MarkerView:
     words : dict of str to str or list of str
         Labels that differ from those of the result page: ``choice``, ``measured``, ``predicted``, ``arrow``, ``difference`` (a noun),
         ``bar`` (above the colours), ``part`` (while the load is not full), ``none`` (no arrow at all), ``lacking`` (of a marker without
-        arrow), ``missing`` (after the number of such markers), ``groups`` (names of `Scene.layer`), ``load`` (the slider), ``from`` and ``to``
-        (its ends).
+        arrow), ``missing`` (after the number of such markers), ``groups`` (names of `Scene.layer`), ``load`` (the slider), ``from`` and
+        ``to`` (its ends).
     """
 
     scenes: tuple[Scene, ...]
