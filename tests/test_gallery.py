@@ -52,4 +52,4 @@ def runs_and_labels_its_axes(script: Path) -> None:
 
 
 def test_there_is_a_gallery() -> None:
-    assert len(SCRIPTS) >= 20 and len(TUTORIALS) >= 4
+    assert len(SCRIPTS) >= 20 and len(TUTORIALS) >= 6

@@ -204,6 +204,7 @@ def serve(server: LiveServer, port: int, ready: Callable[[str], None]) -> None:
         bound = socket.bind_socket()
     except SystemExit as error:
         raise InputError(f"port {port} is taken or not allowed; choose another, or 0 for a free one") from error
+    bound.listen()  # what connects from now on waits for the server
     chosen = bound.getsockname()[1]
     config = uvicorn.Config(
         server.app(chosen), log_level="warning", lifespan="off", ws="websockets-sansio", ws_max_size=LONGEST_MESSAGE,
