@@ -7,7 +7,8 @@ What was identified is pushed in the browser, and in Python by the same steps. O
     naibu identify my_gel -k 'gel=200 kPa' -o results
     naibu live results --experiment my_gel
 
-``--experiment`` names the folder whose body is made; without it, the first experiment of the identification is taken, where that comes with naibu.
+``--experiment`` names the folder whose body is made; without it, the first experiment of the identification is taken, where that comes
+with naibu.
 """
 
 # %%
@@ -92,5 +93,6 @@ plt.show()
 print(f"{force[-1]:.2f} N at 8 mm; a frame of 1/60 s took {1e3 * np.median(took):.0f} ms in the median on this machine")
 
 # %%
-# Buttons of the page do what methods do here: pull, cut, undo, record; a recording is saved as one page that needs no server (:doc:`/live`).
-# A haptic device leads the tool of a lattice, which is fast enough for 1 kHz; finite elements such as these keep up with the eye.
+# Buttons of the page do what methods do here: pull, cut, undo, record; a recording is saved as one page that needs no server
+# (:doc:`/live`). A haptic device leads the tool of a lattice, which is fast enough for 1 kHz; finite elements such as these keep up with
+# the eye.

@@ -43,8 +43,9 @@ def task(number: int) -> subprocess.Popen[bytes]:
 # %%
 # A task that is stopped
 # ----------------------
-# Slurm sends SIGTERM two minutes before the time is over (``--signal=B:TERM@120``). naibu ends with the exit code 143, and leaves the checkpoint
-# that it has written after every iteration: the same command goes on from there. With SIGINT it would also write the best model so far.
+# Slurm sends SIGTERM two minutes before the time is over (``--signal=B:TERM@120``). naibu ends with the exit code 143, and leaves the
+# checkpoint that it has written after every iteration: the same command goes on from there. With SIGINT it would also write the best model
+# so far.
 first = task(0)
 log = place / "ct_cube_bar.log"
 while first.poll() is None and not (log.exists() and "calibration" in log.read_text()):
@@ -70,10 +71,9 @@ for name, document in documents.items():
     print(f"{name}: exit code {document['exit_code']}, {document['results']['verdict']}")
 
 figure, axes = plt.subplots(figsize=(6.5, 3.4), layout="constrained")
-for k, (name, document) in enumerate(documents.items()):
+for k, document in enumerate(documents.values()):
     (table,) = (table for table in document["tables"] if table["title"] == "Parameters")
-    frictions = [row for row in table["rows"] if row["parameter"].endswith("acrylic: friction")]
-    for row in frictions:
+    for row in (row for row in table["rows"] if row["parameter"].endswith("acrylic: friction")):
         axes.errorbar(
             row["estimate"], k, xerr=[[row["estimate"] - row["95 % from"]], [row["to"] - row["estimate"]]], fmt="o", capsize=4, color="C0"
         )

@@ -12,7 +12,7 @@ from touched_lattice import SPACING, TOP, touched_lattice
 
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.rigid_transform import rotation_matrix
-from naibu.mechanics import Assembler, box_indenter, elements, material, spherical_indenter
+from naibu.mechanics import Assembler, box_indenter, elements, material, plane_indenter, spherical_indenter
 from naibu.meshing import box
 from naibu.simulation import FiniteElementBody, InteractiveBody, InteractiveSimulation, RealTimeLoop
 
@@ -228,6 +228,26 @@ def test_a_lattice_is_cut_while_it_is_touched() -> None:
     assert lower[..., 2].max() < 24.0
     assert touched.undo() and touched.undo()
     assert len(touched.last.positions) == before.n_nodes
+
+
+def test_a_body_that_has_sunk_into_its_table_can_be_touched() -> None:
+    held = touched_lattice()
+    weight = np.tile([0.0, 0.0, -5.0], (len(held.points), 1))  # mN a node, ten times its own
+    table = plane_indenter((0.0, 0.0, 0.0), static_friction=0.5)
+    lying = replace(held, supported=np.zeros(0, dtype=np.int64), fixtures=(table,), external_force=weight)
+    touched = InteractiveSimulation(lying, {"sphere": spherical_indenter((20.0, 20.0, 60.0), 8.0)})
+    for _ in range(30):
+        touched.advance()
+    assert table.gap(touched.last.positions).min() < -1e-4  # the foundation yields
+    touched.take("sphere")
+    touched.move((20.0, 20.0, TOP + 4.0))
+    for _ in range(30):
+        frame = touched.advance()
+    assert frame.force[2] < 0.0 and not frame.failed
+    touched.take("")
+    touched.take("sphere")  # and again
+    with pytest.raises(InputError, match="inside the object"):  # a tool that was not in play
+        touched._session.press((table, spherical_indenter((20.0, 20.0, 20.0), 8.0)))
 
 
 def test_what_cannot_be_is_refused() -> None:

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     TOUCH,
     "live                             # the gels of the demonstration",
     "live naibu-results               # the model that you identified",
-    "live liver.vtu --young-modulus-kpa 5 --haptics-port 8766",
+    "live liver.vtu --young-modulus-kpa 5   # a mesh",
+    "live dough-pressed-by-sphere --haptics-port 8766   # a lattice, led by a haptic device",
 )
 def live(
     source: str = "demo",

@@ -112,6 +112,7 @@ class LatticeSession:
     speed: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     clock: Callable[[], float] = perf_counter
     _contact: ContactStepper | None = None
+    _resting: tuple[RigidIndenter, ...] = ()
     _largest_force: float = 0.0
     _began: float = 0.0
     _ended: float = 0.0
@@ -164,14 +165,19 @@ class LatticeSession:
     def press(self, indenters: Sequence[RigidIndenter]) -> None:
         """Bring these indenters, and no others, into play from the next step on, where they were made.
 
+        Those that were last in play and have not moved may be pressed into the object a little, as what carries it is.
+
         Raises
         ------
         InputError
-            An explicit method, or an indenter inside the object.
+            An explicit method, or a new indenter inside the object.
         """
+        if self._contact is not None:
+            where = self._contact.contact.centres
+            self._resting = tuple(p for p, centre in zip(self.indenters, where, strict=True) if np.array_equal(p.centre, centre))
         self._contact, self.indenters = None, ()
         if indenters:
-            self._bring(indenters, None)
+            self._bring(indenters, None, self._resting)
 
     def step(self, velocity: ArrayLike = 0.0, motions: Sequence[IndenterMotion] = (), *, steps: int = 1) -> StepForces:
         """Take steps.
@@ -278,12 +284,12 @@ class LatticeSession:
         """Close it."""
         self.close()
 
-    def _bring(self, indenters: Sequence[RigidIndenter], state: LatticeState | None) -> None:
+    def _bring(self, indenters: Sequence[RigidIndenter], state: LatticeState | None, resting: Sequence[RigidIndenter] = ()) -> None:
         lattice, stepper = self.engine.lattice, self.stepper
         if not isinstance(stepper, ImplicitStepper):
             raise InputError(f"contact needs method='implicit', which is stable when nodes stop at an indenter, not {self.engine.method!r}")
         known, surface = None if state is None else state.contact, self.engine.surface()
-        known = known or begin_contact(lattice, surface, indenters, self.positions())
+        known = known or begin_contact(lattice, surface, indenters, self.positions(), resting)
         self._contact = ContactStepper.of(stepper, indenters, known, surface, self.engine.divided)
         self.indenters, self.speed, self._largest_force = tuple(indenters), np.zeros((len(indenters), 3)), 0.0
 

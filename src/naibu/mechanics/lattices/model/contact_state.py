@@ -68,8 +68,10 @@ class ContactState:
         return replace(self, **{field.name: getattr(self, field.name).copy() for field in fields(self)})
 
 
-def check_outside(lattice: Lattice, indenters: Sequence[RigidIndenter], position: FloatArray | None = None) -> None:
-    """Check that indenters begin outside of a lattice.
+def check_outside(
+    lattice: Lattice, indenters: Sequence[RigidIndenter], position: FloatArray | None = None, resting: Sequence[RigidIndenter] = ()
+) -> None:
+    """Check that indenters begin outside of a lattice; those in `resting` carry it already, and it may have sunk into them a little.
 
     Raises
     ------
@@ -82,6 +84,8 @@ def check_outside(lattice: Lattice, indenters: Sequence[RigidIndenter], position
     middles = points[lattice.elements].mean(axis=1)  # a small indenter may lie between the nodes
     at = np.concatenate([points[np.unique(contact_faces(lattice))], middles])
     for k, indenter in enumerate(indenters):
+        if any(indenter is other for other in resting):
+            continue
         inside = indenter.gap(at)
         if inside.min() < -TOUCH_MM:
             deepest = at[int(np.argmin(inside))]
@@ -92,7 +96,11 @@ def check_outside(lattice: Lattice, indenters: Sequence[RigidIndenter], position
 
 
 def begin_contact(
-    lattice: Lattice, surface: ContactSurface, indenters: Sequence[RigidIndenter], position: FloatArray | None = None
+    lattice: Lattice,
+    surface: ContactSurface,
+    indenters: Sequence[RigidIndenter],
+    position: FloatArray | None = None,
+    resting: Sequence[RigidIndenter] = (),
 ) -> ContactState:
     """Return the contact of a lattice with indenters before anything moves: points on an indenter's surface touch it, the others are free.
 
@@ -106,13 +114,15 @@ def begin_contact(
         Floors included.
     position : ndarray, shape (n, 3)
         Of the nodes, mm; by default those of the reference configuration.
+    resting : sequence of RigidIndenter
+        Those of them that were in contact before.
 
     Raises
     ------
     InputError
         What `check_outside` refuses.
     """
-    check_outside(lattice, indenters, position)
+    check_outside(lattice, indenters, position, resting)
     points = lattice.points if position is None else position
     order = np.array([surface.order(p.geometry) for p in indenters], dtype=np.int64)
     gaps = []
