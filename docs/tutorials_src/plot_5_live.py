@@ -87,12 +87,12 @@ right = figure.add_subplot(1, 2, 2, projection="3d")
 moved = frames[-1].positions
 surface = right.plot_trisurf(*moved.T, triangles=model.body.faces, cmap="viridis", edgecolor="0.4", linewidth=0.2)
 surface.set_array(np.linalg.norm(moved - model.body.points, axis=1)[model.body.faces].mean(axis=1))
+surface.autoscale()
 right.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)")
-figure.colorbar(surface, ax=right, label="displacement (mm)", shrink=0.7)
+figure.colorbar(surface, ax=right, label="displacement (mm)", shrink=0.7, pad=0.15)
 plt.show()
 print(f"{force[-1]:.2f} N at 8 mm; a frame of 1/60 s took {1e3 * np.median(took):.0f} ms in the median on this machine")
 
 # %%
 # Buttons of the page do what methods do here: pull, cut, undo, record; a recording is saved as one page that needs no server
-# (:doc:`/live`). A haptic device leads the tool of a lattice, which is fast enough for 1 kHz; finite elements such as these keep up with
-# the eye.
+# (:doc:`/live`). A haptic device leads the tool at 1 kHz with ``--haptics-port``.
