@@ -34,7 +34,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
 FILES = ("field.h5", "links.csv", "mask.mha", "tracking.html", "tracking.json")
-ARROWS, DOTS = 1500, 12_000  # that a figure shows at most
+ARROWS, DOTS = 1500, 6000  # that a figure shows at most
+DPI = 180  # of arrows and dots, which are too many for vector graphics
 MASK_VOXELS = 2_000_000  # of the mask at most
 REACH = 1.2  # mean distances from a particle within which there is material
 
@@ -220,11 +221,14 @@ def _displacement(motion: ParticleMotion) -> Figure:
     views = _views(p.shape[1])
 
     def draw(canvas: Canvas) -> None:
+        canvas.set_dpi(DPI)
         size = np.linalg.norm(u, axis=1)
         for axis, (a, b) in zip(canvas.subplots(1, len(views), squeeze=False)[0], views, strict=True):
             arrows = axis.quiver(
-                p[:, a], p[:, b], u[:, a], u[:, b], size, angles="xy", scale_units="xy", scale=1.0, width=0.003, cmap="viridis"
-            )
+                p[:, a], p[:, b], u[:, a], u[:, b], size, angles="xy", scale_units="xy", scale=1.0, width=0.003, cmap="viridis",
+                rasterized=True,
+            )  # fmt: skip
+            arrows.set_in_layout(False)  # the layout need not go through all of them
             axis.set(xlabel=f"{'xyz'[a]}, mm", ylabel=f"{'xyz'[b]}, mm", aspect="equal")
         canvas.colorbar(arrows, ax=canvas.axes, label="displacement less its median, mm", shrink=0.7)
 
@@ -243,9 +247,11 @@ def _strain(motion: ParticleMotion) -> Figure:
     a, b = (0, 2) if d == 3 else (0, 1)
 
     def draw(canvas: Canvas) -> None:
+        canvas.set_dpi(DPI)
         limit = float(np.percentile(np.abs(np.diagonal(strain, axis1=1, axis2=2)), 98.0)) if len(some) else 1.0
         for k, axis in enumerate(canvas.subplots(1, d, squeeze=False)[0]):
             dots = axis.scatter(points[some, a], points[some, b], c=strain[:, k, k], s=5.0, cmap="RdBu_r", vmin=-limit, vmax=limit)
+            dots.set(rasterized=True, in_layout=False)
             axis.set(xlabel=f"{'xyz'[a]}, mm", ylabel=f"{'xyz'[b]}, mm", aspect="equal", title=f"$E_{{{'xyz'[k] * 2}}}$")
         canvas.colorbar(dots, ax=canvas.axes, label="strain", shrink=0.7, extend="both")
 
