@@ -55,7 +55,7 @@ def demo(*, out: Out = Path("naibu-demo"), overwrite: Overwrite = False, where: 
     MARKERS,
     "identify my_gel -k 'gel=20 kPa' --open          # your experiment folder, one modulus known",
     "identify ct_two_material_1 -k 'hardness 5'      # bundled data, moduli as ratios",
-    "identify naibu-sense/field.h5 --mask object.mha # a displacement field",
+    "identify naibu-sense/field.h5 --zones labels.nii.gz -k 'label 1=10 kPa' --map   # a displacement field",
 )
 def identify(
     experiments: list[str],

@@ -46,8 +46,8 @@ def sense(
     method
         Digital volume correlation regularised by mechanics (default), or a classic method.
     out
-        Folder for displacement.mha, standard_deviation.mha, displacement.vtu, field.h5, initial.csv and pressed.csv (positions as
-        markers), sense.json and report.html.
+        Folder for displacement.mha, standard_deviation.mha, displacement.vtu, field.h5, mask.mha (the object), initial.csv and pressed.csv
+        (positions as markers), sense.json and report.html.
     overwrite
         Replace results, or files of your own, that the folder already holds.
     """
@@ -61,6 +61,10 @@ def sense(
         say(warning.replace("`mask`", "--mask"), WARNING)
     wrote(*run.files)
     say(f"{run.seconds:.1f} s. Page: {run.files[0]}   fields: {', '.join(str(p.name) for p in run.files[1:])}")
+    if min(scans.reference.shape) > 1:
+        say(
+            f"Stiffness: naibu identify {out / 'field.h5'} --zones LABELS -k 'label 1=10 kPa', a volume of labels, one of them known", "dim"
+        )
 
 
 @verb(

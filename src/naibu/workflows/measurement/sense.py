@@ -38,7 +38,7 @@ from naibu.workflows.results.output_folder import output_folder
 MESH_CELLS, FIELD_POINTS = 60_000, 40_000
 MARKER_TABLES, MARKERS = ("initial", "pressed"), 250
 FILES = (
-    *("report.html", "displacement.mha", "standard_deviation.mha", "displacement.vtu", "field.h5", "sense.json"),
+    *("report.html", "displacement.mha", "standard_deviation.mha", "displacement.vtu", "field.h5", "mask.mha", "sense.json"),
     *(f"{table}.csv" for table in MARKER_TABLES),
 )
 LEAST_CERTAIN = 4.0  # median standard deviations; positions of a larger one make no markers; empirical
@@ -230,7 +230,8 @@ def sense_pair(
         See `naibu.imaging.measure_displacement.measure_displacement`.
     out : path-like, optional
         Folder for ``displacement.mha``, ``standard_deviation.mha`` (where the method states one), ``displacement.vtu`` (of volumes),
-        ``field.h5``, ``initial.csv`` and ``pressed.csv`` (positions in the object as markers), ``sense.json``, ``report.html``.
+        ``field.h5``, ``mask.mha`` (the object), ``initial.csv`` and ``pressed.csv`` (positions in the object as markers), ``sense.json``,
+        ``report.html``.
     overwrite : bool
         Whether results, or other files of these names, that `out` holds already are replaced.
     progress : Progress, optional
@@ -284,6 +285,7 @@ def _written(pair: Pair, run: SenseRun, folder: Path) -> list[Path]:
     if min(grid.shape) > 1:  # between the voxels of a single slice there are no cells
         files.append(_vtu(folder / "displacement.vtu", grid, measured))
     files.append(_field(folder / "field.h5", pair, measured))
+    files.append(write_volume(folder / "mask.mha", grid.with_values(measured.mask.astype(np.uint8))))
     files += [
         write_markers(folder / f"{name}.csv", markers) for name, markers in zip(MARKER_TABLES, _as_markers(measured, grid), strict=True)
     ]
