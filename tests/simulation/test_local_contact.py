@@ -13,7 +13,7 @@ from naibu.mechanics import Assembler, elements, material, spherical_indenter
 from naibu.meshing import box
 from naibu.simulation import FiniteElementBody, ForceLimits, Frame, HapticHand, InteractiveSimulation, LocalContact, SimulatedDevice
 from naibu.simulation.interactive_simulation import FRAME_S
-from naibu.simulation.local_contact import LocalReaction
+from naibu.simulation.local_contact import LocalFrame, LocalReaction
 
 STEP_S = 1e-3
 RADIUS, EDGE = 8.0, 40.0
@@ -33,7 +33,7 @@ class BesideBody:
     def __getattr__(self, name: str) -> object:  # as HapticHand sees it
         return getattr(self.contact, name)
 
-    def advance(self) -> Frame:
+    def advance(self) -> LocalFrame:
         self._due -= STEP_S
         if self._due <= 0.0:
             self._due += self.body.frame_s
@@ -79,7 +79,7 @@ def test_device_model_and_body_are_in_balance_at_rest() -> None:
     channel = LossyChannel(loss=0.0, late=0.0)
     led, hand = beside(channel)
     device = SimulatedDevice(lambda t: np.array([5.0, 6.0, 7.0 - 16.0 * min(t / 0.8, 1.0)]))
-    run = felt(led, hand, device, channel, 2.5)  # type: ignore[arg-type]
+    run = felt(led, hand, device, channel, 2.5)
     frame, force = led.body.last, run.forces[-1]
     assert force[2] > 100.0
     np.testing.assert_allclose(force, -frame.force, atol=0.02 * force[2])
@@ -102,7 +102,7 @@ def test_the_force_is_that_of_a_body_that_takes_steps_of_a_millisecond() -> None
         tool = spherical_indenter((0.0, 0.0, EDGE + RADIUS + 3.0), RADIUS, static_friction=0.3, kinetic_friction=0.3)
         body = InteractiveSimulation(gel(step_s), {"sphere": tool}, frame_s=step_s)
         led, hand = (body, HapticHand(channel)) if step_s == STEP_S else beside(channel, body)
-        runs.append(felt(led, hand, SimulatedDevice(path), channel, 0.9).forces[:, 2])  # type: ignore[arg-type]
+        runs.append(felt(led, hand, SimulatedDevice(path), channel, 0.9).forces[:, 2])
     expected, found = runs
     assert expected.max() > 200.0
     assert np.sqrt(np.mean((found - expected) ** 2)) < 0.03 * expected.max()
@@ -116,7 +116,7 @@ def test_lost_and_late_packets_and_frames_make_no_step_and_no_energy(seed: int) 
 
     channel = LossyChannel(seed, loss=0.01, late=0.02)
     led, hand = beside(channel, step_mn=60.0)
-    run = felt(led, hand, SimulatedDevice(stirring), channel, 1.5)  # type: ignore[arg-type]
+    run = felt(led, hand, SimulatedDevice(stirring), channel, 1.5)
     assert np.linalg.norm(np.diff(run.forces, axis=0), axis=1).max() <= 60.0 * (1 + 1e-9)
     assert np.linalg.norm(run.forces, axis=1).max() > 200.0
     assert run.work.max() <= hand.limits.energy_mn_mm
@@ -127,7 +127,7 @@ def test_a_tool_that_the_page_moves_is_taken_where_it_is() -> None:
     channel = LossyChannel(loss=0.0, late=0.0)
     led, hand = beside(channel)
     device = SimulatedDevice(lambda _: np.zeros(3))
-    felt(led, hand, device, channel, 0.2)  # type: ignore[arg-type]
+    felt(led, hand, device, channel, 0.2)
     led.body.undo()
     led.body.take("sphere")
     led.body.move((0.0, 0.0, EDGE + 3.0 * RADIUS))

@@ -9,10 +9,12 @@ import { LiveView } from "./live-view.js";
 
 const MODES = { push: "Push", pull: "Pull", cut: "Cut", probe: "Probe" };
 const STROKE_PX = 6; // between two positions of the blade
+const CLOSED_PX = 15; // between the ends of a path that is meant to be closed
+const CLOSED_FROM = 8; // positions
 const HINTS = {
   push: "Drag the tool, or use the keys W A S D (up, left, down, right) and Q E (away, towards). Z X, C V, F G or Alt and the wheel turn it. Drag elsewhere to rotate.",
   pull: "Drag a point of the surface; it is released when you let go. Drag elsewhere to rotate.",
-  cut: "Draw a line across the object: the blade cuts through it, away from you. Begin beside it to cut in from its rim.",
+  cut: "Draw a line across the object: the blade cuts through it, away from you. Begin beside it to cut in from its rim; a line that ends where it began cuts a piece out.",
   probe: "Click a point of the surface to follow its displacement.",
 };
 const AXES = ["x", "y", "z"];
@@ -186,12 +188,14 @@ class LivePage {
     const box = this.stage.getBoundingClientRect();
     const follow = (event) => {
       const [x, y] = path[path.length - 1];
-      if (Math.hypot(event.clientX - x, event.clientY - y) < STROKE_PX || path.length >= 200) return;
+      if (Math.hypot(event.clientX - x, event.clientY - y) < STROKE_PX || path.length >= 199) return;
       path.push([event.clientX, event.clientY]);
       this.view.overlay.draw(path.map(([a, b]) => [a - box.left, b - box.top]));
     };
     this.#followed(follow, () => {
       this.view.overlay.draw([]);
+      const [[x0, y0], [x1, y1]] = [path[0], path[path.length - 1]];
+      if (path.length >= CLOSED_FROM && Math.hypot(x1 - x0, y1 - y0) < CLOSED_PX) path.push(path[0]);
       if (path.length > 1) this.command("cut", { edges: path.map(([x, y]) => this.view.edgeThrough(x, y)) });
     });
   }
