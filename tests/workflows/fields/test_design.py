@@ -62,6 +62,25 @@ def test_the_plan_is_what_the_identification_then_states(measured: Path, plates_
     assert together.noise_sd < 0.95 * alone.noise_sd
 
 
+def test_markers_in_a_table_and_a_field_are_identified_together(measured: Path) -> None:
+    """Two loads of one cube, one measured as a field and one by sixty markers: one modulus, better known than from the field alone."""
+    rng = np.random.default_rng(5)
+    points, u = QuadraticBody("cube").solved(PUSHES["z+=3,0,0"], divisions=4).at(rng.uniform(0.05, 0.95, (60, 3)))
+    rows = np.hstack([points, u + 0.02 * rng.standard_normal(u.shape), np.full((60, 3), 0.02)])
+    header = ",".join(f"{name}{axis}_mm" for name in ("", "u", "sd_") for axis in "xyz")
+    np.savetxt(measured / "markers.csv", rows, delimiter=",", header=header, comments="")
+    sds = []
+    for names in (["push0.h5"], ["push0.h5", "markers.csv"]):
+        found = identify_fields(
+            [measured / name for name in names], zones=measured / "labels.mha", zone_names={1: "gel", 2: "pad"}, known=MATERIALS["known"],
+            loaded=["z-", "z+"], law="linear", element_size_mm=EDGE_MM,
+        ).estimate  # fmt: skip
+        (low, high), *_ = found.intervals()[0]
+        assert low < UNKNOWN[0] < high and found.budget is not None
+        sds.append(found.budget.noise[0] / np.sqrt(found.budget.shared))
+    assert sds[1] < sds[0]
+
+
 def test_noise_points_and_free_sides_count_as_they_should(tmp_path: Path) -> None:
     options = {"size_mm": SIZE, "layers": LAYERS, **MATERIALS, "pushes": ["z+=0,0,-4"], "law": "linear", "element_size_mm": EDGE_MM}
     plan = design(points=[400, 1600], noise_mm=[0.02, 0.04], plates_only=True, out=tmp_path, **options)  # type: ignore[arg-type]

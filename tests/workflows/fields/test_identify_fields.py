@@ -109,11 +109,29 @@ def test_a_map_finds_one_gel_where_there_is_one(folder: Path) -> None:
     assert "too coarse" in " ".join(run.notes)  # four cells a side
 
 
-def test_zones_that_end_inside_of_cubes_are_told(folder: Path) -> None:
-    """Five cubes a side: the border between the gels halves the middle ones."""
+def test_cells_end_where_zones_meet_in_a_plane(folder: Path) -> None:
+    """Twenty voxels of 2 mm, the border after 10 of them or after 7: no size of cells misses it, and cells stay near that size."""
     labels = read_volume(folder / "labels.mha")
-    inside, numbers, names = labels.with_values((labels.values > 0).astype(np.uint8)), labels.values.astype(np.int64), {1: "gel", 2: "pad"}
-    for size, told in ((8.0, True), (10.0, False)):
+    inside, names = labels.with_values((labels.values > 0).astype(np.uint8)), {1: "gel", 2: "pad"}
+    for first in (12, 9):
+        numbers = labels.values.astype(np.int64)
+        numbers[2:first, 2:22, 2:22], numbers[first:22, 2:22, 2:22] = 1, 2
+        for size in (5.0, 6.7, 8.0, 13.0):
+            mesh, cells = block_mesh(inside, numbers, names, size)
+            assert not blurred(mesh, cells, inside, numbers, names)
+            heights = np.unique(mesh.points[:, 2].round(6))
+            assert labels.to_physical(np.array([0.0, 0.0, first - 0.5]))[2] in heights
+            assert 0.5 * size < np.diff(heights).min() and np.diff(heights).max() < 1.6 * size
+            assert (cells >= 0).sum() == inside.values.sum()
+
+
+def test_zones_that_end_inside_of_cubes_are_told(folder: Path) -> None:
+    """A border that falls by half a voxel a voxel cuts cubes; one cell a voxel leaves nothing out."""
+    labels = read_volume(folder / "labels.mha")
+    inside, names = labels.with_values((labels.values > 0).astype(np.uint8)), {1: "gel", 2: "pad"}
+    z, _, x = np.indices(labels.shape)
+    numbers = np.where(inside.values > 0, np.where(z + 0.5 * x < 18.0, 1, 2), 0).astype(np.int64)
+    for size, told in ((8.0, True), (2.0, False)):
         mesh, cells = block_mesh(inside, numbers, names, size)
         assert bool(blurred(mesh, cells, inside, numbers, names)) == told
 

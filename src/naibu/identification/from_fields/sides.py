@@ -11,7 +11,7 @@ from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.meshing.surface import boundary_nodes
 
-SIDE = 0.25  # of the edge of a cell: nodes this near to an end of the body are on that side
+SIDE = 0.25  # of the shortest edge of cells: nodes this near to an end of the body are on that side
 SIDES = ("x-", "x+", "y-", "y+", "z-", "z+")
 
 
@@ -21,7 +21,7 @@ def nodes_of_side(mesh: Mesh, axes: FloatArray, side: str) -> BoolArray:
     Parameters
     ----------
     mesh : Mesh
-        Parallelepipeds of one size.
+        Cells of a grid.
     axes : ndarray, shape (3, 3)
         Axes of the grid of cells in the frame of the scan, in columns.
     side : {"x-", "x+", "y-", "y+", "z-", "z+"}
@@ -38,8 +38,7 @@ def nodes_of_side(mesh: Mesh, axes: FloatArray, side: str) -> BoolArray:
     along = axes.T @ world
     axis = int(np.argmax(np.abs(along)))
     height = mesh.points @ (axes[:, axis] * np.sign(along[axis]))
-    corners = mesh.points[mesh.cells[0]]
-    edge = float(np.ptp(corners @ axes[:, axis]))
+    edge = float(np.ptp(height[mesh.cells], axis=1).min())
     return np.asarray(height > height.max() - SIDE * edge)
 
 

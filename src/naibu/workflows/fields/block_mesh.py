@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from itertools import pairwise
 
 import numpy as np
 from scipy import ndimage
 
-from naibu.core.arrays import AnyArray, IntArray, require_lengths
+from naibu.core.arrays import AnyArray, FloatArray, IntArray, require_lengths
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.volume import Volume
@@ -19,6 +20,8 @@ CELLS = 1200  # by default
 BLURRED = 0.01  # part of the object that cubes may misrepresent without a word
 MOST_CELLS = 100_000  # of a mesh whose size is asked for: beyond, a factorization does not fit into memory
 MOST_LABEL = 65535
+PLANE = 0.5  # part of a section of the object that changes its zone there: cells begin at such a plane
+NARROWEST = 0.3  # of a cell, in edge lengths, between such planes
 HALF_FILLED = 0.5  # part of a cell that must lie in the object
 
 
@@ -66,6 +69,8 @@ def names_of_labels(labels: IntArray, inside: Volume, given: Mapping[int, str]) 
 def block_mesh(inside: Volume, labels: IntArray, names: Mapping[int, str], element_size_mm: float) -> tuple[Mesh, IntArray]:
     """Return hexahedra that fill the object, and the cell of every voxel (nz, ny, nx), -1 outside.
 
+    Where zones meet in a plane of the grid, cells end there; other borders are those of the cells with most of their voxels.
+
     Parameters
     ----------
     inside : Volume
@@ -88,16 +93,16 @@ def block_mesh(inside: Volume, labels: IntArray, names: Mapping[int, str], eleme
     volume = len(voxels) * float(np.prod(inside.spacing_mm))
     size = element_size_mm or (volume / CELLS) ** (1.0 / 3.0)
     low, high = voxels.min(axis=0), voxels.max(axis=0) + 1
-    counts = np.clip(np.round((high - low) * inside.spacing_mm / size).astype(int), 1, high - low)
+    edges = [_edges(inside, labels, axis, int(low[axis]), int(high[axis]), size) for axis in range(3)]
+    counts = np.array([len(e) - 1 for e in edges])
     if volume / size**3 > MOST_CELLS and np.prod(counts) > MOST_CELLS:
         least = (volume / MOST_CELLS) ** (1.0 / 3.0)
         raise InputError(f"element_size_mm is {size:.3g} mm, which makes more than {MOST_CELLS} cells; choose at least {least:.2g} mm")
-    width = (high - low) / counts  # of a cell, in voxels
-    block = np.minimum(((voxels + 0.5 - low) / width).astype(int), counts - 1)
+    layer = [np.searchsorted(e, np.arange(n) + 0.5, side="right") - 1 for e, n in zip(edges, high - low, strict=True)]  # of voxels
+    block = np.stack([of_axis[v] for of_axis, v in zip(layer, (voxels - low).T, strict=True)], axis=1)
     number = block @ np.array([1, counts[0], counts[0] * counts[1]])
     total = int(np.prod(counts))
-    sides = zip(high - low, width, counts, strict=True)
-    per_axis = [np.bincount(np.minimum(((np.arange(n) + 0.5) / w).astype(int), c - 1)) for n, w, c in sides]
+    per_axis = [np.bincount(of_axis, minlength=c) for of_axis, c in zip(layer, counts, strict=True)]
     room = (per_axis[2][:, None, None] * per_axis[1][:, None] * per_axis[0]).ravel()  # voxels of a full cell
     share = np.bincount(number, minlength=total) / room
     parts, _ = ndimage.label((share >= HALF_FILLED).reshape(counts[::-1]))
@@ -110,7 +115,7 @@ def block_mesh(inside: Volume, labels: IntArray, names: Mapping[int, str], eleme
     corners = grid_cells(*(counts + 1))[kept]
     used, cells = np.unique(corners, return_inverse=True)
     axes = np.stack(np.unravel_index(used, tuple(counts[::-1] + 1))[::-1], axis=1)
-    points = inside.to_physical(low - 0.5 + axes * width)
+    points = inside.to_physical(low - 0.5 + np.stack([e[i] for e, i in zip(edges, axes.T, strict=True)], axis=1))
     regions = votes[:, kept].argmax(axis=0)
     mesh = Mesh.from_arrays(points, cells.reshape(corners.shape), "hexahedron", regions=regions, region_names=[names[k] for k in order])
     if np.linalg.det(inside.direction) < 0.0:
@@ -120,6 +125,23 @@ def block_mesh(inside: Volume, labels: IntArray, names: Mapping[int, str], eleme
     of_voxel = np.full(inside.shape, -1, dtype=np.int64)
     of_voxel[tuple(voxels.T[::-1])] = cell[number]
     return mesh, of_voxel
+
+
+def _edges(inside: Volume, labels: IntArray, axis: int, low: int, high: int, size_mm: float) -> FloatArray:
+    """Return where cells begin and end along an axis, in voxels from `low`: at plane borders of zones, and evenly between them."""
+    width = size_mm / float(inside.spacing_mm[axis])
+    here, there = (np.moveaxis(a, 2 - axis, 0)[low:high] for a in (inside.values != 0, labels))
+    both = here[1:] & here[:-1]
+    across = both & (there[1:] != there[:-1])
+    pairs, changes = both.sum(axis=(1, 2)), across.sum(axis=(1, 2))
+    planes = np.flatnonzero(changes > PLANE * np.maximum(pairs, 1)) + 1
+    fixed = [0]
+    for plane in planes.tolist():
+        if plane - fixed[-1] >= NARROWEST * width and high - low - plane >= NARROWEST * width:
+            fixed.append(plane)
+    fixed.append(high - low)
+    parts = [np.linspace(a, b, int(np.clip(np.round((b - a) / width), 1, b - a)), endpoint=False) for a, b in pairwise(fixed)]
+    return np.append(np.concatenate(parts), float(high - low))
 
 
 def blurred(mesh: Mesh, cell_of_voxel: IntArray, inside: Volume, labels: IntArray, names: Mapping[int, str]) -> tuple[str, ...]:
