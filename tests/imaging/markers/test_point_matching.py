@@ -149,8 +149,10 @@ def test_limits_of_the_residual_decide_which_links_are_kept() -> None:
     cloud = particle_cloud(900, 2, noise=0.08)
     kept = [len(link_markers(cloud.reference, cloud.deformed, settings=LinkSettings(residual_factor=f))) for f in (1.5, 4.5)]
     assert kept[0] < 0.95 * kept[1]
+    cloud = particle_cloud(900, 2, noise=0.04)
+    everything = link_markers(cloud.reference, cloud.deformed)
     links = link_markers(cloud.reference, cloud.deformed, settings=LinkSettings(residual_bounds=(0.0, 0.2)))
-    assert links.residual_mm.max() < 0.25  # points are about one spacing apart, which varies from place to place
+    assert links.residual_mm.max() < 0.2 < everything.residual_mm.max()  # points are about one spacing apart
 
 
 def test_link_settings_out_of_range_are_refused() -> None:

@@ -23,12 +23,13 @@ SETTLED = 0.005  # fraction of the points whose links change, from which on a ro
 METRICS = 2  # times that the metric is estimated, beside the first rounds without one
 MOST_ANISOTROPIC = 8.0  # ratio of standard deviations along two axes
 ENOUGH = {2: 60, 3: 100}  # links from which on a metric is estimated
-LOCAL = (0.5, 2.5)  # bounds of the local noise, as multiples of that of all
+LOCAL = (0.5, 8.0)  # bounds of the local noise, as multiples of that of all
 ALIKE = 1.2  # ratio of standard deviations up to which axes are alike
 LEAST = 0.01  # least noise, in spacings
 CORE = 3.0  # medians within which residuals tell the metric
 AROUND, PRIOR = 24, 6.0  # deformed points around that tell how many are unlinked there, and weight of those everywhere, in points
 CAUTION = 6.0  # how much more often chance is assumed to link than the densities say
+WITNESSES, CREDIBLE = 16, 0.9  # links around, and their mean probability below which a link is less likely for it
 MEDIAN = {2: 1.1774, 3: 1.5382}  # of the length of a vector of standard normal components
 
 
@@ -179,8 +180,12 @@ def probability(found: RefinedLinks, reference: FloatArray, deformed: FloatArray
     freedom = found.tails
     t = np.exp(gammaln(0.5 * (freedom + d)) - gammaln(0.5 * freedom)) / (np.pi * freedom) ** (0.5 * d)
     right = t * (1.0 + found.ratio[linked] ** 2 / freedom) ** (-0.5 * (freedom + d)) / np.maximum(found.volume[linked], 1e-300)
+    likely = right / np.maximum(right + CAUTION * by_chance, 1e-300)
     out = np.zeros(len(found.link))
-    out[linked] = right / np.maximum(right + CAUTION * by_chance, 1e-300)
+    if len(linked):
+        # where those around are wrong, so is what they predict
+        near = np.asarray(cKDTree(reference[linked]).query(reference[linked], k=min(WITNESSES, len(linked)), workers=-1)[1])
+        out[linked] = likely * np.minimum(likely[near.reshape(len(linked), -1)].mean(axis=1) / CREDIBLE, 1.0)
     return out
 
 

@@ -191,9 +191,9 @@ def _best_grown(cloud: Cloud, rng: np.random.Generator, stretch: FloatArray, how
     smaller = min(len(cloud.reference), len(cloud.deformed))
     best: tuple[float, State] | None = None
     most_seen = 0.0
-    seeds = _seeds(cloud, rng)
-    # near their expected position, at first from few deformation gradients
+    # near their expected position, at first from few deformation gradients, and from other seeds each time
     for radius, wide in [(r, w) for r in how.search_radii for w in (False, True) if np.isfinite(r) or not w]:
+        seeds = _seeds(cloud, rng)
         guesses = _guesses(cloud, seeds[::2] if wide else seeds, stretch, radius, how, wide=wide)
         most_seen = max([most_seen, *(g.score for g in guesses)])
         families = _families(guesses)
