@@ -26,6 +26,7 @@ extensions = [
     "sphinx_copybutton",
     "sphinx_design",
     "sphinxcontrib.bibtex",
+    "benchmark_plots",
     "benchmark_results",
     "naibu_help",
     "public_names",
