@@ -33,7 +33,7 @@ from naibu.mechanics.linear_algebra.solver_selection import SolverName
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 
 Rows = list[tuple[Cell, ...]]
-CELLS, MORE_CELLS = (6, 10, 14), (20, 30, 40)
+CELLS, MORE_CELLS = (6, 10, 14, 20, 30), (40,)
 SUPERLU_MOST = 14  # cells an edge; beyond, it takes minutes
 VOXELS, MORE_VOXELS = (8, 16), (32,)  # an edge of the lattice
 WARM_UP, SCANS, MORE_SCANS = 32, (64, 88), (120,)  # voxels an edge
