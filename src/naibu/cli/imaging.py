@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from naibu.cli.console import WARNING, print_table, progress_display, say
-from naibu.cli.described import ObjectOptions, Out, Overwrite, PairOptions, Whole, require_left_out
+from naibu.cli.described import Flag, ObjectOptions, Out, Overwrite, PairOptions, Whole, require_left_out
 from naibu.cli.run_record import wrote
 from naibu.cli.verbs import MARKERS, SCANS, verb
 from naibu.core.errors import InputError
@@ -33,6 +33,7 @@ def sense(
     method: Method = "default",
     pair: PairOptions | None = None,
     out: Out = Path("naibu-sense"),
+    multiscale: Flag = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Measure the displacement inside an object between two scans by digital volume correlation (DVC), with its uncertainty.
@@ -48,19 +49,25 @@ def sense(
     out
         Folder for displacement.mha, standard_deviation.mha, displacement.vtu, field.h5, mask.mha (the object), initial.csv and pressed.csv
         (positions as markers), sense.json and report.html.
+    multiscale
+        Also write scans, displacement and strain at several resolutions, as OME-Zarr for napari and neuroglancer (needs naibu[cluster]).
     overwrite
         Replace results, or files of your own, that the folder already holds.
     """
+    from naibu.workflows.measurement.multiscale_results import folder_for_multiscale, write_multiscale
     from naibu.workflows.measurement.sense import read_pair, sense_pair
 
     with progress_display() as progress:
         scans = read_pair(reference, deformed, **(pair or PairOptions()).arguments)
+        folder = folder_for_multiscale(out, overwrite=overwrite) if multiscale else None
         run = sense_pair(scans, method=method, out=out, overwrite=overwrite, progress=progress)
+        stores = () if folder is None else write_multiscale(scans, run, folder)
     print_table(f"{reference.name} -> {deformed.name}, {run.measured.method}", ("quantity", "value"), run.rows())
     for warning in run.measured.warnings:
         say(warning.replace("`mask`", "--mask"), WARNING)
-    wrote(*run.files)
-    say(f"{run.seconds:.1f} s. Page: {run.files[0]}   fields: {', '.join(str(p.name) for p in run.files[1:])}")
+    files = (*run.files, *stores)
+    wrote(*files)
+    say(f"{run.seconds:.1f} s. Page: {files[0]}   fields: {', '.join(str(p.name) for p in files[1:])}")
     if min(scans.reference.shape) > 1:
         say(
             f"Stiffness: naibu identify {out / 'field.h5'} --zones LABELS -k 'label 1=10 kPa', a volume of labels, one of them known", "dim"

@@ -20,7 +20,7 @@ from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.io.files.paths import require_usable_path
 from naibu.io.files.reading import guarded_reading
-from naibu.io.image_formats import dicom, hdf5, metaimage, nifti, nrrd, png, tiff, zarr_store
+from naibu.io.image_formats import dicom, hdf5, metaimage, nifti, nrrd, ome_zarr, png, tiff, tiff_stack, zarr_store
 from naibu.io.image_formats.geometry import ReadOptions
 
 _Handler = TypeVar("_Handler")
@@ -32,6 +32,7 @@ VOLUME_READERS: dict[str, Callable[[Path, ReadOptions], Volume]] = {
     **dict.fromkeys((".h5", ".hdf5"), hdf5.read),
     ".png": png.read,
     ".zarr": zarr_store.read,
+    ome_zarr.ENDING: ome_zarr.read,
     **dict.fromkeys((".dcm", ".dicom", ".ima"), dicom.read),
 }
 VOLUME_WRITERS: dict[str, Callable[..., Path]] = {
@@ -41,6 +42,7 @@ VOLUME_WRITERS: dict[str, Callable[..., Path]] = {
     **dict.fromkeys((".tif", ".tiff"), tiff.write),
     **dict.fromkeys((".h5", ".hdf5"), hdf5.write),
     ".zarr": zarr_store.write,
+    ome_zarr.ENDING: ome_zarr.write,
 }
 _VECTOR_READERS: dict[str, Callable[[Path, ReadOptions], tuple[FloatArray, Volume]]] = {
     **dict.fromkeys((".mha", ".mhd"), metaimage.read_vectors),
@@ -51,7 +53,13 @@ _BOX_READERS: dict[str, Callable[[Path, ArrayLike, ArrayLike, ReadOptions], Volu
     **dict.fromkeys((".h5", ".hdf5"), hdf5.read_box),
     ".zarr": zarr_store.read_box,
 }
-_VECTOR_WRITERS = {".mha": metaimage.write, ".mhd": metaimage.write, ".nrrd": nrrd.write}
+_STORES = (".zarr", ome_zarr.ENDING)  # folders that are one volume
+_VECTOR_WRITERS = {".mha": metaimage.write, ".mhd": metaimage.write, ".nrrd": nrrd.write, ome_zarr.ENDING: ome_zarr.write}
+_OPENERS: dict[str, Callable[[Path], ChunkedVolume]] = {
+    ".zarr": zarr_store.open_chunked,
+    ome_zarr.ENDING: ome_zarr.open_levels,
+    **dict.fromkeys((".h5", ".hdf5"), hdf5.open_chunked),
+}
 
 
 def read_volume(
@@ -117,7 +125,7 @@ def write_volume(path: str | os.PathLike[str], volume: Volume, *, compressed: bo
     Parameters
     ----------
     path : path-like
-        ``.mha``, ``.mhd``, ``.nii``, ``.nii.gz``, ``.nrrd``, ``.tif``, ``.h5`` or ``.zarr``.
+        ``.mha``, ``.mhd``, ``.nii``, ``.nii.gz``, ``.nrrd``, ``.tif``, ``.h5``, ``.zarr`` or, for napari and neuroglancer, ``.ome.zarr``.
     volume : Volume
         Image to write; booleans are stored as 0 and 1.
     compressed : bool
@@ -160,12 +168,12 @@ def read_displacement(path: str | os.PathLike[str]) -> tuple[FloatArray, Volume]
 
 
 def write_displacement(path: str | os.PathLike[str], displacement: ArrayLike, grid: Volume, *, compressed: bool = True) -> Path:
-    """Write a displacement field as a vector image that opens in 3D Slicer and ParaView.
+    """Write a displacement field as a vector image that opens in 3D Slicer and ParaView, or in napari and neuroglancer.
 
     Parameters
     ----------
     path : path-like
-        ``.mha``, ``.mhd`` or ``.nrrd``.
+        ``.mha``, ``.mhd`` or ``.nrrd``; ``.ome.zarr`` with the components as channels.
     displacement : array_like, shape (nz, ny, nx, 3)
         Displacement along x, y, z, mm; stored in single precision.
     grid : Volume
@@ -206,38 +214,49 @@ def read_volume_box(path: str | os.PathLike[str], low: ArrayLike, high: ArrayLik
         return _BOX_READERS[_ending(source)](source, low, high, ReadOptions())
 
 
-def open_volume(path: str | os.PathLike[str]) -> ChunkedVolume:
+def open_volume(path: str | os.PathLike[str], *, spacing_mm: ArrayLike | None = None) -> ChunkedVolume:
     """Open an out-of-core volume: only the voxels that are sliced are read (see `naibu.imaging.out_of_core`).
 
     Parameters
     ----------
     path : path-like
-        ``.zarr``.
+        ``.zarr``, ``.ome.zarr``, ``.h5``, ``.hdf5``, ``.tif``, ``.tiff``, or a folder of TIFF slices. Volumes in HDF5 cannot be sent to the
+        workers of a cluster; Zarr can.
+    spacing_mm : array_like, shape (3,), optional
+        Voxel spacing along x, y, z, mm, for TIFF files that do not state it.
 
     Raises
     ------
     InputError
         Another format, no such store, or one that is no volume.
     MissingDependencyError
-        The package zarr is not installed.
+        The package that reads the format is not installed.
     """
     source = Path(path)
-    if _ending(source) != ".zarr":
-        raise InputError(f"{source.name}: only Zarr volumes can be opened out of core; convert it once with write_volume to .zarr")
-    with guarded_reading(source, "Zarr"):
-        return zarr_store.open_chunked(source)
+    spacing = None if spacing_mm is None else np.asarray(spacing_mm, dtype=float)
+    ending = _ending(source)
+    if spacing is not None and (spacing.shape != (3,) or not (np.isfinite(spacing).all() and (spacing > 0.0).all())):
+        raise InputError(f"spacing_mm must be three positive numbers (x, y, z), not {spacing.tolist()}")
+    with guarded_reading(source):
+        if ending in (".tif", ".tiff") or (source.is_dir() and ending not in _OPENERS):
+            return tiff_stack.open_stack(source, spacing)
+        if ending not in _OPENERS:
+            raise InputError(
+                f"{source.name}: only Zarr, HDF5 and TIFF volumes can be opened out of core; convert it once with write_volume to .zarr"
+            )
+        return _OPENERS[ending](source)
 
 
 def _reader(source: Path) -> Callable[[Path, ReadOptions], Volume]:
     """Return the reader of a file or folder."""
-    if source.is_dir() and _ending(source) != ".zarr":
+    if source.is_dir() and _ending(source) not in _STORES:
         return dicom.read if _is_dicom(source) else tiff.read
     return dicom.read if _is_dicom(source) else _of(VOLUME_READERS, source, "read")
 
 
 def _ending(path: Path) -> str:
     name = path.name.lower()
-    return ".nii.gz" if name.endswith(".nii.gz") else path.suffix.lower()
+    return next((ending for ending in (".nii.gz", ome_zarr.ENDING) if name.endswith(ending)), path.suffix.lower())
 
 
 def _of(formats: dict[str, _Handler], path: Path, what: str) -> _Handler:
@@ -250,6 +269,6 @@ def _of(formats: dict[str, _Handler], path: Path, what: str) -> _Handler:
 
 def _is_dicom(path: Path) -> bool:
     """Whether a folder contains DICOM files, or a file is one whatever its extension."""
-    if path.is_dir() and _ending(path) != ".zarr":
+    if path.is_dir() and _ending(path) not in _STORES:
         return any(dicom.is_dicom(file) for file in path.rglob("*") if file.is_file())
     return _ending(path) not in VOLUME_READERS and dicom.is_dicom(path)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from naibu.core.arrays import AnyArray
+from naibu.core.chunked_volume import ChunkedVolume
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.io.files.atomic import new_aside, put_in_place
@@ -46,6 +47,21 @@ def read_box(path: Path, low: ArrayLike, high: ArrayLike, options: ReadOptions) 
         if (a < 0).any() or (b > size).any() or (a >= b).any():
             raise InputError(f"{path.name}: cannot read {a.tolist()}..{b.tolist()}: the volume has {size.tolist()} voxels along x, y, z")
         return _volume(path, stored, tuple(a.tolist()), tuple(b.tolist()), options)
+
+
+def open_chunked(path: Path) -> ChunkedVolume:
+    """Open a volume without reading its voxels; the file stays open as long as the volume exists.
+
+    Raises
+    ------
+    InputError
+        No such file, or one without a volume.
+    """
+    with _dataset(path):
+        pass  # checked
+    stored = h5py.File(path, "r")["values"]
+    frame = {name: np.asarray(stored.attrs[name], dtype=float) for name in _ATTRIBUTES}
+    return ChunkedVolume.from_array(stored, **frame)
 
 
 def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Path:

@@ -106,7 +106,7 @@ def _loaded(tifffile: Any, path: Path) -> tuple[AnyArray, dict[str, Any]]:
             series, page = file.series[0], file.pages[0]
             samples = int(page.samplesperpixel)
             n_series, axes = len(file.series), str(series.axes)
-            stated = _stated_geometry(path.name, file, page)
+            stated = stated_geometry(path.name, file, page)
             values = np.asarray(series.asarray()) if samples == 1 else np.zeros((1, 1, 1))
     except InputError:
         raise
@@ -121,7 +121,7 @@ def _loaded(tifffile: Any, path: Path) -> tuple[AnyArray, dict[str, Any]]:
     return values, stated
 
 
-def _stated_geometry(source: str, file: Any, page: Any) -> dict[str, Any]:
+def stated_geometry(source: str, file: Any, page: Any) -> dict[str, Any]:
     """Return the voxel offsets along x, y, z as columns (NaN where the file states none), and the origin, mm."""
     shaped: dict[str, Any] = (file.shaped_metadata or ({},))[0] if file.is_shaped else {}
     if "spacing_mm" in shaped:
