@@ -23,9 +23,10 @@ SHARED = 0.7  # empirical, cells: SD of the window in which cells share their sa
 STILL = 0.1  # voxels: step below which a cell has converged
 REMAINING = 5.0  # empirical: last steps that a cell which has not converged may still be away from the solution
 # empirical: displacement that is not resolved, of the root mean square second derivative times the square of the resolved length
-UNRESOLVED = 0.055
-# empirical: bias by the bending penalty, in changes that smoothing the field found once more makes: it is itself smoother than the truth
-SHRINKAGE, BIAS_TOLERANCE = 2.0, 0.03
+UNRESOLVED = 0.0275
+# empirical: bias by the bending penalty, in changes that smoothing the field once more makes, which is itself smoother than the truth.
+# Where texture is faint it, and not what is finer than the data resolve, is most of the error, which then hardly changes with the noise
+SHRINKAGE, BIAS_TOLERANCE = 2.5, 0.03
 SQUARE = 151 / 315  # integral of the square of a cubic B-spline along an axis, in cells
 LEAST_FRACTION = 0.003  # bounds the resolved length to seven cells
 
