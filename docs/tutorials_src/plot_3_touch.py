@@ -4,7 +4,8 @@
 
 A lattice is calibrated on captured data, and then stepped in Python by a loop of one millisecond, as a haptic device would drive it.
 ``naibu live`` with ``--haptics-port`` does the same for a device over UDP, with limits on force, change of force and energy
-(:doc:`/live`).
+(:doc:`/live`). The first run on a computer compiles the kernels of lattices, which takes more than a minute, in Python without a word;
+``naibu doctor --warm`` does it ahead.
 """
 
 # %%
