@@ -41,6 +41,7 @@ MOST_TRIES, MOST_WAVES = 4, 400
 
 # links from which on their mean probability is judged; of fewer, this fraction of the markers must be linked
 FEW_LINKS, FEW_LINKED = 8, 0.5
+LEAST_LINKED = 0.1  # fraction of the markers that links which have grown must reach
 UNEVEN = 3.0  # degrees of freedom of residuals that are compared with those of all links, not with those around
 LIKELY = 0.5  # probability, which errs on the safe side, below which a link that has grown is dropped
 
@@ -141,12 +142,14 @@ def link_markers(
     right = coherence_of_links(reference[links.pairs[:, 0]], deformed[links.pairs[:, 1]])
     links = replace(links, confidence=right * links.confidence)
     smaller, sure = min(len(reference), len(deformed)), float(links.confidence.mean()) if len(links) else 0.0
-    if sure < how.min_mean_confidence if len(links) >= FEW_LINKS else len(links) < FEW_LINKED * smaller:
+    kept = links if whole else _likely(links)
+    chance = sure < how.min_mean_confidence if len(links) >= FEW_LINKS else len(links) < FEW_LINKED * smaller
+    if chance or (not whole and len(kept) < LEAST_LINKED * smaller):
         raise InputError(
             f"no common structure in {len(reference)} and {len(deformed)} markers: {len(links)} fit one smooth motion, with a mean "
             f"probability of {sure:.2f}, as by chance. Check that both are in mm and of one object"
         )
-    return links if whole else _likely(links)
+    return kept
 
 
 def _checked(points: ArrayLike, name: str) -> FloatArray:
@@ -206,7 +209,7 @@ def _best_grown(cloud: Cloud, rng: np.random.Generator, stretch: FloatArray, how
                 return best[1]
         if best is not None and best[1].count >= 0.5 * smaller:
             return best[1]
-    if best is None or best[1].count < max(FEWEST, 0.1 * smaller):
+    if best is None or best[1].count < max(FEWEST, LEAST_LINKED * smaller):
         raise InputError(
             f"no common structure in {len(cloud.reference)} and {len(cloud.deformed)} markers: at best {most_seen:.0%} of the neighbours "
             "of a marker are found again under one affine motion. Check that both are in mm and of one object"
