@@ -9,7 +9,17 @@ from typing import Annotated
 
 from cyclopts import CycloptsError, Group, Parameter
 
-from naibu.cli import applications, design, experiments, imaging, new, predicting, studies, touching  # noqa: F401  they bring their verbs
+from naibu.cli import (  # noqa: F401  they bring their verbs
+    applications,
+    calibrating,
+    design,
+    experiments,
+    imaging,
+    new,
+    predicting,
+    studies,
+    touching,
+)
 from naibu.cli.cold_start import first_run
 from naibu.cli.console import BAD_INPUT, COMMANDS, FAILED, INTERRUPTED, app, errors, fail, print_table, progress_display, say
 from naibu.cli.described import Flag

@@ -145,8 +145,8 @@ def simulate(
 
 
 @contextmanager
-def stopped_gently() -> Iterator[Callable[[], bool]]:
-    """Yield whether Ctrl-C, or the end of a cluster job (SIGTERM), requested a stop after the current frame; a second one stops at once."""
+def stopped_gently(part: str = "frame") -> Iterator[Callable[[], bool]]:
+    """Yield whether Ctrl-C, or the end of a cluster job (SIGTERM), requested a stop after the current part; a second one stops at once."""
     asked: list[int] = []
 
     def stop(number: int, frame: object) -> None:
@@ -154,7 +154,7 @@ def stopped_gently() -> Iterator[Callable[[], bool]]:
         if asked:
             raise KeyboardInterrupt
         asked.append(number)
-        errors.print("Stopping after this frame; press again to stop at once.")
+        errors.print(f"Stopping after this {part}; press again to stop at once.")
 
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

@@ -13,6 +13,8 @@ from .measurement.track import ObjectDescription, TrackRun
 from .measurement.track_clouds import CloudRun, track_clouds
 from .measurement.track_sequence import SequenceRun, track_sequence_file
 from .reproduce import ReproducedChapter, reproduce, reproduce_all
+from .studies.calibrate import LatticeCalibration, calibrate_study
+from .studies.calibration_example import write_calibration_example
 from .studies.simulate import NamedStudy, named_studies
 from .studies.simulate_lattice import SimulationRun
 
@@ -25,6 +27,7 @@ __all__ = [
     "FieldIdentification",
     "FieldPredictionRun",
     "Identification",
+    "LatticeCalibration",
     "MeshMaterial",
     "MethodComparison",
     "NamedStudy",
@@ -38,6 +41,7 @@ __all__ = [
     "SurfaceCutRun",
     "TouchableModel",
     "TrackRun",
+    "calibrate_study",
     "compare_methods",
     "cut",
     "cut_surface_file",
@@ -56,4 +60,5 @@ __all__ = [
     "touched_loop",
     "track_clouds",
     "track_sequence_file",
+    "write_calibration_example",
 ]

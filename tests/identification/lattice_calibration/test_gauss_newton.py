@@ -23,7 +23,8 @@ from naibu.identification.lattice_calibration.forward_model import (
     Pushing,
     tributary_fractions,
 )
-from naibu.identification.lattice_calibration.gauss_newton import CalibrationProblem, Index, calibrate_lattice, evaluated, indices
+from naibu.identification.lattice_calibration.gauss_newton import CalibrationProblem, Index, calibrate_lattice, evaluated
+from naibu.identification.lattice_calibration.report_indices import indices
 from naibu.identification.lattice_calibration.unknowns import FRACTION_NOTE, LatticeUnknowns, identifiability
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
 from naibu.validation.specimens.lattice_twin import TRUTH, dough_lattice, dough_parameters, dough_twin, virtual_capture

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from naibu import datasets
-from naibu.identification.lattice_calibration.gauss_newton import ReportIndices
+from naibu.identification.lattice_calibration.report_indices import ReportIndices
 from naibu.reproduction.chapter4.cube import TABLES, cube_section
 from naibu.reproduction.chapter4.lattice import _one_set, _pattern_table, exact_section
 from naibu.reproduction.chapter4.octree import chapter4_octree, cost_section

@@ -20,8 +20,10 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.optional_packages import optional_package
+from naibu.core.progress import Progress, report_progress
 from naibu.identification.lattice_calibration.forward_model import SAMPLE_S
 from naibu.identification.lattice_calibration.gauss_newton import CalibrationProblem, evaluated
+from naibu.identification.lattice_calibration.inverse_problem import InverseProblem
 from naibu.identification.lattice_calibration.shape_distance import closest_points, force_difference
 
 Measure = Literal["chi-squared", "report"]
@@ -44,6 +46,8 @@ class Searched:
         Best cost up to every generation.
     runs : int
         Sets of parameters that were simulated.
+    finished : bool
+        Whether the search came to its end; otherwise Ctrl-C left the best so far.
     """
 
     names: tuple[str, ...]
@@ -51,15 +55,18 @@ class Searched:
     cost: float
     history: FloatArray
     runs: int
+    finished: bool = True
 
 
-def cost_of(problem: CalibrationProblem, theta: FloatArray, *, measure: Measure = "report") -> float:
+def cost_of(problem: InverseProblem, theta: FloatArray, *, measure: Measure = "report") -> float:
     """Return the objective of a search, for logarithms theta (p,); coarse steps.
 
     ``"chi-squared"`` is that of `calibrate_lattice`; ``"report"`` is S_shape in units of the sensor's error, S_force too, or their sum.
     """
     if measure == "chi-squared":
         return float(sum((r**2).sum() for r in evaluated(problem, theta, derivatives=False, threads=1).residual))
+    if not isinstance(problem, CalibrationProblem):
+        raise InputError(f"measure is {measure!r}, which is that of pushed faces; studies are compared by 'chi-squared'")
     parameters, total = problem.unknowns.parameters(np.exp(theta)), 0.0
     for load_case in problem.load_cases:
         capture, found = load_case.capture, load_case.coarse.run(parameters)
@@ -74,7 +81,7 @@ def cost_of(problem: CalibrationProblem, theta: FloatArray, *, measure: Measure 
     return total
 
 
-def _safe_cost(problem: CalibrationProblem, measure: Measure, theta: FloatArray) -> float:
+def _safe_cost(problem: InverseProblem, measure: Measure, theta: FloatArray) -> float:
     try:
         cost = cost_of(problem, theta, measure=measure)
     except (InputError, ConvergenceError, FloatingPointError):
@@ -85,7 +92,7 @@ def _safe_cost(problem: CalibrationProblem, measure: Measure, theta: FloatArray)
 _shared: dict[str, Any] = {}  # of a worker process: the problem, sent once
 
 
-def _prepare_worker(problem: CalibrationProblem, measure: Measure) -> None:
+def _prepare_worker(problem: InverseProblem, measure: Measure) -> None:
     _shared["cost"] = partial(_safe_cost, problem, measure)
 
 
@@ -95,7 +102,7 @@ def _worker_cost(theta: FloatArray) -> float:
 
 @contextmanager
 def evaluator(
-    problem: CalibrationProblem, measure: Measure = "report", *, workers: int = 1, client: Any = None
+    problem: InverseProblem, measure: Measure = "report", *, workers: int = 1, client: Any = None
 ) -> Iterator[Callable[[Sequence[FloatArray]], list[float]]]:
     """Provide a function from many theta to their costs, by this process, by several, or by the workers of a `dask.distributed.Client`.
 
@@ -126,7 +133,7 @@ def evaluator(
 
 
 def search_cma_es(
-    problem: CalibrationProblem,
+    problem: InverseProblem,
     start: ArrayLike | Mapping[str, float],
     *,
     seed: int,
@@ -136,13 +143,14 @@ def search_cma_es(
     max_runs: int = 2000,
     workers: int = 1,
     client: Any = None,
+    progress: Progress | None = None,
 ) -> Searched:
     """Search by CMA-ES (pycma) in the logarithms of the parameters.
 
     Parameters
     ----------
-    problem : CalibrationProblem
-        What is sought.
+    problem : CalibrationProblem or StudyProblem
+        What is sought; of a study, by the measure ``"chi-squared"``.
     start : array_like or mapping
         As for `calibrate_lattice`.
     seed : int
@@ -157,6 +165,8 @@ def search_cma_es(
         Sets in all.
     workers, client
         See `evaluator`.
+    progress : callable
+        Called with a `ProgressReport` after every generation. Where it raises KeyboardInterrupt, the best so far is returned.
 
     Raises
     ------
@@ -175,9 +185,9 @@ def search_cma_es(
     if population is not None:
         options["popsize"] = population
     strategy, history, runs = cma.CMAEvolutionStrategy(begin, spread, options), [], 0
-    best, least = begin, np.inf
+    best, least, finished = begin, np.inf, True
     with evaluator(problem, measure, workers=workers, client=client) as costs_of:
-        while not strategy.stop():
+        while finished and not strategy.stop():
             thetas = strategy.ask()
             costs = costs_of(thetas)
             strategy.tell(thetas, costs)
@@ -185,11 +195,21 @@ def search_cma_es(
             if min(costs) < least:
                 best, least = np.array(thetas[int(np.argmin(costs))]), float(min(costs))
             history.append(least)
-    return Searched(problem.unknowns.names, np.exp(best), least, np.array(history), runs)
+            finished = _reported(progress, runs, max_runs, least)
+    return Searched(problem.unknowns.names, np.exp(best), least, np.array(history), runs, finished)
+
+
+def _reported(progress: Progress | None, runs: int, most: int, cost: float) -> bool:
+    """Report progress; return whether the search is to go on."""
+    try:
+        report_progress(progress, "calibrate", done=runs, total=most, objective=cost)
+    except KeyboardInterrupt:
+        return False
+    return True
 
 
 def search_genetic(
-    problem: CalibrationProblem,
+    problem: InverseProblem,
     start: ArrayLike | Mapping[str, float],
     *,
     seed: int,
@@ -199,12 +219,13 @@ def search_genetic(
     max_runs: int = 2000,
     workers: int = 1,
     client: Any = None,
+    progress: Progress | None = None,
 ) -> Searched:
     """Search by a genetic algorithm (pymoo), as in the report, in the logarithms of the parameters.
 
     Parameters
     ----------
-    problem, start, seed, measure, max_runs, workers, client
+    problem, start, seed, measure, max_runs, workers, client, progress
         As for `search_cma_es`.
     reach : float
         Parameters are sought between the start divided and multiplied by this.
@@ -223,9 +244,9 @@ def search_genetic(
     statement = core.Problem(n_var=len(centre), n_obj=1, xl=centre - half, xu=centre + half)
     algorithm = algorithms.GA(pop_size=population)
     algorithm.setup(statement, termination=("n_eval", max_runs), seed=seed, verbose=False)
-    history, runs, best, least = [], 0, centre, np.inf
+    history, runs, best, least, finished = [], 0, centre, np.inf, True
     with evaluator(problem, measure, workers=workers, client=client) as costs_of:
-        while algorithm.has_next():
+        while finished and algorithm.has_next():
             group = algorithm.ask()
             thetas = list(group.get("X"))
             costs = np.array(costs_of(thetas))
@@ -238,4 +259,5 @@ def search_genetic(
             if costs.min() < least:
                 best, least = thetas[int(np.argmin(costs))], float(costs.min())
             history.append(least)
-    return Searched(problem.unknowns.names, np.exp(best), least, np.array(history), runs)
+            finished = _reported(progress, runs, max_runs, least)
+    return Searched(problem.unknowns.names, np.exp(best), least, np.array(history), runs, finished)

@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -19,10 +18,13 @@ from numpy.typing import ArrayLike
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import ConvergenceError, InputError
+from naibu.core.progress import Progress, report_progress
+from naibu.identification.lattice_calibration.estimate import LatticeEstimate
 from naibu.identification.lattice_calibration.forward_model import SAMPLE_S, Capture, PushedLattice, PushMode, Reproduced, averaged
-from naibu.identification.lattice_calibration.shape_distance import closest_points, force_difference
-from naibu.identification.lattice_calibration.unknowns import UNITS, LatticeUnknowns, identifiability
-from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
+from naibu.identification.lattice_calibration.inverse_problem import InverseProblem
+from naibu.identification.lattice_calibration.shape_distance import closest_points
+from naibu.identification.lattice_calibration.unknowns import LatticeUnknowns, identifiability
+from naibu.mechanics.lattices.model.lattice import Lattice
 
 Index = Literal["shape", "force", "joint"]
 Window = Literal["keep", "contact"]
@@ -32,6 +34,7 @@ LONGEST = 1.0  # change of a logarithm in one iteration
 FARTHEST = 0.2  # of the points at which the covariance is looked at, from the estimate
 POLISHING = 9  # fine runs, at most
 FINE_ITERATIONS = 8  # with derivatives of fine steps, at most; they start next to the minimum, and take what is left of it
+RENEWED = 0.05  # change of a logarithm from which on coarse derivatives are computed anew beside fine residuals
 SETTLED = 0.05  # decrease of chi-squared that is not worth another iteration
 
 
@@ -116,6 +119,15 @@ class CalibrationProblem:
             made.append(LatticeLoadCase(capture, coarse, fine))
         return cls(unknowns or LatticeUnknowns.of(lattice), tuple(made), index, window, float(window_s))
 
+    @property
+    def roughness(self) -> float:
+        """How far chi-squared jumps as the parameters change, as a fraction of it: not at all."""
+        return 0.0
+
+    def enlarged(self, excess: tuple[float, float]) -> CalibrationProblem:
+        """Return the problem with other factors of the noise."""
+        return replace(self, excess=excess)
+
     def weighed(
         self, load_case: LatticeLoadCase, found: Reproduced, step: float
     ) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
@@ -149,55 +161,6 @@ class CalibrationProblem:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LatticeEstimate:
-    """Identified lattice parameters with their covariance.
-
-    Attributes
-    ----------
-    unknowns : LatticeUnknowns
-        What was sought.
-    values : ndarray, shape (p,)
-        mN/mm and mN s/mm.
-    covariance : ndarray, shape (p, p)
-        Of their logarithms; weak priors around the start included. The widest of those at the estimate and at the ends of the interval of
-        its least determined combination, along which the data's information changes.
-    information : ndarray, shape (p, p)
-        Fisher information of the data alone.
-    noise_factor : tuple of float
-        Root mean square residual of points and of forces in units of the stated noise; NaN where they did not count.
-    iterations, runs : int
-        Gauss-Newton iterations, and simulated pushings; one with derivatives counts as 1 + p.
-    undetermined : tuple of str
-        In words, the combinations that the data do not determine.
-    """
-
-    unknowns: LatticeUnknowns
-    values: FloatArray
-    covariance: FloatArray
-    information: FloatArray
-    noise_factor: tuple[float, float]
-    iterations: int
-    runs: int
-    undetermined: tuple[str, ...]
-
-    def parameters(self) -> LatticeParameters:
-        """Return the parameters of all elements."""
-        return self.unknowns.parameters(self.values)
-
-    def intervals(self) -> FloatArray:
-        """Return the 95 % intervals (p, 2) of all values."""
-        half = 1.96 * np.sqrt(np.diag(self.covariance))
-        return np.stack([self.values * np.exp(-half), self.values * np.exp(half)], axis=1)
-
-    def sentences(self) -> tuple[str, ...]:
-        """Return the result in sentences, and what the data do not determine."""
-        lines = []
-        for name, value, (low, high) in zip(self.unknowns.names, self.values, self.intervals(), strict=True):
-            lines.append(f"{name}: {value:.4g} {UNITS[name.split()[0]]} (95 % between {low:.4g} and {high:.4g})")
-        return (*lines, *self.undetermined)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Point:
     theta: FloatArray
     residual: tuple[FloatArray, FloatArray]
@@ -207,15 +170,40 @@ class _Point:
     def information(self) -> FloatArray:
         return np.asarray(sum(j.T @ j for j in self.slopes))
 
-    def gradient(self, residual: tuple[FloatArray, FloatArray] | None = None) -> FloatArray:
-        return np.asarray(sum(j.T @ r for j, r in zip(self.slopes, residual or self.residual, strict=True)))
+    def gradient(self) -> FloatArray:
+        return np.asarray(sum(j.T @ r for j, r in zip(self.slopes, self.residual, strict=True)))
 
 
 Evaluate = Callable[..., _Point]
 
 
+@dataclass(slots=True)
+class _Watched:
+    """Evaluations that are reported, the best of which is kept for the case of an interruption."""
+
+    threads: int
+    executor: Executor | None
+    progress: Progress | None
+    count: int = 0
+    best: _Point | None = None
+    problem: InverseProblem | None = None
+
+    def __call__(self, problem: InverseProblem, theta: FloatArray, *, derivatives: bool = True, fine: bool = False) -> _Point:
+        point = evaluated(problem, theta, derivatives=derivatives, fine=fine, threads=self.threads, executor=self.executor)
+        misfit = _misfit(point)
+        if derivatives and (self.best is None or self.problem is not problem or misfit <= _misfit(self.best)):
+            self.best, self.problem = point, problem
+        self.count += 1
+        report_progress(self.progress, "calibrate", done=self.count, objective=misfit / max(sum(map(len, point.residual)), 1))
+        return point
+
+
+def _misfit(point: _Point) -> float:
+    return float(sum((r**2).sum() for r in point.residual))
+
+
 def evaluated(
-    problem: CalibrationProblem,
+    problem: InverseProblem,
     theta: FloatArray,
     *,
     derivatives: bool = True,
@@ -246,7 +234,7 @@ def _joined(parts: list[Reproduced], order: IntArray) -> Reproduced:
 
 
 def calibrate_lattice(
-    problem: CalibrationProblem,
+    problem: InverseProblem,
     start: ArrayLike | Mapping[str, float],
     *,
     prior_sd: float = PRIOR_SD,
@@ -254,6 +242,7 @@ def calibrate_lattice(
     reweigh: bool = True,
     threads: int = 2,
     executor: Executor | None = None,
+    progress: Progress | None = None,
 ) -> LatticeEstimate:
     """Identify lattice parameters from captures by least squares, with their covariance.
 
@@ -264,7 +253,7 @@ def calibrate_lattice(
 
     Parameters
     ----------
-    problem : CalibrationProblem
+    problem : CalibrationProblem or StudyProblem
         What is sought.
     start : array_like or mapping
         Rough guess: all values, or a mapping by name or by kind (``{"K": 50.0, "C1": 20.0, "C2": 50.0}``), mN/mm and mN s/mm.
@@ -278,6 +267,9 @@ def calibrate_lattice(
         Into how many parts the derivatives of every capture are shared; by default as many threads compute them.
     executor : concurrent.futures.Executor
         Computes the parts instead: a ``ProcessPoolExecutor``, or ``client.get_executor()`` of a `dask.distributed.Client`.
+    progress : callable
+        Called with a `ProgressReport` after every evaluation; the objective is chi-squared over the number of residuals. Where it raises
+        KeyboardInterrupt, or Ctrl-C does, the best estimate so far is returned, with the intervals that belong there.
 
     Raises
     ------
@@ -285,10 +277,23 @@ def calibrate_lattice(
         A start that is not positive.
     ConvergenceError
         The iterations did not settle.
+    KeyboardInterrupt
+        An interruption before the first evaluation has ended.
     """
-    at = partial(evaluated, threads=threads, executor=executor)
-    theta = np.log(problem.unknowns.vector(start))
-    centre, runs, count = theta.copy(), 0, 0
+    centre = np.log(problem.unknowns.vector(start))
+    at = _Watched(threads, executor, progress)
+    try:
+        return _searched(problem, centre, prior_sd, max_iterations, reweigh, at)
+    except KeyboardInterrupt:
+        if at.best is None or at.problem is None:
+            raise
+        return _estimate(at.problem, at.best, _covariance(at.best, prior_sd), at.count, at.count * (1 + len(centre)), finished=False)
+
+
+def _searched(
+    problem: InverseProblem, centre: FloatArray, prior_sd: float, max_iterations: int, reweigh: bool, at: _Watched
+) -> LatticeEstimate:
+    theta, runs, count = centre.copy(), 0, 0
     here, used = problem, 0
     for _ in range(3 if reweigh else 1):
         point, used = _descend(here, theta, centre, prior_sd, max_iterations, at)
@@ -296,72 +301,103 @@ def calibrate_lattice(
         factors = _noise_factors(here, point)
         if not reweigh or max(abs(np.log(max(f, 1.0) / e)) for f, e in zip(factors, here.excess, strict=True)) < 0.05:
             break
-        here = replace(here, excess=(max(factors[0], 1.0), max(factors[1], 1.0)))
+        here = here.enlarged((max(factors[0], 1.0), max(factors[1], 1.0)))
     runs, each = count * (1 + len(theta)), 1 + len(theta)
     point, polished, settled = _polished(here, point, centre, prior_sd, at)
     runs += polished + (polished - 1) * each
     if not settled:  # coarse derivatives do not lead there
         point, used = _descend(here, point.theta, centre, prior_sd, FINE_ITERATIONS, at, fine=True)
         count, runs = count + used, runs + used * each
-    information = point.information
     covariance, extra = _widest(here, point, prior_sd, at)
-    runs += extra * each
-    factors = _noise_factors(here, point)
+    return _estimate(here, point, covariance, count, runs + extra * each)
+
+
+def _estimate(
+    problem: InverseProblem, point: _Point, covariance: FloatArray, iterations: int, runs: int, *, finished: bool = True
+) -> LatticeEstimate:
+    factors = _noise_factors(problem, point)
     shown = tuple(f if len(r) else np.nan for f, r in zip(factors, point.residual, strict=True))
     return LatticeEstimate(
-        problem.unknowns, np.exp(point.theta), covariance, information, (shown[0], shown[1]), count, runs * len(problem.load_cases),
-        identifiability(problem.unknowns.names, information),
+        problem.unknowns, np.exp(point.theta), covariance, point.information, (shown[0], shown[1]), iterations,
+        runs * len(problem.load_cases), identifiability(problem.unknowns.names, point.information), finished,
     )  # fmt: skip
 
 
-def _widest(problem: CalibrationProblem, point: _Point, prior_sd: float, at: Evaluate) -> tuple[FloatArray, int]:
+def estimate_at(problem: InverseProblem, values: ArrayLike, *, prior_sd: float = PRIOR_SD, finished: bool = True) -> LatticeEstimate:
+    """Return values that were found by another search as an estimate, with the intervals that derivatives give there.
+
+    Parameters
+    ----------
+    problem : CalibrationProblem or StudyProblem
+        What was sought.
+    values : array_like
+        As for `calibrate_lattice`; weak priors are centred there.
+    prior_sd : float
+        Standard deviation of the logarithms.
+    finished : bool
+        Whether the search came to its end.
+
+    Raises
+    ------
+    InputError
+        Values that are not positive.
+    """
+    theta = np.log(problem.unknowns.vector(values))
+    factors = _noise_factors(problem, evaluated(problem, theta, derivatives=False, fine=True))
+    here = problem.enlarged((max(factors[0], 1.0), max(factors[1], 1.0)))
+    residual = evaluated(here, theta, derivatives=False, fine=True).residual
+    point = replace(evaluated(here, theta), residual=residual)
+    return _estimate(here, point, _covariance(point, prior_sd), 0, 3 + len(theta), finished=finished)
+
+
+def _covariance(point: _Point, prior_sd: float) -> FloatArray:
+    return np.asarray(np.linalg.inv(point.information + np.eye(len(point.theta)) / prior_sd**2), dtype=np.float64)
+
+
+def _widest(problem: InverseProblem, point: _Point, prior_sd: float, at: Evaluate) -> tuple[FloatArray, int]:
     """Return the covariance at the estimate, or at an end of the 95 % interval of its least determined combination if it is wider there.
 
     What the data tell of the weakest combination changes by tens of per cent along its own interval. Returns the runs, too.
     """
-    prior = np.eye(len(point.theta)) / prior_sd**2
-    here = np.asarray(np.linalg.inv(point.information + prior), dtype=np.float64)
+    here = _covariance(point, prior_sd)
     values, vectors = np.linalg.eigh(here)
     reach = min(1.96 * float(np.sqrt(values[-1])), FARTHEST)
     found = [here]
     for side in (-1.0, 1.0):
         end = at(problem, point.theta + side * reach * vectors[:, -1])
-        found.append(np.asarray(np.linalg.inv(end.information + prior), dtype=np.float64))
+        found.append(_covariance(end, prior_sd))
     return max(found, key=lambda c: float(np.trace(c))), 2
 
 
-def _noise_factors(problem: CalibrationProblem, point: _Point) -> tuple[float, float]:
+def _noise_factors(problem: InverseProblem, point: _Point) -> tuple[float, float]:
     rms = [float(np.sqrt((r**2).mean())) if len(r) else 0.0 for r in point.residual]
     return rms[0] * problem.excess[0], rms[1] * problem.excess[1]
 
 
 def _cost(point: _Point, centre: FloatArray, prior_sd: float) -> float:
-    return float(sum((r**2).sum() for r in point.residual)) + float((((point.theta - centre) / prior_sd) ** 2).sum())
+    return _misfit(point) + float((((point.theta - centre) / prior_sd) ** 2).sum())
 
 
 def _descend(
-    problem: CalibrationProblem, theta: FloatArray, centre: FloatArray, prior_sd: float, most: int, at: Evaluate, *, fine: bool = False
+    problem: InverseProblem, theta: FloatArray, centre: FloatArray, prior_sd: float, most: int, at: Evaluate, *, fine: bool = False
 ) -> tuple[_Point, int]:
     """Iterate by Gauss and Newton; a step that does not help is shortened. Returns the last point and the iterations."""
     point, damping = at(problem, theta, fine=fine), 0.0
     cost, used = _cost(point, centre, prior_sd), 1
     while used < most:
-        hessian = point.information + np.eye(len(theta)) / prior_sd**2
-        slope = point.gradient() + (point.theta - centre) / prior_sd**2
-        step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), slope)
-        if -slope @ step < SETTLED:
+        step, promised = _step(point, centre, prior_sd, damping)
+        if promised < SETTLED:
             return point, used
-        step *= min(1.0, LONGEST / np.abs(step).max())
-        load_case = at(problem, point.theta + step, fine=fine)
+        trial = at(problem, point.theta + step, derivatives=False, fine=fine)
         used += 1
-        if (new := _cost(load_case, centre, prior_sd)) < cost:
-            settled = cost - new < SETTLED + (1e-6 if fine else 1e-5) * cost
-            point, cost, damping = load_case, new, 0.3 * damping if damping > 1e-4 else 0.0
-            if settled:
-                return point, used
+        if (new := _cost(trial, centre, prior_sd)) < cost:
+            settled = cost - new < SETTLED + max(1e-6 if fine else 1e-5, problem.roughness) * cost
+            if settled:  # next to the minimum, where derivatives hardly change
+                return replace(trial, slopes=point.slopes), used
+            point, cost, damping = at(problem, trial.theta, fine=fine), new, 0.3 * damping if damping > 1e-4 else 0.0
         else:
             damping = max(10.0 * damping, 1e-3)
-            if damping > 1e6:
+            if damping > 1e6 or promised < problem.roughness * cost:
                 return point, used
     if fine:
         return point, used
@@ -372,60 +408,34 @@ def _descend(
     )
 
 
-def _polished(problem: CalibrationProblem, point: _Point, centre: FloatArray, prior_sd: float, at: Evaluate) -> tuple[_Point, int, bool]:
+def _step(point: _Point, centre: FloatArray, prior_sd: float, damping: float) -> tuple[FloatArray, float]:
+    """Return the next change of theta, and the decrease of the cost that an undamped one promises."""
+    hessian = point.information + np.eye(len(point.theta)) / prior_sd**2
+    slope = point.gradient() + (point.theta - centre) / prior_sd**2
+    step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), slope)
+    return step * min(1.0, LONGEST / max(float(np.abs(step).max()), 1e-300)), float(-slope @ step)
+
+
+def _polished(problem: InverseProblem, point: _Point, centre: FloatArray, prior_sd: float, at: Evaluate) -> tuple[_Point, int, bool]:
     """Move on to the minimum of residuals of fine steps by derivatives of coarse ones; return it, the runs, and whether it settled."""
 
-    def fine(theta: FloatArray, slopes: tuple[FloatArray, FloatArray] | None = None) -> _Point:
-        residual = at(problem, theta, derivatives=False, fine=True).residual
-        return _Point(theta, residual, slopes or at(problem, theta).slopes)
+    def fine(theta: FloatArray) -> _Point:
+        return at(problem, theta, derivatives=False, fine=True)
 
-    best, damping = fine(point.theta, point.slopes), 0.0
+    best, damping, coarse = replace(fine(point.theta), slopes=point.slopes), 0.0, point.theta
     cost = _cost(best, centre, prior_sd)
     for count in range(1, POLISHING):
-        hessian = best.information + np.eye(len(best.theta)) / prior_sd**2
-        slope = best.gradient() + (best.theta - centre) / prior_sd**2
-        step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), slope)
-        if -slope @ step < SETTLED:
+        step, promised = _step(best, centre, prior_sd, damping)
+        if promised < SETTLED:
             return best, count, True
-        load_case = fine(best.theta + step * min(1.0, LONGEST / np.abs(step).max()))
-        if (new := _cost(load_case, centre, prior_sd)) < cost:
-            best, cost, damping = load_case, new, 0.3 * damping
+        trial = fine(best.theta + step)
+        if (new := _cost(trial, centre, prior_sd)) < cost:
+            slopes = best.slopes
+            if np.abs(trial.theta - coarse).max() > RENEWED:
+                slopes, coarse = at(problem, trial.theta).slopes, trial.theta
+            best, cost, damping = replace(trial, slopes=slopes), new, 0.3 * damping
         else:
+            if promised < problem.roughness * cost:
+                return best, count, True
             damping = max(10.0 * damping, 1e-3)
     return best, POLISHING, False
-
-
-@dataclass(frozen=True, slots=True)
-class ReportIndices:
-    """Misfit measures of the report for one load case.
-
-    Attributes
-    ----------
-    shape_mm : tuple of float
-        S_shape at every capture, mm.
-    points : tuple of int
-        Captured points.
-    large : tuple of int
-        Points that are 2.5 mm or more away.
-    force_mn : float
-        S_force over the samples while the indenters keep still, mN, sum over the sensors.
-    samples : int
-        Their number, for one sensor.
-    """
-
-    shape_mm: tuple[float, ...]
-    points: tuple[int, ...]
-    large: tuple[int, ...]
-    force_mn: float
-    samples: int
-
-
-def indices(capture: Capture, pushed: PushedLattice, parameters: LatticeParameters, *, large_mm: float = 2.5) -> ReportIndices:
-    """Return S_shape and S_force of a lattice against a capture; distances below the sensor's error are not counted in S_shape."""
-    found, since = pushed.run(parameters), round(capture.pushing.push_s / SAMPLE_S)
-    repeated = np.repeat(found.force, round(pushed.long_step / SAMPLE_S), axis=0)
-    distances = [np.abs(closest_points(p, pushed.hull, x).signed) for p, x in zip(capture.points, found.positions, strict=True)]
-    shape = tuple(float(d[d >= capture.point_sd_mm].sum()) for d in distances)
-    large = tuple(int((d >= large_mm).sum()) for d in distances)
-    force, _ = force_difference(capture.force[since:], repeated[since:])
-    return ReportIndices(shape, tuple(len(d) for d in distances), large, force, len(repeated) - since)

@@ -44,6 +44,11 @@ class LatticeUnknowns:
     members: BoolArray
     scale: FloatArray
 
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the values."""
+        return tuple(UNITS[KINDS[kind]] for kind in self.kind)
+
     @classmethod
     def of(cls, lattice: Lattice, *, classes: bool = True, zones: bool = False, levels: bool = False) -> LatticeUnknowns:
         """Name the parameters of a lattice: one of each kind for every class, zone and octree level that occurs, or for all elements."""

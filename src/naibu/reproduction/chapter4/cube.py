@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from naibu.identification.lattice_calibration.estimate import LatticeEstimate
 from naibu.identification.lattice_calibration.forward_model import Capture, PushedLattice
-from naibu.identification.lattice_calibration.gauss_newton import CalibrationProblem, LatticeEstimate, calibrate_lattice, indices
+from naibu.identification.lattice_calibration.gauss_newton import CalibrationProblem, calibrate_lattice
+from naibu.identification.lattice_calibration.report_indices import indices
 from naibu.identification.lattice_calibration.unknowns import LatticeUnknowns
 from naibu.mechanics.lattices.model.lattice import Lattice, box_mask, classic_lattice
 from naibu.mechanics.lattices.model.octree import octree_lattice

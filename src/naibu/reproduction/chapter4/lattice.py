@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from naibu.identification.lattice_calibration.gauss_newton import CalibrationProblem, ReportIndices, calibrate_lattice
+from naibu.identification.lattice_calibration.gauss_newton import CalibrationProblem, calibrate_lattice
+from naibu.identification.lattice_calibration.report_indices import ReportIndices
 from naibu.identification.lattice_calibration.unknowns import UNITS
 from naibu.reproduction.chapter4.patterns import START, PatternStudy, pattern_study, with_interval_factor
 from naibu.reproduction.printed_tables import printed_table

@@ -1,0 +1,63 @@
+"""Identified parameters of a lattice, with covariance and intervals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray
+from naibu.identification.lattice_calibration.inverse_problem import Unknowns
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LatticeEstimate:
+    """Identified lattice parameters with their covariance.
+
+    Attributes
+    ----------
+    unknowns : LatticeUnknowns or StudyUnknowns
+        What was sought.
+    values : ndarray, shape (p,)
+        mN/mm and mN s/mm.
+    covariance : ndarray, shape (p, p)
+        Of their logarithms; weak priors around the start included. The widest of those at the estimate and at the ends of the interval of
+        its least determined combination, along which the data's information changes.
+    information : ndarray, shape (p, p)
+        Fisher information of the data alone.
+    noise_factor : tuple of float
+        Root mean square residual of points and of forces in units of the stated noise; NaN where they did not count.
+    iterations, runs : int
+        Gauss-Newton iterations, and simulated pushings; one with derivatives counts as 1 + p.
+    undetermined : tuple of str
+        In words, the combinations that the data do not determine.
+    finished : bool
+        Whether the search came to its end; otherwise Ctrl-C left the best so far.
+    """
+
+    unknowns: Unknowns
+    values: FloatArray
+    covariance: FloatArray
+    information: FloatArray
+    noise_factor: tuple[float, float]
+    iterations: int
+    runs: int
+    undetermined: tuple[str, ...]
+    finished: bool = True
+
+    def parameters(self) -> Any:
+        """Return the parameters of all elements; of a study, a `naibu.identification.Trial`."""
+        return self.unknowns.parameters(self.values)
+
+    def intervals(self) -> FloatArray:
+        """Return the 95 % intervals (p, 2) of all values."""
+        half = 1.96 * np.sqrt(np.diag(self.covariance))
+        return np.stack([self.values * np.exp(-half), self.values * np.exp(half)], axis=1)
+
+    def sentences(self) -> tuple[str, ...]:
+        """Return the result in sentences, and what the data do not determine."""
+        lines = []
+        for name, unit, value, (low, high) in zip(self.unknowns.names, self.unknowns.units, self.values, self.intervals(), strict=True):
+            lines.append(f"{f'{name}: {value:.4g} {unit}'.rstrip()} (95 % between {low:.4g} and {high:.4g})")
+        return (*lines, *self.undetermined)

@@ -1,0 +1,288 @@
+"""Calibrate the lattice of a study from captured shapes and recorded forces, and write a study that runs with what was found."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from naibu._version import __version__
+from naibu.core.arrays import require_within
+from naibu.core.errors import InputError
+from naibu.core.progress import Progress
+from naibu.identification.lattice_calibration.estimate import LatticeEstimate
+from naibu.identification.lattice_calibration.evolutionary import search_cma_es, search_genetic
+from naibu.identification.lattice_calibration.gauss_newton import calibrate_lattice, estimate_at
+from naibu.identification.lattice_calibration.study_problem import RecordedForces, StudyProblem
+from naibu.identification.lattice_calibration.study_unknowns import PULL_OFF, Friction, Groups, StudyUnknowns
+from naibu.io.captured_shapes import CapturedSurface, read_captured_shapes
+from naibu.io.files.atomic import write_atomically
+from naibu.io.files.provenance import sha256
+from naibu.io.force_records import ForceRecord, read_force_records
+from naibu.io.study_schemas.lattice_study_schema import StudyFile
+from naibu.io.study_schemas.study_writing import study_document
+from naibu.viewer.chapter_page import chapter_html
+from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.studies.calibration_page import Compared, calibration_chapter, held_intervals, misfit_numbers
+from naibu.workflows.studies.lattice_study import PreparedStudy, prepared_study
+
+Method = Literal["gauss-newton", "cma-es", "genetic"]
+POINT_SD_MM = 0.5  # of the report's stereo cameras :cite:p:`hirai2008`
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LatticeCalibration:
+    """A calibrated study, and the files.
+
+    Attributes
+    ----------
+    files : tuple of Path
+        Page, numbers, and the study with the values that were found.
+    estimate : LatticeEstimate
+        Values, covariance, intervals, and what the data do not determine.
+    warnings : tuple of str
+        What a reader must know before trusting them.
+    """
+
+    files: tuple[Path, ...]
+    estimate: LatticeEstimate
+    warnings: tuple[str, ...]
+
+
+def calibrate_study(
+    study: str | os.PathLike[str],
+    *,
+    shapes: Sequence[str | os.PathLike[str]] = (),
+    forces: Sequence[str | os.PathLike[str]] = (),
+    out: str | os.PathLike[str],
+    groups: Groups = "class",
+    friction: Friction = "given",
+    pull_off: bool = False,
+    method: Method = "gauss-newton",
+    point_sd_mm: float = POINT_SD_MM,
+    force_sd_mn: float | None = None,
+    max_runs: int = 2000,
+    seed: int = 0,
+    threads: int = 2,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> LatticeCalibration:
+    """Identify the parameters of a lattice from what cameras and force sensors recorded of it.
+
+    Ctrl-C (KeyboardInterrupt, also from `progress`) keeps the best values so far.
+
+    Parameters
+    ----------
+    study : str or path-like
+        What was done, as for `naibu.simulate`: object, indenters, and their paths. Its parameters are where the search starts.
+    shapes : sequence of path-like
+        Captured points, in the coordinates of the study; see `naibu.io.read_captured_shapes`.
+    forces : sequence of path-like
+        Records of force sensors; see `naibu.io.read_force_records`. One without a name is that of the only indenter.
+    out : path-like
+        Folder for ``calibration.html``, ``calibration.json`` and ``STUDY-calibrated.toml``.
+    groups, friction, pull_off
+        What is unknown; see `naibu.identification.StudyUnknowns`.
+    method : str
+        ``"gauss-newton"``, or a search without derivatives: ``"cma-es"`` or ``"genetic"``, with intervals by derivatives at its end.
+    point_sd_mm : float
+        Standard deviation of a coordinate of the captured points.
+    force_sd_mn : float
+        Standard deviation of a component of a force in one sample; by default estimated from the records.
+    max_runs : int
+        Simulations of a search without derivatives, at most.
+    seed : int
+        Of the random numbers of such a search.
+    threads : int
+        Computing derivatives.
+    overwrite : bool
+        Whether results that the folder holds are replaced.
+    progress : callable, optional
+        Called with a `ProgressReport` after every evaluation.
+
+    Raises
+    ------
+    InputError
+        Files or settings that cannot be used, records that belong to no indenter, forces that point the other way, or a folder that
+        cannot be written to or holds results.
+    ConvergenceError
+        The iterations did not settle.
+    """
+    if method not in get_args(Method):
+        raise InputError(f"method is {method!r}; choose one of {', '.join(get_args(Method))}")
+    require_within("point_sd_mm", point_sd_mm, 1e-6, 1e3, "mm")
+    if force_sd_mn is not None:
+        require_within("force_sd_mn", force_sd_mn, 1e-6, 1e6, "mN")
+    if max_runs < 1 or threads < 1:
+        raise InputError(f"{'max_runs' if max_runs < 1 else 'threads'} must be at least 1")
+    if not shapes and not forces:
+        raise InputError("shapes and forces are both missing; give captured points, records of force sensors, or both")
+    prepared = prepared_study(study)
+    captured = read_captured_shapes(shapes) if shapes else ()
+    records = read_force_records(forces) if forces else ()
+    unknowns = StudyUnknowns.of(prepared.study, groups=groups, friction=friction, pull_off=pull_off)
+    problem = _problem(prepared, unknowns, captured, records, point_sd_mm, force_sd_mn)
+    name = f"{prepared.name}-calibrated.toml"
+    folder = output_folder(out, ("calibration.html", "calibration.json", name), overwrite=overwrite)
+    before = Compared.of(problem, unknowns.start)
+    _check_directions(prepared, before)
+    estimate = _searched(problem, method, seed, max_runs, threads, progress)
+    after = Compared.of(problem, estimate.values)
+    settings = calibrated_settings(prepared.settings, estimate)
+    inputs = {**prepared.inputs, **_hashes((*shapes, *forces))}
+    options: dict[str, str | float | int | None] = {
+        "study": prepared.source, "method": method, "groups": groups, "friction": friction, "point_sd_mm": point_sd_mm, "seed": seed,
+        **{f"SHA-256 of {file}": digest for file, digest in inputs.items()},
+    }  # fmt: skip
+    warnings = _warnings(problem, estimate, before)
+    chapter = calibration_chapter(prepared.title, problem, estimate, before, after, records, warnings, options)
+    comment = f"{prepared.title}, calibrated by naibu {__version__} from {', '.join(map(_file_name, (*shapes, *forces)))}"
+    target = write_atomically(folder / name, study_document(_with_labels(prepared, settings, folder), comment))
+    page = write_atomically(folder / "calibration.html", chapter_html(chapter))
+    numbers = {**_numbers(estimate), "misfit": misfit_numbers(problem, before, after), "warnings": list(warnings), "settings": options}
+    written = write_atomically(folder / "calibration.json", json.dumps(numbers, indent=1, ensure_ascii=False) + "\n")
+    return LatticeCalibration((page, written, target), estimate, warnings)
+
+
+def _problem(
+    prepared: PreparedStudy,
+    unknowns: StudyUnknowns,
+    captured: Sequence[CapturedSurface],
+    records: Sequence[ForceRecord],
+    point_sd_mm: float,
+    force_sd_mn: float | None,
+) -> StudyProblem:
+    study = prepared.study
+    names = [body.name for body in study.bodies]
+    movable = [k for k, name in enumerate(names) if name != "floor"]
+    placed = []
+    for record in records:
+        if not record.indenter and len(movable) != 1:
+            raise InputError(
+                f"forces: a record names no indenter, and the study has {len(movable)}: {', '.join(names[k] for k in movable)}; write "
+                "NAME=FILE, or add a column 'indenter'"
+            )
+        if record.indenter and record.indenter not in names:
+            raise InputError(f"forces: there is no indenter {record.indenter!r} in the study; there are {', '.join(names)}")
+        placed.append((names.index(record.indenter) if record.indenter else movable[0], record.times_s, record.force))
+    recorded = RecordedForces.of(study, placed, sd_mn=force_sd_mn)
+    return StudyProblem.of(unknowns, [(c.time_s, c.points) for c in captured], recorded, point_sd_mm=point_sd_mm)
+
+
+def _check_directions(prepared: PreparedStudy, before: Compared) -> None:
+    """Refuse records that hold what the object exerts on the sensor."""
+    for body, name in enumerate(b.name for b in prepared.study.bodies):
+        seen, ours = before.measured[:, body], before.force[:, body]
+        counted = np.isfinite(seen)
+        product = float((seen[counted] * ours[counted]).sum())
+        sizes = float(np.sqrt((seen[counted] ** 2).sum() * (ours[counted] ** 2).sum()))
+        if product < -0.5 * sizes < 0.0:
+            raise InputError(
+                f"forces of {name!r} point the other way than simulated ones; a record holds what the indenter exerts on the object: "
+                "reverse the signs, or check the axes of the sensor"
+            )
+
+
+def _searched(problem: StudyProblem, method: Method, seed: int, max_runs: int, threads: int, progress: Progress | None) -> LatticeEstimate:
+    start = problem.unknowns.start
+    if method == "gauss-newton":
+        return calibrate_lattice(problem, start, threads=threads, progress=progress)
+    search = search_cma_es if method == "cma-es" else search_genetic
+    found = search(problem, start, seed=seed, measure="chi-squared", max_runs=max_runs, progress=progress)
+    return estimate_at(problem, found.values, finished=found.finished)
+
+
+def _warnings(problem: StudyProblem, estimate: LatticeEstimate, before: Compared) -> tuple[str, ...]:
+    found = [] if estimate.finished else ["The search was interrupted: these are the best values so far, not the end of the search."]
+    for what, factor in zip(("points", "forces"), estimate.noise_factor, strict=True):
+        if factor > 1.3:
+            found.append(
+                f"The calibrated lattice reproduces the {what} to {factor:.2g} times their noise only: the law, the paths of the "
+                "indenters or the stated noise do not hold. Intervals are wider by that factor, and may still be too narrow."
+            )
+        if factor < 0.7:
+            found.append(f"The {what} are met to {factor:.2g} times their noise: it is stated too large, and intervals are too wide.")
+    at_rest = [d for time, d in zip(before.times, before.distance, strict=True) if time == 0.0]
+    offset = float(np.sqrt((at_rest[0] ** 2).mean())) if at_rest else 0.0
+    if offset > 3.0 * problem.point_sd_mm:
+        found.append(
+            f"At rest, before anything moves, the captured points lie {offset:.3g} mm (RMS) from the object of the study: the captures are "
+            "in other coordinates, or size_mm is not that of the object. Estimates absorb this."
+        )
+    unknowns = problem.unknowns
+    for name, value, (low, high) in zip(unknowns.names, estimate.values, unknowns.bounds, strict=True):
+        if not low < value < high:
+            found.append(f"{name} has reached the end of its range, {low:g} to {high:g}.")
+    return tuple(found)
+
+
+def calibrated_settings(settings: StudyFile, estimate: LatticeEstimate) -> StudyFile:
+    """Return the settings of a study with the values of an estimate."""
+    unknowns = estimate.unknowns
+    assert isinstance(unknowns, StudyUnknowns)
+    given = settings.model_dump(mode="python", exclude_unset=True)
+    held = np.clip(estimate.values, *unknowns.bounds.T)
+    tables: dict[str, Any] = {}
+    for name, value in zip(unknowns.names[: len(unknowns.kind)], held, strict=False):
+        kind, *places = name.split()
+        node = tables
+        for inner in (kind, *places)[:-1]:
+            node = node.setdefault(inner, {})
+        node[(kind, *places)[-1]] = _rounded(value)
+    given["parameters"] |= tables
+    indenters = unknowns.parameters(estimate.values).indenters
+    bodies = ([given["floor"]] if settings.floor is not None else []) + given.get("indenter", [])
+    for quantity, members in unknowns.surfaces:
+        unit = PULL_OFF.get(quantity, "")
+        key = f"{quantity}_{unit.replace('/', '_per_').replace(' ', '_')}" if unit else quantity
+        for k in members:
+            bodies[k][key] = _rounded(getattr(indenters[k], quantity))
+    return StudyFile.model_validate(given)
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}")
+
+
+def _with_labels(prepared: PreparedStudy, settings: StudyFile, folder: Path) -> StudyFile:
+    """Copy a volume of labels beside the study that is written, where a study's files must be."""
+    labels = settings.object.labels
+    if labels is None:
+        return settings
+    source = Path(prepared.source).parent / labels
+    target = folder / source.name
+    if not (target.exists() and target.samefile(source)):
+        shutil.copyfile(source, target)
+    return settings.model_copy(update={"object": settings.object.model_copy(update={"labels": source.name})})
+
+
+def _file_name(source: str | os.PathLike[str]) -> str:
+    text = os.fspath(source)
+    return Path(text if Path(text).exists() else text.partition("=")[2]).name
+
+
+def _hashes(sources: Sequence[str | os.PathLike[str]]) -> dict[str, str]:
+    texts = [os.fspath(source) for source in sources]
+    files = [Path(text if Path(text).exists() else text.partition("=")[2]) for text in texts]
+    return {file.name: sha256(file) for file in files}
+
+
+def _numbers(estimate: LatticeEstimate) -> dict[str, Any]:
+    unknowns, low_high = estimate.unknowns, held_intervals(estimate)
+    rows = zip(unknowns.names, unknowns.units, estimate.values.tolist(), low_high.tolist(), strict=True)
+    return {
+        "naibu": __version__,
+        "finished": estimate.finished,
+        "parameters": [{"name": n, "unit": u, "value": v, "interval_95": i} for n, u, v, i in rows],
+        "covariance_of_logarithms": estimate.covariance.tolist(),
+        "noise_factor": dict(zip(("points", "forces"), [None if np.isnan(f) else f for f in estimate.noise_factor], strict=True)),
+        "undetermined": list(estimate.undetermined),
+        "iterations": estimate.iterations,
+        "simulations": estimate.runs,
+    }

@@ -1,0 +1,181 @@
+"""Calibration by studies: against the simulation, differences, the closed form of a block that is pushed over a floor, and known truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lattice_studies import study_file
+
+from naibu.core.errors import InputError
+from naibu.core.progress import ProgressReport
+from naibu.identification.lattice_calibration.gauss_newton import calibrate_lattice, evaluated
+from naibu.identification.lattice_calibration.study_model import StudyModel
+from naibu.identification.lattice_calibration.study_problem import RecordedForces, StudyProblem
+from naibu.identification.lattice_calibration.study_unknowns import SURFACE_MASS, StudyUnknowns
+from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy, run_study
+from naibu.workflows.studies.lattice_study import prepared_study
+
+SQUEEZED = """
+[object]
+size_mm = [30, 20, 20]
+mass_g = 12.0
+[lattice]
+spacing_mm = 10.0
+[parameters]
+K = 40.0
+C1 = 10.0
+C2 = 100.0
+[simulation]
+duration_s = 0.4
+gravity_mm_per_s2 = 9810
+[floor]
+[[indenter]]
+name = "stamp"
+shape = "box"
+size_mm = [10, 20, 10]
+centre_mm = [-5.0, 10.0, 15.0]
+contact = "tied"
+until_s = 0.3
+path = [[0.0, 0, 0, 0], [0.1, 3, 0, 0], [0.2, 3, 0, 0], [0.25, 1, 0, 0]]
+[output]
+every_s = 0.02
+"""
+PUSHED = """
+[object]
+size_mm = [40, 20, 20]
+mass_g = 200.0
+[lattice]
+spacing_mm = 10.0
+[parameters]
+K = 400.0
+C1 = 40.0
+C2 = inf
+[simulation]
+duration_s = 0.4
+gravity_mm_per_s2 = 9810
+[floor]
+contact = "friction"
+static_friction = 0.6
+kinetic_friction = 0.45
+[[indenter]]
+name = "pusher"
+shape = "box"
+size_mm = [10, 10, 10]
+centre_mm = [-5.0, 10.0, 5.0]
+path = [[0.0, 0, 0, 0], [0.4, 12, 0, 0]]
+[output]
+every_s = 0.02
+"""
+
+
+@pytest.fixture
+def squeezed(tmp_path: Path) -> LatticeStudy:
+    return prepared_study(study_file(tmp_path, SQUEEZED)).study
+
+
+@pytest.fixture
+def pushed(tmp_path: Path) -> LatticeStudy:
+    return prepared_study(study_file(tmp_path, PUSHED)).study
+
+
+@pytest.mark.parametrize("text", [SQUEEZED, PUSHED], ids=["tied", "touching"])
+def test_the_forward_model_is_the_simulation(tmp_path: Path, text: str) -> None:
+    study = prepared_study(study_file(tmp_path, text)).study
+    unknowns = StudyUnknowns.of(study)
+    frames = list(run_study(study))
+    model = StudyModel.of(study, [0.2, 0.4], 20, 10, coarse=False)
+    found = model.run(unknowns.parameters(unknowns.start))
+    for position, frame in zip(found.positions, (frames[10], frames[20]), strict=True):
+        assert np.abs(position - frame.state.lattice.position).max() < 2e-3
+    force = np.array([frame.force.mean(axis=0) for frame in frames[1:]])
+    assert np.abs(found.force - force).max() < 5e-3 * np.abs(force).max()
+
+
+def test_derivatives_of_a_tied_study_are_differences(squeezed: LatticeStudy) -> None:
+    unknowns = StudyUnknowns.of(replace(squeezed, tolerance=1e-8), groups="all")
+    model = StudyModel.of(unknowns.study, [0.1, 0.4], 20, 10, coarse=False)
+    found, h = model.run(unknowns.parameters(unknowns.start), unknowns.changes(unknowns.start)), 1e-4
+    for k in range(3):
+        ahead, behind = (model.run(unknowns.parameters(unknowns.start * np.exp(s * h * np.eye(3)[k]))) for s in (1.0, -1.0))
+        for slope, name in ((found.positions_change[k], "positions"), (found.force_change[k], "force")):
+            expected = (getattr(ahead, name) - getattr(behind, name)) / (2.0 * h)
+            assert np.linalg.norm(slope - expected) < 1e-2 * np.linalg.norm(expected)
+
+
+def test_shares_of_samples_weigh_the_steps_alike(squeezed: LatticeStudy) -> None:
+    """A record of samples of single steps is met by the parameters that made it, without any noise, however sparse it is."""
+    unknowns = StudyUnknowns.of(squeezed)
+    fine = StudyModel.of(squeezed, [], 200, 1, coarse=False).run(unknowns.parameters(unknowns.start)).force[:, 1]
+    steps = np.arange(1, 200, 3)
+    recorded = RecordedForces.of(squeezed, [(1, squeezed.step_s * (steps + 0.5), fine[steps])], sd_mn=1.0)
+    problem = StudyProblem.of(unknowns, [], recorded, point_sd_mm=0.5)
+    residual = evaluated(problem, np.log(unknowns.start), derivatives=False, fine=True).residual[1]
+    assert len(residual) == 3 * 20
+    assert np.abs(residual).max() < 1e-3 * np.abs(fine).max()
+
+
+def test_friction_of_a_pushed_block_is_force_over_weight(pushed: LatticeStudy) -> None:
+    """A block that slides steadily is pushed by mu_k m g; the record is made by that law alone, not by a simulation."""
+    unknowns = StudyUnknowns.of(pushed, groups="given", friction="each")
+    times = np.arange(0.2, 0.4, 0.001)
+    truth, weight = 0.3, 200e-3 * 9810.0
+    force = np.column_stack([np.full(len(times), truth * weight), np.zeros((len(times), 2))])
+    noisy = force + 5.0 * np.random.default_rng(0).standard_normal(force.shape)
+    recorded = RecordedForces.of(pushed, [(1, times, noisy)], sd_mn=5.0)
+    problem = StudyProblem.of(unknowns, [], recorded, point_sd_mm=0.5)
+    found = calibrate_lattice(problem, unknowns.start)
+    place = unknowns.names.index("kinetic friction of floor")
+    assert found.values[place] == pytest.approx(truth, rel=0.01)
+    low, high = found.intervals()[place]
+    assert low < truth < high and high - low < 0.05
+    assert any("static friction of floor" in sentence for sentence in found.undetermined)
+
+
+def test_truth_of_a_squeezed_block_lies_within_its_intervals(squeezed: LatticeStudy) -> None:
+    unknowns, rng = StudyUnknowns.of(squeezed, groups="all"), np.random.default_rng(1)
+    truth = unknowns.start * [1.6, 0.6, 1.4]
+    model = StudyModel.of(squeezed, [0.1, 0.4], 200, 1, coarse=False)
+    made = model.run(unknowns.parameters(truth))
+    nodes = np.flatnonzero(squeezed.lattice.surface_node & (squeezed.lattice.points[:, 2] > 0.0))
+    clouds = [(t, x[nodes] + 0.05 * rng.standard_normal((len(nodes), 3))) for t, x in zip((0.1, 0.4), made.positions, strict=True)]
+    noisy = made.force[:, 1] + 10.0 * rng.standard_normal((200, 3))
+    recorded = RecordedForces.of(squeezed, [(1, squeezed.step_s * (np.arange(200) + 0.5), noisy)])
+    assert recorded.sd_mn[1] == pytest.approx(10.0, rel=0.2)
+    reports: list[ProgressReport] = []
+    found = calibrate_lattice(StudyProblem.of(unknowns, clouds, recorded, point_sd_mm=0.05), unknowns.start, progress=reports.append)
+    z = np.log(found.values / truth) / np.sqrt(np.diag(found.covariance))
+    assert np.abs(z).max() < 3.3  # once in a thousand draws
+    assert np.sqrt(np.diag(found.covariance)).max() < 0.2
+    assert reports[-1].done == len(reports) and found.finished
+
+
+def test_an_interruption_keeps_the_best_so_far(squeezed: LatticeStudy) -> None:
+    unknowns = StudyUnknowns.of(squeezed, groups="all")
+    force = StudyModel.of(squeezed, [], 200, 1, coarse=False).run(unknowns.parameters(2.0 * unknowns.start)).force[:, 1]
+    recorded = RecordedForces.of(squeezed, [(1, squeezed.step_s * (np.arange(200) + 0.5), force)], sd_mn=10.0)
+    problem = StudyProblem.of(unknowns, [], recorded, point_sd_mm=0.5)
+
+    def stop(report: ProgressReport) -> None:
+        if report.done == 4:
+            raise KeyboardInterrupt
+
+    found = calibrate_lattice(problem, unknowns.start, progress=stop)
+    costs = [
+        sum((r**2).sum() for r in evaluated(problem, np.log(values), derivatives=False).residual) for values in (unknowns.start, found.values)
+    ]
+    assert not found.finished
+    assert costs[1] < costs[0]
+
+
+def test_masses_of_the_surface_keep_the_total(squeezed: LatticeStudy) -> None:
+    unknowns = StudyUnknowns.of(squeezed, groups="given", friction="given", surface_mass=True) if _has_core(squeezed) else None
+    assert unknowns is None or unknowns.names == (SURFACE_MASS,)
+    with pytest.raises(InputError, match="all nodes of the lattice are at its surface|nothing is unknown"):
+        StudyUnknowns.of(squeezed, groups="given", surface_mass=not _has_core(squeezed))
+
+
+def _has_core(study: LatticeStudy) -> bool:
+    return bool((~study.lattice.surface_node).any())
