@@ -81,6 +81,10 @@ NUMBERS: tuple[tuple[str, tuple[str, ...], str, tuple[str, ...]], ...] = (
     ("live", ("{solid}", "--no-browser"), "--young-modulus-kpa", LENGTH),
     ("reproduce", ("ch3",), "--seed", tuple(v for v in NO_COUNTS if v != "0")),
     ("simulate", ("{study}",), "--checkpoint-every", NO_COUNTS),
+    ("calibrate", ("{study}", "--shapes", "{cloud}"), "--point-sd-mm", LENGTH),
+    ("calibrate", ("{study}", "--forces", "{sensor}"), "--force-sd-mn", LENGTH),
+    ("calibrate", ("{study}", "--shapes", "{cloud}"), "--max-runs", NO_COUNTS),
+    ("calibrate", ("{study}", "--shapes", "{cloud}"), "--threads", NO_COUNTS),
 )
 TRIPLES = (
     ("sense", ("{scan}", "{scan2}"), "--spacing-mm"),
@@ -96,7 +100,8 @@ CHOICES = (
     ("track", (*TRACK, *DIAMETER), "--polarity"), ("track", (*TRACK, *DIAMETER, *SIZE), "--shape"),
     ("track", (*TRACK, *DIAMETER, *SIZE), "--loading"), ("track-sequence", ("{frames}", "--pixel-mm", "1", *DIAMETER), "--polarity"),
     ("import", (*TABLES, *SIZE), "--shape"), ("import", (*TABLES, *SIZE), "--loading"), ("import", (*TABLES, *SIZE), "--unit"),
-    ("simulate", ("{study}",), "--device"),
+    ("simulate", ("{study}",), "--device"), ("calibrate", ("{study}", "--shapes", "{cloud}"), "--groups"),
+    ("calibrate", ("{study}", "--shapes", "{cloud}"), "--friction"), ("calibrate", ("{study}", "--shapes", "{cloud}"), "--method"),
 )  # fmt: skip
 NO_CHOICES = ("", "nan", "Neo_Hookean ", "<script>", "../..", "é" * 50)
 NO_KNOWN = (
@@ -116,6 +121,8 @@ NO_HEIGHTS = (
 NO_VERTICALS = ("", "w", "-", "--", "0,0,0", "0,1", "1,2,3,4", "nan,0,1", "inf,0,1", "0;0;1", "found?", "Found", "0.1,a,1", "<script>")
 TEXTS = (
     ("import", (*TABLES, *SIZE), "--vertical", NO_VERTICALS),
+    ("calibrate", ("{study}",), "--shapes", ("nosuch.csv", "nan={cloud}", "-1=shape.ply", "soon=shape.ply", "<script>")),
+    ("calibrate", ("{study}",), "--forces", ("nosuch.csv", "nosuch=nosuch.csv", "<script>")),
     ("identify", ("{press}",), "--known", NO_KNOWN),
     ("compare", ("{press}",), "--known", NO_KNOWN),
     ("identify", ("{press}",), "--state", NO_STATES),

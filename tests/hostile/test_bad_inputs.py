@@ -52,6 +52,10 @@ def files(press: Press, tmp_path_factory: pytest.TempPathFactory) -> Files:
     named = {**touched_bodies(root), **views(root), **measured_field(root), **recorded_readings(root)}
     scans = {name: root / f"{name}.mha" for name in ("scan", "scan2", "scan3", "frames", "zero", "voxel")}
     tables = {"table": press.folder / "initial.csv", "table2": press.folder / "pressed.csv"}
+    records = {"cloud": "t,x,y,z\n0,10,10,20\n0,20,10,20\n", "sensor": "t,fx,fy,fz\n" + "".join(f"0.0{k},0,0,-{k}\n" for k in range(1, 9))}
+    for name, text in records.items():
+        (root / f"{name}.csv").write_text(text, encoding="utf-8")
+        named[name] = root / f"{name}.csv"
     return {**named, **scans, **tables, "press": press.folder, "model": press.results / "model.json", "study": study_file(root)}
 
 

@@ -34,7 +34,7 @@ def calibrate(
     pull_off: Flag = False,
     method: Literal["gauss-newton", "cma-es", "genetic"] = "gauss-newton",
     point_sd_mm: float = 0.5,
-    force_sd_mn: Annotated[float | None, Parameter(name="--force-sd-mN")] = None,
+    force_sd_mn: float | None = None,
     max_runs: Whole = 2000,
     seed: Whole = 0,
     threads: Whole = 2,

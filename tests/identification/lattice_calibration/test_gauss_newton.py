@@ -14,6 +14,7 @@ import pytest
 
 from naibu.core import optional_packages
 from naibu.core.errors import ConvergenceError, InputError, MissingDependencyError
+from naibu.identification.lattice_calibration.evaluation import evaluated
 from naibu.identification.lattice_calibration.evolutionary import cost_of, evaluator, search_cma_es, search_genetic
 from naibu.identification.lattice_calibration.forward_model import (
     SAMPLE_S,
@@ -23,7 +24,7 @@ from naibu.identification.lattice_calibration.forward_model import (
     Pushing,
     tributary_fractions,
 )
-from naibu.identification.lattice_calibration.gauss_newton import CalibrationProblem, Index, calibrate_lattice, evaluated
+from naibu.identification.lattice_calibration.gauss_newton import CalibrationProblem, Index, calibrate_lattice
 from naibu.identification.lattice_calibration.report_indices import indices
 from naibu.identification.lattice_calibration.unknowns import FRACTION_NOTE, LatticeUnknowns, identifiability
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters

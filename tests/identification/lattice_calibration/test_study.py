@@ -11,10 +11,12 @@ from lattice_studies import study_file
 
 from naibu.core.errors import InputError
 from naibu.core.progress import ProgressReport
-from naibu.identification.lattice_calibration.gauss_newton import calibrate_lattice, evaluated
+from naibu.identification.lattice_calibration.evaluation import evaluated
+from naibu.identification.lattice_calibration.gauss_newton import calibrate_lattice
 from naibu.identification.lattice_calibration.study_model import StudyModel
 from naibu.identification.lattice_calibration.study_problem import RecordedForces, StudyProblem
-from naibu.identification.lattice_calibration.study_unknowns import SURFACE_MASS, StudyUnknowns
+from naibu.identification.lattice_calibration.study_unknowns import StudyUnknowns
+from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy, run_study
 from naibu.workflows.studies.lattice_study import prepared_study
 
@@ -163,19 +165,21 @@ def test_an_interruption_keeps_the_best_so_far(squeezed: LatticeStudy) -> None:
             raise KeyboardInterrupt
 
     found = calibrate_lattice(problem, unknowns.start, progress=stop)
-    costs = [
-        sum((r**2).sum() for r in evaluated(problem, np.log(values), derivatives=False).residual) for values in (unknowns.start, found.values)
-    ]
+    points = [evaluated(problem, np.log(values), derivatives=False) for values in (unknowns.start, found.values)]
+    costs = [sum((r**2).sum() for r in point.residual) for point in points]
     assert not found.finished
     assert costs[1] < costs[0]
 
 
-def test_masses_of_the_surface_keep_the_total(squeezed: LatticeStudy) -> None:
-    unknowns = StudyUnknowns.of(squeezed, groups="given", friction="given", surface_mass=True) if _has_core(squeezed) else None
-    assert unknowns is None or unknowns.names == (SURFACE_MASS,)
-    with pytest.raises(InputError, match="all nodes of the lattice are at its surface|nothing is unknown"):
-        StudyUnknowns.of(squeezed, groups="given", surface_mass=not _has_core(squeezed))
+def test_masses_of_the_surface_keep_the_total() -> None:
+    with pytest.raises(InputError, match="all nodes of the lattice are at its surface"):
+        StudyUnknowns.of(still_box((2, 2, 1)), surface_mass=True)
+    unknowns = StudyUnknowns.of(still_box((2, 2, 2)), groups="given", surface_mass=True)
+    lattice, mass = unknowns.study.lattice, unknowns.parameters(np.array([0.5])).node_mass
+    assert mass.sum() == pytest.approx(0.01)
+    assert mass[lattice.surface_node].mean() == pytest.approx(0.5 * mass[~lattice.surface_node].mean())
 
 
-def _has_core(study: LatticeStudy) -> bool:
-    return bool((~study.lattice.surface_node).any())
+def still_box(cells: tuple[int, int, int]) -> LatticeStudy:
+    lattice = classic_lattice(box_mask(cells), 10.0, total_mass_kg=0.01)
+    return LatticeStudy(lattice, lattice_parameters(lattice, 40.0, 10.0, 100.0), (), 0.002, 1)

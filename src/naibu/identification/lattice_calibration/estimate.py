@@ -22,8 +22,8 @@ class LatticeEstimate:
     values : ndarray, shape (p,)
         mN/mm and mN s/mm.
     covariance : ndarray, shape (p, p)
-        Of their logarithms; weak priors around the start included. The widest of those at the estimate and at the ends of the interval of
-        its least determined combination, along which the data's information changes.
+        Of their logarithms; weak priors around the start included. Widened to where chi-squared itself rises along the least determined
+        combinations.
     information : ndarray, shape (p, p)
         Fisher information of the data alone.
     noise_factor : tuple of float

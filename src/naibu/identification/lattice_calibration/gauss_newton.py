@@ -7,19 +7,19 @@ indices S_shape and S_force are sums of absolute values; `indices` returns them,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import nullcontext
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.progress import Progress, report_progress
 from naibu.identification.lattice_calibration.estimate import LatticeEstimate
+from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint, evaluated
 from naibu.identification.lattice_calibration.forward_model import SAMPLE_S, Capture, PushedLattice, PushMode, Reproduced, averaged
 from naibu.identification.lattice_calibration.inverse_problem import InverseProblem
 from naibu.identification.lattice_calibration.shape_distance import closest_points
@@ -31,7 +31,10 @@ Window = Literal["keep", "contact"]
 
 PRIOR_SD = 1.2  # of the logarithm of every parameter around its start: as wide as the report's ranges, a factor of 60 in all
 LONGEST = 1.0  # change of a logarithm in one iteration
-FARTHEST = 0.2  # of the points at which the covariance is looked at, from the estimate
+FARTHEST = 0.7  # change of a logarithm to where chi-squared is looked at
+PROFILED = 4  # combinations along which it is
+FITTED_AGAIN = 4  # simulations at each end, at most
+WIDEST = 3.0  # factor of standard deviations
 POLISHING = 9  # fine runs, at most
 FINE_ITERATIONS = 8  # with derivatives of fine steps, at most; they start next to the minimum, and take what is left of it
 RENEWED = 0.05  # change of a logarithm from which on coarse derivatives are computed anew beside fine residuals
@@ -160,23 +163,6 @@ class CalibrationProblem:
         return lack[since:].ravel() / sd, slopes[:, since:].reshape(p, lack[since:].size).T / sd
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Point:
-    theta: FloatArray
-    residual: tuple[FloatArray, FloatArray]
-    slopes: tuple[FloatArray, FloatArray]
-
-    @property
-    def information(self) -> FloatArray:
-        return np.asarray(sum(j.T @ j for j in self.slopes))
-
-    def gradient(self) -> FloatArray:
-        return np.asarray(sum(j.T @ r for j, r in zip(self.slopes, self.residual, strict=True)))
-
-
-Evaluate = Callable[..., _Point]
-
-
 @dataclass(slots=True)
 class _Watched:
     """Evaluations that are reported, the best of which is kept for the case of an interruption."""
@@ -185,10 +171,10 @@ class _Watched:
     executor: Executor | None
     progress: Progress | None
     count: int = 0
-    best: _Point | None = None
+    best: EvaluatedPoint | None = None
     problem: InverseProblem | None = None
 
-    def __call__(self, problem: InverseProblem, theta: FloatArray, *, derivatives: bool = True, fine: bool = False) -> _Point:
+    def __call__(self, problem: InverseProblem, theta: FloatArray, *, derivatives: bool = True, fine: bool = False) -> EvaluatedPoint:
         point = evaluated(problem, theta, derivatives=derivatives, fine=fine, threads=self.threads, executor=self.executor)
         misfit = _misfit(point)
         if derivatives and (self.best is None or self.problem is not problem or misfit <= _misfit(self.best)):
@@ -198,39 +184,8 @@ class _Watched:
         return point
 
 
-def _misfit(point: _Point) -> float:
+def _misfit(point: EvaluatedPoint) -> float:
     return float(sum((r**2).sum() for r in point.residual))
-
-
-def evaluated(
-    problem: InverseProblem,
-    theta: FloatArray,
-    *,
-    derivatives: bool = True,
-    fine: bool = False,
-    threads: int = 2,
-    executor: Executor | None = None,
-) -> _Point:
-    """Return residuals, and their derivatives by the logarithms theta (p,); directions are shared among threads, or what executes them."""
-    values = np.exp(theta)
-    parameters, changes = problem.unknowns.parameters(values), problem.unknowns.changes(values) if derivatives else ()
-    parts = [changes[k::threads] for k in range(min(threads, len(changes)))] or [()]
-    order = np.concatenate([np.arange(len(changes))[k::threads] for k in range(len(parts))]).astype(np.int64)
-    rows: list[tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]] = []
-    with ThreadPoolExecutor(threads) if executor is None else nullcontext(executor) as pool:
-        runs = [[pool.submit((t.fine if fine else t.coarse).run, parameters, part) for part in parts] for t in problem.load_cases]
-        for load_case, jobs in zip(problem.load_cases, runs, strict=True):
-            found = _joined([job.result() for job in jobs], order)
-            rows.append(problem.weighed(load_case, found, (load_case.fine if fine else load_case.coarse).long_step))
-    residual = [np.concatenate([row[k][0] for row in rows]) for k in range(2)]
-    slopes = [np.concatenate([row[k][1] for row in rows]) for k in range(2)]
-    return _Point(theta, (residual[0], residual[1]), (slopes[0], slopes[1]))
-
-
-def _joined(parts: list[Reproduced], order: IntArray) -> Reproduced:
-    back = np.argsort(order)
-    positions, forces = (np.concatenate([getattr(p, name) for p in parts])[back] for name in ("positions_change", "force_change"))
-    return replace(parts[0], positions_change=positions, force_change=forces)
 
 
 def calibrate_lattice(
@@ -308,12 +263,14 @@ def _searched(
     if not settled:  # coarse derivatives do not lead there
         point, used = _descend(here, point.theta, centre, prior_sd, FINE_ITERATIONS, at, fine=True)
         count, runs = count + used, runs + used * each
-    covariance, extra = _widest(here, point, prior_sd, at)
-    return _estimate(here, point, covariance, count, runs + extra * each)
+    point = replace(point, slopes=at(here, point.theta).slopes)
+    runs += each
+    covariance, extra = _profiled(here, point, centre, prior_sd, at)
+    return _estimate(here, point, covariance, count, runs + extra)
 
 
 def _estimate(
-    problem: InverseProblem, point: _Point, covariance: FloatArray, iterations: int, runs: int, *, finished: bool = True
+    problem: InverseProblem, point: EvaluatedPoint, covariance: FloatArray, iterations: int, runs: int, *, finished: bool = True
 ) -> LatticeEstimate:
     factors = _noise_factors(problem, point)
     shown = tuple(f if len(r) else np.nan for f, r in zip(factors, point.residual, strict=True))
@@ -350,37 +307,56 @@ def estimate_at(problem: InverseProblem, values: ArrayLike, *, prior_sd: float =
     return _estimate(here, point, _covariance(point, prior_sd), 0, 3 + len(theta), finished=finished)
 
 
-def _covariance(point: _Point, prior_sd: float) -> FloatArray:
+def _covariance(point: EvaluatedPoint, prior_sd: float) -> FloatArray:
     return np.asarray(np.linalg.inv(point.information + np.eye(len(point.theta)) / prior_sd**2), dtype=np.float64)
 
 
-def _widest(problem: InverseProblem, point: _Point, prior_sd: float, at: Evaluate) -> tuple[FloatArray, int]:
-    """Return the covariance at the estimate, or at an end of the 95 % interval of its least determined combination if it is wider there.
+def _profiled(problem: InverseProblem, point: EvaluatedPoint, centre: FloatArray, prior_sd: float, at: _Watched) -> tuple[FloatArray, int]:
+    """Return the covariance at a point, widened along its least determined combinations to where chi-squared says; and the runs.
 
-    What the data tell of the weakest combination changes by tens of per cent along its own interval. Returns the runs, too.
+    Combinations of classes are determined by what is nonlinear, and what the data tell of them changes by a factor within their own
+    interval. Each is moved to the ends of its interval, all others are fitted again, and the increase of the cost there tells how far one
+    standard deviation reaches :cite:p:`venzon1988`. Derivatives are those of the point.
     """
-    here = _covariance(point, prior_sd)
-    values, vectors = np.linalg.eigh(here)
-    reach = min(1.96 * float(np.sqrt(values[-1])), FARTHEST)
-    found = [here]
-    for side in (-1.0, 1.0):
-        end = at(problem, point.theta + side * reach * vectors[:, -1])
-        found.append(_covariance(end, prior_sd))
-    return max(found, key=lambda c: float(np.trace(c))), 2
+    covariance = _covariance(point, prior_sd)
+    values, vectors = np.linalg.eigh(covariance)
+    here = at(problem, point.theta, derivatives=False)
+    least, hessian, runs, widened = _cost(here, centre, prior_sd), np.linalg.inv(covariance), 1, covariance.copy()
+    for value, vector in list(zip(values, vectors.T, strict=True))[::-1][:PROFILED]:
+        others = np.linalg.svd(vector[None])[2][1:].T
+        reach = min(1.96 * float(np.sqrt(value)), FARTHEST)
+        for side in (-1.0, 1.0):
+            theta, best, end = point.theta + side * reach * vector, np.inf, point.theta
+            for _ in range(FITTED_AGAIN):
+                trial = replace(at(problem, theta, derivatives=False), slopes=point.slopes)
+                runs += 1
+                if (cost := _cost(trial, centre, prior_sd)) >= best:
+                    break
+                best, end = cost, theta
+                slope = trial.gradient() + (theta - centre) / prior_sd**2
+                theta = theta - others @ np.linalg.solve(others.T @ hessian @ others, others.T @ slope)
+            expected = reach**2 / float(value)
+            deviation = (end - point.theta) / np.sqrt(max(best - least, expected / WIDEST**2))
+            ratio = float(deviation @ hessian @ deviation)
+            if ratio > 1.0:
+                wider = covariance + (1.0 - 1.0 / ratio) * np.outer(deviation, deviation)
+                factor = np.sqrt(np.maximum(np.diag(wider) / np.diag(widened), 1.0))
+                widened = widened * np.outer(factor, factor)
+    return widened, runs
 
 
-def _noise_factors(problem: InverseProblem, point: _Point) -> tuple[float, float]:
+def _noise_factors(problem: InverseProblem, point: EvaluatedPoint) -> tuple[float, float]:
     rms = [float(np.sqrt((r**2).mean())) if len(r) else 0.0 for r in point.residual]
     return rms[0] * problem.excess[0], rms[1] * problem.excess[1]
 
 
-def _cost(point: _Point, centre: FloatArray, prior_sd: float) -> float:
+def _cost(point: EvaluatedPoint, centre: FloatArray, prior_sd: float) -> float:
     return _misfit(point) + float((((point.theta - centre) / prior_sd) ** 2).sum())
 
 
 def _descend(
-    problem: InverseProblem, theta: FloatArray, centre: FloatArray, prior_sd: float, most: int, at: Evaluate, *, fine: bool = False
-) -> tuple[_Point, int]:
+    problem: InverseProblem, theta: FloatArray, centre: FloatArray, prior_sd: float, most: int, at: _Watched, *, fine: bool = False
+) -> tuple[EvaluatedPoint, int]:
     """Iterate by Gauss and Newton; a step that does not help is shortened. Returns the last point and the iterations."""
     point, damping = at(problem, theta, fine=fine), 0.0
     cost, used = _cost(point, centre, prior_sd), 1
@@ -392,8 +368,10 @@ def _descend(
         used += 1
         if (new := _cost(trial, centre, prior_sd)) < cost:
             settled = cost - new < SETTLED + max(1e-6 if fine else 1e-5, problem.roughness) * cost
-            if settled:  # next to the minimum, where derivatives hardly change
+            if settled and np.abs(step).max() < RENEWED:
                 return replace(trial, slopes=point.slopes), used
+            if settled:
+                return at(problem, trial.theta, fine=fine), used
             point, cost, damping = at(problem, trial.theta, fine=fine), new, 0.3 * damping if damping > 1e-4 else 0.0
         else:
             damping = max(10.0 * damping, 1e-3)
@@ -408,7 +386,7 @@ def _descend(
     )
 
 
-def _step(point: _Point, centre: FloatArray, prior_sd: float, damping: float) -> tuple[FloatArray, float]:
+def _step(point: EvaluatedPoint, centre: FloatArray, prior_sd: float, damping: float) -> tuple[FloatArray, float]:
     """Return the next change of theta, and the decrease of the cost that an undamped one promises."""
     hessian = point.information + np.eye(len(point.theta)) / prior_sd**2
     slope = point.gradient() + (point.theta - centre) / prior_sd**2
@@ -416,10 +394,12 @@ def _step(point: _Point, centre: FloatArray, prior_sd: float, damping: float) ->
     return step * min(1.0, LONGEST / max(float(np.abs(step).max()), 1e-300)), float(-slope @ step)
 
 
-def _polished(problem: InverseProblem, point: _Point, centre: FloatArray, prior_sd: float, at: Evaluate) -> tuple[_Point, int, bool]:
+def _polished(
+    problem: InverseProblem, point: EvaluatedPoint, centre: FloatArray, prior_sd: float, at: _Watched
+) -> tuple[EvaluatedPoint, int, bool]:
     """Move on to the minimum of residuals of fine steps by derivatives of coarse ones; return it, the runs, and whether it settled."""
 
-    def fine(theta: FloatArray) -> _Point:
+    def fine(theta: FloatArray) -> EvaluatedPoint:
         return at(problem, theta, derivatives=False, fine=True)
 
     best, damping, coarse = replace(fine(point.theta), slopes=point.slopes), 0.0, point.theta

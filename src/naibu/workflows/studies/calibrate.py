@@ -122,7 +122,7 @@ def calibrate_study(
     if max_runs < 1 or threads < 1:
         raise InputError(f"{'max_runs' if max_runs < 1 else 'threads'} must be at least 1")
     if not shapes and not forces:
-        raise InputError("shapes and forces are both missing; give captured points, records of force sensors, or both")
+        raise InputError("`shapes` and `forces` are both missing; give captured points, records of force sensors, or both")
     prepared = prepared_study(study)
     captured = read_captured_shapes(shapes) if shapes else ()
     records = read_force_records(forces) if forces else ()

@@ -1,0 +1,129 @@
+"""The verb calibrate: files in, a page, numbers and a study that simulate runs out."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lattice_studies import study_file
+
+from naibu.core.errors import InputError
+from naibu.core.progress import ProgressReport
+from naibu.identification.lattice_calibration.study_model import StudyModel
+from naibu.identification.lattice_calibration.study_unknowns import StudyUnknowns
+from naibu.workflows.studies.calibrate import calibrate_study
+from naibu.workflows.studies.calibration_example import write_calibration_example
+from naibu.workflows.studies.lattice_study import prepared_study
+
+STUDY = """
+[object]
+size_mm = [20, 20, 20]
+mass_g = 10.0
+[lattice]
+spacing_mm = 10.0
+[parameters]
+K = 30.0
+C1 = 8.0
+C2 = inf
+[simulation]
+duration_s = 0.2
+[floor]
+[[indenter]]
+name = "stamp"
+shape = "box"
+size_mm = [20, 20, 10]
+centre_mm = [10.0, 10.0, 25.0]
+contact = "tied"
+path = [[0.0, 0, 0, 0], [0.1, 0, 0, -3]]
+[output]
+every_s = 0.02
+"""
+TRUTH = {"K": 45.0, "C1": 5.0}
+
+
+@pytest.fixture
+def inputs(tmp_path: Path) -> tuple[Path, Path, Path]:
+    """A study, and points and forces of an object with other parameters."""
+    path = study_file(tmp_path, STUDY)
+    study = prepared_study(path).study
+    unknowns, rng = StudyUnknowns.of(study, groups="all"), np.random.default_rng(0)
+    made = StudyModel.of(study, [0.1], 100, 1, coarse=False).run(unknowns.parameters(unknowns.vector(TRUTH)))
+    nodes = np.flatnonzero(study.lattice.points[:, 2] > 0.0)
+    points = made.positions[0][nodes] + 0.05 * rng.standard_normal((len(nodes), 3))
+    cloud, sensor = tmp_path / "points.csv", tmp_path / "force.csv"
+    cloud.write_text("time_s,x_mm,y_mm,z_mm\n" + "".join(f"0.1,{x:.4f},{y:.4f},{z:.4f}\n" for x, y, z in points), encoding="utf-8")
+    force = 1e-3 * (made.force[:, 1] + 5.0 * rng.standard_normal((100, 3)))
+    rows = "".join(f"{2 * k + 1},{x:.6f},{y:.6f},{z:.6f}\n" for k, (x, y, z) in enumerate(force))
+    sensor.write_text(f"Time (ms),Fx (N),Fy (N),Fz (N)\n{rows}", encoding="utf-8")
+    return path, cloud, sensor
+
+
+def test_a_study_is_calibrated_and_runs_with_what_was_found(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    study, cloud, sensor = inputs
+    run = calibrate_study(study, shapes=[cloud], forces=[sensor], out=tmp_path / "out", groups="all", point_sd_mm=0.05)
+    page, numbers, found = run.files
+    told = json.loads(numbers.read_text(encoding="utf-8"))
+    for row in told["parameters"]:
+        assert row["value"] == pytest.approx(TRUTH[row["name"]], rel=0.1)
+    assert told["misfit"]["forces"][0]["rms_mN"] < 0.1 * told["misfit"]["forces"][0]["start_rms_mN"]
+    parameters = tomllib.loads(found.read_text(encoding="utf-8"))["parameters"]
+    assert parameters["K"] == pytest.approx(told["parameters"][0]["value"], rel=1e-5)
+    assert np.isinf(parameters["C2"])
+    assert prepared_study(found).study.frames == prepared_study(study).study.frames
+    assert "Measured against simulated forces" in page.read_text(encoding="utf-8")
+    again = calibrate_study(study, shapes=[cloud], forces=[sensor], out=tmp_path / "again", groups="all", point_sd_mm=0.05)
+    np.testing.assert_array_equal(again.estimate.values, run.estimate.values)
+
+
+def test_an_interrupted_run_writes_the_best_so_far(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    study, cloud, sensor = inputs
+
+    def stop(report: ProgressReport) -> None:
+        if report.done and report.done >= 3:
+            raise KeyboardInterrupt
+
+    run = calibrate_study(study, shapes=[cloud], forces=[sensor], out=tmp_path / "out", groups="all", progress=stop)
+    assert not run.estimate.finished
+    assert "interrupted" in run.warnings[0]
+    assert all(file.exists() for file in run.files)
+
+
+def test_captures_in_other_coordinates_are_told(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    study, _, sensor = inputs
+    shifted = tmp_path / "shifted.csv"
+    shifted.write_text("t,x,y,z\n0,5,5,26\n0,15,5,26\n0,5,15,26\n", encoding="utf-8")
+    run = calibrate_study(study, shapes=[shifted], forces=[sensor], out=tmp_path / "out", groups="all")
+    assert any("other coordinates" in warning and "6 mm" in warning for warning in run.warnings)
+
+
+def test_records_that_point_the_other_way_are_refused(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    study, cloud, sensor = inputs
+    lines = sensor.read_text(encoding="utf-8").splitlines()
+    rows = [[float(cell) for cell in line.split(",")] for line in lines[1:]]
+    turned = "\n".join([lines[0], *(f"{t},{-x},{-y},{-z}" for t, x, y, z in rows)])
+    sensor.write_text(turned, encoding="utf-8")
+    with pytest.raises(InputError, match="'stamp' point the other way"):
+        calibrate_study(study, shapes=[cloud], forces=[sensor], out=tmp_path / "out", groups="all")
+    assert not list((tmp_path / "out").glob("*"))
+
+
+@pytest.mark.parametrize("method", ["cma-es", "genetic"])
+def test_searches_without_derivatives_go_by_their_seed(inputs: tuple[Path, Path, Path], tmp_path: Path, method: str) -> None:
+    pytest.importorskip("cma" if method == "cma-es" else "pymoo")
+    study, _, sensor = inputs
+    runs = [
+        calibrate_study(study, forces=[sensor], out=tmp_path / name, groups="all", method=method, seed=3, max_runs=150)  # type: ignore[arg-type]
+        for name in ("a", "b")
+    ]
+    np.testing.assert_array_equal(runs[0].estimate.values, runs[1].estimate.values)
+    assert runs[0].estimate.values == pytest.approx(list(TRUTH.values()), rel=0.25)
+
+
+def test_the_example_is_complete(tmp_path: Path) -> None:
+    study, shapes, forces = write_calibration_example(tmp_path)
+    assert prepared_study(study).settings.parameters.K == 50.0
+    assert shapes.read_text(encoding="utf-8").count("\n") == 1 + 5 * 2800
+    assert forces.read_text(encoding="utf-8").count("\n") == 1 + 2 * 2000
