@@ -391,7 +391,8 @@ def _step(point: EvaluatedPoint, centre: FloatArray, prior_sd: float, damping: f
     hessian = point.information + np.eye(len(point.theta)) / prior_sd**2
     slope = point.gradient() + (point.theta - centre) / prior_sd**2
     step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), slope)
-    return step * min(1.0, LONGEST / max(float(np.abs(step).max()), 1e-300)), float(-slope @ step)
+    limited = step * min(1.0, LONGEST / max(float(np.abs(step).max()), 1e-300))
+    return np.asarray(limited, dtype=np.float64), float(-slope @ step)
 
 
 def _polished(

@@ -181,7 +181,7 @@ class StudyUnknowns:
         mass = self.study.lattice.node_mass
         if self.masses:
             mass = _masses(self.study.lattice, float(held[-1]))
-        return Trial(LatticeParameters(*tables, given.voigt_fraction), tuple(indenters), mass)
+        return Trial(LatticeParameters(tables[0], tables[1], tables[2], given.voigt_fraction), tuple(indenters), mass)
 
     def changes(self, values: FloatArray) -> tuple[TrialChange, ...]:
         """Return the directions of the logarithms of all values."""
@@ -253,7 +253,13 @@ def _with(indenter: RigidIndenter, quantity: str, value: float) -> RigidIndenter
         return replace(indenter, static_friction=value, kinetic_friction=min(indenter.kinetic_friction, value))
     if quantity == "kinetic_friction":
         return replace(indenter, kinetic_friction=min(value, indenter.static_friction))
-    return replace(indenter, **{quantity: value})
+    pull_off = {name: getattr(indenter, name) for name in PULL_OFF} | {quantity: value}
+    return replace(
+        indenter,
+        pull_stiffness=pull_off["pull_stiffness"],
+        pull_damping=pull_off["pull_damping"],
+        pull_speed=pull_off["pull_speed"],
+    )
 
 
 def _mass_ratio(lattice: Lattice) -> float:

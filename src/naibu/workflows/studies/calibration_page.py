@@ -53,7 +53,7 @@ class Compared:
         found = model.run(problem.unknowns.parameters(values))
         times = tuple(step * model.study.step_s for step in model.captures)
         distance = tuple(closest_points(p, model.hull, x).signed for p, x in zip(load_case.points, found.positions, strict=True))
-        middles = model.long_step * (np.arange(model.windows) + 0.5)
+        middles = np.asarray(model.long_step * (np.arange(model.windows) + 0.5), dtype=np.float64)
         return cls(times, distance, middles, load_case.forces.force, found.force)
 
 
