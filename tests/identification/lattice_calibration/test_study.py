@@ -63,7 +63,7 @@ contact = "friction"
 static_friction = 0.6
 kinetic_friction = 0.45
 [[indenter]]
-name = "pusher"
+name = "slider"
 shape = "box"
 size_mm = [10, 10, 10]
 centre_mm = [-5.0, 10.0, 5.0]
