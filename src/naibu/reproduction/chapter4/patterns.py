@@ -6,15 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from naibu.identification.lattice_calibration.estimate import LatticeEstimate
 from naibu.identification.lattice_calibration.forward_model import Capture, PushedLattice, PushMode
-from naibu.identification.lattice_calibration.gauss_newton import (
-    CalibrationProblem,
-    Index,
-    LatticeEstimate,
-    ReportIndices,
-    calibrate_lattice,
-    indices,
-)
+from naibu.identification.lattice_calibration.gauss_newton import CalibrationProblem, Index, calibrate_lattice
+from naibu.identification.lattice_calibration.report_indices import ReportIndices, indices
 from naibu.mechanics.lattices.model.lattice import Lattice
 from naibu.validation.specimens.lattice_twin import FIRST, SECOND, Law, dough_lattice, dough_twin
 
