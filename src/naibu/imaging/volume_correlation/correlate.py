@@ -208,9 +208,12 @@ class _Correlation:
         stride = _stride(self.step, self.spacing, 1)
         level = self.level(stride, self.settings.smoothing_voxels)
         thin = tuple(slice(None, None, s) for s in stride[::-1])
-        shifts = [np.zeros(3), correlated_shift(self.reference[thin] * self.mask[thin], self.deformed[thin], level.spacing)]
-        # only what both scans can show is compared: else the part that one of them lacks would shift the centroid and stretch the outline
+        # only what both scans can show is compared: else the part that one of them lacks would shift the object and stretch its outline
         both = in_box(self.views[0], self.mask.shape) & in_box(self.views[1], self.mask.shape)
+        if not (self.mask & both).any():
+            both[:] = True
+        scene = np.where(both[thin], self.deformed[thin], self.deformed[both].mean())
+        shifts = [np.zeros(3), correlated_shift(self.reference[thin] * (self.mask & both)[thin], scene, level.spacing)]
         shown = mask_in_view(self.deformed_volume, self.views[1]) if self.deformed_mask is None else self.deformed_mask
         after, before = (np.argwhere(m & both if (m & both).any() else m)[:, ::-1] * self.spacing for m in (shown, self.mask))
         shifts.append(after.mean(axis=0) - before.mean(axis=0))
