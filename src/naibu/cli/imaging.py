@@ -181,7 +181,8 @@ def track(
         require_left_out(
             "goes with scans, and these are positions", diameter_mm=diameter_mm is not None, thickness_mm=thickness_mm is not None,
             polarity=polarity != "auto", count=count is not None, mask=mask is not None, size_mm=size_mm is not None,
-            layer=bool(options.layer), stated_mm=bool(options.stated_mm),
+            layer=bool(options.layer), stated_mm=bool(options.stated_mm), shape=options.shape != "box", loading=options.loading != "plate",
+            bar_width_mm=options.bar_width_mm is not None, vertical=options.vertical is not None,
         )  # fmt: skip
         _track_clouds(scans, unit=unit, spacing_mm=spacing_mm, variable=variable, out=out, overwrite=overwrite)
         return
