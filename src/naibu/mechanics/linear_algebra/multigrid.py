@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pyamg
@@ -43,12 +44,34 @@ class MultigridSolver(RecyclingSolver):
     def preconditioner(self, matrix: sp.bsr_matrix) -> Callable[[FloatArray], FloatArray]:
         """Return one V-cycle of a hierarchy made for `matrix`."""
         hierarchy = pyamg.smoothed_aggregation_solver(
-            matrix, B=self._modes, strength=("symmetric", {"theta": 0.0}), smooth=("jacobi", {"omega": 4.0 / 3.0}),
-            improve_candidates=None, max_coarse=600, coarse_solver="splu", presmoother=("block_gauss_seidel", {"sweep": "forward"}),
-            postsmoother=("block_gauss_seidel", {"sweep": "backward"}),
+            matrix, B=self._modes, strength=("symmetric", {"theta": 0.0}),
+            smooth=("jacobi", {"omega": 4.0 / 3.0}), improve_candidates=None, max_coarse=600, coarse_solver="splu",
+            presmoother=("block_gauss_seidel", {"sweep": "forward"}), postsmoother=("block_gauss_seidel", {"sweep": "backward"}),
         )  # fmt: skip
-        cycle = hierarchy.aspreconditioner()
-        return lambda r: np.stack([cycle @ column for column in r.T], axis=1)
+
+        return lambda r: np.stack([v_cycle(hierarchy, 0, np.ascontiguousarray(column)) for column in r.T], axis=1)
+
+
+def v_cycle(hierarchy: Any, number: int, b: FloatArray) -> FloatArray:
+    """Return the correction of one V-cycle from level `number` down, from zero; pyamg's own computes two residuals more.
+
+    Parameters
+    ----------
+    hierarchy : pyamg.multilevel.MultilevelSolver
+        Levels with their smoothers, and the solver of the coarsest.
+    number : int
+        The level; 0 is the finest.
+    b : ndarray, shape (n,)
+        Its residual.
+    """
+    level = hierarchy.levels[number]
+    if number == len(hierarchy.levels) - 1:
+        return np.asarray(hierarchy.coarse_solver(level.A, b), dtype=float).ravel()
+    x = np.zeros_like(b)
+    level.presmoother(level.A, x, b)
+    x += level.P @ v_cycle(hierarchy, number + 1, level.R @ (b - level.A @ x))
+    level.postsmoother(level.A, x, b)
+    return x
 
 
 def rigid_body_modes(points: FloatArray) -> FloatArray:
