@@ -7,8 +7,10 @@ import json
 import os
 from collections.abc import Callable
 from dataclasses import replace
+from html import escape
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from virtual_press import COARSE, KNOWN, PLATEN_POSITIONS_MM, TRUTH, Press, stop_at
@@ -51,6 +53,17 @@ def test_the_true_parameters_lie_near_the_identified_ones(press: Press) -> None:
         if not p.fixed:  # the elements are coarse; four standard deviations allow for that
             assert abs(p.inner(value) - p.inner(p.value)) < 4.0 * model.standard_deviation(name)
     assert press.identification.calibration.match.status is Status.CONVERGED
+
+
+def test_results_are_shown_in_a_notebook(press: Press) -> None:
+    found = press.identification
+    assert escape((press.results / "report.html").read_text(encoding="utf-8"), quote=True) in found._repr_html_()
+    written = json.loads((press.results / "identification.json").read_text(encoding="utf-8"))["parameters"]
+    for row in found.to_records():
+        assert row["estimate"] == pytest.approx(written[row["parameter"]]["estimate"], rel=1e-4)
+    figure = found.plot()
+    assert figure.axes[-1].get_xlabel() == "predicted from measured markers, RMS (mm)"
+    plt.close(figure)
 
 
 def test_results_are_complete(press: Press) -> None:
@@ -100,6 +113,9 @@ def test_results_name_no_folder(press: Press) -> None:
 
 def test_every_marker_is_predicted(press: Press, tmp_path: Path) -> None:
     prediction = predict.predict(press.results / MODEL_FILE, press.folder, state="pressed_more", heights_from_markers=True, out=tmp_path)
+    assert prediction.page_html() == (tmp_path / "predicted.html").read_text(encoding="utf-8")
+    np.testing.assert_array_equal([[r["x_mm"], r["y_mm"], r["z_mm"]] for r in prediction.to_records()], prediction.points)
+    plt.close(prediction.plot())
     assert names(tmp_path) == {"predicted.csv", "summary.json", "predicted.html", "predicted.json", "predicted.vtu", "predicted.vtkhdf"}
     table = rows(tmp_path / "predicted.csv")
     assert list(table[0]) == ["marker", "x_mm", "y_mm", "z_mm", "sd_model_mm", "sd_mm", "sd_x_mm", "sd_y_mm", "sd_z_mm"]

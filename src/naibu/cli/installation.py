@@ -42,6 +42,7 @@ _REQUIRED = {
     "websockets": "the connection between naibu live and its page",
 }
 _OPTIONAL = {
+    "pandas": "tables of results as DataFrames in notebooks",
     "openpyxl": "importing marker tables from Excel files",
     "zarr": "volumes in Zarr stores",
     "dask": "volumes larger than memory, block by block",

@@ -12,6 +12,7 @@ from .measurement.sense import Pair, SenseRun, read_pair, sense_pair
 from .measurement.track import ObjectDescription, TrackRun
 from .measurement.track_clouds import CloudRun, track_clouds
 from .measurement.track_sequence import SequenceRun, track_sequence_file
+from .predict import PredictionRun
 from .reproduce import ReproducedChapter, reproduce, reproduce_all
 from .studies.calibrate import LatticeCalibration, calibrate_study
 from .studies.calibration_example import write_calibration_example
@@ -34,6 +35,7 @@ __all__ = [
     "ObjectDescription",
     "Pair",
     "Planned",
+    "PredictionRun",
     "ReproducedChapter",
     "SenseRun",
     "SequenceRun",

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from naibu.core.errors import ConvergenceError, InputError, NaibuError
 from naibu.core.experiment import Experiment
@@ -24,10 +25,15 @@ from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.cross_validation import LeftOut
 from naibu.identification.prediction.prediction import rms
 from naibu.identification.verdict import Verdict
+from naibu.viewer.notebook import ShownInNotebook, empty_figure
+from naibu.viewer.result_figures import draw_estimates
+from naibu.viewer.result_page.page import report_html
+from naibu.viewer.result_page.payload import Report
 from naibu.workflows.cross_validation import left_out_in_turn
 from naibu.workflows.experiments import Source, load_experiments, parse_known, provenance_of, require_element_size, require_loaded
 from naibu.workflows.parallel.worker_count import Workers
 from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.report_content import build_report
 from naibu.workflows.results.result_folder import (
     CHECKPOINT_FILE,
     IDENTIFICATION_FILES,
@@ -37,9 +43,12 @@ from naibu.workflows.results.result_folder import (
     write_identification,
 )
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
+
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Identification:
+class Identification(ShownInNotebook):
     """What `identify` returns.
 
     Attributes
@@ -64,6 +73,27 @@ class Identification:
     left_out: tuple[LeftOut, ...]
     interrupted: bool
     verdict: Verdict
+
+    def page_html(self) -> str:
+        """Return the page of the result, a whole HTML document."""
+        return report_html(self._report())
+
+    def plot(self) -> Canvas:
+        """Return a figure: estimates with 95 % intervals, and the distance of predicted from measured markers in every state."""
+        report = self._report()
+        canvas = empty_figure(11.0, 1.6 + 0.45 * max(len(report.parameters), len(report.scenes)))
+        draw_estimates(canvas, report.parameters, report.scenes)
+        return canvas
+
+    def to_records(self) -> tuple[Mapping[str, Any], ...]:
+        """Return one row a parameter: name, estimate, 95 % interval (infinite where the data do not bound it), unit, whether given."""
+        names = ("parameter", "estimate", "from", "to", "unit", "given")
+        return tuple(
+            dict(zip(names, (p.name, p.value, *self.model.interval(p.name), p.unit, p.fixed), strict=True)) for p in self.model.parameters
+        )
+
+    def _report(self) -> Report:
+        return build_report(self.calibration, self.model, self.verdict, self.baselines, self.left_out)
 
 
 def identify(

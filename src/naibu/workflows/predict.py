@@ -3,15 +3,56 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
 
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.experiment import Experiment
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.prediction import Prediction, predict_state
+from naibu.viewer.notebook import ShownInNotebook, empty_figure
+from naibu.viewer.result_figures import draw_marker_motion
+from naibu.viewer.result_page.page import report_html
 from naibu.workflows.experiments import Source, load_experiment, loaded_names, require_loaded
 from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.report_content import prediction_report, prediction_scene
 from naibu.workflows.results.result_folder import PREDICTION_FILES, read_model, write_prediction
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PredictionRun(Prediction, ShownInNotebook):
+    """Predicted markers of one state, and the model that predicts them.
+
+    Attributes
+    ----------
+    model : CalibratedModel
+        The model; for the others see `naibu.identification.Prediction`.
+    """
+
+    model: CalibratedModel
+
+    def page_html(self) -> str:
+        """Return the page of the result, a whole HTML document."""
+        return report_html(prediction_report(self.model, self))
+
+    def plot(self) -> Canvas:
+        """Return a figure of the predicted displacement of the markers, in the object's frame, seen along y, x and z."""
+        scene = prediction_scene(self)
+        canvas = empty_figure(10.5, 4.2)
+        draw_marker_motion(canvas, scene.initial_markers, scene.steps[-1].markers, ["ok"] * len(scene.marker_ids))
+        return canvas
+
+    def to_records(self) -> tuple[Mapping[str, Any], ...]:
+        """Return one row a marker: its number, predicted position, standard deviations, and measured minus predicted position, mm."""
+        names = ("marker", *(f"{kind}{axis}_mm" for kind in ("", "sd_", "residual_") for axis in "xyz"))
+        return tuple(
+            dict(zip(names, (int(i), *p.tolist(), *sd.tolist(), *r.tolist()), strict=True))
+            for i, p, sd, r in zip(self.specimen.marker_ids, self.points, self.sd_mm, self.residual, strict=True)
+        )
 
 
 def predict(
@@ -23,7 +64,7 @@ def predict(
     heights_from_markers: bool = False,
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
-) -> Prediction:
+) -> PredictionRun:
     """Predict the markers of one state with a calibrated model, and write them.
 
     Parameters
@@ -47,7 +88,7 @@ def predict(
 
     Returns
     -------
-    Prediction
+    PredictionRun
         Positions, uncertainty and assumptions.
 
     Raises
@@ -72,7 +113,7 @@ def predict(
         prediction = replace(prediction, notes=(f"the model is doubtful: {calibrated.reservation}", *prediction.notes))
     if folder is not None:
         write_prediction(folder, calibrated, prediction)
-    return prediction
+    return PredictionRun(**{f.name: getattr(prediction, f.name) for f in fields(prediction)}, model=calibrated)
 
 
 def _only_state(experiment: Experiment) -> str:

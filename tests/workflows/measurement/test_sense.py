@@ -9,6 +9,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -21,6 +22,7 @@ from naibu.io.images import read_displacement, read_volume, write_displacement, 
 from naibu.io.marker_tables import import_markers
 from naibu.io.meshes import read_mesh
 from naibu.validation.specimens.textured_sphere import squeezed_ball
+from naibu.viewer.slices import slices_html
 from naibu.workflows.measurement.compare_methods import compare_methods
 from naibu.workflows.measurement.sense import Pair, read_pair, sense_pair
 from naibu.workflows.measurement.sense_page import slice_view
@@ -125,6 +127,14 @@ def test_a_field_that_folds_is_named_on_the_page(folder: Path) -> None:
     pair = read_pair(folder / "before.mha", folder / "after.nrrd")
     run = sense_pair(pair, method="rigid")
     assert not any("folds" in sentence for sentence in slice_view(pair, run).sentences)
+    assert run.page_html() == slices_html(slice_view(pair, run)) and run.to_records()[0]["quantity"] == "measured fraction of the object"
+    figure = run.plot()
+    z = int(np.argmax(run.measured.mask.sum(axis=(1, 2))))
+    np.testing.assert_allclose(
+        figure.axes[0].images[0].get_array()[run.measured.mask[z]],
+        np.linalg.norm(run.measured.displacement.vectors[z], axis=-1)[run.measured.mask[z]],
+    )
+    plt.close(figure)
     folded = replace(run, figures=run.figures | {"folded_fraction": 0.125})
     assert any("folds at 12.50%" in sentence for sentence in slice_view(pair, folded).sentences)
 

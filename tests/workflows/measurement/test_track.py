@@ -9,6 +9,7 @@ import re
 import sys
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -87,6 +88,12 @@ def test_the_page_shows_markers_in_3_d_and_over_the_scans(scans: list[Path], tmp
     before = np.array(scene["measured"]).reshape(-1, 3) * scene["quantum_mm"]["marker"]
     # the arrows are the known motion of the beads
     assert np.abs(before + shift - before @ SQUEEZE).max() < 0.2
+    records = run.to_records()
+    assert len(records) == 2 * len(LATTICE) and {r["state"] for r in records} == {"initial", "pressed"}
+    positions = np.array([[r["x_mm"], r["y_mm"], r["z_mm"]] for r in records if r["state"] == "pressed"])
+    np.testing.assert_array_equal(positions, run.tracked.points[1])
+    assert run.page_html() == page
+    plt.close(run.plot())
     assert f"{len(LATTICE)} of {len(LATTICE)}" in page and page.count("<figure>") == 2
 
 

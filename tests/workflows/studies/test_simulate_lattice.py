@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 
 import h5py
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from lattice_studies import STUDY, study_file
@@ -56,6 +57,23 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = simulate_lattice(study_file(folder), folder / "out")
     assert run.finished and [p.name for p in run.files] == ["mine.html", "mine.vtkhdf", "mine.json"]
     return folder
+
+
+def test_forces_are_a_table_and_a_figure(whole: Path) -> None:
+    files = tuple(whole / "out" / name for name in ("mine.html", "mine.vtkhdf", "mine.json"))
+    run = workflow.SimulationRun(files, FRAMES, FRAMES)
+    told = json.loads(files[2].read_text(encoding="utf-8"))
+    ball = np.array([[r["time_s"], r["x_mN"], r["y_mN"], r["z_mN"]] for r in run.to_records() if r["indenter"] == "ball"])
+    np.testing.assert_array_equal(ball, np.column_stack([told["force_times_s"], told["forces_mN"]["ball"]]))
+    figure = run.plot()
+    (axes,) = figure.axes
+    unit = axes.get_ylabel()[-4:-1].strip("( ")
+    top = {"mN": 1.0, "N": 1e-3}[unit] * max(np.linalg.norm(f, axis=1).max() for f in map(np.array, told["forces_mN"].values()))
+    assert max(line.get_ydata().max() for line in axes.lines) == pytest.approx(top)
+    plt.close(figure)
+    assert run.page_html() == files[0].read_text(encoding="utf-8")
+    with pytest.raises(InputError, match=r"the run has no \.html file"):
+        workflow.SimulationRun(files[1:], 1, FRAMES).page_html()
 
 
 def test_the_series_holds_every_frame(whole: Path) -> None:

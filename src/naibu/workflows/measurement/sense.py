@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,10 +29,15 @@ from naibu.io.images import read_displacement, read_volume, write_displacement, 
 from naibu.io.marker_tables import import_markers, write_markers
 from naibu.io.vtk_files import write_vtu
 from naibu.meshing.primitives import grid_cells
+from naibu.viewer.notebook import ShownInNotebook, empty_figure
+from naibu.viewer.result_figures import draw_slices
 from naibu.viewer.slices import slices_html
 from naibu.viewer.tables import Cell
-from naibu.workflows.measurement.sense_page import slice_view
+from naibu.workflows.measurement.sense_page import middle_slice, slice_view
 from naibu.workflows.results.output_folder import output_folder
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
 
 # bounds of the size of files: hexahedra for ParaView, and points of the field for the identification
 MESH_CELLS, FIELD_POINTS = 60_000, 40_000
@@ -74,18 +79,33 @@ class Pair:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SenseRun:
-    """Measured displacement with its figures (see `FIGURES`) and files."""
+class SenseRun(ShownInNotebook):
+    """Measured displacement with its figures (see `FIGURES`), files, and the volumes that it belongs to."""
 
     measured: MeasuredDisplacement
     seconds: float
     figures: dict[str, float | int | str | None]
+    pair: Pair
     files: tuple[Path, ...] = ()
 
     def rows(self) -> list[tuple[str, Cell]]:
         """Return figures and diagnostics of the method, each with its meaning and unit."""
         figures = [(FIGURES[name], value) for name, value in self.figures.items()]
         return figures + [(FACTS[name], value) for name, value in self.measured.facts.items()]
+
+    def page_html(self) -> str:
+        """Return the page of the result, a whole HTML document."""
+        return slices_html(slice_view(self.pair, self))
+
+    def plot(self) -> Canvas:
+        """Return a figure of the slice with most of the object: displacement, largest principal strain, standard deviation."""
+        canvas = empty_figure(11.0, 3.6)
+        draw_slices(canvas, middle_slice(self.pair, self), self.pair.reference.spacing_mm)
+        return canvas
+
+    def to_records(self) -> tuple[Mapping[str, Any], ...]:
+        """Return one row a figure or diagnostic: quantity with unit, and value."""
+        return tuple({"quantity": name, "value": value} for name, value in self.rows())
 
 
 def read_pair(
@@ -247,7 +267,7 @@ def sense_pair(
     measured = measure_displacement(
         pair.reference, pair.deformed, method=method, mask=pair.mask, deformed_mask=pair.deformed_mask, progress=progress
     )
-    run = SenseRun(measured, time.perf_counter() - began, figures(pair, measured))
+    run = SenseRun(measured, time.perf_counter() - began, figures(pair, measured), pair)
     return run if folder is None else replace(run, files=tuple(_written(pair, run, folder)))
 
 

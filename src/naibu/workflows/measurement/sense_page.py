@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from naibu.core.arrays import BoolArray, FloatArray
+from naibu.core.arrays import AnyFloatArray, BoolArray, FloatArray
 from naibu.imaging.displacement.strain import green_lagrange_strain_of
 from naibu.imaging.preprocessing.resampling import warped
 from naibu.viewer.cards import Card
@@ -50,6 +50,22 @@ def slice_view(pair: Pair, run: SenseRun) -> SliceView:
         direction=grid.direction,
         cards=_cards(run, principal[inside]),
     )
+
+
+def middle_slice(pair: Pair, run: SenseRun) -> list[tuple[str, AnyFloatArray, str]]:
+    """Return fields (ny, nx) of the slice across z with most of the object, each with its name and colour map."""
+    measured = run.measured
+    z = int(np.argmax(measured.mask.sum(axis=(1, 2))))
+    inside = measured.mask[z] & np.isfinite(measured.gradient[z]).all(axis=(-2, -1))
+    strain = np.full(inside.shape, np.nan)
+    strain[inside] = np.linalg.eigvalsh(green_lagrange_strain_of(measured.gradient[z][inside]))[:, 2]
+    size = np.where(measured.mask[z], np.linalg.norm(measured.displacement.vectors[z], axis=-1), np.nan)
+    fields: list[tuple[str, AnyFloatArray, str]] = [
+        ("displacement (mm)", size, "viridis"), ("largest principal Green-Lagrange strain", strain, "viridis"),
+    ]  # fmt: skip
+    if (sd := measured.displacement.largest_sd_mm) is not None:
+        fields.append(("standard deviation (mm)", np.where(measured.mask[z], sd[z], np.nan), "cividis"))
+    return fields
 
 
 def _cards(run: SenseRun, principal: FloatArray) -> tuple[Card, ...]:

@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from naibu.core.arrays import require_count, require_lengths
 from naibu.core.errors import InputError
@@ -18,10 +19,15 @@ from naibu.io.files.provenance import input_record
 from naibu.io.images import read_volume
 from naibu.io.marker_tables import write_experiment_folder, write_markers
 from naibu.viewer.chapter_page import write_chapter
+from naibu.viewer.notebook import ShownInNotebook, empty_figure
+from naibu.viewer.result_figures import draw_marker_motion
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.measurement.track_page import track_chapter, track_rows
 from naibu.workflows.results.output_folder import output_folder
 from naibu.workflows.tilted_tables import Vertical, upright_tables
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
 
 ENDINGS = (".nii.gz", ".ome.tif", ".ome.tiff")
 
@@ -55,7 +61,7 @@ class ObjectDescription:
 
 
 @dataclass(frozen=True, slots=True)
-class TrackRun:
+class TrackRun(ShownInNotebook):
     """Markers in every state and the files that hold them.
 
     Attributes
@@ -79,6 +85,27 @@ class TrackRun:
     rows: tuple[tuple[Cell, ...], ...]
     page: Path
     files: tuple[Path, ...]
+
+    def page_html(self) -> str:
+        """Return the page of the result, a whole HTML document."""
+        return self.page.read_text(encoding="utf-8")
+
+    def plot(self) -> Canvas:
+        """Return a figure of the displacement of the markers from the first to the last state, seen along y, x and z."""
+        canvas = empty_figure(10.5, 4.2)
+        draw_marker_motion(canvas, self.tracked.points[0], self.tracked.points[-1], self.tracked.flags[-1])
+        return canvas
+
+    def to_records(self) -> tuple[Mapping[str, Any], ...]:
+        """Return one row a marker and state: state, marker, position and standard deviations, mm, confidence and flag."""
+        t = self.tracked
+        names = ("state", "marker", "x_mm", "y_mm", "z_mm", "sd_x_mm", "sd_y_mm", "sd_z_mm", "confidence", "flag")
+        return tuple(
+            dict(zip(names, (name, int(i), *p.tolist(), *sd.tolist(), float(confidence), str(flag)), strict=True))
+            for name, points, sds, sure, flags in zip(t.names, t.points, t.sd_mm, t.confidence, t.flags, strict=True)
+            for i, p, sd, confidence, flag in zip(t.ids, points, sds, sure, flags, strict=True)
+        )
+
     notes: tuple[str, ...] = ()
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,10 +21,15 @@ from naibu.mechanics.lattices.model.surface import surface_of
 from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy, StudyFrame, StudyState, run_study
 from naibu.viewer.cards import Card
 from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, force_unit, motion_html
+from naibu.viewer.notebook import ShownInNotebook, empty_figure
+from naibu.viewer.result_figures import draw_forces
 from naibu.viewer.tables import Table
 from naibu.workflows.results.output_folder import output_folder
 from naibu.workflows.studies.lattice_study import PreparedStudy, prepared_study
 from naibu.workflows.studies.simulate_checkpoint import Checkpoint
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
 
 CHECKPOINT_EVERY = 10  # frames
 PAGE_BYTES = 3_000_000
@@ -32,7 +38,7 @@ ARRAYS = {"displacement": "displacement_mm", "velocity": "velocity_mm_per_s", "s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SimulationRun:
+class SimulationRun(ShownInNotebook):
     """The files of a simulation, and how far it came.
 
     Attributes
@@ -54,6 +60,59 @@ class SimulationRun:
     def finished(self) -> bool:
         """Whether all frames are there."""
         return self.frames == self.of
+
+    def page_html(self) -> str:
+        """Return the page of the result, a whole HTML document.
+
+        Raises
+        ------
+        InputError
+            The run was stopped before it wrote a page.
+        """
+        return self._file(".html").read_text(encoding="utf-8")
+
+    def plot(self) -> Canvas:
+        """Return a figure of the forces on a lattice over time.
+
+        Raises
+        ------
+        InputError
+            The study is not one of a lattice, or has no indenters.
+        """
+        times, forces = self._forces()
+        unit, factor = force_unit(max(float(np.abs(f).max(initial=0.0)) for f in forces.values()))
+        canvas = empty_figure(7.0, 4.0)
+        draw_forces(canvas, times, {name: factor * f for name, f in forces.items()}, unit)
+        return canvas
+
+    def to_records(self) -> tuple[Mapping[str, Any], ...]:
+        """Return one row a time, s, and indenter: its force on the lattice along x, y, z, mN.
+
+        Raises
+        ------
+        InputError
+            The study is not one of a lattice, or has no indenters.
+        """
+        times, forces = self._forces()
+        names = ("time_s", "indenter", "x_mN", "y_mN", "z_mN")
+        return tuple(
+            dict(zip(names, (float(t), name, *f.tolist()), strict=True))
+            for name, force in forces.items()
+            for t, f in zip(times, force, strict=True)
+        )
+
+    def _file(self, ending: str) -> Path:
+        found = next((file for file in self.files if file.suffix == ending), None)
+        if found is None:
+            raise InputError(f"the run has no {ending} file; see `files` for what it wrote")
+        return found
+
+    def _forces(self) -> tuple[FloatArray, dict[str, FloatArray]]:
+        numbers = json.loads(self._file(".json").read_text(encoding="utf-8"))
+        if not numbers.get("forces_mN") or "force_times_s" not in numbers:
+            raise InputError(f"{self._file('.json').name} has no forces of indenters on a lattice; its page shows what was computed")
+        forces = {name: np.asarray(rows, dtype=np.float64).reshape(-1, 3) for name, rows in numbers["forces_mN"].items()}
+        return np.asarray(numbers["force_times_s"], dtype=np.float64), forces
 
 
 def simulate_lattice(
