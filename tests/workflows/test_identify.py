@@ -61,7 +61,7 @@ def test_results_are_shown_in_a_notebook(press: Press) -> None:
     cards = re.compile(r"<dt>.*?</dd>")
     assert cards.findall(found.page_html()) == cards.findall((press.results / "report.html").read_text(encoding="utf-8")) != []
     assert escape(found.page_html(), quote=True) in found._repr_html_()
-    written = json.loads((press.results / "identification.json").read_text(encoding="utf-8"))[""]
+    written = json.loads((press.results / "identification.json").read_text(encoding="utf-8"))["parameters_95"]
     for row in found.to_records():
         assert row["estimate"] == pytest.approx(written[row["parameter"]]["estimate"], rel=1e-4)
     figure = found.plot()
