@@ -22,12 +22,30 @@ SOURCES = ROOT / "src" / "naibu"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 POSIX_ONLY = {"fcntl", "grp", "pty", "pwd", "resource", "syslog", "termios", "tty"}
 POSIX_CALLS = {"fork", "geteuid", "getgid", "getuid", "killpg", "nice", "setsid", "statvfs", "sched_getaffinity", "uname", "mkfifo"}
+POSIX_SIGNALS = {
+    "SIGALRM",
+    "SIGHUP",
+    "SIGKILL",
+    "SIGUSR1",
+    "SIGUSR2",
+    "SIGPIPE",
+    "SIGCHLD",
+    "SIGSTOP",
+    "SIGCONT",
+    "alarm",
+    "setitimer",
+    "pause",
+}
+POSIX_SOCKETS = {"AF_UNIX", "SO_REUSEPORT", "MSG_DONTWAIT"}
+ATTRIBUTES = {"os": POSIX_CALLS, "signal": POSIX_SIGNALS, "socket": POSIX_SOCKETS}
+POSIX_PATHS = ("/tmp/", "/dev/", "/proc/", "/var/", "/etc/", "/usr/", "~/")
 
 
 def conditional(path: list[ast.AST]) -> bool:
     """Tell whether a node stands in a branch on the platform, or in one that an error of a missing module or attribute leaves."""
     tests = [ast.unparse(node.test) for node in path if isinstance(node, ast.If | ast.IfExp)]
-    return any("platform" in test or "os.name" in test or "hasattr" in test for test in tests) or any(isinstance(n, ast.Try) for n in path)
+    caught = any(isinstance(n, ast.Try) or (isinstance(n, ast.With) and "suppress(" in ast.unparse(n.items[0])) for n in path)
+    return caught or any("platform" in test or "os.name" in test or "hasattr" in test for test in tests)
 
 
 @pytest.fixture
@@ -46,8 +64,10 @@ def posix_only(tree: ast.AST) -> list[int]:
         modules = (
             [a.name for a in node.names] if isinstance(node, ast.Import) else [node.module] if isinstance(node, ast.ImportFrom) else []
         )
-        call = isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "os" and node.attr in POSIX_CALLS
-        if (POSIX_ONLY & set(modules) or call) and not conditional(path):
+        owner = node.value.id if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) else ""
+        call = isinstance(node, ast.Attribute) and node.attr in ATTRIBUTES.get(owner, ())
+        place = isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith(POSIX_PATHS)
+        if (POSIX_ONLY & set(modules) or call or place) and not conditional(path):
             lines.append(node.lineno)
         for child in ast.iter_child_nodes(node):
             visit(child, [*path, node])
@@ -58,6 +78,10 @@ def posix_only(tree: ast.AST) -> list[int]:
 
 def test_the_check_sees_what_works_on_posix_alone() -> None:
     assert posix_only(ast.parse("import os, fcntl\nos.fork()\nif os.name == 'posix':\n    os.getuid()\n")) == [1, 2]
+    assert posix_only(ast.parse("signal.alarm(3)\nsignal.SIGTERM\nopen('/tmp/x')\nif sys.platform != 'win32':\n    signal.SIGHUP\n")) == [
+        1,
+        3,
+    ]
 
 
 def test_nothing_works_on_posix_alone() -> None:
