@@ -49,8 +49,10 @@ def test_moduli_of_outlined_zones(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.slow
-def test_a_lump_is_found_in_the_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scans = scanned_liver()
+@pytest.mark.parametrize(("seed", "lump_within"), [(0, 0.15), (1, 0.5)])
+def test_a_lump_is_found_in_the_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, lump_within: float) -> None:
+    """Size and stiffness of a small lump can be told from each other roughly: its interval holds the truth, and nothing else is found."""
+    scans = scanned_liver(seed=seed)
     written(tmp_path, scans)
     naibu(
         monkeypatch, "sense", tmp_path / "before.mha", tmp_path / "after.mha", "--mask", tmp_path / "labels.mha",
@@ -63,7 +65,7 @@ def test_a_lump_is_found_in_the_map(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     zones = zones_of(tmp_path / "found")
     assert len(zones) == 2
     found = read_volume(tmp_path / "found" / "zones.mha").values == 2
-    assert 2.0 * (found & scans.lump).sum() / (found.sum() + scans.lump.sum()) > 0.8  # 0.839 when this was written
-    for zone, (young, _) in zip(zones, (LIVER, LUMP), strict=True):
+    assert 2.0 * (found & scans.lump).sum() / (found.sum() + scans.lump.sum()) > 0.8
+    for zone, (young, _), within in zip(zones, (LIVER, LUMP), (0.15, lump_within), strict=True):
         assert zone["95 % from"] < young < zone["to"]
-        assert zone["Young's modulus, kPa"] == pytest.approx(young, rel=0.15)
+        assert zone["Young's modulus, kPa"] == pytest.approx(young, rel=within)
