@@ -158,7 +158,8 @@ CONTRIBUTING = (DOCS.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
 def test_contributing_names_files_that_exist() -> None:
     named = set(re.findall(r"`([\w./-]+(?:\.(?:py|pyi|rst|md|toml|bib)|/))`", CONTRIBUTING))
     roots = (DOCS.parent, DOCS.parent / "src" / "naibu", DOCS.parent / "src" / "naibu" / "io", DOCS.parent / "src/naibu/mechanics/contact")
-    examples = {"src/naibu/io/image_formats/FORMAT.py", "src/naibu/io/mesh_formats/FORMAT.py", "workflows/VERB.py"}
+    formats = {f"src/naibu/io/{folder}/FORMAT.py" for folder in ("image_formats", "mesh_formats", "field_formats")}
+    examples = {*formats, "workflows/VERB.py"}
     lost = sorted(name for name in named - examples if not any((root / name).exists() for root in roots))
     assert len(named) > 30 and not lost, lost
 

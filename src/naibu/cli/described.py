@@ -224,8 +224,10 @@ def direction_of(text: str | None) -> tuple[float, ...] | Literal["found"] | Non
     InputError
         A text of another form.
     """
-    if text is None or text == "found":
-        return text
+    if text is None:
+        return None
+    if text == "found":
+        return "found"
     axis = text.lstrip("+-")
     if axis in ("x", "y", "z"):
         return tuple((-1.0 if text.startswith("-") else 1.0) * (axis == name) for name in "xyz")
