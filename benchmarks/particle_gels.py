@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from naibu.core.errors import InputError
-from naibu.imaging.markers.point_matching import link_markers
+from naibu.imaging.markers.linking.point_matching import link_markers
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "helpers"))
 from particle_gels import particle_gel

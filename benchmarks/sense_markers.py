@@ -23,8 +23,8 @@ from scipy.spatial import cKDTree
 
 from naibu import datasets
 from naibu.core.volume import Volume
-from naibu.imaging.markers.point_matching import link_markers
-from naibu.imaging.markers.sequence_tracking import track_sequence
+from naibu.imaging.markers.linking.point_matching import link_markers
+from naibu.imaging.markers.sequences.sequence_tracking import track_sequence
 from naibu.imaging.markers.tracking import track_markers
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "helpers"))

@@ -8,7 +8,7 @@ import pytest
 from virtual_press import COARSE, KNOWN, Press, virtual_press, write_press
 
 from naibu._numba.process_lock import ProcessLock
-from naibu.workflows import identify
+from naibu.workflows.markers import identify
 
 LONGEST_WAIT_S = 900.0
 

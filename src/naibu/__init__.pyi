@@ -5,8 +5,8 @@ from .core.markers import Markers
 from .core.mesh import Mesh
 from .core.volume import Volume
 from .io.images import read_volume
-from .workflows.compare import compare
-from .workflows.identify import identify
+from .workflows.markers.compare import compare
+from .workflows.markers.identify import identify
 from .workflows.measurement.sense import sense
 from .workflows.measurement.track import track
 from .workflows.predict import predict

@@ -21,8 +21,8 @@ from naibu.identification.from_markers.checks.marker_checks import Doubt
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.io.experiment_folder.reader import read_experiment
 from naibu.mechanics.finite_strain.newton import Newton
-from naibu.workflows import compare as comparison
-from naibu.workflows import identify as workflow
+from naibu.workflows.markers import compare as comparison
+from naibu.workflows.markers import identify as workflow
 
 Run = Callable[..., tuple[int, str, str]]
 COARSE = ("--element-size-mm", "20", "--known", KNOWN[0])

@@ -25,14 +25,14 @@ from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.calibrated_model import CalibratedModel
-from naibu.io.blade_table import read_blade_path, read_tip_path
 from naibu.io.displacement_fields import read_field, write_field
 from naibu.io.experiment_folder.reader import read_experiment
 from naibu.io.images import read_displacement, read_volume, write_displacement, write_volume
-from naibu.io.marker_tables import import_markers
 from naibu.io.meshes import read_mesh, read_surface
-from naibu.io.number_table import read_numbers
 from naibu.io.study_schemas.lattice_study_schema import load_study
+from naibu.io.tables.blade_table import read_blade_path, read_tip_path
+from naibu.io.tables.marker_tables import import_markers
+from naibu.io.tables.number_table import read_numbers
 from naibu.io.vtk_files import write_vtu
 from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.meshing.element_conversion import to_tetra

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.io import savemat
 
 from naibu.io.displacement_fields import read_field
-from naibu.io.point_clouds import read_point_cloud
-from naibu.io.point_tables import TEXT
+from naibu.io.tables.point_clouds import read_point_cloud
+from naibu.io.tables.point_tables import TEXT
 
 POINTS = np.random.default_rng(1).uniform(1.0, 9.0, (20, 3)).round(3)
 VECTORS = np.random.default_rng(2).normal(size=(3, 4, 5, 3)).round(3)

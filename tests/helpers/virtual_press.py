@@ -12,9 +12,9 @@ import pytest
 from naibu.core.experiment import Loading
 from naibu.identification.from_markers.gauss_newton import Matcher
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
-from naibu.io.marker_tables import write_experiment_folder
+from naibu.io.tables.marker_tables import write_experiment_folder
 from naibu.validation.specimens.marker_phantoms import Phantom, Scanner, box_experiment, phantom
-from naibu.workflows.identify import Identification
+from naibu.workflows.markers.identify import Identification
 
 SIDE_MM = 60.0
 TRUTH = {"soft: young_modulus": 100.0, "firm: young_modulus": 200.0, "soft: poisson_ratio": 0.48, "firm: poisson_ratio": 0.48}

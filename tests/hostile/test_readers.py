@@ -28,9 +28,9 @@ from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.io.experiment_folder.reader import read_experiment
 from naibu.io.images import read_volume, write_volume
-from naibu.io.marker_tables import import_markers
 from naibu.io.meshes import read_mesh, read_surface
 from naibu.io.study_schemas.lattice_study_schema import load_study
+from naibu.io.tables.marker_tables import import_markers
 
 EACH = 12
 # a stack whose fourth page is its own successor, found by mutation

@@ -14,11 +14,12 @@ from naibu.identification.from_markers.specimen.specimen_model import ModelSetti
 from naibu.identification.prediction.baselines import affine
 from naibu.identification.prediction.prediction import Prediction
 from naibu.imaging.markers.tracking import TrackedMarkers, track_markers
-from naibu.io.marker_tables import write_experiment_folder
+from naibu.io.tables.marker_tables import write_experiment_folder
 from naibu.validation.scanners.ct_mr import STEEL_WASHER, VirtualScan
 from naibu.validation.scanners.experiments import scanned_states
 from naibu.validation.specimens.marker_phantoms import VirtualSpecimen, box_experiment, virtual_specimen
-from naibu.workflows import identify, predict
+from naibu.workflows import predict
+from naibu.workflows.markers import identify
 
 TRUTH = {
     "soft: young_modulus": 100.0,

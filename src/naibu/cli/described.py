@@ -123,7 +123,7 @@ class ObjectOptions:
     vertical: str | None = None
 
     def described(self, size_mm: tuple[float, float, float]) -> dict[str, Any]:
-        """Return shape, loading, layers, stated_mm and vertical, as `naibu.workflows.import_tables.import_tables` takes them.
+        """Return shape, loading, layers, stated_mm and vertical, as `naibu.workflows.markers.import_tables.import_tables` takes them.
 
         Raises
         ------

@@ -20,7 +20,7 @@ from naibu.core.errors import InputError
 # imported where used, so that --help is immediate and doctor runs even if numpy is broken
 if TYPE_CHECKING:
     from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
-    from naibu.workflows.identify import Identification
+    from naibu.workflows.markers.identify import Identification
 
 DEMO = ("ct_two_material_1", "ct_two_material_2", "ct_two_material_3")
 DEMO_KNOWN = "hardness 5=222 kPa"  # mean of the report's compression tests, Table 3.4
@@ -218,7 +218,7 @@ def _identify(
     overwrite: Overwrite = False,
     where: WorkerOptions | None = None,
 ) -> None:
-    from naibu.workflows import identify
+    from naibu.workflows.markers import identify
 
     began = time.perf_counter()
     with progress_display() as progress:
@@ -296,7 +296,7 @@ def compare(
         Discard what the folder already contains, and compute everything anew.
     """
     from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
-    from naibu.workflows import compare as compare_workflow
+    from naibu.workflows.markers import compare as compare_workflow
     from naibu.workflows.results.report_content import comparison_table
 
     laws: list[Law] = law or ["neo_hookean", "mooney_rivlin"]
@@ -384,7 +384,7 @@ def import_tables(
     overwrite
         Use the folder even if it is not empty, and replace files of the same names.
     """
-    from naibu.workflows import import_tables as import_workflow
+    from naibu.workflows.markers import import_tables as import_workflow
 
     about = (described or ObjectOptions()).described(size_mm)
     about["spacing_mm"] = spacing_mm

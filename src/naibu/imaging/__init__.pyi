@@ -15,10 +15,10 @@ from .feature_matching.harris import InterestPoints, interest_points
 from .feature_matching.relaxation_labelling import PotentialMatches, relaxed
 from .feature_matching.scattered_interpolation import Triangulation, dense_from_sparse, sparse_displacement, triangulated
 from .markers.detection import DetectedMarkers, detect_markers
-from .markers.particle_motion import ParticleMotion, particle_motion
-from .markers.point_matching import Links, link_markers
+from .markers.linking.particle_motion import ParticleMotion, particle_motion
+from .markers.linking.point_matching import Links, link_markers
 from .markers.scan_orientation import ScanOrientation, found_orientation, stated_orientation
-from .markers.sequence_tracking import TrackedSequence, track_sequence
+from .markers.sequences.sequence_tracking import TrackedSequence, track_sequence
 from .markers.settings import DetectionSettings, LinkSettings, SequenceSettings
 from .markers.tracking import TrackedMarkers, track_markers
 from .measure_displacement import MeasuredDisplacement, measure_displacement

@@ -1,11 +1,11 @@
-from .captured_shapes import CapturedSurface, read_captured_shapes
 from .displacement_fields import read_field, write_field
 from .experiment_folder.reader import read_experiment
-from .force_records import ForceRecord, read_force_records
 from .images import open_volume, read_displacement, read_volume_box, write_displacement, write_volume
-from .marker_tables import import_markers, write_experiment_folder, write_markers
 from .meshes import Surface, read_mesh, read_surface
-from .point_clouds import PointCloud, read_point_cloud
+from .tables.captured_shapes import CapturedSurface, read_captured_shapes
+from .tables.force_records import ForceRecord, read_force_records
+from .tables.marker_tables import import_markers, write_experiment_folder, write_markers
+from .tables.point_clouds import PointCloud, read_point_cloud
 from .vtk_files import write_vtkhdf_series, write_vtu
 from .vtkhdf_series import SeriesFile
 

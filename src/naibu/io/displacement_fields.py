@@ -27,8 +27,8 @@ from naibu.io.files.hdf5_stream import Hdf5File
 from naibu.io.files.reading import guarded_reading, read_bytes, require_plausible, require_regular
 from naibu.io.images import read_displacement
 from naibu.io.mesh_formats import vtu
-from naibu.io.point_tables import EXCEL, TEXT
-from naibu.io.table_cells import MM_PER_UNIT
+from naibu.io.tables.point_tables import EXCEL, TEXT
+from naibu.io.tables.table_cells import MM_PER_UNIT
 
 FORMAT = "naibu displacement field 1"
 FRAME = "LPS, mm; the material at x in the reference configuration is found at x + vector"

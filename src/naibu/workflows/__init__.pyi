@@ -1,12 +1,12 @@
 from .fields.design import Design, Planned, design
 from .fields.identify_fields import FieldIdentification, identify_fields
 from .fields.predict_field import Comparison, FieldPredictionRun, predict_field
-from .identify import Identification
 from .interactive.cut import CutRun, cut
 from .interactive.cut_surface import SurfaceCutRun, cut_surface_file
 from .interactive.haptics.device import DeviceRecord, drive_live_simulation
 from .interactive.live import live, touched_loop
 from .interactive.touchable_models import MeshMaterial, TouchableModel, tools_for, touchable
+from .markers.identify import Identification
 from .measurement.compare_methods import MethodComparison, compare_methods
 from .measurement.sense import Pair, SenseRun, read_pair, sense_pair
 from .measurement.track import ObjectDescription, TrackRun

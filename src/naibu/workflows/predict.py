@@ -14,7 +14,7 @@ from naibu.identification.prediction.prediction import Prediction, predict_state
 from naibu.viewer.notebook import ShownInNotebook, empty_figure
 from naibu.viewer.result_figures import draw_marker_motion
 from naibu.viewer.result_page.page import report_html
-from naibu.workflows.experiments import Source, load_experiment, loaded_names, require_loaded
+from naibu.workflows.markers.experiments import Source, load_experiment, loaded_names, require_loaded
 from naibu.workflows.results.output_folder import output_folder
 from naibu.workflows.results.report_content import prediction_report, prediction_scene
 from naibu.workflows.results.result_folder import PREDICTION_FILES, read_model, write_prediction

@@ -17,7 +17,7 @@ from naibu.core.volume import Volume
 from naibu.imaging.markers.joint_localization import joint_positions
 from naibu.imaging.markers.tracking import TrackedMarkers, linked_states, track_markers
 from naibu.io.experiment_folder.reader import read_experiment
-from naibu.io.marker_tables import write_experiment_folder
+from naibu.io.tables.marker_tables import write_experiment_folder
 
 GRID = lattice((4, 4, 3), 5.0, 0.7, seed=2, start=4.5)
 ORIGIN = np.array([7.0, -3.0, 11.0])

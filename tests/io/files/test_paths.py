@@ -15,8 +15,8 @@ from naibu.io.experiment_folder.reader import read_experiment
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.paths import require_usable_path
 from naibu.io.images import read_volume
-from naibu.io.marker_tables import import_markers, write_markers
 from naibu.io.meshes import read_surface
+from naibu.io.tables.marker_tables import import_markers, write_markers
 from naibu.workflows.results.output_folder import output_folder
 
 NOT_TEXT = os.fsdecode(b"scan-\xff\xfe")

@@ -13,7 +13,7 @@ import pytest
 
 from naibu import cli
 from naibu.core.errors import InputError
-from naibu.io.blade_table import read_tip_path
+from naibu.io.tables.blade_table import read_tip_path
 from naibu.meshing import boundary_faces, box
 from naibu.workflows import cut_surface_file
 

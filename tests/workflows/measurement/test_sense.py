@@ -19,8 +19,8 @@ from naibu.core.volume import Volume
 from naibu.imaging.measure_displacement import METHODS, matched_rigidly, measure_displacement
 from naibu.io.displacement_fields import read_field
 from naibu.io.images import read_displacement, read_volume, write_displacement, write_volume
-from naibu.io.marker_tables import import_markers
 from naibu.io.meshes import read_mesh
+from naibu.io.tables.marker_tables import import_markers
 from naibu.validation.specimens.textured_sphere import squeezed_ball
 from naibu.viewer.slices import slices_html
 from naibu.workflows.measurement.compare_methods import compare_methods

@@ -77,7 +77,7 @@ class DetectionSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkSettings:
-    """How `naibu.imaging.markers.point_matching.link_markers` links the markers of two states.
+    """How `naibu.imaging.markers.linking.point_matching.link_markers` links the markers of two states.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ class LinkSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SequenceSettings:
-    """How `naibu.imaging.markers.sequence_tracking.track_sequence` finds and follows echoes.
+    """How `naibu.imaging.markers.sequences.sequence_tracking.track_sequence` finds and follows echoes.
 
     Attributes
     ----------

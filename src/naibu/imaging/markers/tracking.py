@@ -18,10 +18,10 @@ from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
 from naibu.imaging.markers.detection import DetectedMarkers, Polarity, detect_markers
 from naibu.imaging.markers.joint_localization import joint_positions
+from naibu.imaging.markers.linking.point_matching import Links, link_markers
+from naibu.imaging.markers.linking.thin_plate_assignment import spline_through
 from naibu.imaging.markers.peaks import POPULATION
-from naibu.imaging.markers.point_matching import Links, link_markers
 from naibu.imaging.markers.settings import DetectionSettings, LinkSettings, require_between
-from naibu.imaging.markers.thin_plate_assignment import spline_through
 
 FEWEST_COMMON = 4  # markers in common with the reference state that an experiment needs: those of one tetrahedron
 NEARLY_ALL = 0.97  # fraction of linked markers from which on links by way of the previous state are taken as they are; empirical
@@ -43,7 +43,7 @@ class TrackedMarkers:
         Probability that the link to the reference state is right; 1 in the reference state, 0 where there is no link.
     residual_mm : ndarray, shape (s, n)
         Residual from the local affine fit to the neighbours, before the joint localisation, mm; NaN where there is no link. See
-        `naibu.imaging.markers.point_matching.Links`.
+        `naibu.imaging.markers.linking.point_matching.Links`.
     flags : ndarray of str, shape (s, n)
         ``"ok"``, ``"missing"`` or ``"suspect"``.
     found : tuple of DetectedMarkers
@@ -81,7 +81,7 @@ class TrackedMarkers:
 
     @property
     def states(self) -> dict[str, Markers]:
-        """Markers of the states after the first by name, in order, as `naibu.io.marker_tables.write_experiment_folder` takes them."""
+        """Markers of the states after the first by name, in order, as `naibu.io.write_experiment_folder` takes them."""
         return dict(zip(self.names[1:], self.markers[1:], strict=True))
 
 
@@ -177,7 +177,7 @@ def linked_states(
     names : sequence of str, optional
         Names of the states, for messages.
     seed, settings
-        See `naibu.imaging.markers.point_matching.link_markers`.
+        See `naibu.imaging.markers.linking.point_matching.link_markers`.
 
     Returns
     -------

@@ -11,8 +11,8 @@ from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.io.field_formats import tecplot
-from naibu.io.point_tables import PointTable, assembled, columns_of, read_point_table
-from naibu.io.table_cells import unit_factor
+from naibu.io.tables.point_tables import PointTable, assembled, columns_of, read_point_table
+from naibu.io.tables.table_cells import unit_factor
 
 NEEDED = "x_mm, y_mm, z_mm, ux_mm, uy_mm, uz_mm"
 

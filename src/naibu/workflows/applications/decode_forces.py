@@ -15,8 +15,8 @@ from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
-from naibu.io.number_table import read_numbers
 from naibu.io.study_schemas.fingertip_schema import load_decoder
+from naibu.io.tables.number_table import read_numbers
 from naibu.viewer.cards import Card
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter

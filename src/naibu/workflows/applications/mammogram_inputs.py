@@ -17,7 +17,7 @@ from naibu.core.errors import InputError
 from naibu.io.image_formats.dicom import is_dicom
 from naibu.io.images import read_volume
 from naibu.io.mammograms import Mammogram, read_mammogram
-from naibu.io.number_table import read_numbers
+from naibu.io.tables.number_table import read_numbers
 
 _WITHOUT_SIZE = (".png", ".tif", ".tiff")
 _MASKS = (*_WITHOUT_SIZE, ".mha", ".nrrd", ".nii")

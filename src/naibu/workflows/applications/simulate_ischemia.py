@@ -20,8 +20,8 @@ from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress, report_progress
 from naibu.io.files.parsing import parsed_toml
 from naibu.io.files.reading import file_beside, read_bytes
-from naibu.io.number_table import read_numbers
 from naibu.io.study_schemas.ischemia_schema import IschemiaFile, RecordTable, load_ischemia
+from naibu.io.tables.number_table import read_numbers
 from naibu.io.vtk_files import write_vtkhdf_series
 from naibu.mechanics.small_strain.rheology import Rheology, three_element
 from naibu.reproduction.chapter5 import figures

@@ -19,8 +19,8 @@ from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.io.images import write_displacement, write_volume
-from naibu.io.marker_tables import write_experiment_folder
-from naibu.workflows.identify import identify
+from naibu.io.tables.marker_tables import write_experiment_folder
+from naibu.workflows.markers.identify import identify
 from naibu.workflows.measurement.sense import sense
 from naibu.workflows.predict import predict
 from naibu.workflows.studies.simulate import simulate

@@ -28,7 +28,7 @@ from naibu.mechanics.finite_elements.assembly import LARGE, Assembler
 from naibu.mechanics.finite_elements.elements import Formulation, elements
 from naibu.mechanics.finite_elements.hyperelasticity import LAWS, from_moduli
 from naibu.meshing.primitives import box
-from naibu.workflows.identify import identify
+from naibu.workflows.markers.identify import identify
 from naibu.workflows.measurement.sense import sense
 from naibu.workflows.measurement.track import track
 from naibu.workflows.measurement.track_sequence import track_sequence_file

@@ -16,9 +16,9 @@ from naibu.core.arrays import FloatArray, IntArray, require_lengths
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress, report_progress
-from naibu.io.blade_table import read_blade_path
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import sha256
+from naibu.io.tables.blade_table import read_blade_path
 from naibu.io.vtk_files import write_vtkhdf_series, write_vtu
 from naibu.mechanics.lattices.model.hexahedra import lattice_mesh
 from naibu.mechanics.lattices.model.state import ConstrainedNodes
@@ -30,8 +30,8 @@ from naibu.simulation.lattice_cut import LatticeCut
 from naibu.viewer.cards import Card
 from naibu.viewer.motion_page import ColourField, MotionPage, motion_html
 from naibu.viewer.tables import Table, quantity_of
-from naibu.workflows.experiments import Source
 from naibu.workflows.interactive.touchable_models import MeshMaterial, TouchableModel, touchable
+from naibu.workflows.markers.experiments import Source
 from naibu.workflows.results.output_folder import output_folder
 
 FILES = ("cut.html", "cut.vtu", "cut.vtkhdf", "cut.json")
@@ -83,7 +83,7 @@ def cut(
     source : str or path-like
         ``model.json`` of an identification, a mesh, or a lattice study; see `naibu.workflows.touchable`.
     path : path-like
-        Table of the blade's edge, in the frame of the mesh or the scan; see `naibu.io.blade_table.read_blade_path`.
+        Table of the blade's edge, in the frame of the mesh or the scan; see `naibu.io.tables.blade_table.read_blade_path`.
     out : path-like
         Folder for ``cut.html``, ``cut.vtu`` (mesh with pieces), ``cut.vtkhdf`` (motion) and ``cut.json``.
     distance_mm : float, optional

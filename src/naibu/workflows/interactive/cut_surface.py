@@ -17,10 +17,10 @@ from naibu.core.arrays import FloatArray, IntArray, require_lengths, require_wit
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress, report_progress
-from naibu.io.blade_table import read_tip_path
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import sha256
 from naibu.io.meshes import SURFACE_READERS, Surface, read_surface
+from naibu.io.tables.blade_table import read_tip_path
 from naibu.io.vtk_files import write_vtkhdf_series, write_vtu
 from naibu.meshing.cutting.surface import cut_surface as cut_along
 from naibu.meshing.cutting.surface_result import SurfaceCut, groove, triangle_areas
@@ -87,7 +87,7 @@ def cut_surface_file(
     source : path-like
         Surface (``.stl``, ``.ply``, ``.obj``, ``.wrl``, ``.vrml``), which may be open.
     path : path-like
-        Table of the tips; see `naibu.io.blade_table.read_tip_path`.
+        Table of the tips; see `naibu.io.tables.blade_table.read_tip_path`.
     out : path-like
         Folder for ``cut.html``, ``cut.vtu`` (the cut surface with its pieces), ``cut.vtkhdf`` (the cut opens behind the tool) and
         ``cut.json``.

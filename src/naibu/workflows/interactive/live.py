@@ -25,9 +25,9 @@ from naibu.viewer.live.commands import LiveCommand
 from naibu.viewer.live.scene import FAILED, PAUSED, RECORDING, REPLAYING, LiveFrame, LiveScene
 from naibu.viewer.live.server import LiveServer, serve
 from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, motion_html
-from naibu.workflows.experiments import Source
 from naibu.workflows.interactive.haptics.endpoint import HapticEndpoint
 from naibu.workflows.interactive.touchable_models import MeshMaterial, TouchableModel, tools_for, touchable
+from naibu.workflows.markers.experiments import Source
 
 GRIP_RADIUS = 0.08  # of the extent of the body
 PAGE_BYTES = 5_000_000

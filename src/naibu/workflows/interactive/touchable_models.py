@@ -33,7 +33,7 @@ from naibu.mechanics.lattices.model.surface import surface_of
 from naibu.meshing.element_conversion import to_tetra
 from naibu.meshing.point_location import interpolation_operator
 from naibu.simulation.interactive_bodies import FiniteElementBody, InteractiveBody, LatticeBody, nodes_touching
-from naibu.workflows.experiments import Source, load_experiment
+from naibu.workflows.markers.experiments import Source, load_experiment
 from naibu.workflows.results.result_folder import MODEL_FILE, read_any_model
 from naibu.workflows.studies.lattice_study import NAMED, PreparedStudy, prepared_study
 

@@ -26,7 +26,7 @@ from naibu.io.displacement_fields import write_field
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
 from naibu.io.images import read_displacement, read_volume, write_displacement, write_volume
-from naibu.io.marker_tables import import_markers, write_markers
+from naibu.io.tables.marker_tables import import_markers, write_markers
 from naibu.io.vtk_files import write_vtu
 from naibu.meshing.primitives import grid_cells
 from naibu.viewer.notebook import ShownInNotebook, empty_figure
@@ -131,7 +131,7 @@ def read_pair(
     truth : path-like, optional
         True displacement on that grid, an image of vectors, mm.
     check_points : two path-like, optional
-        Tables of points in the reference and in the deformed configuration (see `naibu.io.marker_tables.import_markers`), with one number
+        Tables of points in the reference and in the deformed configuration (see `naibu.io.import_markers`), with one number
         for each point.
     spacing_mm : sequence of float, optional
         Voxel spacing along x, y, z, mm, for files without it.

@@ -17,14 +17,14 @@ from naibu.imaging.markers.tracking import FEWEST_COMMON, TrackedMarkers, track_
 from naibu.io.files.paths import require_usable_path
 from naibu.io.files.provenance import input_record
 from naibu.io.images import read_volume
-from naibu.io.marker_tables import write_experiment_folder, write_markers
+from naibu.io.tables.marker_tables import write_experiment_folder, write_markers
 from naibu.viewer.chapter_page import write_chapter
 from naibu.viewer.notebook import ShownInNotebook, empty_figure
 from naibu.viewer.result_figures import draw_marker_motion
 from naibu.viewer.tables import Cell, Table
+from naibu.workflows.markers.tilted_tables import Vertical, upright_tables
 from naibu.workflows.measurement.track_page import track_chapter, track_rows
 from naibu.workflows.results.output_folder import output_folder
-from naibu.workflows.tilted_tables import Vertical, upright_tables
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -47,7 +47,7 @@ class ObjectDescription:
     stated_mm : mapping of str to float, optional
         Stated platen positions by name of the state, mm.
     vertical : sequence of float or "found", optional
-        Direction away from the base in the axes of the scans, if it is not z, as of `naibu.workflows.import_tables.import_tables`.
+        Direction away from the base in the axes of the scans, if it is not z, as of `naibu.workflows.markers.import_tables.import_tables`.
     title : str
         Title of the experiment.
     """

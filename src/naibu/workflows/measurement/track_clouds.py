@@ -18,13 +18,13 @@ from naibu.core.arrays import FloatArray, require_lengths
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
-from naibu.imaging.markers.particle_motion import ParticleMotion, particle_motion
-from naibu.imaging.markers.point_clouds import NEIGHBOURS
+from naibu.imaging.markers.linking.particle_motion import ParticleMotion, particle_motion
+from naibu.imaging.markers.linking.point_clouds import NEIGHBOURS
 from naibu.io.displacement_fields import write_field
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
 from naibu.io.images import write_volume
-from naibu.io.point_clouds import POINT_FILES, PointCloud, read_point_cloud
+from naibu.io.tables.point_clouds import POINT_FILES, PointCloud, read_point_cloud
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table

@@ -15,7 +15,7 @@ import numpy as np
 
 from naibu.core.arrays import AnyArray, FloatArray, require_lengths, require_within
 from naibu.core.progress import Progress, report_progress
-from naibu.imaging.markers.sequence_tracking import EchoPolarity, TrackedSequence, lengths_mm, track_sequence
+from naibu.imaging.markers.sequences.sequence_tracking import EchoPolarity, TrackedSequence, lengths_mm, track_sequence
 from naibu.imaging.markers.settings import SequenceSettings
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
@@ -82,7 +82,7 @@ def track_sequence_file(
     overwrite : bool
         Whether results, or other files of these names, that `out` holds already are replaced.
     pixel_mm, diameter_mm, region_mm, count, polarity, settings, progress
-        See `naibu.imaging.markers.sequence_tracking.track_sequence`.
+        See `naibu.imaging.markers.sequences.sequence_tracking.track_sequence`.
 
     Returns
     -------

@@ -21,12 +21,12 @@ from naibu.identification.lattice_calibration.evolutionary import search_cma_es,
 from naibu.identification.lattice_calibration.gauss_newton import calibrate_lattice, estimate_at
 from naibu.identification.lattice_calibration.study_problem import RecordedForces, StudyProblem
 from naibu.identification.lattice_calibration.study_unknowns import PULL_OFF, Friction, Groups, StudyUnknowns
-from naibu.io.captured_shapes import CapturedSurface, read_captured_shapes
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import sha256
-from naibu.io.force_records import ForceRecord, read_force_records
 from naibu.io.study_schemas.lattice_study_schema import StudyFile
 from naibu.io.study_schemas.study_writing import study_document
+from naibu.io.tables.captured_shapes import CapturedSurface, read_captured_shapes
+from naibu.io.tables.force_records import ForceRecord, read_force_records
 from naibu.viewer.chapter_page import chapter_html
 from naibu.workflows.results.output_folder import output_folder
 from naibu.workflows.studies.calibration_page import Compared, calibration_chapter, held_intervals, misfit_numbers

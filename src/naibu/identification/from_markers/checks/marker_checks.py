@@ -1,9 +1,9 @@
 """Can the markers belong together? Size, orientation, order and motion of marker clouds are compared before anything is solved.
 
-What no loading can do to a body is refused: a mirror image, other units, labels without order (`naibu.imaging.markers.motion_coherence`),
-and what contradicts the loading. What is only unlikely is returned as doubts, which the verdict on the result takes up. They are judged by
-the best affine map from the reference configuration to a loaded state: its determinant is the ratio of volumes, its right stretch tensor
-tells along which axis the body was shortened (:cite:p:`bonet2008`).
+What no loading can do to a body is refused: a mirror image, other units, labels without order
+(`naibu.imaging.markers.linking.motion_coherence`), and what contradicts the loading. What is only unlikely is returned as doubts, which
+the verdict on the result takes up. They are judged by the best affine map from the reference configuration to a loaded state: its
+determinant is the ratio of volumes, its right stretch tensor tells along which axis the body was shortened (:cite:p:`bonet2008`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from naibu.core.experiment import Experiment, State
 from naibu.core.rigid_transform import RigidTransform, registration
 from naibu.identification.from_markers.observations import NoiseModel
 from naibu.identification.neighbours import neighbours
-from naibu.imaging.markers.motion_coherence import require_coherent
+from naibu.imaging.markers.linking.motion_coherence import require_coherent
 
 FEWEST = 8  # markers of which an affine map says something about the rest
 COINCIDENT_MM = 1e-3

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from naibu.core.errors import InputError
-from naibu.io.force_records import read_force_records
+from naibu.io.tables.force_records import read_force_records
 
 
 def written(folder: Path, text: str, name: str = "f.csv") -> Path:

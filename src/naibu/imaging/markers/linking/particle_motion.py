@@ -12,9 +12,9 @@ from naibu.core.arrays import BoolArray, FloatArray, IntArray, require_shape
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.imaging.displacement.strain import green_lagrange_strain_of
-from naibu.imaging.markers.link_refinement import MEDIAN
-from naibu.imaging.markers.point_clouds import NEIGHBOURS
-from naibu.imaging.markers.point_matching import Links, link_markers
+from naibu.imaging.markers.linking.link_refinement import MEDIAN
+from naibu.imaging.markers.linking.point_clouds import NEIGHBOURS
+from naibu.imaging.markers.linking.point_matching import Links, link_markers
 from naibu.imaging.markers.settings import LinkSettings, require_between
 
 # Empirical values, judged by tests/imaging/markers/test_particle_motion.py.

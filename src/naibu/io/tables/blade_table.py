@@ -8,7 +8,7 @@ import numpy as np
 
 from naibu.core.arrays import LENGTHS_MM, FloatArray
 from naibu.core.errors import InputError
-from naibu.io.number_table import read_number_rows
+from naibu.io.tables.number_table import read_number_rows
 
 FARTHEST_MM = LENGTHS_MM[1]
 

@@ -13,8 +13,8 @@ from naibu.core.experiment import Loading, Shape
 from naibu.core.markers import Markers
 from naibu.core.rigid_transform import registration, rotation_matrix
 from naibu.io.experiment_folder.reader import read_experiment
-from naibu.io.marker_tables import write_markers
-from naibu.workflows.import_tables import import_tables, preview_tables
+from naibu.io.tables.marker_tables import write_markers
+from naibu.workflows.markers.import_tables import import_tables, preview_tables
 
 GEL = datasets.load("ct_cube_plate")
 TURN = rotation_matrix(np.array([0.35, -0.2, 0.1]))

@@ -7,9 +7,9 @@ import pytest
 from marker_scenes import Echoes, ultrasound
 
 from naibu.core.errors import InputError
-from naibu.imaging.markers.sequence_gaps import completed
-from naibu.imaging.markers.sequence_paths import Track
-from naibu.imaging.markers.sequence_tracking import TrackedSequence, track_sequence
+from naibu.imaging.markers.sequences.sequence_gaps import completed
+from naibu.imaging.markers.sequences.sequence_paths import Track
+from naibu.imaging.markers.sequences.sequence_tracking import TrackedSequence, track_sequence
 from naibu.imaging.markers.settings import SequenceSettings
 
 

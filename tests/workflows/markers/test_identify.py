@@ -25,8 +25,9 @@ from naibu.io.experiment_folder.state_csv import parse_state_csv
 from naibu.io.files import atomic
 from naibu.viewer.result_page.payload import report_json
 from naibu.viewer.result_page.reading import report_from_json
-from naibu.workflows import cross_validation, identify, predict, report
-from naibu.workflows.cross_validation import left_out_in_turn
+from naibu.workflows import predict, report
+from naibu.workflows.markers import cross_validation, identify
+from naibu.workflows.markers.cross_validation import left_out_in_turn
 from naibu.workflows.parallel.worker_count import Workers
 from naibu.workflows.results.report_content import load_case_scene, prediction_scene
 from naibu.workflows.results.result_folder import CHECKPOINT_FILE, MODEL_FILE, read_model

@@ -13,7 +13,7 @@ from naibu.core.arrays import LENGTHS_MM, FloatArray
 from naibu.core.errors import InputError
 from naibu.io.files.reading import guarded_reading, read_bytes
 from naibu.io.mesh_formats import ply
-from naibu.io.named_columns import ColumnKind, read_named_columns
+from naibu.io.tables.named_columns import ColumnKind, read_named_columns
 
 LENGTH_UNITS = {"": 1.0, "mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 1e-3, "µm": 1e-3}
 TIME_UNITS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}

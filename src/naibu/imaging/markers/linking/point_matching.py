@@ -4,7 +4,7 @@ The motion is assumed to be nearly affine over a few spacings. A guess pairs a r
 neighbours of the one are found again around the other under one affine motion, so that displacements of many spacings are found. From
 there links grow, each predicted by those around it, and at last every link must agree with the affine fit to its neighbours, itself left
 out. In lattices, where all surroundings are similar, several guesses grow, and the one that links most markers is taken. Up to a few
-hundred markers are assigned at once instead (`naibu.imaging.markers.thin_plate_assignment`).
+hundred markers are assigned at once instead (`naibu.imaging.markers.linking.thin_plate_assignment`).
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from scipy.spatial import cKDTree
 
 from naibu.core.arrays import FloatArray, IntArray, as_points, require_finite, require_shape
 from naibu.core.errors import InputError
-from naibu.imaging.markers._point_matching_kernels import frontier, settle, try_guesses
-from naibu.imaging.markers.link_refinement import RefinedLinks, probability, refined
-from naibu.imaging.markers.motion_coherence import coherence_of_links
-from naibu.imaging.markers.point_clouds import FEW, Cloud, State, local_spacing, prepared, proposed
+from naibu.imaging.markers.linking._point_matching_kernels import frontier, settle, try_guesses
+from naibu.imaging.markers.linking.link_refinement import RefinedLinks, probability, refined
+from naibu.imaging.markers.linking.motion_coherence import coherence_of_links
+from naibu.imaging.markers.linking.point_clouds import FEW, Cloud, State, local_spacing, prepared, proposed
+from naibu.imaging.markers.linking.thin_plate_assignment import ENOUGH, assigned, exchanged, residuals
 from naibu.imaging.markers.settings import LinkSettings
-from naibu.imaging.markers.thin_plate_assignment import ENOUGH, assigned, exchanged, residuals
 
 # Empirical values, judged by tests/imaging/markers/test_point_matching.py and benchmarks/sense_markers.py, unless said otherwise.
 FEWEST = 3  # points that have an arrangement

@@ -14,8 +14,8 @@ import numpy as np
 from naibu.core.arrays import LENGTHS_MM, AnyArray, FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.io.files.reading import guarded_reading, require_plausible, require_regular
-from naibu.io.point_tables import EXCEL, TEXT, read_point_table
-from naibu.io.table_cells import MM_PER_UNIT
+from naibu.io.tables.point_tables import EXCEL, TEXT, read_point_table
+from naibu.io.tables.table_cells import MM_PER_UNIT
 
 ARRAYS = (".npy", ".npz", ".mat")
 POINT_FILES = (*TEXT, *EXCEL, *ARRAYS)

@@ -11,7 +11,7 @@ import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import InputError
-from naibu.io.table_cells import HEADER_WITHIN, decimal_mark, excel_rows, number, text_rows, unit_factor, without_unit
+from naibu.io.tables.table_cells import HEADER_WITHIN, decimal_mark, excel_rows, number, text_rows, unit_factor, without_unit
 
 TEXT, EXCEL = (".csv", ".tsv", ".txt"), (".xlsx",)
 _PLACE = r"(?:pos(?:ition)?|coord(?:inate)?s?|centroid|cent(?:er|re)|points?)?"

@@ -11,7 +11,7 @@ from particle_gels import particle_gel
 
 from naibu import datasets
 from naibu.core.errors import InputError
-from naibu.imaging.markers.point_matching import link_markers
+from naibu.imaging.markers.linking.point_matching import link_markers
 from naibu.imaging.markers.settings import LinkSettings
 
 

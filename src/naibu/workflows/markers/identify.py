@@ -29,8 +29,8 @@ from naibu.viewer.notebook import ShownInNotebook, empty_figure
 from naibu.viewer.result_figures import draw_estimates
 from naibu.viewer.result_page.page import report_html
 from naibu.viewer.result_page.payload import Report
-from naibu.workflows.cross_validation import left_out_in_turn
-from naibu.workflows.experiments import Source, load_experiments, parse_known, provenance_of, require_element_size, require_loaded
+from naibu.workflows.markers.cross_validation import left_out_in_turn
+from naibu.workflows.markers.experiments import Source, load_experiments, parse_known, provenance_of, require_element_size, require_loaded
 from naibu.workflows.parallel.worker_count import Workers
 from naibu.workflows.results.output_folder import output_folder
 from naibu.workflows.results.report_content import build_report

@@ -1,9 +1,9 @@
 """Marker tracking in image sequences such as B-mode ultrasound :cite:p:`hirai2008` (chapter 2.2): through gaps, with ghosts rejected.
 
 Detect-and-link tracking as of particles :cite:p:`crocker1996`, with the links found over all frames at once by dynamic programming
-(`naibu.imaging.markers.sequence_paths`): a marker may be unseen for many frames. Tracks that are weak, short, or a weaker copy of another
-on the same beam (reverberation) are rejected. Outliers are dropped, and gaps are filled by the motion that all markers share
-(`naibu.imaging.markers.sequence_gaps`).
+(`naibu.imaging.markers.sequences.sequence_paths`): a marker may be unseen for many frames. Tracks that are weak, short, or a weaker copy
+of another on the same beam (reverberation) are rejected. Outliers are dropped, and gaps are filled by the motion that all markers share
+(`naibu.imaging.markers.sequences.sequence_gaps`).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from naibu.core.arrays import BoolArray, Float32Array, FloatArray, as_mask
 from naibu.core.errors import InputError
 from naibu.core.markers import Markers
 from naibu.core.progress import Progress, report_progress
-from naibu.imaging.markers.sequence_gaps import completed, position_sd
-from naibu.imaging.markers.sequence_paths import RejectedTrack, find_echoes, find_tracks, markers_among
+from naibu.imaging.markers.sequences.sequence_gaps import completed, position_sd
+from naibu.imaging.markers.sequences.sequence_paths import RejectedTrack, find_echoes, find_tracks, markers_among
 from naibu.imaging.markers.settings import SequenceSettings
 
 EchoPolarity = Literal["bright", "dark"]

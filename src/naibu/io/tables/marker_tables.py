@@ -25,7 +25,7 @@ from naibu.io.experiment_folder.state_csv import COORDINATES, OPTIONAL, REQUIRED
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.paths import require_usable_path
 from naibu.io.files.reading import guarded_reading
-from naibu.io.table_cells import (
+from naibu.io.tables.table_cells import (
     HEADER_WITHIN,
     decimal_mark,
     excel_rows,

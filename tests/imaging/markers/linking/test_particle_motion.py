@@ -7,7 +7,7 @@ import pytest
 from particle_gels import particle_gel
 
 from naibu.core.errors import InputError
-from naibu.imaging.markers.particle_motion import particle_motion
+from naibu.imaging.markers.linking.particle_motion import particle_motion
 
 GRADIENT = np.array([[0.05, 0.1, 0.0], [0.0, 0.02, -0.05], [0.03, 0.0, -0.12]])
 

@@ -12,8 +12,8 @@ from naibu.identification.from_markers.checks.marker_checks import check_markers
 from naibu.identification.from_markers.checks.marker_outliers import without_outliers
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.cross_validation import ModelRow, compare_models
-from naibu.workflows.cross_validation import MEMORY_MB
-from naibu.workflows.experiments import Source, load_experiments, parse_known, provenance_of, require_element_size
+from naibu.workflows.markers.cross_validation import MEMORY_MB
+from naibu.workflows.markers.experiments import Source, load_experiments, parse_known, provenance_of, require_element_size
 from naibu.workflows.parallel.run_tasks import run_tasks
 from naibu.workflows.parallel.task import Outcome, Task
 from naibu.workflows.parallel.worker_count import Workers

@@ -11,8 +11,8 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
-from naibu.io.captured_shapes import LONGEST_S, TIME_UNITS
-from naibu.io.named_columns import ColumnKind, read_named_columns
+from naibu.io.tables.captured_shapes import LONGEST_S, TIME_UNITS
+from naibu.io.tables.named_columns import ColumnKind, read_named_columns
 
 FORCE_UNITS = {"": 1.0, "mn": 1.0, "n": 1e3, "kn": 1e6, "gf": 9.80665, "kgf": 9806.65}
 MOMENT_UNITS = {"": 1.0, "mn_mm": 1.0, "mn mm": 1.0, "mnmm": 1.0, "n_mm": 1e3, "n mm": 1e3, "nmm": 1e3, "n_m": 1e6, "n m": 1e6, "nm": 1e6}

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
-from naibu.imaging.markers.sequence_paths import Track
+from naibu.imaging.markers.sequences.sequence_paths import Track
 from naibu.imaging.markers.settings import SequenceSettings
 
 # Empirical values, judged by tests/imaging/markers/test_sequence_tracking.py and benchmarks/sense_markers.py.

@@ -11,7 +11,7 @@ import pytest
 from scipy.io import savemat
 
 from naibu.core.errors import InputError
-from naibu.io.point_clouds import read_point_cloud
+from naibu.io.tables.point_clouds import read_point_cloud
 
 POINTS = np.random.default_rng(0).uniform(0.0, 9.0, (7, 3)).round(4)
 

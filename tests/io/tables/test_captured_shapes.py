@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from naibu.core.errors import InputError
-from naibu.io.captured_shapes import read_captured_shapes
+from naibu.io.tables.captured_shapes import read_captured_shapes
 
 PLY = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n4 5 6\n"
 

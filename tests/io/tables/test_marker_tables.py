@@ -16,7 +16,7 @@ from naibu.core.experiment import Layer, Loading, Shape
 from naibu.core.markers import Markers
 from naibu.io.experiment_folder.reader import read_experiment
 from naibu.io.files.atomic import write_atomically
-from naibu.io.marker_tables import import_markers, write_experiment_folder, write_markers
+from naibu.io.tables.marker_tables import import_markers, write_experiment_folder, write_markers
 
 EXPECTED = np.array([[12.5, 10.0, 3.0], [22.5, 10.25, 3.5]])
 

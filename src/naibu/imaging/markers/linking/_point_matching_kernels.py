@@ -1,5 +1,5 @@
 # mypy: disallow-untyped-decorators=False
-"""Numba kernels for `naibu.imaging.markers.point_matching`: nearest points, local affine fits, guesses, and growth of links."""
+"""Numba kernels for `naibu.imaging.markers.linking.point_matching`: nearest points, local affine fits, guesses, and growth of links."""
 
 from __future__ import annotations
 

@@ -8,8 +8,8 @@ from marker_scenes import lattice, particle_cloud
 
 from naibu import datasets
 from naibu.core.errors import InputError
-from naibu.imaging.markers.motion_coherence import motion_coherence, require_coherent, strays_named
-from naibu.imaging.markers.point_matching import link_markers
+from naibu.imaging.markers.linking.motion_coherence import motion_coherence, require_coherent, strays_named
+from naibu.imaging.markers.linking.point_matching import link_markers
 
 
 def measured() -> list[tuple[str, np.ndarray, np.ndarray]]:

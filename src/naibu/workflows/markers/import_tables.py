@@ -15,12 +15,12 @@ from naibu.core.arrays import FloatArray, require_lengths
 from naibu.core.errors import InputError
 from naibu.core.experiment import Loading, Shape
 from naibu.core.markers import Markers
-from naibu.imaging.markers.motion_coherence import require_coherent, strays_named
+from naibu.imaging.markers.linking.motion_coherence import require_coherent, strays_named
 from naibu.imaging.markers.tracking import FEWEST_COMMON
-from naibu.io.marker_tables import import_markers, write_experiment_folder
-from naibu.io.table_cells import MM_PER_UNIT
+from naibu.io.tables.marker_tables import import_markers, write_experiment_folder
+from naibu.io.tables.table_cells import MM_PER_UNIT
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.tilted_tables import UprightTables, Vertical, upright_tables
+from naibu.workflows.markers.tilted_tables import UprightTables, Vertical, upright_tables
 
 LEAST_SHARE = 0.15  # of the object's extent, which markers span; below, another unit is suspected
 INITIAL = "initial"

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from naibu.core.arrays import FloatArray, IntArray
-from naibu.imaging.markers._point_matching_kernels import fill_grid, propose, propose_few
+from naibu.imaging.markers.linking._point_matching_kernels import fill_grid, propose, propose_few
 
 # Empirical values, judged by tests/imaging/markers/test_point_matching.py and benchmarks/particle_gels.py.
 # points up to which a wave of growth is too small for threads

@@ -1,0 +1,1 @@
+"""Links between the points of two states, and the motion that they tell."""

@@ -1,0 +1,1 @@
+"""Markers followed through a sequence of images."""

@@ -1,0 +1,1 @@
+"""Tables of other programs: markers, clouds, captured shapes, forces, paths of blades."""
