@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -233,9 +234,11 @@ def direction_of(text: str | None) -> tuple[float, ...] | Literal["found"] | Non
         return tuple((-1.0 if text.startswith("-") else 1.0) * (axis == name) for name in "xyz")
     try:
         x, y, z = (float(part) for part in text.replace(" ", ",").split(",") if part)
+        if not 0.0 < math.hypot(x, y, z) < math.inf:
+            raise ValueError
     except ValueError:
         raise InputError(
-            f"--vertical {text!r} must be 'found', an axis such as 'y' or '-z', or three numbers such as '0.1,0.3,0.95'"
+            f"--vertical {text!r} must be 'found', an axis such as 'y' or '-z', or three numbers that are not all zero, such as '0.1,0.3,0.95'"
         ) from None
     return x, y, z
 

@@ -36,6 +36,7 @@ _REQUIRED = {
     "pydicom": "volumes in DICOM series",
     "pynrrd": "volumes in NRRD files",
     "tifffile": "volumes in TIFF stacks",
+    "threadpoolctl": "one thread for the small matrices of live bodies",
     "lazy-loader": "public names, loaded when first used",
     "starlette": "the page of naibu live",
     "uvicorn": "the server of naibu live",

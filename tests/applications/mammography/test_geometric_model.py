@@ -115,6 +115,7 @@ def test_markers_of_the_measured_half_ellipsoid_without_fitting_a_marker_displac
     spec = importlib.util.spec_from_file_location("mammography_benchmark", source)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    monkeypatch.syspath_prepend(source.parent)
     monkeypatch.setitem(sys.modules, spec.name, module)  # its dataclass looks itself up there
     spec.loader.exec_module(module)
     errors, held = module.phantom_errors(), module.phantom_errors("geometric, base held")

@@ -64,6 +64,8 @@ def read_captured_shapes(sources: Sequence[str | os.PathLike[str]]) -> tuple[Cap
 
 def _parts(source: str) -> list[CapturedSurface]:
     path, time = _timed(source)
+    if not path.exists():
+        raise InputError(f"shapes {source!r}: there is no such file; check the path")
     if path.suffix.lower() == ".ply":
         if time is None:
             raise InputError(f"{path}: a PLY file states no time; write 'TIME={path}' with the time of the capture, in s")

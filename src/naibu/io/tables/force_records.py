@@ -74,6 +74,8 @@ def read_force_records(sources: Sequence[str | os.PathLike[str]]) -> tuple[Force
 def _records(source: str) -> list[ForceRecord]:
     name, mark, rest = source.partition("=")
     path = Path(rest if mark and not Path(source).exists() else source)
+    if not path.exists():
+        raise InputError(f"forces {source!r}: there is no such file; check the path")
     given = name.strip() if str(path) != source else ""
     table = read_named_columns(path, _KINDS, _LABELS)
     numbers, labels = table.numbers, table.labels

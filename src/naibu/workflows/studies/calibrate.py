@@ -119,8 +119,9 @@ def calibrate_study(
     require_within("point_sd_mm", point_sd_mm, 1e-6, 1e3, "mm")
     if force_sd_mn is not None:
         require_within("force_sd_mn", force_sd_mn, 1e-6, 1e6, "mN")
-    if max_runs < 1 or threads < 1:
-        raise InputError(f"{'max_runs' if max_runs < 1 else 'threads'} must be at least 1")
+    for name, count in (("max_runs", max_runs), ("threads", threads)):
+        if count < 1:
+            raise InputError(f"{name} is {count}: must be at least 1")
     if not shapes and not forces:
         raise InputError("`shapes` and `forces` are both missing; give captured points, records of force sensors, or both")
     prepared = prepared_study(study)
