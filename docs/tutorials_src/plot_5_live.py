@@ -49,13 +49,15 @@ command = [sys.executable, "-m", "naibu", "live", str(place / "results"), "--exp
 server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 lines: queue.Queue[str] = queue.Queue()
 threading.Thread(target=lambda: [lines.put(line) for line in server.stdout or ()], daemon=True).start()
-address = ""
-while not address:
-    line = lines.get(timeout=300)
-    address = (re.findall(r"http://\S+", line) or [""])[0]
-page = urllib.request.urlopen(address, timeout=60).read().decode()
-print(re.sub(r"token=[\w-]+", "token=...", address), "answers with", re.findall("<title>(.*?)</title>", page)[0])
-server.send_signal(signal.SIGINT)
+try:
+    address = ""
+    while not address:
+        line = lines.get(timeout=300)
+        address = (re.findall(r"http://\S+", line) or [""])[0]
+    page = urllib.request.urlopen(address, timeout=60).read().decode()
+    print(re.sub(r"token=[\w-]+", "token=...", address), "answers with", re.findall("<title>(.*?)</title>", page)[0])
+finally:
+    server.send_signal(signal.SIGINT)
 print("exit code after Ctrl-C:", server.wait(60))
 
 # %%

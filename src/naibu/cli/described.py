@@ -238,7 +238,7 @@ def direction_of(text: str | None) -> tuple[float, ...] | Literal["found"] | Non
             raise ValueError
     except ValueError:
         raise InputError(
-            f"--vertical {text!r} must be 'found', an axis such as 'y' or '-z', or three numbers that are not all zero, such as '0.1,0.3,0.95'"
+            f"--vertical {text!r} must be 'found', an axis such as 'y' or '-z', or three numbers, not all zero, such as '0.1,0.3,0.95'"
         ) from None
     return x, y, z
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import InputError
-from naibu.identification.lattice_calibration.unknowns import KINDS, UNITS
+from naibu.identification.lattice_calibration.unknowns import KINDS, UNITS, require_positive_values
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.lattices.model.lattice import CLASSES, ZONES, Lattice, LatticeParameters
 from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy
@@ -162,10 +162,7 @@ class StudyUnknowns:
             found = np.array(values, dtype=float)
         if found.shape != (len(self.names),):
             raise InputError(f"values have shape {found.shape}, but there are {len(self.names)} parameters: {', '.join(self.names)}")
-        for name, value in zip(self.names, found, strict=True):
-            if not (np.isfinite(value) and value > 0.0):
-                raise InputError(f"{name} must be positive and finite, not {value:g}")
-        return found
+        return require_positive_values(self.names, found)
 
     def parameters(self, values: FloatArray) -> Trial:
         """Return what is simulated with values (p,); they are held within their bounds, and kinetic friction below static friction."""

@@ -85,10 +85,7 @@ class LatticeUnknowns:
             found = np.array(values, dtype=float)
             if found.shape != (len(self.names),):
                 raise InputError(f"values have shape {found.shape}, but there are {len(self.names)} parameters: {', '.join(self.names)}")
-        for name, value in zip(self.names, found, strict=True):
-            if not (np.isfinite(value) and value > 0.0):
-                raise InputError(f"{name} must be positive and finite, not {value:g}")
-        return found
+        return require_positive_values(self.names, found)
 
     def parameters(self, values: FloatArray) -> LatticeParameters:
         """Return the parameters of all elements for values (p,)."""
@@ -106,6 +103,14 @@ class LatticeUnknowns:
             own = np.where(members, value * self.scale, 0.0)
             result.append(ParameterChange(*(own if k == kind else zero for k in range(3))))
         return tuple(result)
+
+
+def require_positive_values(names: tuple[str, ...], values: FloatArray) -> FloatArray:
+    """Return the values (p,) of parameters; an InputError where one is not positive and finite."""
+    for name, value in zip(names, values, strict=True):
+        if not (np.isfinite(value) and value > 0.0):
+            raise InputError(f"{name} must be positive and finite, not {value:g}")
+    return values
 
 
 def identifiability(names: tuple[str, ...], information: FloatArray, *, loose: float = 0.5) -> tuple[str, ...]:

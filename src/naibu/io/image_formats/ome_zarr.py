@@ -7,8 +7,6 @@ directions of the axes are kept in the attribute ``naibu``, where `naibu.io.open
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Iterator, Sequence
 from itertools import product
 from pathlib import Path
@@ -22,7 +20,7 @@ from naibu.core.chunked_volume import ChunkedVolume
 from naibu.core.errors import InputError
 from naibu.core.optional_packages import optional_package
 from naibu.core.volume import Volume
-from naibu.io.files.paths import require_usable_path
+from naibu.io.files.replaced_folder import replaced_folder
 from naibu.io.image_formats.geometry import ReadOptions
 
 ENDING = ".ome.zarr"
@@ -59,24 +57,11 @@ def write_levels(path: Path, values: Any, grid: Volume | ChunkedVolume, *, chann
     if shape[:3] != tuple(grid.shape) or len(shape) != (4 if channels else 3) or (channels and shape[3] != len(channels)):
         wanted = (*grid.shape, len(channels)) if channels else tuple(grid.shape)
         raise InputError(f"values must have shape {wanted} (z, y, x{', component' if channels else ''}), not {shape}")
-    require_usable_path(path, written=True)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        aside = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose a folder you may write to") from error
-    try:
-        group = zarr.create_group(str(aside / "store"), zarr_format=2)
+    with replaced_folder(path) as folder:
+        group = zarr.create_group(str(folder), zarr_format=2)
         shapes = _shapes(grid.shape)
         _fill(group, values, shapes, len(channels))
         group.attrs.update(_metadata(path.name.removesuffix(ENDING), grid, len(shapes), channels, _shown(values)))
-        if path.exists():
-            path.rename(aside / "old")
-        (aside / "store").rename(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error}); free some space or choose another folder") from error
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
     return path
 
 

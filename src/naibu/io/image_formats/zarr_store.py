@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import shutil
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from naibu.core.errors import InputError
 from naibu.core.optional_packages import optional_package
 from naibu.core.volume import Volume
 from naibu.io.files.paths import require_usable_path
+from naibu.io.files.replaced_folder import replaced_folder
 from naibu.io.image_formats.geometry import ReadOptions, volume_with_axes
 
 CHUNK = 64
@@ -154,22 +154,9 @@ def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Pa
     An existing store is replaced when the new one is complete.
     """
     _zarr()
-    require_usable_path(path, written=True)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        aside = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose a folder you may write to") from error
-    try:
-        stored = create_chunked(aside / "store", grid, dtype=values.dtype, components=values.shape[3] if values.ndim == 4 else None)
+    with replaced_folder(path) as folder:
+        stored = create_chunked(folder, grid, dtype=values.dtype, components=values.shape[3] if values.ndim == 4 else None)
         stored[...] = values
-        if path.exists():
-            path.rename(aside / "old")
-        (aside / "store").rename(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error}); free some space or choose another folder") from error
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
     return path
 
 
