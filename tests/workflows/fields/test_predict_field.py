@@ -93,6 +93,14 @@ def test_plates_that_stick_move_the_body(folder: Path, tmp_path: Path) -> None:
     assert json.loads((tmp_path / "summary.json").read_text())["comparison"]["points"] == len(run.comparison.points)
 
 
+def test_the_field_that_identified_the_model_is_no_test_of_it(folder: Path, tmp_path: Path) -> None:
+    copied = tmp_path / "again.h5"
+    copied.write_bytes((folder / "pressed.h5").read_bytes())
+    said = {f: " ".join(predict_field(folder / "model", f).notes) for f in (copied, folder / "sheared.h5")}
+    assert "identified: no test of it" in said[copied] and "not used" not in said[copied]
+    assert "that were not used" in said[folder / "sheared.h5"]
+
+
 def test_a_larger_load_is_called_an_extrapolation(folder: Path) -> None:
     notes = [" ".join(predict_field(folder / "model", held=["z-"], moved=[f"z+=0,0,{z}"]).notes) for z in (-2.0, -5.0)]
     assert ["extrapolation" in n for n in notes] == [False, True]

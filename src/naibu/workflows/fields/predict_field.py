@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from naibu.identification.from_fields.field_prediction import FieldPrediction, p
 from naibu.identification.from_fields.identified_body import IdentifiedBody
 from naibu.io.displacement_fields import read_field, write_field
 from naibu.io.files.atomic import write_atomically
-from naibu.io.files.provenance import input_record
+from naibu.io.files.provenance import input_record, sha256
 from naibu.io.vtk_files import write_vtu
 from naibu.meshing.point_location import locate
 from naibu.viewer.cards import Card
@@ -37,7 +37,7 @@ EXTRAPOLATED = 1.5  # times the deformation of the identification, from which a 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """A prediction against a measured field, at points that it did not use.
+    """A prediction against a measured field, at points from which it was not computed.
 
     Attributes
     ----------
@@ -51,6 +51,8 @@ class Comparison:
         Root mean square difference in units of its standard deviation, that of the measurement included; None where that is not known.
     within : float or None
         Part of the components within 1.96 standard deviations.
+    identified : bool
+        Whether the moduli were identified from this very field, so that the comparison tests nothing.
     """
 
     points: FloatArray
@@ -58,24 +60,41 @@ class Comparison:
     rms_mm: FloatArray
     rms_sd: float | None
     within: float | None
+    identified: bool = False
 
     @classmethod
-    def of(cls, prediction: FieldPrediction, field: DisplacementField) -> Comparison:
+    def of(cls, prediction: FieldPrediction, field: DisplacementField, *, identified: bool) -> Comparison:
         """Compare at all points of a field."""
         predicted, covariance = prediction.at(field.points)
         difference = predicted - field.vectors
         rms = np.sqrt((difference**2).mean(axis=0))
         if field.covariance is None:
-            return cls(field.points, difference, rms, None, None)
+            return cls(field.points, difference, rms, None, None, identified)
         sd = np.sqrt(np.einsum("kii->ki", covariance + field.covariance))
         return cls(
-            field.points, difference, rms, float(np.sqrt(((difference / sd) ** 2).mean())), float((np.abs(difference) < WIDTH * sd).mean())
-        )
+            field.points, difference, rms, float(np.sqrt(((difference / sd) ** 2).mean())), float((np.abs(difference) < WIDTH * sd).mean()),
+            identified,
+        )  # fmt: skip
+
+    @property
+    def role(self) -> str:
+        """What the points are to the model."""
+        return "of a field from which the model was identified: no test of it" if self.identified else "that were not used"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the numbers as JSON can hold them."""
+        return {
+            "points": len(self.points),
+            "rms_mm": self.rms_mm.tolist(),
+            "rms_in_standard_deviations": self.rms_sd,
+            "within_95_percent": self.within,
+            "identified_the_model": self.identified,
+        }
 
     def sentence(self) -> str:
         """Return the comparison in words."""
         x, y, z = self.rms_mm
-        text = f"At {len(self.points)} measured points that were not used: RMS difference x {x:.3g}, y {y:.3g}, z {z:.3g} mm"
+        text = f"At {len(self.points)} measured points {self.role}: RMS difference x {x:.3g}, y {y:.3g}, z {z:.3g} mm"
         if self.rms_sd is None or self.within is None:
             return f"{text}; the measured field states no standard deviation."
         return f"{text}, {self.rms_sd:.2f} standard deviations; {100 * self.within:.0f} % of the components lie within the 95 % interval."
@@ -157,7 +176,8 @@ def predict_field(
         assert measured is not None
         prediction, inner = predict_inside(body, measured)
         compared = _part(measured, inner)
-    comparison = None if compared is None or not len(compared.points) else Comparison.of(prediction, compared)
+    identified = field is not None and _identified_from(body, field)
+    comparison = None if compared is None or not len(compared.points) else Comparison.of(prediction, compared, identified=identified)
     notes = _notes(body, prediction, motions, comparison, measured is not None)
     run = FieldPredictionRun(body, prediction, comparison, notes)
     if folder is None:
@@ -193,6 +213,12 @@ def _motion(argument: str, text: str) -> tuple[str, tuple[float, float, float]]:
     if not np.abs([x, y, z]).max() <= LENGTHS_MM[1]:
         raise InputError(f"{argument}={text!r}: a displacement must be at most {LENGTHS_MM[1]:g} mm")
     return side.strip(), (x, y, z)
+
+
+def _identified_from(body: IdentifiedBody, field: str | os.PathLike[str]) -> bool:
+    """Whether a file is one of those that the body was identified from, whatever its name."""
+    inputs = body.provenance.get("inputs", {})
+    return any(str(record).endswith(sha256(field)) for record in inputs.values()) if isinstance(inputs, Mapping) else False
 
 
 def _file_of(model: str | os.PathLike[str]) -> Path:
@@ -258,9 +284,7 @@ def _written(folder: Path, run: FieldPredictionRun, motions: dict[str, tuple[flo
         "median_sd_mm": float(np.median(sd)),
         "deformation": prediction.strain,
         "deformation_in_identification": body.strain,
-        "comparison": None
-        if c is None
-        else {"points": len(c.points), "rms_mm": c.rms_mm.tolist(), "rms_in_standard_deviations": c.rms_sd, "within_95_percent": c.within},
+        "comparison": None if c is None else c.to_dict(),
         "notes": list(run.notes),
         "inputs": inputs,
         "provenance": dict(body.provenance),
@@ -299,7 +323,7 @@ def _page(run: FieldPredictionRun, field: DisplacementField) -> SliceView:
     if c is not None:
         overlays.append(Overlay("distance of predicted from measured, mm", _of_voxels(grid, c)))
         rms = float(np.linalg.norm(c.rms_mm))
-        said = "" if c.rms_sd is None else f"{c.rms_sd:.2f} standard deviations, at points that were not used"
+        said = "" if c.rms_sd is None else f"{c.rms_sd:.2f} standard deviations, at points {c.role}"
         cards.append(Card("Predicted less measured, RMS", f"{rms:.2g} mm", said))
     rows = tuple((name, e, nu) for name, e, nu in run.body.moduli()) if len(run.body.zones) <= 20 else ()
     unit = "multiples of the known zone" if run.body.relative else "kPa"
