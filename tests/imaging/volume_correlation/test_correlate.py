@@ -19,6 +19,7 @@ from naibu.imaging.preprocessing.resampling import positions
 from naibu.imaging.volume_correlation import correlate, result
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
 from naibu.imaging.volume_correlation.result import CorrelationResult
+from naibu.imaging.volume_correlation.rigid_initialization import RigidInitialization
 from naibu.imaging.volume_correlation.settings import CorrelationSettings
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid
 
@@ -112,6 +113,22 @@ def test_a_rigid_motion_is_found_without_strain() -> None:
     strain = 0.5 * (np.swapaxes(f, 1, 2) @ f - np.eye(3))
     assert np.sqrt((strain**2).mean()) < 0.005
     assert np.abs(f.mean(axis=0) - rotation).max() < 0.002
+
+
+def test_the_rigid_motion_from_which_the_body_deforms_best_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A dented body may correlate best where it is turned too far; from there alone the search does not come back."""
+    found, turned = RigidInitialization.found, rotation_matrix(np.deg2rad([0.0, 0.0, 60.0]))
+    wrong = turned, MIDDLE - turned @ MIDDLE, 0.99
+    before, after, _ = waved()
+
+    def error() -> float:
+        return float(np.linalg.norm(errors(correlate_volumes(before, after), waves()[0]), axis=1).mean())
+
+    monkeypatch.setattr(RigidInitialization, "found", lambda own, shifts: [wrong, *found(own, shifts)])
+    assert error() < 0.1
+    monkeypatch.setattr(RigidInitialization, "found", lambda own, shifts: [wrong])
+    with pytest.raises(InputError, match="the volumes match in"):
+        error()
 
 
 def test_a_uniform_compression_has_its_gradient() -> None:

@@ -178,6 +178,8 @@ class _Correlation:
         self.strides = _strides(self.step, self.spacing)
         self.inclusions: list[RigidInclusion] = []
         self.ratio, self.dilatation_factor = 1.0, 1.0
+        self.c = np.zeros_like(self.grid.nodes_mm)
+        self.starts = [self.c]
 
     def level(self, stride: tuple[int, ...], smoothing: float) -> ImageLevel:
         return ImageLevel(self.reference, self.deformed, self.mask, self.spacing, stride, smoothing, self.views)
@@ -218,7 +220,8 @@ class _Correlation:
         after, before = (np.argwhere(m & both if (m & both).any() else m)[:, ::-1] * self.spacing for m in (shown, self.mask))
         shifts.append(after.mean(axis=0) - before.mean(axis=0))
         start = RigidInitialization(level)
-        linear, shift, correlation = start.found(shifts)
+        motions = start.found(shifts)
+        linear, _, correlation = motions[0]
         # an object that is compressed as a whole correlates only after it is stretched as its outline is
         outline = np.diag(after.std(axis=0) / before.std(axis=0))
         if np.abs(np.diag(outline) - 1).max() > LEAST_STRETCH:
@@ -226,10 +229,10 @@ class _Correlation:
             ends = [start.stretched(a, a @ (start.middle - before.mean(axis=0)) + after.mean(axis=0) - start.middle) for a in guesses]
             affine = max(ends, key=lambda end: end[2])
             if affine[2] > correlation + LEAST_GAIN and np.linalg.det(affine[0]) > 0.1:
-                linear, shift, _ = affine
-                self.ratio, self.dilatation_factor = float(np.linalg.det(linear)), AFFINE_DILATATION
+                motions = [affine]
+                self.ratio, self.dilatation_factor = float(np.linalg.det(affine[0])), AFFINE_DILATATION
         nodes = self.grid.nodes_mm
-        self.c = nodes @ linear.T + shift - nodes
+        self.starts = [nodes @ a.T + t - nodes for a, t, _ in motions]
 
     def refine(self) -> None:
         """Fit from coarse to fine with weights that do not depend on the data."""
@@ -239,10 +242,15 @@ class _Correlation:
             if k == 0 or stride != self.strides[k - 1]:
                 level = self.level(stride, self.settings.smoothing_voxels)
             system = SplineSystem(level, self.grid, self.ratio)
-            self.fit = CorrelationFit(level, system, self.comparison(k), noisy=k > 1)
             self.bending, self.dilatation = self.weights(system, LEVELS[k].bending)
             iterations = Iterations(LEVELS[k].steps, anchoring=LEVELS[k].anchoring)
-            self.c = self.fit.iterate(self.c, self.bending, self.dilatation * system.gauss_volume, iterations)
+            tried = []
+            # the rigid motion that correlates best may rotate a body whose surface is dented: what deforms from it tells
+            for c in self.starts if k == 0 else [self.c]:
+                fit = CorrelationFit(level, system, self.comparison(k), noisy=k > 1)
+                end = fit.iterate(c, self.bending, self.dilatation * system.gauss_volume, iterations)
+                tried.append((fit.gradient_correlation * float(fit.seen.mean()), end, fit))
+            _, self.c, self.fit = max(tried, key=lambda t: t[0])
             report_progress(
                 self.progress, "coarse-to-fine correlation", done=k + 1, total=len(self.strides), objective=self.fit.residual_sd
             )

@@ -37,16 +37,20 @@ class RigidInitialization:
         self.middle = self.points.mean(axis=0)
         self.value, self.gradient = np.empty(len(self.points), np.float32), np.empty((len(self.points), 3), np.float32)
 
-    def found(self, shifts: list[FloatArray]) -> tuple[FloatArray, FloatArray, float]:
-        """Return rotation (3, 3), translation (3,), mm, about the first voxel, and correlation, from guesses of the shift (3,), mm."""
+    def found(self, shifts: list[FloatArray]) -> list[tuple[FloatArray, FloatArray, float]]:
+        """Return rotations (3, 3), translations (3,), mm, about the first voxel, and correlations, from guesses of the shift (3,), mm.
+
+        The motion of the highest correlation is the first; then come others, and the guessed shifts without rotation.
+        """
         tried = []
         for rotation, shift in _guesses(shifts):
             motion = self._improved(rotation, shift, shift, FIRST_STEPS)
             tried.append((self.correlation(*motion), *motion, shift))
         tried.sort(key=lambda t: -t[0])
         ended = [self._improved(r, t, guess, LAST_STEPS) for _, r, t, guess in tried[:BEST]]
-        rotation, shift = max(ended, key=lambda m: self.correlation(*m))
-        return rotation, shift + self.middle - rotation @ self.middle, self.correlation(rotation, shift)
+        ended.sort(key=lambda m: -self.correlation(*m))
+        ended += [(np.eye(3), shift) for shift in shifts]
+        return [(r, t + self.middle - r @ self.middle, self.correlation(r, t)) for r, t in ended]
 
     def stretched(self, linear: FloatArray, shift: FloatArray) -> tuple[FloatArray, FloatArray, float]:
         """Return matrix (3, 3) and translation (3,), mm, of the affine motion found from a first one, and its correlation."""
