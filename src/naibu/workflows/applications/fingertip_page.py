@@ -14,6 +14,7 @@ from naibu.applications.fingertip.readings import ReadingChain
 from naibu.applications.sensing_chip.filters import noise_gain
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.reproduction.chapter6 import fingertip_figures
+from naibu.viewer.cards import Card
 from naibu.viewer.chapter import Figure, Section
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.applications.fingertip_study import PreparedFingertip
@@ -62,7 +63,27 @@ def fingertip_sections(study: PreparedFingertip, results: FingertipResults) -> t
     sections = [_presses(study, results), _theories(results)]
     if results.decoder is not None:
         sections.insert(1, _decoding(results, results.decoder))
-    return tuple(sections)
+    curves = tuple(_curve(results, k) for k in range(len(results.names)))
+    return (*sections, Section("Curves of the presses", (), curves))
+
+
+def fingertip_cards(results: FingertipResults) -> tuple[Card, ...]:
+    """Return the answers at the head of the page: the largest press, what the chip then feels, and how well readings are decoded."""
+    k = int(np.argmax([p.along_rod_mn[-1] for p in results.pressings]))
+    pressing, on_chip = results.pressings[k], results.loads[k][-1, 2:5]
+    cards = [
+        Card(
+            "Largest force along the rod",
+            f"{1e-3 * pressing.along_rod_mn[-1]:.3g} N",
+            f"{results.names[k]}, {pressing.depth_mm[-1]:.3g} mm deep",
+        ),
+        Card("Force on the chip then", f"{on_chip[0]:.3g} mN", "F_z"),
+        Card("Moment on the chip then", f"{np.hypot(*on_chip[1:]):.3g} N µm", "of M_x and M_y"),
+    ]
+    if results.decoder is not None:
+        left = 100.0 * float(results.decoder.spread[0])
+        cards.append(Card("Force that the decoder leaves unexplained", f"{left:.2g} %", "standard deviation over its training"))
+    return tuple(cards)
 
 
 def _presses(study: PreparedFingertip, results: FingertipResults) -> Section:
@@ -81,7 +102,6 @@ def _presses(study: PreparedFingertip, results: FingertipResults) -> Section:
     )  # fmt: skip
     note = "At the end of each press, without noise. A saturated channel exceeds the converter's range: its reading is not to be used."
     table = Table("Presses", columns, tuple(rows), caption=f"{study.fingertip.diameter_mm:g} mm fingertip.", note=note)
-    curves = tuple(_curve(results, k) for k in range(len(rows)))
     last = results.pressings[-1]
     forces = [1e-3 * p.along_rod_mn for p in results.pressings]
     moments = {name: volts[:, 1:] for name, volts in zip(results.names, all_volts, strict=True)}
@@ -92,7 +112,7 @@ def _presses(study: PreparedFingertip, results: FingertipResults) -> Section:
                lambda canvas: fingertip_figures.readings_over_force(canvas, forces, all_volts, results.names), (11.0, 3.6)),
         Figure("Moments", "M_y over M_x.", lambda canvas: fingertip_figures.moments(canvas, moments), (7.0, 4.0)),
     )  # fmt: skip
-    return Section("Presses", (), (table, *curves), figures)
+    return Section("Presses", (), (table,), figures)
 
 
 def _curve(results: FingertipResults, k: int) -> Table:

@@ -27,7 +27,7 @@ from naibu.viewer.chapter import Chapter
 from naibu.viewer.chapter_page import write_chapter
 from naibu.viewer.tables import Cell
 from naibu.workflows.applications.fingertip_checkpoint import FingertipCheckpoint
-from naibu.workflows.applications.fingertip_page import FingertipResults, fingertip_sections
+from naibu.workflows.applications.fingertip_page import FingertipResults, fingertip_cards, fingertip_sections
 from naibu.workflows.applications.fingertip_study import PreparedFingertip, in_keys, prepared_fingertip
 from naibu.workflows.results.output_folder import output_folder
 from naibu.workflows.studies.simulate_lattice import SimulationRun
@@ -160,7 +160,7 @@ def _recorded(study: PreparedFingertip, chain: ReadingChain, pressing: Pressing,
 
 def _written(study: PreparedFingertip, results: FingertipResults, folder: Path) -> tuple[Path, ...]:
     settings: dict[str, Cell] = {"study": study.source, "sha256": study.digest, "nodes": results.model.mesh.n_points}
-    chapter = Chapter(study.name, study.title, fingertip_sections(study, results), settings)
+    chapter = Chapter(study.name, study.title, fingertip_sections(study, results), settings, fingertip_cards(results))
     page, numbers = write_chapter(chapter, folder)
     rows = [f"{t:.6g},{v[0]:.6g},{v[1]:.6g},{v[2]:.6g}" for t, v in zip(results.times_s, results.recorded_volts, strict=True)]
     head = f"# {study.named(len(study.presses) - 1)}: readings with noise, filtered\ntime_s,F_z_V,M_x_V,M_y_V"
