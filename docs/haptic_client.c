@@ -34,7 +34,7 @@ static void set_force(const double f[3]) { (void)f; }
 int main(int argc, char **argv)
 {
     struct sockaddr_in to = {.sin_family = AF_INET, .sin_port = htons((uint16_t)(argc > 1 ? atoi(argv[1]) : 8766))};
-    double seconds = argc > 2 ? atof(argv[2]) : 10.0, began = now(), due = began, heard = began;
+    double seconds = argc > 2 ? atof(argv[2]) : 10.0, began = now(), due, heard = began;
     struct pose out = {.magic = "NHP1", .version = 1};
     struct force in, last = {.number = 0};
     static const double none[3];
@@ -42,7 +42,7 @@ int main(int argc, char **argv)
     int line = socket(AF_INET, SOCK_DGRAM, 0), answers = 0, acts = 0;
     to.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
     if (line < 0 || connect(line, (struct sockaddr *)&to, sizeof to)) { perror("naibu"); return 1; }
-    while (due - began < seconds) {
+    while (out.sequence < 1e3 * seconds) {
         while (recv(line, &in, sizeof in, MSG_DONTWAIT) == (ssize_t)sizeof in)
             if (!memcmp(in.magic, "NHF1", 4) && in.version == 1
                 && (acts ? (int32_t)(in.number - last.number) > 0 : (int32_t)(in.sequence - free_since) >= 0)) {
@@ -55,7 +55,7 @@ int main(int argc, char **argv)
         out.time_s = now() - began;
         read_device(out.time_s, &out);
         if (send(line, &out, sizeof out, 0) < 0 && errno != ECONNREFUSED) { perror("naibu"); return 1; }
-        due += 1e-3;
+        due = began + 1e-3 * out.sequence;
         struct timespec rest = {0, (long)(1e9 * fmax(0.0, due - now()))};
         nanosleep(&rest, NULL);
     }
