@@ -20,7 +20,7 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.forward.load_cases import KnownRegion
-from naibu.identification.from_fields.identified_body import IdentifiedBody
+from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings

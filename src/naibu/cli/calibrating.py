@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -16,6 +16,9 @@ from naibu.cli.studies import stopped_gently
 from naibu.cli.verbs import SIMULATE, verb
 from naibu.core.errors import InputError
 from naibu.core.progress import ProgressReport
+
+if TYPE_CHECKING:
+    from naibu.workflows.studies.calibrate import LatticeCalibration
 
 
 @verb(
@@ -84,16 +87,11 @@ def calibrate(
         Replace results, or files of your own, that the folder already holds.
     """
     if example is not None:
-        from naibu.workflows.studies.calibration_example import write_calibration_example
-
-        written = write_calibration_example(example, seed=seed, overwrite=overwrite)
-        wrote(*written)
-        say(f"Wrote {', '.join(map(str, written))}. Run: naibu calibrate {written[0]} --shapes {written[1]} --forces {written[2]}")
+        _write_example(example, seed, overwrite)
         return
     if not study:
         raise InputError("naibu calibrate needs STUDY; naibu calibrate --example dough writes inputs to try it with")
     from naibu.workflows.studies.calibrate import calibrate_study
-    from naibu.workflows.studies.calibration_page import held_intervals
 
     began = time.perf_counter()
     with stopped_gently("simulation") as stopping, progress_display() as display:
@@ -108,6 +106,25 @@ def calibrate(
             point_sd_mm=point_sd_mm, force_sd_mn=force_sd_mn, max_runs=max_runs, seed=seed, threads=threads, overwrite=overwrite,
             progress=progress,
         )  # fmt: skip
+    _show(run)
+    say(f"{time.perf_counter() - began:.0f} s. Page: {run.files[0]}   numbers: {run.files[1]}   study: {run.files[2]}")
+    if not run.estimate.finished:
+        errors.print("Interrupted: the best values so far are kept.", soft_wrap=True)
+        sys.exit(INTERRUPTED)
+
+
+def _write_example(folder: Path, seed: int, overwrite: bool) -> None:
+    from naibu.workflows.studies.calibration_example import write_calibration_example
+
+    written = write_calibration_example(folder, seed=seed, overwrite=overwrite)
+    wrote(*written)
+    say(f"Wrote {', '.join(map(str, written))}. Run: naibu calibrate {written[0]} --shapes {written[1]} --forces {written[2]}")
+
+
+def _show(run: LatticeCalibration) -> None:
+    """Print what was found, what the data do not determine, and warnings."""
+    from naibu.workflows.studies.calibration_page import held_intervals
+
     found = run.estimate
     rows = [
         (name, f"{value:.4g}", f"{low:.4g} to {high:.4g}", unit)
@@ -121,7 +138,3 @@ def calibrate(
     for warning in run.warnings:
         say(warning, WARNING)
     wrote(*run.files)
-    say(f"{time.perf_counter() - began:.0f} s. Page: {run.files[0]}   numbers: {run.files[1]}   study: {run.files[2]}")
-    if not found.finished:
-        errors.print("Interrupted: the best values so far are kept.", soft_wrap=True)
-        sys.exit(INTERRUPTED)

@@ -63,7 +63,7 @@ def predict(
     overwrite
         Replace results, or files of your own, that the folder already holds.
     """
-    from naibu.identification.from_fields.identified_body import IdentifiedBody
+    from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
     from naibu.workflows.results.result_folder import read_any_model
 
     of_markers = {"state": state, "height_mm": height_mm, "heights_from_markers": heights_from_markers or None}

@@ -6,6 +6,7 @@ ever; what they need is therefore asked for before they are loaded. Only POSIX s
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import sys
 from pathlib import Path
@@ -34,13 +35,12 @@ def address_space() -> tuple[float, float]:
 def available_memory_mb() -> float:
     """Return the memory that can be taken without swapping, MB: what is free, or what a container leaves; infinite where nothing tells."""
     room = [address_space()[0] - address_space()[1]]
-    try:
+    with contextlib.suppress(OSError, ValueError):  # another system: nothing tells
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
         room += [float(line.split()[1]) / 1024.0 for line in lines if line.startswith("MemAvailable:")]
+    with contextlib.suppress(OSError, ValueError):  # no container
         limit, used = (Path(f"/sys/fs/cgroup/memory.{name}").read_text(encoding="ascii").strip() for name in ("max", "current"))
         room += [(float(limit) - float(used)) / MEGABYTE] if limit != "max" else []
-    except (OSError, ValueError):
-        pass  # another system, or no container
     return min(room)
 
 

@@ -4,9 +4,9 @@ from .equilibrium_gap.weighted import weighted_equilibrium_gap
 from .from_fields.assumptions import Assumption
 from .from_fields.estimate import FieldEstimate, identify_field
 from .from_fields.experiment_design import Accuracy, expected_accuracy
-from .from_fields.field_prediction import FieldPrediction, predict_inside, predict_moved_sides
 from .from_fields.forward.load_cases import FieldLoadCase, KnownRegion, Zones
-from .from_fields.identified_body import IdentifiedBody
+from .from_fields.identified.field_prediction import FieldPrediction, predict_inside, predict_moved_sides
+from .from_fields.identified.identified_body import IdentifiedBody
 from .from_fields.uncertainty import ErrorBudget, cramer_rao_bound
 from .from_markers.calibration import Calibration, calibrate
 from .from_markers.gauss_newton import MatchingSettings

@@ -18,7 +18,7 @@ from naibu.core.arrays import FloatArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
-from naibu.identification.from_fields.identified_body import IdentifiedBody
+from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.io.displacement_fields import read_field, write_field
 from naibu.io.images import write_volume
 from naibu.validation.specimens.quadratic_body import QuadraticBody, Solved

@@ -15,11 +15,11 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.identification.from_fields.estimate import FieldEstimate, identify_field
-from naibu.identification.from_fields.field_prediction import displacement_under_moved_sides
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
-from naibu.identification.from_fields.identified_body import IdentifiedBody
+from naibu.identification.from_fields.identified.field_prediction import displacement_under_moved_sides
+from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
+from naibu.identification.from_fields.identified.sides import loaded_nodes
 from naibu.identification.from_fields.regularization import cell_volumes
-from naibu.identification.from_fields.sides import loaded_nodes
 from naibu.identification.from_fields.uncertainty import Uncertainty
 from naibu.meshing.point_location import interpolation_operator
 

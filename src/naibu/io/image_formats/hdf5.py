@@ -57,11 +57,9 @@ def open_chunked(path: Path) -> ChunkedVolume:
     InputError
         No such file, or one without a volume.
     """
-    with _dataset(path):
-        pass  # checked
-    stored = h5py.File(path, "r")["values"]
-    frame = {name: np.asarray(stored.attrs[name], dtype=float) for name in _ATTRIBUTES}
-    return ChunkedVolume.from_array(stored, **frame)
+    with _dataset(path) as checked:
+        frame = {name: np.asarray(checked.attrs[name], dtype=float) for name in _ATTRIBUTES}
+    return ChunkedVolume.from_array(h5py.File(path, "r")["values"], **frame)
 
 
 def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Path:

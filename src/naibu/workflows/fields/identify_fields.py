@@ -18,7 +18,7 @@ from naibu.identification.from_fields.estimate import FieldEstimate, identify_fi
 from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
-from naibu.identification.from_fields.identified_body import IdentifiedBody
+from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.io.displacement_fields import read_field
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record

@@ -13,7 +13,7 @@ from naibu.core.mesh import Mesh
 from naibu.core.rigid_transform import registration
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
-from naibu.identification.from_fields.sides import loaded_nodes
+from naibu.identification.from_fields.identified.sides import loaded_nodes
 from naibu.meshing.point_location import locate
 
 MOST_POINTS = 10_000  # measurements of a load case: neighbours in a field say the same

@@ -16,8 +16,8 @@ from naibu.core.arrays import LENGTHS_MM, FloatArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
-from naibu.identification.from_fields.field_prediction import FieldPrediction, predict_inside, predict_moved_sides
-from naibu.identification.from_fields.identified_body import IdentifiedBody
+from naibu.identification.from_fields.identified.field_prediction import FieldPrediction, predict_inside, predict_moved_sides
+from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.io.displacement_fields import read_field, write_field
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record, sha256

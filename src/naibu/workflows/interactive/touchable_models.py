@@ -14,7 +14,7 @@ from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.units import MODULI_KPA
 from naibu.identification.from_fields.forward.field_laws import NeoHookean
-from naibu.identification.from_fields.identified_body import IdentifiedBody
+from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.identification.from_markers.specimen.specimen_model import GRAVITY, Specimen, specimen
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.io.meshes import MESH_READERS, read_mesh

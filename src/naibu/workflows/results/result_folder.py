@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from naibu.core.errors import InputError
-from naibu.identification.from_fields.identified_body import FORMAT as FORMAT_OF_FIELDS
-from naibu.identification.from_fields.identified_body import IdentifiedBody
+from naibu.identification.from_fields.identified.identified_body import FORMAT as FORMAT_OF_FIELDS
+from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.identification.from_markers.calibration import Calibration
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.calibrated_model import CalibratedModel

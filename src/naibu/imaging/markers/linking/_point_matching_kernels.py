@@ -317,27 +317,9 @@ def propose(
     """
     for t in prange(len(active)):
         _propose_one(
-            t,
-            reference,
-            neighbours,
-            deformed,
-            origin,
-            width,
-            dims,
-            starts,
-            members,
-            scales,
-            active,
-            link,
-            gradients,
-            reach,
-            most,
-            robust,
-            predicted,
-            proposal,
-            distance,
-            fitted,
-        )
+            t, reference, neighbours, deformed, origin, width, dims, starts, members, scales, active, link, gradients, reach, most, robust,
+            predicted, proposal, distance, fitted,
+        )  # fmt: skip
 
 
 @njit(cache=True)
@@ -365,27 +347,9 @@ def propose_few(
     """Do the same as `propose` in one thread, for few points."""
     for t in range(len(active)):
         _propose_one(
-            t,
-            reference,
-            neighbours,
-            deformed,
-            origin,
-            width,
-            dims,
-            starts,
-            members,
-            scales,
-            active,
-            link,
-            gradients,
-            reach,
-            most,
-            robust,
-            predicted,
-            proposal,
-            distance,
-            fitted,
-        )
+            t, reference, neighbours, deformed, origin, width, dims, starts, members, scales, active, link, gradients, reach, most, robust,
+            predicted, proposal, distance, fitted,
+        )  # fmt: skip
 
 
 @njit(cache=True)

@@ -22,7 +22,7 @@ def check_stored_body(data: Mapping[str, Any]) -> None:
     Parameters
     ----------
     data : mapping
-        As `naibu.identification.from_fields.identified_body.IdentifiedBody.to_dict` wrote it.
+        As `naibu.identification.from_fields.identified.identified_body.IdentifiedBody.to_dict` wrote it.
 
     Raises
     ------

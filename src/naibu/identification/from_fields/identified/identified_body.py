@@ -18,7 +18,7 @@ from naibu.identification.from_fields.forward.forward_model import whitening
 from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, KnownRegion, Zones
 from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.identification.from_fields.forward.sensitivities import logarithms, young_and_poisson
-from naibu.identification.from_fields.stored_body import check_stored_body
+from naibu.identification.from_fields.identified.stored_body import check_stored_body
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
 FORMAT = "naibu field model 1"

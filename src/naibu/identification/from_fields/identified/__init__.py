@@ -1,0 +1,1 @@
+"""Bodies identified from displacement fields: kept in files, and predicted under other loads."""
