@@ -81,3 +81,13 @@ def test_arrows_have_the_length_of_the_displacement() -> None:
         assert [(float(a.U[0]), float(a.V[0])) for a in arrows] == [(1.0 + pair[0], 1.0 + pair[1])] * 2  # the missing one has none
         assert axes.get_xlabel() == f"{'xyz'[pair[0]]} (mm)"
     plt.close(figure)
+
+
+def test_particles_of_a_plane_are_drawn_in_it() -> None:
+    figure = plt.figure()
+    draw_marker_motion(figure, np.array([[0.0, 0.0], [4.0, 1.0]]), np.array([[1.0, 2.0], [5.0, 3.0]]), ["ok", "ok"])
+    (axes,) = figure.axes
+    (arrows,) = axes.collections
+    assert arrows.U.tolist() == [1.0, 1.0] and arrows.V.tolist() == [2.0, 2.0]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x (mm)", "y (mm)")
+    plt.close(figure)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lattice_studies import study_file
+from notebooks import check_shown
 
 from naibu.core.errors import InputError
 from naibu.core.progress import ProgressReport
@@ -68,6 +69,7 @@ def test_a_study_is_calibrated_and_runs_with_what_was_found(inputs: tuple[Path, 
     told = json.loads(numbers.read_text(encoding="utf-8"))
     for row in told["parameters"]:
         assert row["value"] == pytest.approx(TRUTH[row["name"]], rel=0.1)
+    assert [row["value"] for row in check_shown(run, page)] == run.estimate.values.tolist()
     assert told["misfit"]["forces"][0]["rms_mN"] < 0.1 * told["misfit"]["forces"][0]["start_rms_mN"]
     parameters = tomllib.loads(found.read_text(encoding="utf-8"))["parameters"]
     assert parameters["K"] == pytest.approx(told["parameters"][0]["value"], rel=1e-5)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from html import escape
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from naibu.core.optional_packages import optional_package
@@ -65,18 +67,14 @@ def empty_figure(width: float, height: float) -> Canvas:
     return made
 
 
-class ShownInNotebook:
-    """What a result with a page offers: the page inline, a figure, and a table."""
+class ShownResult:
+    """What every result with a page offers in a notebook: the page inline, and a table."""
 
     __slots__ = ()
 
     @abstractmethod
     def page_html(self) -> str:
         """Return the page of the result, a whole HTML document."""
-
-    @abstractmethod
-    def plot(self) -> Canvas:
-        """Return a figure of the result, drawn by matplotlib."""
 
     @abstractmethod
     def to_records(self) -> tuple[Mapping[str, Any], ...]:
@@ -96,3 +94,36 @@ class ShownInNotebook:
 
     def _repr_html_(self) -> str:
         return inline_page(self.page_html())
+
+
+class ShownInNotebook(ShownResult):
+    """What a result with a page and a figure offers in a notebook."""
+
+    __slots__ = ()
+
+    @abstractmethod
+    def plot(self) -> Canvas:
+        """Return a figure of the result, drawn by matplotlib."""
+
+
+class WrittenResult(ShownResult):
+    """A result whose page is one of the files that were written."""
+
+    __slots__ = ()
+
+    files: tuple[Path, ...]
+
+    def page_html(self) -> str:
+        """Return the page of the result, a whole HTML document.
+
+        Raises
+        ------
+        OSError
+            The file has been moved or deleted since.
+        """
+        return next(path for path in self.files if path.suffix == ".html").read_text(encoding="utf-8")
+
+    def _rows_of(self, name: str) -> tuple[Mapping[str, float], ...]:
+        """Return the rows of a table of numbers among the files; NaN where a cell is empty."""
+        with next(path for path in self.files if path.name == name).open(encoding="utf-8", newline="") as stream:
+            return tuple({column: float(value or "nan") for column, value in row.items()} for row in csv.DictReader(stream))

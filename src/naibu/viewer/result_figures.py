@@ -32,9 +32,10 @@ def draw_estimates(canvas: Canvas, parameters: Sequence[ParameterRow], scenes: S
 
 
 def draw_marker_motion(canvas: Canvas, before: FloatArray, after: FloatArray, flags: Sequence[str]) -> None:
-    """Draw displacements of markers (n, 3), mm, seen along y, x and z; flags are ``"ok"``, ``"suspect"`` or ``"missing"``."""
+    """Draw displacements of markers (n, 3), mm, seen along y, x and z, or (n, 2); flags are ``"ok"``, ``"suspect"`` or ``"missing"``."""
     kind = np.asarray(flags)
-    for axes, (a, b) in zip(canvas.subplots(1, 3), ((0, 2), (1, 2), (0, 1)), strict=True):
+    views = ((0, 2), (1, 2), (0, 1)) if before.shape[1] == 3 else ((0, 1),)
+    for axes, (a, b) in zip(canvas.subplots(1, len(views), squeeze=False)[0], views, strict=True):
         for flag, colour, label in (("ok", "#0b5c8f", "linked"), ("suspect", "#d55e00", "suspect")):
             p, q = before[kind == flag], after[kind == flag]
             if len(p):

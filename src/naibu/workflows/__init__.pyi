@@ -1,3 +1,5 @@
+from .applications.decode_forces import DecodedRecord, decode_forces
+from .applications.mammography import MammographyRun, relate_views
 from .fields.design import Design, Planned, design
 from .fields.identify_fields import FieldIdentification, identify_fields
 from .fields.predict_field import Comparison, FieldPredictionRun, predict_field
@@ -23,12 +25,14 @@ __all__ = [
     "CloudRun",
     "Comparison",
     "CutRun",
+    "DecodedRecord",
     "Design",
     "DeviceRecord",
     "FieldIdentification",
     "FieldPredictionRun",
     "Identification",
     "LatticeCalibration",
+    "MammographyRun",
     "MeshMaterial",
     "MethodComparison",
     "NamedStudy",
@@ -47,6 +51,7 @@ __all__ = [
     "compare_methods",
     "cut",
     "cut_surface_file",
+    "decode_forces",
     "design",
     "drive_live_simulation",
     "identify_fields",
@@ -54,6 +59,7 @@ __all__ = [
     "named_studies",
     "predict_field",
     "read_pair",
+    "relate_views",
     "reproduce",
     "reproduce_all",
     "sense_pair",

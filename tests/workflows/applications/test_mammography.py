@@ -10,6 +10,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 import tifffile
+from notebooks import check_shown
 from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.uid import ExplicitVRLittleEndian, generate_uid
 
@@ -40,6 +41,7 @@ def test_page_and_numbers_from_tables_and_from_masks(tmp_path: Path) -> None:
     assert numbers["notice"] == NOTICE
     assert NOTICE in run.files[0].read_text(encoding="utf-8")
     assert numbers["lesion"]["agrees"]
+    assert [(row["quantity"], row["value"]) for row in check_shown(run, run.files[0])] == list(run.rows)
     rows, columns = np.mgrid[:360, :260]
     for name, (depth, width) in (("cc", (110.0, 80.0)), ("mlo", (112.0, 85.0))):
         mask = ((columns + 0.5) / (2 * depth)) ** 2 + ((rows + 0.5 - 180.0) / (2 * width)) ** 2 < 1.0

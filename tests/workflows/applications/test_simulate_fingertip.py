@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from notebooks import check_shown
 from vtkmodules.vtkIOHDF import vtkHDFReader
 
 from naibu.core.errors import InputError
@@ -113,6 +114,8 @@ def test_recorded_readings_are_decoded(folder: Path, tmp_path: Path) -> None:
     assert rows[0]["force_N"] == "" and rows[-1]["force_N"] == ""  # nothing touches
     best = max((row for row in rows if row["force_N"]), key=lambda row: float(row["force_N"]))
     assert float(best["force_low_N"]) < 1.5 < float(best["force_high_N"])
+    shown = check_shown(record, record.files[0])
+    assert len(shown) == len(rows) and float(best["force_N"]) in [row["force_N"] for row in shown]
     assert float(best["azimuth_deg"]) == pytest.approx(90.0, abs=3.0) and 11.0 < float(best["tilt_deg"]) < 17.0
     with pytest.raises(InputError, match=r"already holds forces\.html"):
         decode_forces(out / "my_finger-decoder.json", out / "my_finger-readings.csv", out=tmp_path)

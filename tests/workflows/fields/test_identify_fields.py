@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from notebooks import check_shown
 
 from naibu.cli import main
 from naibu.core.displacement_field import DisplacementField
@@ -63,6 +64,7 @@ def test_a_zone_is_identified_on_the_grid_of_the_scan(folder: Path) -> None:
     assert numbers["verdict"]["explanation"] == "explained" and numbers["zones"][0]["zone"] == "gel"
     page = (folder / "out" / "report.html").read_text()
     assert "Young&#x27;s modulus" in page and "Moduli under other assumptions" in page
+    assert check_shown(run, folder / "out" / "report.html") == numbers["zones"]
 
 
 def test_what_the_other_law_would_give_stands_next_to_the_moduli(folder: Path) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from notebooks import check_shown
 
 from naibu.cli import main
 from naibu.core.arrays import FloatArray
@@ -91,6 +92,8 @@ def test_plates_that_stick_move_the_body(folder: Path, tmp_path: Path) -> None:
     assert field.vectors[voxel] == pytest.approx(run.prediction.at(field.grid.to_physical(np.array([voxel[::-1]])))[0][0], abs=1e-9)
     assert "Predicted displacement" in (tmp_path / "predicted.html").read_text()
     assert json.loads((tmp_path / "summary.json").read_text())["comparison"]["points"] == len(run.comparison.points)
+    nodes = check_shown(run, tmp_path / "predicted.html")
+    assert [nodes[-1][f"u{axis}_mm"] for axis in "xyz"] == run.prediction.displacement[-1].tolist()
 
 
 def test_the_field_that_identified_the_model_is_no_test_of_it(folder: Path, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from notebooks import check_shown
 
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
@@ -50,6 +51,7 @@ def test_a_whole_cut_parts_the_pieces_by_the_pull(tmp_path: Path) -> None:
     np.testing.assert_allclose(done.volumes_mm3.sum(), SIZE**3, rtol=1e-12)
     assert len(done.volumes_mm3) == 2
     assert done.opening_mm == pytest.approx(2.0, rel=0.05)
+    assert sum(float(str(row["volume_mm3"])) for row in check_shown(done, done.files[0])) == pytest.approx(SIZE**3)
 
 
 LATTICE = """

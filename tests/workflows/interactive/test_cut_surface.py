@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from notebooks import check_shown
 
 from naibu import cli
 from naibu.core.errors import InputError
@@ -89,6 +90,7 @@ def test_a_scan_of_any_format_is_cut_and_opens(tmp_path: Path, ending: str) -> N
     steps = np.linalg.norm(np.diff(done.displacement, axis=0), axis=2).max(axis=1)
     assert steps[0] > 0.0  # it opens behind the tool
     assert "opens by" in (tmp_path / "out" / "cut.html").read_text()
+    assert {row["quantity"]: row["value"] for row in check_shown(done, done.files[0])} == numbers
 
 
 def test_without_tension_nothing_moves_and_without_refinement_nothing_is_refined(tmp_path: Path) -> None:

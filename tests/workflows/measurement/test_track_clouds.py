@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from notebooks import check_shown
 from particle_gels import Cloud, particle_gel
 
 from naibu.cli import main
@@ -59,6 +60,7 @@ def test_the_field_is_that_of_the_particles(gel: Cloud, tables: tuple[Path, Path
     assert dict(summary["tables"][0]["rows"])["linked"] == len(rows)
     assert "SHA-256" in summary["settings"]["deformed"]
     assert run.page.read_text().startswith("<!DOCTYPE html>")
+    assert [row["uz_mm"] for row in check_shown(run, run.page)] == [float(row["uz_mm"]) for row in rows]
 
 
 def test_clouds_that_do_not_correspond_are_refused(gel: Cloud, tables: tuple[Path, Path], tmp_path: Path) -> None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from naibu.io.tables.number_table import read_numbers
 from naibu.viewer.cards import Card
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
+from naibu.viewer.notebook import WrittenResult
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.results.output_folder import output_folder
 
@@ -33,7 +35,7 @@ _COLUMNS = (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DecodedRecord:
+class DecodedRecord(WrittenResult):
     """What was decoded, and the files.
 
     Attributes
@@ -46,6 +48,10 @@ class DecodedRecord:
 
     files: tuple[Path, ...]
     rows: tuple[tuple[str, str], ...]
+
+    def to_records(self) -> tuple[Mapping[str, Any], ...]:
+        """Return one row a reading: time, force, direction and point of contact with their 95 % bounds, as in ``forces.csv``."""
+        return self._rows_of("forces.csv")
 
 
 def decode_forces(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from naibu.io.files.atomic import write_atomically
 from naibu.viewer.cards import Card
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import chapter_html
+from naibu.viewer.notebook import WrittenResult
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.applications.mammogram_inputs import place_in, plate_distances, positioner_angle, read_scan, read_views
 from naibu.workflows.applications.mammography_figures import draw_breast, draw_views
@@ -44,7 +45,7 @@ _SHOWN = 9  # points of a curve in the 3-D view
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MammographyRun:
+class MammographyRun(WrittenResult):
     """What was found and written.
 
     Attributes
@@ -60,6 +61,10 @@ class MammographyRun:
     files: tuple[Path, ...]
     rows: tuple[tuple[str, str], ...]
     warnings: tuple[str, ...]
+
+    def to_records(self) -> tuple[Mapping[str, Any], ...]:
+        """Return one row a result: quantity, and value in words."""
+        return tuple({"quantity": name, "value": value} for name, value in self.rows)
 
 
 def relate_views(

@@ -7,6 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,6 +24,8 @@ from naibu.io.displacement_fields import read_field
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
 from naibu.io.images import write_volume
+from naibu.viewer.notebook import ShownInNotebook, empty_figure
+from naibu.viewer.result_figures import draw_slices
 from naibu.viewer.slices import Overlay, SliceView, slices_html
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.fields.block_mesh import CELLS, block_mesh, blurred, labelled_object, names_of_labels
@@ -30,12 +33,15 @@ from naibu.workflows.fields.known_zones import parse_known_zones
 from naibu.workflows.fields.measured_load_case import measured_load_case, relative_deformation
 from naibu.workflows.results.output_folder import output_folder
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
+
 FILES = ("model.json", "report.html", "zones.mha", "young_modulus.mha", "young_modulus_sd.mha", "poisson_ratio.mha", "identification.json")
 CELLS_OF_MAP = 2500  # of the model by default
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FieldIdentification:
+class FieldIdentification(ShownInNotebook):
     """What `identify_fields` returns.
 
     Attributes
@@ -48,6 +54,10 @@ class FieldIdentification:
         Whether moduli are multiples of that of a zone whose modulus was not stated.
     notes : tuple of str
         Verdict, intervals and what limits them, in words.
+    scan : Volume
+        Not zero in the object.
+    cell_of_voxel : ndarray, shape (nz, ny, nx), int
+        Cell of the model at every voxel of it; -1 outside.
     files : tuple of Path
         What was written.
     """
@@ -56,7 +66,30 @@ class FieldIdentification:
     body: IdentifiedBody
     relative: bool
     notes: tuple[str, ...]
+    scan: Volume
+    cell_of_voxel: IntArray
     files: tuple[Path, ...] = ()
+
+    @property
+    def unit(self) -> str:
+        """Unit of Young's modulus."""
+        return "multiples of the known zone" if self.relative else "kPa"
+
+    def page_html(self) -> str:
+        """Return the page of the result, a whole HTML document."""
+        return slices_html(_page(self))
+
+    def plot(self) -> Canvas:
+        """Return a figure of the slice with most of the object: Young's modulus and its standard deviation, and Poisson's ratio."""
+        z = int(np.argmax((self.cell_of_voxel >= 0).sum(axis=(1, 2))))
+        shown = [(name, values[z], colours) for (name, values), colours in zip(_maps(self), ("viridis", "cividis", "viridis"), strict=True)]
+        canvas = empty_figure(11.0, 3.6)
+        draw_slices(canvas, shown, self.scan.spacing_mm)
+        return canvas
+
+    def to_records(self) -> tuple[Mapping[str, Any], ...]:
+        """Return one row a zone or region: its name, Young's modulus, Poisson's ratio, and their 95 % intervals."""
+        return tuple(_as_records(table_of_zones(self)))
 
 
 def identify_fields(
@@ -139,8 +172,8 @@ def identify_fields(
         load_cases=cases, provenance={"naibu": __version__, "known": list(known), "loaded": list(loaded), "inputs": dict(inputs)},
     )  # fmt: skip
     notes = (*found.identifiability, *blurred(mesh, cell_of_voxel, inside, labels, names))
-    result = FieldIdentification(found, body, stated.relative, notes)
-    return result if folder is None else replace(result, files=tuple(_written(folder, result, inside, cell_of_voxel)))
+    result = FieldIdentification(found, body, stated.relative, notes, inside, cell_of_voxel)
+    return result if folder is None else replace(result, files=tuple(_written(folder, result)))
 
 
 def zones_of_voxels(found: FieldEstimate, inside: Volume, cells: IntArray) -> IntArray:
@@ -169,13 +202,12 @@ def table_of_zones(result: FieldIdentification) -> Table:
     """Return the table of moduli with their intervals, which take the law as given."""
     found = result.estimate
     rows: list[tuple[Cell, ...]] = []
-    unit = "multiples of the known zone" if result.relative else "kPa"
     if found.uncertainty is not None:
         young, poisson = found.intervals()
         for i, name in enumerate(found.zones.names):
             e, nu = (float(values[i]) for values in (found.young_modulus, found.poisson_ratio))
             rows.append((name, e, *map(float, young[i]), nu, *map(float, poisson[i])))
-    columns = ("zone", f"Young's modulus, {unit}", "95 % from", "to", "Poisson's ratio", "of which 95 % from", "up to")
+    columns = ("zone", f"Young's modulus, {result.unit}", "95 % from", "to", "Poisson's ratio", "of which 95 % from", "up to")
     return Table("Moduli", columns, tuple(rows))
 
 
@@ -189,8 +221,7 @@ def table_of_assumptions(result: FieldIdentification) -> Table:
             young, poisson = young_and_poisson(found.theta + one.theta)
             for name, e, nu, (low, high) in zip(found.zones.names, young, poisson, inside, strict=True):
                 rows.append((one.text, name, float(e), float(nu), "yes" if low <= e <= high else "no"))
-    unit = "multiples of the known zone" if result.relative else "kPa"
-    columns = ("other assumption", "zone", f"Young's modulus, {unit}", "Poisson's ratio", "modulus within the interval above")
+    columns = ("other assumption", "zone", f"Young's modulus, {result.unit}", "Poisson's ratio", "modulus within the interval above")
     return Table("Moduli under other assumptions", columns, tuple(rows))
 
 
@@ -198,36 +229,53 @@ def _as_records(table: Table) -> list[dict[str, Cell]]:
     return [dict(zip(table.columns, row, strict=True)) for row in table.rows]
 
 
-def _written(folder: Path, result: FieldIdentification, inside: Volume, cells: IntArray) -> list[Path]:
-    """Write the model first, then numbers and volumes, and the page."""
-    found, body = result.estimate, result.body
+def _volumes(result: FieldIdentification) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return Young's modulus, its standard deviation (NaN where there is none), and Poisson's ratio of every voxel; 0 outside."""
+    found, cells = result.estimate, result.cell_of_voxel
     young, sd, poisson = (np.where(cells >= 0, values[cells], 0.0) for values in moduli_of_cells(found))
-    regions = zones_of_voxels(found, inside, cells)
     if found.borders is not None and found.uncertainty is not None:
+        regions = zones_of_voxels(found, result.scan, cells)
         there = regions != KNOWN
         of_young = found.young_modulus * found.uncertainty.of_young_and_poisson(found.theta)[0]
         for full, values in ((young, found.young_modulus), (sd, of_young), (poisson, found.poisson_ratio)):
             full[there] = values[regions[there]]
+    return young, sd, poisson
+
+
+def _maps(result: FieldIdentification) -> list[tuple[str, FloatArray]]:
+    """Return what a page and a figure show, with names; NaN outside and where nothing is known."""
+    young, sd, poisson = _volumes(result)
+    outside = np.where(result.cell_of_voxel >= 0, 0.0, np.nan)
+    return [
+        (f"Young's modulus, {result.unit}", young + outside),
+        (f"standard deviation of Young's modulus, {result.unit}", np.where(sd > 0.0, sd, np.nan) + outside),
+        ("Poisson's ratio", poisson + outside),
+    ]
+
+
+def _page(result: FieldIdentification) -> SliceView:
+    scan = result.scan
+    return SliceView(
+        title="Moduli from displacement fields",
+        sentences=[*result.notes, *result.estimate.steps],
+        spacing_mm=scan.spacing_mm,
+        images=[("object", scan.values.astype(np.float32))],
+        displacement=np.full((*scan.shape, 3), np.nan),
+        overlays=[Overlay(name, values) for name, values in _maps(result)],
+        tables=[t for t in (table_of_zones(result), table_of_assumptions(result)) if t.rows],
+        origin_mm=scan.origin_mm @ scan.direction,
+    )
+
+
+def _written(folder: Path, result: FieldIdentification) -> list[Path]:
+    """Write the model first, then numbers and volumes, and the page."""
+    found, body, scan = result.estimate, result.body, result.scan
+    young, sd, poisson = _volumes(result)
+    regions = zones_of_voxels(found, scan, result.cell_of_voxel)
     volumes = {"young_modulus": young, "young_modulus_sd": np.nan_to_num(sd, nan=-1.0, posinf=-1.0), "poisson_ratio": poisson}
     files = [write_atomically(folder / "model.json", json.dumps(body.to_dict(), ensure_ascii=False, allow_nan=False) + "\n")]
-    files += [write_volume(folder / f"{name}.mha", inside.with_values(v.astype(np.float32))) for name, v in volumes.items()]
-    files.append(write_volume(folder / "zones.mha", inside.with_values((regions + 1).astype(np.uint16))))
-    outside = np.where(cells >= 0, 0.0, np.nan)
-    unit = "multiples of the known zone" if result.relative else "kPa"
-    view = SliceView(
-        title="Moduli from displacement fields",
-        sentences=[*result.notes, *found.steps],
-        spacing_mm=inside.spacing_mm,
-        images=[("object", inside.values.astype(np.float32))],
-        displacement=np.full((*inside.shape, 3), np.nan),
-        overlays=[
-            Overlay(f"Young's modulus, {unit}", young + outside),
-            Overlay(f"standard deviation of Young's modulus, {unit}", np.where(sd > 0.0, sd, np.nan) + outside),
-            Overlay("Poisson's ratio", poisson + outside),
-        ],
-        tables=[t for t in (table_of_zones(result), table_of_assumptions(result)) if t.rows],
-        origin_mm=inside.origin_mm @ inside.direction,
-    )
+    files += [write_volume(folder / f"{name}.mha", scan.with_values(v.astype(np.float32))) for name, v in volumes.items()]
+    files.append(write_volume(folder / "zones.mha", scan.with_values((regions + 1).astype(np.uint16))))
     verdict = found.verdict
     numbers = {
         "naibu": __version__,
@@ -244,4 +292,4 @@ def _written(folder: Path, result: FieldIdentification, inside: Volume, cells: I
         "inputs": body.provenance["inputs"],
     }
     files.append(write_atomically(folder / "identification.json", json.dumps(numbers, indent=1, ensure_ascii=False) + "\n"))
-    return [write_atomically(folder / "report.html", slices_html(view)), *files]
+    return [write_atomically(folder / "report.html", result.page_html()), *files]

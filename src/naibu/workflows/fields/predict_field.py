@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,10 +24,15 @@ from naibu.io.files.provenance import input_record, sha256
 from naibu.io.vtk_files import write_vtu
 from naibu.meshing.point_location import locate
 from naibu.viewer.cards import Card
+from naibu.viewer.notebook import ShownInNotebook, empty_figure
+from naibu.viewer.result_figures import draw_slices
 from naibu.viewer.slices import Overlay, SliceView, slices_html
 from naibu.viewer.tables import Table
 from naibu.workflows.results.output_folder import output_folder
 from naibu.workflows.results.result_folder import read_any_model
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
 
 FILES = ("predicted.html", "field.h5", "predicted.vtu", "summary.json")
 VOXELS = 60_000  # of the grid on which a prediction is written
@@ -101,7 +106,7 @@ class Comparison:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FieldPredictionRun:
+class FieldPredictionRun(ShownInNotebook):
     """What `predict_field` returns.
 
     Attributes
@@ -123,6 +128,28 @@ class FieldPredictionRun:
     comparison: Comparison | None
     notes: tuple[str, ...]
     files: tuple[Path, ...] = ()
+
+    def page_html(self) -> str:
+        """Return the page of the result, a whole HTML document."""
+        return slices_html(_page(self, on_grid(self.body, self.prediction)))
+
+    def plot(self) -> Canvas:
+        """Return a figure of the slice with most of the body: predicted displacement, and its largest standard deviation."""
+        field = on_grid(self.body, self.prediction)
+        size, sd = np.linalg.norm(field.vectors, axis=-1), field.largest_sd_mm
+        assert sd is not None
+        z = int(np.argmax(np.isfinite(size).sum(axis=(1, 2))))
+        canvas = empty_figure(8.0, 3.6)
+        draw_slices(
+            canvas, [("displacement (mm)", size[z], "viridis"), ("standard deviation (mm)", sd[z], "cividis")], field.grid.spacing_mm
+        )
+        return canvas
+
+    def to_records(self) -> tuple[Mapping[str, Any], ...]:
+        """Return one row a node of the model: its position, predicted displacement, and the standard deviations of that, mm."""
+        names = [f"{kind}{axis}_mm" for kind in ("", "u", "sd_") for axis in "xyz"]
+        columns = np.hstack([self.prediction.mesh.points, self.prediction.displacement, self.prediction.standard_deviation])
+        return tuple(dict(zip(names, row, strict=True)) for row in columns.tolist())
 
 
 def predict_field(

@@ -29,6 +29,7 @@ from naibu.simulation.interactive_bodies import AnySession, FiniteElementBody, I
 from naibu.simulation.lattice_cut import LatticeCut
 from naibu.viewer.cards import Card
 from naibu.viewer.motion_page import ColourField, MotionPage, motion_html
+from naibu.viewer.notebook import WrittenResult
 from naibu.viewer.tables import Table, quantity_of
 from naibu.workflows.interactive.touchable_models import MeshMaterial, TouchableModel, touchable
 from naibu.workflows.markers.experiments import Source
@@ -43,7 +44,7 @@ END = 1e-3  # of the extent: nodes this near to an end are pulled
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CutRun:
+class CutRun(WrittenResult):
     """A cut body and what was written of it.
 
     Attributes
@@ -62,6 +63,10 @@ class CutRun:
     cut: VolumeCut | LatticeCut
     volumes_mm3: FloatArray
     opening_mm: float
+
+    def to_records(self) -> tuple[Mapping[str, Any], ...]:
+        """Return one row a piece: its number from 1, the largest first, and its volume, mm^3."""
+        return tuple({"piece": k + 1, "volume_mm3": float(v)} for k, v in enumerate(self.volumes_mm3))
 
 
 def cut(

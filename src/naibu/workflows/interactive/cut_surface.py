@@ -27,6 +27,7 @@ from naibu.meshing.cutting.surface_result import SurfaceCut, groove, triangle_ar
 from naibu.simulation.surface_opening import LARGEST_TENSION, opening
 from naibu.viewer.cards import Card
 from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, motion_html
+from naibu.viewer.notebook import WrittenResult
 from naibu.viewer.tables import Table, quantity_of
 from naibu.workflows.results.output_folder import output_folder
 
@@ -40,7 +41,7 @@ INSIDE = 0.5  # of the distance: tips deeper than this below the surface cut a g
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SurfaceCutRun:
+class SurfaceCutRun(WrittenResult):
     """A cut surface and what was written of it.
 
     Attributes
@@ -59,6 +60,10 @@ class SurfaceCutRun:
     cut: SurfaceCut
     numbers: dict[str, Any]
     displacement: FloatArray
+
+    def to_records(self) -> tuple[Mapping[str, Any], ...]:
+        """Return one row a number: quantity, and value."""
+        return tuple({"quantity": name, "value": value} for name, value in self.numbers.items())
 
 
 def is_surface(source: str | os.PathLike[str]) -> bool:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import ndimage
@@ -27,6 +27,8 @@ from naibu.io.images import write_volume
 from naibu.io.tables.point_clouds import POINT_FILES, PointCloud, read_point_cloud
 from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
+from naibu.viewer.notebook import ShownInNotebook, WrittenResult, empty_figure
+from naibu.viewer.result_figures import draw_marker_motion
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.results.output_folder import output_folder
 
@@ -41,7 +43,7 @@ REACH = 1.2  # mean distances from a particle within which there is material
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CloudRun:
+class CloudRun(WrittenResult, ShownInNotebook):
     """Motion of the particles, figures and files.
 
     Attributes
@@ -53,13 +55,25 @@ class CloudRun:
     page : Path
         ``tracking.html``.
     files : tuple of Path
-        All others.
+        The page first.
     """
 
     motion: ParticleMotion
     rows: tuple[tuple[str, Cell], ...]
     page: Path
     files: tuple[Path, ...]
+
+    def plot(self) -> Canvas:
+        """Return a figure of the displacement of the particles, those whose link is not trusted marked as suspect."""
+        field = self.motion.field
+        flags = np.where(field.valid, "ok", "suspect").tolist()
+        canvas = empty_figure(10.5 if field.points.shape[1] == 3 else 5.0, 4.2)
+        draw_marker_motion(canvas, field.points, field.points + field.vectors, flags)
+        return canvas
+
+    def to_records(self) -> tuple[Mapping[str, Any], ...]:
+        """Return one row a link: rows in the files, positions, displacement, its deviation, confidence, and strain, as in ``links.csv``."""
+        return self._rows_of("links.csv")
 
 
 def is_point_file(path: str | os.PathLike[str]) -> bool:
@@ -132,7 +146,7 @@ def track_clouds(
     page, numbers = write_chapter(
         Chapter("tracking", "Particles linked between two states", (_section(names, rows, motion),), settings), folder
     )
-    return CloudRun(motion, rows, page, (*files, numbers))
+    return CloudRun(motion, rows, page, (page, *files, numbers))
 
 
 def _rows(clouds: Sequence[PointCloud], motion: ParticleMotion) -> tuple[tuple[str, Cell], ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -28,6 +28,7 @@ from naibu.io.study_schemas.study_writing import study_document
 from naibu.io.tables.captured_shapes import CapturedSurface, read_captured_shapes
 from naibu.io.tables.force_records import ForceRecord, read_force_records
 from naibu.viewer.chapter_page import chapter_html
+from naibu.viewer.notebook import WrittenResult
 from naibu.workflows.results.output_folder import output_folder
 from naibu.workflows.studies.calibration_page import Compared, calibration_chapter, held_intervals, misfit_numbers
 from naibu.workflows.studies.lattice_study import PreparedStudy, prepared_study
@@ -37,7 +38,7 @@ POINT_SD_MM = 0.5  # of the report's stereo cameras :cite:p:`hirai2008`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LatticeCalibration:
+class LatticeCalibration(WrittenResult):
     """A calibrated study, and the files.
 
     Attributes
@@ -53,6 +54,16 @@ class LatticeCalibration:
     files: tuple[Path, ...]
     estimate: LatticeEstimate
     warnings: tuple[str, ...]
+
+    def to_records(self) -> tuple[Mapping[str, Any], ...]:
+        """Return one row an unknown: its name, value, 95 % interval and unit."""
+        found = self.estimate
+        return tuple(
+            {"unknown": name, "value": float(value), "lower": float(low), "upper": float(high), "unit": unit}
+            for name, unit, value, (low, high) in zip(
+                found.unknowns.names, found.unknowns.units, found.values, found.intervals(), strict=True
+            )
+        )
 
 
 def calibrate_study(
