@@ -25,22 +25,24 @@ export class ForceCurve {
     const context = canvas.getContext("2d");
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.clearRect(0, 0, width, height);
-    const [left, right, top, bottom] = [44, 8, 8, 32];
+    context.font = `11px ${style.fontFamily}`;
     const end = samples.length ? samples[samples.length - 1][0] : 0;
     const most = niceCeiling(Math.max(1e-3, ...samples.map((s) => s[1])));
+    const ticks = [0, 0.5, 1].map((part) => [part * most, String(Number((part * most).toPrecision(3)))]);
+    const widest = Math.max(...ticks.map(([, label]) => context.measureText(label).width));
+    const [left, right, top, bottom] = [26 + widest, 8, 8, 32]; // the name of the axis stands left of the numbers
     const x = (time) => left + ((time - end + SECONDS) / SECONDS) * (width - left - right);
     const y = (force) => height - bottom - (force / most) * (height - top - bottom);
-    context.font = `11px ${style.fontFamily}`;
     context.fillStyle = colour("--soft");
     context.strokeStyle = colour("--line");
     context.lineWidth = 1;
-    [0, 0.5, 1].forEach((part) => {
+    ticks.forEach(([force, label]) => {
       context.beginPath();
-      context.moveTo(left, y(part * most));
-      context.lineTo(width - right, y(part * most));
+      context.moveTo(left, y(force));
+      context.lineTo(width - right, y(force));
       context.stroke();
       context.textAlign = "right";
-      context.fillText(String(Number((part * most).toPrecision(3))), left - 6, y(part * most) + 4);
+      context.fillText(label, left - 6, y(force) + 4);
     });
     context.textAlign = "center";
     [-10, -5, 0].forEach((t) => context.fillText(t === 0 ? "now" : `${t} s`.replace("-", "−"), Math.min(width - 16, x(end + t)), height - bottom + 14));
