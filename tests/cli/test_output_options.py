@@ -127,7 +127,7 @@ def test_a_new_experiment_is_valid_and_tells_its_keys(naibu: Run) -> None:
     assert code == 2 and "meta.toml" in err and "--overwrite" in err
 
 
-@pytest.mark.parametrize("kind", ["lattice", "chip", "fingertip", "ischemia"])
+@pytest.mark.parametrize("kind", ["lattice", "indentation", "chip", "fingertip", "ischemia"])
 def test_a_new_study_is_the_example_of_its_kind(naibu: Run, kind: str) -> None:
     code, out, _ = naibu("new", kind, "-o", "here/study.toml")
     assert code == 0 and "naibu simulate here/study.toml" in out

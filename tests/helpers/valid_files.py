@@ -42,6 +42,7 @@ from naibu.workflows.applications.simulate_chip import prepared_chip
 from naibu.workflows.applications.simulate_ischemia import prepared_ischemia
 from naibu.workflows.fields.block_mesh import block_mesh, labelled_object, names_of_labels
 from naibu.workflows.results.result_folder import read_any_model, read_model
+from naibu.workflows.studies.indentation_study import prepared_indentation
 from naibu.workflows.studies.simulate import example_text
 
 
@@ -326,6 +327,7 @@ def _records(folder: Path) -> list[ValidFile]:
         "chip.toml": example_text("chip"),
         "fingertip.toml": example_text("fingertip"),
         "ischemia.toml": example_text("ischemia"),
+        "indentation.toml": example_text("indentation"),
     }
     paths = {name: _written(folder / f"record-{name}" / name, text.encode()) for name, text in contents.items()}
     readers: dict[str, Callable[[Path], object]] = {
@@ -336,6 +338,7 @@ def _records(folder: Path) -> list[ValidFile]:
         "chip.toml": prepared_chip,
         "fingertip.toml": prepared_fingertip,
         "ischemia.toml": prepared_ischemia,
+        "indentation.toml": prepared_indentation,
     }
     plane = np.zeros((1, 100, 60), dtype=np.uint8)
     y, x = np.mgrid[:100, :60]

@@ -64,13 +64,14 @@ class MotionPage {
   }
 
   #timeControls() {
-    this.slider = h("input", { type: "range", id: "naibu-time", min: 0, max: this.duration, step: this.duration / 1000 || 1, "aria-label": "Time",
+    this.clock = this.data.clock ?? ["time", "s"];
+    this.slider = h("input", { type: "range", id: "naibu-time", min: 0, max: this.duration, step: this.duration / 1000 || 1, "aria-label": this.clock[0],
       oninput: () => { this.stop(); this.setTime(Number(this.slider.value)); } });
     this.play = h("button", { type: "button", class: "play", onclick: () => this.toggle() }, "▶ Play");
     this.label = h("output", { for: "naibu-time", class: "timelabel" });
     const usual = SPEEDS.find((s) => this.duration / s <= LONGEST_S) ?? SPEEDS[SPEEDS.length - 1];
     this.speed = h("select", { id: "naibu-speed", "aria-label": "Speed", onchange: () => { if (this.timer) { this.stop(); this.start(); } } },
-      ...SPEEDS.map((s) => h("option", { value: s, selected: s === (this.duration >= 2 ? Math.max(usual, 1) : usual) }, s === 1 ? "real time" : `${s}×`)));
+      ...SPEEDS.map((s) => h("option", { value: s, selected: s === (this.duration >= 2 ? Math.max(usual, 1) : usual) }, s !== 1 ? `${s}×` : this.clock[1] === "s" ? "real time" : `1 ${this.clock[1]}/s`)));
     return h("div", { class: "load" }, this.play, h("div", { class: "slide" }, this.slider, this.label), this.speed);
   }
 
@@ -89,7 +90,7 @@ class MotionPage {
     const span = times.length > 1 ? times[i + 1] - times[i] : 1;
     this.view.setFrame(i + (this.time - times[i]) / span);
     this.slider.value = this.time;
-    this.label.value = `${this.time.toFixed(this.duration < 10 ? 2 : 1)} s`;
+    this.label.value = `${this.time.toFixed(this.duration < 10 ? 2 : 1)} ${this.clock[1]}`;
     if (this.mark) {
       const { from, to } = this.mark.dataset;
       const x = Number(from) + (Number(to) - Number(from)) * (this.duration ? this.time / this.duration : 0);

@@ -10,7 +10,7 @@ from naibu.cli.described import Out, Overwrite
 from naibu.cli.run_record import wrote
 from naibu.cli.verbs import START, verb
 
-KindName = Literal["experiment", "lattice", "chip", "fingertip", "ischemia"]
+KindName = Literal["experiment", "lattice", "indentation", "chip", "fingertip", "ischemia"]
 
 
 @verb(START, "new -o my_gel && naibu identify my_gel", "new lattice -o my_study.toml && naibu simulate my_study.toml")
@@ -20,7 +20,8 @@ def new(kind: KindName = "experiment", *, out: Out | None = None, overwrite: Ove
     Parameters
     ----------
     kind
-        An experiment with markers, or a study for naibu simulate: a lattice, a sensing chip, a fingertip, layered skin (ischemia).
+        An experiment with markers, or a study for naibu simulate: a lattice, an indentation, a sensing chip, a
+        fingertip, layered skin (ischemia).
     out
         Folder of the experiment (my_experiment), or file of the study (my_study.toml).
     overwrite

@@ -100,8 +100,8 @@ def simulate(
     Parameters
     ----------
     study
-        Name of a study, or your own file STUDY.toml of a mass-spring-dashpot lattice, a sensing chip, a fingertip, layered
-        skin, or a sweep: many runs of a lattice's study with some numbers changed.
+        Name of a study, or your own file STUDY.toml of a mass-spring-dashpot lattice, an indentation (adaptive finite
+        elements), a sensing chip, a fingertip, layered skin, or a sweep: many runs of a lattice's study with some numbers changed.
     out
         Folder for the files.
     resume
@@ -114,7 +114,7 @@ def simulate(
         Where a lattice is computed: cpu, cuda (an NVIDIA GPU; needs naibu[gpu]), or warp-cpu (the GPU's kernels on the CPU, for tests).
     example
         Print the file of a study as a template for your own: naibu simulate --example > my_study.toml, or, of a sensing chip,
-        naibu simulate chip --example > my_chip.toml; the same for fingertip, ischemia and sweep
+        naibu simulate chip --example > my_chip.toml; the same for indentation, fingertip, ischemia and sweep
     """
     from naibu.workflows.studies.simulate import example_text, named_studies
     from naibu.workflows.studies.simulate import simulate as simulated

@@ -3,6 +3,7 @@ from .adaptive.conditions import Conditions, face_force, weight
 from .adaptive.error_criterion import StressError
 from .adaptive.error_estimator import recovery_indicators, residual_indicators
 from .adaptive.hyperelastic_dynamics import HyperelasticDynamics
+from .adaptive.indentation import Indentation, indent
 from .adaptive.lattice import AdaptiveLattice, SpringMaterial
 from .adaptive.linear_dynamics import LinearDynamics
 from .adaptive.spring_levels import level_spring
@@ -35,6 +36,7 @@ __all__ = [
     "HapticHand",
     "HapticThread",
     "HyperelasticDynamics",
+    "Indentation",
     "InteractiveBody",
     "InteractiveSimulation",
     "LatticeBody",
@@ -53,6 +55,7 @@ __all__ = [
     "cut_session",
     "face_force",
     "hyperelastic_static",
+    "indent",
     "level_spring",
     "linear_static",
     "opened",

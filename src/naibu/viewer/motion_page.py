@@ -97,6 +97,8 @@ class MotionPage:
         How the motion was computed.
     cards : sequence of Card
         What to know first.
+    clock : (str, str)
+        What `times` are, and their unit: another quantity that grows, such as a travel in mm, for motions without inertia.
     """
 
     title: str
@@ -113,6 +115,7 @@ class MotionPage:
     tables: Sequence[Table] = ()
     provenance: Mapping[str, object] = field(default_factory=dict)
     cards: Sequence[Card] = ()
+    clock: tuple[str, str] = ("time", "s")
 
     def __post_init__(self) -> None:
         s, n, b = len(self.times), len(self.reference), len(self.bodies)
@@ -179,6 +182,7 @@ def _packed(page: MotionPage) -> dict[str, object]:
     whole = np.rint(page.displacement / quantum).astype(np.int16).reshape(len(page.times), -1)
     return {
         "times": [round(float(t), 6) for t in page.times],
+        "clock": page.clock,
         "faces": page.faces.ravel().tolist(),
         "reference": np.round(page.reference, 3).ravel().tolist(),
         "quantum": quantum,
@@ -239,14 +243,14 @@ def force_curves(page: MotionPage) -> str:
         line = f'<svg class="key" width="22" height="10" aria-hidden="true"><path d="M0 5h22" class="curve c-{k % CURVES}"/></svg>'
         keys += f"<li>{line} {escape(shape.name)}, along {axis}</li>"
     middle = 0.5 * (LEFT + WIDTH - RIGHT)
-    body += f'<text x="{middle:.0f}" y="{HEIGHT - 8:.0f}" text-anchor="middle">time (s)</text>'
+    body += f'<text x="{middle:.0f}" y="{HEIGHT - 8:.0f}" text-anchor="middle">{escape(page.clock[0])} ({page.clock[1]})</text>'
     up = 0.5 * (TOP + HEIGHT - BOTTOM)
     body += f'<text transform="translate(12 {up:.0f}) rotate(-90)" text-anchor="middle">force on the object ({unit})</text>'
     body += (
         f'<g id="naibu-now" data-from="{LEFT:g}" data-to="{WIDTH - RIGHT:g}" transform="translate({LEFT:g} 0)">'
         f'<path d="M0 {TOP:g}V{HEIGHT - BOTTOM:g}" class="now"/></g>'
     )
-    label = f"Forces of {', '.join(b.name for b in page.bodies)} on the object over time"
+    label = f"Forces of {', '.join(b.name for b in page.bodies)} on the object over {page.clock[0]}"
     svg = f'<svg viewBox="0 0 {WIDTH:.0f} {HEIGHT:.0f}" role="img" aria-label="{escape(label)}">{body}</svg>'
     return f'<p class="fig-title">Forces on the object</p>{svg}<ul class="curve-key">{keys}</ul>'
 

@@ -13,7 +13,7 @@ from naibu.io.files.atomic import write_atomically
 from naibu.workflows.results.output_folder import output_folder
 from naibu.workflows.studies.simulate import example_text
 
-Kind = Literal["experiment", "lattice", "chip", "fingertip", "ischemia"]
+Kind = Literal["experiment", "lattice", "indentation", "chip", "fingertip", "ischemia"]
 EXAMPLE = "ct_cube_plate"  # the bundled measurement whose tables the folder starts with
 TABLES = {"initial.csv": "initial.csv", "pressed.csv": "height_45.csv"}
 
@@ -25,7 +25,7 @@ def new(kind: Kind, out: str | os.PathLike[str], *, overwrite: bool = False) -> 
     ----------
     kind : str
         ``"experiment"``, a folder with ``meta.toml`` and marker tables for `naibu.identify`; or a file for `naibu.simulate` of a
-        ``"lattice"``, a sensing ``"chip"``, a ``"fingertip"`` or layered skin (``"ischemia"``).
+        ``"lattice"``, an ``"indentation"``, a sensing ``"chip"``, a ``"fingertip"`` or layered skin (``"ischemia"``).
     out : path-like
         Folder of the experiment, or file of the study.
     overwrite : bool

@@ -116,6 +116,19 @@ class Newton:
         residual, scale, matrix, responses = self._tangent(u, anchors, load)
         return residual, scale, self._factorized(matrix), responses
 
+    def adjoint(self, u: FloatArray, anchors: tuple[FloatArray, ...], load: float, derivatives: FloatArray) -> FloatArray:
+        """Return the solutions (n, 3, k) of the transposed tangent for derivatives (n, 3, k) of quantities by the displacement.
+
+        Raises
+        ------
+        ConvergenceError
+            An inverted element, or a singular tangent.
+        """
+        matrix = self._tangent(u, anchors, load)[2]
+        rhs = np.where(self.problem.prescribed.constrained[:, :, None], 0.0, derivatives)
+        factorization = self._factorized(matrix.T.tobsr((3, 3)) if self.problem.unsymmetric else matrix)
+        return np.asarray(factorization.solve(np.ascontiguousarray(rhs.reshape(-1, rhs.shape[2]))).reshape(rhs.shape))
+
     def _tangent(
         self, u: FloatArray, anchors: tuple[FloatArray, ...], load: float, *, curvature: bool = True
     ) -> tuple[FloatArray, float, sp.bsr_matrix, list[ContactResponse]]:

@@ -35,16 +35,27 @@ def recovery_indicators(mesh: Mesh, stress: FloatArray, shear_modulus: ArrayLike
         Other cells, or a stress or moduli of another shape.
     """
     body, mu = _checked(mesh, stress, shear_modulus)
+    gap = recovered_differences(mesh, body, stress.reshape(body.n_cells, -1))
+    return np.asarray(np.sqrt(linear_products(body, gap, gap) / (2.0 * mu)))
+
+
+def recovered_differences(mesh: Mesh, body: Simplices, values: FloatArray) -> FloatArray:
+    """Return how values of the cells (m, k) differ from their averages at the nodes (m, d + 1, k), over the cells of one region."""
     d, m = body.dimension, body.n_cells
     number = body.cells + mesh.n_points * mesh.regions[:, None]
     count = mesh.n_points * (int(mesh.regions.max()) + 1)
     weights = np.repeat(body.measures, d + 1)
     total = np.bincount(number.ravel(), weights, minlength=count)
-    sums = np.stack([np.bincount(number.ravel(), weights * np.repeat(s, d + 1), minlength=count) for s in stress.reshape(m, -1).T], axis=1)
+    sums = np.stack([np.bincount(number.ravel(), weights * np.repeat(v, d + 1), minlength=count) for v in values.T], axis=1)
     nodal = np.divide(sums, total[:, None], out=np.zeros_like(sums), where=total[:, None] > 0.0)
-    gap = nodal[number] - stress.reshape(m, 1, -1)
-    squares = (gap**2).sum(axis=(1, 2)) + (gap.sum(axis=1) ** 2).sum(axis=1)
-    return np.asarray(np.sqrt(body.measures * squares / ((d + 1) * (d + 2)) / (2.0 * mu)))
+    return np.asarray(nodal[number] - values.reshape(m, 1, -1))
+
+
+def linear_products(body: Simplices, first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the integrals (m,) of the products of two fields that are linear in every cell, given at its nodes (m, d + 1, k)."""
+    d = body.dimension
+    squares = (first * second).sum(axis=(1, 2)) + (first.sum(axis=1) * second.sum(axis=1)).sum(axis=1)
+    return np.asarray(body.measures * squares / ((d + 1) * (d + 2)))
 
 
 def residual_indicators(mesh: Mesh, stress: FloatArray, shear_modulus: ArrayLike, body_force: ArrayLike = 0.0) -> FloatArray:

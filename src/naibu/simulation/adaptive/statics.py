@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,12 +17,11 @@ from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
-from naibu.mechanics.finite_elements.elements import elements
+from naibu.mechanics.finite_elements.elements import Formulation, elements
 from naibu.mechanics.finite_elements.hyperelasticity import Material, lame_parameters
 from naibu.mechanics.finite_elements.linear_simplices import lumped_mass, simplices
-from naibu.mechanics.finite_elements.stress_history import second_piola
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
-from naibu.mechanics.finite_strain.statics import solve
+from naibu.mechanics.finite_strain.statics import Solution, solve
 from naibu.mechanics.linear_algebra.block_matrix import block_pattern
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.meshing.refinement.forest import BisectionForest, LeafMesh
@@ -30,6 +30,7 @@ from naibu.meshing.refinement.transfer import transferred_nodes
 from naibu.meshing.surface import boundary_faces
 from naibu.simulation.adaptive.conditions import Conditions, Selection
 from naibu.simulation.adaptive.error_estimator import recovery_indicators
+from naibu.simulation.adaptive.force_error import first_piola, path_force_errors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,20 +47,37 @@ class StaticResult:
         Strain energy, mN mm.
     reactions : dict
         Forces (3,), mN, of rigid bodies on the body, by their names.
+    force_errors : dict
+        Estimated errors (3,), mN, of the forces of moving indenters, by their names; empty where they were not asked for.
+    force_error : float, optional
+        Sum of the sizes of the errors of all cells as a fraction of the force, of the indenter where that is largest: the estimate of
+        `force_errors`, without cells whose errors cancel.
+    carried : ndarray, shape (n, k), optional
+        Values of the nodes that the next solution begins from, on its mesh, instead of the displacement.
     """
 
     displacement: FloatArray
     indicators: FloatArray
     energy: float
     reactions: dict[str, FloatArray] = field(default_factory=dict)
+    force_errors: dict[str, FloatArray] = field(default_factory=dict)
+    force_error: float | None = None
+    carried: FloatArray | None = None
+
+    def corrected_force(self, name: str) -> FloatArray:
+        """Return the force (3,), mN, of an indenter on the body less its estimated error."""
+        return np.asarray(self.reactions[name] - self.force_errors[name])
 
     @property
     def relative_error(self) -> float:
-        """Estimated error in the energy norm, as a fraction of the norm of the displacement."""
+        """Estimated error of the forces where they are the goal, else that in the energy norm, as a fraction."""
+        if self.force_error is not None:
+            return self.force_error
         return float(np.linalg.norm(self.indicators) / np.sqrt(max(2.0 * self.energy, 1e-300)))
 
 
 StaticSolve = Callable[[Mesh, FloatArray | None], StaticResult]
+Goal = Literal["energy", "force"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,9 +124,10 @@ def solve_adaptively(
     mesh : Mesh
         The coarsest one: triangles or linear tetrahedra.
     solve_on : callable
-        Solves on a mesh, from a displacement (n, d), mm, of the mesh before or None: `linear_static`, `hyperelastic_static`, or one's own.
+        Solves on a mesh, from a displacement (n, d), mm, of the mesh before (or what that solution carried) or None: `linear_static`,
+        `hyperelastic_static`, or one's own.
     tolerance : float
-        Estimated error in the energy norm, as a fraction.
+        Estimated error as a fraction (`StaticResult.relative_error`).
     max_unknowns : int
         No finer mesh is solved when this number of displacement components is reached.
     fraction : float
@@ -137,8 +156,9 @@ def solve_adaptively(
         unknowns.append(found.displacement.size)
         if found.relative_error <= tolerance or unknowns[-1] >= max_unknowns:
             return AdaptiveSolution(forest, leaf, tuple(rounds), tuple(unknowns))
-        nodal = np.zeros((forest.node_rows, mesh.dimension))
-        nodal[leaf.nodes] = found.displacement
+        values = found.displacement if found.carried is None else found.carried
+        nodal = np.zeros((forest.node_rows, values.shape[1]))
+        nodal[leaf.nodes] = values
         marked = leaf.cells[doerfler_marks(found.indicators, fraction)]
         anything = False
         for _ in range(bisections):
@@ -235,6 +255,23 @@ def pressed_by(
     return contacts
 
 
+def hyperelastic_problem(
+    mesh: Mesh,
+    conditions: Conditions,
+    materials: Sequence[Material],
+    *,
+    contacts: tuple[Contact, ...] = (),
+    density: float = 0.0,
+    formulation: Formulation = "standard",
+) -> Problem:
+    """Return the boundary value problem on one mesh of tetrahedra; see `hyperelastic_static`."""
+    parts = elements(mesh, formulation)
+    pattern = block_pattern(mesh.n_points, parts.connectivity, *(c.nodes for c in contacts))
+    assembler = Assembler.from_materials(parts, mesh.regions, list(materials), pattern)
+    held = PrescribedDisplacement(conditions.constrained(mesh.points), np.zeros_like(mesh.points))
+    return Problem(mesh.points, assembler, contacts, held, conditions.force(mesh, lumped_mass(simplices(mesh), density)))
+
+
 def hyperelastic_static(
     conditions: Conditions,
     materials: Sequence[Material],
@@ -242,6 +279,8 @@ def hyperelastic_static(
     contacts: Callable[[Mesh], tuple[Contact, ...]] = lambda mesh: (),
     density: float = 0.0,
     settings: SolverSettings | None = None,
+    formulation: Formulation = "standard",
+    goal: Goal = "energy",
 ) -> StaticSolve:
     """Return what solves for equilibrium at finite strain, in contact or not, on any mesh of tetrahedra, for `solve_adaptively`.
 
@@ -257,21 +296,40 @@ def hyperelastic_static(
         kg/mm^3, for loads that depend on the mass.
     settings : SolverSettings, optional
         Load steps and tolerances; the equilibrium of the mesh before is the initial guess.
+    formulation : {"standard", "mean_dilatation"}
+        See `naibu.mechanics.elements`; the latter for Poisson's ratios above 0.4.
+    goal : {"energy", "force"}
+        Whether cells are marked by their part in the error in the energy norm, or in those of the forces of moving indenters along their
+        travel, which `StaticResult.force_errors` then holds :cite:p:`becker2001`.
     """
 
     def solve_on(mesh: Mesh, start: FloatArray | None) -> StaticResult:
-        bodies = contacts(mesh)
-        parts = elements(mesh, "standard")
-        pattern = block_pattern(mesh.n_points, parts.connectivity, *(c.nodes for c in bodies))
-        assembler = Assembler.from_materials(parts, mesh.regions, list(materials), pattern)
-        held = PrescribedDisplacement(conditions.constrained(mesh.points), np.zeros_like(mesh.points))
-        geometry = simplices(mesh)
-        problem = Problem(mesh.points, assembler, bodies, held, conditions.force(mesh, lumped_mass(geometry, density)))
+        problem = hyperelastic_problem(mesh, conditions, materials, contacts=contacts(mesh), density=density, formulation=formulation)
         found = solve(problem, settings=settings, warm_start=() if start is None else [(1.0, start)])
-        u = found.displacement
-        gradient = geometry.displacement_gradients(u) + np.eye(3)
-        stress = gradient @ second_piola(assembler, assembler.parameters, u)[:, 0]
-        shear = np.array([m.small_strain_shear_modulus for m in materials])[mesh.regions]
-        return StaticResult(u, recovery_indicators(mesh, stress, shear), assembler.forces(u)[0], found.reactions)
+        return static_result(mesh, found, materials, goal)
 
     return solve_on
+
+
+def static_result(mesh: Mesh, found: Solution, materials: Sequence[Material], goal: Goal) -> StaticResult:
+    """Return the last state of a solution with the errors of the cells; see `hyperelastic_static`."""
+    u = found.displacement
+    energy = found.problem.assembler.forces(u)[0]
+    if goal == "force":
+        return _with_force_errors(mesh, found, energy)
+    stress = first_piola(mesh, found.problem, u, simplices(mesh).displacement_gradients(u))
+    shear = np.array([m.small_strain_shear_modulus for m in materials])[mesh.regions]
+    return StaticResult(u, recovery_indicators(mesh, stress, shear), energy, found.reactions)
+
+
+def _with_force_errors(mesh: Mesh, found: Solution, energy: float) -> StaticResult:
+    """Return the result whose indicators are roots of the parts of the cells in the errors of the forces."""
+    errors = path_force_errors(mesh, found.problem, found.states[-2:])[0]
+    sums = np.zeros(mesh.n_cells)
+    worst = 0.0
+    for name, cells in errors.cells.items():
+        along = float(np.abs(found.reactions[name] @ errors.directions[name]))
+        parts = np.abs(cells) / (along if along > 0.0 else np.inf)
+        sums += parts
+        worst = max(worst, float(parts.sum()))
+    return StaticResult(found.displacement, np.sqrt(sums), energy, found.reactions, dict(errors.total), worst)

@@ -13,7 +13,9 @@ from naibu.workflows.applications.simulate_chip import CHIP, CHIP_TITLE, chip_te
 from naibu.workflows.applications.simulate_fingertip import simulate_fingertip
 from naibu.workflows.applications.simulate_ischemia import ISCHEMIA, ISCHEMIA_TITLE, describes_ischemia, ischemia_text, simulate_ischemia
 from naibu.workflows.parallel.worker_count import Workers
+from naibu.workflows.studies.indentation_study import INDENTATION, INDENTATION_TITLE, describes_indentation, indentation_text
 from naibu.workflows.studies.lattice_study import NAMED, TEMPLATE, study_text
+from naibu.workflows.studies.simulate_indentation import simulate_indentation
 from naibu.workflows.studies.simulate_lattice import CHECKPOINT_EVERY, SimulationRun, simulate_lattice
 from naibu.workflows.studies.simulate_study import SLUGS, SQUARES_TOGETHER, simulate_study
 from naibu.workflows.studies.simulate_sweep import SWEEP, describes_sweep, simulate_sweep, sweep_text
@@ -28,7 +30,8 @@ class NamedStudy:
     name : str
         What `simulate` takes.
     model : str
-        ``"finite elements"``, ``"mass-spring-dashpot lattice"``, ``"sensing chip"``, ``"fingertip"`` or ``"layered skin"``.
+        ``"finite elements"``, ``"adaptive finite elements"``, ``"mass-spring-dashpot lattice"``, ``"sensing chip"``, ``"fingertip"`` or
+        ``"layered skin"``.
     title : str
         What is simulated.
     """
@@ -45,6 +48,7 @@ def named_studies() -> tuple[NamedStudy, ...]:
     return (
         *(NamedStudy(name, "finite elements", title) for name, title in elements),
         *(NamedStudy(name, "mass-spring-dashpot lattice", title) for name, title in lattices),
+        NamedStudy(INDENTATION, "adaptive finite elements", INDENTATION_TITLE),
         NamedStudy(CHIP, "sensing chip", CHIP_TITLE),
         NamedStudy(FINGERTIP, "fingertip", FINGERTIP_TITLE),
         NamedStudy(ISCHEMIA, "layered skin", ISCHEMIA_TITLE),
@@ -52,7 +56,7 @@ def named_studies() -> tuple[NamedStudy, ...]:
 
 
 def example_text(study: str = "") -> str:
-    """Return the file of a study as a template: of a lattice, a sensing chip, a fingertip, layered skin, or a sweep.
+    """Return the file of a study as a template: of a lattice, an indentation, a sensing chip, a fingertip, layered skin, or a sweep.
 
     Parameters
     ----------
@@ -64,7 +68,7 @@ def example_text(study: str = "") -> str:
     InputError
         There is no such study, or it has no file.
     """
-    of_name = {CHIP: chip_text, FINGERTIP: fingertip_text, ISCHEMIA: ischemia_text, SWEEP: sweep_text}
+    of_name = {CHIP: chip_text, FINGERTIP: fingertip_text, ISCHEMIA: ischemia_text, INDENTATION: indentation_text, SWEEP: sweep_text}
     return of_name[study]() if study in of_name else study_text(study or TEMPLATE)
 
 
@@ -87,8 +91,8 @@ def simulate(
     Parameters
     ----------
     study : str or path-like
-        Name of a study (see `named_studies`), or a TOML file that describes a lattice, its indenters and their motion, a sensing chip, a
-        fingertip, layered skin, or a sweep of parameters of a lattice's study.
+        Name of a study (see `named_studies`), or a TOML file that describes a lattice, its indenters and their motion, an indentation, a
+        sensing chip, a fingertip, layered skin, or a sweep of parameters of a lattice's study.
     out : path-like
         Folder for the files.
     resume : bool
@@ -125,7 +129,8 @@ def simulate(
     if Workers(workers, cluster).elsewhere:
         raise InputError(f"`workers` and `cluster` share out the runs of a sweep, and {name} is one run; leave them out")
     of_chip, of_skin, of_finger = describes_chip(study), describes_ischemia(study), describes_fingertip(study)
-    if not (of_chip or of_skin or of_finger) and name != SQUARES_TOGETHER and name not in SLUGS:
+    pressed = describes_indentation(study)
+    if not (of_chip or of_skin or of_finger or pressed) and name != SQUARES_TOGETHER and name not in SLUGS:
         return simulate_lattice(
             study, out, resume=resume, overwrite=overwrite, checkpoint_every=checkpoint_every, device=device, progress=progress
         )
@@ -135,6 +140,8 @@ def simulate(
         raise InputError(f"device is {device!r}, and {name} is a study of finite elements, which run on 'cpu'; choose that, or a lattice")
     if of_finger:
         return simulate_fingertip(study, out, resume=resume, overwrite=overwrite, progress=progress)
+    if pressed:
+        return SimulationRun(simulate_indentation(study, out, overwrite=overwrite, progress=progress), 1, 1)
     if of_chip:
         return SimulationRun(simulate_chip(study, out, overwrite=overwrite, progress=progress), 1, 1)
     if of_skin:
