@@ -10,6 +10,7 @@ export function decodeScene(payload) {
     points: new Float32Array(bytes(payload.points)),
     faces: new Uint32Array(bytes(payload.faces)),
     cells: new Uint32Array(bytes(payload.cells)),
+    outline: new Uint32Array(bytes(payload.outline)),
     markers: {
       each: payload.markers.each,
       nodes: new Uint32Array(bytes(payload.markers.nodes)),

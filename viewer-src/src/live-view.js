@@ -1,7 +1,7 @@
 // The 3-D view of a running simulation: coloured surface, section, markers, tool, fixtures, and picking.
 import {
   BufferAttribute, BufferGeometry, DataTexture, DirectionalLight, DoubleSide, DynamicDrawUsage, HemisphereLight, InstancedMesh,
-  LinearFilter, Matrix4, Mesh, MeshBasicMaterial, Plane, Raycaster, Scene, ShaderMaterial, Sphere, SphereGeometry,
+  LineBasicMaterial, LineSegments, LinearFilter, Matrix4, Mesh, MeshBasicMaterial, Plane, Raycaster, Scene, ShaderMaterial, Sphere, SphereGeometry,
   Vector2, Vector3,
 } from "three";
 import { gridLines } from "./body.js";
@@ -25,6 +25,7 @@ export class LiveView extends View {
     this.top ??= 1;
     this.skin = this.#coloured(this.position, this.level);
     this.skin.geometry.setIndex(new BufferAttribute(scene.faces, 1));
+    this.outline = this.#outline(this.position, scene.outline);
     this.cap = this.#coloured(new BufferAttribute(new Float32Array(0), 3), new BufferAttribute(new Float32Array(0), 1));
     this.cap.visible = false;
     this.#measure();
@@ -34,7 +35,7 @@ export class LiveView extends View {
     this.tools = scene.tools.map((t) => rigidBody(t));
     this.tools.forEach((t) => { t.visible = false; });
     this.made = this.tools.map((t) => t.quaternion.clone());
-    this.world.add(this.grid, this.skin, this.cap, this.markers, ...this.fixtures, ...this.tools, new HemisphereLight(0xffffff, 0x8a8a8a, 2.0), this.sun);
+    this.world.add(this.grid, this.skin, this.outline, this.cap, this.markers, ...this.fixtures, ...this.tools, new HemisphereLight(0xffffff, 0x8a8a8a, 2.0), this.sun);
     this.applyTheme();
     this.#colours();
     this.#clipBy(clip ?? null);
@@ -64,10 +65,24 @@ export class LiveView extends View {
       uniforms: { colours: { value: null } },
       side: DoubleSide,
       clipping: true,
+      polygonOffset: true, // lines on the surface are seen
+      polygonOffsetFactor: 1,
+      polygonOffsetUnits: 2,
     });
     const mesh = new Mesh(geometry, material);
     mesh.frustumCulled = false;
     return mesh;
+  }
+
+  /** Where cuts meet the surface, also while they are closed: lines drawn a little in front of it. */
+  #outline(position, edges) {
+    const geometry = new BufferGeometry();
+    geometry.setAttribute("position", position);
+    geometry.setIndex(new BufferAttribute(edges, 1));
+    const lines = new LineSegments(geometry, new LineBasicMaterial());
+    lines.frustumCulled = false;
+    lines.visible = edges.length > 0;
+    return lines;
   }
 
   #spheres() {
@@ -164,7 +179,7 @@ export class LiveView extends View {
   #clipBy(plane) {
     this.clip = plane;
     this.renderer.localClippingEnabled = Boolean(this.clip);
-    this.skin.material.clippingPlanes = this.clip ? [this.clip] : [];
+    for (const { material } of [this.skin, this.outline]) material.clippingPlanes = this.clip ? [this.clip] : [];
     this.cap.visible = Boolean(this.clip);
     this.#cut();
     this.#placeMarkers();
@@ -241,7 +256,7 @@ export class LiveView extends View {
     this.world.background = null;
     this.renderer.setClearColor(colours.background);
     this.grid.material.color.set(colours.grid);
-    this.markers.material.color.set(colours.predicted);
+    for (const drawn of [this.markers, this.outline]) drawn.material.color.set(colours.predicted);
     for (const group of [...this.tools, ...this.fixtures]) group.children.forEach((part) => part.material.color.set(colours.box));
     this.requestRender();
   }

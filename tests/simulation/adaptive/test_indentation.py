@@ -23,7 +23,7 @@ BOTTOM = Conditions(
 
 
 def layer_force(radius, depth, height):
-    """Force of a sphere on a layer bonded to a rigid base, mN (Dimitriadis et al. 2002, equation 1)."""
+    """Force of a sphere on a layer bonded to a rigid base, mN (Dimitriadis et al. 2002)."""
     chi = np.sqrt(radius * depth) / height
     a = -(1.2876 - 1.4678 * NU + 1.3442 * NU**2) / (1.0 - NU)
     b = (0.6387 - 1.0277 * NU + 1.5164 * NU**2) / (1.0 - NU)

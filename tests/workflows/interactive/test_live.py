@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import uvicorn
 from browser import CHROMIUM, opened_browser
+from matplotlib.image import imread
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from touched_lattice import touched_lattice
@@ -119,6 +120,12 @@ def pieces(simulation: LiveSimulation) -> int:
     return int(connected_components(graph, directed=False)[0])
 
 
+def orange(picture: Path) -> int:
+    """Number of pixels of a picture that are more orange than any colour of the map."""
+    red, green, blue = imread(picture)[..., :3].transpose(2, 0, 1)
+    return int(((red > 0.6) & (green < 0.6 * red) & (blue < 0.3)).sum())
+
+
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
 @pytest.mark.parametrize("kind", ["mesh", "lattice"])
 def test_a_person_cuts_a_body_and_takes_it_back(tmp_path: Path, kind: str) -> None:
@@ -128,6 +135,7 @@ def test_a_person_cuts_a_body_and_takes_it_back(tmp_path: Path, kind: str) -> No
         page.open(address)
         page.wait("document.querySelector('.stage[data-ready]') !== null && naibuLive.frame.tool === 0", 60)
         page.value("naibuLive.take(''); naibuLive.setMode('cut')")
+        assert page.value("naibuLive.scene.outline.length") == 0 and orange(page.picture(tmp_path / "whole.png")) == 0
         left, top, width, height = page.value(
             "(() => { const b = naibuLive.view.canvas.getBoundingClientRect(); return [b.left, b.top, b.width, b.height]; })()"
         )
@@ -139,7 +147,9 @@ def test_a_person_cuts_a_body_and_takes_it_back(tmp_path: Path, kind: str) -> No
         page.wait("naibuLive.scene.topology === 1 && naibuLive.frame.topology === 1", 60)
         assert page.value("naibuLive.scene.points.length") > 3 * 125
         assert simulation.scene.topology == 1
-        page.picture(tmp_path / f"{kind}.png")
+        assert page.value("naibuLive.scene.outline.length") > 0  # the cut is closed: its outline shows where it is
+        page.wait("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))")
+        assert orange(page.picture(tmp_path / f"{kind}.png")) > 100
         if kind == "mesh":  # a closed line, but for a gap of some pixels, cuts a second piece out
             radius, before = 0.13 * height, pieces(simulation)
             ring = [(left + 0.5 * width + radius * np.cos(t), top + 0.62 * height + radius * np.sin(t)) for t in np.linspace(0.0, 6.2, 24)]
