@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import struct
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ from hypothesis import strategies as st
 from naibu.core.errors import InputError, MissingDependencyError
 from naibu.core.rigid_transform import rotation_matrix
 from naibu.core.volume import Volume
-from naibu.io.images import read_displacement, read_volume, read_volume_box, write_displacement, write_volume
+from naibu.io.images import open_volume, read_displacement, read_volume, read_volume_box, write_displacement, write_volume
 
 RNG = np.random.default_rng(5)
 TURN = rotation_matrix(np.array([0.3, -0.5, 0.7]))
@@ -193,6 +195,21 @@ def test_what_is_no_volume_is_refused(tmp_path: Path) -> None:
         read_volume(tmp_path / "c.tif", spacing_mm=(1, 1, 1))
     with pytest.raises(InputError, match="three positive"):
         read_volume(tmp_path / "c.tif", spacing_mm=(1, 1, 0))
+
+
+@pytest.mark.parametrize("opened", [read_volume, open_volume])
+def test_a_tiff_whose_size_takes_more_strips_than_it_lists_is_refused(tmp_path: Path, opened: Callable[[Path], object]) -> None:
+    """The length of the image is damaged; reading it would take minutes."""
+    tifffile = pytest.importorskip("tifffile")
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, np.arange(42, dtype="<i2").reshape(6, 7), compression="zlib", rowsperstrip=6)
+    with tifffile.TiffFile(path) as file:
+        tag = file.pages[0].tags["ImageLength"]
+    content = bytearray(path.read_bytes())
+    content[tag.offset + 2 : tag.offset + 12] = struct.pack("<HII", 4, 1, 6 + (2 << 24))
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"takes 5592407 strips, and it lists 1"):
+        opened(path)
 
 
 def test_tiff_stacks_of_other_programs(tmp_path: Path) -> None:

@@ -104,6 +104,7 @@ def _loaded(tifffile: Any, path: Path) -> tuple[AnyArray, dict[str, Any]]:
             if not len(file.pages):  # counting ends where pages refer to each other in a circle, iterating does not
                 raise InputError(f"{path.name}: contains no image; copy the file again")
             series, page = file.series[0], file.pages[0]
+            require_all_strips(path.name, page)
             samples = int(page.samplesperpixel)
             n_series, axes = len(file.series), str(series.axes)
             stated = stated_geometry(path.name, file, page)
@@ -119,6 +120,21 @@ def _loaded(tifffile: Any, path: Path) -> tuple[AnyArray, dict[str, Any]]:
     if any(axis in axes and values.shape[axes.index(axis)] > 1 for axis in "TCS"):
         raise InputError(f"{path.name}: contains several time points or channels (axes {axes}, {values.shape}); save one as a stack")
     return values, stated
+
+
+def require_all_strips(source: str, page: Any) -> None:
+    """Raise unless a page lists as many strips or tiles as its size takes: tifffile would go through millions that are not there.
+
+    Raises
+    ------
+    InputError
+        Fewer are listed.
+    """
+    expected, listed = int(np.prod(page.chunked)), len(page.dataoffsets)
+    if listed < expected and not page.is_contiguous:
+        raise InputError(
+            f"{source}: its size of {page.shape} takes {expected} strips, and it lists {listed}; its header is damaged, copy the file again"
+        )
 
 
 def stated_geometry(source: str, file: Any, page: Any) -> dict[str, Any]:

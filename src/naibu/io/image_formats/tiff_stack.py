@@ -13,7 +13,7 @@ from naibu.core.errors import InputError
 from naibu.core.optional_packages import optional_package
 from naibu.io.files.reading import require_regular
 from naibu.io.image_formats.geometry import no_colours
-from naibu.io.image_formats.tiff import slices_of_folder, stated_geometry
+from naibu.io.image_formats.tiff import require_all_strips, slices_of_folder, stated_geometry
 
 
 class Slices:
@@ -68,6 +68,7 @@ def open_stack(path: Path, spacing_mm: FloatArray | None = None) -> ChunkedVolum
                 raise InputError(f"{path.name}: contains no image; copy the file again")
             page, count = file.pages[0], len(file.pages)
             no_colours(path.name, int(page.samplesperpixel))
+            require_all_strips(path.name, page)
             shape, dtype, stated = tuple(page.shape), page.dtype, stated_geometry(path.name, file, page)
             series = file.series[0]
             whole = tuple(series.shape)
