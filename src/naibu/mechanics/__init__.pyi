@@ -36,6 +36,7 @@ from .finite_strain.viscoelasticity import PronySeries, ViscoelasticSolution, si
 from .lattices.cpu.engine import LatticeEngine
 from .lattices.cpu.session import LatticeSession
 from .lattices.gpu.engine import WarpLatticeEngine
+from .lattices.model.elastic_springs import elastic_stiffness
 from .lattices.model.hexahedra import lattice_mesh
 from .lattices.model.lattice import (
     Lattice,
@@ -141,6 +142,7 @@ __all__ = [
     "cylindrical_indenter",
     "direct_solver",
     "elastic",
+    "elastic_stiffness",
     "elements",
     "general_lattice",
     "interface",

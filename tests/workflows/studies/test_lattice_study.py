@@ -37,7 +37,7 @@ def test_the_studies_that_come_along_are_valid(name: str) -> None:
     ("name", "pushing"), [("dough-first-pushing", FIRST), ("dough-second-pushing", SECOND), ("cube-pushing", CUBE_PUSHING)]
 )
 def test_the_report_s_pushings_are_those_of_the_twin(name: str, pushing: object) -> None:
-    from naibu.mechanics.lattices.simulation.loading_history import tied_nodes
+    from naibu.mechanics.lattices.simulation.tied_bodies import tied_nodes
 
     study = prepared_study(name).study
     floor, *constrained = tied_nodes(study.lattice, study.bodies)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -12,14 +13,16 @@ from naibu.core.arrays import FloatArray, IntArray
 from naibu.identification.lattice_calibration.forward_model import Reproduced
 from naibu.identification.lattice_calibration.inverse_problem import InverseProblem
 
+Residual = tuple[FloatArray, FloatArray]  # of points and of forces
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EvaluatedPoint:
     """Residuals of points and of forces in units of their noise, and derivatives by the logarithms theta (p,) of the parameters."""
 
     theta: FloatArray
-    residual: tuple[FloatArray, FloatArray]
-    slopes: tuple[FloatArray, FloatArray]
+    residual: Residual
+    slopes: Residual
 
     @property
     def information(self) -> FloatArray:
@@ -54,6 +57,26 @@ def evaluated(
     residual = [np.concatenate([row[k][0] for row in rows]) for k in range(2)]
     slopes = [np.concatenate([row[k][1] for row in rows]) for k in range(2)]
     return EvaluatedPoint(theta, (residual[0], residual[1]), (slopes[0], slopes[1]))
+
+
+def residuals_at(
+    problem: InverseProblem, trials: Sequence[tuple[FloatArray, bool]], *, threads: int = 2, executor: Executor | None = None
+) -> Iterator[Residual]:
+    """Return residuals in units of their noise at logarithms theta (p,), each with long or (True) fine steps; trials run side by side."""
+    with ThreadPoolExecutor(threads) if executor is None else nullcontext(executor) as pool:
+        jobs = []
+        for theta, fine in trials:
+            parameters = problem.unknowns.parameters(np.exp(theta))
+            jobs.append([pool.submit((case.fine if fine else case.coarse).run, parameters) for case in problem.load_cases])
+        try:
+            for (_, fine), parts in zip(trials, jobs, strict=True):
+                rows = []
+                for case, job in zip(problem.load_cases, parts, strict=True):
+                    rows.append(problem.weighed(case, job.result(), (case.fine if fine else case.coarse).long_step))
+                yield np.concatenate([row[0][0] for row in rows]), np.concatenate([row[1][0] for row in rows])
+        finally:
+            for job in (job for parts in jobs for job in parts):
+                job.cancel()
 
 
 def _joined(parts: list[Reproduced], order: IntArray) -> Reproduced:

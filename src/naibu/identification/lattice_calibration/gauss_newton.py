@@ -17,28 +17,32 @@ from numpy.typing import ArrayLike
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
-from naibu.core.progress import Progress, report_progress
+from naibu.core.progress import Progress
 from naibu.identification.lattice_calibration.estimate import LatticeEstimate
 from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint, evaluated
 from naibu.identification.lattice_calibration.forward_model import SAMPLE_S, Capture, PushedLattice, PushMode, Reproduced, averaged
 from naibu.identification.lattice_calibration.inverse_problem import InverseProblem
+from naibu.identification.lattice_calibration.least_squares import (
+    SETTLED,
+    Evaluations,
+    cost_of,
+    covariance_at,
+    next_step,
+    noise_factors,
+)
+from naibu.identification.lattice_calibration.secant_search import SecantSearch
 from naibu.identification.lattice_calibration.shape_distance import closest_points
 from naibu.identification.lattice_calibration.unknowns import LatticeUnknowns, identifiability
+from naibu.identification.lattice_calibration.widened_covariance import widened_covariance
 from naibu.mechanics.lattices.model.lattice import Lattice
 
 Index = Literal["shape", "force", "joint"]
 Window = Literal["keep", "contact"]
 
 PRIOR_SD = 1.2  # of the logarithm of every parameter around its start: as wide as the report's ranges, a factor of 60 in all
-LONGEST = 1.0  # change of a logarithm in one iteration
-FARTHEST = 0.7  # change of a logarithm to where chi-squared is looked at
-PROFILED = 4  # combinations along which it is
-FITTED_AGAIN = 4  # simulations at each end, at most
-WIDEST = 3.0  # factor of standard deviations
 POLISHING = 9  # fine runs, at most
 FINE_ITERATIONS = 8  # with derivatives of fine steps, at most; they start next to the minimum, and take what is left of it
 RENEWED = 0.05  # change of a logarithm from which on coarse derivatives are computed anew beside fine residuals
-SETTLED = 0.05  # decrease of chi-squared that is not worth another iteration
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,6 +131,10 @@ class CalibrationProblem:
         """How far chi-squared jumps as the parameters change, as a fraction of it: not at all."""
         return 0.0
 
+    def shifts(self, values: FloatArray) -> FloatArray | None:
+        """Return None: derivatives are integrated along with the motion."""
+        return None
+
     def enlarged(self, excess: tuple[float, float]) -> CalibrationProblem:
         """Return the problem with other factors of the noise."""
         return replace(self, excess=excess)
@@ -163,31 +171,6 @@ class CalibrationProblem:
         return lack[since:].ravel() / sd, slopes[:, since:].reshape(p, lack[since:].size).T / sd
 
 
-@dataclass(slots=True)
-class _Watched:
-    """Evaluations that are reported, the best of which is kept for the case of an interruption."""
-
-    threads: int
-    executor: Executor | None
-    progress: Progress | None
-    count: int = 0
-    best: EvaluatedPoint | None = None
-    problem: InverseProblem | None = None
-
-    def __call__(self, problem: InverseProblem, theta: FloatArray, *, derivatives: bool = True, fine: bool = False) -> EvaluatedPoint:
-        point = evaluated(problem, theta, derivatives=derivatives, fine=fine, threads=self.threads, executor=self.executor)
-        misfit = _misfit(point)
-        if derivatives and (self.best is None or self.problem is not problem or misfit <= _misfit(self.best)):
-            self.best, self.problem = point, problem
-        self.count += 1
-        report_progress(self.progress, "calibrate", done=self.count, objective=misfit / max(sum(map(len, point.residual)), 1))
-        return point
-
-
-def _misfit(point: EvaluatedPoint) -> float:
-    return float(sum((r**2).sum() for r in point.residual))
-
-
 def calibrate_lattice(
     problem: InverseProblem,
     start: ArrayLike | Mapping[str, float],
@@ -204,7 +187,8 @@ def calibrate_lattice(
     Iterations take steps that are long but after changes of motion; then residuals of fine steps throughout are brought to their minimum,
     by the same derivatives, or by those of fine steps where that fails. Where the law does not reproduce points or forces to within their
     noise, the noise is taken as that much larger, each for itself, and the search goes on: neither then outweighs the other by being
-    measured more precisely than the model can tell.
+    measured more precisely than the model can tell. Where derivatives are differences of simulations, as in contact, Broyden's updates
+    spare most of them (`SecantSearch`).
 
     Parameters
     ----------
@@ -236,24 +220,26 @@ def calibrate_lattice(
         An interruption before the first evaluation has ended.
     """
     centre = np.log(problem.unknowns.vector(start))
-    at = _Watched(threads, executor, progress)
+    at = Evaluations(threads, executor, progress)
     try:
         return _searched(problem, centre, prior_sd, max_iterations, reweigh, at)
     except KeyboardInterrupt:
         if at.best is None or at.problem is None:
             raise
-        return _estimate(at.problem, at.best, _covariance(at.best, prior_sd), at.count, at.count * (1 + len(centre)), finished=False)
+        return _estimate(at.problem, at.best, covariance_at(at.best, prior_sd), at.count, at.count * (1 + len(centre)), finished=False)
 
 
 def _searched(
-    problem: InverseProblem, centre: FloatArray, prior_sd: float, max_iterations: int, reweigh: bool, at: _Watched
+    problem: InverseProblem, centre: FloatArray, prior_sd: float, max_iterations: int, reweigh: bool, at: Evaluations
 ) -> LatticeEstimate:
+    if problem.shifts(np.exp(centre)) is not None:
+        return _searched_by_secants(problem, centre, prior_sd, max_iterations, reweigh, at)
     theta, runs, count = centre.copy(), 0, 0
     here, used = problem, 0
     for _ in range(3 if reweigh else 1):
         point, used = _descend(here, theta, centre, prior_sd, max_iterations, at)
         count, theta = count + used, point.theta
-        factors = _noise_factors(here, point)
+        factors = noise_factors(here, point.residual)
         if not reweigh or max(abs(np.log(max(f, 1.0) / e)) for f, e in zip(factors, here.excess, strict=True)) < 0.05:
             break
         here = here.enlarged((max(factors[0], 1.0), max(factors[1], 1.0)))
@@ -265,14 +251,23 @@ def _searched(
         count, runs = count + used, runs + used * each
     point = replace(point, slopes=at(here, point.theta).slopes)
     runs += each
-    covariance, extra = _profiled(here, point, centre, prior_sd, at)
+    covariance, extra = widened_covariance(here, point, centre, prior_sd, at)
     return _estimate(here, point, covariance, count, runs + extra)
+
+
+def _searched_by_secants(
+    problem: InverseProblem, centre: FloatArray, prior_sd: float, max_iterations: int, reweigh: bool, at: Evaluations
+) -> LatticeEstimate:
+    search = SecantSearch(problem, centre, prior_sd, at)
+    search.run(max_iterations, reweigh=reweigh)
+    covariance, extra = widened_covariance(search.problem, search.point, centre, prior_sd, at, coarse=search.coarse)
+    return _estimate(search.problem, search.point, covariance, search.iterations, search.runs + extra)
 
 
 def _estimate(
     problem: InverseProblem, point: EvaluatedPoint, covariance: FloatArray, iterations: int, runs: int, *, finished: bool = True
 ) -> LatticeEstimate:
-    factors = _noise_factors(problem, point)
+    factors = noise_factors(problem, point.residual)
     shown = tuple(f if len(r) else np.nan for f, r in zip(factors, point.residual, strict=True))
     return LatticeEstimate(
         problem.unknowns, np.exp(point.theta), covariance, point.information, (shown[0], shown[1]), iterations,
@@ -300,73 +295,26 @@ def estimate_at(problem: InverseProblem, values: ArrayLike, *, prior_sd: float =
         Values that are not positive.
     """
     theta = np.log(problem.unknowns.vector(values))
-    factors = _noise_factors(problem, evaluated(problem, theta, derivatives=False, fine=True))
+    factors = noise_factors(problem, evaluated(problem, theta, derivatives=False, fine=True).residual)
     here = problem.enlarged((max(factors[0], 1.0), max(factors[1], 1.0)))
     residual = evaluated(here, theta, derivatives=False, fine=True).residual
     point = replace(evaluated(here, theta), residual=residual)
-    return _estimate(here, point, _covariance(point, prior_sd), 0, 3 + len(theta), finished=finished)
-
-
-def _covariance(point: EvaluatedPoint, prior_sd: float) -> FloatArray:
-    return np.asarray(np.linalg.inv(point.information + np.eye(len(point.theta)) / prior_sd**2), dtype=np.float64)
-
-
-def _profiled(problem: InverseProblem, point: EvaluatedPoint, centre: FloatArray, prior_sd: float, at: _Watched) -> tuple[FloatArray, int]:
-    """Return the covariance at a point, widened along its least determined combinations to where chi-squared says; and the runs.
-
-    Combinations of classes are determined by what is nonlinear, and what the data tell of them changes by a factor within their own
-    interval. Each is moved to the ends of its interval, all others are fitted again, and the increase of the cost there tells how far one
-    standard deviation reaches :cite:p:`venzon1988`. Derivatives are those of the point.
-    """
-    covariance = _covariance(point, prior_sd)
-    values, vectors = np.linalg.eigh(covariance)
-    here = at(problem, point.theta, derivatives=False)
-    least, hessian, runs, widened = _cost(here, centre, prior_sd), np.linalg.inv(covariance), 1, covariance.copy()
-    for value, vector in list(zip(values, vectors.T, strict=True))[::-1][:PROFILED]:
-        others = np.linalg.svd(vector[None])[2][1:].T
-        reach = min(1.96 * float(np.sqrt(value)), FARTHEST)
-        for side in (-1.0, 1.0):
-            theta, best, end = point.theta + side * reach * vector, np.inf, point.theta
-            for _ in range(FITTED_AGAIN):
-                trial = replace(at(problem, theta, derivatives=False), slopes=point.slopes)
-                runs += 1
-                if (cost := _cost(trial, centre, prior_sd)) >= best:
-                    break
-                best, end = cost, theta
-                slope = trial.gradient() + (theta - centre) / prior_sd**2
-                theta = theta - others @ np.linalg.solve(others.T @ hessian @ others, others.T @ slope)
-            expected = reach**2 / float(value)
-            deviation = (end - point.theta) / np.sqrt(max(best - least, expected / WIDEST**2))
-            ratio = float(deviation @ hessian @ deviation)
-            if ratio > 1.0:
-                wider = covariance + (1.0 - 1.0 / ratio) * np.outer(deviation, deviation)
-                factor = np.sqrt(np.maximum(np.diag(wider) / np.diag(widened), 1.0))
-                widened = widened * np.outer(factor, factor)
-    return widened, runs
-
-
-def _noise_factors(problem: InverseProblem, point: EvaluatedPoint) -> tuple[float, float]:
-    rms = [float(np.sqrt((r**2).mean())) if len(r) else 0.0 for r in point.residual]
-    return rms[0] * problem.excess[0], rms[1] * problem.excess[1]
-
-
-def _cost(point: EvaluatedPoint, centre: FloatArray, prior_sd: float) -> float:
-    return _misfit(point) + float((((point.theta - centre) / prior_sd) ** 2).sum())
+    return _estimate(here, point, covariance_at(point, prior_sd), 0, 3 + len(theta), finished=finished)
 
 
 def _descend(
-    problem: InverseProblem, theta: FloatArray, centre: FloatArray, prior_sd: float, most: int, at: _Watched, *, fine: bool = False
+    problem: InverseProblem, theta: FloatArray, centre: FloatArray, prior_sd: float, most: int, at: Evaluations, *, fine: bool = False
 ) -> tuple[EvaluatedPoint, int]:
     """Iterate by Gauss and Newton; a step that does not help is shortened. Returns the last point and the iterations."""
     point, damping = at(problem, theta, fine=fine), 0.0
-    cost, used = _cost(point, centre, prior_sd), 1
+    cost, used = cost_of(point, centre, prior_sd), 1
     while used < most:
-        step, promised = _step(point, centre, prior_sd, damping)
+        step, promised = next_step(point, centre, prior_sd, damping)
         if promised < SETTLED:
             return point, used
         trial = at(problem, point.theta + step, derivatives=False, fine=fine)
         used += 1
-        if (new := _cost(trial, centre, prior_sd)) < cost:
+        if (new := cost_of(trial, centre, prior_sd)) < cost:
             settled = cost - new < SETTLED + max(1e-6 if fine else 1e-5, problem.roughness) * cost
             if settled and np.abs(step).max() < RENEWED:
                 return replace(trial, slopes=point.slopes), used
@@ -386,17 +334,8 @@ def _descend(
     )
 
 
-def _step(point: EvaluatedPoint, centre: FloatArray, prior_sd: float, damping: float) -> tuple[FloatArray, float]:
-    """Return the next change of theta, and the decrease of the cost that an undamped one promises."""
-    hessian = point.information + np.eye(len(point.theta)) / prior_sd**2
-    slope = point.gradient() + (point.theta - centre) / prior_sd**2
-    step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), slope)
-    limited = step * min(1.0, LONGEST / max(float(np.abs(step).max()), 1e-300))
-    return np.asarray(limited, dtype=np.float64), float(-slope @ step)
-
-
 def _polished(
-    problem: InverseProblem, point: EvaluatedPoint, centre: FloatArray, prior_sd: float, at: _Watched
+    problem: InverseProblem, point: EvaluatedPoint, centre: FloatArray, prior_sd: float, at: Evaluations
 ) -> tuple[EvaluatedPoint, int, bool]:
     """Move on to the minimum of residuals of fine steps by derivatives of coarse ones; return it, the runs, and whether it settled."""
 
@@ -404,13 +343,13 @@ def _polished(
         return at(problem, theta, derivatives=False, fine=True)
 
     best, damping, coarse = replace(fine(point.theta), slopes=point.slopes), 0.0, point.theta
-    cost = _cost(best, centre, prior_sd)
+    cost = cost_of(best, centre, prior_sd)
     for count in range(1, POLISHING):
-        step, promised = _step(best, centre, prior_sd, damping)
+        step, promised = next_step(best, centre, prior_sd, damping)
         if promised < SETTLED:
             return best, count, True
         trial = fine(best.theta + step)
-        if (new := _cost(trial, centre, prior_sd)) < cost:
+        if (new := cost_of(trial, centre, prior_sd)) < cost:
             slopes = best.slopes
             if np.abs(trial.theta - coarse).max() > RENEWED:
                 slopes, coarse = at(problem, trial.theta).slopes, trial.theta

@@ -21,6 +21,9 @@ class Unknowns(Protocol):
     def vector(self, values: Any) -> FloatArray:
         """Return values (p,) from numbers or a mapping by name."""
 
+    def held(self, values: FloatArray) -> FloatArray:
+        """Return values (p,) within their ranges."""
+
     def parameters(self, values: FloatArray) -> Any:
         """Return what the forward models run with."""
 
@@ -46,6 +49,9 @@ class InverseProblem(Protocol):
     @property
     def roughness(self) -> float:
         """How far chi-squared jumps as the parameters change, as a fraction of it: a decrease below that cannot be relied on."""
+
+    def shifts(self, values: FloatArray) -> FloatArray | None:
+        """Return by how much logarithms (p,) change for derivatives that are differences; None where they come with a simulation."""
 
     def enlarged(self, excess: tuple[float, float]) -> Any:
         """Return the problem with other factors of the noise."""

@@ -11,17 +11,20 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.identification.lattice_calibration.forward_model import QUICK_S, Reproduced
-from naibu.identification.lattice_calibration.study_unknowns import SHIFT, Trial, TrialChange
+from naibu.identification.lattice_calibration.study_unknowns import Trial, TrialChange
 from naibu.mechanics.contact.triangle_tree import TriangleTree
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import Lattice
 from naibu.mechanics.lattices.model.state import ConstrainedNodes
 from naibu.mechanics.lattices.model.surface import surface_of
 from naibu.mechanics.lattices.simulation.contact import push
-from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy, check_study, tied_nodes
+from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy, check_study
 from naibu.mechanics.lattices.simulation.tangent_linear import Loads, ParameterChange, driven_steps, rest_change
+from naibu.mechanics.lattices.simulation.tied_bodies import tied_constraints
 
 QUICK_TOUCHING_S = 0.02  # like `QUICK_S`, in contact, where the first touch of moving indenters is no change of their motion
+
+ROUGH = 1e-2  # tolerance of the solver in long steps: its error is a tenth of what they differ from fine ones
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,6 +70,8 @@ class StudyModel:
         Sums over fine steps of their shares in the means of the windows, those of a window adding up to one.
     stretches : tuple
         How the steps are taken.
+    coarse : bool
+        Whether most of them are long.
     """
 
     study: LatticeStudy
@@ -76,6 +81,7 @@ class StudyModel:
     window_steps: int
     weights: FloatArray
     stretches: tuple[_Stretch, ...]
+    coarse: bool
 
     @classmethod
     def of(
@@ -123,7 +129,7 @@ class StudyModel:
         each = np.full((windows * window_steps, len(study.bodies)), 1.0 / window_steps) if shares is None else shares
         weights = np.concatenate([np.zeros((1, len(study.bodies))), np.cumsum(each, axis=0)])
         stretches = _stretches(study, captures, end, window_steps, coarse)
-        return cls(study, surface_of(study.lattice), captures, windows, window_steps, weights, stretches)
+        return cls(study, surface_of(study.lattice), captures, windows, window_steps, weights, stretches, coarse)
 
     @property
     def long_step(self) -> float:
@@ -150,7 +156,7 @@ class StudyModel:
 
     def _difference(self, found: Reproduced, change: TrialChange) -> tuple[FloatArray, FloatArray]:
         moved = self._tied(change.moved, ()) if self.study.tied else self._touching(change.moved)
-        return (moved.positions - found.positions) / SHIFT, (moved.force - found.force) / SHIFT
+        return (moved.positions - found.positions) / change.shift, (moved.force - found.force) / change.shift
 
     def _lattice(self, trial: Trial) -> tuple[Lattice, FloatArray | None]:
         """Return the lattice with a trial's masses, and the external force on it."""
@@ -192,7 +198,10 @@ class StudyModel:
         study = self.study
         lattice, external = self._lattice(trial)
         engines = {
-            e: LatticeEngine.of(lattice, trial.parameters, step=e * study.step_s, tolerance=study.tolerance) for e in self._lengths()
+            e: LatticeEngine.of(
+                lattice, trial.parameters, step=e * study.step_s, tolerance=max(study.tolerance, ROUGH if self.coarse else 0.0)
+            )
+            for e in self._lengths()
         }
         state = next(iter(engines.values())).rest()
         sums, kept = np.zeros((self.windows, len(study.bodies), 3)), {0: state.position}
@@ -223,7 +232,7 @@ def _stretches(study: LatticeStudy, captures: Sequence[int], end: int, ratio: in
     step, bodies = study.step_s, len(study.bodies)
     never = np.iinfo(np.int64).max
     until = [never if b.tied_until_s is None or np.isinf(b.tied_until_s) else round(b.tied_until_s / step) for b in study.bodies]
-    nodes = tied_nodes(study.lattice, study.bodies) if study.tied else ()
+    tied = tied_constraints(study.lattice, study.bodies) if study.tied else ()
     kinks = {0, *(round(t / step) for b in study.bodies if b.motion is not None for t in b.motion.kinks), *(u for u in until if u < end)}
     events = sorted({*captures, *kinks})
     quick = round((QUICK_S if study.tied else QUICK_TOUCHING_S) / step)
@@ -242,6 +251,6 @@ def _stretches(study: LatticeStudy, captures: Sequence[int], end: int, ratio: in
             path = np.stack([np.diff(body.moved(times), axis=0) / (each * step) for body in study.bodies], axis=1)
             constrained = ConstrainedNodes.none()
             for k in range(bodies if study.tied else 0):
-                constrained = constrained + ConstrainedNodes.of(nodes[k], k) if until[k] > a else constrained
+                constrained = constrained + tied[k] if until[k] > a else constrained
             found.append(_Stretch(a, b, each, constrained, path))
     return tuple(found)

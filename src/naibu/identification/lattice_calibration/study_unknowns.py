@@ -43,12 +43,15 @@ class TrialChange:
     Attributes
     ----------
     moved : Trial
-        The trial with one logarithm larger by `SHIFT`, for differences.
+        The trial with one logarithm larger by `shift`, for differences.
+    shift : float
+        Plus or minus `SHIFT`.
     tangent : ParameterChange, optional
         Derivative of the elements' parameters by that logarithm; None of what is no parameter of the elements.
     """
 
     moved: Trial
+    shift: float
     tangent: ParameterChange | None
 
 
@@ -165,8 +168,8 @@ class StudyUnknowns:
         return require_positive_values(self.names, found)
 
     def parameters(self, values: FloatArray) -> Trial:
-        """Return what is simulated with values (p,); they are held within their bounds, and kinetic friction below static friction."""
-        held = np.clip(values, *self.bounds.T)
+        """Return what is simulated with values (p,), as far as they are `held`."""
+        held = self.held(values)
         given, scale = self.study.parameters, self.study.lattice.scale
         tables = [given.stiffness.copy(), given.voigt_damping.copy(), given.series_damping.copy()]
         for kind, mine, value in zip(self.kind, self.members, held, strict=False):
@@ -182,17 +185,39 @@ class StudyUnknowns:
 
     def changes(self, values: FloatArray) -> tuple[TrialChange, ...]:
         """Return the directions of the logarithms of all values."""
-        held, scale = np.clip(values, *self.bounds.T), self.study.lattice.scale
+        held, scale, shifts = self.held(values), self.study.lattice.scale, self.shifts(values)
         zero, result = np.zeros(len(scale)), []
         for k in range(len(values)):
             moved = held.copy()
-            moved[k] *= np.exp(SHIFT)
+            moved[k] *= np.exp(shifts[k])
             tangent = None
             if k < len(self.kind):
                 own = np.where(self.members[k], held[k] * scale, 0.0)
                 tangent = ParameterChange(*(own if self.kind[k] == kind else zero for kind in range(3)))
-            result.append(TrialChange(self.parameters(moved), tangent))
+            result.append(TrialChange(self.parameters(moved), float(shifts[k]), tangent))
         return tuple(result)
+
+    def held(self, values: FloatArray) -> FloatArray:
+        """Return values (p,) within their bounds, static friction not below kinetic friction.
+
+        Kinetic friction follows from the force while something slides, static friction from how it begins to: the latter gives way.
+        """
+        held = np.clip(values, *self.bounds.T)
+        for static, kinetic in self._frictions():
+            held[static] = max(held[static], held[kinetic])
+        return held
+
+    def shifts(self, values: FloatArray) -> FloatArray:
+        """Return by how much logarithms (p,) change for differences: up, but down from an upper bound and from static friction."""
+        most = self.bounds[:, 1].copy()
+        for static, kinetic in self._frictions():
+            most[kinetic] = min(most[kinetic], values[static])
+        return np.where(values * np.exp(SHIFT) > most, -SHIFT, SHIFT)
+
+    def _frictions(self) -> list[tuple[int, int]]:
+        """Return the places of static and kinetic friction of the same bodies."""
+        where = {(quantity, bodies): len(self.kind) + k for k, (quantity, bodies) in enumerate(self.surfaces)}
+        return [(place, where["kinetic_friction", bodies]) for (quantity, bodies), place in where.items() if quantity == "static_friction"]
 
 
 def _element_groups(study: LatticeStudy, groups: Groups) -> tuple[list[int], list[BoolArray], list[str], list[float]]:

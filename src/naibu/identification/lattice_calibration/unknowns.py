@@ -87,6 +87,10 @@ class LatticeUnknowns:
                 raise InputError(f"values have shape {found.shape}, but there are {len(self.names)} parameters: {', '.join(self.names)}")
         return require_positive_values(self.names, found)
 
+    def held(self, values: FloatArray) -> FloatArray:
+        """Return the values (p,): they have no range."""
+        return values
+
     def parameters(self, values: FloatArray) -> LatticeParameters:
         """Return the parameters of all elements for values (p,)."""
         tables = np.zeros((3, len(self.scale)))

@@ -14,6 +14,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from naibu.core.errors import InputError
 from naibu.io.experiment_folder.schema import Finite, Length, Mass, NotNegative, Position, Positive, between
 from naibu.io.files.parsing import parsed_toml
+from naibu.io.study_schemas.material_table import MaterialTable
 
 # beyond these bounds the unit, or the number, is another; computations within them neither overflow nor vanish
 Duration = Annotated[Positive, between(1e-9, 1e6)]
@@ -165,7 +166,8 @@ class IndenterTable(_Surface):
     length_mm: Length | None = None
     axis: Three = [0.0, 0.0, 1.0]
     centre_mm: Three
-    contact: Literal["friction", "tied"] = "friction"
+    contact: Literal["friction", "tied", "points"] = "friction"
+    points_mm: Length | None = None
     until_s: Annotated[NotNegative, between(0.0, 1e6)] | None = None
     path: _timed(4, "[time in s, displacement along x, y, z in mm]") | None = None  # type: ignore[valid-type]
     velocity: _timed(4, "[time in s, velocity along x, y, z in mm/s from then on]") | None = None  # type: ignore[valid-type]
@@ -190,17 +192,24 @@ class IndenterTable(_Surface):
                 f"path begins with the displacement {self.path[0][1:]}; it must begin with 0, 0, 0: set centre_mm to the start"
             )
         self._driven()
-        if self.until_s is not None and self.contact != "tied":
-            raise ValueError('until_s is the time at which a tied indenter lets go; write contact = "tied", or remove it')
+        if self.until_s is not None and self.contact == "friction":
+            raise ValueError('until_s is the time at which a tied indenter lets go; write contact = "tied" or "points", or remove it')
+        if self.contact == "points" and self.shape != "box":
+            raise ValueError(f'contact = "points" needs a flat side: write shape = "box", not "{self.shape}", or contact = "tied"')
+        if self.points_mm is not None and self.contact != "points":
+            raise ValueError('points_mm is the distance of the points of contact = "points"; write that, or remove points_mm')
         return self
 
     def _driven(self) -> None:
         if self.force is None and (self.direction or self.mass_g):
             raise ValueError("direction and mass_g belong to an indenter that is moved by force; give force, or remove them")
-        if self.force is not None and (self.direction is None or np.linalg.norm(self.direction) < _LEAST or self.mass_g is None):
+        lacks_mass = self.mass_g is None and self.contact != "points"
+        if self.force is not None and (self.direction is None or np.linalg.norm(self.direction) < _LEAST or lacks_mass):
             raise ValueError("an indenter that is moved by force needs direction = [x, y, z] and mass_g")
         if self.force is not None and self.contact == "tied":
-            raise ValueError('a tied indenter cannot be moved by force; write contact = "friction"')
+            raise ValueError('a tied indenter cannot be moved by force; write contact = "friction", or "points"')
+        if self.mass_g is not None and self.contact == "points":
+            raise ValueError('mass_g: points of contact = "points" have no mass; remove it')
 
 
 class OutputTable(_Table):
@@ -217,7 +226,8 @@ class StudyFile(_Table):
     title: str = ""
     object: ObjectTable
     lattice: LatticeTable
-    parameters: ParametersTable
+    parameters: ParametersTable | None = None
+    material: MaterialTable | None = None
     simulation: SimulationTable
     floor: FloorTable | None = None
     indenter: list[IndenterTable] = []
@@ -240,11 +250,27 @@ class StudyFile(_Table):
                     f"[object] size_mm = {self.object.size_mm}: {edge:g} mm is no whole number of voxels of [lattice] spacing_mm = "
                     f"{spacing:g}; choose a spacing that divides all edges"
                 )
+        if self.parameters is None and self.material is None:
+            raise ValueError(
+                "[parameters] is missing; add a table [parameters] with K = 40.0, C1 = 20.0 and C2 = 60.0, or [material] with "
+                "young_modulus_kPa of the solid"
+            )
+        if self.parameters is not None and self.material is not None:
+            raise ValueError("[parameters] and [material] are both there; keep one of the two")
+        self._material()
         if self.floor is None and not self.indenter:
             raise ValueError("there is neither a [floor] nor a [[indenter]]: nothing would touch the object; add one")
         self._times()
         self._contacts()
         return self
+
+    def _material(self) -> None:
+        if self.material is None:
+            return
+        if self.lattice.kind != "classic":
+            raise ValueError(f'[material] does not go with [lattice] kind = "{self.lattice.kind}"; write kind = "classic", or [parameters]')
+        if not isinstance(self.material.young_modulus_kPa, float) and self.object.labels is None:
+            raise ValueError("[material] young_modulus_kPa by label or by voxel needs [object] labels; give one number for a box")
 
     def _times(self) -> None:
         simulation, output = self.simulation, self.output
@@ -273,10 +299,12 @@ class StudyFile(_Table):
 
     def _contacts(self) -> None:
         touching = [_number(k) for k, p in enumerate(self.indenter) if p.contact == "friction"]
-        tied = [_number(k) for k, p in enumerate(self.indenter) if p.contact == "tied"]
+        tied = [_number(k) for k, p in enumerate(self.indenter) if p.contact != "friction"]
         sticking = self.floor is not None and self.floor.contact == "sticking"
         if touching and tied:
-            raise ValueError(f'{touching[0]} has contact = "friction" and {tied[0]} contact = "tied"; one study has one kind of contact')
+            raise ValueError(
+                f'{touching[0]} has contact = "friction" and {tied[0]} contact = "tied" or "points"; one study has one kind of contact'
+            )
         if touching and sticking:
             raise ValueError(
                 f'[floor] contact = "sticking" does not go with {touching[0]} in contact by friction; write contact = "friction" with '
@@ -287,7 +315,7 @@ class StudyFile(_Table):
         rubbing = bool(touching) or (self.floor is not None and not sticking)
         if rubbing and self.simulation.method != "implicit":
             raise ValueError(f'[simulation] method = "{self.simulation.method}": contact by friction needs method = "implicit"')
-        driven = [k for k, p in enumerate(self.indenter) if p.force is not None]
+        driven = [k for k, p in enumerate(self.indenter) if p.force is not None and p.contact == "friction"]
         if len(driven) > 1:
             raise ValueError(f"{_number(driven[1])} force: one indenter of a study can be moved by force; give the others a path")
         moving = [k for k, p in enumerate(self.indenter) if p.path or p.velocity]
@@ -299,10 +327,11 @@ def _number(k: int) -> str:
     return f"[[indenter]] number {k + 1}"
 
 
-_TABLES: dict[str, type[_Table]] = {
+_TABLES: dict[str, type[BaseModel]] = {
     "object": ObjectTable,
     "lattice": LatticeTable,
     "parameters": ParametersTable,
+    "material": MaterialTable,
     "simulation": SimulationTable,
     "floor": FloorTable,
     "indenter": IndenterTable,
@@ -311,8 +340,8 @@ _TABLES: dict[str, type[_Table]] = {
 _MENDS = {
     "object": "add a table [object] with size_mm = [100, 50, 70] and mass_g = 510",
     "lattice": "add a table [lattice] with spacing_mm = 10.0",
-    "parameters": "add a table [parameters] with K = 40.0, C1 = 20.0 and C2 = 60.0",
     "simulation": "add a table [simulation] with duration_s = 5.0",
+    "young_modulus_kPa": "write a number, { 1 = 12.0, 2 = 40.0 } by label, or the file of a volume",
     "K": "stiffness of an element, mN/mm",
     "C1": "dashpot parallel to the spring, mN s/mm",
     "C2": "dashpot in series with the spring, mN s/mm",

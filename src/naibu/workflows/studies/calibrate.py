@@ -136,6 +136,10 @@ def calibrate_study(
     if not shapes and not forces:
         raise InputError("`shapes` and `forces` are both missing; give captured points, records of force sensors, or both")
     prepared = prepared_study(study)
+    if prepared.settings.material is not None and groups != "given":
+        raise InputError(
+            f"groups is {groups!r}, but the elements of {prepared.source} come from [material]; choose 'given', or write [parameters]"
+        )
     captured = read_captured_shapes(shapes) if shapes else ()
     records = read_force_records(forces) if forces else ()
     unknowns = StudyUnknowns.of(prepared.study, groups=groups, friction=friction, pull_off=pull_off)
@@ -155,7 +159,7 @@ def calibrate_study(
     warnings = _warnings(problem, estimate, before)
     chapter = calibration_chapter(prepared.title, problem, estimate, before, after, records, warnings, options)
     comment = f"{prepared.title}, calibrated by naibu {__version__} from {', '.join(map(_file_name, (*shapes, *forces)))}"
-    target = write_atomically(folder / name, study_document(_with_labels(prepared, settings, folder), comment))
+    target = write_atomically(folder / name, study_document(_with_volumes(prepared, settings, folder), comment))
     page = write_atomically(folder / "calibration.html", chapter_html(chapter))
     numbers = {**_numbers(estimate), "misfit": misfit_numbers(problem, before, after), "warnings": list(warnings), "settings": options}
     written = write_atomically(folder / "calibration.json", json.dumps(numbers, indent=1, ensure_ascii=False) + "\n")
@@ -247,7 +251,8 @@ def calibrated_settings(settings: StudyFile, estimate: LatticeEstimate) -> Study
         for inner in (kind, *places)[:-1]:
             node = node.setdefault(inner, {})
         node[(kind, *places)[-1]] = _rounded(value)
-    given["parameters"] |= tables
+    if tables:
+        given["parameters"] |= tables
     indenters = unknowns.parameters(estimate.values).indenters
     bodies = ([given["floor"]] if settings.floor is not None else []) + given.get("indenter", [])
     for quantity, members in unknowns.surfaces:
@@ -262,16 +267,24 @@ def _rounded(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-def _with_labels(prepared: PreparedStudy, settings: StudyFile, folder: Path) -> StudyFile:
-    """Copy a volume of labels beside the study that is written, where a study's files must be."""
-    labels = settings.object.labels
-    if labels is None:
-        return settings
-    source = Path(prepared.source).parent / labels
+def _with_volumes(prepared: PreparedStudy, settings: StudyFile, folder: Path) -> StudyFile:
+    """Copy the volumes that a study names beside the study that is written, where they must be."""
+    labels, material = settings.object.labels, settings.material
+    if labels is not None:
+        copied = _copied(prepared, labels, folder)
+        settings = settings.model_copy(update={"object": settings.object.model_copy(update={"labels": copied})})
+    if material is not None and isinstance(material.young_modulus_kPa, str):
+        copied = _copied(prepared, material.young_modulus_kPa, folder)
+        settings = settings.model_copy(update={"material": material.model_copy(update={"young_modulus_kPa": copied})})
+    return settings
+
+
+def _copied(prepared: PreparedStudy, name: str, folder: Path) -> str:
+    source = Path(prepared.source).parent / name
     target = folder / source.name
     if not (target.exists() and target.samefile(source)):
         shutil.copyfile(source, target)
-    return settings.model_copy(update={"object": settings.object.model_copy(update={"labels": source.name})})
+    return source.name
 
 
 def _file_name(source: str | os.PathLike[str]) -> str:

@@ -7,7 +7,7 @@ import json
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -20,20 +20,21 @@ from naibu.core.arrays import BoolArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.rigid_transform import RigidTransform
-from naibu.core.volume import Volume
 from naibu.io.files.parsing import parsed_toml
 from naibu.io.files.provenance import sha256
-from naibu.io.files.reading import file_beside, guarded_reading, read_bytes, require_regular
-from naibu.io.images import read_volume
-from naibu.io.study_schemas.lattice_study_schema import FloorTable, IndenterTable, ObjectTable, StudyFile, checked_study, load_study
+from naibu.io.files.reading import file_beside, read_bytes
+from naibu.io.study_schemas.lattice_study_schema import FloorTable, IndenterTable, StudyFile, checked_study, load_study
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter, box_indenter, cylindrical_indenter, plane_indenter, spherical_indenter
-from naibu.mechanics.lattices.model.contact_state import check_outside
+from naibu.mechanics.lattices.model.contact_state import TOUCH_MM, check_outside
 from naibu.mechanics.lattices.model.hexahedra import lattice_mesh
-from naibu.mechanics.lattices.model.lattice import CLASSES, Lattice, box_mask, classic_lattice, lattice_parameters
+from naibu.mechanics.lattices.model.lattice import CLASSES, Lattice, box_mask, classic_lattice
 from naibu.mechanics.lattices.model.octree import octree_lattice
 from naibu.mechanics.lattices.model.voxels import cropped_mask, voxel_mask
 from naibu.mechanics.lattices.simulation.loading_history import Drive, LatticeStudy, StudyBody, check_study
+from naibu.mechanics.lattices.simulation.tied_bodies import FacePoints
 from naibu.mechanics.prescribed_motion import PrescribedMotion
+from naibu.workflows.studies.label_volume import label_volume
+from naibu.workflows.studies.lattice_material import element_parameters, material_inputs
 
 OCTREES = ("octree-0", "octree-1", "octree-2")
 BASES = ("cube-pushing", "dough-first-pushing", "dough-second-pushing", "dough-pressed-by-sphere", "dough-pushed-over-floor")
@@ -151,6 +152,7 @@ def _read(source: str | os.PathLike[str]) -> tuple[bytes, Path, str]:
 
 def _prepared(source: str | os.PathLike[str], path: Path, name: str, settings: StudyFile, digest: str) -> PreparedStudy:
     mask, frame, inputs = _mask(path, path.parent, settings)
+    inputs |= material_inputs(path, settings)
     study = _study(path, settings, mask, frame)
     said = json.dumps([settings.model_dump(mode="json"), inputs, __version__], sort_keys=True)
     inputs = {path.name: digest, **inputs}
@@ -169,7 +171,7 @@ def _mask(path: Path, folder: Path, settings: StudyFile) -> tuple[BoolArray, Rig
         return box_mask((x, y, z)), RigidTransform.identity(), {}
     assert table.labels is not None
     file = file_beside(folder / path.name, table.labels)
-    volume = _label_volume(path, file, table)
+    volume = label_volume(path, file, table)
     chosen = np.isin(volume.values, table.label) if table.label else volume.values != 0
     if not chosen.any():
         present = ", ".join(f"{v:g}" for v in np.unique(volume.values)[:8])
@@ -193,39 +195,14 @@ def _mask(path: Path, folder: Path, settings: StudyFile) -> tuple[BoolArray, Rig
     return mask, frame, {Path(table.labels).name: sha256(file)}
 
 
-def _label_volume(path: Path, file: Path, table: ObjectTable) -> Volume:
-    """Read labels; an array of NumPy has the axes x, y, z."""
-    place = f"{path}: [object] labels = {table.labels!r}"
-    if file.suffix != ".npy":
-        try:
-            return read_volume(file, spacing_mm=table.voxel_mm)
-        except InputError as error:
-            raise InputError(f"{place}: {error}") from error
-    if table.voxel_mm is None:
-        raise InputError(f"{place}: an array does not state its voxel size; add voxel_mm = [1.0, 1.0, 1.0]")
-    try:
-        require_regular(file)
-        with guarded_reading(file, "an array of NumPy"):
-            # of a memory map the announced size is checked against that of the file
-            values = np.load(file, mmap_mode="r", allow_pickle=False)
-            return Volume.from_array(np.array(values).T, spacing_mm=table.voxel_mm)
-    except InputError as error:
-        raise InputError(f"{place}: {error}; save the labels by numpy.save, with the axes x, y, z") from error
-
-
 def _study(path: Path, settings: StudyFile, mask: BoolArray, frame: RigidTransform) -> LatticeStudy:
     simulation = settings.simulation
     lattice = _lattice(path, settings, mask, frame)
-    p = settings.parameters
-    try:
-        parameters = lattice_parameters(lattice, p.K, p.C1, p.C2)
-    except InputError as error:
-        raise InputError(f"{path}: [parameters] {error}") from error
     samples = round(settings.output.every_s / settings.sample_s)
     gravity = simulation.gravity_mm_per_s2
     study = LatticeStudy(
         lattice,
-        parameters,
+        element_parameters(path, settings, lattice),
         _bodies(path, settings, lattice),
         simulation.step_s,
         round(simulation.duration_s / settings.output.every_s),
@@ -250,6 +227,7 @@ def _lattice(path: Path, settings: StudyFile, mask: BoolArray, frame: RigidTrans
     try:
         if table.kind == "classic":
             return classic_lattice(mask, table.spacing_mm, lumping=table.masses, frame=frame, **amount)
+        assert settings.parameters is not None  # no [material] with octrees
         ratios = class_ratios(settings.parameters.K)
         return octree_lattice(
             mask, table.spacing_mm, int(table.kind[-1]), lumping=table.masses, class_stiffness=ratios, frame=frame, **amount
@@ -278,6 +256,8 @@ def _bodies(path: Path, settings: StudyFile, lattice: Lattice) -> tuple[StudyBod
         body = _indenter(table, k, settings.simulation.duration_s)
         try:
             check_outside(lattice, [body.indenter])
+            if table.contact == "points":
+                body = replace(body, points=_face_points(table, lattice))
         except InputError as error:
             told = re.sub(r"^indenters\[0\], an? \w+, ", "the indenter ", str(error))
             raise InputError(f"{path}: [[indenter]] number {k + 1} centre_mm = {table.centre_mm}: {told}") from error
@@ -314,9 +294,29 @@ def _indenter(table: IndenterTable, k: int, duration_s: float) -> StudyBody:
         force = np.array(table.force)
         drive = Drive(force[:, 0], force[:, 1], np.array(table.direction), 1e-3 * (table.mass_g or 0.0))
     until = None
-    if table.contact == "tied":
+    if table.contact != "friction":
         until = np.inf if table.until_s is None else table.until_s
     return StudyBody(table.name or f"indenter {k + 1}", _rigid(table), _motion(table, duration_s), drive, until)
+
+
+def _face_points(table: IndenterTable, lattice: Lattice) -> FacePoints:
+    """Return a grid of points on the side of a box that lies on a face of the object, as far as they are over it."""
+    size, centre = np.array(table.size_mm), np.array(table.centre_mm)
+    low, high = lattice.points.min(axis=0), lattice.points.max(axis=0)
+    ends = {"-": (centre + 0.5 * size, low), "+": (centre - 0.5 * size, high)}
+    faces = [(sign, a) for sign, (own, face) in ends.items() for a in range(3) if abs(own[a] - face[a]) < TOUCH_MM]
+    if not faces:
+        raise InputError('contact = "points" needs a side of the box on an outermost face of the object; move centre_mm so that they touch')
+    sign, across = faces[0]
+    each, axes = table.points_mm or lattice.spacing_mm, []
+    for a in range(3):
+        count = int(np.floor(size[a] / each + 1e-9))
+        own = centre[a] + each * (np.arange(count + 1) - 0.5 * count)
+        axes.append(ends[sign][1][[a]] if a == across else own[(own >= low[a] - 1e-9) & (own <= high[a] + 1e-9)])
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    if not len(points):
+        raise InputError("none of the points of the box lies over the face of the object; make points_mm less, or move centre_mm")
+    return FacePoints(f"{sign}{'xyz'[across]}", points)
 
 
 def _rigid(table: IndenterTable) -> RigidIndenter:

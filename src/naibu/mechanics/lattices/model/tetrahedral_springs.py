@@ -59,6 +59,11 @@ def volumetric_lattice(
     -----
     With the volumes V of the tetrahedra at a node or an edge: ``m = density sum V / 4``, ``K = E sum V / L^2`` and
     ``C1 = 2 ratio sqrt(K (m_i + m_j))``.
+
+    Averaged over all directions such springs have the modulus E and Poisson's ratio 1/4; where edges have preferred directions they do
+    not. Kuhn's six tetrahedra of a cube, all cut along one space diagonal, have springs of E h along the axes and E h / 3 along the
+    diagonals of faces and of the cube: a bar along an axis is 1.36 times as stiff as E says. Springs of cubes from moduli
+    (`naibu.mechanics.elastic_stiffness`) have no such error.
     """
     require_positive(density, "the density", "kg/mm^3")
     require_positive(young_modulus, "Young's modulus", "kPa")

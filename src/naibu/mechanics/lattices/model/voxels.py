@@ -6,8 +6,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from naibu.core.arrays import BoolArray, FloatArray, as_mask, require_positive
+from naibu.core.errors import InputError
 from naibu.core.rigid_transform import RigidTransform
 from naibu.core.volume import Volume
+from naibu.mechanics.lattices.model.lattice import Lattice
 
 
 def voxel_mask(volume: Volume, chosen: ArrayLike, spacing_mm: float) -> tuple[BoolArray, RigidTransform]:
@@ -48,6 +50,45 @@ def cropped_mask(mask: BoolArray, frame: RigidTransform, spacing_mm: float) -> t
     low, high = inside.min(axis=0), inside.max(axis=0) + 1
     box = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
     return mask[box], RigidTransform(frame.rotation, np.zeros(3), frame.applied(spacing_mm * low))
+
+
+def cube_means(lattice: Lattice, volume: Volume) -> FloatArray:
+    """Return the mean of a volume in every cube (c,) of a lattice: of the voxels whose centres lie in it.
+
+    Cubes that hold no centre take the voxel around their own. NaN is not counted, and marks cubes without a value.
+
+    Parameters
+    ----------
+    lattice : Lattice
+        Classic, with cubes, in a frame of the scanner.
+    volume : Volume
+        In the scanner's frame, on any grid.
+
+    Raises
+    ------
+    InputError
+        A lattice without cubes.
+    """
+    if lattice.cells is None:
+        raise InputError("the lattice has no cubes; make it by classic_lattice")
+    low, cells = lattice.points.min(axis=0), lattice.cells
+    at = np.rint((lattice.points[cells].min(axis=1) - low) / lattice.spacing_mm).astype(np.int64)
+    number = np.full(tuple(at.max(axis=0) + 1), -1)
+    number[tuple(at.T)] = np.arange(len(cells))
+    known = np.isfinite(volume.values)
+    centres = volume.to_physical(np.argwhere(known.transpose(2, 1, 0)).astype(float))
+    place = np.floor((lattice.frame.inverse().applied(centres) - low) / lattice.spacing_mm + 1e-9).astype(np.int64)
+    inside = ((place >= 0) & (place < number.shape)).all(axis=1)
+    mine = np.full(len(place), -1)
+    mine[inside] = number[tuple(place[inside].T)]
+    values = np.asarray(volume.values, dtype=float).transpose(2, 1, 0)[known.transpose(2, 1, 0)]
+    sums, counts = (np.bincount(mine[mine >= 0], w, minlength=len(cells)) for w in (values[mine >= 0], None))
+    found = np.divide(sums, counts, out=np.full(len(cells), np.nan), where=counts > 0)
+    middle = volume.to_index(lattice.frame.applied(lattice.points[cells].mean(axis=1)))
+    nearest = np.rint(middle).astype(np.int64)
+    near = ((nearest >= 0) & (nearest < np.array(volume.shape)[::-1])).all(axis=1) & (counts == 0)
+    found[near] = volume.values[tuple(nearest[near][:, ::-1].T)]
+    return np.asarray(found)
 
 
 def _filled_cubes(voxels: BoolArray, voxel_mm: FloatArray, spacing_mm: float) -> BoolArray:

@@ -13,12 +13,13 @@ from naibu.core.errors import InputError
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.contact.session_protocol import Engine, Session
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
-from naibu.mechanics.lattices.model.contact_state import TOUCH_MM, begin_contact, check_outside
+from naibu.mechanics.lattices.model.contact_state import begin_contact, check_outside
 from naibu.mechanics.lattices.model.contact_surface import ContactSurface
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState, Method
 from naibu.mechanics.lattices.simulation.contact import push, push_by_force
 from naibu.mechanics.lattices.simulation.engine_selection import lattice_engine
+from naibu.mechanics.lattices.simulation.tied_bodies import FacePoints, tied_constraints
 from naibu.mechanics.prescribed_motion import PrescribedMotion
 
 StudyEngine = Engine[LatticeState, ConstrainedNodes]
@@ -60,6 +61,8 @@ class StudyBody:
         Force that moves it instead; one body of a study at most, and the others then stand still.
     tied_until_s : float, optional
         Nodes that touch it at the start move with it until then, s, and are free of it afterwards; infinite for ever. None for contact.
+    points : FacePoints, optional
+        Of a tied body: points that hand its displacement over to the nodes around them, or its force if it is driven.
     """
 
     name: str
@@ -67,6 +70,12 @@ class StudyBody:
     motion: PrescribedMotion | None = None
     drive: Drive | None = None
     tied_until_s: float | None = None
+    points: FacePoints | None = None
+
+    @property
+    def by_force(self) -> bool:
+        """Whether a force moves it."""
+        return self.drive is not None
 
     def moved(self, times: FloatArray) -> FloatArray:
         """Return the displacement (k, 3), mm, at times (k,), s."""
@@ -191,29 +200,6 @@ class StudyFrame:
     force: FloatArray
 
 
-def tied_nodes(lattice: Lattice, bodies: tuple[StudyBody, ...]) -> tuple[IntArray, ...]:
-    """Return the nodes that are tied to every body: those on its surface at the start, and on no earlier body's.
-
-    Raises
-    ------
-    InputError
-        A body that touches no node, or starts inside the object.
-    """
-    free = np.ones(lattice.n_nodes, dtype=bool)
-    found = []
-    for body in bodies:
-        check_outside(lattice, [body.indenter])
-        touched = np.abs(body.indenter.gap(lattice.points)) < TOUCH_MM
-        if not touched.any():
-            nearest = float(body.indenter.gap(lattice.points).min())
-            raise InputError(
-                f"{body.name} touches no node, the nearest is {nearest:.4g} mm away: a body can be tied to what it touches at the start"
-            )
-        found.append(np.flatnonzero(touched & free))
-        free &= ~touched
-    return tuple(found)
-
-
 def check_study(study: LatticeStudy) -> None:
     """Check that a study can be run.
 
@@ -227,7 +213,12 @@ def check_study(study: LatticeStudy) -> None:
         loose = [body.name for body in study.bodies if body.tied_until_s is None]
         if loose:
             raise InputError(f"{', '.join(loose)} cannot be in contact while other bodies are tied: tie all, or none")
-        tied_nodes(study.lattice, study.bodies)
+        rigid = [body.name for body in study.bodies if body.drive is not None and body.points is None]
+        if rigid:
+            raise InputError(
+                f"{', '.join(rigid)} cannot be tied and driven by a force; give points that hand it over, or let it be in contact"
+            )
+        tied_constraints(study.lattice, study.bodies)
         return
     if study.method != "implicit":
         raise InputError(f"contact with friction needs method 'implicit', not {study.method!r}; or tie the bodies")
@@ -318,21 +309,24 @@ def _external_work(study: LatticeStudy, before: LatticeState, after: LatticeStat
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Tied:
-    """Steps of nodes that are tied to bodies."""
+    """Steps of nodes that are tied to bodies, or that their points push."""
 
     study: LatticeStudy
-    session: Session[LatticeState, ConstrainedNodes]
+    engine: StudyEngine
+    session: Session[LatticeState, ConstrainedNodes] | None  # none where forces change from sample to sample
     constrained: tuple[ConstrainedNodes, ...]
     until: IntArray
+    shares: dict[int, FloatArray]  # of the nodes in the forces of bodies
 
     @classmethod
     def of(cls, study: LatticeStudy, engine: StudyEngine, start: StudyState) -> _Tied:
-        nodes = tied_nodes(study.lattice, study.bodies)
+        constrained = tied_constraints(study.lattice, study.bodies)
         ends = [body.tied_until_s for body in study.bodies]
         never = np.iinfo(np.int64).max
         until = np.array([never if end is None or np.isinf(end) else round(end / study.step_s) for end in ends], dtype=np.int64)
-        session = engine.session(start.lattice, external_force=study.external_force)
-        return cls(study, session, tuple(ConstrainedNodes.of(mine, k) for k, mine in enumerate(nodes)), until)
+        shares = {k: b.points.shares(study.lattice) for k, b in enumerate(study.bodies) if b.by_force and b.points is not None}
+        session = None if shares else engine.session(start.lattice, external_force=study.external_force)
+        return cls(study, engine, session, constrained, until, shares)
 
     def advance(self, state: StudyState, first: int) -> tuple[StudyState, FloatArray]:
         """Take the steps of a sample, in pieces between which bodies let go."""
@@ -341,20 +335,46 @@ class _Tied:
         stops = [first, *sorted({int(u) for u in self.until if first < u < last}), last]
         work, impulse = state.work.copy(), np.zeros((bodies, 3))
         path = _velocities(study, first) if bodies else np.zeros((study.sample_steps, 0, 3))
+        lattice = state.lattice
         for begin, end in pairwise(stops):
             constrained = ConstrainedNodes.none()
             for mine, until in zip(self.constrained, self.until, strict=True):
                 constrained = constrained + mine if until > begin else constrained
-            own = path[begin - first : end - first]
-            self.session.constrain(constrained, bodies)
-            reaction = self.session.step(own, steps=end - begin).bodies
+            own, forces = path[begin - first : end - first], self._forces(begin, end)
+            session = self.session or self.engine.session(lattice, external_force=self._pushed(forces))
+            session.constrain(constrained, bodies)
+            reaction = session.step(own, steps=end - begin).bodies
+            before, lattice = lattice, session.state()
             work += study.step_s * (reaction * own).sum(axis=(0, 2))
             impulse += study.step_s * reaction.sum(axis=0)
-        lattice = self.session.state()
-        moved = [body.moved(np.array([study.step_s * last]))[0] + body.indenter.centre for body in study.bodies]
+            for k, force in forces.items():
+                work[k] += float(force @ (self.shares[k] @ (lattice.position - before.position)))
+                impulse[k] += (end - begin) * study.step_s * force
         external = state.external_work + _external_work(study, state.lattice, lattice)
+        moved = [body.moved(np.array([study.step_s * last]))[0] + body.indenter.centre for body in study.bodies]
+        for k, share in self.shares.items():
+            moved[k] = study.bodies[k].indenter.centre + share @ (lattice.position - study.lattice.points)
         positions = np.array(moved).reshape(-1, 3)
         return StudyState(state.frame, lattice, 0.0, positions, work, external, 0), impulse / study.sample_s
+
+    def _forces(self, begin: int, end: int) -> dict[int, FloatArray]:
+        """Return the mean forces (3,), mN, of bodies that are driven, between two steps; none of those that have let go."""
+        found = {}
+        for k in self.shares:
+            drive = self.study.bodies[k].drive
+            assert drive is not None
+            times = self.study.step_s * (np.arange(begin, end) + 0.5)
+            mean = float(np.interp(times, drive.times, drive.force).mean()) if self.until[k] > begin else 0.0
+            found[k] = mean * drive.direction / np.linalg.norm(drive.direction)
+        return found
+
+    def _pushed(self, forces: dict[int, FloatArray]) -> FloatArray:
+        """Return the forces on all nodes (n, 3), mN."""
+        given = self.study.external_force
+        total = np.zeros((self.study.lattice.n_nodes, 3)) if given is None else given.copy()
+        for k, force in forces.items():
+            total += np.outer(self.shares[k], force)
+        return total
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,0 +1,89 @@
+"""What searches by least squares share: evaluations that are reported, the cost with its weak prior, steps, and the covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray
+from naibu.core.progress import Progress, report_progress
+from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint, Residual, evaluated, residuals_at
+from naibu.identification.lattice_calibration.inverse_problem import InverseProblem
+
+LONGEST = 1.0  # change of a logarithm in one iteration
+SETTLED = 0.05  # decrease of chi-squared that is not worth another iteration
+
+
+@dataclass(slots=True)
+class Evaluations:
+    """Evaluations that are reported, the best of which is kept for the case of an interruption."""
+
+    threads: int
+    executor: Executor | None
+    progress: Progress | None
+    count: int = 0
+    best: EvaluatedPoint | None = None
+    problem: InverseProblem | None = None
+
+    def __call__(self, problem: InverseProblem, theta: FloatArray, *, derivatives: bool = True, fine: bool = False) -> EvaluatedPoint:
+        """Return residuals, and their derivatives, at theta (p,)."""
+        point = evaluated(problem, theta, derivatives=derivatives, fine=fine, threads=self.threads, executor=self.executor)
+        if derivatives:
+            self.keep(problem, point)
+        self._report(point.residual)
+        return point
+
+    def many(self, problem: InverseProblem, trials: Sequence[tuple[FloatArray, bool]]) -> list[Residual]:
+        """Return residuals at several theta (p,), each with long or with fine steps, simulated side by side."""
+        found = []
+        for residual in residuals_at(problem, trials, threads=self.threads, executor=self.executor):
+            found.append(residual)
+            self._report(residual)
+        return found
+
+    def keep(self, problem: InverseProblem, point: EvaluatedPoint) -> None:
+        """Keep a point with derivatives if it is the best of its problem."""
+        if self.best is None or self.problem is not problem or misfit(point.residual) <= misfit(self.best.residual):
+            self.best, self.problem = point, problem
+
+    def _report(self, residual: Residual) -> None:
+        self.count += 1
+        report_progress(self.progress, "calibrate", done=self.count, objective=misfit(residual) / max(sum(map(len, residual)), 1))
+
+
+def misfit(residual: Residual) -> float:
+    """Return chi-squared."""
+    return float(sum((r**2).sum() for r in residual))
+
+
+def cost_at(residual: Residual, theta: FloatArray, centre: FloatArray, prior_sd: float) -> float:
+    """Return chi-squared with that of the weak prior of the logarithms theta (p,)."""
+    return misfit(residual) + float((((theta - centre) / prior_sd) ** 2).sum())
+
+
+def cost_of(point: EvaluatedPoint, centre: FloatArray, prior_sd: float) -> float:
+    """Return chi-squared of a point with that of the weak prior."""
+    return cost_at(point.residual, point.theta, centre, prior_sd)
+
+
+def next_step(point: EvaluatedPoint, centre: FloatArray, prior_sd: float, damping: float) -> tuple[FloatArray, float]:
+    """Return the next change of theta, and the decrease of the cost that an undamped one promises."""
+    hessian = point.information + np.eye(len(point.theta)) / prior_sd**2
+    slope = point.gradient() + (point.theta - centre) / prior_sd**2
+    step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), slope)
+    limited = step * min(1.0, LONGEST / max(float(np.abs(step).max()), 1e-300))
+    return np.asarray(limited, dtype=np.float64), float(-slope @ step)
+
+
+def covariance_at(point: EvaluatedPoint, prior_sd: float) -> FloatArray:
+    """Return the covariance (p, p) that the derivatives at a point give, with the prior."""
+    return np.asarray(np.linalg.inv(point.information + np.eye(len(point.theta)) / prior_sd**2), dtype=np.float64)
+
+
+def noise_factors(problem: InverseProblem, residual: Residual) -> tuple[float, float]:
+    """Return root mean squares of the residuals of points and forces in units of the stated noise; 0 of what there is none of."""
+    rms = [float(np.sqrt((r**2).mean())) if len(r) else 0.0 for r in residual]
+    return rms[0] * problem.excess[0], rms[1] * problem.excess[1]
