@@ -9,7 +9,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint, Residual
 from naibu.identification.lattice_calibration.inverse_problem import InverseProblem
-from naibu.identification.lattice_calibration.least_squares import Evaluations, cost_at, cost_of, covariance_at
+from naibu.identification.lattice_calibration.least_squares import SETTLED, Evaluations, cost_at, cost_of, covariance_at
 
 FARTHEST = 0.7  # change of a logarithm to where chi-squared is looked at
 PROFILED = 4  # combinations along which it is
@@ -71,9 +71,10 @@ def widened_covariance(
             runs += 1
             corrected = (found[0] + fine[0] - coarse[0], found[1] + fine[1] - coarse[1])
             cost = cost_at(corrected, end.theta, centre, prior_sd)
-            end.fitting = cost < end.lowest
-            if end.fitting:
+            end.fitting = cost < end.lowest - SETTLED
+            if cost < end.lowest:
                 end.lowest, end.at = cost, end.theta
+            if end.fitting:
                 slope = replace(point, residual=corrected).gradient() + (end.theta - centre) / prior_sd**2
                 end.theta = end.theta - end.others @ np.linalg.solve(end.others.T @ hessian @ end.others, end.others.T @ slope)
     widened = covariance.copy()
