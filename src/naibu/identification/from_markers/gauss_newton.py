@@ -232,7 +232,7 @@ class Matcher:
         pose: RigidTransform | None,
     ) -> LoadCaseFit:
         specimen = load_case.specimen.reshaped(values)
-        u = specimen.observation @ solution.displacement
+        u = specimen.at_markers(solution.displacement)
         gradient = specimen.deformation_gradient(solution.displacement)
         moved = specimen.marker_points + u
         enlargement = specimen.enlargement(values)
@@ -251,12 +251,12 @@ class Matcher:
             )
         du = path[-1]
         n_free = du.shape[2]
-        at_markers = np.stack([specimen.observation @ du[:, i, :] for i in range(3)], axis=1) if n_free else np.zeros((len(u), 3, 0))
+        at_markers = specimen.at_markers(du) if n_free else np.zeros((len(u), 3, 0))
         for k, parameter in enumerate(self.parameters.free):
             if (motion := load_case.specimen.marker_motion(parameter.name, values)) is not None:
                 at_markers[:, :, k] += np.einsum("kij,kj->ki", gradient, motion)
             if (shift := load_case.specimen.shift(parameter.name, values)) is not None:  # the nodes move past the markers, which stay
-                at_markers[:, :, k] -= np.einsum("kij,kj->ki", gradient - np.eye(3), specimen.observation @ shift)
+                at_markers[:, :, k] -= np.einsum("kij,kj->ki", gradient - np.eye(3), specimen.at_markers(shift))
         jacobian = np.einsum("ij,kjp->kip", pose.rotation, at_markers)
         for k, parameter in enumerate(self.parameters.free):
             if parameter.name == pixel_scale(specimen.experiment):

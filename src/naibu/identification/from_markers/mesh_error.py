@@ -131,5 +131,5 @@ def change_on_mesh(
         known = [(s.load, np.asarray(between @ s.displacement)) for s in fit.solution.states[1:]]
     solution = solve(problem, settings=PATH, warm_start=known)
     moved = body.reshaped(values)
-    points = moved.marker_points + moved.observation @ solution.displacement
+    points = moved.marker_points + moved.at_markers(solution.displacement)
     return np.asarray(fit.pose.applied(points) / body.enlargement(values) - fit.predicted)

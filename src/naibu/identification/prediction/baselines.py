@@ -83,7 +83,7 @@ def equilibrium_gap_baseline(calibration: Calibration) -> dict[str, float]:
         except ConvergenceError:
             continue
         body = load_case.specimen.reshaped(values)
-        moved = body.marker_points + body.observation @ displacement
+        moved = body.marker_points + body.at_markers(displacement)
         out[load_case.name] = rms(load_case.measured - registration(moved, load_case.measured).applied(moved))
     return out
 
@@ -133,5 +133,5 @@ def _linear(load_case: MarkerLoadCase, values: Mapping[str, float]) -> FloatArra
         solution = solve(body.problem(chosen, load_case.state), settings=FOLLOWED)
     except ConvergenceError:
         return np.full_like(load_case.measured, np.nan)
-    moved = body.marker_points + body.observation @ solution.displacement
+    moved = body.marker_points + body.at_markers(solution.displacement)
     return registration(moved, load_case.measured).applied(moved)

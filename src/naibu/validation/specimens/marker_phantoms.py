@@ -274,7 +274,7 @@ def virtual_specimen(
     places = marker_lattice(template) if markers is None else np.asarray(markers, dtype=float)
     free = places + jitter_mm * np.random.default_rng([seed, 0]).normal(size=places.shape)
     clean = _described(template, free)
-    model = specimen(clean, chosen)
+    model = specimen(clean, chosen, whole=True)
     values = _complete(clean, model, truth)
     at_markers = interpolation_operator(model.mesh, free)
     solutions = {s.name: solve(model.problem(values, s.name), settings=solver) for s in clean.states[1:]}

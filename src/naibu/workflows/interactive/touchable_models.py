@@ -184,7 +184,7 @@ def _identified(model: CalibratedModel, source: Source | None) -> TouchableModel
         mend = "name the folder of an experiment with these materials as `experiment`"
         raise InputError(f"the body of the model is that of experiment {name!r}: {error}; {mend}") from error
     values = model.parameters.values()
-    body = specimen(experiment, model.settings)
+    body = specimen(experiment, model.settings, whole=True)
     missing = [m for m in experiment.materials if not any(p.startswith(f"{m}: ") for p in values)]
     if missing:
         raise InputError(

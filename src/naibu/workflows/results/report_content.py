@@ -120,24 +120,26 @@ def scene(specimen: Specimen, state: str, fit: LoadCaseFit, measured: FloatArray
     role : str
         Whether the state was fitted or predicted.
     """
-    boundary = boundary_faces(specimen.mesh)
+    body = specimen.reshaped(values)
+    whole = body.whole
+    boundary = boundary_faces(whole.mesh)
     nodes, local = np.unique(boundary.faces, return_inverse=True)
     faces = triangles_of_faces(local.reshape(boundary.faces.shape))
     steps = []
     paths = specimen.indenter_paths(values, state)
-    body, experiment = specimen.reshaped(values), specimen.experiment
+    experiment = specimen.experiment
     for s in fit.solution.states:
-        markers = body.marker_points + body.observation @ s.displacement
+        markers = body.marker_points + body.at_markers(s.displacement)
         boxes = tuple(_box(specimen, start + s.load * (stop - start), normal) for start, stop, normal in paths)
         travel = float(max(np.linalg.norm(stop - start) for start, stop, _ in paths))
         label = f"{100 * s.load:.0f} % of the load" if s.load < 1.0 else "full load"
-        steps.append(Step(label, s.load * travel, body.mesh.points[nodes] + s.displacement[nodes], markers, boxes))
+        steps.append(Step(label, s.load * travel, whole.mesh.points[nodes] + whole.field(s.displacement)[nodes], markers, boxes))
     layer = marker_layers(specimen.marker_points[:, 2], experiment.nominal_spacing_mm)
     sd = np.sqrt((fit.sd**2).mean(axis=1))
     # a marker whose reference position was completed from the lattice counts in no figure of accuracy, here neither
     shown = np.where(np.any(specimen.marker_filled, axis=1)[:, None], np.nan, measured)
     return Scene(
-        f"{experiment.name}/{state}", experiment.name, state, faces, body.mesh.points[nodes], tuple(steps), body.marker_ids,
+        f"{experiment.name}/{state}", experiment.name, state, faces, whole.mesh.points[nodes], tuple(steps), body.marker_ids,
         body.marker_points, shown, sd, layer, role,
     )  # fmt: skip
 

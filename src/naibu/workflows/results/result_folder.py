@@ -18,7 +18,7 @@ from naibu.core.errors import InputError
 from naibu.identification.from_fields.identified.identified_body import FORMAT as FORMAT_OF_FIELDS
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.identification.from_markers.calibration import Calibration
-from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings, Specimen
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.cross_validation import LeftOut, ModelRow
 from naibu.identification.prediction.interval import per_axis
@@ -149,8 +149,8 @@ def write_identification(
     for load_case, fit in zip(calibration.load_cases, calibration.match.fits, strict=True):
         series = folder / series_file(load_case.name)
         states = fit.solution.states
-        mesh = load_case.specimen.reshaped(values).mesh
-        write_vtkhdf_series(series, mesh, [s.load for s in states], {"displacement_mm": [s.displacement for s in states]})
+        body = load_case.specimen.reshaped(values).whole
+        write_vtkhdf_series(series, body.mesh, [s.load for s in states], {"displacement_mm": [body.field(s.displacement) for s in states]})
     _write_report(folder, REPORT_STEM, build_report(calibration, model, verdict, baselines, left_out))
 
 
@@ -162,7 +162,7 @@ def _identification_summary(
         load_cases[load_case.name] = _figures(accuracy(load_case.specimen, fit)) | {
             "baselines_rms_3d_mm": dict(baselines.get(load_case.name, {})),
             "linear_solver": fit.solution.linear_solver,
-            "reactions_mN": _reactions(fit.solution),
+            "reactions_mN": _reactions(load_case.specimen, fit.solution),
         }
     rows = {f"{r.experiment}/{r.state}": {"rms_3d_mm": r.rms_mm, "markers": r.marker_count} for r in left_out}
     found = {p.name: {"estimate": p.value, "from": low, "to": high, "unit": p.unit} for p, low, high in _intervals(model)}
@@ -193,8 +193,8 @@ def _figures(a: Accuracy) -> dict[str, float | int]:
     }
 
 
-def _reactions(solution: Solution) -> dict[str, list[float]]:
-    return {name: np.asarray(force).tolist() for name, force in solution.reactions.items()}
+def _reactions(body: Specimen, solution: Solution) -> dict[str, list[float]]:
+    return {name: np.asarray(force).tolist() for name, force in body.reactions(solution).items()}
 
 
 def _text(data: object) -> str:
@@ -239,15 +239,15 @@ def write_prediction(folder: Path, model: CalibratedModel, prediction: Predictio
         "interval": p.interval,
         "notes": [*p.specimen.experiment.loading.assumed, *p.notes],
         "linear_solver": p.fit.solution.linear_solver,
-        "reactions_mN": _reactions(p.fit.solution),
+        "reactions_mN": _reactions(p.specimen, p.fit.solution),
         "inputs": {p.specimen.experiment.name: dict(p.specimen.experiment.input_hashes)},
         "provenance": dict(model.provenance),
     }
     write_atomically(folder / SUMMARY_FILE, _text(summary))
-    states, mesh = p.fit.solution.states, p.specimen.reshaped(p.values).mesh
-    write_vtu(folder / f"{PREDICTED_STEM}.vtu", mesh, {"displacement_mm": states[-1].displacement}, {})
+    states, body = p.fit.solution.states, p.specimen.reshaped(p.values).whole
+    write_vtu(folder / f"{PREDICTED_STEM}.vtu", body.mesh, {"displacement_mm": body.field(states[-1].displacement)}, {})
     path = folder / f"{PREDICTED_STEM}.vtkhdf"
-    write_vtkhdf_series(path, mesh, [s.load for s in states], {"displacement_mm": [s.displacement for s in states]})
+    write_vtkhdf_series(path, body.mesh, [s.load for s in states], {"displacement_mm": [body.field(s.displacement) for s in states]})
     _write_report(folder, PREDICTED_STEM, prediction_report(model, p))
 
 

@@ -68,7 +68,9 @@ def _box(experiment: Experiment, edge: float) -> Mesh:
     """A box; under a bar the cells shrink towards its edges and towards the top."""
     size, loading = np.array(experiment.shape.size_mm), experiment.loading
     top = edge
-    flat = [np.linspace(-s / 2.0, s / 2.0, max(2, round(s / edge)) + 1) for s in size[:2]]
+    even = loading.kind == "side_plates"  # a mirror plane parts the cells
+    counts = [2 * max(1, round(s / (2.0 * edge))) if even else max(2, round(s / edge)) for s in size[:2]]
+    flat = [np.linspace(-s / 2.0, s / 2.0, n + 1) for s, n in zip(size[:2], counts, strict=True)]
     if loading.kind == "bar" and loading.bar_width_mm and loading.bar_width_mm < min(size[:2]):
         top = REFINEMENT * edge
         axis = 0 if loading.bar_axis == "y" else 1

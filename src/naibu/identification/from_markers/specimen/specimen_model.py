@@ -16,6 +16,7 @@ from naibu.core.mesh import Mesh
 from naibu.core.rigid_transform import rotation_matrix
 from naibu.identification.from_markers.specimen.boundary_conditions import material_of, rigid_bodies, sliding_joints
 from naibu.identification.from_markers.specimen.marker_grid import completed
+from naibu.identification.from_markers.specimen.mirror_planes import MirrorPlanes, WholeBody
 from naibu.identification.from_markers.specimen.parameter_names import (
     SHAPE_NAMES,
     base_offset,
@@ -35,14 +36,13 @@ from naibu.identification.from_markers.specimen.scan_alignment import Placement,
 from naibu.identification.from_markers.specimen.specimen_mesh import element_size, model_mesh, on_straight_base
 from naibu.mechanics.contact.penalty_contact import STICK, Contact
 from naibu.mechanics.finite_elements.assembly import Assembler, body_force
-from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import Law, from_moduli, law_named, parameter_vector
 from naibu.mechanics.finite_strain.problem import Problem
 from naibu.mechanics.finite_strain.sensitivities import Direction
+from naibu.mechanics.finite_strain.statics import Solution
 from naibu.mechanics.linear_algebra.block_matrix import block_pattern
 from naibu.meshing.point_location import interpolation_operator
-from naibu.meshing.surface import boundary_faces
 
 ContactModel = Literal["coulomb", "stick", "springs"]
 GRAVITY = np.array([0.0, 0.0, -9810.0])  # mm/s2
@@ -93,8 +93,10 @@ class Specimen:
         Law, contact, mesh size.
     placement : Placement
         Where the object lies in its reference scan.
+    mirror : MirrorPlanes
+        Planes that complete what is modelled to the whole object.
     mesh : Mesh
-        In the object's frame, mm.
+        Of what is modelled, in the object's frame, mm.
     marker_ids : ndarray, shape (k,), int64
         Trusted markers whose position in the reference configuration is known, or known in part and completed from the lattice.
     marker_points : ndarray, shape (k, 3)
@@ -102,12 +104,13 @@ class Specimen:
     marker_filled : ndarray, shape (k, 3), bool
         Which coordinates (in the scan's axes) were completed.
     observation : csr_matrix, shape (k, n)
-        Interpolates nodal displacements at the markers.
+        Interpolates at the markers, or at their images in what is modelled; see `at_markers`.
     """
 
     experiment: Experiment
     settings: ModelSettings
     placement: Placement
+    mirror: MirrorPlanes
     mesh: Mesh
     marker_ids: IntArray
     marker_points: FloatArray
@@ -134,6 +137,21 @@ class Specimen:
         """Return start and end of the path (3,), mm, and the outward normal (3,) of every indenter in a state."""
         moved = [self._moved(self._contacts[i], values, state) for i in self.indenters]
         return [(c.start, c.stop, c.orientation(1.0) @ c.surface.normal) for c in moved]
+
+    @property
+    def whole(self) -> WholeBody:
+        """The whole object, of which a part may be modelled."""
+        return self.mirror.whole(self.mesh)
+
+    def reactions(self, solution: Solution) -> dict[str, FloatArray]:
+        """Return the force (3,), mN, of every rigid body and joint on the whole object, by name."""
+        return self.mirror.reactions([(c.name, c.surface.normal, solution.reactions[c.name]) for c in self._contacts])
+
+    def at_markers(self, vectors: FloatArray) -> FloatArray:
+        """Return vectors (k, 3), or (k, 3, p), at the markers from those (n, 3), or (n, 3, p), at the nodes."""
+        found = (self.observation @ vectors.reshape(len(vectors), -1)).reshape(len(self.marker_points), *vectors.shape[1:])
+        signs = self.mirror.signs(self.marker_points)
+        return np.asarray(found * signs.reshape(*signs.shape, *(1,) * (vectors.ndim - 2)))
 
     @property
     def has_unknown_base(self) -> bool:
@@ -195,7 +213,7 @@ class Specimen:
             c if c.name.startswith("joint") else replace(c, rest=np.einsum("pk,pki->pi", c.shape, mesh.points[c.nodes]))
             for c in self._contacts
         )
-        observation, gradient = _observation(mesh, points, self.experiment, self.settings)
+        observation, gradient = _observation(mesh, points, self.experiment, self.settings, self.mirror)
         assembler = self._assembler.with_elements(self._assembler.elements.moved(shift))
         return replace(
             self, mesh=mesh, marker_points=points, observation=observation, _gradient=gradient, _assembler=assembler, _contacts=contacts
@@ -204,9 +222,9 @@ class Specimen:
     def deformation_gradient(self, displacement: FloatArray) -> FloatArray:
         """Return F (k, 3, 3) at the markers, by central differences over a tenth of an element."""
         step = _difference_step(self.settings, self.experiment)
-        forward, backward = self._gradient[:3], self._gradient[3:]
-        columns = [(f @ displacement - b @ displacement) / (2.0 * step) for f, b in zip(forward, backward, strict=True)]
-        return np.stack(columns, axis=2) + np.eye(3)
+        places = zip(self._gradient, _around(self.marker_points, step), strict=True)
+        values = [self.mirror.signs(p) * (at @ displacement) for at, p in places]
+        return np.stack([(f - b) / (2.0 * step) for f, b in zip(values[:3], values[3:], strict=True)], axis=2) + np.eye(3)
 
     def material_parameters(self, values: Mapping[str, float]) -> FloatArray:
         """Return the parameters (cells, 4), kPa, of all cells."""
@@ -232,11 +250,10 @@ class Specimen:
             changed = body._with_friction(i, values)
             contacts.append(self._moved(changed, values, state) if i in self.indenters else changed)
         assembler = body._assembler.with_parameters(self.material_parameters(values))
-        n = self.mesh.n_points
-        weight = np.zeros((n, 3))
+        weight = np.zeros((self.mesh.n_points, 3))
         if self.experiment.loading.kind == "side_plates":
             weight = body_force(body._assembler.elements, np.full(self.mesh.n_cells, self.settings.density), GRAVITY)
-        return Problem(body.mesh.points, assembler, tuple(contacts), PrescribedDisplacement.none(n), weight)
+        return Problem(body.mesh.points, assembler, tuple(contacts), self.mirror.held(body.mesh.points), weight)
 
     def direction(self, name: str, values: Mapping[str, float], state: str) -> list[Direction]:
         """Return how the problem of a state depends on the physical value of a parameter; empty where it does not.
@@ -341,8 +358,17 @@ class Specimen:
         return out
 
 
-def specimen(experiment: Experiment, settings: ModelSettings | None = None) -> Specimen:
+def specimen(experiment: Experiment, settings: ModelSettings | None = None, *, whole: bool = False) -> Specimen:
     """Mesh an experiment and prepare its contacts and observations.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        What was measured.
+    settings : ModelSettings, optional
+        Law, contact, mesh size.
+    whole : bool
+        Whether the whole object is modelled even where mirror planes would save most of it.
 
     Raises
     ------
@@ -352,9 +378,10 @@ def specimen(experiment: Experiment, settings: ModelSettings | None = None) -> S
     chosen = settings or ModelSettings()
     _require_supported(experiment)
     place = placement(experiment)
-    mesh = model_mesh(experiment, chosen.element_size_mm)
+    mirror = MirrorPlanes() if whole else MirrorPlanes.of(experiment)
+    mesh = mirror.part(model_mesh(experiment, chosen.element_size_mm))
     mesh, joints = sliding_joints(experiment, mesh, chosen.normal_stiffness) if chosen.joined == "sliding" else (mesh, [])
-    boundary = boundary_faces(mesh)
+    boundary = mirror.outer_faces(mesh)
     bodies = rigid_bodies(experiment, mesh, boundary.faces, chosen.normal_stiffness, chosen.tangential_stiffness)
     material = {layer.region: layer.material for layer in experiment.layers}
     pairs = [tuple(friction(material[m], material_of(c)) for m in mesh.region_names) for c in bodies]
@@ -371,22 +398,26 @@ def specimen(experiment: Experiment, settings: ModelSettings | None = None) -> S
     partly = np.isfinite(np.where(initial.trusted[:, None], initial.points, np.nan)).any(axis=1)
     usable = partly & np.isfinite(filled).all(axis=1)
     points = place.to_object(filled[usable])
-    observation, gradient = _observation(mesh, points, experiment, chosen)
+    observation, gradient = _observation(mesh, points, experiment, chosen, mirror)
     return Specimen(
-        experiment, chosen, place, mesh, initial.ids[usable], points, was_missing[usable], observation, gradient, mesh.points, assembler,
-        contacts, tuple(pairs), tuple(pair_of_points),
+        experiment, chosen, place, mirror, mesh, initial.ids[usable], points, was_missing[usable], observation, gradient, mesh.points,
+        assembler, contacts, tuple(pairs), tuple(pair_of_points),
     )  # fmt: skip
 
 
 def _observation(
-    mesh: Mesh, points: FloatArray, experiment: Experiment, settings: ModelSettings
+    mesh: Mesh, points: FloatArray, experiment: Experiment, settings: ModelSettings, mirror: MirrorPlanes
 ) -> tuple[sp.csr_array, tuple[sp.csr_array, ...]]:
     """Interpolation at markers (k, 3), mm, and at points a little before and behind them along each axis."""
     tolerance = 0.05 * experiment.height_mm
-    step = _difference_step(settings, experiment)
-    around = [points + sign * step * axis for sign in (1.0, -1.0) for axis in np.eye(3)]
-    here = interpolation_operator(mesh, points, tolerance_mm=tolerance)
-    return here, tuple(interpolation_operator(mesh, p, tolerance_mm=2 * tolerance) for p in around)
+    around = _around(points, _difference_step(settings, experiment))
+    here = interpolation_operator(mesh, points * mirror.signs(points), tolerance_mm=tolerance)
+    return here, tuple(interpolation_operator(mesh, p * mirror.signs(p), tolerance_mm=2 * tolerance) for p in around)
+
+
+def _around(points: FloatArray, step: float) -> list[FloatArray]:
+    """Points (k, 3) one step before, and one behind, `points` along each axis."""
+    return [points + sign * step * axis for sign in (1.0, -1.0) for axis in np.eye(3)]
 
 
 def _require_supported(experiment: Experiment) -> None:
