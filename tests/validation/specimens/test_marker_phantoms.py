@@ -100,7 +100,7 @@ def test_a_phantom_is_an_experiment_that_can_be_identified(gel):
     error = model.marker_points - marker_lattice(plate())
     assert np.sqrt((error**2).mean(axis=0)).max() < 0.35
     state = solve(model.problem(gel.truth, "pressed")).displacement
-    predicted = model.marker_points + model.observation @ state
+    predicted = model.marker_points + model.at_markers(state)
     measured = experiment.state("pressed").markers.aligned(model.marker_ids)
     misfit = measured - registration(predicted, measured).applied(predicted)
     noise = np.sqrt(2) * Scanner().standard_deviation  # of two scans
