@@ -2,8 +2,7 @@
 
 The chest wall is held away from the plates' plane only: tissue slides along it against elastic resistance. Plates rub by Coulomb's law, the
 skin is smeared over the outermost elements, and the weight hangs downwards. Tissue is of one kind: what differs is in the band of the
-epipolar
-curve.
+epipolar curve. Contact is as stiff as the tissue asks for, so that a body of another modulus under forces in proportion deforms alike.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ from naibu.meshing.surface import level_extents
 _EDGE = 0.2  # of the elements, in a half ball of radius 1
 _LEVELS = 60
 _EDGE_LEVELS, _SMOOTH_LEVELS = 4, 4.0
-_NORMAL_STIFFNESS, _RUBBING_STIFFNESS = 60.0, 3.0  # kPa/mm
+_NORMAL_STIFFNESS, _RUBBING_STIFFNESS = 7.5, 0.375  # of contact, 1/mm: over Young's modulus of the tissue
 _SETTINGS = SolverSettings(first_step=0.25, largest_step=0.5, tolerance=1e-3)
 _NEAR_MM = 1.0  # outside of the facets of the mesh still counts as in the breast
 _FAR_MM = 1e4
@@ -329,11 +328,11 @@ def _plates(
     stop: tuple[float, float],
 ) -> list[Contact]:
     press = view_axes(angle_deg)[1]
-    rough = Friction(parameters.friction, _RUBBING_STIFFNESS)
+    rough = Friction(parameters.friction, _RUBBING_STIFFNESS * parameters.tissue_kpa)
     return [
         rigid_contact(
             f"{name} plate", points, skin, plane_geometry(sign * press), start=a * press, stop=b * press, friction=rough,
-            normal_stiffness=_NORMAL_STIFFNESS,
+            normal_stiffness=_NORMAL_STIFFNESS * parameters.tissue_kpa,
         )
         for name, sign, a, b in zip(("lower", "upper"), (1.0, -1.0), start, stop, strict=True)
     ]  # fmt: skip
@@ -342,7 +341,7 @@ def _plates(
 def _chest_wall(points: FloatArray, wall: IntArray, parameters: MechanicalParameters) -> Contact:
     return rigid_contact(
         "chest wall", points, wall, plane_geometry((0.0, 0.0, 1.0)), start=np.zeros(3), stop=np.zeros(3),
-        friction=Friction(STICK, parameters.wall_kpa_per_mm), normal_stiffness=_NORMAL_STIFFNESS, tied=True,
+        friction=Friction(STICK, parameters.wall_kpa_per_mm), normal_stiffness=_NORMAL_STIFFNESS * parameters.tissue_kpa, tied=True,
     )  # fmt: skip
 
 
@@ -350,7 +349,8 @@ def _table(points: FloatArray, base: IntArray, parameters: MechanicalParameters)
     at = np.array([0.0, 0.0, _SUNK_MM])
     return rigid_contact(
         "table", points, base, plane_geometry((0.0, 0.0, 1.0)), start=at, stop=at,
-        friction=Friction(parameters.friction, _RUBBING_STIFFNESS), normal_stiffness=_NORMAL_STIFFNESS,
+        friction=Friction(parameters.friction, _RUBBING_STIFFNESS * parameters.tissue_kpa),
+        normal_stiffness=_NORMAL_STIFFNESS * parameters.tissue_kpa,
     )  # fmt: skip
 
 
