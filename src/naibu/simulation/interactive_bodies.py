@@ -18,6 +18,7 @@ from naibu.mechanics.finite_elements.assembly import Assembler, body_force
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import material
 from naibu.mechanics.finite_strain.dynamic_session import DynamicEngine, DynamicState
+from naibu.mechanics.finite_strain.lip_assembly import with_lips
 from naibu.mechanics.finite_strain.real_time_session import RealTimeEngine, RealTimeSession
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState
@@ -326,6 +327,7 @@ class FiniteElementBody:
         placeholder = [material(young_modulus=1.0, poisson_ratio=0.3)] * len(mesh.region_names)
         made = Assembler.from_materials(elements(found.mesh, "mean_dilatation"), found.mesh.regions, placeholder)
         made = replace(made, law_codes=assembler.law_codes[before], parameters=assembler.parameters[before])
+        made = with_lips(made, found.mesh.points, boundary_faces(found.mesh).faces)
         held = np.zeros(mesh.n_points)
         held[self.supported] = 1.0
         body = FiniteElementBody.of(

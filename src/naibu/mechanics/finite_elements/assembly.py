@@ -71,12 +71,18 @@ class Assembler:
         chosen = block_pattern(elements.n_points, elements.connectivity) if pattern is None else pattern
         positions = chosen.positions(elements.connectivity)
         if elements.weights.shape[1] == 1 and elements.connectivity.shape[1] == 4 and not elements.shared_dilatation:
-            count = thread_count() if len(elements.connectivity) > LARGE else 1
-            divided = partition(elements.connectivity, chosen.indptr, chosen.indices, count)
             none = np.empty(0, dtype=np.int64)
-            return cls(elements, codes, parameters, chosen, positions, none, none, divided)
+            return cls(elements, codes, parameters, chosen, positions, none, none, _divided(elements, chosen))
         order, start = _colours(elements.connectivity, elements.n_points)
         return cls(elements, codes, parameters, chosen, positions, order, start)
+
+    def with_couplings(self, *connectivities: IntArray) -> Assembler:
+        """Return the assembler with a tangent that also has places for the couplings of other groups (m, k) of nodes."""
+        rows = np.repeat(np.arange(self.pattern.n_points), np.diff(self.pattern.indptr))
+        known = np.stack([rows, self.pattern.indices.astype(np.int64)], axis=1)
+        pattern = block_pattern(self.pattern.n_points, known[known[:, 0] <= known[:, 1]], *connectivities)
+        parts = None if self._partition is None else _divided(self.elements, pattern)
+        return replace(self, pattern=pattern, _positions=pattern.positions(self.elements.connectivity), _partition=parts)
 
     def with_parameters(self, parameters: FloatArray) -> Assembler:
         """Return the same assembler with other parameters (m, 4) of the cells, kPa."""
@@ -133,6 +139,9 @@ class Assembler:
         """
         return self._run(displacement, direction, np.empty((0, 3, 3)))[1]
 
+    def add_contact_of_lips(self, displacement: FloatArray, force: FloatArray) -> None:
+        """Add the forces of the two sides of cuts on each other to internal forces (n, 3), mN; here there are none."""
+
     def _run(self, displacement: FloatArray, parameters: FloatArray, blocks: FloatArray) -> tuple[float, FloatArray, float]:
         force = np.zeros((self.elements.n_points, 3))
         if self._partition is not None:
@@ -160,6 +169,12 @@ class Assembler:
             displacement, self._positions, force, blocks,
         )  # fmt: skip
         return float(energy), force, float(smallest)
+
+
+def _divided(elements: Elements, pattern: BlockPattern) -> ThreadPartition:
+    """Divide single tetrahedra among threads."""
+    count = thread_count() if len(elements.connectivity) > LARGE else 1
+    return partition(elements.connectivity, pattern.indptr, pattern.indices, count)
 
 
 def body_force(elements: Elements, density_of_cell: FloatArray, acceleration: FloatArray) -> FloatArray:

@@ -99,6 +99,7 @@ class PressureElements:
             self.start, self.connectivity, self.local, self.gradients, self.weights, self.cells, a.law_codes, a.parameters, self.bulk,
             np.ascontiguousarray(displacement), pressure, force, mismatch,
         )  # fmt: skip
+        a.add_contact_of_lips(displacement, force)
         return force, mismatch, float(smallest)
 
     def dilatation(self, displacement: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -20,6 +20,7 @@ from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDispla
 from naibu.mechanics.finite_elements.elements import Formulation, elements
 from naibu.mechanics.finite_elements.hyperelasticity import Material, lame_parameters
 from naibu.mechanics.finite_elements.linear_simplices import lumped_mass, simplices
+from naibu.mechanics.finite_strain.lip_assembly import with_lips
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
 from naibu.mechanics.finite_strain.statics import Solution, solve
 from naibu.mechanics.linear_algebra.block_matrix import block_pattern
@@ -268,6 +269,7 @@ def hyperelastic_problem(
     parts = elements(mesh, formulation)
     pattern = block_pattern(mesh.n_points, parts.connectivity, *(c.nodes for c in contacts))
     assembler = Assembler.from_materials(parts, mesh.regions, list(materials), pattern)
+    assembler = with_lips(assembler, mesh.points, boundary_faces(mesh).faces)
     held = PrescribedDisplacement(conditions.constrained(mesh.points), np.zeros_like(mesh.points))
     return Problem(mesh.points, assembler, contacts, held, conditions.force(mesh, lumped_mass(simplices(mesh), density)))
 

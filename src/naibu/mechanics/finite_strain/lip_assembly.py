@@ -1,0 +1,66 @@
+"""Assembly with the contact of the two sides of cuts, which internal forces and tangent contain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray, Int32Array, IntArray
+from naibu.mechanics.contact.cut_lips import CutLips, cut_lips
+from naibu.mechanics.finite_elements.assembly import Assembler
+from naibu.mechanics.finite_strain.penalties import node_shear_moduli
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LipAssembler(Assembler):
+    """An assembler whose forces and tangent contain the contact of the sides of cuts.
+
+    Attributes
+    ----------
+    lips : CutLips, optional
+        Pairs of nodes on both sides.
+    """
+
+    lips: CutLips | None = None
+    _pairs: Int32Array = field(default_factory=lambda: np.zeros((0, 2, 2), dtype=np.int32))
+
+    def forces_of_parameter(self, displacement: FloatArray, direction: FloatArray) -> FloatArray:
+        """Return the derivative (n, 3) of the internal forces along `direction` (m, 4) in the cells' parameters; lips have none."""
+        return Assembler._run(self, displacement, direction, np.empty((0, 3, 3)))[1]
+
+    def add_contact_of_lips(self, displacement: FloatArray, force: FloatArray) -> None:
+        """Add the forces of lips in contact to internal forces (n, 3), mN."""
+        if self.lips is not None:
+            self.lips.add(displacement, force)
+
+    def _run(self, displacement: FloatArray, parameters: FloatArray, blocks: FloatArray) -> tuple[float, FloatArray, float]:
+        energy, force, smallest = Assembler._run(self, displacement, parameters, blocks)
+        if self.lips is None:
+            return energy, force, smallest
+        more, stiffness = self.lips.add(displacement, force)
+        if len(blocks):
+            for a in range(2):
+                for b in range(2):
+                    np.add.at(blocks, self._pairs[:, a, b], stiffness if a == b else -stiffness)
+        return energy + more, force, smallest
+
+
+def with_lips(assembler: Assembler, points: FloatArray, faces: IntArray) -> Assembler:
+    """Return an assembler in which the two sides of cuts do not pass through each other; the same where there is no cut.
+
+    Parameters
+    ----------
+    assembler : Assembler
+        Of a mesh in which cuts have doubled nodes.
+    points : ndarray, shape (n, 3)
+        Its nodes in the reference configuration, mm.
+    faces : ndarray, shape (f, 3), int64
+        Its boundary triangles; those that lie on each other are the sides of cuts. Quadrilaterals have no such contact.
+    """
+    lips = cut_lips(points, faces, node_shear_moduli(assembler)) if faces.shape[1] == 3 else None
+    if lips is None:
+        return assembler
+    coupled = assembler.with_couplings(lips.pairs)
+    known = {f.name: getattr(coupled, f.name) for f in fields(Assembler)}
+    return LipAssembler(**known, lips=lips, _pairs=coupled.pattern.positions(lips.pairs))

@@ -1,0 +1,143 @@
+"""The two sides of a cut: pressed together they carry what the whole body carries, pulled apart they open, and they never overlap."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from naibu.core.mesh import Mesh
+from naibu.mechanics.contact.cut_lips import STIFFNESS, cut_lips
+from naibu.mechanics.contact.indenter_motion import IndenterVelocity
+from naibu.mechanics.contact.rigid_indenters import plane_indenter
+from naibu.mechanics.finite_elements.assembly import Assembler
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
+from naibu.mechanics.finite_elements.elements import elements
+from naibu.mechanics.finite_elements.hyperelasticity import material
+from naibu.mechanics.finite_strain.lip_assembly import LipAssembler, with_lips
+from naibu.mechanics.finite_strain.problem import Problem
+from naibu.mechanics.finite_strain.statics import solve
+from naibu.meshing.cutting.swept_blade import swept_blade
+from naibu.meshing.cutting.volume import cut_volume
+from naibu.meshing.primitives import box
+from naibu.meshing.surface import boundary_faces
+from naibu.simulation.interactive_bodies import FiniteElementBody
+
+SIZE = 20.0
+LAW = material("neo_hookean", young_modulus=10.0, poisson_ratio=0.3)
+
+
+def cut_block(height, tilt=0.0, through=True, n=4):
+    """A block cut near a height, right through or half way, and the same cells joined again."""
+    whole = box((SIZE,) * 3, (n, n, n), cell_type="tetra", centred=False)
+    end = SIZE + 1.0 if through else 0.5 * SIZE
+    edge = np.array([[-1.0, -1.0, height], [-1.0, SIZE + 1.0, height + tilt]])
+    cut = cut_volume(whole, swept_blade(np.stack([edge, edge + [end + 1.0, 0.0, 0.0]])), SIZE / n).mesh
+    points, number = np.unique(cut.points, axis=0, return_inverse=True)
+    return Mesh.from_arrays(points, number.ravel()[cut.cells], "tetra"), cut
+
+
+def assembled(mesh):
+    plain = Assembler.from_materials(elements(mesh, "standard"), mesh.regions, [LAW])
+    return with_lips(plain, mesh.points, boundary_faces(mesh).faces)
+
+
+def pressed(mesh, top, lips=True):
+    """Displacement and force of a block whose upper face moves by `top`, mm."""
+    assembler = assembled(mesh) if lips else Assembler.from_materials(elements(mesh, "standard"), mesh.regions, [LAW])
+    low, high = mesh.points[:, 2] < 1e-9, mesh.points[:, 2] > SIZE - 1e-9
+    value = np.where(high[:, None], np.array([0.0, 0.0, top]), 0.0)
+    held = PrescribedDisplacement(np.repeat((low | high)[:, None], 3, axis=1), value)
+    found = solve(Problem(mesh.points, assembler, (), held, np.zeros_like(mesh.points)))
+    reaction = assembler.forces(found.displacement)[1][high].sum(axis=0)
+    return assembler, found.displacement, reaction[2]
+
+
+@pytest.mark.parametrize(("tilt", "within"), [(0.0, 0.015), (1.0, 0.04)])
+def test_a_cut_block_under_compression_is_as_stiff_as_the_whole_one(tilt, within):
+    joined, cut = cut_block(0.5 * SIZE, tilt)
+    _, _, expected = pressed(joined, -3.0)
+    assembler, u, force = pressed(cut, -3.0)
+    assert force == pytest.approx(expected, rel=within)  # across the level cut there is no shear; on a slope, sides slide without friction
+    assert isinstance(assembler, LipAssembler)
+    gaps = assembler.lips.gaps(u)
+    assert np.isfinite(gaps).all() and gaps.min() > -0.02 * assembler.lips.edge.min()  # a quarter of a percent of the height is 0.05 mm
+    mean = -force / SIZE**2  # kPa
+    assert -gaps.mean() == pytest.approx(mean / assembler.lips.stiffness.mean(), rel=0.5)
+
+
+def test_a_cut_block_under_tension_opens_as_without_contact():
+    _, cut = cut_block(0.5 * SIZE, through=False)
+    assembler, u, force = pressed(cut, 1.0)
+    _, free, expected = pressed(cut, 1.0, lips=False)
+    assert force == pytest.approx(expected, rel=1e-6) and u == pytest.approx(free, abs=1e-5)
+    assert assembler.lips.gaps(u).max() > 0.3
+
+
+def test_forces_are_the_derivative_of_the_energy_of_level_sides_and_balance():
+    _, cut = cut_block(0.5 * SIZE)
+    assembler = assembled(cut)
+    lips = assembler.lips
+    rng = np.random.default_rng(1)
+    u = np.zeros_like(cut.points)
+    u[lips.pairs[:, 1], 2] = -1e-3 * rng.uniform(0.5, 4.0, len(lips.pairs))
+    force = np.zeros_like(u)
+    energy, blocks = lips.add(u, force)
+    assert energy > 0.0 and force.sum(axis=0) == pytest.approx(0.0, abs=1e-9)
+    v = np.zeros_like(u)
+    v[:, 2] = rng.normal(size=len(u)) * 1e-7  # along the normal, whose change is left out
+    up, down = (lips.add(u + s * v, np.zeros_like(u))[0] for s in (1.0, -1.0))
+    assert (up - down) / 2.0 == pytest.approx(float((force * v).sum()), rel=1e-3)
+    moved = np.zeros_like(u)
+    lips.add(u + v, moved)
+    other = np.zeros_like(u)
+    lips.add(u - v, other)
+    relative = v[lips.pairs[:, 0]] - v[lips.pairs[:, 1]]
+    change = np.einsum("pij,pj->pi", blocks, relative)
+    expected = np.zeros_like(u)
+    np.add.at(expected, lips.pairs[:, 0], change)
+    np.add.at(expected, lips.pairs[:, 1], -change)
+    assert 0.5 * (moved - other) == pytest.approx(expected, rel=1e-2, abs=1e-4 * np.abs(expected).max())
+
+
+def test_sides_that_face_away_or_lie_far_apart_do_not_touch():
+    whole, cut = cut_block(0.5 * SIZE)
+    lips = assembled(cut).lips
+    assert assembled(whole).pattern.n_blocks and not isinstance(assembled(whole), LipAssembler)
+    assert cut_lips(whole.points, boundary_faces(whole).faces, np.ones(whole.n_points)) is None
+    assert lips.stiffness == pytest.approx(STIFFNESS * 3.0 * LAW.small_strain_shear_modulus / lips.edge)
+    of_upper = np.unique(cut.cells[cut.points[cut.cells].mean(axis=1)[:, 2] > 0.5 * SIZE])
+    for motion, touching in (([0.0, 0.0, -0.1], True), ([0.0, 0.0, 0.1], False), ([15.0, 0.0, -0.1], False)):
+        u = np.zeros_like(cut.points)
+        u[of_upper] = motion
+        gaps = lips.gaps(u)
+        assert (gaps < 0.0).all() if touching else not (gaps < 0.0).any()
+
+
+def test_a_live_body_cut_and_pressed_carries_the_pressure():
+    mesh = box((SIZE, SIZE, SIZE), (4, 4, 4), cell_type="tetra", centred=False)
+    assembler = Assembler.from_materials(elements(mesh, "mean_dilatation"), mesh.regions, [LAW])
+    supported = np.flatnonzero(mesh.points[:, 2] < 1e-9).astype(np.int64)
+    block = FiniteElementBody.of(mesh, assembler, supported=supported, step_s=0.02)
+    edge = np.array([[-1.0, -1.0, 0.5 * SIZE], [-1.0, SIZE + 1.0, 0.5 * SIZE]])
+    cut, _, _ = block.cut(block.session().state(), swept_blade(np.stack([edge, edge + [SIZE + 2.0, 0.0, 0.0]])), 5.0)
+    assert cut.engine.assembler.lips.stiffness.max() > 10.0  # of the material, not of a placeholder
+    joined, _ = cut_block(0.5 * SIZE)
+    whole = FiniteElementBody.of(
+        joined, Assembler.from_materials(elements(joined, "mean_dilatation"), joined.regions, [LAW]),
+        supported=np.flatnonzero(joined.points[:, 2] < 1e-9).astype(np.int64), step_s=0.02,
+    )  # fmt: skip
+    forces = []
+    for body in (whole, cut):
+        engine = replace(body.engine, background=False)  # repeatable
+        with replace(body, engine=engine).session() as session:
+            plate = plane_indenter((0.0, 0.0, SIZE), (0.0, 0.0, -1.0), static_friction=5.0, kinetic_friction=5.0)
+            session.press([plate])  # it holds the piece cut off
+            for k in range(50):
+                found = session.step(motions=[IndenterVelocity((0.0, 0.0, -5.0 if k < 20 else 0.0))])
+            forces.append(found.indenters[0, 0, 2])
+            u = session.state().displacement
+    gaps = cut.engine.assembler.lips.gaps(u)
+    assert forces[1] == pytest.approx(forces[0], rel=0.03) and forces[0] < -100.0
+    assert gaps[np.isfinite(gaps)].min() > -0.02 * cut.engine.assembler.lips.edge.min()
