@@ -33,7 +33,7 @@ def cut_block(height, tilt=0.0, through=True, n=4):
     whole = box((SIZE,) * 3, (n, n, n), cell_type="tetra", centred=False)
     end = SIZE + 1.0 if through else 0.5 * SIZE
     edge = np.array([[-1.0, -1.0, height], [-1.0, SIZE + 1.0, height + tilt]])
-    cut = cut_volume(whole, swept_blade(np.stack([edge, edge + [end + 1.0, 0.0, 0.0]])), SIZE / n).mesh
+    cut = cut_volume(whole, swept_blade(np.stack([edge, edge + np.array([end + 1.0, 0.0, 0.0])])), SIZE / n).mesh
     points, number = np.unique(cut.points, axis=0, return_inverse=True)
     return Mesh.from_arrays(points, number.ravel()[cut.cells], "tetra"), cut
 
@@ -121,7 +121,7 @@ def test_a_live_body_cut_and_pressed_carries_the_pressure():
     supported = np.flatnonzero(mesh.points[:, 2] < 1e-9).astype(np.int64)
     block = FiniteElementBody.of(mesh, assembler, supported=supported, step_s=0.02)
     edge = np.array([[-1.0, -1.0, 0.5 * SIZE], [-1.0, SIZE + 1.0, 0.5 * SIZE]])
-    cut, _, _ = block.cut(block.session().state(), swept_blade(np.stack([edge, edge + [SIZE + 2.0, 0.0, 0.0]])), 5.0)
+    cut, _, _ = block.cut(block.session().state(), swept_blade(np.stack([edge, edge + np.array([SIZE + 2.0, 0.0, 0.0])])), 5.0)
     assert cut.engine.assembler.lips.stiffness.max() > 10.0  # of the material, not of a placeholder
     joined, _ = cut_block(0.5 * SIZE)
     whole = FiniteElementBody.of(

@@ -1,8 +1,8 @@
 """Contact of the two sides of a cut with each other: pairs of nodes that were one before the cut.
 
 Each pair resists approach along the mean normal of its two sides, as they are in the deformed body, by a penalty :cite:p:`wriggers2006`; it
-exerts nothing while it is open, and no friction. Pairs are those of the cut: sides that slide past each other further than `FURTHEST` edges,
-or that no longer face each other, do not touch.
+exerts nothing while it is open, and no friction. Pairs are those of the cut: sides that slide past each other further than `FURTHEST`
+edges, or that no longer face each other, do not touch.
 """
 
 from __future__ import annotations
@@ -50,8 +50,9 @@ class CutLips:
     stiffness: FloatArray
 
     def gaps(self, displacement: FloatArray) -> FloatArray:
-        """Return the distances (p,), mm, along the normals; negative where the sides overlap, infinite where they do not face each other."""
-        return _state(self.points, self.faces, self.pairs, self.corner_pair, self.edge, np.ascontiguousarray(displacement))[0]
+        """Return the distances (p,), mm, along the normals: negative where the sides overlap, infinite where they face away."""
+        gap, _ = _state(self.points, self.faces, self.pairs, self.corner_pair, self.edge, np.ascontiguousarray(displacement))
+        return np.asarray(gap)
 
     def add(self, displacement: FloatArray, force: FloatArray) -> tuple[float, FloatArray]:
         """Add to internal forces (n, 3), mN; return the energy, mN mm, and the stiffness of every pair (p, 3, 3), mN/mm."""
@@ -90,7 +91,7 @@ def cut_lips(points: FloatArray, faces: IntArray, shear_modulus: FloatArray) -> 
     corners = points[sorted_faces[first]]
     areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     share = np.repeat(areas / 3.0, 3)[apart]
-    area = np.bincount(corner[apart], share, minlength=len(pairs))
+    area = np.asarray(np.bincount(corner[apart], share, minlength=len(pairs)), dtype=np.float64)
     edge = np.sqrt(2.0 * 3.0 * area / np.bincount(corner[apart], minlength=len(pairs)))
     stiffness = STIFFNESS * 3.0 * shear_modulus[pairs].max(axis=1) / edge
     oriented = [np.take_along_axis(corner.reshape(-1, 3), np.argsort(order[f], axis=1), axis=1) for f in (first, second)]
