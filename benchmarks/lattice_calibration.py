@@ -2,9 +2,9 @@
 
 A block of dough, CELLS^3 cubes of 10 mm, stands on a floor; a plate presses it, drags it aside until it slides, stays, and leaves. K, C1
 and C2 of three classes of elements (nine values), static and kinetic friction are sought from five captures of points (0.5 mm) and the
-plate's force (500 samples a second, 50 mN); ``--unknown pull-off`` or ``surface-mass`` seeks K, C1 and C2 of all elements, friction, and
-stiffness, damping and speed of the pull-off, or the ratio of masses. Every draw has a truth, noise and points of its own; truths differ
-from the start by 35 % (standard deviation of logarithms), friction by 20 %. Nothing is tuned to a draw.
+plate's force (500 samples a second, 50 mN). ``--unknown all`` seeks K, C1 and C2 of all elements and friction, ``pull-off`` beside these
+stiffness, damping and speed of the pull-off, ``surface-mass`` the ratio of masses. Every draw has a truth, noise and points of its own;
+truths differ from the start by 35 % (standard deviation of logarithms), friction by 20 %. Nothing is tuned to a draw.
 
 Prints, for each parameter, the root mean square error as a logarithm, the mean half width of its interval, and in how many draws the
 interval held the truth; and time, processor time and simulations of a draw. ``--record`` writes ``results/lattice_calibration.json``.
@@ -79,6 +79,7 @@ class Draw:
     processor_s: float
     runs: int
     factors: tuple[float, float]
+    settled: bool
 
 
 def study_of(cells: int, unknown: str, pace: float, folder: Path) -> LatticeStudy:
@@ -103,7 +104,7 @@ def study_of(cells: int, unknown: str, pace: float, folder: Path) -> LatticeStud
 
 def unknowns_of(study: LatticeStudy, unknown: str) -> StudyUnknowns:
     """Return what is sought."""
-    if unknown == "friction":
+    if unknown == "classes":
         return StudyUnknowns.of(study, friction="common")
     return StudyUnknowns.of(study, groups="all", friction="common", pull_off=unknown == "pull-off", surface_mass=unknown == "surface-mass")
 
@@ -153,7 +154,7 @@ def drawn(seed: int, *, cells: int, unknown: str, pace: float = 1.0, threads: in
     found = calibrate_lattice(problem, unknowns.start, threads=threads)
     wall, busy = time.perf_counter() - began, time.process_time() - busy
     half = 0.5 * np.diff(np.log(found.intervals()), axis=1)[:, 0]
-    return Draw(unknowns.names, np.log(found.values / truth), half, wall, busy, found.runs, found.noise_factor)
+    return Draw(unknowns.names, np.log(found.values / truth), half, wall, busy, found.runs, found.noise_factor, found.settled)
 
 
 def main() -> None:
@@ -161,7 +162,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("draws", type=int, nargs="?", default=1)
     parser.add_argument("--cells", type=int, default=8, help="along an edge")
-    parser.add_argument("--unknown", choices=("friction", "pull-off", "surface-mass"), default="friction")
+    parser.add_argument("--unknown", choices=("classes", "all", "pull-off", "surface-mass"), default="classes")
     parser.add_argument("--pace", type=float, default=1.0, help="how many times faster all is done than in 5 s")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--workers", type=int, default=1, help="processes, one draw each")
@@ -173,11 +174,13 @@ def main() -> None:
         for draw in pool.map(one, range(chosen.draws)) if chosen.workers > 1 else map(one, range(chosen.draws)):
             found.append(draw)
             outside = [f"{n} {e:+.3f} ({h:.3f})" for n, e, h in zip(draw.names, draw.error, draw.half, strict=True) if abs(e) > h]
+            state = "settled" if draw.settled else "NOT SETTLED"
             print(
-                f"draw {len(found) - 1}: {draw.wall_s:.1f} s, processor {draw.processor_s:.1f} s, {draw.runs} simulations, noise factors "
-                f"{draw.factors[0]:.2f} {draw.factors[1]:.2f}; not held: {', '.join(outside) or 'none'}",
+                f"draw {len(found) - 1}: {draw.wall_s:.1f} s, processor {draw.processor_s:.1f} s, {draw.runs} simulations, {state}, "
+                f"noise factors {draw.factors[0]:.2f} {draw.factors[1]:.2f}; not held: {', '.join(outside) or 'none'}",
                 flush=True,
             )
+    print(f"settled: {sum(d.settled for d in found)} of {len(found)}")
     error, half = np.array([d.error for d in found]), np.array([d.half for d in found])
     held = np.abs(error) <= half
     rows = tuple(

@@ -90,7 +90,8 @@ def read_field(path: str | os.PathLike[str], *, unit: str | None = None, spacing
     ----------
     path : path-like
         ``.h5`` as `write_field`, ``naibu sense`` and ``naibu track`` write it, or a transform of ITK, ANTs or 3D Slicer (also ``.tfm``); an
-        image of vectors (``.mha``, ``.mhd``, ``.nrrd``, ``.nii``, ``.nii.gz``); a mesh with displacements at its points (``.vtu``); a
+        image of vectors (``.mha``, ``.mhd``, ``.nrrd``, ``.nii``, ``.nii.gz``; a ``PREFIX1Warp.nii.gz`` of ANTs with the
+        ``PREFIX0GenericAffine.mat`` beside it, which is applied after it); a mesh with displacements at its points (``.vtu``); a
         result of ALDVC (``.mat``); or a table (``.csv``, ``.tsv``, ``.txt``, ``.xlsx``, Tecplot ``.dat``) with columns such as x_mm,
         y_mm, z_mm, ux_mm, uy_mm, uz_mm and, where they are known, sd_x_mm, sd_y_mm, sd_z_mm.
     unit : str, optional
@@ -119,6 +120,8 @@ def read_field(path: str | os.PathLike[str], *, unit: str | None = None, spacing
             require_regular(source)
             return _in_voxels(source, *aldvc.read(source), spacing_mm)
         vectors, grid = itk_transforms.read_tfm(source) if ending == ".tfm" else read_displacement(source)
+        if (affine := itk_transforms.ants_affine(source)) is not None:
+            vectors = itk_transforms.followed_by(affine, vectors, grid)
         return DisplacementField.on_grid(grid, vectors)
 
 

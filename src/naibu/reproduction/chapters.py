@@ -36,7 +36,7 @@ PROCESSOR_S: dict[str, float] = {
     "ch3": 36.0,
     "ch4-adaptive": 9.0,
     "ch4-cut": 7.0,
-    "ch4-lattice": 60.0,
+    "ch4-lattice": 170.0,
     "ch4-cube": 60.0,
     "ch4-octree": 60.0,
     "ch5": 18.0,

@@ -46,6 +46,43 @@ def test_ants_writes_lps_vectors_and_the_standard_ras(tmp_path: Path) -> None:
     check_grid(nifti(tmp_path / "ras.nii", VECTORS * (-1.0, -1.0, 1.0), 1006))
 
 
+@pytest.mark.parametrize("kind", ["affine", "euler", "euler zyx"])
+def test_the_linear_transform_of_ants_follows_its_warp(tmp_path: Path, kind: str) -> None:
+    """As ITK itself writes it (MATLAB, version 4) and applies it to the ends of the vectors."""
+    sitk = pytest.importorskip("SimpleITK")
+    if kind == "affine":
+        linear = sitk.AffineTransform(3)
+        linear.SetMatrix([1.02, 0.1, -0.05, 0.03, 0.97, 0.08, -0.02, 0.04, 1.05])
+    else:
+        linear = sitk.Euler3DTransform()
+        linear.SetRotation(0.2, -0.3, 0.5)
+        linear.SetComputeZYX(kind == "euler zyx")
+    linear.SetCenter((3.0, -4.0, 5.0))
+    linear.SetTranslation((1.0, 2.0, -3.0))
+    sitk.WriteTransform(linear, str(tmp_path / "sub0GenericAffine.mat"))
+    warp = nifti(tmp_path / "sub1Warp.nii.gz", VECTORS, 1007)
+    field = read_field(warp)
+    ends = field.points.reshape(*SHAPE, 3) + VECTORS
+    expected = np.array([linear.TransformPoint(p) for p in ends.reshape(-1, 3)]).reshape(ends.shape)
+    np.testing.assert_allclose(field.vectors, expected - (ends - VECTORS), atol=1e-5)
+    warp.rename(tmp_path / "alone1Warp.nii.gz")
+    check_grid(tmp_path / "alone1Warp.nii.gz")
+
+
+def test_what_lies_beside_a_warp_and_is_no_linear_transform_is_refused(tmp_path: Path) -> None:
+    warp = nifti(tmp_path / "1Warp.nii.gz", VECTORS, 1007)
+    for stored, words in (
+        ({"other": np.eye(3)}, "no linear transform"),
+        ({"BSplineTransform_double_3_3": np.ones(9), "fixed": np.ones(3)}, "BSpline"),
+    ):
+        savemat(tmp_path / "0GenericAffine.mat", stored, format="4")
+        with pytest.raises(InputError, match=words):
+            read_field(warp)
+    (tmp_path / "0GenericAffine.mat").write_bytes(b"no matlab at all, but long enough to be looked at " * 10)
+    with pytest.raises(InputError, match="0GenericAffine"):
+        read_field(warp)
+
+
 def test_warps_that_mean_something_else_are_refused(tmp_path: Path) -> None:
     for intent, name, words in ((2006, "", "a warp of FSL"), (1007, "NREG_TRANS", "a warp of NiftyReg"), (0, "", "intent 0")):
         with pytest.raises(InputError, match=words):

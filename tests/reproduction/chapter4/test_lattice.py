@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from matplotlib.figure import Figure as Canvas
 
 from naibu import datasets
+from naibu.identification.lattice_calibration.forward_model import Capture, PushedFace, PushedLattice
 from naibu.identification.lattice_calibration.report_indices import ReportIndices
 from naibu.reproduction.chapter4.cube import TABLES, cube_section
-from naibu.reproduction.chapter4.lattice import _one_set, _pattern_table, exact_section
+from naibu.reproduction.chapter4.lattice import _drawn_sets, _one_set, _pattern_table, exact_section
+from naibu.reproduction.chapter4.lattice_figures import FinalShape, ForceWave, final_shapes, force_waves
 from naibu.reproduction.chapter4.octree import chapter4_octree, cost_section
 from naibu.reproduction.chapter4.patterns import JOINT, PATTERNS, SEPARATE, PatternStudy, pattern_study
-from naibu.validation.specimens.lattice_twin import dough_lattice
+from naibu.validation.specimens.lattice_twin import CUBE_PUSHING, dough_lattice, dough_parameters
 from naibu.viewer.tables import Table
 
 PAPER = {t["id"]: t["rows"] for t in datasets.paper_tables()["tables"]}
@@ -101,3 +106,30 @@ def test_octrees_describe_the_cube_as_the_classic_lattice_does(n: int) -> None:
     classic, *octrees = cells(shape, "sum", "ours, sum, m")
     for octree in octrees:  # about as well, or better
         assert 0.5 * classic < octree < 1.1 * classic  # type: ignore[operator]
+
+
+def test_figures_show_the_last_shape_and_the_points_far_from_it() -> None:
+    lattice = dough_lattice(25.0, size_cm=(5, 5, 5))
+    pushing = replace(CUBE_PUSHING, faces=(PushedFace((0.0, 0.0, 25.0), (0.0, 50.0, 50.0), (10.0, 0.0, 0.0)),), push_s=0.1, keep_s=0.1)
+    pushing = replace(pushing, free_s=0.1, capture_s=(0.0, 0.3))
+    pushed = PushedLattice.of(lattice, pushing)
+    motion = pushed.run(dough_parameters(lattice))
+    off = np.array([0.0, 0.0, 3.0])
+    tops = motion.positions[1][lattice.points[:, 2] == 50.0]
+    capture = Capture.of(pushing, [tops, np.concatenate([tops, tops + off])], motion.force, lattice, point_sd_mm=0.5, force_sd_mn=1.0)
+    shape, wave = FinalShape.of("(a)", capture, pushed, motion), ForceWave.of("(a)", capture, pushed, motion)
+    assert (len(shape.far), shape.captured) == (9, 18)
+    np.testing.assert_allclose(shape.far, tops + off)
+    np.testing.assert_allclose(wave.measured, wave.computed)
+    assert wave.times[[0, -1]] == pytest.approx([0.001, 0.199])
+    for draw in (final_shapes([shape] * 3), force_waves([wave] * 4)):
+        canvas = Canvas()
+        draw(canvas)
+        assert len(canvas.axes) in (3, 4)
+
+
+def test_draws_are_summed_up_by_mean_and_range(made_up_study: PatternStudy) -> None:
+    table = _drawn_sets([made_up_study, made_up_study])
+    once = _one_set(made_up_study).rows[0]
+    assert table.rows[0][:2] == ("first load case", 2)
+    assert table.rows[0][2] == f"{once[4]:.3g} ({once[4]:.3g} to {once[4]:.3g})"

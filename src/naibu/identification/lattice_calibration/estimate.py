@@ -34,6 +34,8 @@ class LatticeEstimate:
         In words, the combinations that the data do not determine.
     finished : bool
         Whether the search came to its end; otherwise Ctrl-C left the best so far.
+    settled : bool
+        Whether it came to rest there; otherwise intervals do not hold.
     """
 
     unknowns: Unknowns
@@ -45,6 +47,7 @@ class LatticeEstimate:
     runs: int
     undetermined: tuple[str, ...]
     finished: bool = True
+    settled: bool = True
 
     def parameters(self) -> Any:
         """Return the parameters of all elements; of a study, a `naibu.identification.Trial`."""

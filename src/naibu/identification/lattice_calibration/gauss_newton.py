@@ -261,7 +261,8 @@ def _searched_by_secants(
     search = SecantSearch(problem, centre, prior_sd, at)
     search.run(max_iterations, reweigh=reweigh)
     covariance, extra = widened_covariance(search.problem, search.point, centre, prior_sd, at, coarse=search.coarse)
-    return _estimate(search.problem, search.point, covariance, search.iterations, search.runs + extra)
+    found = _estimate(search.problem, search.point, covariance, search.iterations, search.runs + extra)
+    return replace(found, settled=search.settled)
 
 
 def _estimate(

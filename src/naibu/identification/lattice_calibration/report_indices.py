@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from naibu.identification.lattice_calibration.forward_model import SAMPLE_S, Capture, PushedLattice
+from naibu.identification.lattice_calibration.forward_model import SAMPLE_S, Capture, PushedLattice, Reproduced
 from naibu.identification.lattice_calibration.shape_distance import closest_points, force_difference
 from naibu.mechanics.lattices.model.lattice import LatticeParameters
 
@@ -38,7 +38,12 @@ class ReportIndices:
 
 def indices(capture: Capture, pushed: PushedLattice, parameters: LatticeParameters, *, large_mm: float = 2.5) -> ReportIndices:
     """Return S_shape and S_force of a lattice against a capture; distances below the sensor's error are not counted in S_shape."""
-    found, since = pushed.run(parameters), round(capture.pushing.push_s / SAMPLE_S)
+    return indices_of(capture, pushed, pushed.run(parameters), large_mm=large_mm)
+
+
+def indices_of(capture: Capture, pushed: PushedLattice, found: Reproduced, *, large_mm: float = 2.5) -> ReportIndices:
+    """Return S_shape and S_force of a motion that was computed, as `indices`."""
+    since = round(capture.pushing.push_s / SAMPLE_S)
     repeated = np.repeat(found.force, round(pushed.long_step / SAMPLE_S), axis=0)
     distances = [np.abs(closest_points(p, pushed.hull, x).signed) for p, x in zip(capture.points, found.positions, strict=True)]
     shape = tuple(float(d[d >= capture.point_sd_mm].sum()) for d in distances)

@@ -23,7 +23,8 @@ POOR = 0.25  # of the promised decrease, below which a step has failed
 FAILED = 2  # steps one after the other from which on derivatives are not trusted
 ENOUGH = (2e-3, 3e-4, 0.0)  # of the cost, before fine steps are simulated, then once, and then again
 NEAR = 0.1  # change of a logarithm since fine steps were simulated, up to which their correction holds
-FINE_RUNS = 4  # at most
+CLOSE = 0.2  # change of a logarithm since differences were taken, up to which they hold with their updates
+FINE_RUNS = 8  # at most
 BESIDE = 0.1  # least damping of the second step that is tried beside the first
 LEAST_DAMPING = 1e-3
 
@@ -46,10 +47,14 @@ class SecantSearch:
         What residuals of fine steps differ from these.
     slopes : tuple of ndarray
         Derivatives.
+    differenced : ndarray
+        Where differences were taken last.
     fresh : bool
-        Whether these are differences at theta.
+        Whether that is theta.
     runs, iterations : int
         Simulations, and steps.
+    settled : bool
+        Whether the search came to rest.
     """
 
     problem: InverseProblem
@@ -60,9 +65,11 @@ class SecantSearch:
     coarse: Residual = field(init=False)
     correction: Residual = field(init=False)
     slopes: Residual = field(init=False)
+    differenced: FloatArray = field(init=False)
     fresh: bool = False
     runs: int = 0
     iterations: int = 0
+    settled: bool = False
 
     def __post_init__(self) -> None:
         self.theta = self.centre.copy()
@@ -83,12 +90,15 @@ class SecantSearch:
         ConvergenceError
             It did not settle within `max_iterations` steps.
         """
-        while not self._settle(max_iterations, ENOUGH[0]) and not self.fresh:
+        settled = self._settle(max_iterations, ENOUGH[0])
+        while not settled and not self.fresh:
             self._take_differences(self._simulated(self._shifted()))
+            settled = self._settle(max_iterations, ENOUGH[0])
         for k in range(FINE_RUNS):
             enough = ENOUGH[min(k + 1, 2)]
             checked = self.theta
-            fine, *shifted = self._simulated([(self.theta, True), *([] if self.fresh else self._shifted())])
+            known = self.fresh or (settled and float(np.abs(self.theta - self.differenced).max()) < CLOSE)
+            fine, *shifted = self._simulated([(self.theta, True), *([] if known else self._shifted())])
             if shifted:
                 self._take_differences(shifted)
             self.correction = (fine[0] - self.coarse[0], fine[1] - self.coarse[1])
@@ -96,7 +106,8 @@ class SecantSearch:
                 self._weigh()
             settled = self._settle(max_iterations, enough)
             moved = float(np.abs(self.theta - checked).max())
-            if moved < NEAR and (settled or moved == 0.0):
+            self.settled = settled and moved < NEAR
+            if self.settled or moved == 0.0:
                 return
 
     def _settle(self, max_iterations: int, enough: float = 0.0) -> bool:
@@ -107,7 +118,7 @@ class SecantSearch:
         cost, damping, failed = self._cost(self.theta, self.coarse), 0.0, 0
         for _ in range(max_iterations):
             self.at.keep(self.problem, self.point)
-            dampings = (damping, max(10.0 * damping, BESIDE))[: self.at.threads]
+            dampings = (damping, max(10.0 * damping, BESIDE))
             steps = [next_step(self.point, self.centre, self.prior_sd, d) for d in dampings]
             promised = steps[0][1]
             if promised < SETTLED + max(self.problem.roughness, enough) * cost:
@@ -151,7 +162,7 @@ class SecantSearch:
         points, forces = (
             np.stack([(found[k] - self.coarse[k]) / h for found, h in zip(shifted, self._shifts(), strict=True)], axis=1) for k in range(2)
         )
-        self.slopes, self.fresh = (points, forces), True
+        self.slopes, self.fresh, self.differenced = (points, forces), True, self.theta
 
     def _update(self, step: FloatArray, found: Residual) -> None:
         """Make the derivatives (count, p) tell what a step from theta, with the residuals of long steps that were found, did."""

@@ -1,5 +1,7 @@
 """Displacement field transforms of ITK: ``.h5`` (also of ANTs and 3D Slicer, with linear transforms after them) and text (``.tfm``).
 
+The linear transform that ANTs writes beside its warp is in a MATLAB file (``.mat``, version 4).
+
 A transform maps points of the fixed image to the moving one, in LPS and mm: x to x + d(x). Fixed parameters of a displacement field
 transform are size, origin, spacing and direction (row by row); its parameters are the vectors, voxel by voxel, with x fastest. A composite
 transform applies its last member first. The formats are described in the ITK Software Guide, https://itk.org/ItkSoftwareGuide.pdf.
@@ -16,7 +18,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
-from naibu.io.files.reading import read_bytes, require_plausible
+from naibu.io.files.reading import guarded_reading, read_bytes, require_plausible, require_regular
 from naibu.io.image_formats.geometry import volume_with_axes
 
 GROUP = "TransformGroup"
@@ -80,6 +82,39 @@ def read_tfm(source: Path) -> tuple[FloatArray, Volume]:
     return _field(source, [t for t in found if not t.kind.startswith("CompositeTransform")])
 
 
+def ants_affine(source: Path) -> Path | None:
+    """Return the linear transform of ANTs that belongs to a warp ``PREFIX1Warp.nii.gz``, ``PREFIX0GenericAffine.mat``, if it is there."""
+    prefix, found, _ = source.name.partition("1Warp.nii")
+    affine = source.with_name(f"{prefix}0GenericAffine.mat")
+    return affine if found and affine.exists() else None
+
+
+def followed_by(source: Path, vectors: FloatArray, grid: Volume) -> FloatArray:
+    """Return vectors (nz, ny, nx, 3), mm, after which a linear transform is applied, of a file ``.mat`` as ITK and ANTs write it.
+
+    Raises
+    ------
+    InputError
+        No linear transform of three dimensions.
+    """
+    from scipy.io import loadmat
+
+    require_regular(source)
+    with guarded_reading(source, "linear transform"):
+        stored = {name: np.asarray(values) for name, values in loadmat(source).items() if not name.startswith("__")}
+    kind = next((name for name in stored if name.endswith("_3_3")), None)
+    if kind is None or "fixed" not in stored or any(values.dtype.kind not in "fiu" for values in stored.values()):
+        raise InputError(
+            f"{source.name}: holds {', '.join(stored) or 'nothing'}, no linear transform of ITK in three dimensions with its 'fixed'; "
+            "move it elsewhere if it does not belong to the warp beside it"
+        )
+    transform = _Transform(kind, stored[kind].astype(float).ravel(), stored["fixed"].astype(float).ravel())
+    if not (np.isfinite(transform.parameters).all() and np.isfinite(transform.fixed).all()):
+        raise InputError(f"{source.name}: {kind} holds numbers that are not finite; write the file again")
+    places = grid.positions()
+    return _linear(source, transform, places + vectors) - places
+
+
 def _dataset(source: Path, entry: Any, name: str) -> FloatArray:
     stored = next((entry[f"{start}{name}"] for start in _TYPO if f"{start}{name}" in entry), None)
     if not isinstance(stored, h5py.Dataset) or stored.external or stored.is_virtual:
@@ -130,8 +165,20 @@ def _linear(source: Path, transform: _Transform, points: FloatArray) -> FloatArr
         return points
     if transform.kind.startswith("TranslationTransform") and len(p) == 3:
         return np.asarray(points + p)
-    if not transform.kind.startswith(_LINEAR) or len(p) != 12 or len(centre) < 3:
+    if transform.kind.startswith("Euler3DTransform") and len(p) == 6 and len(centre) >= 3:
+        p = np.concatenate([_euler(p[:3], zyx=len(centre) > 3 and centre[3] != 0.0).ravel(), p[3:]])
+    elif not transform.kind.startswith(_LINEAR) or len(p) != 12 or len(centre) < 3:
         raise InputError(
-            f"{source.name}: the field is followed by a {transform.kind}; naibu reads affine transforms, translations and identities there"
+            f"{source.name}: the field is followed by a {transform.kind}; naibu reads affine and Euler transforms, translations and "
+            "identities there"
         )
     return np.asarray((points - centre[:3]) @ p[:9].reshape(3, 3).T + centre[:3] + p[9:])
+
+
+def _euler(angles: FloatArray, *, zyx: bool) -> FloatArray:
+    """Return the rotation of ITK's Euler angles about x, y and z, rad: Rz Rx Ry, or Rz Ry Rx."""
+    (cx, cy, cz), (sx, sy, sz) = np.cos(angles), np.sin(angles)
+    x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    return np.asarray(z @ y @ x if zyx else z @ x @ y)

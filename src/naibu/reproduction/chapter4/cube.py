@@ -5,10 +5,11 @@ from __future__ import annotations
 from naibu.identification.lattice_calibration.estimate import LatticeEstimate
 from naibu.identification.lattice_calibration.forward_model import Capture, PushedLattice
 from naibu.identification.lattice_calibration.gauss_newton import CalibrationProblem, calibrate_lattice
-from naibu.identification.lattice_calibration.report_indices import indices
+from naibu.identification.lattice_calibration.report_indices import ReportIndices, indices_of
 from naibu.identification.lattice_calibration.unknowns import LatticeUnknowns
 from naibu.mechanics.lattices.model.lattice import Lattice, box_mask, classic_lattice
 from naibu.mechanics.lattices.model.octree import octree_lattice
+from naibu.reproduction.chapter4.lattice_figures import FinalShape, final_shapes
 from naibu.reproduction.chapter4.patterns import START, with_interval_factor
 from naibu.reproduction.printed_tables import printed_table
 from naibu.validation.specimens.lattice_twin import (
@@ -22,11 +23,12 @@ from naibu.validation.specimens.lattice_twin import (
     dough_parameters,
     virtual_capture,
 )
-from naibu.viewer.chapter import Chapter, Section
+from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 MODELS = ("classic", "type 0", "type 1", "type 2")
 TABLES = {8: ("4-III", "4-V"), 16: ("4-IV", "4-VI")}  # calibrated parameters and shape differences, by voxels per edge
+FIGURES = {8: "Fig. 13", 16: "Fig. 14"}
 ORDERS = ("1st", "2nd", "3rd")
 EDGE_MM = 10.0 * CUBE_CM[0]
 
@@ -63,7 +65,14 @@ def cube_section(n: int, seed: int, points: int) -> Section:
         "surface. The units printed with the parameters cannot be those of a spring (gf/cm^3): they are shown as printed.",
     )
     title = f"{n + 1} x {n + 1} x {n + 1} nodes"
-    return Section(title, text, (_parameters(n, fits), _differences(n, fits, lattices, capture)))
+    pushed = [PushedLattice.of(lattice, capture.pushing) for lattice in lattices]
+    motions = [p.run(fit.parameters()) for p, fit in zip(pushed, fits, strict=True)]
+    shapes = [FinalShape.of(model, capture, p, m) for model, p, m in zip(MODELS, pushed, motions, strict=True)]
+    figure = Figure(
+        FIGURES[n], "Final shapes, and captured points that lie 2.5 mm or more away from them (orange).", final_shapes(shapes), (8.0, 7.0)
+    )
+    found = [indices_of(capture, p, m) for p, m in zip(pushed, motions, strict=True)]
+    return Section(title, text, (_parameters(n, fits), _differences(n, found)), (figure,))
 
 
 def _fitted(lattice: Lattice, capture: Capture) -> LatticeEstimate:
@@ -91,10 +100,9 @@ def _parameters(n: int, fits: list[LatticeEstimate]) -> Table:
     return Table(f"Table {number[2:]}", columns, tuple(rows), caption=f"Calibrated parameters, {n + 1} nodes per edge.", note=note)
 
 
-def _differences(n: int, fits: list[LatticeEstimate], lattices: list[Lattice], capture: Capture) -> Table:
+def _differences(n: int, found: list[ReportIndices]) -> Table:
     number = TABLES[n][1]
     _, printed = printed_table(number)
-    found = [indices(capture, PushedLattice.of(m, capture.pushing), f.parameters()) for m, f in zip(lattices, fits, strict=True)]
     rows: list[tuple[Cell, ...]] = []
     for time, *cells in printed:
         chosen = range(5) if time == "sum" else [int(time) - 1]

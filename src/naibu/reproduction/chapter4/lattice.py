@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from naibu.identification.lattice_calibration.gauss_newton import CalibrationProblem, calibrate_lattice
 from naibu.identification.lattice_calibration.report_indices import ReportIndices
 from naibu.identification.lattice_calibration.unknowns import UNITS
-from naibu.reproduction.chapter4.patterns import START, PatternStudy, pattern_study, with_interval_factor
+from naibu.reproduction.chapter4.lattice_figures import final_shapes, force_waves
+from naibu.reproduction.chapter4.patterns import ONE_SET, START, PatternStudy, pattern_study, with_interval_factor
 from naibu.reproduction.printed_tables import printed_table
 from naibu.validation.specimens.lattice_twin import FORCE_SD_MN, POINT_SD_MM, POINTS, TRUTH, dough_lattice, dough_twin
-from naibu.viewer.chapter import Chapter, Section
+from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 PRINTED_FORCE_N = {"a": 3803.6, "b": 538.7, "c": 7448.3, "d": 979.5}  # captions of Figure 14 of the ICAT paper
 PRINTED_COUNTS = {"first": (2821, 2795, 3075, 2815, 2811), "second": (2255, 2195, 2213, 2201, 2165)}  # the third and the second corrected
+DRAWS = 10
+_ON_SECOND = ("g", "force 1 on 2", "joint 1 on 2")
 TWIN_TEXT = (
     "The measurements of the report are not available. A virtual twin replaces the dough: a block of 10 x 5 x 7 cm and 510 g fixed to the "
     "floor, compressed by two opposite indenters that close at 20 mm/s on the middle of its faces, pause and retract. Two stereo "
@@ -24,7 +29,7 @@ TWIN_TEXT = (
 )
 
 
-def chapter4_lattice(seed: int = 0, *, points: int = POINTS) -> Chapter:
+def chapter4_lattice(seed: int = 0, *, points: int = POINTS, draws: int = DRAWS) -> Chapter:
     """Reproduce the calibrations of chapter 4.3 on a virtual twin.
 
     Parameters
@@ -33,10 +38,13 @@ def chapter4_lattice(seed: int = 0, *, points: int = POINTS) -> Chapter:
         Seed of the twin's noise.
     points : int
         Number of captured points.
+    draws : int
+        Twins, with noise and points of their own, for which one joint set is compared with two.
     """
     study = pattern_study(seed, points=points)
-    sections = (exact_section(seed, points), *pattern_sections(study))
-    settings: dict[str, Cell] = {"seed": seed, "points": points, "point_sd_mm": POINT_SD_MM, "force_sd_mn": FORCE_SD_MN}
+    others = [pattern_study(seed + k, points=points, patterns=ONE_SET) for k in range(1, draws)]
+    sections = (exact_section(seed, points), *pattern_sections(study, others))
+    settings: dict[str, Cell] = {"seed": seed, "points": points, "draws": draws, "point_sd_mm": POINT_SD_MM, "force_sd_mn": FORCE_SD_MN}
     return Chapter("ch4-lattice", "Chapter 4.3: lattices of dough, calibrated on shape and force", sections, settings)
 
 
@@ -63,7 +71,7 @@ def exact_section(seed: int, points: int) -> Section:
     )
 
 
-def pattern_sections(study: PatternStudy) -> tuple[Section, ...]:
+def pattern_sections(study: PatternStudy, others: Sequence[PatternStudy] = ()) -> tuple[Section, ...]:
     """Return the tables of the patterns (a) to (h), printed and ours, and one joint parameter set compared with the report's two."""
     first = _pattern_table("4-force-1", "first", "abcd", ("joint 1",), study)
     second = _pattern_table("4-force-2", "second", "efgh", ("joint 2", "joint 1 on 2"), study)
@@ -79,9 +87,49 @@ def pattern_sections(study: PatternStudy) -> tuple[Section, ...]:
         "jointly.",
     )
     return (
-        Section("Eight patterns of loading and calibration", text, (first, second)),
-        Section("One parameter set or two", (), (_one_set(study), _parameter_table(study), _undetermined_table(study))),
+        Section("Eight patterns of loading and calibration", text, (first, second), _figures(study)),
+        Section(
+            "One parameter set or two",
+            (),
+            (_one_set(study), _drawn_sets((study, *others)), _parameter_table(study), _undetermined_table(study)),
+        ),
     )
+
+
+def _figures(study: PatternStudy) -> tuple[Figure, ...]:
+    """Return the figures of shapes and forces of the patterns that were computed."""
+    found = []
+    for letters, number, which in (("abcd", 13, "First"), ("efgh", 15, "Second")):
+        if all(k in study.shapes for k in letters):
+            text = f"{which} load case: final shapes, and captured points that lie 0.25 cm or more away from them (orange)."
+            found.append(Figure(f"Fig. {number}", text, final_shapes([study.shapes[k] for k in letters]), (8.0, 6.5)))
+            text = f"{which} load case: force of the first indenter, measured and computed."
+            found.append(Figure(f"Fig. {number + 1}", text, force_waves([study.waves[k] for k in letters]), (8.0, 5.0)))
+    return tuple(found)
+
+
+def _drawn_sets(studies: Sequence[PatternStudy]) -> Table:
+    """Return how one joint set compares with the two sets of the first load case, over several draws."""
+    rows: list[tuple[Cell, ...]] = []
+    for text, shape, force, joint in (("first load case", "a", "force 1", "joint 1"), ("second, calibrated on the first", *_ON_SECOND)):
+        ratios = np.array(
+            [
+                (
+                    sum(s.found[joint].shape_mm) / sum(s.found[shape].shape_mm),
+                    s.found[joint].force_mn / s.found[force].force_mn,
+                    s.found[shape].force_mn / s.found[joint].force_mn,
+                    sum(s.found[force].shape_mm) / sum(s.found[joint].shape_mm),
+                )
+                for s in studies
+            ]
+        )
+        rows.append((text, len(studies), *(f"{r.mean():.3g} ({r.min():.3g} to {r.max():.3g})" for r in ratios.T)))
+    columns = (
+        "displacement control", "draws", "S_shape, joint / set for shape", "S_force, joint / set for force",
+        "S_force, set for shape / joint", "S_shape, set for force / joint",
+    )  # fmt: skip
+    note = "Mean, least and largest ratio over twins with noise and captured points of their own."
+    return Table("One set or two, drawn", columns, tuple(rows), caption="One joint set against two sets.", note=note)
 
 
 def _pattern_table(number: str, which: str, letters: str, joint: tuple[str, ...], study: PatternStudy) -> Table:

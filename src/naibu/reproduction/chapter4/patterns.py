@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from naibu.identification.lattice_calibration.estimate import LatticeEstimate
 from naibu.identification.lattice_calibration.forward_model import Capture, PushedLattice, PushMode
 from naibu.identification.lattice_calibration.gauss_newton import CalibrationProblem, Index, calibrate_lattice
-from naibu.identification.lattice_calibration.report_indices import ReportIndices, indices
+from naibu.identification.lattice_calibration.report_indices import ReportIndices, indices_of
 from naibu.mechanics.lattices.model.lattice import Lattice
+from naibu.reproduction.chapter4.lattice_figures import FinalShape, ForceWave
 from naibu.validation.specimens.lattice_twin import FIRST, SECOND, Law, dough_lattice, dough_twin
 
 START = {"K": 40.0, "C1": 30.0, "C2": 50.0}  # mN/mm and mN s/mm: the initial guess of all calibrations
@@ -48,6 +50,8 @@ SEPARATE = (  # the report's two sets under displacement control, on either load
     Pattern("force 2", 1, "displacement", (1, "displacement", "force")),
     Pattern("force 1 on 2", 1, "displacement", (0, "displacement", "force")),
 )
+EVERY = (*PATTERNS, *JOINT, *SEPARATE)
+ONE_SET = (PATTERNS[0], PATTERNS[6], JOINT[0], JOINT[2], SEPARATE[0], SEPARATE[2])  # the three sets of the first load case, on either
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,15 +68,26 @@ class PatternStudy:
         Estimates by load case, control and index.
     found : dict
         Indices of every pattern by its letter or name.
+    shapes, waves : dict
+        Likewise the final shapes, and the forces over time.
     """
 
     lattice: Lattice
     captures: tuple[Capture, ...]
     estimates: dict[Key, LatticeEstimate]
     found: dict[str, ReportIndices]
+    shapes: dict[str, FinalShape] = field(default_factory=dict)
+    waves: dict[str, ForceWave] = field(default_factory=dict)
 
 
-def pattern_study(seed: int = 0, *, law: Law = "finer", spacing_mm: float = 10.0, points: int = 2800) -> PatternStudy:
+def pattern_study(
+    seed: int = 0,
+    *,
+    law: Law = "finer",
+    spacing_mm: float = 10.0,
+    points: int = 2800,
+    patterns: Sequence[Pattern] = (*PATTERNS, *JOINT, *SEPARATE),
+) -> PatternStudy:
     """Calibrate on either load case under displacement and force control, on shape, force and both, and evaluate all patterns.
 
     Parameters
@@ -85,18 +100,24 @@ def pattern_study(seed: int = 0, *, law: Law = "finer", spacing_mm: float = 10.0
         Node spacing of the model, mm.
     points : int
         Number of captured points.
+    patterns : sequence of Pattern
+        Which ones.
     """
     twin = dough_twin((FIRST, SECOND), law=law, spacing_mm=spacing_mm, seed=seed, points=points)
     lattice = dough_lattice(spacing_mm)
-    estimates: dict[Key, LatticeEstimate] = {}
-    found = {}
-    for pattern in (*PATTERNS, *JOINT, *SEPARATE):
+    study = PatternStudy(lattice, twin.captures, {}, {})
+    estimates = study.estimates
+    for pattern in patterns:
         if pattern.calibration not in estimates:
             estimates[pattern.calibration] = calibrated(lattice, twin.captures, pattern.calibration)
         capture = twin.captures[pattern.pushing]
         pushed = PushedLattice.of(lattice, capture.pushing, pattern.mode, force=capture.force)
-        found[pattern.letter] = indices(capture, pushed, estimates[pattern.calibration].parameters())
-    return PatternStudy(lattice, twin.captures, estimates, found)
+        motion = pushed.run(estimates[pattern.calibration].parameters())
+        title = f"({pattern.letter})"
+        study.found[pattern.letter] = indices_of(capture, pushed, motion)
+        study.shapes[pattern.letter] = FinalShape.of(title, capture, pushed, motion)
+        study.waves[pattern.letter] = ForceWave.of(title, capture, pushed, motion)
+    return study
 
 
 def calibrated(lattice: Lattice, captures: tuple[Capture, ...], key: Key) -> LatticeEstimate:

@@ -216,6 +216,11 @@ def _searched(problem: StudyProblem, method: Method, seed: int, max_runs: int, t
 
 def _warnings(problem: StudyProblem, estimate: LatticeEstimate, before: Compared) -> tuple[str, ...]:
     found = [] if estimate.finished else ["The search was interrupted: these are the best values so far, not the end of the search."]
+    if not estimate.settled:
+        found.append(
+            "The search did not come to rest: long and short steps of time differ by more than the noise, or contacts jump between "
+            "sticking and sliding. Intervals do not hold; begin nearer (the calibrated study), or identify fewer parameters."
+        )
     for what, factor in zip(("points", "forces"), estimate.noise_factor, strict=True):
         if factor > 1.3:
             found.append(
@@ -304,6 +309,7 @@ def _numbers(estimate: LatticeEstimate) -> dict[str, Any]:
     return {
         "naibu": __version__,
         "finished": estimate.finished,
+        "settled": estimate.settled,
         "parameters": [{"name": n, "unit": u, "value": v, "interval_95": i} for n, u, v, i in rows],
         "covariance_of_logarithms": estimate.covariance.tolist(),
         "noise_factor": dict(zip(("points", "forces"), [None if np.isnan(f) else f for f in estimate.noise_factor], strict=True)),
