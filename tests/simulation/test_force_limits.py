@@ -56,7 +56,7 @@ def test_an_environment_that_drives_the_hand_gives_no_more_than_the_bound(gain: 
             position += 1e-3 * velocity
             work += force * 1e-3 * velocity
             most = max(most, work)
-            controller.observe(np.array([force, 0.0, 0.0]), np.array([1e-3 * velocity, 0.0, 0.0]))
+            controller.observe(-work)
             moving = np.array([velocity, 0.0, 0.0])
             limiter.forget()
             force = limiter.limited(limits.within_magnitude(controller.controlled(gain * moving, moving, 1e-3)))[0]

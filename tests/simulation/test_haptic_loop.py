@@ -82,6 +82,33 @@ def test_a_body_under_tension_pushes_the_hand_no_further_than_the_bound() -> Non
     assert all(work[bound] <= bound for bound in (4.0, 8.0, 16.0))
 
 
+def test_the_bound_holds_while_a_busy_computer_answers_rarely() -> None:
+    """The same device, with an answer every 15 ms: the force that goes on between them hands out more than it may, but for the device."""
+    most = {}
+    for guarded in (True, False):
+        touched, channel = simulation(), LossyChannel(loss=0.0, late=0.0)
+        touched.take("sphere")
+        touched.move((20.0, 20.0, TOP - 4.0))
+        for _ in range(200):
+            touched.advance()
+        device, step = SimulatedDevice(lambda _: np.zeros(3), stiffness=1.0, damping=0.05, mass_kg=0.02), touched.frame_s
+        hand = HapticHand(channel, limits=replace(ForceLimits(), energy_mn_mm=4.0))
+        work = []
+        for k in range(round(0.3 / step)):
+            channel.up.send(pose_bytes(device.advance(step)))
+            work.append(device.work)
+            if k % round(0.015 / step) == 0:
+                hand.before(touched)
+                hand.after(touched.advance(), step)
+            for packet in channel.down.arrived():
+                answer = read_force(packet)
+                device.hear(answer if guarded else replace(answer, energy_mn_mm=1e12))
+        most[guarded] = max(work)
+        touched.close()
+    assert most[True] <= 4.0 * (1 + 1e-9)
+    assert most[False] > 8.0
+
+
 def test_the_force_fades_when_the_device_falls_silent_and_it_may_come_back() -> None:
     touched, channel = simulation(), LossyChannel(loss=0.0, late=0.0)
     device, hand = pressing(10.0, 0.3), HapticHand(channel)

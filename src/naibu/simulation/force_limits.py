@@ -76,9 +76,9 @@ class PassivityController:
     stiffness: float
     absorbed: float = 0.0
 
-    def observe(self, force: FloatArray, moved: FloatArray) -> None:
-        """Count a motion of the device (3,), mm, under a force on it (3,), mN."""
-        self.absorbed -= float(force @ moved)
+    def observe(self, absorbed: float) -> None:
+        """Take note of the energy that the device has put in so far less what it got, mN mm."""
+        self.absorbed = absorbed
 
     def controlled(self, force: FloatArray, velocity: FloatArray, step_s: float) -> FloatArray:
         """Return a force (3,), mN, reduced where a device at a velocity (3,), mm/s, would get more energy than there is.

@@ -45,6 +45,8 @@ class DevicePose:
         Bits; the lowest one lets the device move without its tool.
     applied : int
         Number of the answer whose force it applied since its last packet, 0 for none.
+    energy_mn_mm : float
+        Energy that the forces have handed out to it so far, less what it put in, mN mm: by its own account, which lost packets leave right.
     """
 
     sequence: int
@@ -53,6 +55,7 @@ class DevicePose:
     quaternion: FloatArray = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
     buttons: int = 0
     applied: int = 0
+    energy_mn_mm: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,6 +74,8 @@ class DeviceForce:
         Force on the device, mN.
     flags : int
         Sum of `CONTACT`, `LIMITED` (magnitude or step), `STALE` (no pose has come for a while) and `DAMPED` (passivity).
+    energy_mn_mm : float
+        What the account of the device may come to at most, mN mm; it applies no more of any force than that permits.
     """
 
     number: int
@@ -78,6 +83,7 @@ class DeviceForce:
     time_s: float
     force_mn: FloatArray
     flags: int
+    energy_mn_mm: float = 0.0
 
 
 class DeviceChannel(Protocol):
@@ -161,6 +167,7 @@ class HapticHand:
     _velocity: FloatArray = field(init=False, default_factory=lambda: np.zeros(3))
     _offset: FloatArray = field(init=False, default_factory=lambda: np.zeros(3))
     _silence: float = field(init=False, default=0.0)
+    _energy: float = field(init=False, default=0.0)  # on the account of the device when it came
 
     def __post_init__(self) -> None:
         self.passivity = PassivityController(self.limits, self.coupling.stiffness)
@@ -223,14 +230,16 @@ class HapticHand:
             wanted = damped
         force = self._limiter.limited(self.limits.within_magnitude(wanted))
         flags |= LIMITED * (bool(np.abs(force - wanted).max() > ROUNDING_MN))
-        self.channel.send(DeviceForce(self._limiter.number, self._pose.sequence, self._pose.time_s, force, flags))
+        most = self._energy + self.limits.energy_mn_mm
+        self.channel.send(DeviceForce(self._limiter.number, self._pose.sequence, self._pose.time_s, force, flags, most))
 
     def _observe(self, pose: DevicePose) -> None:
         """Take a pose in: energy since the one before, and velocity."""
-        applied = self._limiter.confirmed(pose.applied)
+        self._limiter.confirmed(pose.applied)
         before, self._pose = self._pose, pose
-        if before is not None:
-            self.passivity.observe(applied, pose.position - before.position)
+        if before is None:
+            self._energy = pose.energy_mn_mm
+        self.passivity.observe(self._energy - pose.energy_mn_mm)
         if before is None or self._silence > self.limits.silence_s:
             self._tool, self._velocity = None, np.zeros(3)
         else:

@@ -128,6 +128,7 @@ class LatticeCut:
             before, first=np.concatenate([[0], np.cumsum(each * len(known))]).astype(np.int64), mode=carried(before.mode),
             touched=carried(before.touched), compression=carried(before.compression), extension=carried(before.extension),
             friction=carried(before.friction), multiplier=np.ascontiguousarray(before.multiplier[:, self.source]),
+            acceleration=np.ascontiguousarray(before.acceleration[:, self.source]),
         )  # fmt: skip
 
 

@@ -18,8 +18,8 @@ class SimulatedDevice:
     """A handle of some mass, led by a hand: a spring and a dashpot to where the hand wants it.
 
     It does what a program for a real device does: it counts its packets, tells which answer it applies, drops answers that were overtaken,
-    and lets go when none comes; from then on it takes only answers to poses that said so. Beside that it keeps account of the energy that
-    it gets.
+    and lets go when none comes; from then on it takes only answers to poses that said so. It keeps account of the energy that it gets, and
+    applies no more of a force than the energy permits that the answer allows: also where the next answer is late, it gets no more.
 
     Attributes
     ----------
@@ -74,11 +74,26 @@ class SimulatedDevice:
             self.applied, self._free = None, self._sequence + 1
         self.time_s += step_s
         goal = self.path(self.time_s)
-        pull = self.stiffness * (goal - self.position) + self.force + self.mass_kg / step_s * self.velocity
-        self.velocity = pull / (self.mass_kg / step_s + self.damping + self.stiffness * step_s)
-        moved = step_s * self.velocity
-        self.work += float(self.force @ moved)
+        pull = self.stiffness * (goal - self.position) + self.mass_kg / step_s * self.velocity
+        compliance = step_s / (self.mass_kg / step_s + self.damping + self.stiffness * step_s)
+        force = self._permitted(compliance * pull, compliance)
+        moved = compliance * (pull + force)
+        self.velocity = moved / step_s
+        self.work += float(force @ moved)
         self.position = self.position + moved
         self._sequence += 1
         number = 0 if self.applied is None else self.applied.number
-        return DevicePose(self._sequence, self.time_s, self.position, buttons=self.buttons, applied=number)
+        return DevicePose(self._sequence, self.time_s, self.position, buttons=self.buttons, applied=number, energy_mn_mm=self.work)
+
+    def _permitted(self, moved: FloatArray, compliance: float) -> FloatArray:
+        """Return as much of the force (3,), mN, as hands out no more than the answer allows.
+
+        `moved` is the motion of the step without force (3,), mm, `compliance` what a force adds to it, mm/mN.
+        """
+        if self.applied is None:
+            return self.force
+        left, linear, square = self.applied.energy_mn_mm - self.work, float(self.force @ moved), compliance * float(self.force @ self.force)
+        if linear + square <= max(left, 0.0):
+            return self.force
+        share = (-linear + np.sqrt(linear**2 + 4.0 * square * max(left, 0.0))) / (2.0 * square)
+        return np.asarray(min(max(share, 0.0), 1.0) * self.force)

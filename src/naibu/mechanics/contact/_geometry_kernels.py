@@ -18,6 +18,16 @@ PLANE, BOX, CYLINDER, SPHERE, CAPSULE, BAR, MESH = range(7)
 @njit(cache=True)
 def signed_distance(kind, size, mesh, q, n, h):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return the signed distance of q from a shape; see the module for n and h, `packed_geometries` for `size` and `mesh`."""
+    if kind == MESH:
+        n[:] = 0.0
+        h[:] = 0.0
+        return _from_mesh(q, mesh, n, h)
+    return distance_from_primitive(kind, size, q, n, h)
+
+
+@njit(cache=True)
+def distance_from_primitive(kind, size, q, n, h):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return the signed distance of q from a shape without a mesh, as `signed_distance` does."""
     n[:] = 0.0
     h[:] = 0.0
     if kind == PLANE:
@@ -33,9 +43,7 @@ def signed_distance(kind, size, mesh, q, n, h):  # type: ignore[no-untyped-def] 
         if abs(q[2]) > size[1]:
             return _from_centre(q[0], q[1], q[2] - (size[1] if q[2] > 0.0 else -size[1]), size[0], n, h)
         return _from_axis(q, size[0], n, h)
-    if kind == BAR:
-        return _from_bar(q, size, n, h)
-    return _from_mesh(q, mesh, n, h)
+    return _from_bar(q, size, n, h)
 
 
 @njit(cache=True)

@@ -43,6 +43,7 @@ def transferred_contact(
     held = ("mode", "touched", "compression", "extension", "friction")
     return replace(
         contact, order=order, first=first, multiplier=np.ascontiguousarray(multiplier),
+        acceleration=np.zeros((3, len(after.points))), lasting=np.zeros(1),
         **{name: getattr(contact, name)[source] for name in held},
     )  # fmt: skip
 

@@ -16,11 +16,7 @@ from naibu.core.errors import InputError
 from naibu.mechanics import Assembler, elements, material
 from naibu.meshing import box
 from naibu.simulation import FiniteElementBody, ForceLimits, SimulatedDevice
-from naibu.simulation.simulated_device import SILENCE_S
 from naibu.workflows import TouchableModel, drive_live_simulation, live, touched_loop
-from naibu.workflows.interactive.haptics.device import STEP_S
-
-FASTEST = 40.0  # mm/s, of the hand
 
 
 def device() -> SimulatedDevice:
@@ -40,9 +36,7 @@ def driven(seconds: float) -> None:
     assert sys.getswitchinterval() == interval
     assert record.steps_mn.max() <= limits.step_mn * (1 + 1e-9)
     assert np.linalg.norm(record.forces, axis=1).max() > 50.0
-    # no answer: the last force goes on until the device lets go
-    held = FASTEST * (SILENCE_S + STEP_S) * np.linalg.norm(record.forces, axis=1).max()
-    assert record.most_work <= limits.energy_mn_mm + held
+    assert record.most_work <= limits.energy_mn_mm * (1 + 1e-9)  # however late answers come
     assert frame.tool_centre[2] < TOP + 20.0
     assert counted["old"] > 0
     assert not counted["foreign"]

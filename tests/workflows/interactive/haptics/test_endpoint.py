@@ -16,41 +16,42 @@ from naibu.workflows.interactive.haptics.endpoint import DeviceDatagrams, Haptic
 from naibu.workflows.interactive.haptics.packets import force_bytes, pose_bytes, read_force, read_pose
 
 HERE = ("127.0.0.1", 5000)
-POSE = DevicePose(7, 1.5, np.array([1.0, -2.0, 3.5]), np.array([0.0, 1.0, 0.0, 0.0]), 3, 6)
+POSE = DevicePose(7, 1.5, np.array([1.0, -2.0, 3.5]), np.array([0.0, 1.0, 0.0, 0.0]), 3, 6, -40.0)
 
 
 def test_a_pose_has_the_documented_layout() -> None:
     packet = pose_bytes(POSE)
-    assert len(packet) == 80
+    assert len(packet) == 88
     assert packet[:4] == b"NHP1"
-    assert packet[4:16] == bytes([1, 0, 3, 0, 7, 0, 0, 0, 6, 0, 0, 0])
-    assert struct.unpack_from("<8d", packet, 16) == (1.5, 1.0, -2.0, 3.5, 0.0, 1.0, 0.0, 0.0)
+    assert packet[4:16] == bytes([2, 0, 3, 0, 7, 0, 0, 0, 6, 0, 0, 0])
+    assert struct.unpack_from("<9d", packet, 16) == (1.5, 1.0, -2.0, 3.5, 0.0, 1.0, 0.0, 0.0, -40.0)
     again = read_pose(packet)
-    assert (again.sequence, again.time_s, again.buttons, again.applied) == (7, 1.5, 3, 6)
+    assert (again.sequence, again.time_s, again.buttons, again.applied, again.energy_mn_mm) == (7, 1.5, 3, 6, -40.0)
     np.testing.assert_array_equal(again.position, POSE.position)
     np.testing.assert_array_equal(again.quaternion, POSE.quaternion)
 
 
 def test_an_answer_has_the_documented_layout() -> None:
-    packet = force_bytes(DeviceForce(9, 7, 1.5, np.array([10.0, 0.0, -250.0]), 5))
-    assert len(packet) == 72
+    packet = force_bytes(DeviceForce(9, 7, 1.5, np.array([10.0, 0.0, -250.0]), 5, 960.0))
+    assert len(packet) == 80
     assert packet[:4] == b"NHF1"
-    assert packet[4:16] == bytes([1, 0, 5, 0, 9, 0, 0, 0, 7, 0, 0, 0])
-    assert struct.unpack_from("<7d", packet, 16) == (1.5, 10.0, 0.0, -250.0, 0.0, 0.0, 0.0)
+    assert packet[4:16] == bytes([2, 0, 5, 0, 9, 0, 0, 0, 7, 0, 0, 0])
+    assert struct.unpack_from("<8d", packet, 16) == (1.5, 10.0, 0.0, -250.0, 0.0, 0.0, 0.0, 960.0)
     again = read_force(packet)
-    assert (again.number, again.sequence, again.flags) == (9, 7, 5)
+    assert (again.number, again.sequence, again.flags, again.energy_mn_mm) == (9, 7, 5, 960.0)
 
 
 @pytest.mark.parametrize(
     "packet",
     [
         b"", b"x", pose_bytes(POSE)[:-1], pose_bytes(POSE) + b"\0", b"NHP2" + pose_bytes(POSE)[4:],
-        pose_bytes(POSE)[:4] + b"\2\0" + pose_bytes(POSE)[6:], pose_bytes(replace(POSE, position=np.array([np.nan, 0, 0]))),
+        pose_bytes(POSE)[:4] + b"\1\0" + pose_bytes(POSE)[6:], pose_bytes(replace(POSE, position=np.array([np.nan, 0, 0]))),
         pose_bytes(replace(POSE, position=np.array([np.inf, 0, 0]))), pose_bytes(replace(POSE, position=np.array([0, 1e7, 0]))),
-        pose_bytes(replace(POSE, time_s=float("nan"))), pose_bytes(replace(POSE, quaternion=np.zeros(4))),
+        pose_bytes(replace(POSE, time_s=float("nan"))), pose_bytes(replace(POSE, energy_mn_mm=float("nan"))),
+        pose_bytes(replace(POSE, quaternion=np.zeros(4))),
         pose_bytes(replace(POSE, quaternion=np.array([np.nan, 0, 0, 1]))), force_bytes(DeviceForce(1, 1, 0.0, np.zeros(3), 0)),
     ],
-    ids=["empty", "x", "short", "long", "magic", "version", "nan", "inf", "far", "time", "no rotation", "nan rotation", "answer"],
+    ids=["empty", "x", "short", "long", "magic", "version", "nan", "inf", "far", "time", "energy", "no rotation", "nan rotation", "answer"],
 )  # fmt: skip
 def test_malformed_packets_are_dropped_and_counted(packet: bytes) -> None:
     datagrams = DeviceDatagrams()

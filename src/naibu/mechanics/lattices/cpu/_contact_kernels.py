@@ -9,29 +9,36 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import njit
-from naibu.mechanics.lattices.cpu._coarse_kernels import begin
+from naibu.mechanics.lattices.cpu._coarse_kernels import begin_with
 from naibu.mechanics.lattices.cpu._contact_history import keep, pull_off, update_multipliers
 from naibu.mechanics.lattices.cpu._contact_operator import FACES, NODES, add_contact, close_operator
 from naibu.mechanics.lattices.cpu._contact_points import SLIDE, assemble, look, near_faces
-from naibu.mechanics.lattices.cpu._implicit_kernels import add_momenta, add_reactions, advance, improved_velocity, new_velocity
+from naibu.mechanics.lattices.cpu._implicit_kernels import (
+    add_momenta,
+    add_reactions,
+    advance,
+    extrapolated_velocity,
+    improved_velocity,
+)
 
 AGREED = 1e-4  # error of the pressures, as a fraction of their sum, at which a step is settled
 AGREED_FRICTION = 2e-3  # likewise of the friction, of the sum of its limits
 
 
 @njit(cache=True)
-def _settle(engine, held, contact, base, right, smoother, most):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _settle(engine, held, contact, base, right, ahead, smoother, most):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Solve a step until its contacts agree with the solution; return iterations, passes, what the solver lost, and whether they agree.
 
     The first pass reduces the residual by the tolerance; those that follow, whose contacts differ little, reduce theirs to the same size.
 
-    `engine` are what `new_velocity` takes; `contact` what `look` takes behind the step, and what is scratch; `base` the right side without
-    contact (3 pad,).
+    `engine` are what `extrapolated_velocity` takes; `contact` what `look` takes behind the step, and what is scratch; `base` the right side
+    without contact (3 pad,); `ahead` what the velocity changed by in the step before
+    (3 pad,), and the share of it that was added to v. Returns last the share that was right.
     """
     blocks, tables, x, v, y, mass, work, inner, step, solver = engine
     count, indenters, motion, surface, history, lists, slid, points, slot, diagonal = contact
     operator, r = inner[9], work[1]
-    iterations, lost, goal = 0, 0.0, 0.0
+    iterations, lost, goal, share = 0, 0.0, 0.0, 0.0
     look(count, x, v, step, indenters, motion, surface, history, lists, slid, points, True)
     for attempt in range(most):
         if attempt:  # the residual of the same solution with other contacts
@@ -47,12 +54,12 @@ def _settle(engine, held, contact, base, right, smoother, most):  # type: ignore
             add_contact(operator[0], operator[1], operator[5][FACES], -1.0, v, r)
             done, lost = improved_velocity(blocks, tables, x, v, mass, work, inner, held, goal, solver[1])
         else:
-            done, lost, goal = new_velocity(blocks, tables, x, v, y, mass, right, work, inner, held, step, solver)
+            done, lost, goal, share = extrapolated_velocity(blocks, tables, x, v, ahead, y, mass, right, work, inner, held, step, solver)
         iterations += done
         wrong, wrong_friction, total, limits = look(count, x, v, step, indenters, motion, surface, history, lists, slid, points, False)
         if wrong <= AGREED * total and wrong_friction <= AGREED_FRICTION * limits + 1e-300:
-            return iterations, attempt + 1, lost, True
-    return iterations, most, lost, False
+            return iterations, attempt + 1, lost, True, share
+    return iterations, most, lost, False, share
 
 
 @njit(cache=True)
@@ -84,19 +91,21 @@ def contact_steps(  # type: ignore[no-untyped-def]  # pragma: no cover
     the faces (f, 4), inverse areas (f, 4), foundation (f, 4), shape functions with inverse thickness (q, 5) and weights (p,) at the
     points, and where points (k + 1,) and shape functions (k + 1,) of each indenter begin; `history` the arrays of `ContactState`;
     `scratch` what `near_faces` lists, linearizations and what they exert, which points slide, slots of the nodes, their diagonal blocks,
-    and four numbers a node (4, k, n); `held` node, direction, weight and body of constrained components; `motion` velocities of the
-    bodies that move these (steps, bodies, 3), velocities and angular velocities of the indenters (steps, k, 3); `reactions` those of the
-    bodies and of the indenters; `most` the most passes. Returns iterations, passes and the steps whose contacts did not settle.
+    four numbers a node (4, k, n), the mean acceleration in the step before (3, n) and how much of it lasted (1,), which are changed;
+    `held` node, direction, weight and body of constrained components; `motion` velocities of the bodies that move these (steps, bodies, 3),
+    velocities and angular velocities of the indenters (steps, k, 3); `reactions` those of the bodies and of the indenters; `most` the most
+    passes. Returns iterations, passes and the steps whose contacts did not settle.
     """
     x, v, y, lengths = state
     (_, axes), centres, _, _, _ = indenters
     held_velocity, velocity, spin = motion
-    lists, points, slid, slot, diagonal, nodal = scratch
+    lists, points, slid, slot, diagonal, nodal, trend, trust = scratch
     operator, first = inner[9], surface[5]
     now = (held[0], held[1], np.zeros(len(held[0])), held[3])
-    right, before, base = np.empty_like(x), np.empty_like(x), np.empty_like(x)
+    right, before, base, change = np.empty_like(x), np.empty_like(x), np.empty_like(x), np.zeros_like(x)
+    pad = len(mass)
     iterations, passes, unsettled = 0, 0, 0
-    begin(inner[8])
+    begin_with(inner, now)
     for n in range(len(velocity)):
         before[:] = v
         base[:] = 0.0
@@ -115,7 +124,15 @@ def contact_steps(  # type: ignore[no-untyped-def]  # pragma: no cover
                 slid[p] = history[0][p] == SLIDE
         contact = (count, indenters, moving, surface, history, lists, slid, points, slot, diagonal)
         engine = (blocks, tables, x, v, y, mass, work, inner, step, solver)
-        done, tries, lost, agreed = _settle(engine, now, contact, base, right, inner[3], most)
+        for a in range(3):
+            for i in range(trend.shape[1]):
+                change[a * pad + i] = step * trend[a, i]
+                v[a * pad + i] += trust[0] * change[a * pad + i]
+        done, tries, lost, agreed, share = _settle(engine, now, contact, base, right, (change, trust[0]), inner[3], most)
+        trust[0] = min(max(share, 0.0), 1.0)
+        for a in range(3):
+            for i in range(trend.shape[1]):
+                trend[a, i] = (v[a * pad + i] - before[a * pad + i]) / step
         iterations, passes, unsettled = iterations + done, passes + tries, unsettled + (not agreed)
         add_reactions(now, work[1], len(mass), step, reactions[0][n])
         keep(count, indenters, surface, history, lists, slid, points[1], reactions[1][n])

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import njit
-from naibu.mechanics.contact._geometry_kernels import SPHERE, mesh_of, signed_distance
+from naibu.mechanics.contact._geometry_kernels import MESH, SPHERE, distance_from_primitive, mesh_of, signed_distance
 from naibu.mechanics.lattices.cpu._contact_operator import FACES
 
 FREE, STICK, SLIDE = range(3)
@@ -53,7 +53,7 @@ def near_faces(x, v, step, indenters, motion, surface, lists):  # type: ignore[n
     for k in range(len(centres)):
         turns = spin[k, 0] != 0.0 or spin[k, 1] != 0.0 or spin[k, 2] != 0.0
         moved[k] = 0.0 if turns else moved[k] + 2.0 * step * np.sqrt(fastest)
-        mesh = mesh_of(geometry, k)
+        kind, size, mesh = geometry[0][k], geometry[1][k], mesh_of(geometry, k)
         for f in range(len(corners)):
             if not turns and clear[k, f] > moved[k] and not live[k, f]:
                 continue
@@ -70,7 +70,8 @@ def near_faces(x, v, step, indenters, motion, surface, lists):  # type: ignore[n
                 radius = max(radius, away)
             for a in range(3):
                 q[a] = axes[k, a, 0] * d[0] + axes[k, a, 1] * d[1] + axes[k, a, 2] * d[2]
-            free = signed_distance(geometry[0][k], geometry[1][k], mesh, q, n, none) - (1.0 + MARGIN) * np.sqrt(radius)
+            gap = signed_distance(kind, size, mesh, q, n, none) if kind == MESH else distance_from_primitive(kind, size, q, n, none)
+            free = gap - (1.0 + MARGIN) * np.sqrt(radius)
             clear[k, f] = free + moved[k]
             if free <= 0.0 or live[k, f]:
                 body[count], face[count] = k, f
@@ -81,17 +82,36 @@ def near_faces(x, v, step, indenters, motion, surface, lists):  # type: ignore[n
 @njit(cache=True)
 def gap_of(geometry, mesh, axes, k, d, q, m, n, none):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return the gap of a point at d (3,) from the reference point of indenter k, and set its outward normal n; q and m are scratch."""
-    if geometry[0][k] == SPHERE:
-        r = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
-        for a in range(3):
-            n[a] = d[a] / r if r > 0.0 else axes[k, 2, a]
-        return r - geometry[1][k, 0]
+    kind, size, own = geometry[0][k], geometry[1][k], axes[k]
+    if kind != MESH:
+        return _gap_of_primitive(kind, size, own, d, q, m, n, none)
     for a in range(3):
-        q[a] = axes[k, a, 0] * d[0] + axes[k, a, 1] * d[1] + axes[k, a, 2] * d[2]
-    gap = signed_distance(geometry[0][k], geometry[1][k], mesh, q, m, none)
+        q[a] = own[a, 0] * d[0] + own[a, 1] * d[1] + own[a, 2] * d[2]
+    gap = signed_distance(kind, size, mesh, q, m, none)
     for a in range(3):
-        n[a] = axes[k, 0, a] * m[0] + axes[k, 1, a] * m[1] + axes[k, 2, a] * m[2]
+        n[a] = own[0, a] * m[0] + own[1, a] * m[1] + own[2, a] * m[2]
     return gap
+
+
+@njit(cache=True)
+def _gap_of_primitive(kind, size, axes, d, q, m, n, none):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Do what `gap_of` does for an indenter without a mesh: meshes are many arrays, which take time to hand over."""
+    if kind == SPHERE:
+        return _gap_of_sphere(size[0], d, n)
+    for a in range(3):
+        q[a] = axes[a, 0] * d[0] + axes[a, 1] * d[1] + axes[a, 2] * d[2]
+    gap = distance_from_primitive(kind, size, q, m, none)
+    for a in range(3):
+        n[a] = axes[0, a] * m[0] + axes[1, a] * m[1] + axes[2, a] * m[2]
+    return gap
+
+
+@njit(cache=True)
+def _gap_of_sphere(radius, d, n):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Do what `gap_of` does for a sphere."""
+    r = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    n[0], n[1], n[2] = (d[0] / r, d[1] / r, d[2] / r) if r > 0.0 else (0.0, 0.0, 1.0)
+    return r - radius
 
 
 @njit(cache=True)
@@ -129,7 +149,7 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
     wrong, wrong_friction, total, limits = 0.0, 0.0, 0.0, 0.0
     for entry in range(count):
         k, f = lists[0][entry], lists[1][entry]
-        mesh, each = mesh_of(geometry, k), rule[k + 1] - rule[k]
+        kind, size, own_axes, mesh, each = geometry[0][k], geometry[1][k], axes[k], mesh_of(geometry, k), rule[k + 1] - rule[k]
         _gather(x, v, step, corners[f], at, speed)
         at -= centres[k]
         for c in range(4):
@@ -137,16 +157,23 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
         _face_normal(at, across)
         for g in range(each):
             p, shape = first[k] + f * each + g, shapes[rule[k] + g]
-            own, result, weight = linear[p], found[p], weights[p]
+            weight = weights[p]
             _combine(shape, at, d)
-            gap = gap_of(geometry, mesh, axes, k, d, q, m, n, none)
+            if kind == SPHERE:
+                gap = _gap_of_sphere(size[0], d, n)
+            elif kind == MESH:
+                gap = gap_of(geometry, mesh, axes, k, d, q, m, n, none)
+            else:
+                gap = _gap_of_primitive(kind, size, own_axes, d, q, m, n, none)
             if begins:
-                own[ACTIVE] = 0.0
-            if own[ACTIVE] == 0.0:
-                for c in range(RESULTS):
-                    result[c] = 0.0
+                linear[p, ACTIVE] = 0.0
+            if linear[p, ACTIVE] == 0.0:
+                if found[p, TOUCHING] != 0.0:
+                    for c in range(RESULTS):
+                        found[p, c] = 0.0
                 if _is_far(gap, np.sqrt(weight), form[k, 0]):
                     continue
+            own, result = linear[p], found[p]
             _combine(shape, speed, slip)
             _exerted(own, slip, result)
             stiff, spring = shape[4] * foundation[f, 0], shape[4] * foundation[f, 1]

@@ -158,12 +158,13 @@ class ContactStepper:
         indenters = ((self.geometry, contact.axes), contact.centres, self.friction, self.pull, self.form)
         corners, spread, *rest = self.points
         (blocks, tables), (work, inner) = base.kernel, base.scratch
-        operator, *scratch = self.scratch
+        operator, *own = self.scratch
+        scratch = (*own, contact.acceleration, contact.lasting)
         for values in reactions:
             values[:] = 0.0
         found: tuple[int, int, int] = contact_steps(
             blocks, tables, (base.position, base.velocity, base.extension, base.length), base.mass, base.external, work,
-            (*inner[:9], operator), indenters, (corners, spread, self._foundation[parts], *rest), history, tuple(scratch),
+            (*inner[:9], operator), indenters, (corners, spread, self._foundation[parts], *rest), history, scratch,
             base.constrained, (held_velocity, velocity, spin), base.step, (base.tolerance, MOST_ITERATIONS), reactions, self.passes,
         )  # fmt: skip
         return found
@@ -191,7 +192,7 @@ class ContactStepper:
         assert base.length is not None  # as of all implicit steps
         lattice = (base.position, base.velocity, base.extension, base.length)
         history = (contact.mode, contact.touched, contact.compression, contact.extension, contact.friction, contact.multiplier)
-        return (*lattice, *history, contact.centres, contact.axes)
+        return (*lattice, *history, contact.centres, contact.axes, contact.acceleration, contact.lasting)
 
 
 def _points(surface: ContactSurface, contact: ContactState) -> KernelTuple:
@@ -205,7 +206,7 @@ def _points(surface: ContactSurface, contact: ContactState) -> KernelTuple:
 
 
 def _scratch(faces: int, indenters: int, points: int, pad: int) -> KernelTuple:
-    """Return an empty operator, what `near_faces` lists, linearized points and what they exert, which slide, slots and diagonal blocks."""
+    """Return the scratch of `contact_steps`."""
     pairs = faces * indenters
     lists = (
         np.zeros(pairs, np.int64), np.zeros(pairs, np.int64), np.zeros((indenters, faces)), np.zeros(indenters),

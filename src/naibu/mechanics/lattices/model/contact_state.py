@@ -44,6 +44,10 @@ class ContactState:
         Axes of the indenters, in rows.
     begun : ndarray, shape (), bool
         Whether the foundations are compressed by what the indenters cover at the start.
+    acceleration : ndarray, shape (3, n)
+        Mean acceleration of the nodes in the last step, mm/s2, from which the next one begins.
+    lasting : ndarray, shape (1,)
+        How much of that before lasted in the last step, from 0 to 1.
     """
 
     order: IntArray
@@ -57,6 +61,8 @@ class ContactState:
     centres: FloatArray
     axes: FloatArray
     begun: BoolArray
+    acceleration: FloatArray
+    lasting: FloatArray
 
     @property
     def indenters(self) -> int:
@@ -135,4 +141,5 @@ def begin_contact(
     begun, traction = np.zeros((), dtype=bool), np.zeros((len(gap), 3))
     return ContactState(
         order, first, touched.astype(np.int8), touched, none, none.copy(), traction, at_node, centres, axes, begun,
+        np.zeros((3, lattice.n_nodes)), np.zeros(1),
     )  # fmt: skip
