@@ -84,7 +84,7 @@ def gap_of(geometry, mesh, axes, k, d, q, m, n, none):  # type: ignore[no-untype
     """Return the gap of a point at d (3,) from the reference point of indenter k, and set its outward normal n; q and m are scratch."""
     kind, size, own = geometry[0][k], geometry[1][k], axes[k]
     if kind != MESH:
-        return _gap_of_primitive(kind, size, own, d, q, m, n, none)
+        return _primitive_gap(kind, size, own, d, q, m, n, none)
     for a in range(3):
         q[a] = own[a, 0] * d[0] + own[a, 1] * d[1] + own[a, 2] * d[2]
     gap = signed_distance(kind, size, mesh, q, m, none)
@@ -94,7 +94,7 @@ def gap_of(geometry, mesh, axes, k, d, q, m, n, none):  # type: ignore[no-untype
 
 
 @njit(cache=True)
-def _gap_of_primitive(kind, size, axes, d, q, m, n, none):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _primitive_gap(kind, size, axes, d, q, m, n, none):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Do what `gap_of` does for an indenter without a mesh: meshes are many arrays, which take time to hand over."""
     if kind == SPHERE:
         return _gap_of_sphere(size[0], d, n)
@@ -149,7 +149,7 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
     wrong, wrong_friction, total, limits = 0.0, 0.0, 0.0, 0.0
     for entry in range(count):
         k, f = lists[0][entry], lists[1][entry]
-        kind, size, own_axes, mesh, each = geometry[0][k], geometry[1][k], axes[k], mesh_of(geometry, k), rule[k + 1] - rule[k]
+        kind, size, turn, mesh, each = geometry[0][k], geometry[1][k], axes[k], mesh_of(geometry, k), rule[k + 1] - rule[k]
         _gather(x, v, step, corners[f], at, speed)
         at -= centres[k]
         for c in range(4):
@@ -161,16 +161,17 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
             _combine(shape, at, d)
             if kind == SPHERE:
                 gap = _gap_of_sphere(size[0], d, n)
-            elif kind == MESH:
-                gap = gap_of(geometry, mesh, axes, k, d, q, m, n, none)
             else:
-                gap = _gap_of_primitive(kind, size, own_axes, d, q, m, n, none)
+                gap = (
+                    gap_of(geometry, mesh, axes, k, d, q, m, n, none)
+                    if kind == MESH
+                    else _primitive_gap(kind, size, turn, d, q, m, n, none)
+                )
             if begins:
                 linear[p, ACTIVE] = 0.0
             if linear[p, ACTIVE] == 0.0:
                 if found[p, TOUCHING] != 0.0:
-                    for c in range(RESULTS):
-                        found[p, c] = 0.0
+                    found[p] = 0.0
                 if _is_far(gap, np.sqrt(weight), form[k, 0]):
                     continue
             own, result = linear[p], found[p]
