@@ -182,18 +182,14 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
             carried = shape[0] * share[0] + shape[1] * share[1] + shape[2] * share[2] + shape[3] * share[3]
             _towards_face(n, across)
             depth, covered, growth = _covered(-gap, slope, np.sqrt(weight), form[k, 0])
-            pressure, hard = 0.0, 0.0
-            if covered > 0.0:
-                pressure = stiff * (depth - compression[p]) + spring * extension[p] + covered * carried
-                if depth > form[k, 1]:
-                    hard = HARD * stiff
-                    pressure += hard * (depth - form[k, 1])
+            hard = HARD * stiff if covered > 0.0 and depth > form[k, 1] else 0.0
+            pressure = stiff * (depth - compression[p]) + spring * extension[p] + covered * carried + hard * (depth - form[k, 1])
+            pressure = pressure if covered > 0.0 else 0.0
             wrong += weight * abs(max(pressure, 0.0) - result[ALONG])
-            own[ACTIVE] = 0.0
+            own[ACTIVE] = covered if pressure > 0.0 else 0.0
             if pressure <= 0.0:
                 continue
             total += weight * pressure
-            own[ACTIVE] = covered
             away = _open(own, n, motion, k, d, slip)
             own[STIFF] = step * ((stiff + hard) * covered + growth * carried)
             own[PRESSURE] = pressure + own[STIFF] * away
