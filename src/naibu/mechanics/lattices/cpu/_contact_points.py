@@ -183,8 +183,8 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
             _towards_face(n, across)
             depth, covered, growth = _covered(-gap, slope, np.sqrt(weight), form[k, 0])
             hard = HARD * stiff if covered > 0.0 and depth > form[k, 1] else 0.0
-            pressure = stiff * (depth - compression[p]) + spring * extension[p] + covered * carried + hard * (depth - form[k, 1])
-            pressure = pressure if covered > 0.0 else 0.0
+            own_pressure = stiff * (depth - compression[p]) + spring * extension[p] + covered * carried
+            pressure = own_pressure + hard * max(depth - form[k, 1], 0.0) if covered > 0.0 else 0.0
             wrong += weight * abs(max(pressure, 0.0) - result[ALONG])
             own[ACTIVE] = covered if pressure > 0.0 else 0.0
             if pressure <= 0.0:
