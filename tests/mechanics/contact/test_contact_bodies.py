@@ -189,7 +189,7 @@ def test_departing_plate_releases_the_block():
     )
     pressed = []
     solution = solve(problem(mesh, contacts=(tied, top)), callback=pressed.append)
-    assert len(pressed) == len(solution.states) - 1
+    assert pressed[-len(solution.states) + 1 :] == [state.load for state in solution.states[1:]]  # after those of a first attempt
     early = -solution.states[1].displacement[:, 2].min()
     assert early > 1
     assert not solution.reactions["top"].any()

@@ -79,6 +79,36 @@ def test_the_solver_that_size_chooses_finds_it_too(monkeypatch: pytest.MonkeyPat
     np.testing.assert_allclose(found, exact, atol=1e-7 * SIDE)
 
 
+@pytest.mark.parametrize(
+    ("poisson", "unknowns", "expected"),
+    [(POISSON, 2999, "MultigridSolver"), (POISSON, 3001, "PardisoSolver"), (0.4999, 2999, "PardisoSolver")],
+)
+@pytest.mark.skipif(pardiso_library() is None, reason="oneMKL is not installed")
+def test_a_single_system_that_is_not_nearly_incompressible_is_solved_by_multigrid_sooner(
+    monkeypatch: pytest.MonkeyPatch, poisson: float, unknowns: int, expected: str
+) -> None:
+    """The same cube of 3000 unknowns with the limit on either side of its size; a body factorized for many loads keeps its factors."""
+    mesh, support, exact = bar(9)
+    assert support.constrained.size == 3000
+    monkeypatch.setattr(solver_selection, "SINGLE_LIMIT", unknowns)
+    chosen: list[str] = []
+    choose = solver_selection.choose_solver
+
+    def noted(*arguments: object, **options: object) -> object:
+        found = choose(*arguments, **options)  # type: ignore[arg-type]
+        chosen.append(type(found).__name__)
+        return found
+
+    monkeypatch.setattr("naibu.mechanics.small_strain.linear_elasticity.choose_solver", noted)
+    lam, mu = lame_parameters(YOUNG, poisson)
+    body = LinearBody.of(mesh)
+    found = body.solve(lam, mu, support)
+    body.factorized(lam, mu, support.constrained)
+    assert chosen == [expected, "PardisoSolver"]
+    if poisson == POISSON:
+        np.testing.assert_allclose(found, exact, atol=1e-7 * SIDE)
+
+
 @pytest.mark.parametrize("solver", ["automatic", "superlu", "multigrid"])
 def test_constraints_of_another_shape_are_refused(solver: SolverName) -> None:
     mesh, support, _ = bar(3)

@@ -6,10 +6,12 @@ import csv
 import json
 import os
 import re
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -19,7 +21,9 @@ from virtual_press import COARSE, KNOWN, PLATEN_POSITIONS_MM, TRUTH, Press, stop
 import naibu
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
+from naibu.core.experiment import Experiment
 from naibu.core.status import Status
+from naibu.identification.prediction import cross_validation as folds
 from naibu.identification.verdict import Explanation
 from naibu.io.experiment_folder.state_csv import parse_state_csv
 from naibu.io.files import atomic
@@ -31,6 +35,7 @@ from naibu.workflows.markers.cross_validation import left_out_in_turn
 from naibu.workflows.parallel.worker_count import Workers
 from naibu.workflows.results.report_content import load_case_scene, prediction_scene
 from naibu.workflows.results.result_folder import CHECKPOINT_FILE, MODEL_FILE, read_model
+from naibu.workflows.results.search_checkpoint import SearchCheckpoint
 
 STATE = {"press": ["pressed"]}
 
@@ -202,14 +207,48 @@ def test_experiments_are_predicted_from_each_other(press: Press, experiment_fold
     assert all(r.rms_mm < 0.6 for r in found.left_out)
     used = {t.specimen.experiment.name: t.specimen.experiment for t in found.calibration.load_cases}
     used["press"] = replace(used["press"], states=tuple(s for s in used["press"].states if s.name != "pressed_more"))
-    there, trouble = left_out_in_turn(list(used.values()), found.calibration, Workers(2), None)
+    kept = SearchCheckpoint({}, folder=tmp_path)
+    there, trouble = left_out_in_turn(list(used.values()), found.calibration, Workers(2), None, kept)
     assert trouble is None
+    assert set(SearchCheckpoint.read(tmp_path, {}).models) == {"press", "sister"}
     here = {(r.experiment, r.state): r for r in found.left_out}
     assert [(r.experiment, r.state) for r in there] == list(here)
     for row in there:
         np.testing.assert_allclose(row.prediction.residual, here[row.experiment, row.state].prediction.residual, atol=1e-9)
     with pytest.raises(InputError, match="cross_validate"):
         identify.identify(press.folder, workers=2)
+
+
+def test_an_experiment_that_was_predicted_before_an_interruption_is_not_calibrated_again(
+    press: Press, experiment_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other, out = experiment_folder.rename(tmp_path / "sister"), tmp_path / "out"
+    calibrated: list[list[str]] = []
+    calibrate = folds.calibrate
+
+    def kept() -> SearchCheckpoint:
+        return SearchCheckpoint.read(out, json.loads((out / CHECKPOINT_FILE).read_text(encoding="utf-8"))["provenance"])
+
+    def noted(experiments: Sequence[Experiment], **options: object) -> object:
+        calibrated.append([e.name for e in experiments])
+        return calibrate(experiments, **options)  # type: ignore[arg-type]
+
+    def interrupted(experiments: Sequence[Experiment], **options: object) -> object:
+        if experiments[0].name == "press":
+            return calibrate(experiments, **options)  # type: ignore[arg-type]
+        while "sister" not in kept().models:
+            time.sleep(0.05)
+        raise KeyboardInterrupt
+
+    arguments: dict[str, Any] = {"known": KNOWN, "settings": COARSE, "states": STATE, "cross_validate": True, "out": out}
+    monkeypatch.setattr(folds, "calibrate", interrupted)
+    assert identify.identify([other, press.folder], **arguments).interrupted
+    assert set(kept().models) == {"sister"}
+    monkeypatch.setattr(folds, "calibrate", noted)
+    found = identify.identify([other, press.folder], **arguments)
+    assert calibrated == [["sister"]]  # what was interrupted: the model that has not seen the press
+    assert not found.interrupted and {r.experiment for r in found.left_out} == {"press", "sister"}
+    assert all(r.rms_mm < 0.6 for r in found.left_out) and CHECKPOINT_FILE not in names(out)
 
 
 def test_an_interrupted_search_keeps_the_best_and_goes_on(press: Press, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

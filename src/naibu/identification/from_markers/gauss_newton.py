@@ -38,7 +38,8 @@ UNEVEN = 0.01  # points that slip over an edge make the objective uneven; a step
 ENOUGH = 2  # steps in succession that gain less than that, and less than half of what they promise, after which the search ends
 ROUGH = 0.1  # a search is rough while a step may lower the objective by more than this fraction
 PATH = SolverSettings(first_step=0.02, largest_step=0.15, tolerance=1e-6)
-NEARBY = replace(PATH, smallest_step=0.15, pseudo_transient=False)  # for a path close to a known one: no load step is halved
+NEARBY = replace(PATH, smallest_step=0.02, pseudo_transient=False)  # for a path close to a known one
+REFINED = replace(PATH, smallest_step=0.004, pseudo_transient=False)  # for one known on larger elements
 TRIAL_EFFORT = 1.2  # times the iterations of the dearest solution so far, which a step of the search may cost before it is given up
 LEAST_EFFORT = 100  # iterations that a solution at least is taken to have cost
 
@@ -160,7 +161,7 @@ class Matcher:
             settings = self._trial_settings(i, near, bool(estimates)) if trial else PATH
             if near and near.between is not None:
                 try:
-                    return self._evaluate_one(i, values, estimates, pose, NEARBY, derivatives=not trial)
+                    return self._evaluate_one(i, values, estimates, pose, REFINED, derivatives=not trial)
                 except ConvergenceError:
                     estimates = []
             return self._evaluate_one(i, values, estimates, pose, settings, derivatives=not trial)
@@ -316,7 +317,7 @@ class Matcher:
         """
         free = self.parameters.free
         inner = np.array([p.inner((start or {}).get(p.name, p.value)) for p in free])
-        fits = self.evaluate(self.parameters.values(inner), [(warm_starts or {}).get(t.name) for t in self.load_cases])
+        fits = self._starting_fits(self.parameters.values(inner), [(warm_starts or {}).get(t.name) for t in self.load_cases])
         now = self.normal_equations(fits, inner)
         history, damping, rough, status = [now.objective], 1e-3, True, Status.ITERATION_LIMIT
         reach, disappointed = 1.0, 0
@@ -355,6 +356,18 @@ class Matcher:
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
         return self._match(inner, fits, status, history)
+
+    def _starting_fits(self, values: Mapping[str, float], warm_starts: Sequence[SolvedLoadCase | None]) -> list[LoadCaseFit]:
+        """Fits at `values`: those of `warm_starts` where all were found there, else solved anew."""
+        names, out = [q.name for q in self.parameters.free], []
+        for i, (load_case, near) in enumerate(zip(self.load_cases, warm_starts, strict=True)):
+            path = None if near is None else near.path_at(values, names, load_case.specimen.reshaped(values).mesh.points)
+            if near is None or path is None:
+                return self.evaluate(values, warm_starts)
+            solution = near.fit.solution
+            self._dearest[i], self._penalties[i] = solution.iterations, solution.states[-1].normal_stiffness
+            out.append(self._observed(load_case, values, solution, path, near.fit.pose))
+        return out
 
     def _try(
         self, inner: FloatArray, step: FloatArray, fits: list[LoadCaseFit], objective: float

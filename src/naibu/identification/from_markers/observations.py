@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,7 @@ from naibu.identification.from_markers.specimen.specimen_model import Specimen
 from naibu.mechanics.finite_strain.statics import Solution, WarmStart
 
 WARM_START_SPACING = 0.05  # of the load, between states that the next evaluation starts from
+SAME = 1e-9  # relative difference of parameters and positions from rounding
 FAR = 0.05  # of the extent of the object, by which nodes move with a change of the parameters that is not small
 
 
@@ -149,6 +150,29 @@ class SolvedLoadCase:
         change = np.array([values.get(q.name, q.value) - q.value for q in self.parameters.free])
         estimates = _warm_start(self.fit, change)
         return estimates if self.between is None else [(load, np.asarray(self.between @ u)) for load, u in estimates]
+
+    def path_at(self, values: Mapping[str, float], names: Sequence[str], points: FloatArray) -> tuple[FloatArray, ...] | None:
+        """Return the derivatives (n, 3, p) of the states with respect to the parameters `names`; None where they are not those at `values`.
+
+        Parameters
+        ----------
+        values : mapping
+            Physical value of every parameter, by name.
+        names : sequence of str
+            Free parameters.
+        points : ndarray, shape (n, 3)
+            Nodes in the reference configuration at `values`, mm.
+        """
+        known, free = self.parameters.values(), {q.name: k for k, q in enumerate(self.parameters.free)}
+        if self.between is not None or not self.fit.path or any(name not in free for name in names):
+            return None
+        if not all(name in known and np.isclose(known[name], value, rtol=SAME, atol=SAME) for name, value in values.items()):
+            return None
+        nodes = self.fit.solution.problem.points
+        if nodes.shape != points.shape or not np.allclose(nodes, points, rtol=0.0, atol=SAME * float(np.ptp(nodes))):
+            return None
+        columns = [free[name] for name in names]
+        return tuple(derivative[:, :, columns] for derivative in self.fit.path)
 
 
 def _warm_start(previous: LoadCaseFit, change: FloatArray) -> list[WarmStart]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,6 +40,8 @@ class LeftOut:
         Number of complete markers.
     prediction : Prediction
         Positions, uncertainty and assumptions.
+    model : CalibratedModel
+        The model that predicted them.
     """
 
     experiment: str
@@ -48,6 +50,7 @@ class LeftOut:
     rms_xyz: tuple[float, float, float]
     marker_count: int
     prediction: Prediction
+    model: CalibratedModel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,6 +91,8 @@ def leave_one_out(
     noise: NoiseModel | None = None,
     search: MatchingSettings | None = None,
     reference: Calibration | None = None,
+    models: Mapping[str, CalibratedModel] | None = None,
+    finished: Callable[[Sequence[LeftOut]], None] | None = None,
     progress: Progress | None = None,
 ) -> list[LeftOut]:
     """Predict all loaded states of every experiment with a model calibrated on the others.
@@ -102,6 +107,10 @@ def leave_one_out(
         As for `calibrate`.
     reference : Calibration, optional
         The calibration on all experiments: the others start from its solutions, which saves time.
+    models : mapping of str to CalibratedModel, optional
+        Models of an earlier call, by the experiment that they have not seen; they are not calibrated again.
+    finished : callable, optional
+        Called in this thread with the states of every experiment, when they are predicted.
     progress : callable, optional
         Gets a report after every step of a calibration, its stage "without EXPERIMENT"; it is called from several threads.
 
@@ -130,12 +139,17 @@ def leave_one_out(
             search=search,
             start=start,
             warm_starts=warm_starts,
+            model=(models or {}).get(left.name),
             progress=_until(progress, stop),
         )
 
     with ThreadPoolExecutor(min(len(experiments), usable_cores()), initializer=use_one_thread) as pool:
         turns = [pool.submit(without, left) for left in experiments]
         try:
+            for turn in as_completed(turns):
+                rows = turn.result()
+                if finished is not None:
+                    finished(rows)
             return [row for turn in turns for row in turn.result()]
         except BaseException:
             stop.set()
@@ -153,6 +167,7 @@ def predicted_from_others(
     search: MatchingSettings | None = None,
     start: Mapping[str, float] | None = None,
     warm_starts: Mapping[str, SolvedLoadCase] | None = None,
+    model: CalibratedModel | None = None,
     progress: Progress | None = None,
 ) -> list[LeftOut]:
     """Predict all loaded states of one experiment with a model calibrated on the others: a part of `leave_one_out`.
@@ -165,6 +180,8 @@ def predicted_from_others(
         Name of the one that is predicted.
     known_materials, settings, noise, search, start, warm_starts : optional
         As for `calibrate`.
+    model : CalibratedModel, optional
+        A model calibrated on the others before.
     progress : callable, optional
         Gets a report after every step of the calibration, its stage "without EXPERIMENT".
 
@@ -180,22 +197,24 @@ def predicted_from_others(
     left = next(e for e in experiments if e.name == left_out)
     others = [e for e in experiments if e is not left]
     near = {} if warm_starts is None else warm_starts
-    found = calibrate(
-        others,
-        known_materials=_applicable(known_materials, others),
-        settings=settings,
-        noise=noise,
-        search=search,
-        start=start,
-        warm_starts=near,
-        progress=_under_stage(progress, f"without {left.name}"),
-    )
-    if found.match.status is Status.INTERRUPTED:
-        raise KeyboardInterrupt
-    model = CalibratedModel.of(found)
+    if model is None:
+        found = calibrate(
+            others,
+            known_materials=_applicable(known_materials, others),
+            settings=settings,
+            noise=noise,
+            search=search,
+            start=start,
+            warm_starts=near,
+            progress=_under_stage(progress, f"without {left.name}"),
+        )
+        if found.match.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+        model = CalibratedModel.of(found)
+    labels = {state.name: f"{left.name}/{state.name}" for state in left.loaded_states}
     return [
-        _left_out(predict_state(model, left, state.name, heights_from_markers=True, warm_start=near.get(f"{left.name}/{state.name}")))
-        for state in left.loaded_states
+        _left_out(predict_state(model, left, name, heights_from_markers=True, warm_start=near.get(label)), model)
+        for name, label in labels.items()
     ]
 
 
@@ -225,10 +244,10 @@ def _until(progress: Progress | None, stop: threading.Event) -> Progress:
     return passed_on
 
 
-def _left_out(p: Prediction) -> LeftOut:
+def _left_out(p: Prediction, model: CalibratedModel) -> LeftOut:
     x, y, z = (rms(p.residual, [axis]) for axis in range(3))
     count = int(np.isfinite(p.residual).all(axis=1).sum())
-    return LeftOut(p.specimen.experiment.name, p.state, rms(p.residual), (x, y, z), count, p)
+    return LeftOut(p.specimen.experiment.name, p.state, rms(p.residual), (x, y, z), count, p, model)
 
 
 def pooled_rms(rows: Sequence[LeftOut]) -> float:

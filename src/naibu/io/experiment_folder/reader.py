@@ -8,7 +8,6 @@ import os
 import re
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
@@ -96,8 +95,8 @@ def _experiment(root: Path, meta: Meta, hashes: dict[str, str]) -> Experiment:
         up_axis=up,
         dimensions=meta.dimensions,
         known_problems=tuple(meta.known_problems),
-        scanner=MappingProxyType(meta.scanner.model_dump(exclude_none=True)),
-        input_hashes=MappingProxyType(hashes),
+        scanner=meta.scanner.model_dump(exclude_none=True),
+        input_hashes=hashes,
     )
 
 

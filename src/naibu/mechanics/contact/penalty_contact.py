@@ -15,7 +15,7 @@ import numpy as np
 from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
 from naibu.core.rigid_transform import rotation_matrix
-from naibu.mechanics.contact._geometry_kernels import distance_with_derivatives
+from naibu.mechanics.contact._geometry_kernels import distance_with_derivatives, mesh_of, signed_distance
 from naibu.mechanics.contact.indenter_geometry import IndenterGeometry, packed_geometry
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 
@@ -122,26 +122,23 @@ class Contact:
         vectors, matrices = np.zeros((3, n, 3)), np.zeros((3, n, 3, 3))
         response = ContactResponse(self.orientation(load), y, np.empty(n), *vectors, *matrices)
         _tractions(
-            packed_geometry(self.surface), self.surface.axes, y, anchors, self.normal_stiffness, self.tangential_stiffness,
+            packed_geometry(self.surface), self.surface.axes, y, anchors, self.area, self.normal_stiffness, self.tangential_stiffness,
             self.friction_coefficient, self.tied, float(curvature), response.gap, response.force, response.tangential,
             response.slip_direction, response.stiffness, response.tangential_stiffness, response.anchor_stiffness,
         )  # fmt: skip
-        for field in (response.force, response.stiffness, response.anchor_stiffness, response.slip_direction):
-            field *= self.area.reshape((-1,) + (1,) * (field.ndim - 1))
         return response
 
     def scattered(self, force: FloatArray, n_points: int, orientation: FloatArray) -> FloatArray:
         """Return the nodal forces (n, 3), mN, of point forces (p, 3), mN, given in the frame of a body of this `orientation` (3, 3)."""
-        world = force @ orientation.T
-        out = np.empty((n_points, 3))
-        for i in range(3):
-            out[:, i] = np.bincount(self.nodes.ravel(), (self.shape * world[:, i : i + 1]).ravel(), minlength=n_points)
+        out = np.zeros((n_points, 3))
+        _scatter_forces(self.nodes, self.shape, np.ascontiguousarray(force), np.ascontiguousarray(orientation), out)
         return out
 
     def add_stiffness(self, response: ContactResponse, pattern: BlockPattern, positions: Int32Array, blocks: FloatArray) -> None:
         """Add the negative derivative of the contact forces to the tangent `blocks`; `positions` from ``pattern.positions(nodes)``."""
-        world = np.einsum("ij,pjk,lk->pil", response.orientation, response.stiffness, response.orientation)
-        _scatter_blocks(positions, self.shape, world, blocks)
+        touching = np.flatnonzero(response.stiffness.any(axis=(1, 2)))  # few of all points
+        world = response.orientation @ response.stiffness[touching] @ response.orientation.T
+        _scatter_blocks(touching, positions, self.shape, world, blocks)
 
     def next_anchors(self, response: ContactResponse) -> FloatArray:
         """Return the anchors (p, 3) with which the next load step starts: where the elastic slip is that of the present traction."""
@@ -199,17 +196,21 @@ def normal_pressure(g, k_n, tied):  # type: ignore[no-untyped-def]  # pragma: no
 
 @njit(cache=True, nogil=True)
 def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
-    geometry, axes, y, anchors, k_n, k_t, mu, tied, curvature, gap, force, friction, slip, stiffness, friction_stiffness, anchor_stiffness
-):
-    """Tractions of all points and their derivatives (per unit of area); see the module's text for the law."""
-    n, e = np.empty(3), np.empty(3)
-    h, d_trial = np.empty((3, 3)), np.empty((3, 3))
+    geometry, axes, y, anchors, area, k_n, k_t, mu, tied, curvature,
+    gap, force, friction, slip, stiffness, friction_stiffness, anchor_stiffness,
+):  # fmt: skip
+    """Forces and tractions of all points and their derivatives; see the module's text for the law."""
+    n, e, turned = np.empty(3), np.empty(3), np.empty(3)
+    h, d_trial, none = np.empty((3, 3)), np.empty((3, 3)), np.empty((0, 0))
+    mesh = mesh_of(geometry, 0)
     for q in range(len(y)):
-        g = distance_with_derivatives(geometry, axes, y[q], n, h)
-        gap[q] = g
-        p, dp = normal_pressure(g, k_n[q], tied)
+        for i in range(3):
+            turned[i] = y[q, 0] * axes[i, 0] + y[q, 1] * axes[i, 1] + y[q, 2] * axes[i, 2]
+        gap[q] = signed_distance(geometry[0][0], geometry[1][0], mesh, turned, n, none)
+        p, dp = normal_pressure(gap[q], k_n[q], tied)
         if dp == 0.0:
             continue
+        distance_with_derivatives(geometry, axes, y[q], n, h)
         along = 0.0
         for i in range(3):
             along += n[i] * (y[q, i] - anchors[q, i])
@@ -229,7 +230,7 @@ def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
         ratio = mu[q] * p / size if sliding else 1.0
         for i in range(3):
             friction[q, i] = ratio * e[i]
-            force[q, i] = p * n[i] - ratio * e[i]
+            force[q, i] = area[q] * (p * n[i] - ratio * e[i])
         for i in range(3):
             for j in range(3):
                 dt = d_trial[i, j]
@@ -242,20 +243,34 @@ def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
                     dt = ratio * projected + mu[q] * dp * n[j] * e[i] / size
                     da = ratio * projected_a
                 friction_stiffness[q, i, j] = dt
-                stiffness[q, i, j] = dt - dp * n[i] * n[j] - curvature * p * h[i, j]
-                anchor_stiffness[q, i, j] = da
+                stiffness[q, i, j] = area[q] * (dt - dp * n[i] * n[j] - curvature * p * h[i, j])
+                anchor_stiffness[q, i, j] = area[q] * da
             if sliding:
-                slip[q, i] = -p * e[i] / size
+                slip[q, i] = -area[q] * p * e[i] / size
 
 
 @njit(cache=True, nogil=True)
-def _scatter_blocks(positions, shape, stiffness, blocks):  # type: ignore[no-untyped-def]  # pragma: no cover
-    n, k = shape.shape
-    for q in range(n):
+def _scatter_forces(nodes, shape, force, orientation, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add the forces of points, in the frame of a body, to those of their nodes."""
+    for q in range(len(nodes)):
+        if force[q, 0] == 0.0 and force[q, 1] == 0.0 and force[q, 2] == 0.0:
+            continue
+        for i in range(3):
+            world = orientation[i, 0] * force[q, 0] + orientation[i, 1] * force[q, 1] + orientation[i, 2] * force[q, 2]
+            for a in range(nodes.shape[1]):
+                out[nodes[q, a], i] += shape[q, a] * world
+
+
+@njit(cache=True, nogil=True)
+def _scatter_blocks(points, positions, shape, stiffness, blocks):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add the stiffnesses (m, 3, 3) of the `points` (m,) to the blocks of their nodes."""
+    k = shape.shape[1]
+    for row in range(len(points)):
+        q = points[row]
         for a in range(k):
             for b in range(k):
                 w = shape[q, a] * shape[q, b]
                 block = blocks[positions[q, a, b]]
                 for i in range(3):
                     for j in range(3):
-                        block[i, j] += w * stiffness[q, i, j]
+                        block[i, j] += w * stiffness[row, i, j]

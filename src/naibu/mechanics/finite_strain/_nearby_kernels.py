@@ -20,8 +20,8 @@ def add_forces(  # type: ignore[no-untyped-def]  # pragma: no cover
     for p in range(len(nodes)):
         _place(nodes[p], shape[p], rest[p], u, centre, orientation, axes, d, y, q)
         gap[p] = signed_distance(kinds[0], sizes[0], mesh, q, m, none)
-        pressure = normal_pressure(gap[p], k_n[p], tied)[0]
-        if pressure == 0.0:
+        pressure, slope = normal_pressure(gap[p], k_n[p], tied)
+        if slope == 0.0:
             continue
         along = 0.0
         for i in range(3):

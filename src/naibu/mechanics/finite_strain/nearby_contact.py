@@ -55,12 +55,8 @@ class NearbyContact:
 
     def add_force(self, displacement: FloatArray, force: FloatArray) -> None:
         """Evaluate the contact at a displacement (n, 3), mm, which must not change afterwards, and add its forces to `force` (n, 3), mN."""
-        c = self.contact
-        self.gap, self._displacement, self._response = np.empty(len(self.points)), displacement, None
-        add_forces(
-            packed_geometry(c.surface), c.surface.axes, c.nodes, c.shape, c.rest, c.area, c.normal_stiffness, c.tangential_stiffness,
-            c.friction_coefficient, c.tied, displacement, c.stop, c.orientation(1.0), self.anchors, self.gap, force,
-        )  # fmt: skip
+        self._displacement, self._response = displacement, None
+        self.gap = add_contact_forces(self.contact, self.anchors, displacement, 1.0, force)
 
     def touching(self) -> NearbyContact:
         """Return the points that touch, at the last evaluation."""
@@ -92,6 +88,30 @@ def _points(contact: Contact, which: IntArray | BoolArray) -> Contact:
         normal_stiffness=contact.normal_stiffness[which], tangential_stiffness=contact.tangential_stiffness[which],
         friction_coefficient=contact.friction_coefficient[which], element_size=contact.element_size[which],
     )  # fmt: skip
+
+
+def add_contact_forces(contact: Contact, anchors: FloatArray, displacement: FloatArray, load: float, force: FloatArray) -> FloatArray:
+    """Add the forces of a contact at a displacement (n, 3), mm, to `force` (n, 3), mN, and return the gaps (p,), mm.
+
+    Parameters
+    ----------
+    contact : Contact
+        The contact.
+    anchors : ndarray, shape (p, 3)
+        Anchors of its points, mm.
+    displacement : ndarray, shape (n, 3)
+        Of the nodes, mm.
+    load : float
+        Fraction of the path of the body.
+    force : ndarray, shape (n, 3)
+        Of the nodes, mN; changed.
+    """
+    c, gap = contact, np.empty(len(contact.nodes))
+    add_forces(
+        packed_geometry(c.surface), c.surface.axes, c.nodes, c.shape, c.rest, c.area, c.normal_stiffness, c.tangential_stiffness,
+        c.friction_coefficient, c.tied, displacement, c.start + load * (c.stop - c.start), c.orientation(load), anchors, gap, force,
+    )  # fmt: skip
+    return gap
 
 
 def local_positions(contact: Contact, displacement: FloatArray, load: float) -> tuple[FloatArray, FloatArray]:

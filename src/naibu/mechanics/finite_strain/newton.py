@@ -15,6 +15,7 @@ import scipy.sparse as sp
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError
 from naibu.mechanics.contact.penalty_contact import ContactResponse
+from naibu.mechanics.finite_strain.nearby_contact import add_contact_forces
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
 from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
 from naibu.mechanics.linear_algebra.iterative import ApproximateFactorization
@@ -28,6 +29,9 @@ FIRST_DRAG = 0.02  # viscosity over the first step in pseudo-time, as a fraction
 MOST_DRAG = 1e3  # likewise; a step so short hardly moves the body
 PATIENCE = 4  # iterations in which the residual of a step in pseudo-time must fall to half of the first
 CALM = 2  # steps in pseudo-time after a failed one that do not grow
+NEAR = 0.1  # of the residual before an iteration, below which that after it can be lowered further with the same tangent
+SAME_TANGENT = 4  # iterations with it
+WORTHWHILE = 0.3  # of the residual, below which an iteration with the same tangent must bring it
 _COARSE = 0.01  # relative tolerance of linear solves far from equilibrium, for solvers that can make use of it
 
 
@@ -88,9 +92,13 @@ class Newton:
             return internal, np.inf, smallest
         contact = np.zeros_like(internal)
         for c, a in zip(self.problem.contacts, anchors, strict=True):
-            response = c.evaluate(u, a, load)
-            contact += c.scattered(response.force, len(u), response.orientation)
+            add_contact_forces(c, a, u, load, contact)
         return *self._balance(internal, contact), smallest
+
+    def unbalanced(self, u: FloatArray, anchors: tuple[FloatArray, ...], load: float) -> float:
+        """Return the out-of-balance force relative to the contact and support forces; infinite where elements are inverted."""
+        residual, scale, smallest = self.residual(u, anchors, load)
+        return float(np.abs(residual).sum()) / scale if smallest > 0.0 else np.inf
 
     def _balance(self, internal: FloatArray, contact: FloatArray) -> tuple[FloatArray, float]:
         r = internal - contact - self.problem.external_force
@@ -168,18 +176,41 @@ class Newton:
                 if norm <= self.settings.tolerance * scale:
                     return u, norm / scale
                 self.iterations += 1
-                step = -solved(self._factorized(matrix), residual, self._forcing(norm, previous, scale))
+                tangent = self._factorized(matrix)
+                step = -solved(tangent, residual, self._forcing(norm, previous, scale))
                 self.rigid_motion = float(np.abs(step).max()) > RIGID_MOTION * extent
                 found = self.line_search(u, step, anchors, load, residual)
                 poor += found is None or found[1] < 0.15
                 if found is None or poor > 2 or np.abs(step).max() > extent:
                     return None  # a shorter load step costs less than many poor iterations
-                u, previous = found[0], norm
-                if found[2] <= self.settings.tolerance:
-                    return u, found[2]
+                u, previous, left = found[0], norm, found[2]
+                if left > self.settings.tolerance and left < NEAR * norm / scale:
+                    u, left = self._with_same_tangent(tangent, u, left, anchors, load)
+                if left <= self.settings.tolerance:
+                    return u, left
         except ConvergenceError:
             return None
         return None
+
+    def _with_same_tangent(
+        self, tangent: Factorization, u: FloatArray, left: float, anchors: tuple[FloatArray, ...], load: float
+    ) -> tuple[FloatArray, float]:
+        """Return displacement (n, 3) mm and relative residual after iterations with a tangent of before, as long as they pay.
+
+        Near equilibrium a factorization costs as much as several of them :cite:p:`kelley1995`.
+        """
+        residual, before = self.residual(u, anchors, load)[0], left
+        for _ in range(SAME_TANGENT):
+            trial = u - solved(tangent, residual, NEAR)
+            residual, scale, smallest = self.residual(trial, anchors, load)
+            now = float(np.abs(residual).sum()) / scale
+            if not (smallest > 0.0 and now < WORTHWHILE * left):
+                break
+            u, left = trial, now
+            if left <= self.settings.tolerance:
+                break
+        self.iterations += left < before  # all of them replace one
+        return u, left
 
     def pseudo_transient(self, u: FloatArray, anchors: tuple[FloatArray, ...], load: float) -> tuple[FloatArray, float] | None:
         """Return displacement (n, 3) mm and relative residual in equilibrium by pseudo-transient continuation; None where it fails.

@@ -199,7 +199,10 @@ class _LoadPath:
     def _solved(self, load: float, passed: WarmStart | None, ahead: WarmStart | None) -> tuple[tuple[FloatArray, float] | None, int]:
         """Return equilibrium at `load` and its residual, None where there is none, and the iterations of the last guess."""
         newton, last, found, before = self.newton, self.states[-1], None, 0
-        for guess in _guesses(self.states[self.smooth_from :], load, passed, ahead):
+        guesses = _guesses(self.states[self.smooth_from :], load, passed, ahead)
+        if len(guesses) > 1:  # states of a similar problem may penetrate bodies
+            guesses.sort(key=lambda guess: newton.unbalanced(guess, last.anchors, load))
+        for guess in guesses:
             before = newton.iterations
             found = newton.solve(guess, last.anchors, load)
             if found is not None:

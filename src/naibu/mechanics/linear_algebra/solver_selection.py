@@ -32,11 +32,19 @@ from naibu.mechanics.linear_algebra.protocols import LinearSolver
 SolverName = Literal["automatic", "superlu", "pardiso", "recycled_cholesky", "multigrid"]
 
 DIRECT_LIMIT = 200_000  # unknowns from which a factorization costs more than multigrid, even if it is recycled; a tenth of that for SuperLU
+SINGLE_LIMIT = 25_000  # unknowns from which multigrid solves a single system sooner, up to the Poisson's ratio below
+COMPRESSIBLE = 0.49  # beyond it the iterations of multigrid become many
 RECYCLING_FROM = 4_000  # unknowns from which a factorization is worth recycling
 
 
 def choose_solver(
-    matrix: sp.bsr_matrix, points: FloatArray, constrained: BoolArray, *, symmetric: bool, solver: SolverName = "automatic"
+    matrix: sp.bsr_matrix,
+    points: FloatArray,
+    constrained: BoolArray,
+    *,
+    symmetric: bool,
+    solver: SolverName = "automatic",
+    poisson_ratio: float | None = None,
 ) -> LinearSolver:
     """Return a linear solver for matrices of the pattern of `matrix`.
 
@@ -53,6 +61,8 @@ def choose_solver(
     solver : {"automatic", "superlu", "pardiso", "recycled_cholesky", "multigrid"}
         See the module. ``"automatic"`` is direct for unsymmetric and for small systems, recycled Cholesky up to `DIRECT_LIMIT` unknowns
         (where oneMKL is installed), and multigrid above; without oneMKL multigrid begins at a tenth of that.
+    poisson_ratio : float, optional
+        The largest in the body, if one system only is to be solved: multigrid then begins at `SINGLE_LIMIT` unknowns up to `COMPRESSIBLE`.
 
     Raises
     ------
@@ -62,7 +72,7 @@ def choose_solver(
     if solver not in get_args(SolverName):
         raise InputError(f"solver={solver!r} is not known; use one of {', '.join(get_args(SolverName))}")
     if solver == "automatic":
-        solver = _automatic(matrix.shape[0], symmetric=symmetric)
+        solver = _automatic(matrix.shape[0], symmetric, poisson_ratio)
     if solver == "superlu":
         return SuperLUSolver()
     if solver == "pardiso":
@@ -72,11 +82,13 @@ def choose_solver(
     return RecycledCholesky(matrix) if solver == "recycled_cholesky" else MultigridSolver(points, constrained)
 
 
-def _automatic(unknowns: int, *, symmetric: bool) -> SolverName:
+def _automatic(unknowns: int, symmetric: bool, poisson_ratio: float | None) -> SolverName:
     with_mkl = pardiso_library() is not None
     direct: SolverName = "pardiso" if with_mkl else "superlu"
     if not symmetric:
         return direct
-    if unknowns > (DIRECT_LIMIT if with_mkl else DIRECT_LIMIT // 10):
+    single = poisson_ratio is not None and poisson_ratio <= COMPRESSIBLE
+    limit = DIRECT_LIMIT if with_mkl else DIRECT_LIMIT // 10
+    if unknowns > (min(limit, SINGLE_LIMIT) if single else limit):
         return "multigrid"
     return "recycled_cholesky" if with_mkl and unknowns > RECYCLING_FROM else direct

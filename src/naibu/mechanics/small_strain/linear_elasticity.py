@@ -113,12 +113,15 @@ class LinearBody:
         """
         return self._factorized(self.stiffness(lame_lambda, shear_modulus), constrained, solver)
 
-    def _factorized(self, stiffness: sp.bsr_matrix, constrained: BoolArray, solver: SolverName) -> Factorization:
-        """Factorize a stiffness, which is changed in place."""
+    def _factorized(
+        self, stiffness: sp.bsr_matrix, constrained: BoolArray, solver: SolverName, poisson_ratio: float | None = None
+    ) -> Factorization:
+        """Factorize a stiffness, which is changed in place; with `poisson_ratio` for a single right-hand side."""
         require_shape("constrained", constrained, self.points.shape)
         require_constrained(self.points, constrained)
         matrix = with_dirichlet_rows(stiffness, constrained)
-        return choose_solver(matrix, self.points, constrained, symmetric=True, solver=solver).factorize(matrix)
+        chosen = choose_solver(matrix, self.points, constrained, symmetric=True, solver=solver, poisson_ratio=poisson_ratio)
+        return chosen.factorize(matrix)
 
     def solve(
         self,
@@ -158,7 +161,9 @@ class LinearBody:
             require_shape("external_force", external_force, self.points.shape)
             right += external_force
         right[constrained] = 0.0
-        solution = self._factorized(stiffness, constrained, solver).solve(right.ravel()).reshape(right.shape)
+        lam = np.asarray(lame_lambda, dtype=float)
+        largest = float(np.max(0.5 * lam / (lam + np.asarray(shear_modulus, dtype=float))))
+        solution = self._factorized(stiffness, constrained, solver, largest).solve(right.ravel()).reshape(right.shape)
         return np.where(constrained, prescribed.values, solution)
 
 

@@ -34,14 +34,8 @@ from naibu.workflows.markers.experiments import Source, load_experiments, parse_
 from naibu.workflows.parallel.worker_count import Workers
 from naibu.workflows.results.output_folder import output_folder
 from naibu.workflows.results.report_content import build_report
-from naibu.workflows.results.result_folder import (
-    CHECKPOINT_FILE,
-    IDENTIFICATION_FILES,
-    read_checkpoint,
-    series_file,
-    write_checkpoint,
-    write_identification,
-)
+from naibu.workflows.results.result_folder import IDENTIFICATION_FILES, series_file, write_identification
+from naibu.workflows.results.search_checkpoint import CHECKPOINT_FILE, SearchCheckpoint
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -115,7 +109,8 @@ def identify(
     Data that cannot belong together are refused; markers that are grossly misplaced are left out and listed; and whether the model explains
     the rest is said in a verdict (`naibu.identification.Verdict`), at the top of every result.
 
-    Ctrl-C (KeyboardInterrupt) ends the search: what is returned and written is the best so far, and the same call goes on from it.
+    Ctrl-C (KeyboardInterrupt) ends the search: what is returned and written is the best so far, and the same call goes on from it, without
+    calibrating the models again that have predicted an experiment left out.
 
     Parameters
     ----------
@@ -169,16 +164,13 @@ def identify(
     provenance = provenance_of(loaded, known, states or {}, chosen)
     doubts = check_markers(loaded, states)
     loaded, outliers = without_outliers(loaded, states)
-    start = read_checkpoint(Path(out), provenance) if out is not None and resume else None
-    folder = None if out is None else _folder(out, loaded, states or {}, start is not None, overwrite)
-
-    def checkpoint(values: Mapping[str, float]) -> None:
-        if folder is not None:
-            write_checkpoint(folder, provenance, values)
-
-    search = partial(calibrate, known_materials=known_materials, states=states, settings=chosen, progress=progress, checkpoint=checkpoint)
+    kept = SearchCheckpoint.read(Path(out), provenance) if out is not None and resume else SearchCheckpoint(provenance)
+    folder = kept.folder = None if out is None else _folder(out, loaded, states or {}, bool(kept.values), overwrite)
+    search = partial(
+        calibrate, known_materials=known_materials, states=states, settings=chosen, progress=progress, checkpoint=kept.keep_values
+    )
     try:
-        calibration = search(loaded, start=start)
+        calibration = search(loaded, start=kept.values or None)
         if misfits := _outliers(calibration):
             loaded, outliers = distrusted(loaded, misfits), (*outliers, *misfits)
             calibration = search(loaded, start=calibration.match.parameters.values(), warm_starts=calibration.warm_starts)
@@ -189,13 +181,13 @@ def identify(
     verdict = verdict_of(calibration, doubts, outliers)
     model = replace(CalibratedModel.of(calibration, provenance), reservation=verdict.reservation)
     left_in_turn = [_with_states(e, states or {}) for e in loaded] if cross_validate else []
-    result, trouble = _compared(calibration, model, verdict, left_in_turn, where, progress)
+    result, trouble = _compared(calibration, model, verdict, left_in_turn, where, progress, kept)
     if folder is not None:
         write_identification(folder, calibration, model, verdict, result.baselines, result.left_out)
         if result.interrupted:
-            write_checkpoint(folder, provenance, model.parameters.values())
+            kept.keep_values(model.parameters.values())
         else:
-            (folder / CHECKPOINT_FILE).unlink(missing_ok=True)
+            kept.remove()
     if trouble is not None:
         raise trouble
     return result
@@ -243,6 +235,7 @@ def _compared(
     left_in_turn: Sequence[Experiment],
     where: Workers,
     progress: Progress | None,
+    kept: SearchCheckpoint,
 ) -> tuple[Identification, NaibuError | None]:
     """Compute what the calibration is compared with; what goes wrong here is returned, so that the model is written first."""
     compared: dict[str, dict[str, float]] = {}
@@ -257,7 +250,7 @@ def _compared(
             for label, distance in equilibrium_gap_baseline(calibration).items():
                 compared[label]["equilibrium gap"] = distance
         if not interrupted and left_in_turn:
-            left_out, trouble = left_out_in_turn(left_in_turn, calibration, where, progress)
+            left_out, trouble = left_out_in_turn(left_in_turn, calibration, where, progress, kept)
     except KeyboardInterrupt:
         interrupted = True
     except NaibuError as error:

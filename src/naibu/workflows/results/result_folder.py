@@ -34,8 +34,9 @@ from naibu.viewer.result_page.page import report_html
 from naibu.viewer.result_page.payload import Report, report_json
 from naibu.viewer.result_page.reading import report_from_json
 from naibu.workflows.results.report_content import Accuracy, accuracy, build_report, prediction_report, search_sentence
+from naibu.workflows.results.search_checkpoint import CHECKPOINT_FILE
 
-MODEL_FILE, CHECKPOINT_FILE, RESIDUALS_FILE = "model.json", "checkpoint.json", "residuals.csv"
+MODEL_FILE, RESIDUALS_FILE = "model.json", "residuals.csv"
 IDENTIFICATION_FILE, COMPARISON_FILE, REPORT_STEM = "identification.json", "comparison.json", "report"
 # a prediction may share the folder of the model it was made with, so nothing but its own files bears these names
 PREDICTED_FILE, SUMMARY_FILE, PREDICTED_STEM = "predicted.csv", "summary.json", "predicted"
@@ -80,22 +81,6 @@ def read_any_model(path: str | os.PathLike[str]) -> CalibratedModel | Identified
             return IdentifiedBody.from_dict(data) if data.get("format") == FORMAT_OF_FIELDS else CalibratedModel.from_dict(data)
     except InputError as error:
         raise InputError(f"{file}: {str(error).removeprefix(f'{file}: ')}; {mend}") from error
-
-
-def read_checkpoint(folder: Path, provenance: Mapping[str, Any]) -> dict[str, float] | None:
-    """Return the values of an interrupted search with the same inputs and settings, if there are any."""
-    try:
-        data = json.loads((folder / CHECKPOINT_FILE).read_text(encoding="utf-8"))
-        same = data["provenance"] == json.loads(json.dumps(provenance))
-        return {str(name): float(value) for name, value in data["values"].items()} if same else None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        # without a usable checkpoint the search begins anew
-        return None
-
-
-def write_checkpoint(folder: Path, provenance: Mapping[str, Any], values: Mapping[str, float]) -> None:
-    """Keep the best values so far."""
-    write_atomically(folder / CHECKPOINT_FILE, json.dumps({"provenance": provenance, "values": dict(values)}))
 
 
 def read_comparison(folder: Path, provenance: Mapping[str, Any]) -> ModelRow | None:
