@@ -76,6 +76,8 @@ def solve_state(
     """
     narrow = parameters.changed({p.name: replace(p, fixed=True) for p in parameters.free if p.name != platen})
     coarse, start = None, warm_start
+    if warm_start is not None and markers is not None and (known := warm_start.parameters.values().get(platen)) is not None:
+        narrow = narrow.with_values({platen: known})  # the markers tell it anyhow; from there the solution is near
     if warm_start is None and load_case.specimen.mesh.n_points >= WORTHWHILE:
         coarse, start = _solved_on_larger_elements(load_case, narrow, platen, markers)
     if coarse is not None:
