@@ -110,19 +110,25 @@ def _from_box(q, size, n, h):  # type: ignore[no-untyped-def]  # pragma: no cove
 @njit(cache=True)
 def _from_cylinder(q, size, n, h):  # type: ignore[no-untyped-def]  # pragma: no cover
     r = np.sqrt(q[0] ** 2 + q[1] ** 2)
-    m = np.zeros(3)
-    gap = box_distance(np.array([r, 0.0, q[2]]), np.array([size[0], 1e300, size[1]]), m)
+    outward, upward = r - size[0], abs(q[2]) - size[1]
+    if outward > 0.0 and upward > 0.0:
+        gap = np.sqrt(outward * outward + upward * upward)
+        radial, axial = outward / gap, upward / gap
+    elif upward > outward:
+        gap, radial, axial = upward, 0.0, 1.0
+    else:
+        gap, radial, axial = outward, 1.0, 0.0
     x, y = (q[0] / r, q[1] / r) if r > 0.0 else (1.0, 0.0)
-    n[0] = m[0] * x
-    n[1] = m[0] * y
-    n[2] = m[2]
+    n[0] = radial * x
+    n[1] = radial * y
+    n[2] = axial if q[2] >= 0.0 else -axial
     if len(h):
-        if gap > 0.0 and m[0] != 0.0 and m[2] != 0.0:  # the rim: a circle, seen in the plane of the axis
+        if gap > 0.0 and radial != 0.0 and axial != 0.0:  # the rim: a circle, seen in the plane of the axis
             e = np.array([x, y, 0.0])
             for a in range(3):
                 for b in range(3):
                     h[a, b] = (e[a] * e[b] + (1.0 if a == 2 and b == 2 else 0.0) - n[a] * n[b]) / gap
-        _add_hoop(x, y, m[0], r, h)
+        _add_hoop(x, y, radial, r, h)
     return gap
 
 

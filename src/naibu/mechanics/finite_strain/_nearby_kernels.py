@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import njit
-from naibu.mechanics.contact._geometry_kernels import mesh_of, signed_distance
+from naibu.mechanics.contact._geometry_kernels import MESH, distance_from_primitive, mesh_of, signed_distance
 from naibu.mechanics.contact.penalty_contact import normal_pressure
 
 
@@ -15,11 +15,11 @@ def add_forces(  # type: ignore[no-untyped-def]  # pragma: no cover
 ):
     """Put the gaps of all points in place, and add the forces of those that touch to `force` (n, 3)."""
     kinds, sizes, _ = geometry
-    mesh = mesh_of(geometry, 0)
+    kind, size, mesh = kinds[0], sizes[0], mesh_of(geometry, 0)
     d, y, q, m, n, e, none = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty((0, 0))
     for p in range(len(nodes)):
         _place(nodes[p], shape[p], rest[p], u, centre, orientation, axes, d, y, q)
-        gap[p] = signed_distance(kinds[0], sizes[0], mesh, q, m, none)
+        gap[p] = distance_from_primitive(kind, size, q, m, none) if kind != MESH else signed_distance(kind, size, mesh, q, m, none)
         pressure, slope = normal_pressure(gap[p], k_n[p], tied)
         if slope == 0.0:
             continue
@@ -27,12 +27,12 @@ def add_forces(  # type: ignore[no-untyped-def]  # pragma: no cover
         for i in range(3):
             n[i] = axes[0, i] * m[0] + axes[1, i] * m[1] + axes[2, i] * m[2]
             along += n[i] * (y[i] - anchors[p, i])
-        size = 0.0
+        slip = 0.0
         for i in range(3):
             e[i] = k_t[p] * (y[i] - anchors[p, i] - along * n[i])
-            size += e[i] * e[i]
-        size = np.sqrt(size)
-        ratio = mu[p] * pressure / size if not tied and size > mu[p] * pressure else 1.0
+            slip += e[i] * e[i]
+        slip = np.sqrt(slip)
+        ratio = mu[p] * pressure / slip if not tied and slip > mu[p] * pressure else 1.0
         for i in range(3):
             d[i] = area[p] * (pressure * n[i] - ratio * e[i])
         for i in range(3):
@@ -45,11 +45,11 @@ def add_forces(  # type: ignore[no-untyped-def]  # pragma: no cover
 def local(geometry, axes, nodes, shape, rest, u, centre, orientation, y, gap):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Put the positions (p, 3) of all points in the frame of the body, and their gaps (p,), in place."""
     kinds, sizes, _ = geometry
-    mesh = mesh_of(geometry, 0)
+    kind, size, mesh = kinds[0], sizes[0], mesh_of(geometry, 0)
     d, q, n, none = np.empty(3), np.empty(3), np.empty(3), np.empty((0, 0))
     for p in range(len(nodes)):
         _place(nodes[p], shape[p], rest[p], u, centre, orientation, axes, d, y[p], q)
-        gap[p] = signed_distance(kinds[0], sizes[0], mesh, q, n, none)
+        gap[p] = distance_from_primitive(kind, size, q, n, none) if kind != MESH else signed_distance(kind, size, mesh, q, n, none)
 
 
 @njit(cache=True, inline="always")
