@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -44,19 +44,23 @@ def hand(t: float) -> FloatArray:
     return np.array([0.0, 0.0, -10.0]) if t < 0.5 else np.array([40.0 * np.cos(5.0 * t), 30.0 * np.sin(4.0 * t), 10.0 * np.sin(9.0 * t)])
 
 
-def timed(step: Callable[[int], object], steps: int) -> tuple[FloatArray, float]:
-    """Return wall times of the steps, ms, and the mean time of the processor, ms."""
-    taken, began = np.empty(steps), time.process_time()
+def timed(step: Callable[[int], object], steps: int) -> FloatArray:
+    """Return times of the processor and of the clock (2, steps), ms."""
+    taken = np.empty((2, steps))
     for n in range(steps):
-        start = time.perf_counter()
+        start, began = time.thread_time(), time.perf_counter()
         step(n)
-        taken[n] = time.perf_counter() - start
-    return 1e3 * taken, 1e3 * (time.process_time() - began) / steps
+        taken[:, n] = time.thread_time() - start, time.perf_counter() - began
+    return 1e3 * taken
 
 
-def row(name: str, taken: FloatArray, cpu: float, told: str = "") -> None:
-    least, middle, late = np.quantile(taken, (0.0, 0.5, 0.99))
-    print(f"  {name:24s} cpu {cpu:7.3f}   wall: least {least:7.3f}, median {middle:7.3f}, p99 {late:7.3f} ms   {told}", flush=True)
+def row(name: str, taken: FloatArray, told: str = "") -> None:
+    found = [f"{unit}: least {a:.3f}, median {b:.3f}, p99 {c:.3f}" for unit, (a, b, c) in _quantiles(taken)]
+    print(f"  {name:24s} {'   '.join(found)} ms   {told}", flush=True)
+
+
+def _quantiles(taken: FloatArray) -> Iterable[tuple[str, FloatArray]]:
+    return zip(("cpu", "wall"), np.quantile(taken, (0.0, 0.5, 0.99), axis=1).T, strict=True)
 
 
 def sessions(n: int, steps: int, radius: float) -> None:
@@ -64,13 +68,13 @@ def sessions(n: int, steps: int, radius: float) -> None:
     print(f"{n + 1}^3 nodes, sphere of {radius:g} mm")
     with engine.session(constrained=held(engine)) as free:
         free.step(steps=5)
-        row("no sphere", *timed(lambda k: free.step(), steps))
+        row("no sphere", timed(lambda k: free.step(), steps))
     ball = spherical_indenter((40.0, 40.0, SIDE_MM + radius), radius, static_friction=0.3, kinetic_friction=0.3)
     with engine.session(constrained=held(engine), indenters=[ball]) as session:
         session.step(motions=[IndenterVelocity()], steps=5)
         before = session.iterations
         found = timed(lambda k: session.step(motions=[IndenterVelocity(hand(k * STEP_S))]), steps)
-        row("sphere, with friction", *found, f"{(session.iterations - before) / steps:.1f} iterations, {session.unsettled} unsettled")
+        row("sphere, with friction", found, f"{(session.iterations - before) / steps:.1f} iterations, {session.unsettled} unsettled")
 
 
 def curve(n: int, radius: float, place: tuple[float, float], steps: int = 250) -> FloatArray:

@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import njit
-from naibu.mechanics.contact._geometry_kernels import MESH, distance_from_primitive, mesh_of, signed_distance
+from naibu.mechanics.contact._geometry_kernels import (
+    BOX,
+    MESH,
+    PLANE,
+    distance_and_normal_of_box,
+    distance_from_primitive,
+    mesh_of,
+    signed_distance,
+)
 from naibu.mechanics.contact.penalty_contact import normal_pressure
 
 
@@ -18,8 +26,13 @@ def add_forces(  # type: ignore[no-untyped-def]  # pragma: no cover
     kind, size, mesh = kinds[0], sizes[0], mesh_of(geometry, 0)
     d, y, q, m, n, e, none = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty((0, 0))
     for p in range(len(nodes)):
-        _place(nodes[p], shape[p], rest[p], u, centre, orientation, axes, d, y, q)
-        gap[p] = distance_from_primitive(kind, size, q, m, none) if kind != MESH else signed_distance(kind, size, mesh, q, m, none)
+        _place(p, nodes, shape, rest, u, centre, orientation, axes, d, y, q)
+        if kind == PLANE:
+            gap[p], m[0], m[1], m[2] = q[2], 0.0, 0.0, 1.0
+        elif kind == BOX:
+            gap[p], m[0], m[1], m[2] = distance_and_normal_of_box(q[0], q[1], q[2], size[0], size[1], size[2])
+        else:
+            gap[p] = distance_from_primitive(kind, size, q, m, none) if kind != MESH else signed_distance(kind, size, mesh, q, m, none)
         pressure, slope = normal_pressure(gap[p], k_n[p], tied)
         if slope == 0.0:
             continue
@@ -46,19 +59,27 @@ def local(geometry, axes, nodes, shape, rest, u, centre, orientation, y, gap):  
     """Put the positions (p, 3) of all points in the frame of the body, and their gaps (p,), in place."""
     kinds, sizes, _ = geometry
     kind, size, mesh = kinds[0], sizes[0], mesh_of(geometry, 0)
-    d, q, n, none = np.empty(3), np.empty(3), np.empty(3), np.empty((0, 0))
+    d, at, q, n, none = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty((0, 0))
     for p in range(len(nodes)):
-        _place(nodes[p], shape[p], rest[p], u, centre, orientation, axes, d, y[p], q)
-        gap[p] = distance_from_primitive(kind, size, q, n, none) if kind != MESH else signed_distance(kind, size, mesh, q, n, none)
+        _place(p, nodes, shape, rest, u, centre, orientation, axes, d, at, q)
+        y[p, 0], y[p, 1], y[p, 2] = at[0], at[1], at[2]
+        if kind == PLANE:
+            gap[p] = q[2]
+        elif kind == BOX:
+            gap[p] = distance_and_normal_of_box(q[0], q[1], q[2], size[0], size[1], size[2])[0]
+        else:
+            gap[p] = distance_from_primitive(kind, size, q, n, none) if kind != MESH else signed_distance(kind, size, mesh, q, n, none)
 
 
 @njit(cache=True, inline="always")
-def _place(nodes, shape, rest, u, centre, orientation, axes, d, y, q):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Put the position of a point in the frame of the body, y (3,), and in that of its shape, q (3,), in place; d (3,) is scratch."""
+def _place(p, nodes, shape, rest, u, centre, orientation, axes, d, y, q):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Put the position of point p in the frame of the body, y (3,), and in that of its shape, q (3,), in place; d (3,) is scratch."""
     for i in range(3):
-        d[i] = rest[i] - centre[i]
-        for a in range(len(shape)):
-            d[i] += shape[a] * u[nodes[a], i]
+        d[i] = rest[p, i] - centre[i]
+    for a in range(shape.shape[1]):
+        part, node = shape[p, a], nodes[p, a]
+        for i in range(3):
+            d[i] += part * u[node, i]
     for i in range(3):
         y[i] = d[0] * orientation[0, i] + d[1] * orientation[1, i] + d[2] * orientation[2, i]
     for i in range(3):

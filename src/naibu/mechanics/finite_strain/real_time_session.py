@@ -357,13 +357,13 @@ class RealTimeSession(DynamicSession):
 
     def _soon_touched(self, contacts: Sequence[Contact], gaps: Sequence[FloatArray]) -> IntArray:
         """Nodes in contact, and those about to be, the nearest first."""
-        nodes, order = [np.zeros(0, np.int64)], [np.zeros(0)]
+        nodes, order = [np.zeros((0, self.engine.faces.shape[1]), np.int64)], [np.zeros(0)]
         reach = REACH * self.engine._extent
         for contact, gap in zip(contacts, gaps, strict=True):
             near = np.flatnonzero(gap < reach)
-            nodes.append(contact.nodes[near].ravel())
-            order.append(np.repeat(np.maximum(gap[near], 0.0), contact.nodes.shape[1]))
-        ranked = np.concatenate(nodes)[np.argsort(np.concatenate(order), kind="stable")]
+            nodes.append(contact.nodes[near])
+            order.append(np.maximum(gap[near], 0.0))
+        ranked = np.concatenate(nodes)[np.argsort(np.concatenate(order), kind="stable")].ravel()
         return np.asarray(ranked[np.sort(np.unique(ranked, return_index=True)[1])][:AHEAD], dtype=np.int64)
 
     def _current_tangent(self) -> EarlierTangent:
