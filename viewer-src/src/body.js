@@ -62,9 +62,10 @@ export function gridLines(reference, spacing) {
   }
   const from = [0, 1].map((k) => spacing * (Math.floor(low[k] / spacing) - 1));
   const to = [0, 1].map((k) => spacing * (Math.ceil(high[k] / spacing) + 1));
+  const floor = low[2] - 0.02 * spacing; // not in the lowest part of an open surface, which it would shine through
   const points = [];
-  for (let x = from[0]; x <= to[0] + 1e-6; x += spacing) points.push(x, from[1], low[2], x, to[1], low[2]);
-  for (let y = from[1]; y <= to[1] + 1e-6; y += spacing) points.push(from[0], y, low[2], to[0], y, low[2]);
+  for (let x = from[0]; x <= to[0] + 1e-6; x += spacing) points.push(x, from[1], floor, x, to[1], floor);
+  for (let y = from[1]; y <= to[1] + 1e-6; y += spacing) points.push(from[0], y, floor, to[0], y, floor);
   const geometry = new BufferGeometry();
   geometry.setAttribute("position", new BufferAttribute(new Float32Array(points), 3));
   return new LineSegments(geometry, new LineBasicMaterial());
