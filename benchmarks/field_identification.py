@@ -28,7 +28,8 @@ from records import ResultTable, write_record
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.mesh import Mesh
 from naibu.core.progress import ProgressReport
-from naibu.identification.from_fields.estimate import FieldEstimate, identify_field
+from naibu.identification.from_fields.estimate import identify_field
+from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.sensitivities import logarithms, young_and_poisson
 from naibu.identification.from_fields.regularization import cell_volumes

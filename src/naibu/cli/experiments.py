@@ -7,12 +7,13 @@ import time
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from naibu.cli.console import GRAVE, INTERRUPTED, NOT_EXPLAINED, WARNING, print_table, progress_display, say
-from naibu.cli.described import Flag, Known, ObjectOptions, Out, Overwrite, WorkerOptions, labels_of, require_left_out
+from naibu.cli.described import Flag, Known, ObjectOptions, Out, Overwrite, WorkerOptions, require_left_out
+from naibu.cli.identifying import ContactModel, Joined, Law, PixelScale, Unit, identify_from_both, identify_from_fields
 from naibu.cli.run_record import found, wrote
 from naibu.cli.verbs import MARKERS, START, verb
 from naibu.core.errors import InputError
@@ -29,11 +30,6 @@ FIELD_FILES = (
     *(".h5", ".hdf5", ".tfm", ".mha", ".mhd", ".nrrd", ".nhdr", ".nii", ".gz"),
     *(".vtu", ".mat", ".csv", ".tsv", ".txt", ".xlsx", ".dat"),
 )
-Unit = Literal["mm", "cm", "m", "um", "inch"]
-ContactModel = Literal["coulomb", "stick", "springs"]
-PixelScale = Literal["given", "sought"]
-Joined = Literal["tied", "sliding"]
-Law = Literal["neo_hookean", "neo_hookean_isochoric", "mooney_rivlin", "yeoh", "saint_venant_kirchhoff"]
 
 
 @verb(START, "demo --open   # about a minute; opens the report")
@@ -83,6 +79,7 @@ def identify(
     """Identify material parameters, friction and boundary conditions by finite element model updating (FEMU).
 
     Operands are experiments with markers, or files of displacement fields, such as the field.h5 of naibu sense, which need a mask or zones.
+    With both, materials and zones of one name share their moduli.
 
     The first line says whether the model explains the markers: explained, explained in part (what and where), or not explained. In the last
     case the results are written, marked as not to be used, and the exit code is 3.
@@ -128,13 +125,26 @@ def identify(
     overwrite
         Replace results, or files of your own, that the folder already holds.
     """
+    of_fields = [name for name in experiments if Path(name).suffix.lower() in FIELD_FILES]
+    others = [name for name in experiments if name not in of_fields]
+    if of_fields and others:
+        require_left_out(
+            "goes with markers or fields, not with both", each_cell=cell_map, cross_validate=cross_validate, resume=not resume,
+            workers=where is not None, law=law != "neo_hookean",
+        )  # fmt: skip
+        identify_from_both(
+            others, of_fields, known=known or (), states=_states(others, state or []), contact=contact, joined=joined,
+            pixel_scale=pixel_scale, element_size_mm=element_size_mm, mask=mask, zones=zones, zone_name=zone_name or [],
+            loaded=loaded or (), unit=unit, spacing_mm=spacing_mm, out=out, overwrite=overwrite,
+        )  # fmt: skip
+        return
     if mask is not None or zones is not None or all(Path(name).suffix.lower() in FIELD_FILES for name in experiments):
         require_left_out(
             "goes with markers, and these are displacement fields", states=bool(state), contact=contact != "coulomb",
             joined=joined != "tied", pixel_scale=pixel_scale != "given", cross_validate=cross_validate, resume=not resume,
             workers=where is not None,
         )  # fmt: skip
-        _identify_fields(
+        identify_from_fields(
             experiments, mask=mask, zones=zones, zone_name=zone_name or [], known=known or (), law=law, each_cell=cell_map,
             loaded=loaded or (), element_size_mm=element_size_mm, unit=unit, spacing_mm=spacing_mm, out=out, overwrite=overwrite,
         )  # fmt: skip
@@ -151,46 +161,6 @@ def identify(
         experiments, known=known or (), states=states, settings=settings, out=out, cross_validate=cross_validate, resume=resume,
         overwrite=overwrite, where=where,
     )  # fmt: skip
-
-
-def _identify_fields(
-    fields: Sequence[str],
-    *,
-    mask: Path | None,
-    zones: Path | None,
-    zone_name: Sequence[str],
-    known: Sequence[str],
-    law: Law,
-    each_cell: bool,
-    loaded: Sequence[str],
-    element_size_mm: float,
-    unit: Unit | None,
-    spacing_mm: tuple[float, float, float] | None,
-    out: Path,
-    overwrite: bool,
-) -> None:
-    from naibu.workflows.fields.identify_fields import identify_fields, table_of_assumptions, table_of_zones
-
-    if law != "neo_hookean":
-        raise InputError(f"law={law!r} is not known for fields; use 'neo_hookean'")
-    began = time.perf_counter()
-    with progress_display() as progress:
-        result = identify_fields(
-            fields, mask=mask, zones=zones, zone_names=labels_of(zone_name), known=known, loaded=loaded, each_cell=each_cell,
-            element_size_mm=element_size_mm, unit=unit, spacing_mm=spacing_mm, out=out, overwrite=overwrite, progress=progress,
-        )  # fmt: skip
-    usable = result.estimate.verdict is None or result.estimate.verdict.ok
-    for number, line in enumerate(result.notes):
-        say(line, "dim" if number else "bold" if usable else GRAVE)
-    for table in (table_of_zones(result), table_of_assumptions(result)):
-        if table.rows:
-            print_table(table.title, table.columns, table.rows, digits=4)
-    wrote(*result.files)
-    found(usable=usable)
-    say(f"{time.perf_counter() - began:.0f} s. Results in {out}: open report.html; naibu predict, live and cut take model.json.")
-    if not usable:
-        say("The model does not explain the data: the results are marked as not to be used.", GRAVE)
-        sys.exit(NOT_EXPLAINED)
 
 
 def _states(experiments: Sequence[str], chosen: Sequence[str]) -> dict[str, list[str]] | None:

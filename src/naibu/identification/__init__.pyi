@@ -2,8 +2,9 @@ from .equilibrium_gap.batch import EquilibriumGapEstimate, batch_equilibrium_gap
 from .equilibrium_gap.incremental import IncrementalEstimate, incremental_equilibrium_gap
 from .equilibrium_gap.weighted import weighted_equilibrium_gap
 from .from_fields.assumptions import Assumption
-from .from_fields.estimate import FieldEstimate, identify_field
+from .from_fields.estimate import identify_field
 from .from_fields.experiment_design import Accuracy, expected_accuracy
+from .from_fields.field_estimate import FieldEstimate
 from .from_fields.forward.load_cases import FieldLoadCase, KnownRegion, Zones
 from .from_fields.identified.field_prediction import FieldPrediction, predict_inside, predict_moved_sides
 from .from_fields.identified.identified_body import IdentifiedBody

@@ -72,6 +72,8 @@ class SliceView:
         Axes of the grid in the frame of the scan, in columns: values are read in that frame.
     cards : sequence of Card
         What to know first.
+    details : sequence of str
+        Paragraphs below the tables, folded.
     """
 
     title: str
@@ -85,6 +87,7 @@ class SliceView:
     difference: tuple[tuple[str, int, int], ...] = ()
     direction: AnyFloatArray | Sequence[Sequence[float]] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     cards: Sequence[Card] = ()
+    details: Sequence[str] = ()
 
 
 def slices_html(view: SliceView) -> str:
@@ -117,6 +120,8 @@ def slices_html(view: SliceView) -> str:
     lead = "".join(f"<p{' class=lead' if i == 0 else ''}>{escape(s)}</p>" for i, s in enumerate(view.sentences))
     words = f"{cards_html(view.cards)}{lead}"
     tables = "".join(table_html(t) for t in view.tables)
+    if view.details:
+        tables += f"<details><summary>Details</summary>{''.join(f'<p>{escape(s)}</p>' for s in view.details)}</details>"
     return filled_template(
         "slices.html", {"TITLE": escape(view.title), "WORDS": words, "TABLES": tables, "FRAME": FRAME, "DATA": embedded_json(payload)}
     )

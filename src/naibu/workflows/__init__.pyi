@@ -8,6 +8,7 @@ from .interactive.cut_surface import SurfaceCutRun, cut_surface_file
 from .interactive.haptics.device import DeviceRecord, drive_live_simulation
 from .interactive.live import live, touched_loop
 from .interactive.touchable_models import MeshMaterial, TouchableModel, tools_for, touchable
+from .joint_identification import JointIdentification, identify_jointly
 from .markers.identify import Identification
 from .measurement.compare_methods import MethodComparison, compare_methods
 from .measurement.sense import Pair, SenseRun, read_pair, sense_pair
@@ -31,6 +32,7 @@ __all__ = [
     "FieldIdentification",
     "FieldPredictionRun",
     "Identification",
+    "JointIdentification",
     "LatticeCalibration",
     "MammographyRun",
     "MeshMaterial",
@@ -55,6 +57,7 @@ __all__ = [
     "design",
     "drive_live_simulation",
     "identify_fields",
+    "identify_jointly",
     "live",
     "named_studies",
     "predict_field",

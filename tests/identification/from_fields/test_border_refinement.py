@@ -8,12 +8,17 @@ from functools import cache
 import numpy as np
 
 from naibu.core.displacement_field import DisplacementField
-from naibu.identification.from_fields.border_refinement import Borders, _Mixing, refined_borders
+from naibu.identification.from_fields.border_refinement import RefinedRegions, on_finer_cells, refined_borders
+from naibu.identification.from_fields.borders import Borders, Mixing
+from naibu.identification.from_fields.forward.field_laws import field_law
+from naibu.identification.from_fields.forward.forward_model import Solvers, equilibrium
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
-from naibu.identification.from_fields.forward.sensitivities import FieldModel, logarithms, young_and_poisson
+from naibu.identification.from_fields.forward.refinement import Refinement
+from naibu.identification.from_fields.forward.sensitivities import FieldModel, Point, logarithms, moduli_of, young_and_poisson
 from naibu.identification.from_fields.gauss_newton import Bounds, first_point
 from naibu.identification.from_fields.segmentation import joined
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
+from naibu.meshing.point_location import interpolation_operator
 from naibu.meshing.primitives import box
 from naibu.meshing.surface import boundary_nodes
 
@@ -43,7 +48,7 @@ def _in_sphere(points: np.ndarray) -> np.ndarray:
 
 def test_borders_start_with_the_volume_of_the_cells_and_are_rounder_than_these() -> None:
     fields, zones = model()
-    borders = _Mixing.of(fields, zones).borders
+    borders = Mixing.of(fields, Borders.of(fields.mesh, zones)).borders
     points = np.random.default_rng(1).uniform([-15.0, -15.0, 10.0], [15.0, 15.0, 30.0], (20_000, 3))
     deep = borders.distances(points)[0][:, 0]
     # volume of the sphere that the border encloses, by Monte Carlo, against that of the cells
@@ -70,8 +75,39 @@ def test_a_plane_border_is_where_it_was() -> None:
     np.testing.assert_allclose(deep, x, atol=0.12 * borders.edge_mm)
 
 
+def test_a_compact_region_starts_as_a_ball_and_a_slab_does_not() -> None:
+    """The ball of the volume of a sphere's cells is nearer to the sphere than what is smoothed from the cells."""
+    fields, zones = model()
+    borders = Borders.of(fields.mesh, zones)
+    points = np.random.default_rng(1).uniform([-15.0, -15.0, 10.0], [15.0, 15.0, 30.0], (20_000, 3))
+    away = RADIUS_MM - np.linalg.norm(points - [0.0, 0.0, 20.0], axis=1)
+    errors = [np.abs(b.distances(points)[0][:, 0] - away)[np.abs(away) < 3.0].mean() for b in (borders, borders.rounded())]
+    assert errors[1] < 0.5 * errors[0]
+    slab = joined(fields.zones, (fields.mesh.points[fields.mesh.cells].mean(axis=1)[fields.zones.of_cell >= 0, 0] > 11.0).astype(np.int64))
+    assert not Borders.of(fields.mesh, slab).rounded().round.any()
+
+
+def test_moduli_on_half_the_cells_are_on_average_those_of_the_cells() -> None:
+    """A linear border cuts off of a cell what it cuts off of the eight cells in it."""
+    fields, zones = model()
+    refined = refined_borders(fields, zones, _homogeneous(fields), Bounds())
+    finer = Refinement.of(fields.mesh)
+    fine, coarse = (refined.moduli_on(m, z)[1] for m, z in ((finer.mesh, finer.zones(fields.zones)), (fields.mesh, fields.zones)))
+    np.testing.assert_allclose(coarse, moduli_of(fields.zones, refined.point.theta)[1], rtol=1e-9)
+    per_cell = np.log(fine).reshape(-1, 8).mean(axis=1)
+    assert np.abs(per_cell - np.log(coarse)).max() < 0.1 * np.ptp(np.log(coarse)) + 1e-9
+    assert abs(per_cell.mean() - np.log(coarse).mean()) < 0.01 * np.ptp(np.log(coarse)) + 1e-9
+
+
+def _homogeneous(fields: FieldModel) -> Point:
+    lame, shear = np.array([lame_parameters(e, 0.45) for e in (5.0, 15.0)]).T
+    of_cells = np.repeat(logarithms(lame[:1], shear[:1]), fields.zones.count)
+    return replace(first_point(fields, of_cells), theta=logarithms(lame, shear))
+
+
 def test_derivatives_of_the_moduli_of_cells() -> None:
-    mixing = _Mixing.of(*model())
+    fields, zones = model()
+    mixing = Mixing.of(fields, Borders.of(fields.mesh, zones))
     rng = np.random.default_rng(2)
     theta, moves = np.array([1.0, 2.0, 2.5, 2.2]), mixing.borders.moves.ravel() + 0.2 * rng.standard_normal(10)
     _, slopes = mixing.moduli(theta, moves)
@@ -87,7 +123,7 @@ def test_size_and_stiffness_of_an_inclusion_are_found_together() -> None:
     fields, zones = model()
     truth = np.array([5.0, 15.0])
     lame, shear = np.array([lame_parameters(e, 0.45) for e in truth]).T
-    mixing = _Mixing.of(fields, zones)
+    mixing = Mixing.of(fields, Borders.of(fields.mesh, zones))
     moves = mixing.borders.moves.ravel() + np.array([0.7, 0.3, 0, 0, 0, 0, 0, 0, 0, 0])
     start = first_point(fields, mixing.moduli(logarithms(lame, shear), moves)[0])
     state = start.states[0]
@@ -103,3 +139,35 @@ def test_size_and_stiffness_of_an_inclusion_are_found_together() -> None:
     of_contrast, known = (c[0, 0] + c[1, 1] - 2.0 * c[0, 1] for c in (found.covariance, found.at_these_borders))
     assert of_contrast > 1.05 * known
     assert abs(young[1] / truth[1] - 1.0) < 0.15
+
+
+def test_corrections_for_the_size_of_cells_find_what_smaller_cells_made() -> None:
+    """Data of cells of half the size, with a sharper border: the coarse fit is off, the corrected one is not."""
+    fields, zones = model(7)
+    truth = np.array([5.0, 15.0])
+    theta = logarithms(*np.array([lame_parameters(e, 0.45) for e in truth]).T)
+    finer, borders = Refinement.of(fields.mesh), Borders.of(fields.mesh, zones).rounded()
+    exact = replace(refined_borders_at(fields, borders), theta=theta).moduli_on(finer.mesh, finer.zones(fields.zones))
+    coarse = fields.observed[0].load_case
+    start = first_point(fields, np.repeat(logarithms(*np.array([lame_parameters(5.0, 0.45)]).T), fields.zones.count)).states[0]
+    on = finer.load_case(coarse)
+    law = field_law(finer.mesh, "linear", averaged=True)
+    u, _ = equilibrium(law, Solvers(law, finer.mesh.points), *exact, on, finer.displacement(start), b"")
+    seen = interpolation_operator(finer.mesh, coarse.field.points) @ u
+    case = replace(coarse, field=DisplacementField.from_arrays(coarse.field.points, seen, sd_mm=0.1 * SD_MM))
+    again = FieldModel(fields.mesh, [case], fields.zones, "linear", "accurate")
+    found = refined_borders(again, zones, replace(_homogeneous(fields), theta=theta), Bounds())
+    corrected = on_finer_cells(again, "linear", found, Bounds())
+    assert corrected is not None
+    assert corrected.converged
+    off, left = (abs(np.log(young_and_poisson(t)[0][1] / truth[1])) for t in (found.theta, corrected.refined.theta))
+    assert left < 0.03
+    assert left < 0.3 * off
+    assert sum(float(r @ r) for r in corrected.residuals) < 0.2 * found.point.misfit
+
+
+def refined_borders_at(fields: FieldModel, borders: Borders) -> RefinedRegions:
+    """Return regions with these borders, before any search."""
+    mixing = Mixing.of(fields, borders)
+    nothing = np.zeros((4, 4))
+    return RefinedRegions(fields.zones, mixing.borders, np.zeros(4), _homogeneous(fields), nothing, nothing, 0.0, np.zeros((0, 2)), mixing)

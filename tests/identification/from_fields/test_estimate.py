@@ -13,8 +13,8 @@ from other_mesh import grid_of_points, load_cases_of
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.estimate import FieldEstimate
 from naibu.identification.from_fields.estimate import identify_field as identify_accurately
+from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, Point, logarithms, moduli_of, young_and_poisson
 from naibu.identification.from_fields.gauss_newton import Bounds, Objective, SearchSettings, exact_step, first_point, search

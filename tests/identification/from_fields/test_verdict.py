@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from naibu.core.displacement_field import DisplacementField
-from naibu.identification.from_fields.estimate import FieldEstimate, identify_field
+from naibu.identification.from_fields.estimate import identify_field
+from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.verdict import Explanation
 from naibu.validation.specimens.quadratic_body import QuadraticBody, Solved

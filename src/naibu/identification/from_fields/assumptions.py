@@ -92,7 +92,7 @@ def effects(found: tuple[Assumption, ...], zones: Zones, theta: FloatArray, with
     for one in found:
         other, ratio = young_and_poisson(theta + one.theta)
         rows = [
-            f"{name} {100 * (a / b - 1):+.2g} %, Poisson's ratio {c - d:+.2g}"
+            f"{name} {100 * (a / b - 1):+.2g} %, Poisson's ratio {c - d:+.3f}"
             for name, a, b, c, d in zip(zones.names[:3], other, young, ratio, poisson, strict=False)
         ]
         out = [name for name, e, (low, high) in zip(zones.names, other, within, strict=True) if not low <= e <= high]

@@ -1,112 +1,38 @@
 """Borders of regions that run through cells, fitted together with the moduli: what the data say of the size of an inclusion, and what not.
 
 A smaller stiffer inclusion and a larger softer one displace their surroundings nearly alike, so that moduli of regions made of whole cells
-depend on which cells these are, by more than their standard errors. The border of every region but the largest is therefore moved along its
-normal by polynomials of degree two in the direction from its middle, a low-order level set :cite:p:`osher1988`; cells on borders are mixed
-in logarithms of moduli. Moduli and moves are found together, and the covariance of the moduli holds what is not known of the borders.
+depend on which cells these are, by more than their standard errors. Moduli and moves of borders are found together, and the covariance of
+the moduli holds what is not known of the borders.
+
+Cells are a poor start where a region is only a few of them wide. Borders of compact regions therefore start as spheres as well, and the
+better end counts. Four cells across make a lump of three times the modulus about a third too stiff and a quarter too small; the fit is
+therefore corrected for what cells of half the size change (defect correction, :cite:p:`stetter1978`); what half of their size would change
+once more is part of the doubt.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
-from scipy.special import ndtr, ndtri
 
-from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError
 from naibu.core.mesh import Mesh
+from naibu.identification.from_fields.borders import Borders, Mixing
+from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Point
 from naibu.identification.from_fields.gauss_newton import Bounds, Objective
+from naibu.identification.from_fields.mesh_error import DOUBT, changes_on_finer_mesh, refitted
 from naibu.identification.from_fields.regularization import ZoneGraph, cell_volumes
 from naibu.identification.from_fields.segmentation import Segmentation, areas_between, joined
 
 MOST_REGIONS, CANDIDATES = 6, 3  # whose borders are refined; pairs that are tried as one
-WINDOW = 0.8  # standard deviation, in cells, of the window in which cells are smoothed
-REACH, NEIGHBOURS = 3.0, 64  # of that window, in standard deviations, and cells in it at most
-INWARDS = 0.42  # way from a corner to the middle of a cell at which borders are evaluated, about that of Gauss points
-SHARPNESS = 0.25  # standard deviation, in cells, over which a border is spread when cells are mixed
 LONGEST = 0.5  # of a step: of logarithms, and of borders in cells
-BISECTIONS = 30  # for the move of a border that keeps the volume
 ITERATIONS, HALVINGS, ENOUGH = 12, 5, 0.02  # Gauss-Newton steps; halvings of one; fall of half of chi squared that is worth no further step
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Borders:
-    """Regions with borders that run through cells.
-
-    Attributes
-    ----------
-    middles : ndarray, shape (m, 3)
-        Middles of the cells, mm.
-    volumes : ndarray, shape (m,)
-        Their volumes, mm^3.
-    region_of_cell : ndarray, shape (m,), int64
-        Region of every cell, -1 where the moduli are known; 0 is the largest.
-    moves : ndarray, shape (regions - 1, 10)
-        How far the borders of the other regions move outwards, mm: coefficients of 1, x, y, z, xx, xy, xz, yy, yz, zz of the direction from
-        the middle of the region.
-    edge_mm : float
-        Edge length of the cells.
-    """
-
-    middles: FloatArray
-    volumes: FloatArray
-    region_of_cell: IntArray
-    moves: FloatArray
-    edge_mm: float
-    _tree: cKDTree = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_tree", cKDTree(self.middles))
-
-    @classmethod
-    def of(cls, mesh: Mesh, zones: Zones) -> Borders:
-        """Return the borders of regions made of whole cells."""
-        volumes = cell_volumes(mesh)
-        edge = float(np.median(volumes) ** (1.0 / 3.0))
-        return cls(mesh.points[mesh.cells].mean(axis=1), volumes, zones.of_cell, np.zeros((zones.count - 1, 10)), edge)
-
-    def distances(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return how deep points (n, 3) lie in each region but the largest (n, regions - 1), mm, and derivatives with respect to moves."""
-        wide = WINDOW * self.edge_mm
-        distance, near = self._tree.query(points, k=min(NEIGHBOURS, len(self.middles)), distance_upper_bound=REACH * wide)
-        there = np.isfinite(distance)
-        near = np.where(there, near, 0)
-        weight = np.where(there, self.volumes[near] * np.exp(-0.5 * (np.where(there, distance, 0.0) / wide) ** 2), 0.0)
-        total = np.maximum(weight.sum(axis=1), 1e-300)
-        deep, modes = [], []
-        for region, moves in enumerate(self.moves, start=1):
-            own = self.region_of_cell == region
-            part = np.where(own[near], weight, 0.0).sum(axis=1) / total
-            # the mean of a half-space in a Gaussian window is the normal distribution of the distance from its border
-            plain = wide * np.clip(ndtri(np.clip(part, 1e-9, 1.0 - 1e-9)), -REACH, REACH)
-            mode = _modes(points - np.average(self.middles[own], weights=self.volumes[own], axis=0))
-            deep.append(plain + mode @ moves)
-            modes.append(mode)
-        return np.stack(deep, axis=1), np.stack(modes, axis=1)
-
-    def with_moves(self, moves: FloatArray) -> Borders:
-        """Return the borders where moves (regions - 1, 10) put them."""
-        return replace(self, moves=moves.reshape(self.moves.shape))
-
-    def region_at(self, points: ArrayLike, otherwise: ArrayLike) -> IntArray:
-        """Return the region of points (n, 3), mm, in cells of the regions `otherwise` (n,); known ones, -1, stay known."""
-        given = np.asarray(otherwise, dtype=np.int64)
-        deep, _ = self.distances(np.asarray(points, dtype=float))
-        best = deep.argmax(axis=1)
-        return np.where(given == KNOWN, KNOWN, np.where(deep[np.arange(len(deep)), best] > 0.0, best + 1, 0))
-
-
-def _modes(away: FloatArray) -> FloatArray:
-    """Return 1, x, y, z, xx, xy, xz, yy, yz, zz of directions (n, 3) as columns (n, 10); the diagonal squares less their mean."""
-    x, y, z = (away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-300)).T
-    third = 1.0 / 3.0
-    return np.stack([np.ones_like(x), x, y, z, x * x - third, x * y, x * z, y * y - third, y * z, z * z - third], axis=1)
+CORRECTIONS, CORRECTED = 4, 0.03  # defect corrections; change of a logarithm that is worth no further one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,6 +55,8 @@ class RefinedRegions:
         Half of chi squared and priors.
     parts : ndarray, shape (m, regions)
         Part of every cell in each region, without parts where moduli are known: logarithms of moduli are mixed by them.
+    mixing : Mixing
+        The moduli of all zones from those of the regions.
     """
 
     zones: Zones
@@ -139,6 +67,17 @@ class RefinedRegions:
     at_these_borders: FloatArray
     objective: float
     parts: FloatArray
+    mixing: Mixing
+
+    def moduli_on(self, mesh: Mesh, zones: Zones) -> tuple[FloatArray, FloatArray]:
+        """Return lambda and mu (m,), kPa, of the cells of another mesh of the body; `zones` tell which of them are known."""
+        unknown = np.flatnonzero(zones.of_cell != KNOWN)
+        edge = float(np.median(cell_volumes(mesh)) ** (1.0 / 3.0))
+        share = Mixing.at(self.borders, mesh, unknown, edge).fractions(self.borders.moves.ravel())[0]
+        shear, ratio = np.exp(np.column_stack([1.0 - share.sum(axis=1), share]) @ self.theta.reshape(2, -1).T).T
+        lame, out = zones.known_lambda.copy(), zones.known_mu.copy()
+        lame[unknown], out[unknown] = shear * (ratio - 2.0 / 3.0), shear
+        return lame, out
 
 
 def refined_regions(model: FieldModel, regions: Segmentation, graph: ZoneGraph, bounds: Bounds) -> RefinedRegions:
@@ -201,7 +140,14 @@ def refined_borders(model: FieldModel, zones: Zones, start: Point, bounds: Bound
     ConvergenceError
         The data do not determine moduli and borders together.
     """
-    mixing = _Mixing.of(model, zones)
+    cells = Borders.of(model.mesh, zones)
+    starts = [cells] + [ball for ball in [cells.rounded()] if ball.round.any()]
+    ends = [_searched(model, Mixing.of(model, borders), start, bounds) for borders in starts]
+    return _with_covariance(model, *min(ends, key=lambda e: e[1].value))
+
+
+def _searched(model: FieldModel, mixing: Mixing, start: Point, bounds: Bounds) -> tuple[Mixing, _Trial]:
+    """Return where Gauss-Newton steps lead from borders that keep the volume."""
     first = mixing.borders.moves.ravel()
     here = _Trial.at(model, mixing, start.theta, first, start.states)
     for _ in range(ITERATIONS):
@@ -211,7 +157,69 @@ def refined_borders(model: FieldModel, zones: Zones, start: Point, bounds: Bound
         gain, here = here.value - better.value, better
         if gain < ENOUGH:
             break
-    return _with_covariance(model, mixing, here)
+    return mixing, here
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CorrectedRegions:
+    """Regions as cells of half the size would fit them.
+
+    Attributes
+    ----------
+    refined : RefinedRegions
+        Moduli and borders.
+    residuals : tuple of ndarray, shape (q,)
+        Whitened residuals of every load case on the small cells.
+    shift : ndarray, shape (2 regions,)
+        By how much the small cells changed the logarithms of the moduli.
+    converged : bool
+        Whether the last correction changed them by next to nothing.
+    """
+
+    refined: RefinedRegions
+    residuals: tuple[FloatArray, ...]
+    shift: FloatArray
+    converged: bool
+
+    @property
+    def doubt(self) -> tuple[FloatArray, FloatArray]:
+        """Standard deviations (2 regions,) and covariance (2 regions, 2 regions) of what still smaller cells would change."""
+        return DOUBT * np.abs(self.shift), DOUBT**2 * np.outer(self.shift, self.shift)
+
+
+def on_finer_cells(model: FieldModel, law: LawName, found: RefinedRegions, bounds: Bounds) -> CorrectedRegions | None:
+    """Fit moduli and borders so that the residuals on cells of half the size are least, with derivatives of the given cells.
+
+    None where there is no finer mesh, see `naibu.identification.from_fields.mesh_error.changes_on_finer_mesh`.
+
+    Raises
+    ------
+    ConvergenceError
+        There is no equilibrium on the way.
+    """
+    mixing, n, edge = found.mixing, len(found.theta), found.mixing.borders.edge_mm
+    here, now, objective = _Trial(found.theta, found.borders.moves.ravel(), found.point, found.objective), found, Objective(bounds=bounds)
+    residuals, converged = tuple[FloatArray, ...](), False
+    for _ in range(CORRECTIONS):
+        at = model.linearised(model.evaluate(here.point.theta, here.point.states))
+        changes = changes_on_finer_mesh(at, law, now.moduli_on)
+        if changes is None:
+            return None
+        slopes = mixing.moduli(here.theta, here.moves)[1]
+        quadratic = at.concentrated(slopes)
+        hessian = quadratic.hessian.copy()
+        hessian[n:, n:] += np.eye(len(here.moves)) / edge**2
+        pull = np.concatenate([np.zeros(n), (here.moves - mixing.borders.moves.ravel()) / edge**2])
+        fit = refitted(at, replace(quadratic, hessian=hessian), changes, slopes, pull)
+        scale = min(1.0, LONGEST / max(np.abs(fit.theta[:n]).max(), np.abs(fit.theta[n:]).max() / edge, 1e-300))
+        theta, moves = objective.clipped(here.theta + scale * fit.theta[:n]), here.moves + scale * fit.theta[n:]
+        guesses = [u + scale * du for u, du in zip(here.point.states, fit.moved, strict=True)]
+        here, residuals = _Trial.at(model, mixing, theta, moves, guesses), fit.residuals
+        now = replace(found, theta=theta, borders=found.borders.with_moves(moves))
+        converged = bool(np.abs(fit.theta[:n]).max() < CORRECTED)
+        if converged:
+            break
+    return CorrectedRegions(_with_covariance(model, mixing, here), residuals, here.theta - found.theta, converged)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,13 +232,13 @@ class _Trial:
     value: float
 
     @classmethod
-    def at(cls, model: FieldModel, mixing: _Mixing, theta: FloatArray, moves: FloatArray, states: Sequence[FloatArray]) -> _Trial:
+    def at(cls, model: FieldModel, mixing: Mixing, theta: FloatArray, moves: FloatArray, states: Sequence[FloatArray]) -> _Trial:
         point = model.evaluate(mixing.moduli(theta, moves)[0], list(states))
         away = (moves - mixing.borders.moves.ravel()) / mixing.borders.edge_mm
         return cls(theta, moves, point, 0.5 * (point.misfit + point.prior + float(away @ away)))
 
 
-def _stepped(model: FieldModel, mixing: _Mixing, here: _Trial, bounds: Bounds) -> _Trial | None:
+def _stepped(model: FieldModel, mixing: Mixing, here: _Trial, bounds: Bounds) -> _Trial | None:
     """Return where a Gauss-Newton step leads, halved until the objective falls; None where it never does."""
     n, edge, objective = len(here.theta), mixing.borders.edge_mm, Objective(bounds=bounds)
     slopes = mixing.moduli(here.theta, here.moves)[1]
@@ -254,12 +262,12 @@ def _stepped(model: FieldModel, mixing: _Mixing, here: _Trial, bounds: Bounds) -
     return None
 
 
-def _with_covariance(model: FieldModel, mixing: _Mixing, found: _Trial) -> RefinedRegions:
+def _with_covariance(model: FieldModel, mixing: Mixing, found: _Trial) -> RefinedRegions:
     """Return what was found as regions, with the covariance of the moduli."""
-    theta, moves, n = found.theta, found.moves, len(found.theta)
+    theta, moves, n, edge = found.theta, found.moves, len(found.theta), mixing.borders.edge_mm
     point = model.evaluate(found.point.theta, found.point.states)
     hessian = model.linearised(point).concentrated(mixing.moduli(theta, moves)[1]).hessian.copy()
-    hessian[n:, n:] += np.eye(len(moves)) / mixing.borders.edge_mm**2
+    hessian[n:, n:] += np.eye(len(moves)) / edge**2
     try:
         whole, part = (np.asarray(np.linalg.inv(h)[:n, :n], dtype=float) for h in (hessian, hessian[:n, :n]))
     except np.linalg.LinAlgError as error:
@@ -275,53 +283,4 @@ def _with_covariance(model: FieldModel, mixing: _Mixing, found: _Trial) -> Refin
     zones = replace(joined(model.zones, of_zone), of_cell=of_cell)
     parts = np.zeros((len(of_cell), share.shape[1] + 1))
     parts[unknown] = np.column_stack([1.0 - share.sum(axis=1), share])[model.zones.of_cell[unknown]]
-    return RefinedRegions(zones, borders, theta, point, whole, part, found.value, parts)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Mixing:
-    """Moduli of zones from those of regions with moved borders."""
-
-    borders: Borders
-    deep: FloatArray  # (zones, points, regions - 1), without moves
-    modes: FloatArray  # (zones, points, regions - 1, 10)
-
-    @classmethod
-    def of(cls, model: FieldModel, zones: Zones) -> _Mixing:
-        """Return it for every zone of the model, each a single cell."""
-        mesh, borders = model.mesh, Borders.of(model.mesh, zones)
-        cells = np.flatnonzero(model.zones.of_cell != KNOWN)
-        cells = cells[np.argsort(model.zones.of_cell[cells], kind="stable")]
-        corners = mesh.points[mesh.cells[cells]]
-        points = corners + INWARDS * (corners.mean(axis=1, keepdims=True) - corners)
-        deep, modes = borders.distances(points.reshape(-1, 3))
-        shape = points.shape[:2]
-        made = cls(borders, deep.reshape(*shape, -1), modes.reshape(*shape, *modes.shape[1:]))
-        volume = borders.volumes[cells]
-        whole = np.array([volume[zones.of_cell[cells] == region].sum() for region in range(1, zones.count)])
-        low, high = (np.full(len(whole), sign * REACH * borders.edge_mm) for sign in (-1.0, 1.0))
-        for _ in range(BISECTIONS):
-            moves = np.zeros_like(borders.moves)
-            moves[:, 0] = 0.5 * (low + high)
-            less = volume @ made.fractions(moves.ravel())[0] < whole
-            low, high = np.where(less, moves[:, 0], low), np.where(less, high, moves[:, 0])
-        return replace(made, borders=borders.with_moves(moves))
-
-    def moduli(self, theta: FloatArray, moves: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return theta of the zones (2 zones,) and its derivatives (2 zones, 2 regions + moves)."""
-        part, slope = self.fractions(moves)
-        fractions = np.column_stack([1.0 - part.sum(axis=1), part])
-        values = theta.reshape(2, -1)
-        jumps = values[:, 1:] - values[:, :1]
-        of_moves = np.concatenate([(slope * jump[:, None]).reshape(len(slope), -1) for jump in jumps])
-        return (fractions @ values.T).T.ravel(), np.column_stack([np.kron(np.eye(2), fractions), of_moves])
-
-    def fractions(self, moves: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the part of every zone in each region but the largest (zones, regions - 1), and its derivatives (..., 10)."""
-        wide = SHARPNESS * self.borders.edge_mm
-        deep = self.deep + np.einsum("zpra,ra->zpr", self.modes, moves.reshape(self.borders.moves.shape))
-        share = ndtr(deep / wide)
-        density = np.exp(-0.5 * (deep / wide) ** 2) / (wide * np.sqrt(2.0 * np.pi))
-        crowd = np.maximum(share.sum(axis=2, keepdims=True), 1.0)  # regions never fill more than the whole
-        part = (share / crowd).mean(axis=1)
-        return part, np.einsum("zpr,zpra->zra", density / crowd, self.modes) / deep.shape[1]
+    return RefinedRegions(zones, borders, theta, point, whole, part, found.value, parts, mixing)

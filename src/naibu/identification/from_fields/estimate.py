@@ -17,12 +17,19 @@ from typing import Literal
 import numpy as np
 
 from naibu.core.arrays import FloatArray
-from naibu.core.errors import InputError
+from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress, report_progress
 from naibu.core.status import Status
-from naibu.identification.from_fields.assumptions import Assumption, assumptions, covariance_of, effects
-from naibu.identification.from_fields.border_refinement import MOST_REGIONS, Borders, RefinedRegions, refined_regions
+from naibu.identification.from_fields.assumptions import assumptions, covariance_of, effects
+from naibu.identification.from_fields.border_refinement import (
+    MOST_REGIONS,
+    CorrectedRegions,
+    RefinedRegions,
+    on_finer_cells,
+    refined_regions,
+)
+from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import FieldElements, LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.sensitivities import (
@@ -31,7 +38,6 @@ from naibu.identification.from_fields.forward.sensitivities import (
     Linearised,
     Point,
     logarithms,
-    moduli_of,
     young_and_poisson,
 )
 from naibu.identification.from_fields.gauss_newton import (
@@ -52,7 +58,7 @@ from naibu.identification.from_fields.truncated_newton import truncated_step
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, report, resolution, resolution_report
 from naibu.identification.from_fields.verdict import inflation, verdict
 from naibu.identification.load_case import require_load_cases
-from naibu.identification.verdict import Explanation, Verdict
+from naibu.identification.verdict import Explanation
 
 FEW = 12  # zones up to which no penalty is needed by default
 START_POISSON_RATIO = 0.4
@@ -60,105 +66,6 @@ TOO_COARSE = "The elements are too coarse for extrapolation to be trusted, and i
 MOST_UNKNOWNS = 120_000  # nodal displacements of the quadratic elements with which regions of a map are refitted
 SEARCH_AT_WEIGHT = SearchSettings(max_iterations=15, tolerance=1e-3)
 UNEXPLAINED = 3.0  # standard deviations of chi squared by which regions may fit worse than the regularised field
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FieldEstimate:
-    """Moduli found from measured fields.
-
-    Attributes
-    ----------
-    mesh : Mesh
-        The model.
-    zones : Zones
-        Zones of the result: those given, or the regions that were found.
-    theta : ndarray, shape (2 count,)
-        ln mu, then ln(kappa / mu) of the zones; kPa.
-    states : tuple of ndarray, shape (n, d)
-        Displacement of every load case in the fit on `mesh`, mm.
-    chi_squared, degrees_of_freedom : float
-        Misfit in units of the stated noise, and what noise alone would leave on average.
-    uncertainty : Uncertainty or None
-        Of theta: of the measurement, of the discretisation and of what is known; None where zones are too many to invert.
-    weights : WeightChoice or None
-        The weights of the penalty that were tried.
-    regularized : tuple of ndarray, shape (count of the given zones,), or None
-        Young's modulus, kPa, and Poisson's ratio under the penalty, before regions were made of them.
-    resolution : ndarray, shape (2 count of the given zones,), or None
-        See `naibu.identification.from_fields.uncertainty.resolution`.
-    segmentation : Segmentation or None
-        The regions, also where they were not taken as the result.
-    status : Status
-        How the last search ended.
-    steps : tuple of str
-        What was done, a sentence a step.
-    identifiability : tuple of str
-        Which moduli the measurements determine, in words.
-    verdict : Verdict or None
-        Whether the model explains the measurements.
-    budget : ErrorBudget or None
-        Where the uncertainty stems from.
-    mesh_shift : ndarray, shape (2 count,), or None
-        What extrapolation to vanishing element size added to the best theta on `mesh`; None where that error was not estimated.
-    assumptions : tuple of Assumption
-        What other moduli of the known regions, or another law, would do.
-    borders : Borders or None
-        Borders of regions that were found, which run through cells; None where regions are made of whole cells.
-    parts : ndarray, shape (m, count), or None
-        With such borders: part of every cell in each region, by which logarithms of moduli are mixed.
-    """
-
-    mesh: Mesh
-    zones: Zones
-    theta: FloatArray
-    states: tuple[FloatArray, ...]
-    chi_squared: float
-    degrees_of_freedom: float
-    uncertainty: Uncertainty | None
-    weights: WeightChoice | None
-    regularized: tuple[FloatArray, FloatArray] | None
-    resolution: FloatArray | None
-    segmentation: Segmentation | None
-    status: Status
-    steps: tuple[str, ...]
-    identifiability: tuple[str, ...]
-    verdict: Verdict | None = None
-    budget: ErrorBudget | None = None
-    mesh_shift: FloatArray | None = None
-    assumptions: tuple[Assumption, ...] = ()
-    borders: Borders | None = None
-    parts: FloatArray | None = None
-
-    @property
-    def young_modulus(self) -> FloatArray:
-        """Young's modulus of every zone (count,), kPa."""
-        return young_and_poisson(self.theta)[0]
-
-    @property
-    def poisson_ratio(self) -> FloatArray:
-        """Poisson's ratio of every zone (count,)."""
-        return young_and_poisson(self.theta)[1]
-
-    def lame_of_cells(self) -> tuple[FloatArray, FloatArray]:
-        """Return lambda and mu of every cell (m,), kPa, known ones included."""
-        return moduli_of(self.zones, self.theta)
-
-    def intervals(self, level: float = 0.95) -> tuple[FloatArray, FloatArray]:
-        """Return the bounds of Young's modulus (count, 2), kPa, and of Poisson's ratio (count, 2) at a level of confidence.
-
-        Raises
-        ------
-        InputError
-            The estimate has no covariance.
-        """
-        if self.uncertainty is None:
-            raise InputError("a field of many moduli under a penalty has no intervals; see its `resolution`, or use regions")
-        return intervals(self.theta, self.uncertainty, level)
-
-    @property
-    def noise_factor(self) -> float:
-        """Root mean square misfit in units of the stated noise: above 1 the model or the noise is not as stated."""
-        return float(np.sqrt(self.chi_squared / max(self.degrees_of_freedom, 1.0)))
 
 
 def identify_field(
@@ -362,14 +269,35 @@ class _Recipe:
         if not single or not 1 < regions.zones.count <= MOST_REGIONS:
             return self._sharp(regions.zones, regions.point, None)
         refined = refined_regions(self.model, regions, graph, self.bounds)
-        if not refined.point.misfit < regions.point.misfit:
+        charge = float(np.log(self.model.n_free) + np.log(graph.count)) * (regions.zones.count - refined.zones.count)
+        if not 0.5 * refined.point.misfit < 0.5 * regions.point.misfit + charge:
             self.record("borders within cells explain no more than those on faces of cells, which are kept")
             return self._sharp(regions.zones, regions.point, None)
         self.record(f"borders of {refined.zones.count} regions within cells: misfit {refined.point.misfit:.4g}")
+        corrected = self._corrected(refined)
+        refined = refined if corrected is None else corrected.refined
         model = self.model.with_zones(refined.zones)
         start = model.evaluate(refined.theta, refined.point.states)
         fitted = search(model, start, Objective(bounds=self.bounds)).point
+        if corrected is not None:
+            return self._estimate(model, model.evaluate(fitted.theta, fitted.states), Status.CONVERGED, refined, corrected)
         return self._sharp(refined.zones, fitted, refined)
+
+    def _corrected(self, refined: RefinedRegions) -> CorrectedRegions | None:
+        """Return regions with borders as cells of half the size fit them; None where there are none, or they find no equilibrium."""
+        if self.elements != "accurate" or not self.model.averaged:
+            return None
+        try:
+            corrected = on_finer_cells(self.model, self.law, refined, self.bounds)
+        except ConvergenceError:
+            corrected = None
+        if corrected is None:
+            self.record("on cells of half the size no equilibrium was found: borders are not corrected for the size of cells")
+            return None
+        young, before = (young_and_poisson(theta)[0] for theta in (corrected.refined.theta, refined.theta))
+        most = 100.0 * float(np.abs(young / before - 1.0).max())
+        self.record(f"borders and moduli on cells of half the size: Young's modulus changes by up to {most:.2g} %")
+        return corrected
 
     def _sharp(self, zones: Zones, point: Point, refined: RefinedRegions | None) -> FieldEstimate:
         """Return the fit of regions, with accurate elements where those of the map were not and such a body is not too large."""
@@ -382,36 +310,44 @@ class _Recipe:
                 return self._estimate(accurate, found.point, found.status, refined)
         return self._estimate(model, model.evaluate(point.theta, point.states), Status.CONVERGED, refined)
 
-    def _estimate(self, model: FieldModel, point: Point, status: Status, refined: RefinedRegions | None = None) -> FieldEstimate:
+    def _estimate(
+        self,
+        model: FieldModel,
+        point: Point,
+        status: Status,
+        refined: RefinedRegions | None = None,
+        corrected: CorrectedRegions | None = None,
+    ) -> FieldEstimate:
         """Return moduli that were fitted without a penalty, with the errors of measurement, discretisation and knowledge."""
         at = model.linearised(point)
         quadratic = at.concentrated(np.eye(2 * model.zones.count))
-        theta, residuals, shift = self._extrapolated(at, quadratic)
+        if corrected is not None:
+            theta, residuals, shift = corrected.refined.theta, corrected.residuals, corrected.shift
+        else:
+            theta, residuals, shift = self._extrapolated(at, quadratic)
+            if refined is not None:
+                theta = Objective(bounds=self.bounds).clipped(theta + refined.theta - point.theta)
         misfit, freedom = sum(float(r @ r) for r in residuals), model.n_free - 2.0 * model.zones.count
         factor = 1.0 if freedom <= 0.0 else max(1.0, float(np.sqrt(misfit / freedom)))
         of_noise = Uncertainty.of(quadratic.hessian, factor)
         shared = inflation(model.observed, residuals, at.jacobians(quadratic), of_noise.covariance, freedom)
         of_noise = Uncertainty(of_noise.information / shared, of_noise.covariance * shared)
         if refined is not None:
-            theta = Objective(bounds=self.bounds).clipped(theta + refined.theta - point.theta)
             of_noise = of_noise.with_added(factor**2 * shared * (refined.covariance - refined.at_these_borders))
         others = assumptions(at, quadratic, self.law)
         of_known = covariance_of(others, len(theta))
         of_mesh, total, coarse = np.full(len(theta), np.nan), of_noise.with_added(of_known), False
         if shift is not None:
-            of_mesh, covariance = doubt_of(shift)
-            total, coarse = total.with_added(covariance), float(np.abs(shift).max()) > COARSE
+            of_mesh, covariance = doubt_of(shift) if corrected is None else corrected.doubt
+            total = total.with_added(covariance)
+            coarse = float(np.abs(shift).max()) > COARSE if corrected is None else not corrected.converged
         judged = verdict(model.observed, residuals, freedom)
         budget = ErrorBudget(of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), shared)
         sure = judged.explanation is Explanation.EXPLAINED and not coarse
         how_well = report(model.zones, theta, total, budget=budget, usable=judged.ok, sure=sure)
         words = (judged.sentence, *how_well, *effects(others, model.zones, theta, intervals(theta, total)[0]))
         if coarse:
-            words = (
-                words[0],
-                TOO_COARSE,
-                *words[1:],
-            )
+            words = (words[0], TOO_COARSE, *words[1:])
         states = tuple(u[: model.mesh.n_points] for u in point.states)
         return FieldEstimate(
             model.mesh, model.zones, theta, states, misfit, freedom, total, None, None, None, None, status, tuple(self.steps), words,

@@ -8,22 +8,28 @@ extrapolation adds is doubted accordingly.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError
+from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.forward.field_laws import LawName, computed_mesh, field_law
 from naibu.identification.from_fields.forward.forward_model import Observed, Solvers, equilibrium
+from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of
 from naibu.meshing.point_location import interpolation_operator
 
 EXTRAPOLATED = 1.4  # whole error over the change to half the element size: 1 / (1 - 2^-1.8)
-DOUBT = 0.4  # standard deviation of that error over the change: orders from 1 to 2.5 give 2 to 1.2 for it
+DOUBT = (
+    0.4  # standard deviation of that error over the change: orders from 1 to 2.5 give 2 to 1.2 for it; also what is left on the finer mesh
+)
 COARSE = 0.25  # change of a logarithm from which extrapolation is not trusted: then every modulus gets the doubt of the worst
 MOST_UNKNOWNS = 600_000  # of the finer mesh
+ModuliOn = Callable[[Mesh, Zones], tuple[FloatArray, FloatArray]]  # lambda and mu, kPa, of the cells of a mesh
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,10 +42,13 @@ class Refit:
         Change of the logarithms of the moduli.
     residuals : tuple of ndarray, shape (q,)
         Whitened residuals of every load case.
+    moved : tuple of ndarray, shape (n, d)
+        Change of the displacement of every load case, mm.
     """
 
     theta: FloatArray
     residuals: tuple[FloatArray, ...]
+    moved: tuple[FloatArray, ...]
 
     @property
     def misfit(self) -> float:
@@ -59,21 +68,31 @@ def doubt_of(shift: FloatArray) -> tuple[FloatArray, FloatArray]:
     return DOUBT / EXTRAPOLATED * np.abs(shift), (DOUBT / EXTRAPOLATED) ** 2 * np.outer(shift, shift)
 
 
-def refitted(at: Linearised, quadratic: Concentrated, changes: list[FloatArray]) -> Refit:
-    """Return the best fit when the whitened residuals of the load cases change by `changes` (q,); `quadratic` is in all of theta."""
+def refitted(
+    at: Linearised, quadratic: Concentrated, changes: list[FloatArray], basis: FloatArray | None = None, pull: FloatArray | float = 0.0
+) -> Refit:
+    """Return the best fit when the whitened residuals of the load cases change by `changes` (q,).
+
+    `quadratic` is in the columns of `basis` (2 count, k), by default in all of theta; `pull` (k,) is the gradient of half of a prior, whose
+    Hessian is part of that of `quadratic`.
+    """
     observed = at.model.observed
     residuals = [o.residual(u) + c for o, u, c in zip(observed, at.point.states, changes, strict=True)]
     theta, loaded = at.gradient_of(residuals)
     offset = at.loaded_solved([g[:, None] for g in loaded])
-    gradient = theta - sum(x.T @ g for x, g in zip(quadratic.response, loaded, strict=True))
+    along = theta if basis is None else basis.T @ theta
+    gradient = along + pull - sum(x.T @ g for x, g in zip(quadratic.response, loaded, strict=True))
     step: FloatArray = -np.linalg.lstsq(quadratic.hessian, np.asarray(gradient), rcond=1e-12)[0].astype(np.float64)
-    moved = at.forward(step[:, None], [-(x @ step)[:, None] - b for x, b in zip(quadratic.response, offset, strict=True)])
-    return Refit(step, tuple(r + (o.operator @ u)[:, 0] for o, r, u in zip(observed, residuals, moved, strict=True)))
+    of_theta = step if basis is None else basis @ step
+    moved = at.forward(of_theta[:, None], [-(x @ step)[:, None] - b for x, b in zip(quadratic.response, offset, strict=True)])
+    left = tuple(r + (o.operator @ u)[:, 0] for o, r, u in zip(observed, residuals, moved, strict=True))
+    return Refit(step, left, tuple(u.reshape(state.shape) for u, state in zip(moved, at.point.states, strict=True)))
 
 
-def changes_on_finer_mesh(at: Linearised, law: LawName) -> list[FloatArray] | None:
+def changes_on_finer_mesh(at: Linearised, law: LawName, moduli_on: ModuliOn | None = None) -> list[FloatArray] | None:
     """Return by how much the whitened residuals (q,) of every load case change on a mesh of half the element size.
 
+    `moduli_on` gives the moduli of its cells, where borders run through the coarse ones; by default they are those of the latter.
     Where no equilibrium at finite strain is found on it, because the displacement of the loaded nodes is too rough for small cells, the
     change is that of small strain. None where the elements are used as given, or the finer mesh is too large.
     """
@@ -83,7 +102,7 @@ def changes_on_finer_mesh(at: Linearised, law: LawName) -> list[FloatArray] | No
     names: tuple[LawName, ...] = ("linear",) if law == "linear" else (law, "linear")
     for name in names:
         try:
-            return _changes(at, name, at.point.states if name == law else _small_strain(at))
+            return _changes(at, name, at.point.states if name == law else _small_strain(at), moduli_on)
         except ConvergenceError:
             continue
     return None
@@ -98,11 +117,12 @@ def _small_strain(at: Linearised) -> tuple[FloatArray, ...]:
     return tuple(equilibrium(law, solvers, lame, shear, o.load_case, u, b"")[0] for o, u in pairs)
 
 
-def _changes(at: Linearised, law: LawName, states: tuple[FloatArray, ...]) -> list[FloatArray]:
+def _changes(at: Linearised, law: LawName, states: tuple[FloatArray, ...], moduli_on: ModuliOn | None) -> list[FloatArray]:
     model, finer = at.model, Refinement.of(at.model.mesh)
     computed, averaged = computed_mesh(finer.mesh, "accurate")
     body = field_law(computed, law, averaged=averaged)
-    lame, shear = moduli_of(finer.zones(model.zones), at.point.theta)
+    zones = finer.zones(model.zones)
+    lame, shear = moduli_of(zones, at.point.theta) if moduli_on is None else moduli_on(finer.mesh, zones)
     solvers, between = Solvers(body, computed.points, iterative=True), interpolation_operator(model.computed, computed.points)
     out = []
     for o, u in zip(model.observed, states, strict=True):

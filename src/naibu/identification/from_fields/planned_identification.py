@@ -14,7 +14,8 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.core.displacement_field import DisplacementField
-from naibu.identification.from_fields.estimate import FieldEstimate, identify_field
+from naibu.identification.from_fields.estimate import identify_field
+from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.identified.field_prediction import displacement_under_moved_sides
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody

@@ -18,7 +18,7 @@ from naibu.core.errors import InputError
 from naibu.core.experiment import Layer
 from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
-from naibu.identification.from_fields.estimate import FieldEstimate
+from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody

@@ -15,7 +15,8 @@ from naibu._version import __version__
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.progress import Progress
 from naibu.core.volume import Volume
-from naibu.identification.from_fields.estimate import FieldEstimate, identify_field
+from naibu.identification.from_fields.estimate import TOO_COARSE, identify_field
+from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
@@ -24,6 +25,7 @@ from naibu.io.displacement_fields import read_field
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
 from naibu.io.images import write_volume
+from naibu.viewer.cards import Card
 from naibu.viewer.notebook import ShownInNotebook, empty_figure
 from naibu.viewer.result_figures import draw_slices
 from naibu.viewer.slices import Overlay, SliceView, slices_html
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
 FILES = ("model.json", "report.html", "zones.mha", "young_modulus.mha", "young_modulus_sd.mha", "poisson_ratio.mha", "identification.json")
+MOST_CARDS = 4
 CELLS_OF_MAP = 2500  # of the model by default
 
 
@@ -54,6 +57,8 @@ class FieldIdentification(ShownInNotebook):
         Whether moduli are multiples of that of a zone whose modulus was not stated.
     notes : tuple of str
         Verdict, intervals and what limits them, in words.
+    blurred : tuple of str
+        Those of them that tell what cubes leave out of the object.
     scan : Volume
         Not zero in the object.
     cell_of_voxel : ndarray, shape (nz, ny, nx), int
@@ -66,6 +71,7 @@ class FieldIdentification(ShownInNotebook):
     body: IdentifiedBody
     relative: bool
     notes: tuple[str, ...]
+    blurred: tuple[str, ...]
     scan: Volume
     cell_of_voxel: IntArray
     files: tuple[Path, ...] = ()
@@ -171,6 +177,9 @@ def identify_fields(
         found, axes=inside.direction, law=law, relative=stated.relative, strain=max(relative_deformation(c.field) for c in cases),
         load_cases=cases, provenance={"naibu": __version__, "known": list(known), "loaded": list(loaded), "inputs": dict(inputs)},
     )  # fmt: skip
+    coarse = blurred(mesh, cell_of_voxel, inside, labels, names)
+    result = FieldIdentification(found, body, stated.relative, (*found.identifiability, *coarse), coarse)
+    return result if folder is None else replace(result, files=tuple(_written(folder, result, inside, cell_of_voxel)))
     notes = (*found.identifiability, *blurred(mesh, cell_of_voxel, inside, labels, names))
     result = FieldIdentification(found, body, stated.relative, notes, inside, cell_of_voxel)
     return result if folder is None else replace(result, files=tuple(_written(folder, result)))
@@ -225,6 +234,15 @@ def table_of_assumptions(result: FieldIdentification) -> Table:
     return Table("Moduli under other assumptions", columns, tuple(rows))
 
 
+def _cards(result: FieldIdentification, unit: str) -> list[Card]:
+    """Return Young's modulus of the first zones with its interval."""
+    found = result.estimate
+    if found.uncertainty is None:
+        return []
+    rows = zip(found.zones.names[:MOST_CARDS], found.young_modulus, found.intervals()[0], strict=False)
+    return [Card(f"Young's modulus, {name}", f"{e:.3g} {unit}", f"95 % from {low:.3g} to {high:.3g}") for name, e, (low, high) in rows]
+
+
 def _as_records(table: Table) -> list[dict[str, Cell]]:
     return [dict(zip(table.columns, row, strict=True)) for row in table.rows]
 
@@ -274,6 +292,27 @@ def _written(folder: Path, result: FieldIdentification) -> list[Path]:
     regions = zones_of_voxels(found, scan, result.cell_of_voxel)
     volumes = {"young_modulus": young, "young_modulus_sd": np.nan_to_num(sd, nan=-1.0, posinf=-1.0), "poisson_ratio": poisson}
     files = [write_atomically(folder / "model.json", json.dumps(body.to_dict(), ensure_ascii=False, allow_nan=False) + "\n")]
+    files += [write_volume(folder / f"{name}.mha", inside.with_values(v.astype(np.float32))) for name, v in volumes.items()]
+    files.append(write_volume(folder / "zones.mha", inside.with_values((regions + 1).astype(np.uint16))))
+    outside = np.where(cells >= 0, 0.0, np.nan)
+    unit = "multiples of the known zone" if result.relative else "kPa"
+    first = [line for line in (*result.notes[:1], TOO_COARSE, *result.blurred) if line in result.notes]
+    view = SliceView(
+        title="Moduli from displacement fields",
+        sentences=first,
+        cards=_cards(result, unit),
+        details=[line for line in (*result.notes, *found.steps) if line not in first],
+        spacing_mm=inside.spacing_mm,
+        images=[("object", inside.values.astype(np.float32))],
+        displacement=np.full((*inside.shape, 3), np.nan),
+        overlays=[
+            Overlay(f"Young's modulus, {unit}", young + outside),
+            Overlay(f"standard deviation of Young's modulus, {unit}", np.where(sd > 0.0, sd, np.nan) + outside),
+            Overlay("Poisson's ratio", poisson + outside),
+        ],
+        tables=[t for t in (table_of_zones(result), table_of_assumptions(result)) if t.rows],
+        origin_mm=inside.origin_mm @ inside.direction,
+    )
     files += [write_volume(folder / f"{name}.mha", scan.with_values(v.astype(np.float32))) for name, v in volumes.items()]
     files.append(write_volume(folder / "zones.mha", scan.with_values((regions + 1).astype(np.uint16))))
     verdict = found.verdict

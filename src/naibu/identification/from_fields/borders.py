@@ -1,0 +1,186 @@
+"""Borders of regions that run through cells: a low-order level set :cite:p:`osher1988`, and the moduli of cells that they cut.
+
+The border of every region but the largest is moved along its normal by polynomials of degree two in the direction from its middle. It
+starts from the cells of the region, smoothed, or from the ball of their volume. Cells on borders are mixed in logarithms of moduli.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
+from scipy.special import ndtr, ndtri
+
+from naibu.core.arrays import BoolArray, FloatArray, IntArray
+from naibu.core.mesh import Mesh
+from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
+from naibu.identification.from_fields.forward.sensitivities import FieldModel
+from naibu.identification.from_fields.regularization import cell_volumes
+
+WINDOW = 0.8  # standard deviation, in cells, of the window in which cells are smoothed
+REACH, NEIGHBOURS = 3.0, 64  # of that window, in standard deviations, and cells in it at most
+INWARDS = 0.42  # way from a corner to the middle of a cell at which borders are evaluated, about that of Gauss points
+SHARPNESS = 0.25  # standard deviation, in cells, over which a border is spread when cells are mixed
+COMPACT = 0.6  # part of a region within the ball of its volume from which its border may start as a sphere
+BISECTIONS = 30  # for the move of a border that keeps the volume
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Borders:
+    """Regions with borders that run through cells.
+
+    Attributes
+    ----------
+    middles : ndarray, shape (m, 3)
+        Middles of the cells, mm.
+    volumes : ndarray, shape (m,)
+        Their volumes, mm^3.
+    region_of_cell : ndarray, shape (m,), int64
+        Region of every cell, -1 where the moduli are known; 0 is the largest.
+    moves : ndarray, shape (regions - 1, 10)
+        How far the borders of the other regions move outwards, mm: coefficients of 1, x, y, z, xx, xy, xz, yy, yz, zz of the direction from
+        the middle of the region.
+    edge_mm : float
+        Edge length of the cells.
+    round : ndarray, shape (regions - 1,), bool
+        Which of the other regions are, without moves, balls of the volume of their cells.
+    """
+
+    middles: FloatArray
+    volumes: FloatArray
+    region_of_cell: IntArray
+    moves: FloatArray
+    edge_mm: float
+    round: BoolArray
+    _tree: cKDTree = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_tree", cKDTree(self.middles))
+
+    @classmethod
+    def of(cls, mesh: Mesh, zones: Zones) -> Borders:
+        """Return the borders of regions made of whole cells."""
+        volumes = cell_volumes(mesh)
+        edge = float(np.median(volumes) ** (1.0 / 3.0))
+        others = zones.count - 1
+        return cls(mesh.points[mesh.cells].mean(axis=1), volumes, zones.of_cell, np.zeros((others, 10)), edge, np.zeros(others, dtype=bool))
+
+    def rounded(self) -> Borders:
+        """Return the borders with those of compact regions as spheres."""
+        away = [np.linalg.norm(self.middles - middle, axis=1) < radius for middle, radius in self._balls()]
+        own = [self.region_of_cell == region for region in range(1, len(self.moves) + 1)]
+        within = [self.volumes[o & a].sum() / self.volumes[o].sum() for o, a in zip(own, away, strict=True)]
+        return replace(self, round=np.asarray(within) > COMPACT)
+
+    def _balls(self) -> list[tuple[FloatArray, float]]:
+        """Return middle and radius, mm, of the ball of the volume of every region but the largest."""
+        own = [self.region_of_cell == region for region in range(1, len(self.moves) + 1)]
+        radii = [float((0.75 / np.pi * self.volumes[o].sum()) ** (1.0 / 3.0)) for o in own]
+        return [(np.average(self.middles[o], weights=self.volumes[o], axis=0), r) for o, r in zip(own, radii, strict=True)]
+
+    def distances(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return how deep points (n, 3) lie in each region but the largest (n, regions - 1), mm, and derivatives with respect to moves."""
+        wide = WINDOW * self.edge_mm
+        distance, near = self._tree.query(points, k=min(NEIGHBOURS, len(self.middles)), distance_upper_bound=REACH * wide)
+        there = np.isfinite(distance)
+        near = np.where(there, near, 0)
+        weight = np.where(there, self.volumes[near] * np.exp(-0.5 * (np.where(there, distance, 0.0) / wide) ** 2), 0.0)
+        total = np.maximum(weight.sum(axis=1), 1e-300)
+        deep, modes = [], []
+        for region, (moves, ball, (middle, radius)) in enumerate(zip(self.moves, self.round, self._balls(), strict=True), start=1):
+            if ball:
+                plain = radius - np.linalg.norm(points - middle, axis=1)
+            else:
+                part = np.where((self.region_of_cell == region)[near], weight, 0.0).sum(axis=1) / total
+                # the mean of a half-space in a Gaussian window is the normal distribution of the distance from its border
+                plain = wide * np.clip(ndtri(np.clip(part, 1e-9, 1.0 - 1e-9)), -REACH, REACH)
+            mode = _modes(points - middle)
+            deep.append(plain + mode @ moves)
+            modes.append(mode)
+        return np.stack(deep, axis=1), np.stack(modes, axis=1)
+
+    def with_moves(self, moves: FloatArray) -> Borders:
+        """Return the borders where moves (regions - 1, 10) put them."""
+        return replace(self, moves=moves.reshape(self.moves.shape))
+
+    def region_at(self, points: ArrayLike, otherwise: ArrayLike) -> IntArray:
+        """Return the region of points (n, 3), mm, in cells of the regions `otherwise` (n,); known ones, -1, stay known."""
+        given = np.asarray(otherwise, dtype=np.int64)
+        deep, _ = self.distances(np.asarray(points, dtype=float))
+        best = deep.argmax(axis=1)
+        return np.where(given == KNOWN, KNOWN, np.where(deep[np.arange(len(deep)), best] > 0.0, best + 1, 0))
+
+
+def _modes(away: FloatArray) -> FloatArray:
+    """Return 1, x, y, z, xx, xy, xz, yy, yz, zz of directions (n, 3) as columns (n, 10); the diagonal squares less their mean."""
+    x, y, z = (away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-300)).T
+    third = 1.0 / 3.0
+    return np.stack([np.ones_like(x), x, y, z, x * x - third, x * y, x * z, y * y - third, y * z, z * z - third], axis=1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mixing:
+    """Moduli of cells from those of regions with moved borders.
+
+    Attributes
+    ----------
+    borders : Borders
+        Borders of the regions.
+    deep : ndarray, shape (cells, points, regions - 1)
+        How deep points of every cell lie in the regions without moves, mm.
+    modes : ndarray, shape (cells, points, regions - 1, 10)
+        Derivatives with respect to moves.
+    edge_mm : float
+        Edge length of the cells.
+    """
+
+    borders: Borders
+    deep: FloatArray
+    modes: FloatArray
+    edge_mm: float
+
+    @classmethod
+    def at(cls, borders: Borders, mesh: Mesh, cells: IntArray, edge_mm: float) -> Mixing:
+        """Return it for some cells of a mesh, of that edge length, mm."""
+        corners = mesh.points[mesh.cells[cells]]
+        points = corners + INWARDS * (corners.mean(axis=1, keepdims=True) - corners)
+        deep, modes = replace(borders, moves=np.zeros_like(borders.moves)).distances(points.reshape(-1, 3))
+        shape = points.shape[:2]
+        return cls(borders, deep.reshape(*shape, -1), modes.reshape(*shape, *modes.shape[1:]), edge_mm)
+
+    @classmethod
+    def of(cls, model: FieldModel, borders: Borders) -> Mixing:
+        """Return it for every zone of the model, each a single cell, with the borders moved so that volumes are those of the cells."""
+        cells = np.flatnonzero(model.zones.of_cell != KNOWN)
+        cells = cells[np.argsort(model.zones.of_cell[cells], kind="stable")]
+        made, region_of_cell = cls.at(borders, model.mesh, cells, borders.edge_mm), borders.region_of_cell[cells]
+        volume = borders.volumes[cells]
+        whole = np.array([volume[region_of_cell == region].sum() for region in range(1, len(borders.moves) + 1)])
+        low, high = (np.full(len(whole), sign * REACH * borders.edge_mm) for sign in (-1.0, 1.0))
+        for _ in range(BISECTIONS):
+            moves = np.zeros_like(borders.moves)
+            moves[:, 0] = 0.5 * (low + high)
+            less = volume @ made.fractions(moves.ravel())[0] < whole
+            low, high = np.where(less, moves[:, 0], low), np.where(less, high, moves[:, 0])
+        return replace(made, borders=borders.with_moves(moves))
+
+    def moduli(self, theta: FloatArray, moves: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return theta of the zones (2 zones,) and its derivatives (2 zones, 2 regions + moves)."""
+        part, slope = self.fractions(moves)
+        fractions = np.column_stack([1.0 - part.sum(axis=1), part])
+        values = theta.reshape(2, -1)
+        jumps = values[:, 1:] - values[:, :1]
+        of_moves = np.concatenate([(slope * jump[:, None]).reshape(len(slope), -1) for jump in jumps])
+        return (fractions @ values.T).T.ravel(), np.column_stack([np.kron(np.eye(2), fractions), of_moves])
+
+    def fractions(self, moves: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the part of every zone in each region but the largest (zones, regions - 1), and its derivatives (..., 10)."""
+        wide = SHARPNESS * self.edge_mm
+        deep = self.deep + np.einsum("zpra,ra->zpr", self.modes, moves.reshape(self.borders.moves.shape))
+        share = ndtr(deep / wide)
+        density = np.exp(-0.5 * (deep / wide) ** 2) / (wide * np.sqrt(2.0 * np.pi))
+        crowd = np.maximum(share.sum(axis=2, keepdims=True), 1.0)  # regions never fill more than the whole
+        part = (share / crowd).mean(axis=1)
+        return part, np.einsum("zpr,zpra->zra", density / crowd, self.modes) / deep.shape[1]

@@ -1,0 +1,259 @@
+"""Identify moduli from experiments with markers and from displacement fields together: what both kinds name is one parameter."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from naibu._version import __version__
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import InputError
+from naibu.core.progress import Progress
+from naibu.identification.from_fields.field_estimate import FieldEstimate
+from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
+from naibu.identification.from_markers.specimen.parameter_names import poisson_ratio, young_modulus
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
+from naibu.identification.joint_estimate import JointEstimate, NormalEstimate, joint_estimate
+from naibu.identification.prediction.calibrated_model import CalibratedModel
+from naibu.io.files.atomic import write_atomically
+from naibu.viewer.page_frame import page_html
+from naibu.viewer.tables import Cell, Table, table_html
+from naibu.workflows.fields.block_mesh import labelled_object, names_of_labels
+from naibu.workflows.fields.identify_fields import FieldIdentification, identify_fields
+from naibu.workflows.markers.experiments import RATIO_REFERENCE_KPA, Source, load_experiments
+from naibu.workflows.markers.identify import Identification, identify
+from naibu.workflows.results.output_folder import output_folder
+
+FILES = ("joint.json", "report.html")
+MARKERS, FIELDS = "markers", "fields"  # folders of either kind
+WIDTH = 1.959964  # standard deviations of a 95 % interval
+_PLACES = (("markers", 1), ("fields", 4), ("both", 7))  # of estimate and interval in a row of the table
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointIdentification:
+    """What `identify_jointly` returns.
+
+    Attributes
+    ----------
+    markers : Identification
+        From the experiments with markers alone.
+    fields : FieldIdentification
+        From the displacement fields alone.
+    joint : JointEstimate
+        Both: logarithms of Young's moduli, kPa or ratios, and of ``1 - 2 nu``.
+    table : Table
+        Moduli from either kind and from both, with 95 % intervals.
+    notes : tuple of str
+        What is shared, and whether both kinds agree, in words.
+    files : tuple of Path
+        What was written, beside the folders of either kind.
+    """
+
+    markers: Identification
+    fields: FieldIdentification
+    joint: JointEstimate
+    table: Table
+    notes: tuple[str, ...]
+    files: tuple[Path, ...] = ()
+
+    @property
+    def usable(self) -> bool:
+        """Whether the models explain both kinds of data."""
+        judged = self.fields.estimate.verdict
+        return self.markers.verdict.ok and (judged is None or judged.ok)
+
+
+def identify_jointly(
+    experiments: Sequence[Source],
+    fields: Sequence[str | os.PathLike[str]],
+    *,
+    out: str | os.PathLike[str],
+    known: Sequence[str] = (),
+    settings: ModelSettings | None = None,
+    states: Mapping[str, Sequence[str]] | None = None,
+    mask: str | os.PathLike[str] | None = None,
+    zones: str | os.PathLike[str] | None = None,
+    zone_names: Mapping[int, str] | None = None,
+    loaded: Sequence[str] = (),
+    unit: str | None = None,
+    spacing_mm: Sequence[float] | None = None,
+    element_size_mm: float = 0.0,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> JointIdentification:
+    """Identify moduli from experiments with markers and from displacement fields, and join what both tell.
+
+    Each kind is identified by itself, with its own boundary conditions. Young's modulus and Poisson's ratio of a zone of the fields and of
+    a material of the experiments are one parameter where their names are the same; about the optima, the joint estimate is that of maximum
+    likelihood (`naibu.identification.joint_estimate`). Both must have one scale: kPa, or multiples of the same material.
+
+    Parameters
+    ----------
+    experiments, settings, states
+        As for `naibu.workflows.identify`.
+    fields, mask, zones, zone_names, loaded, unit, spacing_mm
+        As for `naibu.workflows.identify_fields`.
+    out : path-like
+        Folder for ``joint.json`` and ``report.html``, and for the results of either kind in ``markers`` and ``fields``.
+    known : sequence of str
+        Materials and zones, each in one kind of data at least.
+    element_size_mm : float
+        Of the cells in fields; 0 chooses it.
+    overwrite : bool
+        Whether these files may be there already.
+    progress : callable, optional
+        Gets a report after every step.
+
+    Raises
+    ------
+    InputError
+        Data that cannot be used, a known name in neither kind, two scales, or no modulus that both kinds tell.
+    """
+    folder = output_folder(out, FILES, overwrite=overwrite)
+    loaded_experiments = load_experiments(list(experiments))
+    inside, labels = labelled_object(mask, zones)
+    materials = {m for e in loaded_experiments for m in e.materials}
+    there = set(names_of_labels(labels, inside, zone_names or {}).values())
+    of_markers, of_fields = _divided(known, materials, there)
+    from_fields = identify_fields(
+        fields, mask=mask, zones=zones, zone_names=zone_names, known=of_fields, loaded=loaded, unit=unit, spacing_mm=spacing_mm,
+        element_size_mm=element_size_mm, out=folder / FIELDS, overwrite=overwrite, progress=progress,
+    )  # fmt: skip
+    from_markers = identify(
+        loaded_experiments, known=of_markers, settings=settings, states=states, out=folder / MARKERS, overwrite=overwrite, progress=progress
+    )
+    _require_one_scale(from_markers.model, from_fields)
+    parts = (told_by_markers(from_markers.model), told_by_fields(from_fields.estimate))
+    joint = joint_estimate(parts)
+    table = table_of_moduli(parts, joint, relative=from_fields.relative)
+    result = JointIdentification(from_markers, from_fields, joint, table, _in_words(joint, parts))
+    return replace(result, files=tuple(_written(folder, result)))
+
+
+def _divided(known: Sequence[str], materials: set[str], zones: set[str]) -> tuple[list[str], list[str]]:
+    """Return what is known of materials of experiments, and of zones of fields."""
+    names = [text.partition("=")[0].strip() for text in known]
+    for name in names:
+        if name not in materials | zones:
+            raise InputError(
+                f"known names {name!r}, which is neither a material of the experiments ({', '.join(sorted(materials))}) nor a zone of the "
+                f"fields ({', '.join(sorted(zones))})"
+            )
+    both = list(zip(names, known, strict=True))
+    return [text for name, text in both if name in materials], [text for name, text in both if name in zones]
+
+
+def _require_one_scale(model: CalibratedModel, fields: FieldIdentification) -> None:
+    absolute = model.known_materials.scale_is_absolute
+    if absolute == (not fields.relative):
+        known = set(model.known_materials.young_moduli)
+        if absolute or known == {region.name for region in fields.estimate.zones.known}:
+            return
+    kinds = ["in kPa" if kpa else "multiples of a known material" for kpa in (absolute, not fields.relative)]
+    raise InputError(
+        f"moduli from the experiments are {kinds[0]}, those from the fields {kinds[1]}: give `known` a modulus for a material of the "
+        "experiments and for a zone of the fields, or name one that both have"
+    )
+
+
+def told_by_markers(model: CalibratedModel) -> NormalEstimate:
+    """Return logarithms of Young's moduli, kPa or ratios, and of ``1 - 2 nu``, as experiments with markers tell them."""
+    free = [p.name for p in model.parameters.free]
+    told: list[tuple[str, float, float]] = []
+    for p in model.parameters.free:
+        if p.name.endswith(young_modulus("")):
+            unit = 1.0 if model.known_materials.scale_is_absolute else RATIO_REFERENCE_KPA
+            told.append((p.name, float(np.log(p.value / unit)), 1.0))
+        elif p.name.endswith(poisson_ratio("")):
+            left = 1.0 - 2.0 * p.value
+            told.append((p.name, float(np.log(left)), -2.0 * p.slope(p.value) / left))
+    at, scale = [free.index(name) for name, _, _ in told], np.array([slope for _, _, slope in told])
+    return NormalEstimate(
+        tuple(name for name, _, _ in told),
+        np.array([value for _, value, _ in told]),
+        model.covariance[np.ix_(at, at)] * np.outer(scale, scale),
+    )
+
+
+def told_by_fields(found: FieldEstimate) -> NormalEstimate:
+    """Return the same as displacement fields tell them."""
+    if found.uncertainty is None:
+        raise InputError("the fields have no covariance of moduli: a map cannot be joined with markers")
+    k = found.zones.count
+    ratio = np.exp(found.theta[k:])
+    young, poisson = young_and_poisson(found.theta)
+    # ln E = ln mu + ln(9 r / (3 r + 1)) and ln(1 - 2 nu) = ln(3 / (3 r + 1)), with r = kappa / mu
+    slope = np.block([[np.eye(k), np.diag(1.0 / (3.0 * ratio + 1.0))], [np.zeros((k, k)), np.diag(-3.0 * ratio / (3.0 * ratio + 1.0))]])
+    lost = np.isinf(np.diag(found.uncertainty.covariance))
+    finite = np.where(lost[:, None] | lost, 0.0, found.uncertainty.covariance)
+    covariance = slope @ finite @ slope.T
+    unknown = (np.abs(slope) @ lost.astype(float)) > 0.0
+    covariance[unknown, unknown] = np.inf
+    names = tuple([young_modulus(n) for n in found.zones.names] + [poisson_ratio(n) for n in found.zones.names])
+    return NormalEstimate(names, np.concatenate([np.log(young), np.log(1.0 - 2.0 * poisson)]), covariance)
+
+
+def table_of_moduli(parts: Sequence[NormalEstimate], joint: JointEstimate, *, relative: bool) -> Table:
+    """Return the table of parameters: from markers, from fields, and from both, with 95 % intervals."""
+    rows: list[tuple[Cell, ...]] = []
+    for name in joint.together.names:
+        cells: list[Cell] = [name.replace(": ", ", ").replace("_", " ").replace("young", "Young's").replace("poisson", "Poisson's")]
+        for part in (*parts, joint.together):
+            if name in part.names and np.isfinite(part.standard_deviation(name)):
+                cells += [
+                    float(v) for v in _physical(name, part.value(name) + part.standard_deviation(name) * np.array([0.0, -WIDTH, WIDTH]))
+                ]
+            else:
+                cells += [None] * 3
+        rows.append(tuple(cells))
+    columns = ("parameter", *(c for kind in ("markers", "fields", "both") for c in (kind, "95 % from", "to")))
+    unit = "multiples of the known material" if relative else "kPa"
+    return Table("Moduli", columns, tuple(rows), note=f"Young's moduli in {unit}.")
+
+
+def _physical(name: str, inner: FloatArray) -> FloatArray:
+    values = np.exp(inner)
+    return values if name.endswith(young_modulus("")) else np.sort(0.5 * (1.0 - values))[[1, 0, 2]]
+
+
+def _in_words(joint: JointEstimate, parts: Sequence[NormalEstimate]) -> tuple[str, ...]:
+    shared = ", ".join(joint.shared)
+    measure = f"chi squared {joint.chi_squared:.3g} with {joint.degrees_of_freedom} degrees of freedom"
+    if not joint.contradicted:
+        return (f"Markers and fields agree ({measure}) on what both tell: {shared}.",)
+    apart = {n: abs(parts[0].value(n) - parts[1].value(n)) / np.hypot(*(p.standard_deviation(n) for p in parts)) for n in joint.shared}
+    worst = max(apart, key=lambda n: apart[n])
+    return (
+        f"Markers and fields contradict each other ({measure}), most about {worst}: {apart[worst]:.2g} standard deviations. Intervals of "
+        f"what both tell together are {joint.widened:.2g} times as wide for it; question names, known values and loads.",
+    )
+
+
+def _written(folder: Path, result: JointIdentification) -> list[Path]:
+    table = result.table
+    numbers = {
+        "naibu": __version__,
+        "usable": result.usable,
+        "shared": list(result.joint.shared),
+        "chi_squared": result.joint.chi_squared,
+        "degrees_of_freedom": result.joint.degrees_of_freedom,
+        "widened": result.joint.widened,
+        "moduli": [
+            {"parameter": row[0]} | {kind: dict(zip(("estimate", "from", "to"), row[i : i + 3], strict=True)) for kind, i in _PLACES}
+            for row in table.rows
+        ],
+        "in_words": list(result.notes),
+    }
+    warning = "" if result.usable else "<p><strong>A model does not explain its data: not to be used.</strong></p>"
+    links = f'<p><a href="{MARKERS}/report.html">Results from markers</a>, <a href="{FIELDS}/report.html">results from fields</a></p>'
+    main = warning + "".join(f"<p>{escape(line)}</p>" for line in result.notes) + table_html(table) + links
+    page = page_html("Moduli from markers and displacement fields", "", main, f"naibu {escape(__version__)}")
+    files = [write_atomically(folder / "joint.json", json.dumps(numbers, indent=1, ensure_ascii=False) + "\n")]
+    return [write_atomically(folder / "report.html", page), *files]
