@@ -102,13 +102,15 @@ def joint_estimate(estimates: Sequence[NormalEstimate]) -> JointEstimate:
     for at, weight, e in zip(chosen, weights, kept, strict=True):
         information[np.ix_(at, at)] += weight
         right[at] += weight @ e.values
-    covariance = np.linalg.inv(information)
+    covariance: FloatArray = np.linalg.inv(information).astype(np.float64)
     values = covariance @ right
     left = [values[at] - e.values for at, e in zip(chosen, kept, strict=True)]
     chi_squared = sum(float(r @ w @ r) for r, w in zip(left, weights, strict=True))
     freedom = sum(len(e.names) for e in kept) - len(names)
     widened = float(np.sqrt(chi_squared / freedom)) if chi2.sf(chi_squared, freedom) < CONTRADICTED else 1.0
-    return JointEstimate(NormalEstimate(names, values, covariance * widened**2), shared, chi_squared, freedom, widened)
+    return JointEstimate(
+        NormalEstimate(names, values, np.asarray(covariance * widened**2, dtype=np.float64)), shared, chi_squared, freedom, widened
+    )
 
 
 def _determined(e: NormalEstimate) -> NormalEstimate:

@@ -32,7 +32,9 @@ from naibu.identification.from_fields.segmentation import Segmentation, areas_be
 MOST_REGIONS, CANDIDATES = 6, 3  # whose borders are refined; pairs that are tried as one
 LONGEST = 0.5  # of a step: of logarithms, and of borders in cells
 ITERATIONS, HALVINGS, ENOUGH = 12, 5, 0.02  # Gauss-Newton steps; halvings of one; fall of half of chi squared that is worth no further step
-CORRECTIONS, CORRECTED = 4, 0.03  # defect corrections; change of a logarithm that is worth no further one
+CORRECTIONS = 5  # of the defect
+RELAXED = 0.7  # part of a correction that is taken: whole ones go too far by 40 %, as derivatives are those of larger cells
+CORRECTED, WITHIN = 0.03, 0.25  # correction of a logarithm, as such and in standard deviations, that is worth no further one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -199,24 +201,30 @@ def on_finer_cells(model: FieldModel, law: LawName, found: RefinedRegions, bound
     """
     mixing, n, edge = found.mixing, len(found.theta), found.mixing.borders.edge_mm
     here, now, objective = _Trial(found.theta, found.borders.moves.ravel(), found.point, found.objective), found, Objective(bounds=bounds)
-    residuals, converged = tuple[FloatArray, ...](), False
+    residuals, converged, before, least = tuple[FloatArray, ...](), False, here, np.inf
     for _ in range(CORRECTIONS):
         at = model.linearised(model.evaluate(here.point.theta, here.point.states))
         changes = changes_on_finer_mesh(at, law, now.moduli_on)
         if changes is None:
             return None
+        left = sum(float(np.sum((o.residual(u) + c) ** 2)) for o, u, c in zip(model.observed, at.point.states, changes, strict=True))
+        if left > least:  # surfaces that follow precise data move differently among smaller cells: no more can be said
+            here = before
+            break
+        before, least = here, left
         slopes = mixing.moduli(here.theta, here.moves)[1]
         quadratic = at.concentrated(slopes)
         hessian = quadratic.hessian.copy()
         hessian[n:, n:] += np.eye(len(here.moves)) / edge**2
         pull = np.concatenate([np.zeros(n), (here.moves - mixing.borders.moves.ravel()) / edge**2])
         fit = refitted(at, replace(quadratic, hessian=hessian), changes, slopes, pull)
-        scale = min(1.0, LONGEST / max(np.abs(fit.theta[:n]).max(), np.abs(fit.theta[n:]).max() / edge, 1e-300))
+        scale = min(RELAXED, LONGEST / max(np.abs(fit.theta[:n]).max(), np.abs(fit.theta[n:]).max() / edge, 1e-300))
         theta, moves = objective.clipped(here.theta + scale * fit.theta[:n]), here.moves + scale * fit.theta[n:]
         guesses = [u + scale * du for u, du in zip(here.point.states, fit.moved, strict=True)]
         here, residuals = _Trial.at(model, mixing, theta, moves, guesses), fit.residuals
         now = replace(found, theta=theta, borders=found.borders.with_moves(moves))
-        converged = bool(np.abs(fit.theta[:n]).max() < CORRECTED)
+        sd = np.sqrt(np.abs(np.diag(np.linalg.pinv(hessian))[:n]))
+        converged = bool((np.abs(fit.theta[:n]) < np.maximum(CORRECTED, WITHIN * sd)).all())
         if converged:
             break
     return CorrectedRegions(_with_covariance(model, mixing, here), residuals, here.theta - found.theta, converged)
