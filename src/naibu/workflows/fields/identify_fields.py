@@ -178,10 +178,7 @@ def identify_fields(
         load_cases=cases, provenance={"naibu": __version__, "known": list(known), "loaded": list(loaded), "inputs": dict(inputs)},
     )  # fmt: skip
     coarse = blurred(mesh, cell_of_voxel, inside, labels, names)
-    result = FieldIdentification(found, body, stated.relative, (*found.identifiability, *coarse), coarse)
-    return result if folder is None else replace(result, files=tuple(_written(folder, result, inside, cell_of_voxel)))
-    notes = (*found.identifiability, *blurred(mesh, cell_of_voxel, inside, labels, names))
-    result = FieldIdentification(found, body, stated.relative, notes, inside, cell_of_voxel)
+    result = FieldIdentification(found, body, stated.relative, (*found.identifiability, *coarse), coarse, inside, cell_of_voxel)
     return result if folder is None else replace(result, files=tuple(_written(folder, result)))
 
 
@@ -234,13 +231,15 @@ def table_of_assumptions(result: FieldIdentification) -> Table:
     return Table("Moduli under other assumptions", columns, tuple(rows))
 
 
-def _cards(result: FieldIdentification, unit: str) -> list[Card]:
+def _cards(result: FieldIdentification) -> list[Card]:
     """Return Young's modulus of the first zones with its interval."""
     found = result.estimate
     if found.uncertainty is None:
         return []
     rows = zip(found.zones.names[:MOST_CARDS], found.young_modulus, found.intervals()[0], strict=False)
-    return [Card(f"Young's modulus, {name}", f"{e:.3g} {unit}", f"95 % from {low:.3g} to {high:.3g}") for name, e, (low, high) in rows]
+    return [
+        Card(f"Young's modulus, {name}", f"{e:.3g} {result.unit}", f"95 % from {low:.3g} to {high:.3g}") for name, e, (low, high) in rows
+    ]
 
 
 def _as_records(table: Table) -> list[dict[str, Cell]]:
@@ -272,10 +271,12 @@ def _maps(result: FieldIdentification) -> list[tuple[str, FloatArray]]:
 
 
 def _page(result: FieldIdentification) -> SliceView:
-    scan = result.scan
+    scan, first = result.scan, [line for line in (*result.notes[:1], TOO_COARSE, *result.blurred) if line in result.notes]
     return SliceView(
         title="Moduli from displacement fields",
-        sentences=[*result.notes, *result.estimate.steps],
+        sentences=first,
+        cards=_cards(result),
+        details=[line for line in (*result.notes, *result.estimate.steps) if line not in first],
         spacing_mm=scan.spacing_mm,
         images=[("object", scan.values.astype(np.float32))],
         displacement=np.full((*scan.shape, 3), np.nan),
@@ -292,27 +293,6 @@ def _written(folder: Path, result: FieldIdentification) -> list[Path]:
     regions = zones_of_voxels(found, scan, result.cell_of_voxel)
     volumes = {"young_modulus": young, "young_modulus_sd": np.nan_to_num(sd, nan=-1.0, posinf=-1.0), "poisson_ratio": poisson}
     files = [write_atomically(folder / "model.json", json.dumps(body.to_dict(), ensure_ascii=False, allow_nan=False) + "\n")]
-    files += [write_volume(folder / f"{name}.mha", inside.with_values(v.astype(np.float32))) for name, v in volumes.items()]
-    files.append(write_volume(folder / "zones.mha", inside.with_values((regions + 1).astype(np.uint16))))
-    outside = np.where(cells >= 0, 0.0, np.nan)
-    unit = "multiples of the known zone" if result.relative else "kPa"
-    first = [line for line in (*result.notes[:1], TOO_COARSE, *result.blurred) if line in result.notes]
-    view = SliceView(
-        title="Moduli from displacement fields",
-        sentences=first,
-        cards=_cards(result, unit),
-        details=[line for line in (*result.notes, *found.steps) if line not in first],
-        spacing_mm=inside.spacing_mm,
-        images=[("object", inside.values.astype(np.float32))],
-        displacement=np.full((*inside.shape, 3), np.nan),
-        overlays=[
-            Overlay(f"Young's modulus, {unit}", young + outside),
-            Overlay(f"standard deviation of Young's modulus, {unit}", np.where(sd > 0.0, sd, np.nan) + outside),
-            Overlay("Poisson's ratio", poisson + outside),
-        ],
-        tables=[t for t in (table_of_zones(result), table_of_assumptions(result)) if t.rows],
-        origin_mm=inside.origin_mm @ inside.direction,
-    )
     files += [write_volume(folder / f"{name}.mha", scan.with_values(v.astype(np.float32))) for name, v in volumes.items()]
     files.append(write_volume(folder / "zones.mha", scan.with_values((regions + 1).astype(np.uint16))))
     verdict = found.verdict
