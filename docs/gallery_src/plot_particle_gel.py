@@ -12,7 +12,7 @@ import numpy as np
 
 from naibu.identification import FieldLoadCase, Zones, identify_field
 from naibu.imaging import particle_motion
-from naibu.validation.specimens.quadratic_body import QuadraticBody
+from naibu.validation import QuadraticBody
 
 rng = np.random.default_rng(0)
 body = QuadraticBody("cube")

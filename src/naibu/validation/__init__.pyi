@@ -9,6 +9,7 @@ from .scanners.ultrasound import Scatterers, UltrasoundDevice, ultrasound, ultra
 from .specimens.hand import hand_surface
 from .specimens.lattice_twin import Twin, dough_lattice, dough_parameters, dough_twin, virtual_capture
 from .specimens.marker_phantoms import Phantom, Scanner, VirtualSpecimen, box_experiment, phantom, two_gels, virtual_specimen
+from .specimens.quadratic_body import QuadraticBody
 from .specimens.scanned_liver import ScannedLiver, scanned_liver
 from .specimens.specimen_matching import BlockMatch, block_match
 from .specimens.textured_sphere import ScannedBall, squeezed_ball
@@ -24,6 +25,7 @@ __all__ = [
     "MeshMotion",
     "Phantom",
     "PosedMotion",
+    "QuadraticBody",
     "ScannedBall",
     "ScannedLiver",
     "Scanner",
