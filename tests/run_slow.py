@@ -21,6 +21,7 @@ from tempfile import TemporaryDirectory
 
 ROOT = Path(__file__).resolve().parent.parent
 NOTE = Path(__file__).resolve().parent / "slow_last_run.txt"
+USAGE_ERROR = 4  # pytest's exit status where it cannot even load its settings, for example where naibu is not installed
 MARK = "pytest.mark." + "slow"
 LINE = re.compile(r"^(?P<file>tests/\S+\.py): (?P<outcome>\d+ passed, (?P<failed>\d+) failed, \d+ skipped, .*)$")
 
@@ -59,6 +60,8 @@ def run(file: str) -> str:
         outcome = Path(folder) / "outcome.xml"
         command = [sys.executable, "-m", "pytest", "-n", "0", "-q", "-m", "slow", f"--junitxml={outcome}", file]
         status = subprocess.run(command, cwd=ROOT, check=False).returncode
+        if status == USAGE_ERROR:
+            sys.exit(f"pytest could not begin with {file} (its message is above); nothing is recorded of it")
         if not outcome.exists():
             return f"0 passed, 1 failed, 0 skipped, pytest ended with {status}"
         cases = list(ElementTree.parse(outcome).iter("testcase"))
