@@ -35,6 +35,7 @@ from naibu.identification.from_markers.specimen.parameter_names import (
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings, Specimen, specimen
 
 REFERENCE_MODULUS_KPA = 200.0  # of the known region when only ratios are sought
+WEIGHED_SD = 1.5  # of ln(modulus) of a gel about that reference: 10 to 4000 kPa
 START_POISSON_RATIO = 0.49
 START_FRICTION = 0.2
 START_SPRING = 30.0  # kPa/mm
@@ -214,11 +215,14 @@ def initial_parameters(specimens: Sequence[Specimen], states: Mapping[str, Seque
 
 def _material_parameters(s: Specimen, known_materials: KnownMaterials, reference: float) -> list[Parameter]:
     out = []
+    # what only its weight holds down shows how stiff it is beside its weight; its modulus is but a first guess if nobody states it
+    weighed = s.experiment.loading.kind == "side_plates" and not known_materials.scale_is_absolute
     for m in s.experiment.materials:
         given = known_materials.young_moduli.get(m)
         # without a known material in the body its modulus does not follow from displacements: one body of one material has no scale
         alone = len(s.experiment.materials) == 1 and given is None
-        out.append(Parameter(young_modulus(m), given or reference, "kPa", "log", prior_sd=2.0, fixed=given is not None or alone))
+        fixed, sd = (given is not None or alone) and not weighed, WEIGHED_SD if weighed else 2.0
+        out.append(Parameter(young_modulus(m), given or reference, "kPa", "log", prior_sd=sd, fixed=fixed))
         out.append(Parameter(poisson_ratio(m), START_POISSON_RATIO, "", "incompressibility", prior_sd=1.0))
         out += [Parameter(shape_parameter(m, k), 0.0, "", prior_sd=0.3) for k in SHAPE_NAMES.get(s.settings.law, ())]
     return out

@@ -24,11 +24,12 @@ from naibu.core.status import Status
 from naibu.identification.from_markers.bounded_step import bounded_step, next_reach, step_limits
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase, SolvedLoadCase
 from naibu.identification.from_markers.specimen.parameter_names import pixel_scale
+from naibu.identification.from_markers.specimen.resting_state import resting_derivatives, resting_state
 from naibu.identification.from_markers.specimen.specimen_model import Specimen
 from naibu.mechanics.finite_strain.newton import Newton
 from naibu.mechanics.finite_strain.penalties import with_normal_stiffness
 from naibu.mechanics.finite_strain.problem import SolverSettings
-from naibu.mechanics.finite_strain.sensitivities import sensitivities
+from naibu.mechanics.finite_strain.sensitivities import Direction, sensitivities
 from naibu.mechanics.finite_strain.statics import Solution, WarmStart, solve
 from naibu.mechanics.linear_algebra.direct import use_one_thread
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
@@ -135,6 +136,7 @@ class Matcher:
     _solvers: dict[int, LinearSolver | None] = field(default_factory=dict)
     _penalties: dict[int, tuple[FloatArray, ...]] = field(default_factory=dict)
     _dearest: dict[int, int] = field(default_factory=dict)
+    _resting: dict[int, Solution | None] = field(default_factory=dict)
 
     def evaluate(
         self,
@@ -189,10 +191,11 @@ class Matcher:
         except ConvergenceError as error:
             raise ConvergenceError(f"{load_case.name}: {error}") from error
         self._dearest[index] = max(solution.iterations, self._dearest.get(index, 0))
+        resting = self._resting[index] = resting_state(solution, self._resting.get(index))
         newton = Newton(solution.problem, PATH, self._solvers.get(index))
         path = self._path_derivatives(load_case, values, solution, newton) if derivatives else ()
         self._solvers[index], self._penalties[index] = newton.solver, solution.states[-1].normal_stiffness
-        return self._observed(load_case, values, solution, path, pose)
+        return self._observed(load_case, values, solution, resting, path, pose)
 
     def _trial_settings(self, index: int, near: SolvedLoadCase | None, warm: bool) -> SolverSettings:
         """Settings of a step of the search: what a solution that starts from another one has not needed, it does without."""
@@ -206,13 +209,19 @@ class Matcher:
         for i, (load_case, fit) in enumerate(zip(self.load_cases, fits, strict=True)):
             newton = Newton(fit.solution.problem, PATH, self._solvers.get(i))
             path = self._path_derivatives(load_case, values, fit.solution, newton)
-            out.append(self._observed(load_case, values, fit.solution, path, fit.pose))
+            out.append(self._observed(load_case, values, fit.solution, fit.resting, path, fit.pose))
         return out
 
     def _path_derivatives(
         self, load_case: MarkerLoadCase, values: Mapping[str, float], solution: Solution, newton: Newton
     ) -> tuple[FloatArray, ...]:
         """Derivatives (n, 3, p) of every state on the path with respect to the physical values of the free parameters."""
+        directions, gather = self._directions(load_case, values)
+        raw = sensitivities(newton.problem, solution.states, directions, newton=newton)
+        return tuple(d @ gather for d in raw)
+
+    def _directions(self, load_case: MarkerLoadCase, values: Mapping[str, float]) -> tuple[list[Direction], FloatArray]:
+        """Directions of the load case, and which of them (k, p) each free parameter takes."""
         free = self.parameters.free
         directions, owner = [], []
         for k, parameter in enumerate(free):
@@ -221,19 +230,19 @@ class Matcher:
             owner += [k] * len(found)
         gather = np.zeros((len(directions), len(free)))
         gather[np.arange(len(owner)), owner] = 1.0
-        raw = sensitivities(newton.problem, solution.states, directions, newton=newton)
-        return tuple(d @ gather for d in raw)
+        return directions, gather
 
     def _observed(
         self,
         load_case: MarkerLoadCase,
         values: Mapping[str, float],
         solution: Solution,
+        resting: Solution | None,
         path: tuple[FloatArray, ...],
         pose: RigidTransform | None,
     ) -> LoadCaseFit:
         specimen = load_case.specimen.reshaped(values)
-        u = specimen.at_markers(solution.displacement)
+        u = specimen.at_markers(solution.displacement - (0.0 if resting is None else resting.displacement))
         gradient = specimen.deformation_gradient(solution.displacement)
         moved = specimen.marker_points + u
         enlargement = specimen.enlargement(values)
@@ -248,9 +257,13 @@ class Matcher:
         sd = np.sqrt(load_case.sd**2 + np.einsum("kil,kl->ki", both**2, load_case.free_sd**2))
         if not path:
             return LoadCaseFit(
-                solution, pose, predicted, load_case.measured - predicted, sd, np.zeros((*u.shape, 0)), np.zeros((*u.shape, 6)), path
-            )
+                solution, pose, predicted, load_case.measured - predicted, sd, np.zeros((*u.shape, 0)), np.zeros((*u.shape, 6)), path,
+                resting,
+            )  # fmt: skip
         du = path[-1]
+        if resting is not None:
+            directions, gather = self._directions(load_case, values)
+            du = du - resting_derivatives(resting, directions) @ gather
         n_free = du.shape[2]
         at_markers = specimen.at_markers(du) if n_free else np.zeros((len(u), 3, 0))
         for k, parameter in enumerate(self.parameters.free):
@@ -269,7 +282,7 @@ class Matcher:
         for axis in range(3):
             pose_jacobian[:, :, 3 + axis] = np.cross(np.eye(3)[axis], arm)
         pose_jacobian /= enlargement[:, None]
-        return LoadCaseFit(solution, pose, predicted, load_case.measured - predicted, sd, jacobian, pose_jacobian, path)
+        return LoadCaseFit(solution, pose, predicted, load_case.measured - predicted, sd, jacobian, pose_jacobian, path, resting)
 
     def normal_equations(self, fits: Sequence[LoadCaseFit], inner: FloatArray) -> NormalEquations:
         """Linearise the objective at some fits of the load cases and the free parameters that gave them, on the optimiser's scale."""

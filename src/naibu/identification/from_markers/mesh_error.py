@@ -20,6 +20,7 @@ from naibu.core.parameters import ParameterSet
 from naibu.identification.from_markers.coarse_search import COARSER
 from naibu.identification.from_markers.gauss_newton import PATH, Match, Matcher
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase, SolvedLoadCase
+from naibu.identification.from_markers.specimen.resting_state import since_scan
 from naibu.identification.from_markers.specimen.specimen_mesh import element_size
 from naibu.identification.from_markers.specimen.specimen_model import specimen
 from naibu.mechanics.finite_strain.statics import WarmStart, solve
@@ -131,5 +132,5 @@ def change_on_mesh(
         known = [(s.load, np.asarray(between @ s.displacement)) for s in fit.solution.states[1:]]
     solution = solve(problem, settings=PATH, warm_start=known)
     moved = body.reshaped(values)
-    points = moved.marker_points + moved.at_markers(solution.displacement)
+    points = moved.marker_points + moved.at_markers(since_scan(solution))
     return np.asarray(fit.pose.applied(points) / body.enlargement(values) - fit.predicted)

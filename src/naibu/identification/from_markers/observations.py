@@ -115,6 +115,10 @@ class LoadCaseFit:
         Derivatives of `predicted` with respect to the physical values of the free parameters.
     pose_jacobian : ndarray, shape (k, 3, 6)
         Derivatives with respect to the pose.
+    path : tuple of ndarray, shape (n, 3, p)
+        Derivatives of the states of `solution`; empty where they were not asked for.
+    resting : Solution or None
+        The body under its weight alone, as the reference scan saw it; None where no weight is applied.
     """
 
     solution: Solution
@@ -125,6 +129,11 @@ class LoadCaseFit:
     jacobian: FloatArray
     pose_jacobian: FloatArray
     path: tuple[FloatArray, ...]
+    resting: Solution | None = None
+
+    def since_scan(self, displacement: FloatArray) -> FloatArray:
+        """Return a displacement (n, 3) of the nodes, mm, less that by the weight alone, which the reference scan has seen."""
+        return displacement if self.resting is None or not displacement.any() else np.asarray(displacement - self.resting.displacement)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

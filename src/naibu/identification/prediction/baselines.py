@@ -15,6 +15,7 @@ from naibu.identification.from_markers.calibration import Calibration
 from naibu.identification.from_markers.initial_guess import equilibrium_gap
 from naibu.identification.from_markers.observations import MarkerLoadCase
 from naibu.identification.from_markers.specimen.parameter_names import platen_position, poisson_ratio, young_modulus
+from naibu.identification.from_markers.specimen.resting_state import since_scan
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings, specimen
 from naibu.identification.prediction.prediction import rms
 from naibu.mechanics.finite_strain.problem import SolverSettings
@@ -79,7 +80,7 @@ def equilibrium_gap_baseline(calibration: Calibration) -> dict[str, float]:
     for load_case in calibration.load_cases:
         near = calibration.warm_starts[load_case.name].warm_start(values)
         try:
-            displacement = solve(load_case.specimen.problem(values, load_case.state), settings=FOLLOWED, warm_start=near).displacement
+            displacement = since_scan(solve(load_case.specimen.problem(values, load_case.state), settings=FOLLOWED, warm_start=near))
         except ConvergenceError:
             continue
         body = load_case.specimen.reshaped(values)
@@ -133,5 +134,5 @@ def _linear(load_case: MarkerLoadCase, values: Mapping[str, float]) -> FloatArra
         solution = solve(body.problem(chosen, load_case.state), settings=FOLLOWED)
     except ConvergenceError:
         return np.full_like(load_case.measured, np.nan)
-    moved = body.marker_points + body.at_markers(solution.displacement)
+    moved = body.marker_points + body.at_markers(since_scan(solution))
     return registration(moved, load_case.measured).applied(moved)

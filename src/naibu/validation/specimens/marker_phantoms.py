@@ -21,6 +21,7 @@ from naibu.core.markers import Markers
 from naibu.core.rigid_transform import RigidTransform, rotation_matrix
 from naibu.identification.from_markers.calibration import state_parameters
 from naibu.identification.from_markers.specimen.parameter_names import friction, poisson_ratio, young_modulus
+from naibu.identification.from_markers.specimen.resting_state import since_scan
 from naibu.identification.from_markers.specimen.scan_alignment import placement
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings, Specimen, specimen
 from naibu.mechanics.finite_strain.problem import SolverSettings
@@ -278,7 +279,7 @@ def virtual_specimen(
     values = _complete(clean, model, truth)
     at_markers = interpolation_operator(model.mesh, free)
     solutions = {s.name: solve(model.problem(values, s.name), settings=solver) for s in clean.states[1:]}
-    loaded = {name: free + at_markers @ s.displacement for name, s in solutions.items()}
+    loaded = {name: free + at_markers @ since_scan(s) for name, s in solutions.items()}
     return VirtualSpecimen(clean, MappingProxyType(values), model, free, MappingProxyType(loaded), MappingProxyType(solutions))
 
 

@@ -129,11 +129,13 @@ def scene(specimen: Specimen, state: str, fit: LoadCaseFit, measured: FloatArray
     paths = specimen.indenter_paths(values, state)
     experiment = specimen.experiment
     for s in fit.solution.states:
-        markers = body.marker_points + body.at_markers(s.displacement)
+        markers = body.marker_points + body.at_markers(fit.since_scan(s.displacement))
         boxes = tuple(_box(specimen, start + s.load * (stop - start), normal) for start, stop, normal in paths)
         travel = float(max(np.linalg.norm(stop - start) for start, stop, _ in paths))
         label = f"{100 * s.load:.0f} % of the load" if s.load < 1.0 else "full load"
-        steps.append(Step(label, s.load * travel, whole.mesh.points[nodes] + whole.field(s.displacement)[nodes], markers, boxes))
+        steps.append(
+            Step(label, s.load * travel, whole.mesh.points[nodes] + whole.field(fit.since_scan(s.displacement))[nodes], markers, boxes)
+        )
     layer = marker_layers(specimen.marker_points[:, 2], experiment.nominal_spacing_mm)
     sd = np.sqrt((fit.sd**2).mean(axis=1))
     # a marker whose reference position was completed from the lattice counts in no figure of accuracy, here neither
@@ -202,7 +204,14 @@ def parameter_rows(model: CalibratedModel, names: Sequence[str]) -> tuple[Parame
 def undetermined(model: CalibratedModel, names: Sequence[str], priors: ParameterSet | None = None) -> tuple[str, ...]:
     """Return, in words, what the data do not determine about the parameters `names`; `priors` tells what was assumed of them."""
     out = []
-    if not model.known_materials.scale_is_absolute:
+    weighed = [
+        p
+        for p in model.parameters
+        if p.name.endswith(": young_modulus") and not p.fixed and p.name.partition(": ")[0] in model.known_materials.young_moduli
+    ]
+    if weighed:
+        out.append("The stiffness follows from the weight that bends the object, at the density of water.")
+    elif not model.known_materials.scale_is_absolute:
         out.append("Displacements alone do not give the absolute stiffness: the moduli are ratios to the material that sets the scale.")
     by_name: dict[str, Parameter] = {p.name: p for p in model.parameters}
     assumed = {p.name: p for p in priors or ()}

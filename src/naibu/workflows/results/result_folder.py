@@ -135,7 +135,9 @@ def write_identification(
         series = folder / series_file(load_case.name)
         states = fit.solution.states
         body = load_case.specimen.reshaped(values).whole
-        write_vtkhdf_series(series, body.mesh, [s.load for s in states], {"displacement_mm": [body.field(s.displacement) for s in states]})
+        write_vtkhdf_series(
+            series, body.mesh, [s.load for s in states], {"displacement_mm": [body.field(fit.since_scan(s.displacement)) for s in states]}
+        )
     _write_report(folder, REPORT_STEM, build_report(calibration, model, verdict, baselines, left_out))
 
 
@@ -230,9 +232,11 @@ def write_prediction(folder: Path, model: CalibratedModel, prediction: Predictio
     }
     write_atomically(folder / SUMMARY_FILE, _text(summary))
     states, body = p.fit.solution.states, p.specimen.reshaped(p.values).whole
-    write_vtu(folder / f"{PREDICTED_STEM}.vtu", body.mesh, {"displacement_mm": body.field(states[-1].displacement)}, {})
+    write_vtu(folder / f"{PREDICTED_STEM}.vtu", body.mesh, {"displacement_mm": body.field(p.fit.since_scan(states[-1].displacement))}, {})
     path = folder / f"{PREDICTED_STEM}.vtkhdf"
-    write_vtkhdf_series(path, body.mesh, [s.load for s in states], {"displacement_mm": [body.field(s.displacement) for s in states]})
+    write_vtkhdf_series(
+        path, body.mesh, [s.load for s in states], {"displacement_mm": [body.field(p.fit.since_scan(s.displacement)) for s in states]}
+    )
     _write_report(folder, PREDICTED_STEM, prediction_report(model, p))
 
 

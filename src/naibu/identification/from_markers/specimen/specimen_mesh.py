@@ -12,13 +12,16 @@ from naibu.meshing.primitives import box_from_coordinates, cylinder, half_ellips
 
 CELLS_PER_HEIGHT = {"plate": 9.0, "bar": 8.0}  # of a box; its cells shrink further under a bar
 ROUND_CELLS_PER_HEIGHT = 7.0
+MIRRORED_CELLS_PER_HEIGHT = 10.0  # where mirror planes leave a quarter of the object
 REFINEMENT = 0.45  # edge of the cells at a bar over that of the cells far from it
 
 
 def element_size(experiment: Experiment, element_size_mm: float) -> float:
-    """Return the edge of the cells far from the indenter, mm; 0 chooses a seventh to a ninth of the object's height."""
-    box = experiment.shape.kind == "box"
-    cells = CELLS_PER_HEIGHT.get(experiment.loading.kind, ROUND_CELLS_PER_HEIGHT) if box else ROUND_CELLS_PER_HEIGHT
+    """Return the edge of the cells far from the indenter, mm; 0 chooses a seventh to a tenth of the object's height."""
+    box, kind = experiment.shape.kind == "box", experiment.loading.kind
+    cells = CELLS_PER_HEIGHT.get(kind, ROUND_CELLS_PER_HEIGHT) if box else ROUND_CELLS_PER_HEIGHT
+    if kind == "side_plates":
+        cells = MIRRORED_CELLS_PER_HEIGHT
     return element_size_mm or experiment.height_mm / cells
 
 

@@ -62,7 +62,7 @@ class ModelSettings:
     joined : {"tied", "sliding"}
         Bond between separately cast blocks.
     element_size_mm : float
-        Edge of the hexahedra, smaller under a bar; 0 takes a seventh to a ninth of the object's height.
+        Edge of the hexahedra, smaller under a bar; 0 takes a seventh to a tenth of the object's height.
     normal_stiffness : float
         Contact penalty, kPa/mm.
     density : float

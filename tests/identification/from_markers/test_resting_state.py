@@ -1,0 +1,94 @@
+"""The reference scan saw the object bent by its weight, which tells how stiff it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from naibu import datasets
+from naibu.core.experiment import Experiment, Loading
+from naibu.identification.from_markers.calibration import calibrate, initial_parameters
+from naibu.identification.from_markers.gauss_newton import Matcher
+from naibu.identification.from_markers.known_materials import KnownMaterials
+from naibu.identification.from_markers.observations import MarkerLoadCase, NoiseModel
+from naibu.identification.from_markers.specimen.parameter_names import (
+    friction,
+    platen_position,
+    poisson_ratio,
+    straight_base,
+    young_modulus,
+)
+from naibu.identification.from_markers.specimen.resting_state import resting_state
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings, specimen
+from naibu.mechanics.finite_strain.statics import solve
+from naibu.validation.specimens.marker_phantoms import Scanner, box_experiment, virtual_specimen
+
+SIZE, YOUNG = (40.0, 60.0, 30.0), 8.0
+TRUTH = {young_modulus("gel"): YOUNG, poisson_ratio("gel"): 0.48, friction("gel", "table"): 0.2, friction("gel", "acrylic"): 0.2}
+EXACT = Scanner(placing_mm=0.05, xy_step_mm=0.0, z_step_mm=0.0)
+
+
+def squeezed(width_mm: float) -> Experiment:
+    """A very soft block between side plates, computed whole on elements of its own."""
+    template = box_experiment("soft", SIZE, [("gel", SIZE[2])], Loading("side_plates"), {"pressed": width_mm}, margin_mm=5.0)
+    return virtual_specimen(template, TRUTH, settings=ModelSettings(element_size_mm=7.0)).scanned(seed=2, scanner=EXACT).experiment
+
+
+def test_a_block_settles_under_its_weight_as_a_column_does() -> None:
+    """The settlement of a column is rho g h^2 / (2 E); its ends bulge freely but for friction on the table."""
+    experiment = squeezed(50.0)
+    body = specimen(experiment, ModelSettings(element_size_mm=6.0))
+    values = {**TRUTH, friction("gel", "table"): 1e-3, platen_position(experiment, "pressed"): 50.0}
+    resting = resting_state(solve(body.problem(values, "pressed")))
+    assert resting is not None
+    top = np.abs(body.mesh.points[:, 2] - SIZE[2]) < 1e-6
+    expected = body.settings.density * 9810.0 * SIZE[2] ** 2 / (2.0 * YOUNG)
+    assert -resting.displacement[top, 2].mean() == pytest.approx(expected, rel=0.05)
+    weight = body.settings.density * 9810.0 * np.prod(SIZE)
+    assert body.reactions(resting)["base of table"][2] == pytest.approx(weight, rel=1e-3)
+
+
+def test_plates_that_do_not_press_leave_the_markers_where_the_reference_scan_saw_them() -> None:
+    experiment = squeezed(50.0)
+    body = specimen(experiment, ModelSettings(element_size_mm=8.0))
+    case = MarkerLoadCase.of(body, "pressed", NoiseModel())
+    parameters = initial_parameters([body], {experiment.name: ["pressed"]}, KnownMaterials())
+    values = parameters.values() | TRUTH | {platen_position(experiment, "pressed"): experiment.full_platen_position_mm + 6.0}
+    fit = Matcher([case], parameters).evaluate(values)[0]
+    settled, left = (np.abs(body.at_markers(u)) for u in (fit.solution.displacement, fit.since_scan(fit.solution.displacement)))
+    assert settled.max() > 0.2
+    assert left.max() < 0.15 * settled.max()  # the plates leave while the sides bulge: friction on the table remembers that
+
+
+def test_derivatives_count_what_the_reference_scan_has_seen() -> None:
+    """By the modulus, which the settlement depends on, against differences of whole solutions."""
+    experiment = squeezed(50.0)
+    body = specimen(experiment, ModelSettings(element_size_mm=12.0))
+    parameters = initial_parameters([body], {experiment.name: ["pressed"]}, KnownMaterials({"gel": YOUNG}, scale_is_absolute=False))
+    assert not next(p for p in parameters if p.name == young_modulus("gel")).fixed
+    matcher = Matcher([MarkerLoadCase.of(body, "pressed", NoiseModel())], parameters)
+    values = parameters.values() | TRUTH
+    fit, at = matcher.evaluate(values)[0], [p.name for p in parameters.free].index(young_modulus("gel"))
+    ends = [matcher.evaluate(values | {young_modulus("gel"): YOUNG * f}, poses=[fit.pose])[0].predicted for f in (1.01, 0.99)]
+    difference = (ends[0] - ends[1]) / (0.02 * YOUNG)
+    np.testing.assert_allclose(fit.jacobian[:, :, at], difference, atol=0.03 * np.abs(difference).max())
+
+
+@pytest.mark.slow
+def test_the_weight_of_an_arch_tells_its_modulus() -> None:
+    """Nothing states a modulus: the search begins at 200 kPa and finds 25 kPa, and that the arch has no straight base."""
+    template = datasets.load("ct_half_ellipsoid")
+    gel, state = template.materials[0], f"{template.name}/width_100"
+    truth = {young_modulus(gel): 25.0, poisson_ratio(gel): 0.49, f"{state}: width": 101.0}
+    truth |= {friction(gel, "table"): 0.2, friction(gel, "acrylic"): 0.15}
+    one = replace(template, states=tuple(s for s in template.states if s.name in ("initial", "width_100")))
+    inside = specimen(one, ModelSettings(element_size_mm=16.0)).marker_points
+    virtual = virtual_specimen(one, truth, settings=ModelSettings(element_size_mm=10.0), markers=inside)
+    seen = replace(virtual.scanned(seed=3, scanner=EXACT).experiment, base_z_mm=None)
+    found = calibrate([seen], settings=ModelSettings(element_size_mm=11.0), with_mesh_error=False).match
+    values = found.parameters.values()
+    assert values[young_modulus(gel)] == pytest.approx(25.0, rel=0.25)
+    assert values[straight_base(seen)] == pytest.approx(0.0, abs=4.0)
+    assert values[f"{state}: width"] == pytest.approx(101.0, abs=0.6)
