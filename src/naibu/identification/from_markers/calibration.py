@@ -35,7 +35,7 @@ from naibu.identification.from_markers.specimen.parameter_names import (
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings, Specimen, specimen
 
 REFERENCE_MODULUS_KPA = 200.0  # of the known region when only ratios are sought
-WEIGHED_SD = 1.5  # of ln(modulus) of a gel about that reference: 10 to 4000 kPa
+WEIGHED_SD = 1.5  # of ln(modulus) of a gel about that reference, where its weight is to tell: 10 to 4000 kPa
 START_POISSON_RATIO = 0.49
 START_FRICTION = 0.2
 START_SPRING = 30.0  # kPa/mm
@@ -215,8 +215,7 @@ def initial_parameters(specimens: Sequence[Specimen], states: Mapping[str, Seque
 
 def _material_parameters(s: Specimen, known_materials: KnownMaterials, reference: float) -> list[Parameter]:
     out = []
-    # what only its weight holds down shows how stiff it is beside its weight; its modulus is but a first guess if nobody states it
-    weighed = s.experiment.loading.kind == "side_plates" and not known_materials.scale_is_absolute
+    weighed = s.settings.modulus == "weighed" and s.experiment.loading.kind == "side_plates" and not known_materials.scale_is_absolute
     for m in s.experiment.materials:
         given = known_materials.young_moduli.get(m)
         # without a known material in the body its modulus does not follow from displacements: one body of one material has no scale

@@ -62,7 +62,13 @@ def _check_predictive(predictive: Mapping[str, Any]) -> None:
 
 
 def _check_settings(settings: Mapping[str, Any]) -> None:
-    choices = {"law": tuple(LAWS), "contact": get_args(ContactModel), "joined": ("tied", "sliding"), "pixel_scale": ("given", "sought")}
+    choices = {
+        "law": tuple(LAWS),
+        "contact": get_args(ContactModel),
+        "joined": ("tied", "sliding"),
+        "pixel_scale": ("given", "sought"),
+        "modulus": ("given", "weighed"),
+    }
     ranges = {
         "element_size_mm": (0.0, 1e4),
         "normal_stiffness": (1e-9, 1e12),

@@ -204,12 +204,7 @@ def parameter_rows(model: CalibratedModel, names: Sequence[str]) -> tuple[Parame
 def undetermined(model: CalibratedModel, names: Sequence[str], priors: ParameterSet | None = None) -> tuple[str, ...]:
     """Return, in words, what the data do not determine about the parameters `names`; `priors` tells what was assumed of them."""
     out = []
-    weighed = [
-        p
-        for p in model.parameters
-        if p.name.endswith(": young_modulus") and not p.fixed and p.name.partition(": ")[0] in model.known_materials.young_moduli
-    ]
-    if weighed:
+    if model.settings.modulus == "weighed":
         out.append("The stiffness follows from the weight that bends the object, at the density of water.")
     elif not model.known_materials.scale_is_absolute:
         out.append("Displacements alone do not give the absolute stiffness: the moduli are ratios to the material that sets the scale.")

@@ -69,6 +69,8 @@ class ModelSettings:
         kg/mm3; weight is applied where an object is not pressed onto its base.
     pixel_scale : {"given", "sought"}
         Whether the true size of a pixel along x and y is that of the file, or an unknown of every experiment.
+    modulus : {"given", "weighed"}
+        Whether a modulus that nobody states stays at a reference value, or is sought between side plates from the weight.
     """
 
     law: str = "neo_hookean"
@@ -79,6 +81,7 @@ class ModelSettings:
     tangential_stiffness: float = 200.0
     density: float = 1e-6
     pixel_scale: Literal["given", "sought"] = "given"
+    modulus: Literal["given", "weighed"] = "given"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -222,8 +225,7 @@ class Specimen:
     def deformation_gradient(self, displacement: FloatArray) -> FloatArray:
         """Return F (k, 3, 3) at the markers, by central differences over a tenth of an element."""
         step = _difference_step(self.settings, self.experiment)
-        places = zip(self._gradient, _around(self.marker_points, step), strict=True)
-        values = [self.mirror.signs(p) * (at @ displacement) for at, p in places]
+        values = [self.mirror.signs(p) * (a @ displacement) for a, p in zip(self._gradient, _around(self.marker_points, step), strict=True)]
         return np.stack([(f - b) / (2.0 * step) for f, b in zip(values[:3], values[3:], strict=True)], axis=2) + np.eye(3)
 
     def material_parameters(self, values: Mapping[str, float]) -> FloatArray:
