@@ -89,7 +89,8 @@ class MirrorPlanes:
     def outer_faces(self, mesh: Mesh) -> Boundary:
         """Return the boundary faces of the modelled part that are on the outside of the object rather than on a plane."""
         found = boundary_faces(mesh)
-        outside = ~self.nodes(mesh.points)[found.faces].all(axis=1).any(axis=1)
+        on_plane: BoolArray = np.all(self.nodes(mesh.points)[found.faces], axis=1)
+        outside = on_plane.sum(axis=1) == 0
         return Boundary(found.faces[outside], found.cells[outside])
 
     def signs(self, points: FloatArray) -> FloatArray:
