@@ -379,7 +379,8 @@ class Matcher:
                 return self.evaluate(values, warm_starts)
             solution = near.fit.solution
             self._dearest[i], self._penalties[i] = solution.iterations, solution.states[-1].normal_stiffness
-            out.append(self._observed(load_case, values, solution, path, near.fit.pose))
+            self._resting[i] = near.fit.resting
+            out.append(self._observed(load_case, values, solution, near.fit.resting, path, near.fit.pose))
         return out
 
     def _try(
