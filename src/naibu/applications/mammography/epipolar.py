@@ -35,6 +35,9 @@ class ModelUncertainty:
     unresolved_mm : float
         Displacements within a view that no parameter describes, in each direction: heterogeneous tissue, gravity, positioning. The default
         gives a mean distance from the curve as it was measured on 50 pairs of mammograms, 7 mm :cite:p:`kita2002`.
+    unloaded_mm : float
+        Of each coordinate in the unloaded breast against where both views put it: weight and roll move tissue along the curves, which no
+        view shows. The default covers virtual breasts (``benchmarks/mammography_population.py``).
     """
 
     volume_ratio: float = 0.05
@@ -43,6 +46,7 @@ class ModelUncertainty:
     angle_deg: float = 2.0
     thickness_mm: float = 2.0
     unresolved_mm: float = 6.0
+    unloaded_mm: float = 4.0
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -142,6 +146,8 @@ class MammographicPair:
         Unresolved displacements of each: view, then depth and position along the chest wall, mm.
     refused : int
         How many draws gave no breast.
+    unloaded_mm : float
+        See `ModelUncertainty`.
     """
 
     outlines: tuple[BreastOutline, BreastOutline]
@@ -150,6 +156,7 @@ class MammographicPair:
     drawn: tuple[TwoViews, ...]
     noise: FloatArray
     refused: int
+    unloaded_mm: float
 
     def epipolar_curve(self, point: ArrayLike, *, from_view: str = "CC", probability: float = 0.95) -> EpipolarCurve:
         """Return the curve in the other view of a point of one view.
@@ -195,7 +202,7 @@ class MammographicPair:
         point_cc, point_mlo : array_like, shape (2,)
             Depth and position along the chest wall in each view, mm.
         probability : float
-            Of the intervals.
+            Of the interval of each coordinate.
 
         Raises
         ------
@@ -215,7 +222,7 @@ class MammographicPair:
         tail = 0.5 * (1.0 - probability)
         position = _nearest(_views(self.nominal), places)
         middle = _nearest(_views(self.centre), places)
-        half = float(stdtrit(len(found), 1.0 - tail)) * np.sqrt(((np.array(found) - middle) ** 2).mean(axis=0))
+        half = float(stdtrit(len(found), 1.0 - tail)) * np.sqrt(((np.array(found) - middle) ** 2).mean(axis=0) + self.unloaded_mm**2)
         return LesionPosition(position, position - half, position + half, curve.distance(places[1]), bool(curve.in_band(places[1])))
 
     def project(self, position: ArrayLike, *, probability: float = 0.95) -> Projection:

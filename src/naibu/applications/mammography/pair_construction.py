@@ -166,7 +166,7 @@ def _with_draws(
     z -= z.mean(axis=0)
     z = np.linalg.solve(np.linalg.cholesky(z.T @ z / len(z)), z.T).T  # so few draws would have another covariance than the stated one
     noise = uncertainty.unresolved_mm * z.reshape(-1, 2, 2)
-    return MammographicPair(outlines, nominal, centre, tuple(drawn), noise, refused)
+    return MammographicPair(outlines, nominal, centre, tuple(drawn), noise, refused, uncertainty.unloaded_mm)
 
 
 _Draw = tuple[tuple[CompressionParameters, CompressionParameters], tuple[float, float], float]

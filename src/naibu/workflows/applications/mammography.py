@@ -337,6 +337,7 @@ def _assumed(model: str, sds: ModelUncertainty) -> Table:
         ("positioner angle, degrees", None, sds.angle_deg),
         ("distance of the plates, mm", None, sds.thickness_mm),
         ("unresolved displacement in each direction of a view, mm", 0.0, sds.unresolved_mm),
+        ("each coordinate of tissue in the unloaded breast, by weight and roll, mm", 0.0, sds.unloaded_mm),
     )
     if model == "mechanical":
         rows += (
