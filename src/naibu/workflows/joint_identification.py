@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -228,7 +229,7 @@ def _in_words(joint: JointEstimate, parts: Sequence[NormalEstimate]) -> tuple[st
     measure = f"chi squared {joint.chi_squared:.3g} with {joint.degrees_of_freedom} degrees of freedom"
     if not joint.contradicted:
         return (f"Markers and fields agree ({measure}) on what both tell: {shared}.",)
-    apart = {n: abs(parts[0].value(n) - parts[1].value(n)) / np.hypot(*(p.standard_deviation(n) for p in parts)) for n in joint.shared}
+    apart = {n: abs(parts[0].value(n) - parts[1].value(n)) / math.hypot(*(p.standard_deviation(n) for p in parts)) for n in joint.shared}
     worst = max(apart, key=lambda n: apart[n])
     return (
         f"Markers and fields contradict each other ({measure}), most about {worst}: {apart[worst]:.2g} standard deviations. Intervals of "
