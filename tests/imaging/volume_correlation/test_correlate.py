@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -16,7 +17,8 @@ from naibu.core.volume import Volume
 from naibu.imaging.measure_displacement import measure_displacement
 from naibu.imaging.preprocessing.object_mask import object_mask
 from naibu.imaging.preprocessing.resampling import positions
-from naibu.imaging.volume_correlation import correlate, result
+from naibu.imaging.volume_correlation import correlate, gauss_newton
+from naibu.imaging.volume_correlation.common_content import CommonContent
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
 from naibu.imaging.volume_correlation.result import CorrelationResult
 from naibu.imaging.volume_correlation.rigid_initialization import RigidInitialization
@@ -198,7 +200,7 @@ def test_the_outer_halves_of_the_end_slices_are_answered() -> None:
 def test_cells_that_have_not_converged_widen_the_covariance_and_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     before, after, found = waved()
     assert found.converged.all() and found.status.startswith("converged")
-    monkeypatch.setattr(result, "STILL", 0.0)
+    monkeypatch.setattr(gauss_newton, "STILL", 0.0)
     monkeypatch.setattr(correlate, "MOST_MOVING", 1.0)
     moving = correlate_volumes(before, after)
     assert not moving.converged.all()
@@ -210,6 +212,21 @@ def test_cells_that_have_not_converged_widen_the_covariance_and_are_counted(monk
     monkeypatch.setattr(correlate, "MOST_MOVING", 0.0)
     with pytest.raises(InputError, match="had not converged"):
         correlate_volumes(before, after)
+
+
+def test_steps_go_on_as_long_as_cells_move(monkeypatch: pytest.MonkeyPatch) -> None:
+    levels = tuple(replace(level, steps=1) if k >= correlate.HALVINGS else level for k, level in enumerate(correlate.LEVELS))
+    monkeypatch.setattr(correlate, "LEVELS", levels)
+    monkeypatch.setattr(correlate, "ADAPTED_STEPS", 1)
+    before, after, usual = waved()
+    found = correlate_volumes(before, after)
+    assert found.converged.mean() > 0.95
+    assert np.nanmax(np.linalg.norm(found.displacement.vectors - usual.displacement.vectors, axis=-1)) < 0.3
+
+
+def test_little_agreement_counts_as_no_match_where_the_residual_is_no_noise() -> None:
+    content = CommonContent(np.array([0.2, 0.5, 0.5, 0.7]), np.array([0.0, 0.0, 0.3, 0.3]))
+    assert content.matched.tolist() == [False, True, False, True]
 
 
 def test_the_covariance_covers_the_truth() -> None:

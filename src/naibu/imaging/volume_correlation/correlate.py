@@ -36,7 +36,7 @@ from naibu.imaging.volume_correlation.inclusion_candidates import LEAST_VOLUME, 
 from naibu.imaging.volume_correlation.intensity_comparison import ComparisonSettings
 from naibu.imaging.volume_correlation.normal_equations import SplineSystem
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise
-from naibu.imaging.volume_correlation.result import CorrelationResult, collected, last_steps, still_mm
+from naibu.imaging.volume_correlation.result import CorrelationResult, collected
 from naibu.imaging.volume_correlation.rigid_inclusions import RigidInclusion, rigid_inclusions_among
 from naibu.imaging.volume_correlation.rigid_initialization import RigidInitialization, correlated_shift
 from naibu.imaging.volume_correlation.settings import REFERENCE_FRACTION, CorrelationSettings
@@ -57,6 +57,7 @@ INCLUSION_SMOOTHING = 0.8  # of both volumes, for rigid inclusions, voxels
 WEIGHT_WINDOW = 1.9  # cells: standard deviation of the window in which cells share a weight
 ADAPTATION_SAMPLES, ADAPTATIONS = 12, 4  # random fields of a round, and rounds, in which the weights are adapted
 INCLUSION_STEPS, ADAPTED_STEPS = 3, 5  # Gauss-Newton steps with rigid inclusions, and after each adaptation
+UNSETTLED = 0.05  # fraction of the cells that still move, above which these steps go on: large strains of small volumes need more
 LEAST_WEIGHT = 1e-3  # of the dilatation weight of the round before
 DEFAULT = CorrelationSettings()
 
@@ -243,7 +244,7 @@ class _Correlation:
                 level = self.level(stride, self.settings.smoothing_voxels)
             system = SplineSystem(level, self.grid, self.ratio)
             self.bending, self.dilatation = self.weights(system, LEVELS[k].bending)
-            iterations = Iterations(LEVELS[k].steps, anchoring=LEVELS[k].anchoring)
+            iterations = Iterations(LEVELS[k].steps, anchoring=LEVELS[k].anchoring, unsettled=UNSETTLED if k >= HALVINGS else 1.0)
             tried = []
             # the rigid motion that correlates best may rotate a body whose surface is dented: what deforms from it tells
             for c in self.starts if k == 0 else [self.c]:
@@ -294,7 +295,8 @@ class _Correlation:
             if s.dilatation_penalty:
                 # never more than assumed: what little volume changes may not be noise alone
                 self.dilatation = float(np.clip(dilatation, LEAST_WEIGHT * before, most))
-            self.c = fit.iterate(self.c, self.bending, self.dilatation * system.gauss_volume, Iterations(ADAPTED_STEPS))
+            iterations = Iterations(ADAPTED_STEPS, unsettled=UNSETTLED)
+            self.c = fit.iterate(self.c, self.bending, self.dilatation * system.gauss_volume, iterations)
             # a field that was penalised too much shows only in part how much volume changes
             if self.dilatation > 0.5 * before:
                 break
@@ -323,11 +325,10 @@ class _Correlation:
         refuse_unrelated(fit)
         content = common_content(fit, self.depth_mm(fit.level))
         content.refuse_chance(system.inner)
-        moving = float((last_steps(fit)[system.inner] > still_mm(fit)).mean())
-        if moving > MOST_MOVING:
+        if fit.moving_fraction > MOST_MOVING:
             raise InputError(
-                f"no displacement fits the volumes: {moving:.0%} of the object had not converged after the last step; check that both show "
-                "the same object, and give masks of it if there is much else in them"
+                f"no displacement fits the volumes: {fit.moving_fraction:.0%} of the object had not converged after the last step; check "
+                "that both show the same object, and give masks of it if there is much else in them"
             )
         for inclusion in self.inclusions:
             inclusion.draws.clear()

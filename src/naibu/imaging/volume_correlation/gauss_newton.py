@@ -33,6 +33,8 @@ AGREEMENT_WINDOW = 0.5  # cells: standard deviation of the window in which the g
 LEAST_RELIABILITY = 0.01  # keeps the normal matrix regular where the gradients do not agree at all
 REGULAR = 1e-6  # of the trace: gradients of a cell may all have one direction
 FRESH = 2  # steps at which the reliability of the gradients is estimated anew: it varies little from step to step
+STILL = 0.1  # voxels: step below which a cell has converged
+MOST_STEPS = 25  # by far not converged after so many, a fit never is
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +44,7 @@ class Iterations:
     Attributes
     ----------
     most : int
-        Largest number of steps.
+        Largest number of steps, but for those below.
     stop_voxels : float
         Root mean square step of the cells at which they end, voxels.
     limit_voxels : float
@@ -50,12 +52,15 @@ class Iterations:
     anchoring : float
         Stiffness of springs to the first displacement, as a fraction of the mean stiffness that the intensities give: keeps voxels without
         texture in position while the volumes are far from registered.
+    unsettled : float
+        Fraction of the cells that have not converged, above which the steps go on, up to `MOST_STEPS`.
     """
 
     most: int = 6
     stop_voxels: float = 0.01
     limit_voxels: float = 2.0
     anchoring: float = 0.0
+    unsettled: float = 1.0
 
 
 class CorrelationFit(IntensityComparison):
@@ -87,6 +92,21 @@ class CorrelationFit(IntensityComparison):
         number[tuple(system.cells[:, 2:].T)] = np.arange(len(system.cells))
         return np.asarray(number[tuple(system.cell_of[a][where[a]] for a in (2, 1, 0))])
 
+    @property
+    def last_steps_mm(self) -> FloatArray:
+        """How far the middle of every cell (m,) was moved by the last step, mm."""
+        return np.asarray(np.linalg.norm(self.system.at_middles(self.last_step, every=True), axis=1))
+
+    @property
+    def moving(self) -> BoolArray:
+        """Cells (m,) that have not converged: the last step moved them by a tenth of a voxel or more."""
+        return np.asarray(self.last_steps_mm > STILL * float(np.prod(self.level.spacing) ** (1 / 3)))
+
+    @property
+    def moving_fraction(self) -> float:
+        """Fraction of the cells in the object that have not converged."""
+        return float(self.moving[self.system.inner].mean())
+
     def cell_sums(self, values: AnyFloatArray) -> FloatArray:
         """Return the sums (m,) over the listed voxels (n,) of every cell."""
         return np.bincount(self.cell_of_voxel, np.asarray(values, dtype=float), minlength=len(self.system.cells)).astype(float)
@@ -95,7 +115,9 @@ class CorrelationFit(IntensityComparison):
         """Return the coefficients after Gauss-Newton steps from c; bending (m, 3) and dilatation (m,) are weights of the cells."""
         voxel = float(np.prod(self.level.spacing) ** (1 / 3))
         first = None
-        for k in range(times.most):
+        for k in range(MOST_STEPS):
+            if k >= times.most and self.moving_fraction <= times.unsettled:
+                break
             if k < FRESH:
                 self.reliability = None
             self.compare(c)

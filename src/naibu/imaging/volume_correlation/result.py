@@ -20,15 +20,10 @@ from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable
 
 VOXELS_PER_CELL = 6  # at which the random fields are evaluated: splines vary little within a cell
 SHARED = 0.7  # empirical, cells: SD of the window in which cells share their samples
-STILL = 0.1  # voxels: step below which a cell has converged
 REMAINING = 5.0  # empirical: last steps that a cell which has not converged may still be away from the solution
-# empirical: displacement that is not resolved, of the root mean square second derivative times the square of the resolved length
-UNRESOLVED = 0.0275
-# empirical: bias by the bending penalty, in changes that smoothing the field once more makes, which is itself smoother than the truth.
-# Where texture is faint it, and not what is finer than the data resolve, is most of the error, which then hardly changes with the noise
-SHRINKAGE, BIAS_TOLERANCE = 2.5, 0.03
-SQUARE = 151 / 315  # integral of the square of a cubic B-spline along an axis, in cells
-LEAST_FRACTION = 0.003  # bounds the resolved length to seven cells
+# empirical: standard deviation along every axis of the bias by the bending penalty, in lengths of the change that smoothing the field once
+# more makes. Errors of legs and chests exceed what the samples say by 4 to 5 such lengths in three axes, and along the change only in part
+BIAS, BIAS_TOLERANCE = 2.0, 0.03
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -218,8 +213,9 @@ def collected(
 
     Notes
     -----
-    The samples hold the error of fields as rough as the penalty assumes. That of others is a bias, which is estimated by smoothing the
-    field once more, as in Tukey's twicing :cite:p:`tukey1977`, and added as a variance along its direction.
+    The samples hold the error of fields as rough as the penalty assumes. That of others is a bias, whose size is estimated by smoothing
+    the field once more, as in Tukey's twicing :cite:p:`tukey1977`. Its direction is not: what the penalty took from the true field was not
+    parallel to what it takes from its estimate. It is therefore added as a variance along every axis.
     """
     system, level = fit.system, fit.level
     box = tuple(slice(int(a), int(b)) for a, b in zip(level.low, level.high, strict=True))
@@ -245,28 +241,16 @@ def collected(
     for full, listed in zip(maps, (fit.gain, fit.offset), strict=True):
         full[box][level.mask] = listed
         full[~valid] = np.nan
-    moving = last_steps(fit)
-    variance = _unresolved(fit, c, samples, bending) + np.where(moving > still_mm(fit), (REMAINING * moving) ** 2, 0.0)
-    bias = SHRINKAGE * system.at_middles(system.solved(system.bending_load(c, bending), BIAS_TOLERANCE)[0], every=True)
-    spread = sampled_covariance(fit, samples) + variance[:, None, None] * np.eye(3) + bias[:, :, None] * bias[:, None, :]
+    variance = _bias_variance(fit, c, bending) + np.where(fit.moving, (REMAINING * fit.last_steps_mm) ** 2, 0.0)
+    spread = sampled_covariance(fit, samples) + variance[:, None, None] * np.eye(3)
     covariance = _per_cell(system.grid, fit, spread)
     converged = np.ones(tuple(int(n) for n in system.grid.cells[::-1]), dtype=bool)
-    converged[tuple(system.cells[:, 2:].T)] = (moving <= still_mm(fit)) | ~system.inner
+    converged[tuple(system.cells[:, 2:].T)] = ~fit.moving | ~system.inner
     return CorrelationResult(
         DisplacementField.on_grid(volume, vectors, valid=valid), system.grid, c, volume.direction @ covariance @ volume.direction.T,
         _per_cell(system.grid, fit, bending), dilatation, fit.residual_sd, maps[0], maps[1], converged, inclusions, motions,
         _status(system.grid, volume, converged),
     )  # fmt: skip
-
-
-def last_steps(fit: CorrelationFit) -> FloatArray:
-    """Return how far the middle of every cell (m,) was moved by the last step, mm."""
-    return np.asarray(np.linalg.norm(fit.system.at_middles(fit.last_step, every=True), axis=1))
-
-
-def still_mm(fit: CorrelationFit) -> float:
-    """Return the length of a step, mm, below which a cell has converged."""
-    return STILL * float(np.prod(fit.level.spacing) ** (1 / 3))
 
 
 def sampled_covariance(fit: CorrelationFit, samples: Float32Array) -> FloatArray:
@@ -296,25 +280,11 @@ def sampled_covariance(fit: CorrelationFit, samples: Float32Array) -> FloatArray
     return np.asarray((wide[:, 1:] / wide[:, :1]).reshape(-1, 3, 3))
 
 
-def _unresolved(fit: CorrelationFit, c: FloatArray, samples: Float32Array, bending: FloatArray) -> FloatArray:
-    """Return the variance (m,), mm^2, of displacement that is finer than the data resolve.
-
-    Notes
-    -----
-    Where the data are a fraction s of the stiffness of a coefficient, the rest being the bending penalty, they resolve lengths of about
-    ``h s^(-1/3)``. What is finer is missed: the root mean square second derivative, from field and samples, times the square of that
-    length.
-    """
-    system = fit.system
-    h = float(np.prod(system.grid.step_mm) ** (1 / 3))
-    likely = (system.bending_energy + system.energies(samples, c)[0]).astype(float).mean(axis=1) / h**3
-    known = fit.cell_sums(fit.products[:, [0, 3, 5]].sum(axis=1) / 3)
-    dense = np.zeros((*(int(n) for n in system.grid.cells[::-1]), 2))
-    at = tuple(system.cells[:, 2:].T)
-    dense[at] = np.stack([SQUARE**3 * known, bending.mean(axis=1) * float(np.trace(system.stiffness))], axis=-1)
-    wide = ndimage.gaussian_filter(dense, (SHARED, SHARED, SHARED, 0), mode="constant", truncate=3.0)[at]
-    fraction = np.clip(wide[:, 0] / wide.sum(axis=1), LEAST_FRACTION, 1.0)
-    return np.asarray((UNRESOLVED * h**2) ** 2 * fraction ** (-4 / 3) * likely)
+def _bias_variance(fit: CorrelationFit, c: FloatArray, bending: FloatArray) -> FloatArray:
+    """Return the variance (m,), mm^2 along every axis, of the bias by the bending penalty, as in the notes of `collected`."""
+    again = fit.system.solved(fit.system.bending_load(c, bending), BIAS_TOLERANCE)[0]
+    length = np.linalg.norm(fit.system.at_middles(again, every=True), axis=1)
+    return np.asarray(BIAS**2 * fit.windowed(length**2, SHARED) / fit.windowed(np.ones_like(length), SHARED))
 
 
 def _some_voxels(fit: CorrelationFit) -> tuple[IntArray, IntArray]:
