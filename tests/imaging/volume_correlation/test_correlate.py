@@ -201,6 +201,7 @@ def test_cells_that_have_not_converged_widen_the_covariance_and_are_counted(monk
     before, after, found = waved()
     assert found.converged.all() and found.status.startswith("converged")
     monkeypatch.setattr(gauss_newton, "STILL", 0.0)
+    monkeypatch.setattr(correlate, "UNSETTLED", 1.0)
     monkeypatch.setattr(correlate, "MOST_MOVING", 1.0)
     moving = correlate_volumes(before, after)
     assert not moving.converged.all()

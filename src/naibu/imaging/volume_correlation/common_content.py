@@ -22,7 +22,7 @@ LEAST_AGREEMENT = 0.05
 MATCHED, LEAST_MATCHED = 0.3, 0.75
 # where the residual has the structure of an image, noise does not explain that gradients agree little: a strain too large to be followed
 # leaves 0.28 to 0.5, good fits of legs, chests and small balls 0.7 or more
-MATCHED_IF_STRUCTURED = 0.6
+MATCHED_IF_STRUCTURED, MUCH_STRUCTURE = 0.6, 0.25
 # autocorrelation of the residual at a distance of two voxels: -0.05 to 0.1 where it is the noise of an image that was smoothed by half a
 # voxel, 0.3 where both volumes show different things
 STRUCTURED = 0.15
@@ -51,7 +51,7 @@ class CommonContent:
     @property
     def matched(self) -> BoolArray:
         """Cells (m,) with a texture that both volumes share; the displacement of others would be an extrapolation."""
-        return np.asarray(self.agreement > np.where(self.structure > STRUCTURED, MATCHED_IF_STRUCTURED, MATCHED))
+        return np.asarray(self.agreement > np.where(self.structure > MUCH_STRUCTURE, MATCHED_IF_STRUCTURED, MATCHED))
 
     def refuse_chance(self, inner: BoolArray) -> None:
         """Refuse volumes that agree in a part of the given cells (m,) only, and differ elsewhere by more than noise.

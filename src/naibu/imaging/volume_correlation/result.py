@@ -23,7 +23,7 @@ SHARED = 0.7  # empirical, cells: SD of the window in which cells share their sa
 REMAINING = 5.0  # empirical: last steps that a cell which has not converged may still be away from the solution
 # empirical: standard deviation along every axis of the bias by the bending penalty, in lengths of the change that smoothing the field once
 # more makes. Errors of legs and chests exceed what the samples say by 4 to 5 such lengths in three axes, and along the change only in part
-BIAS, BIAS_TOLERANCE = 2.0, 0.03
+BIAS, BIAS_TOLERANCE = 1.9, 0.03
 
 
 @dataclass(frozen=True, slots=True, eq=False)
