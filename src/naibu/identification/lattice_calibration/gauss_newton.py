@@ -260,7 +260,7 @@ def _searched_by_secants(
 ) -> LatticeEstimate:
     search = SecantSearch(problem, centre, prior_sd, at)
     search.run(max_iterations, reweigh=reweigh)
-    covariance, extra = widened_covariance(search.problem, search.point, centre, prior_sd, at, coarse=search.coarse)
+    covariance, extra = widened_covariance(search.problem, search.point, centre, prior_sd, at)
     found = _estimate(search.problem, search.point, covariance, search.iterations, search.runs + extra)
     return replace(found, settled=search.settled)
 

@@ -2,8 +2,8 @@
 
 A difference by every unknown costs as many simulations as there are unknowns. They are taken at the start and where the search has
 settled; in between every simulation improves the derivatives along the way it went (a rank-one update; :cite:t:`nocedal2006`, chapter 11),
-and they are taken anew only where a step does much less than it promised. Long steps of time carry the search; what fine steps differ from
-them is simulated where it settles, and added to the residuals from then on, until that no longer moves the minimum.
+and they are taken anew only where steps do much less than they promised. The search takes long steps of time first, then goes on with the
+residuals of fine ones; differences are always those of long steps.
 """
 
 from __future__ import annotations
@@ -19,12 +19,11 @@ from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint, 
 from naibu.identification.lattice_calibration.inverse_problem import InverseProblem
 from naibu.identification.lattice_calibration.least_squares import SETTLED, Evaluations, cost_at, next_step, noise_factors
 
+NEAR = 0.1  # change of a logarithm since derivatives were taken, up to which they hold with their updates
 POOR = 0.25  # of the promised decrease, below which a step has failed
 FAILED = 2  # steps one after the other from which on derivatives are not trusted
-ENOUGH = (2e-3, 3e-4, 0.0)  # of the cost, before fine steps are simulated, then once, and then again
-NEAR = 0.1  # change of a logarithm since fine steps were simulated, up to which their correction holds
-CLOSE = 0.2  # change of a logarithm since differences were taken, up to which they hold with their updates
-FINE_RUNS = 8  # at most
+ENOUGH = 2e-3  # of the cost, before fine steps are simulated
+RENEWALS = 5  # of derivatives with fine steps, at most
 BESIDE = 0.1  # least damping of the second step that is tried beside the first
 LEAST_DAMPING = 1e-3
 
@@ -41,16 +40,14 @@ class SecantSearch:
         Of the weak prior.
     at : Evaluations
         Of residuals.
-    theta, coarse : ndarray, tuple of ndarray
-        Where it is, and residuals of long steps there.
-    correction : tuple of ndarray
-        What residuals of fine steps differ from these.
+    theta, residual : ndarray, tuple of ndarray
+        Where it is, and residuals there: of long steps, or of fine ones.
+    fine : bool
+        Which.
     slopes : tuple of ndarray
         Derivatives.
-    differenced : ndarray
-        Where differences were taken last.
     fresh : bool
-        Whether that is theta.
+        Whether these are differences at theta.
     runs, iterations : int
         Simulations, and steps.
     settled : bool
@@ -62,10 +59,9 @@ class SecantSearch:
     prior_sd: float
     at: Evaluations
     theta: FloatArray = field(init=False)
-    coarse: Residual = field(init=False)
-    correction: Residual = field(init=False)
+    residual: Residual = field(init=False)
     slopes: Residual = field(init=False)
-    differenced: FloatArray = field(init=False)
+    fine: bool = False
     fresh: bool = False
     runs: int = 0
     iterations: int = 0
@@ -73,41 +69,32 @@ class SecantSearch:
 
     def __post_init__(self) -> None:
         self.theta = self.centre.copy()
-        self.coarse, *shifted = self._simulated([(self.theta, False), *self._shifted()])
-        self.correction = (np.zeros_like(self.coarse[0]), np.zeros_like(self.coarse[1]))
-        self._take_differences(shifted)
+        self.residual = self._differences()[0]
 
     @property
     def point(self) -> EvaluatedPoint:
-        """Where it is, with residuals of fine steps as far as they are known."""
-        return EvaluatedPoint(self.theta, self._corrected(self.coarse), self.slopes)
+        """Where it is."""
+        return EvaluatedPoint(self.theta, self.residual, self.slopes)
 
     def run(self, max_iterations: int, *, reweigh: bool) -> None:
-        """Search until fine steps no longer move the minimum.
+        """Search with long steps, then with fine ones.
 
         Raises
         ------
         ConvergenceError
             It did not settle within `max_iterations` steps.
         """
-        settled = self._settle(max_iterations, ENOUGH[0])
-        while not settled and not self.fresh:
-            self._take_differences(self._simulated(self._shifted()))
-            settled = self._settle(max_iterations, ENOUGH[0])
-        for k in range(FINE_RUNS):
-            enough = ENOUGH[min(k + 1, 2)]
-            checked = self.theta
-            known = self.fresh or (settled and float(np.abs(self.theta - self.differenced).max()) < CLOSE)
-            fine, *shifted = self._simulated([(self.theta, True), *([] if known else self._shifted())])
-            if shifted:
-                self._take_differences(shifted)
-            self.correction = (fine[0] - self.coarse[0], fine[1] - self.coarse[1])
-            if reweigh and k:  # the first correction does not belong to the minimum
+        while not self._settle(max_iterations, ENOUGH) and not self.fresh:
+            self.residual = self._differences()[0]
+        self.fine = True
+        for _ in range(RENEWALS):
+            before = self.theta
+            self.residual = self._differences((self.theta, True))[1]
+            self.settled = self._settle(max_iterations)
+            if reweigh and self.settled:
                 self._weigh()
-            settled = self._settle(max_iterations, enough)
-            moved = float(np.abs(self.theta - checked).max())
-            self.settled = settled and moved < NEAR
-            if self.settled or moved == 0.0:
+                self.settled = self._settle(max_iterations)
+            if self.fresh or (self.settled and float(np.abs(self.theta - before).max()) < NEAR):
                 return
 
     def _settle(self, max_iterations: int, enough: float = 0.0) -> bool:
@@ -115,7 +102,7 @@ class SecantSearch:
 
         `enough` is a decrease, as a fraction of the cost, that is not worth a step either.
         """
-        cost, damping, failed = self._cost(self.theta, self.coarse), 0.0, 0
+        cost, damping, failed = self._cost(self.theta, self.residual), 0.0, 0
         for _ in range(max_iterations):
             self.at.keep(self.problem, self.point)
             dampings = (damping, max(10.0 * damping, BESIDE))
@@ -125,7 +112,7 @@ class SecantSearch:
                 return True
             self.iterations += 1
             trials = [np.log(self.problem.unknowns.held(np.exp(self.theta + step))) for step, _ in steps]
-            tried = self._simulated([(theta, False) for theta in trials])
+            tried = self._simulated([(theta, self.fine) for theta in trials])
             costs = [self._cost(theta, found) for theta, found in zip(trials, tried, strict=True)]
             order = [int(k) for k in np.argsort(costs)[::-1]]  # the best last: what it tells stays
             for k in order:
@@ -133,7 +120,7 @@ class SecantSearch:
             best = order[-1]
             failed = failed + 1 if cost - costs[best] < POOR * promised else 0
             if costs[best] < cost:
-                self.theta, self.coarse, cost, self.fresh = trials[best], tried[best], costs[best], False
+                self.theta, self.residual, cost, self.fresh = trials[best], tried[best], costs[best], False
                 damping = 0.3 * dampings[best] if dampings[best] > LEAST_DAMPING else 0.0
             else:
                 damping = max(10.0 * damping, BESIDE)
@@ -149,26 +136,27 @@ class SecantSearch:
         self.runs += len(trials)
         return self.at.many(self.problem, trials)
 
-    def _shifted(self) -> list[tuple[FloatArray, bool]]:
-        return [(self.theta + row, False) for row in np.diag(self._shifts())]
+    def _differences(self, *others: tuple[FloatArray, bool]) -> list[Residual]:
+        """Take derivatives by differences of long steps: by the values, in which forces are nearly linear.
 
-    def _shifts(self) -> FloatArray:
+        Returns residuals of long steps at theta, and those of other simulations that are made beside.
+        """
         shifts = self.problem.shifts(np.exp(self.theta))
         assert shifts is not None
-        return shifts
-
-    def _take_differences(self, shifted: Sequence[Residual]) -> None:
-        """Take derivatives from residuals at shifted parameters."""
+        shifted = [(self.theta + row, False) for row in np.diag(shifts)]
+        found = self._simulated([*others, (self.theta, False), *shifted])
+        base, moved = found[len(others)], found[len(others) + 1 :]
         points, forces = (
-            np.stack([(found[k] - self.coarse[k]) / h for found, h in zip(shifted, self._shifts(), strict=True)], axis=1) for k in range(2)
+            np.stack([(own[k] - base[k]) / np.expm1(h) for own, h in zip(moved, shifts, strict=True)], axis=1) for k in range(2)
         )
-        self.slopes, self.fresh, self.differenced = (points, forces), True, self.theta
+        self.slopes, self.fresh = (points, forces), True
+        return [base, *found[: len(others)]]
 
     def _update(self, step: FloatArray, found: Residual) -> None:
-        """Make the derivatives (count, p) tell what a step from theta, with the residuals of long steps that were found, did."""
+        """Make the derivatives (count, p) tell what a step from theta, with the residuals that were found, did."""
         if not step.any():
             return
-        for slopes, new, old in zip(self.slopes, found, self.coarse, strict=True):
+        for slopes, new, old in zip(self.slopes, found, self.residual, strict=True):
             slopes += np.outer(new - old - slopes @ step, step) / float(step @ step)
 
     def _weigh(self) -> None:
@@ -177,12 +165,7 @@ class SecantSearch:
         excess = (max(factors[0], 1.0), max(factors[1], 1.0))
         points, forces = (old / new for old, new in zip(self.problem.excess, excess, strict=True))
         self.problem = self.problem.enlarged(excess)
-        self.coarse, self.correction, self.slopes = (
-            (pair[0] * points, pair[1] * forces) for pair in (self.coarse, self.correction, self.slopes)
-        )
+        self.residual, self.slopes = ((pair[0] * points, pair[1] * forces) for pair in (self.residual, self.slopes))
 
-    def _corrected(self, coarse: Residual) -> Residual:
-        return coarse[0] + self.correction[0], coarse[1] + self.correction[1]
-
-    def _cost(self, theta: FloatArray, coarse: Residual) -> float:
-        return cost_at(self._corrected(coarse), theta, self.centre, self.prior_sd)
+    def _cost(self, theta: FloatArray, residual: Residual) -> float:
+        return cost_at(residual, theta, self.centre, self.prior_sd)

@@ -17,8 +17,7 @@ from naibu.mechanics.lattices.model.lattice import require_positive
 from naibu.mechanics.lattices.model.surface import surface_of
 from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy
 
-WINDOW_S = 0.02  # of tied studies
-TOUCHING_WINDOW_S = 0.04  # in contact, where derivatives are differences
+WINDOW_S = 0.02
 ROUGHNESS = 1e-4  # of chi-squared in contact
 
 
@@ -53,7 +52,7 @@ class RecordedForces:
         records: Sequence[tuple[int, FloatArray, FloatArray]],
         *,
         sd_mn: float | None = None,
-        window_s: float | None = None,
+        window_s: float = WINDOW_S,
     ) -> RecordedForces:
         """Average samples over windows of time, the same for all records.
 
@@ -69,7 +68,7 @@ class RecordedForces:
         sd_mn : float
             Standard deviation of a component of a sample, mN; by default estimated from second differences of neighbouring samples.
         window_s : float
-            s; by default 0.02 s of tied studies and 0.04 s in contact.
+            s.
 
         Raises
         ------
@@ -79,8 +78,7 @@ class RecordedForces:
         if sd_mn is not None:
             require_positive(sd_mn, "force_sd_mn", "mN")
         slowest = max((float(np.median(np.diff(times))) for _, times, _ in records), default=0.0)
-        least = (WINDOW_S if study.tied else TOUCHING_WINDOW_S) if window_s is None else window_s
-        each = max(1, round(least / study.step_s), int(np.ceil(1.0001 * slowest / study.step_s)))
+        each = max(1, round(window_s / study.step_s), int(np.ceil(1.0001 * slowest / study.step_s)))
         end = round(study.frames * study.frame_s / study.step_s)
         windows, bodies = end // each, len(study.bodies)
         if windows == 0:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from naibu.core.arrays import FloatArray
-from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint, Residual
+from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint
 from naibu.identification.lattice_calibration.inverse_problem import InverseProblem
 from naibu.identification.lattice_calibration.least_squares import SETTLED, Evaluations, cost_at, cost_of, covariance_at
 
@@ -31,7 +31,7 @@ class _End:
 
 
 def widened_covariance(
-    problem: InverseProblem, point: EvaluatedPoint, centre: FloatArray, prior_sd: float, at: Evaluations, *, coarse: Residual | None = None
+    problem: InverseProblem, point: EvaluatedPoint, centre: FloatArray, prior_sd: float, at: Evaluations
 ) -> tuple[FloatArray, int]:
     """Return the covariance at a point, widened along its least determined combinations to where chi-squared says; and the runs.
 
@@ -50,15 +50,10 @@ def widened_covariance(
         Of the weak prior.
     at : Evaluations
         Of residuals.
-    coarse : tuple of ndarray
-        Residuals of long steps at the point; simulated by default.
     """
     covariance = covariance_at(point, prior_sd)
     values, vectors = np.linalg.eigh(covariance)
-    runs = 0
-    if coarse is None:
-        coarse, runs = at.many(problem, [(point.theta, False)])[0], 1
-    fine = point.residual
+    coarse, runs, fine = at.many(problem, [(point.theta, False)])[0], 1, point.residual
     least, hessian = cost_of(point, centre, prior_sd), np.linalg.inv(covariance)
     ends = []
     for value, vector in list(zip(values, vectors.T, strict=True))[::-1][:PROFILED]:

@@ -65,9 +65,13 @@ class ForceWave:
     def of(cls, title: str, capture: Capture, pushed: PushedLattice, motion: Reproduced) -> ForceWave:
         """Return the force of a motion while the indenters touch."""
         computed = np.repeat(motion.force, round(pushed.long_step / SAMPLE_S), axis=0)
-        times = SAMPLE_S * (np.arange(len(computed)) + 0.5)
-        measured, found = (np.sqrt((1e-6 * force[:, SENSOR] ** 2).sum(axis=1)) for force in (capture.force, computed))
-        return cls(title, times, measured, found)
+        times = np.asarray(SAMPLE_S * (np.arange(len(computed)) + 0.5), dtype=np.float64)
+        return cls(title, times, _newtons(capture.force[:, SENSOR]), _newtons(computed[:, SENSOR]))
+
+
+def _newtons(force: FloatArray) -> FloatArray:
+    """Return the sizes (k,), N, of forces (k, 3), mN."""
+    return np.asarray(1e-3 * np.sqrt((force**2).sum(axis=1)), dtype=np.float64)
 
 
 def final_shapes(shapes: Sequence[FinalShape]) -> Draw:
