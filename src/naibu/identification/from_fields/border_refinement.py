@@ -5,9 +5,8 @@ depend on which cells these are, by more than their standard errors. Moduli and 
 the moduli holds what is not known of the borders.
 
 Cells are a poor start where a region is only a few of them wide. Borders of compact regions therefore start as spheres as well, and the
-better end counts. Four cells across make a lump of three times the modulus about a third too stiff and a quarter too small; the fit is
-therefore corrected for what cells of half the size change (defect correction, :cite:p:`stetter1978`); what half of their size would change
-once more is part of the doubt.
+better end counts. Few cells across make a stiff lump too stiff and too small; the fit is therefore corrected for what cells of half the
+size change (defect correction, :cite:p:`stetter1978`); what half of their size would change once more is part of the doubt.
 """
 
 from __future__ import annotations
