@@ -81,10 +81,10 @@ def final_shapes(shapes: Sequence[FinalShape]) -> Draw:
         from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
 
         for k, shape in enumerate(shapes):
-            axes = canvas.add_subplot((len(shapes) + 1) // 2, 2, k + 1, projection="3d")
+            axes = canvas.add_subplot((len(shapes) + 1) // 2, 2, k + 1, projection="3d", computed_zorder=False)
             faces = Poly3DCollection(shape.position[shape.triangles], facecolors="#b9cbd9", edgecolors="#5c7080", linewidths=0.2, alpha=0.6)
             axes.add_collection3d(faces)
-            axes.scatter(*shape.far.T, s=3.0, c="#e8710a", depthshade=False)
+            axes.scatter(*shape.far.T, s=3.0, c="#e8710a", depthshade=False, zorder=3)
             low, high = shape.position.min(axis=0), shape.position.max(axis=0)
             middle, half = 0.5 * (low + high), 0.45 * float((high - low).max())
             axes.set(**{f"{a}lim": (m - half, m + half) for a, m in zip("xyz", middle, strict=True)})
