@@ -49,7 +49,7 @@ def test_moduli_of_outlined_zones(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "lump_within"), [(0, 0.15), (1, 0.5)])
+@pytest.mark.parametrize(("seed", "lump_within"), [(0, 0.15), (1, 0.15)])
 def test_a_lump_is_found_in_the_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, lump_within: float) -> None:
     """Size and stiffness of a small lump can be told from each other roughly: its interval holds the truth, and nothing else is found."""
     scans = scanned_liver(seed=seed)
@@ -65,7 +65,7 @@ def test_a_lump_is_found_in_the_map(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     zones = zones_of(tmp_path / "found")
     assert len(zones) == 2
     found = read_volume(tmp_path / "found" / "zones.mha").values == 2
-    assert 2.0 * (found & scans.lump).sum() / (found.sum() + scans.lump.sum()) > 0.8
+    assert 2.0 * (found & scans.lump).sum() / (found.sum() + scans.lump.sum()) > 0.85
     for zone, (young, _), within in zip(zones, (LIVER, LUMP), (0.15, lump_within), strict=True):
         assert zone["95 % from"] < young < zone["to"]
         assert zone["Young's modulus, kPa"] == pytest.approx(young, rel=within)
