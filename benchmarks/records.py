@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from naibu.cli.version import version_text
+from naibu.cli.shell.version import version_text
 from naibu.io.files.atomic import write_atomically
 
 FOLDER = Path(__file__).resolve().parent / "results"

@@ -17,8 +17,8 @@ import pytest
 from virtual_press import Press
 
 from naibu import cli, datasets
-from naibu.cli.run_record import RunRecord
-from naibu.cli.version import checked_out_commit
+from naibu.cli.shell.run_record import RunRecord
+from naibu.cli.shell.version import checked_out_commit
 from naibu.io.experiment_folder.reader import read_experiment
 from naibu.io.experiment_folder.schema import Meta
 

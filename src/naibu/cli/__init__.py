@@ -20,10 +20,11 @@ from naibu.cli import (  # noqa: F401  they bring their verbs
     studies,
     touching,
 )
-from naibu.cli.cold_start import first_run
-from naibu.cli.console import BAD_INPUT, COMMANDS, FAILED, INTERRUPTED, app, errors, fail, print_table, progress_display, say
-from naibu.cli.described import Flag
-from naibu.cli.failures import (
+from naibu.cli.installation import doctor_rows, healthy
+from naibu.cli.shell.cold_start import first_run
+from naibu.cli.shell.console import BAD_INPUT, COMMANDS, FAILED, INTERRUPTED, app, errors, fail, print_table, progress_display, say
+from naibu.cli.shell.described import Flag
+from naibu.cli.shell.failures import (
     OutputLostError,
     flush_output,
     leave_quietly,
@@ -33,10 +34,9 @@ from naibu.cli.failures import (
     require_room,
     unexpected,
 )
-from naibu.cli.installation import doctor_rows, healthy
-from naibu.cli.option_names import in_options, usage_error
-from naibu.cli.run_record import RunRecord, current_run, recorded_run
-from naibu.cli.verbs import START, verb
+from naibu.cli.shell.option_names import in_options, usage_error
+from naibu.cli.shell.run_record import RunRecord, current_run, recorded_run
+from naibu.cli.shell.verbs import START, verb
 from naibu.core.errors import ConvergenceError, NaibuError, WorkerLostError
 from naibu.core.memory import is_out_of_memory
 

@@ -7,10 +7,10 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from naibu.cli.console import WARNING, print_table, say
-from naibu.cli.described import Out, Overwrite, Whole
-from naibu.cli.run_record import wrote
-from naibu.cli.verbs import SCANS, SIMULATE, verb
+from naibu.cli.shell.console import WARNING, print_table, say
+from naibu.cli.shell.described import Out, Overwrite, Whole
+from naibu.cli.shell.run_record import wrote
+from naibu.cli.shell.verbs import SCANS, SIMULATE, verb
 from naibu.core.errors import InputError
 
 

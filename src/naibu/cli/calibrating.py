@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from naibu.cli.console import INTERRUPTED, WARNING, errors, print_table, progress_display, say
-from naibu.cli.described import Flag, Out, Overwrite, Whole
-from naibu.cli.run_record import wrote
+from naibu.cli.shell.console import INTERRUPTED, WARNING, errors, print_table, progress_display, say
+from naibu.cli.shell.described import Flag, Out, Overwrite, Whole
+from naibu.cli.shell.run_record import wrote
+from naibu.cli.shell.verbs import SIMULATE, verb
 from naibu.cli.studies import stopped_gently
-from naibu.cli.verbs import SIMULATE, verb
 from naibu.core.errors import InputError
 from naibu.core.progress import ProgressReport
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from naibu.cli.console import print_table, progress_display, say
-from naibu.cli.described import Flag, Known, Layers, Out, Overwrite, Whole, labels_of, layers_of
-from naibu.cli.run_record import wrote
-from naibu.cli.verbs import START, verb
+from naibu.cli.shell.console import print_table, progress_display, say
+from naibu.cli.shell.described import Flag, Known, Layers, Out, Overwrite, Whole, labels_of, layers_of
+from naibu.cli.shell.run_record import wrote
+from naibu.cli.shell.verbs import START, verb
 
 
 @verb(

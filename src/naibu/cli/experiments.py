@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from naibu.cli.console import GRAVE, INTERRUPTED, NOT_EXPLAINED, WARNING, print_table, progress_display, say
-from naibu.cli.described import Flag, Known, ObjectOptions, Out, Overwrite, WorkerOptions, require_left_out
 from naibu.cli.identifying import ContactModel, Joined, Law, PixelScale, Unit, identify_from_both, identify_from_fields
-from naibu.cli.run_record import found, wrote
-from naibu.cli.verbs import MARKERS, START, verb
+from naibu.cli.shell.console import GRAVE, INTERRUPTED, NOT_EXPLAINED, WARNING, print_table, progress_display, say
+from naibu.cli.shell.described import Flag, Known, ObjectOptions, Out, Overwrite, WorkerOptions, require_left_out
+from naibu.cli.shell.run_record import found, wrote
+from naibu.cli.shell.verbs import MARKERS, START, verb
 from naibu.core.errors import InputError
 
 # imported where used, so that --help is immediate and doctor runs even if numpy is broken

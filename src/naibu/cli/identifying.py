@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from naibu.cli.console import GRAVE, NOT_EXPLAINED, print_table, progress_display, say
-from naibu.cli.described import labels_of
-from naibu.cli.run_record import found, wrote
+from naibu.cli.shell.console import GRAVE, NOT_EXPLAINED, print_table, progress_display, say
+from naibu.cli.shell.described import labels_of
+from naibu.cli.shell.run_record import found, wrote
 from naibu.core.errors import InputError
 
 Unit = Literal["mm", "cm", "m", "um", "inch"]

@@ -7,10 +7,10 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from naibu.cli.console import WARNING, print_table, progress_display, say
-from naibu.cli.described import Flag, ObjectOptions, Out, Overwrite, PairOptions, Whole, require_left_out
-from naibu.cli.run_record import wrote
-from naibu.cli.verbs import MARKERS, SCANS, verb
+from naibu.cli.shell.console import WARNING, print_table, progress_display, say
+from naibu.cli.shell.described import Flag, ObjectOptions, Out, Overwrite, PairOptions, Whole, require_left_out
+from naibu.cli.shell.run_record import wrote
+from naibu.cli.shell.verbs import MARKERS, SCANS, verb
 from naibu.core.errors import InputError
 
 # other parts are imported where they are used: --help answers at once

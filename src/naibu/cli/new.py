@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from naibu.cli.console import say
-from naibu.cli.described import Out, Overwrite
-from naibu.cli.run_record import wrote
-from naibu.cli.verbs import START, verb
+from naibu.cli.shell.console import say
+from naibu.cli.shell.described import Out, Overwrite
+from naibu.cli.shell.run_record import wrote
+from naibu.cli.shell.verbs import START, verb
 
 KindName = Literal["experiment", "lattice", "indentation", "chip", "fingertip", "ischemia"]
 

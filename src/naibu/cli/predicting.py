@@ -8,10 +8,10 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from naibu.cli.console import say
-from naibu.cli.described import Flag, Out, Overwrite
-from naibu.cli.run_record import found, wrote
-from naibu.cli.verbs import MARKERS, verb
+from naibu.cli.shell.console import say
+from naibu.cli.shell.described import Flag, Out, Overwrite
+from naibu.cli.shell.run_record import found, wrote
+from naibu.cli.shell.verbs import MARKERS, verb
 from naibu.core.errors import InputError
 
 

@@ -10,10 +10,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
-from naibu.cli.console import INTERRUPTED, errors, print_table, progress_display, say
-from naibu.cli.described import Flag, Out, Overwrite, Whole, WorkerOptions
-from naibu.cli.run_record import wrote
-from naibu.cli.verbs import REPRODUCE, SIMULATE, verb
+from naibu.cli.shell.console import INTERRUPTED, errors, print_table, progress_display, say
+from naibu.cli.shell.described import Flag, Out, Overwrite, Whole, WorkerOptions
+from naibu.cli.shell.run_record import wrote
+from naibu.cli.shell.verbs import REPRODUCE, SIMULATE, verb
 from naibu.core.errors import InputError
 from naibu.core.progress import ProgressReport
 

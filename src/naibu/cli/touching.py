@@ -6,10 +6,10 @@ import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from naibu.cli.console import errors, progress_display, say
-from naibu.cli.described import Out, Overwrite, Whole
-from naibu.cli.run_record import wrote
-from naibu.cli.verbs import TOUCH, verb
+from naibu.cli.shell.console import errors, progress_display, say
+from naibu.cli.shell.described import Out, Overwrite, Whole
+from naibu.cli.shell.run_record import wrote
+from naibu.cli.shell.verbs import TOUCH, verb
 from naibu.core.errors import InputError
 
 if TYPE_CHECKING:

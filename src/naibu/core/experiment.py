@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Literal
 
 from naibu.core.errors import InputError
@@ -148,8 +148,8 @@ class Experiment:
     up_axis: Axis = "z"
     dimensions: Literal[2, 3] = 3
     known_problems: tuple[str, ...] = ()
-    scanner: MappingProxyType[str, object] = field(default_factory=lambda: MappingProxyType({}))
-    input_hashes: MappingProxyType[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    scanner: Mapping[str, object] = field(default_factory=dict)
+    input_hashes: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def initial(self) -> Markers:

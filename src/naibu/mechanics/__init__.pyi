@@ -26,11 +26,11 @@ from .finite_elements.assembly import Assembler, body_force
 from .finite_elements.boundary_conditions import PrescribedDisplacement
 from .finite_elements.elements import Elements, elements
 from .finite_elements.hyperelasticity import Law, Material, lame_parameters, law_named, material
-from .finite_strain.dynamic_session import DynamicEngine, DynamicSession, DynamicState
 from .finite_strain.problem import Problem, SolverSettings
-from .finite_strain.quasi_static_session import EquilibriumState, QuasiStaticEngine, QuasiStaticSession
-from .finite_strain.real_time_session import RealTimeEngine, RealTimeSession
 from .finite_strain.sensitivities import sensitivities
+from .finite_strain.sessions.dynamic_session import DynamicEngine, DynamicSession, DynamicState
+from .finite_strain.sessions.quasi_static_session import EquilibriumState, QuasiStaticEngine, QuasiStaticSession
+from .finite_strain.sessions.real_time_session import RealTimeEngine, RealTimeSession
 from .finite_strain.statics import LoadState, Solution, solve
 from .finite_strain.viscoelasticity import PronySeries, ViscoelasticSolution, simulate_viscoelastic
 from .lattices.cpu.engine import LatticeEngine

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from naibu.core.errors import NaibuError
-from naibu.mechanics.finite_strain.dynamic_session import DynamicState
+from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicState
 from naibu.meshing.cutting.swept_blade import SweptBlade
 from naibu.meshing.cutting.volume import VolumeCut
 from naibu.simulation.interactive_bodies import FiniteElementBody

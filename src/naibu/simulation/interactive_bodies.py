@@ -17,9 +17,9 @@ from naibu.mechanics.contact.session_protocol import Session
 from naibu.mechanics.finite_elements.assembly import Assembler, body_force
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import material
-from naibu.mechanics.finite_strain.dynamic_session import DynamicEngine, DynamicState
 from naibu.mechanics.finite_strain.lip_assembly import with_lips
-from naibu.mechanics.finite_strain.real_time_session import RealTimeEngine, RealTimeSession
+from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicEngine, DynamicState
+from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeEngine, RealTimeSession
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState
 from naibu.mechanics.lattices.model.surface import surface_triangles

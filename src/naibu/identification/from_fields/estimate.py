@@ -321,6 +321,7 @@ class _Recipe:
         """Return moduli that were fitted without a penalty, with the errors of measurement, discretisation and knowledge."""
         at = model.linearised(point)
         quadratic = at.concentrated(np.eye(2 * model.zones.count))
+        shift: FloatArray | None
         if corrected is not None:
             theta, residuals, shift = corrected.refined.theta, corrected.residuals, corrected.shift
         else:

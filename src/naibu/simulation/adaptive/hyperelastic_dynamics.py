@@ -18,9 +18,9 @@ from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import Material
-from naibu.mechanics.finite_strain.implicit_step import ImplicitStep
 from naibu.mechanics.finite_strain.lip_assembly import with_lips
 from naibu.mechanics.finite_strain.penalties import relative_penetrations, with_less_penetration
+from naibu.mechanics.finite_strain.sessions.implicit_step import ImplicitStep
 from naibu.mechanics.finite_strain.viscoelasticity import HistoryVariables, PronySeries, ViscoelasticBody
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
 from naibu.mechanics.linear_algebra.recycled_lu import RecycledLU

@@ -6,7 +6,7 @@ import pytest
 from cyclopts import CycloptsError
 
 from naibu.cli import app
-from naibu.cli.option_names import OTHER_NAMES, in_options, usage_error
+from naibu.cli.shell.option_names import OTHER_NAMES, in_options, usage_error
 
 SAID = {
     "predict": [

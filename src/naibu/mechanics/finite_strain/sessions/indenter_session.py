@@ -20,7 +20,7 @@ from naibu.mechanics.contact.indenter_motion import IndenterMotion
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.contact.session_protocol import StepForces
-from naibu.mechanics.finite_strain.session_checks import checked_bodies, checked_velocities, require_state
+from naibu.mechanics.finite_strain.sessions.session_checks import checked_bodies, checked_velocities, require_state
 
 
 class TouchedState(Protocol):

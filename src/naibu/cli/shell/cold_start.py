@@ -15,7 +15,7 @@ from types import FrameType
 from rich.console import Console
 
 from naibu._numba.reports import reported_compilation
-from naibu.cli.console import INTERRUPTED
+from naibu.cli.shell.console import INTERRUPTED
 
 TERMINATED = 143  # exit code after SIGTERM, as shells have it
 INTERVAL_S = 5.0  # between lines of progress

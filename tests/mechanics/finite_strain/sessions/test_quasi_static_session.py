@@ -18,7 +18,7 @@ from naibu.mechanics.contact.rigid_indenters import RigidIndenter, box_indenter,
 from naibu.mechanics.contact.session_protocol import Engine
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
-from naibu.mechanics.finite_strain.quasi_static_session import EquilibriumState, QuasiStaticEngine
+from naibu.mechanics.finite_strain.sessions.quasi_static_session import EquilibriumState, QuasiStaticEngine
 from naibu.mechanics.finite_strain.statics import solve
 from naibu.meshing.primitives import box
 from naibu.meshing.surface import faces_towards, side_nodes

@@ -28,8 +28,8 @@ from rich.progress import (
 from rich.progress import Progress as Display
 from rich.table import Table
 
-from naibu.cli.run_record import current_run
-from naibu.cli.version import version_text
+from naibu.cli.shell.run_record import current_run
+from naibu.cli.shell.version import version_text
 from naibu.core.progress import Progress, ProgressReport
 
 COMMANDS = Group("This program", sort_key=90)

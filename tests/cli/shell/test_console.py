@@ -7,7 +7,7 @@ import io
 import pytest
 from rich.console import Console
 
-from naibu.cli import console
+from naibu.cli.shell import console
 from naibu.core.progress import ProgressReport, report_progress
 
 

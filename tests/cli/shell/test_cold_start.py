@@ -17,7 +17,7 @@ from rich.console import Console
 
 from naibu import cli
 from naibu._numba.reports import report
-from naibu.cli.cold_start import SECONDS, TERMINATED, CompilationNotice, first_run
+from naibu.cli.shell.cold_start import SECONDS, TERMINATED, CompilationNotice, first_run
 from naibu.workflows.installation import warm_up
 
 

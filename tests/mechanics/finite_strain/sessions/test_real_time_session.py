@@ -25,9 +25,9 @@ from naibu.mechanics import (
     spherical_indenter,
 )
 from naibu.mechanics.contact.indenter_contacts import indenter_contacts
-from naibu.mechanics.finite_strain import real_time_session
-from naibu.mechanics.finite_strain.dynamic_session import DynamicSession
-from naibu.mechanics.finite_strain.real_time_session import RealTimeSession
+from naibu.mechanics.finite_strain.sessions import real_time_session
+from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicSession
+from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeSession
 from naibu.meshing import boundary_faces, box
 from naibu.meshing.element_conversion import to_tetra
 

@@ -7,8 +7,8 @@ import pytest
 import scipy.sparse as sp
 
 from naibu.core.arrays import FloatArray
-from naibu.mechanics.finite_strain.condensed_contact import CondensedContact
-from naibu.mechanics.finite_strain.earlier_tangent import EarlierTangent
+from naibu.mechanics.finite_strain.sessions.condensed_contact import CondensedContact
+from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
 from naibu.mechanics.linear_algebra.direct import SuperLUSolver
 from naibu.mechanics.linear_algebra.updated_factors import BlockChange, UpdatedFactors
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from cyclopts import Group
 
-from naibu.cli.console import app
+from naibu.cli.shell.console import app
 
 START = Group("Start", sort_key=1)
 MARKERS = Group("Markers: from positions to a calibrated model", sort_key=2)

@@ -20,9 +20,9 @@ from naibu.mechanics.contact.indenter_motion import IndenterForce, IndenterMotio
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
-from naibu.mechanics.finite_strain.indenter_session import IndenterSession
 from naibu.mechanics.finite_strain.penalties import with_normal_stiffness
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
+from naibu.mechanics.finite_strain.sessions.indenter_session import IndenterSession
 from naibu.mechanics.finite_strain.statics import LoadState, Solution, solve
 
 IN_FEW_STEPS = SolverSettings(first_step=0.5, largest_step=1.0)

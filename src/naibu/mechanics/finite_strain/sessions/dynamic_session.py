@@ -1,10 +1,11 @@
 """Dynamic sessions of finite elements: nonlinear implicit Euler steps with rigid indenters, for bodies that are touched in real time.
 
-A step solves the balance of momentum of backward Euler (`naibu.mechanics.finite_strain.implicit_step`) by a few Newton iterations whose
-linear systems are solved by stabilised biconjugate gradients with the LU factors of an earlier matrix :cite:p:`courtecuisse2010`. A step
-that does not converge, as where an indenter stops at once, is taken in halves, and one in which an indenter would pass through the body in
-shorter ones, by conservative advancement :cite:p:`ericson2005`. Backward Euler damps motions that are faster than a step; where the
-indenters rest, the body settles in the equilibrium of `naibu.mechanics.finite_strain.statics`, with the same elements, law and contact.
+A step solves the balance of momentum of backward Euler (`naibu.mechanics.finite_strain.sessions.implicit_step`) by a few Newton
+iterations whose linear systems are solved by stabilised biconjugate gradients with the LU factors of an earlier matrix
+:cite:p:`courtecuisse2010`. A step that does not converge, as where an indenter stops at once, is taken in halves, and one in which an
+indenter would pass through the body in shorter ones, by conservative advancement :cite:p:`ericson2005`. Backward Euler damps motions that
+are faster than a step; where the indenters rest, the body settles in the equilibrium of `naibu.mechanics.finite_strain.statics`, with the
+same elements, law and contact.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ from naibu.mechanics.contact.indenter_motion import IndenterForce, IndenterMotio
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.assembly import Assembler
-from naibu.mechanics.finite_strain.implicit_step import ImplicitStep
-from naibu.mechanics.finite_strain.indenter_session import IndenterSession
 from naibu.mechanics.finite_strain.penalties import relative_penetrations, with_less_penetration
+from naibu.mechanics.finite_strain.sessions.implicit_step import ImplicitStep
+from naibu.mechanics.finite_strain.sessions.indenter_session import IndenterSession
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
 from naibu.mechanics.linear_algebra.recycled_lu import RecycledLU
 

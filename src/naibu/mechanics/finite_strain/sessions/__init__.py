@@ -1,0 +1,1 @@
+"""Bodies of finite elements stepped while somebody touches them."""
