@@ -15,8 +15,8 @@ import scipy.sparse as sp
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError
 from naibu.mechanics.contact.penalty_contact import ContactResponse
+from naibu.mechanics.finite_strain.nearby_contact import add_contact_forces
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
-from naibu.mechanics.finite_strain.sessions.nearby_contact import add_contact_forces
 from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
 from naibu.mechanics.linear_algebra.iterative import ApproximateFactorization
 from naibu.mechanics.linear_algebra.protocols import Factorization, LinearSolver

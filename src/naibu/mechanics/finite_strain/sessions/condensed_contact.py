@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
+from naibu.mechanics.finite_strain.nearby_contact import NearbyContact
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent, add_earlier_forces, contact_change
-from naibu.mechanics.finite_strain.sessions.nearby_contact import NearbyContact
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 from naibu.mechanics.linear_algebra.updated_factors import BlockChange, ChangedInverse
 

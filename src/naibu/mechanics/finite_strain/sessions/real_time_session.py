@@ -22,11 +22,11 @@ from naibu.mechanics.contact.indenter_motion import parts_of_approach, slow_enou
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.pressure_elements import PressureElements
+from naibu.mechanics.finite_strain.nearby_contact import NearbyContact, local_positions
 from naibu.mechanics.finite_strain.penalties import with_less_penetration
 from naibu.mechanics.finite_strain.sessions.condensed_contact import CondensedContact, ContactBesideTangent
 from naibu.mechanics.finite_strain.sessions.dynamic_session import PENETRATION, DynamicEngine, DynamicSession, DynamicState
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent, SolverPool, TangentThread
-from naibu.mechanics.finite_strain.sessions.nearby_contact import NearbyContact, local_positions
 from naibu.mechanics.linear_algebra.anderson import AndersonMixing
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern, block_pattern, with_dirichlet_rows
 from naibu.mechanics.linear_algebra.direct import PardisoSolver, SuperLUSolver, pardiso_library

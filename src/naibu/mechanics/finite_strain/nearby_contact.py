@@ -9,7 +9,7 @@ import numpy as np
 from naibu.core.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from naibu.mechanics.contact.indenter_geometry import packed_geometry
 from naibu.mechanics.contact.penalty_contact import Contact, ContactResponse
-from naibu.mechanics.finite_strain.sessions._nearby_kernels import add_forces, local
+from naibu.mechanics.finite_strain._nearby_kernels import add_forces, local
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 
 

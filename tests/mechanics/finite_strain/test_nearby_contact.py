@@ -8,7 +8,7 @@ import pytest
 from naibu.core.arrays import FloatArray
 from naibu.mechanics import RigidIndenter, box_indenter, cylindrical_indenter, plane_indenter, spherical_indenter
 from naibu.mechanics.contact.indenter_contacts import indenter_contacts
-from naibu.mechanics.finite_strain.sessions.nearby_contact import NearbyContact, local_positions
+from naibu.mechanics.finite_strain.nearby_contact import NearbyContact, local_positions
 from naibu.meshing import boundary_faces, box
 
 SIZE = 30.0
