@@ -14,10 +14,11 @@ from naibu.cli import main
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
+from naibu.identification.joint_estimate import NormalEstimate, joint_estimate
 from naibu.io.displacement_fields import write_field
 from naibu.io.images import write_volume
 from naibu.validation.specimens.quadratic_body import QuadraticBody
-from naibu.workflows.joint_identification import identify_jointly, told_by_markers
+from naibu.workflows.joint_identification import JointIdentification, identify_jointly, table_of_moduli, told_by_markers
 from naibu.workflows.results.result_folder import read_model
 
 SOFT, FIRM = (TRUTH["soft: young_modulus"], TRUTH["soft: poisson_ratio"]), (TRUTH["firm: young_modulus"], TRUTH["firm: poisson_ratio"])
@@ -76,6 +77,17 @@ def test_scales_of_moduli_agree_with_finite_differences(press: Press) -> None:
     at, step = p.inner(p.value), 1e-5
     slope = (np.log(1.0 - 2.0 * p.physical(at + step)) - np.log(1.0 - 2.0 * p.physical(at - step))) / (2.0 * step)
     assert told.standard_deviation(p.name) == pytest.approx(abs(slope) * model.standard_deviation(p.name), rel=1e-6)
+
+
+def test_a_table_for_a_notebook_holds_what_each_kind_tells(press: Press) -> None:
+    parts = [NormalEstimate(("soft: young_modulus",), np.log([e]), np.array([[0.01]])) for e in (10.0, 11.0)]
+    joint = joint_estimate(parts)
+    table = table_of_moduli(parts, joint, relative=False)
+    shown = JointIdentification(press.identification, None, joint, table, ())  # type: ignore[arg-type]
+    (row,) = shown.to_records()
+    assert (row["markers"], row["fields"]) == pytest.approx((10.0, 11.0))
+    assert row["both"] == pytest.approx(np.sqrt(110.0))
+    assert np.log(row["both_upper"] / row["both_lower"]) == pytest.approx(2.0 * 1.959964 * np.sqrt(0.005))
 
 
 def test_a_known_name_in_neither_kind_is_refused(press: Press, tmp_path: Path) -> None:

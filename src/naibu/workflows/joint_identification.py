@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from naibu.identification.from_markers.specimen.specimen_model import ModelSetti
 from naibu.identification.joint_estimate import JointEstimate, NormalEstimate, joint_estimate
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.io.files.atomic import write_atomically
+from naibu.viewer.notebook import WrittenResult
 from naibu.viewer.page_frame import page_html
 from naibu.viewer.tables import Cell, Table, table_html
 from naibu.workflows.fields.block_mesh import labelled_object, names_of_labels
@@ -38,7 +40,7 @@ _PLACES = (("markers", 1), ("fields", 4), ("both", 7))  # of estimate and interv
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class JointIdentification:
+class JointIdentification(WrittenResult):
     """What `identify_jointly` returns.
 
     Attributes
@@ -63,6 +65,11 @@ class JointIdentification:
     table: Table
     notes: tuple[str, ...]
     files: tuple[Path, ...] = ()
+
+    def to_records(self) -> tuple[Mapping[str, Any], ...]:
+        """Return one row a parameter: its name, and what markers, fields and both tell, with 95 % intervals."""
+        columns = ("parameter", *(f"{kind}{end}" for kind in ("markers", "fields", "both") for end in ("", "_lower", "_upper")))
+        return tuple(dict(zip(columns, row, strict=True)) for row in self.table.rows)
 
     @property
     def usable(self) -> bool:
