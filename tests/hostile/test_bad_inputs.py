@@ -22,6 +22,7 @@ from lattice_studies import study_file
 from virtual_press import Press
 
 from naibu import cli
+from naibu._numba.reports import reported_compilation
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.volume import Volume
 from naibu.io.displacement_fields import write_field
@@ -113,6 +114,9 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Run]:
     def too_long(number: int, frame: FrameType | None) -> None:
         raise TimeoutError("not refused, or not at once")
 
+    def wait_from_now(*_: object) -> None:
+        signal.alarm(PATIENCE_S)
+
     place = tmp_path / "place"
     place.mkdir()
     monkeypatch.chdir(place)
@@ -124,9 +128,10 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Run]:
         monkeypatch.setattr(sys, "stderr", said)
         monkeypatch.setattr(sys, "stdout", io.StringIO())
         monkeypatch.setattr(sys, "argv", ["naibu", *words])
-        signal.alarm(PATIENCE_S)
+        wait_from_now()
         try:
-            cli.main()
+            with reported_compilation(wait_from_now):  # kernels that are compiled for the first time take longer
+                cli.main()
             code = 0
         except SystemExit as ended:
             code = int(ended.code or 0)

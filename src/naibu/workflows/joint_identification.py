@@ -19,6 +19,7 @@ from naibu.core.errors import InputError
 from naibu.core.progress import Progress
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
+from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.specimen.parameter_names import poisson_ratio, young_modulus
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.joint_estimate import JointEstimate, NormalEstimate, joint_estimate
@@ -29,7 +30,8 @@ from naibu.viewer.page_frame import page_html
 from naibu.viewer.tables import Cell, Table, table_html
 from naibu.workflows.fields.block_mesh import labelled_object, names_of_labels
 from naibu.workflows.fields.identify_fields import FieldIdentification, identify_fields
-from naibu.workflows.markers.experiments import RATIO_REFERENCE_KPA, Source, load_experiments
+from naibu.workflows.fields.known_zones import KnownZones, parse_known_zones
+from naibu.workflows.markers.experiments import RATIO_REFERENCE_KPA, Source, load_experiments, parse_known
 from naibu.workflows.markers.identify import Identification, identify
 from naibu.workflows.results.output_folder import output_folder
 
@@ -128,8 +130,9 @@ def identify_jointly(
     loaded_experiments = load_experiments(list(experiments))
     inside, labels = labelled_object(mask, zones)
     materials = {m for e in loaded_experiments for m in e.materials}
-    there = set(names_of_labels(labels, inside, zone_names or {}).values())
-    of_markers, of_fields = _divided(known, materials, there)
+    zones_there = list(names_of_labels(labels, inside, zone_names or {}).values())
+    of_markers, of_fields = _divided(known, materials, set(zones_there))
+    _require_one_scale(parse_known(of_markers), parse_known_zones(of_fields, zones_there))
     from_fields = identify_fields(
         fields, mask=mask, zones=zones, zone_names=zone_names, known=of_fields, loaded=loaded, unit=unit, spacing_mm=spacing_mm,
         element_size_mm=element_size_mm, out=folder / FIELDS, overwrite=overwrite, progress=progress,
@@ -137,7 +140,6 @@ def identify_jointly(
     from_markers = identify(
         loaded_experiments, known=of_markers, settings=settings, states=states, out=folder / MARKERS, overwrite=overwrite, progress=progress
     )
-    _require_one_scale(from_markers.model, from_fields)
     parts = (told_by_markers(from_markers.model), told_by_fields(from_fields.estimate))
     joint = joint_estimate(parts)
     table = table_of_moduli(parts, joint, relative=from_fields.relative)
@@ -158,13 +160,11 @@ def _divided(known: Sequence[str], materials: set[str], zones: set[str]) -> tupl
     return [text for name, text in both if name in materials], [text for name, text in both if name in zones]
 
 
-def _require_one_scale(model: CalibratedModel, fields: FieldIdentification) -> None:
-    absolute = model.known_materials.scale_is_absolute
-    if absolute == (not fields.relative):
-        known = set(model.known_materials.young_moduli)
-        if absolute or known == {region.name for region in fields.estimate.zones.known}:
-            return
-    kinds = ["in kPa" if kpa else "multiples of a known material" for kpa in (absolute, not fields.relative)]
+def _require_one_scale(materials: KnownMaterials | None, zones: KnownZones) -> None:
+    absolute = materials is not None and materials.scale_is_absolute
+    if absolute == (not zones.relative) and (absolute or (materials is not None and set(materials.young_moduli) == set(zones.values))):
+        return
+    kinds = ["in kPa" if kpa else "multiples of a known material" for kpa in (absolute, not zones.relative)]
     raise InputError(
         f"moduli from the experiments are {kinds[0]}, those from the fields {kinds[1]}: give `known` a modulus for a material of the "
         "experiments and for a zone of the fields, or name one that both have"

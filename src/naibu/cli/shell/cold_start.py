@@ -19,6 +19,7 @@ from naibu.cli.shell.console import INTERRUPTED
 
 TERMINATED = 143  # exit code after SIGTERM, as shells have it
 INTERVAL_S = 5.0  # between lines of progress
+DEFAULTS = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}  # handlers that are replaced
 PATIENCE_S = 0.7  # after a signal, before a process that is still compiling is ended
 # seconds to compile all kernels of a verb, on two cores; what is there already, or shared with other verbs, takes none
 SECONDS = {"identify": 40, "demo": 40, "predict": 40, "compare": 40, "sense": 60, "compare-methods": 120, "track": 30, "simulate": 60}
@@ -82,9 +83,10 @@ def first_run(verb: str, console: Console) -> Iterator[None]:
 def _prompt_end(compiling: Callable[[], bool]) -> Iterator[None]:
     """End the process soon after a signal while LLVM compiles, which keeps Python's handlers waiting.
 
-    A thread is woken by the signal itself. Python's handler, which runs where the main thread is in Python, comes first and cleans up; only
-    where a compilation is still going on after `PATIENCE_S`, the process ends at once. Files are written under temporary names until they
-    are complete, so that none is left half-written.
+    LLVM drops what is raised in its callbacks, and may crash for want of what the callback was to do: nothing is raised while a compilation
+    is going on. A thread that is woken by the signal itself sends it again once the compilation has ended; where it is still going on after
+    `PATIENCE_S`, the process ends at once. Files are written under temporary names until they are complete, so that none is left
+    half-written.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -94,51 +96,45 @@ def _prompt_end(compiling: Callable[[], bool]) -> Iterator[None]:
     watch = threading.Thread(target=_watch, args=(theirs, compiling), name="signal watch", daemon=True)
     watch.start()
     wakeup = signal.set_wakeup_fd(ours.fileno(), warn_on_full_buffer=False)
-    before = signal.getsignal(signal.SIGTERM)
-    if before is signal.SIG_DFL:
-        signal.signal(signal.SIGTERM, _terminated)
-    lost: list[BaseException] = []
-    hook, sys.unraisablehook = sys.unraisablehook, _keeping_interruptions(lost)
+    before = {number: signal.getsignal(number) for number in DEFAULTS}
+    ending = _ending(compiling)
+    for number, default in DEFAULTS.items():
+        if before[number] is default:
+            signal.signal(number, ending)
     try:
         yield
-    except Exception as error:
-        # LLVM drops what is raised in its callbacks, and fails afterwards for want of what the callback was to do
-        if lost:
-            raise lost[0] from error
-        raise
     finally:
-        sys.unraisablehook = hook
-        if before is signal.SIG_DFL:
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for number, handler in before.items():
+            signal.signal(number, handler)
         signal.set_wakeup_fd(wakeup)
         ours.close()
         watch.join()
         theirs.close()
 
 
-def _terminated(number: int, frame: FrameType | None) -> None:
-    sys.exit(TERMINATED)
+def _ending(compiling: Callable[[], bool]) -> Callable[[int, FrameType | None], None]:
+    """Return a handler of signals that raises where no kernel is being compiled."""
 
+    def handler(number: int, frame: FrameType | None) -> None:
+        if not compiling():
+            if number == signal.SIGINT:
+                raise KeyboardInterrupt
+            sys.exit(TERMINATED)
 
-def _keeping_interruptions(lost: list[BaseException]) -> Callable[[sys.UnraisableHookArgs], None]:
-    """Return a hook that prints what could not be raised, but keeps interruptions in a list."""
-
-    def hook(unraisable: sys.UnraisableHookArgs) -> None:
-        if isinstance(unraisable.exc_value, KeyboardInterrupt | SystemExit):
-            lost.append(unraisable.exc_value)
-        else:
-            sys.__unraisablehook__(unraisable)
-
-    return hook
+    return handler
 
 
 def _watch(signals: socket.socket, compiling: Callable[[], bool]) -> None:
     while number := signals.recv(1):
         if number[0] not in (signal.SIGINT, signal.SIGTERM):
             continue
+        if not compiling():
+            continue
         deadline = time.monotonic() + PATIENCE_S
         while compiling() and time.monotonic() < deadline:
             time.sleep(0.02)
-        if compiling():
+        if not compiling():
+            signal.raise_signal(number[0])
+        else:
             os.write(2, b"Interrupted while kernels were compiled; every file written is complete.\n")
             os._exit(INTERRUPTED if number[0] == signal.SIGINT else TERMINATED)
