@@ -11,6 +11,7 @@ size change (defect correction, :cite:p:`stetter1978`); what half of their size 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -114,7 +115,10 @@ def refined_regions(model: FieldModel, regions: Segmentation, graph: ZoneGraph, 
             ratio = np.bincount(new, graph.volume * best.theta[best.zones.count :][labels]) / np.bincount(new, graph.volume)
             zones = joined(model.zones, new)
             start = replace(regions.point, theta=np.concatenate([mean, ratio]))
-            trials.append((new, refined_borders(model, zones, start, bounds)))
+            with contextlib.suppress(ConvergenceError):  # regions that are too different to be one; others may be joined
+                trials.append((new, refined_borders(model, zones, start, bounds)))
+        if not trials:
+            break
         new, trial = min(trials, key=lambda t: t[1].objective)
         if trial.objective > best.objective + charge:
             break
@@ -143,7 +147,13 @@ def refined_borders(model: FieldModel, zones: Zones, start: Point, bounds: Bound
     """
     cells = Borders.of(model.mesh, zones)
     starts = [cells] + [ball for ball in [cells.rounded()] if ball.round.any()]
-    ends = [_searched(model, Mixing.of(model, borders), start, bounds) for borders in starts]
+    ends: list[tuple[Mixing, _Trial]] = []
+    for last, borders in enumerate(starts, 1 - len(starts)):
+        try:
+            ends.append(_searched(model, Mixing.of(model, borders), start, bounds))
+        except ConvergenceError:  # of one start; the other may lead somewhere
+            if last == 0 and not ends:
+                raise
     return _with_covariance(model, *min(ends, key=lambda e: e[1].value))
 
 
@@ -184,8 +194,12 @@ class CorrectedRegions:
 
     @property
     def doubt(self) -> tuple[FloatArray, FloatArray]:
-        """Standard deviations (2 regions,) and covariance (2 regions, 2 regions) of what still smaller cells would change."""
-        return DOUBT * np.abs(self.shift), DOUBT**2 * np.outer(self.shift, self.shift)
+        """Standard deviations (2 regions,) and covariance (2 regions, 2 regions) of what still smaller cells would change.
+
+        Regions share their borders: none is surer than the one that changed most.
+        """
+        sd = np.full_like(self.shift, DOUBT * float(np.abs(self.shift).max(initial=0.0)))
+        return sd, np.diag(sd**2)
 
 
 def on_finer_cells(model: FieldModel, law: LawName, found: RefinedRegions, bounds: Bounds) -> CorrectedRegions | None:

@@ -268,7 +268,11 @@ class _Recipe:
         single = graph.count == int((self.model.zones.of_cell != KNOWN).sum()) and self.model.mesh.dimension == 3
         if not single or not 1 < regions.zones.count <= MOST_REGIONS:
             return self._sharp(regions.zones, regions.point, None)
-        refined = refined_regions(self.model, regions, graph, self.bounds)
+        try:
+            refined = refined_regions(self.model, regions, graph, self.bounds)
+        except ConvergenceError:
+            self.record("no equilibrium was found with borders within cells: those on faces of cells are kept")
+            return self._sharp(regions.zones, regions.point, None)
         charge = float(np.log(self.model.n_free) + np.log(graph.count)) * (regions.zones.count - refined.zones.count)
         if not 0.5 * refined.point.misfit < 0.5 * regions.point.misfit + charge:
             self.record("borders within cells explain no more than those on faces of cells, which are kept")
