@@ -8,15 +8,15 @@ from functools import cache
 import numpy as np
 
 from naibu.core.displacement_field import DisplacementField
-from naibu.identification.from_fields.border_refinement import RefinedRegions, on_finer_cells, refined_borders
-from naibu.identification.from_fields.borders import Borders, Mixing
 from naibu.identification.from_fields.forward.field_laws import field_law
 from naibu.identification.from_fields.forward.forward_model import Solvers, equilibrium
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Point, logarithms, moduli_of, young_and_poisson
 from naibu.identification.from_fields.gauss_newton import Bounds, first_point
-from naibu.identification.from_fields.segmentation import joined
+from naibu.identification.from_fields.regions.border_refinement import RefinedRegions, on_finer_cells, refined_borders
+from naibu.identification.from_fields.regions.borders import Borders, Mixing
+from naibu.identification.from_fields.regions.segmentation import joined
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.meshing.point_location import interpolation_operator
 from naibu.meshing.primitives import box

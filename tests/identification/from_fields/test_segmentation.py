@@ -10,8 +10,17 @@ from hypothesis import strategies as st
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, logarithms, young_and_poisson
 from naibu.identification.from_fields.gauss_newton import Bounds, first_point
+from naibu.identification.from_fields.regions.segmentation import (
+    CLEAR,
+    Criterion,
+    areas_between,
+    border_moves,
+    clusters,
+    joined,
+    merged,
+    segment,
+)
 from naibu.identification.from_fields.regularization import ZoneGraph
-from naibu.identification.from_fields.segmentation import CLEAR, Criterion, areas_between, border_moves, clusters, joined, merged, segment
 from naibu.meshing.primitives import box
 from naibu.reproduction.chapter3.bodies import LAYERS, cube
 

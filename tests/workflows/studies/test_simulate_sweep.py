@@ -13,8 +13,8 @@ from naibu.core.progress import ProgressReport
 from naibu.io.study_schemas.sweep_schema import SweepFile, load_sweep
 from naibu.workflows.studies.simulate import simulate
 from naibu.workflows.studies.simulate_lattice import simulate_lattice
-from naibu.workflows.studies.simulate_sweep import sweep_text
-from naibu.workflows.studies.sweep_design import design
+from naibu.workflows.studies.sweeps.simulate_sweep import sweep_text
+from naibu.workflows.studies.sweeps.sweep_design import design
 
 SWEEP = """
 [sweep]

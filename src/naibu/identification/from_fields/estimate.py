@@ -22,13 +22,6 @@ from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress, report_progress
 from naibu.core.status import Status
 from naibu.identification.from_fields.assumptions import assumptions, covariance_of, effects
-from naibu.identification.from_fields.border_refinement import (
-    MOST_REGIONS,
-    CorrectedRegions,
-    RefinedRegions,
-    on_finer_cells,
-    refined_regions,
-)
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import FieldElements, LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones
@@ -51,9 +44,16 @@ from naibu.identification.from_fields.gauss_newton import (
     search,
 )
 from naibu.identification.from_fields.mesh_error import COARSE, EXTRAPOLATED, changes_on_finer_mesh, doubt_of, refitted
+from naibu.identification.from_fields.regions.border_refinement import (
+    MOST_REGIONS,
+    CorrectedRegions,
+    RefinedRegions,
+    on_finer_cells,
+    refined_regions,
+)
+from naibu.identification.from_fields.regions.segmentation import EXPLICIT, Segmentation, segment, weight_of_borders
 from naibu.identification.from_fields.regularization import Regularization, RegularizationName, ZoneGraph, regularization
 from naibu.identification.from_fields.regularization_weight import WeightChoice, WeightRule, WeightTrial, choose_weight
-from naibu.identification.from_fields.segmentation import EXPLICIT, Segmentation, segment, weight_of_borders
 from naibu.identification.from_fields.truncated_newton import truncated_step
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, report, resolution, resolution_report
 from naibu.identification.from_fields.verdict import inflation, verdict

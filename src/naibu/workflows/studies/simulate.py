@@ -18,7 +18,7 @@ from naibu.workflows.studies.lattice_study import NAMED, TEMPLATE, study_text
 from naibu.workflows.studies.simulate_indentation import simulate_indentation
 from naibu.workflows.studies.simulate_lattice import CHECKPOINT_EVERY, SimulationRun, simulate_lattice
 from naibu.workflows.studies.simulate_study import SLUGS, SQUARES_TOGETHER, simulate_study
-from naibu.workflows.studies.simulate_sweep import SWEEP, describes_sweep, simulate_sweep, sweep_text
+from naibu.workflows.studies.sweeps.simulate_sweep import SWEEP, describes_sweep, simulate_sweep, sweep_text
 
 
 @dataclass(frozen=True, slots=True)

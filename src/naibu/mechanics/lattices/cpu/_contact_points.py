@@ -161,12 +161,10 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
             _combine(shape, at, d)
             if kind == SPHERE:
                 gap = _gap_of_sphere(size[0], d, n)
+            elif kind == MESH:
+                gap = gap_of(geometry, mesh, axes, k, d, q, m, n, none)
             else:
-                gap = (
-                    gap_of(geometry, mesh, axes, k, d, q, m, n, none)
-                    if kind == MESH
-                    else _primitive_gap(kind, size, turn, d, q, m, n, none)
-                )
+                gap = _primitive_gap(kind, size, turn, d, q, m, n, none)
             if begins:
                 linear[p, ACTIVE] = 0.0
             if linear[p, ACTIVE] == 0.0:

@@ -30,9 +30,9 @@ from naibu.workflows.results.output_folder import output_folder
 from naibu.workflows.studies.checkpoint_file import CheckpointFile
 from naibu.workflows.studies.lattice_study import NAMED, prepared_document, study_tables
 from naibu.workflows.studies.simulate_lattice import SimulationRun
-from naibu.workflows.studies.sweep_design import design
-from naibu.workflows.studies.sweep_page import SweepRows, sweep_html
-from naibu.workflows.studies.sweep_run import quantities_of, run_of_sweep, with_values
+from naibu.workflows.studies.sweeps.sweep_design import design
+from naibu.workflows.studies.sweeps.sweep_page import SweepRows, sweep_html
+from naibu.workflows.studies.sweeps.sweep_run import quantities_of, run_of_sweep, with_values
 
 SWEEP = "sweep"
 MEMORY_MB = 500.0  # of a lattice of some thousand nodes with the libraries

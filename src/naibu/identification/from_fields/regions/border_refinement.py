@@ -20,14 +20,14 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.borders import Borders, Mixing
 from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Point
 from naibu.identification.from_fields.gauss_newton import Bounds, Objective
 from naibu.identification.from_fields.mesh_error import DOUBT, changes_on_finer_mesh, refitted
+from naibu.identification.from_fields.regions.borders import Borders, Mixing
+from naibu.identification.from_fields.regions.segmentation import Segmentation, areas_between, joined
 from naibu.identification.from_fields.regularization import ZoneGraph, cell_volumes
-from naibu.identification.from_fields.segmentation import Segmentation, areas_between, joined
 
 MOST_REGIONS, CANDIDATES = 6, 3  # whose borders are refined; pairs that are tried as one
 LONGEST = 0.5  # of a step: of logarithms, and of borders in cells
