@@ -48,7 +48,8 @@ def gel(step_s: float = FRAME_S) -> FiniteElementBody:
     assembler = Assembler.from_materials(
         elements(mesh, "mean_dilatation"), mesh.regions, [material(young_modulus=10.0, poisson_ratio=0.45)]
     )
-    return FiniteElementBody.of(mesh, assembler, supported=np.flatnonzero(mesh.points[:, 2] < 1e-9).astype(np.int64), step_s=step_s)
+    body = FiniteElementBody.of(mesh, assembler, supported=np.flatnonzero(mesh.points[:, 2] < 1e-9).astype(np.int64), step_s=step_s)
+    return replace(body, engine=replace(body.engine, background=False))  # repeatable
 
 
 def beside(channel: LossyChannel, body: InteractiveSimulation | None = None, **limits: float) -> tuple[BesideBody, HapticHand]:
