@@ -45,7 +45,7 @@ def goes_in(scene: Scene, file: Path) -> None:
     body(axes, scene.reference_surface, scene.faces)
     axes.scatter(*scene.initial_markers.T, s=10, c="0.65", depthshade=False, label="unloaded")
     axes.scatter(*scene.measured.T, s=12, c="#0072B2", depthshade=False, label="under load")
-    axes.legend(loc="upper left", frameon=False, fontsize=8)
+    axes.legend(loc="upper left", frameon=False, fontsize=13, markerscale=1.8, handletextpad=0.1, borderpad=0.1)
     figure.savefig(file, dpi=110)
 
 
@@ -57,7 +57,7 @@ def comes_out(scene: Scene, file: Path) -> None:
     axes.scatter(*scene.measured.T, s=16, facecolors="none", edgecolors="#0072B2", depthshade=False, label="measured")
     axes.scatter(*last.markers.T, s=9, c="#D55E00", marker="x", linewidths=0.9, depthshade=False, label="model")
     rms = np.sqrt(np.nanmean(((last.markers - scene.measured) ** 2).sum(axis=1)))
-    axes.legend(loc="upper left", frameon=False, fontsize=8, title=f"{rms:.2f} mm RMS", title_fontsize=9)
+    axes.legend(loc="upper left", frameon=False, fontsize=13, title=f"{rms:.2f} mm RMS", title_fontsize=13, markerscale=1.8, handletextpad=0.1, borderpad=0.1)
     figure.savefig(file, dpi=110)
 
 
@@ -77,7 +77,7 @@ def moves(scene: Scene, file: Path) -> None:
         body(axes, (1.0 - share) * a.surface + share * b.surface, scene.faces)
         moved = np.linalg.norm(markers - scene.steps[0].markers, axis=1)
         axes.scatter(*markers.T, c=moved, s=14, cmap="viridis", vmin=0.0, vmax=loads[-1], depthshade=False)
-        axes.text2D(0.03, 0.93, f"pressed by {load:.0f} mm", transform=axes.transAxes, fontsize=9)
+        axes.text2D(0.03, 0.93, f"pressed by {load:.0f} mm", transform=axes.transAxes, fontsize=14)
 
     FuncAnimation(figure, frame, frames=FRAMES).save(file, writer=PillowWriter(fps=12), dpi=75)
 
