@@ -20,6 +20,7 @@ from naibu.viewer.result_page.payload import Scene
 from naibu.viewer.result_page.reading import report_from_json
 
 SIZE, FRAMES = (4.0, 3.6), 18
+LEGEND = {"frameon": False, "fontsize": 13, "markerscale": 1.8, "handletextpad": 0.1, "borderpad": 0.1}
 
 
 def axes_of(figure: plt.Figure, scene: Scene) -> plt.Axes:
@@ -45,7 +46,7 @@ def goes_in(scene: Scene, file: Path) -> None:
     body(axes, scene.reference_surface, scene.faces)
     axes.scatter(*scene.initial_markers.T, s=10, c="0.65", depthshade=False, label="unloaded")
     axes.scatter(*scene.measured.T, s=12, c="#0072B2", depthshade=False, label="under load")
-    axes.legend(loc="upper left", frameon=False, fontsize=13, markerscale=1.8, handletextpad=0.1, borderpad=0.1)
+    axes.legend(loc="upper left", **LEGEND)
     figure.savefig(file, dpi=110)
 
 
@@ -57,7 +58,7 @@ def comes_out(scene: Scene, file: Path) -> None:
     axes.scatter(*scene.measured.T, s=16, facecolors="none", edgecolors="#0072B2", depthshade=False, label="measured")
     axes.scatter(*last.markers.T, s=9, c="#D55E00", marker="x", linewidths=0.9, depthshade=False, label="model")
     rms = np.sqrt(np.nanmean(((last.markers - scene.measured) ** 2).sum(axis=1)))
-    axes.legend(loc="upper left", frameon=False, fontsize=13, title=f"{rms:.2f} mm RMS", title_fontsize=13, markerscale=1.8, handletextpad=0.1, borderpad=0.1)
+    axes.legend(loc="upper left", **LEGEND, title=f"{rms:.2f} mm RMS", title_fontsize=13)
     figure.savefig(file, dpi=110)
 
 

@@ -163,8 +163,8 @@ def cut_surface(
         low, high = cut.points.min(axis=0), cut.points.max(axis=0)
         reach = ", ".join(f"{axis} from {a:.4g} to {b:.4g} mm" for axis, a, b in zip("xyz", low, high, strict=True))
         raise InputError(
-            f"the tip stays more than {cutter.reach_mm:.4g} mm away from the surface, which reaches {reach}; check the path and its unit (mm), "
-            "or state a larger reach_mm"
+            f"the tip stays more than {cutter.reach_mm:.4g} mm away from the surface, which reaches {reach}; check the path and its unit "
+            "(mm), or state a larger reach_mm"
         )
     return cut
 
