@@ -33,6 +33,7 @@ from naibu.workflows.fields.identify_fields import FieldIdentification, identify
 from naibu.workflows.fields.known_zones import KnownZones, parse_known_zones
 from naibu.workflows.markers.experiments import RATIO_REFERENCE_KPA, Source, load_experiments, parse_known
 from naibu.workflows.markers.identify import Identification, identify
+from naibu.workflows.results.files_together import written_together
 from naibu.workflows.results.output_folder import output_folder
 
 FILES = ("joint.json", "report.html")
@@ -144,7 +145,7 @@ def identify_jointly(
     joint = joint_estimate(parts)
     table = table_of_moduli(parts, joint, relative=from_fields.relative)
     result = JointIdentification(from_markers, from_fields, joint, table, _in_words(joint, parts))
-    return replace(result, files=tuple(_written(folder, result)))
+    return replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))
 
 
 def _divided(known: Sequence[str], materials: set[str], zones: set[str]) -> tuple[list[str], list[str]]:

@@ -15,6 +15,7 @@ from naibu.viewer.notebook import ShownInNotebook, empty_figure
 from naibu.viewer.result_figures import draw_marker_motion
 from naibu.viewer.result_page.page import report_html
 from naibu.workflows.markers.experiments import Source, load_experiment, loaded_names, require_loaded
+from naibu.workflows.results.files_together import written_together
 from naibu.workflows.results.output_folder import output_folder
 from naibu.workflows.results.report_content import prediction_report, prediction_scene
 from naibu.workflows.results.result_folder import PREDICTION_FILES, read_model, write_prediction
@@ -112,7 +113,7 @@ def predict(
     if calibrated.reservation:
         prediction = replace(prediction, notes=(f"the model is doubtful: {calibrated.reservation}", *prediction.notes))
     if folder is not None:
-        write_prediction(folder, calibrated, prediction)
+        written_together(folder, PREDICTION_FILES, lambda at: write_prediction(at, calibrated, prediction))
     return PredictionRun(**{f.name: getattr(prediction, f.name) for f in fields(prediction)}, model=calibrated)
 
 

@@ -8,6 +8,7 @@ import hashlib
 import os
 import platform
 import re
+import shutil
 import tempfile
 import time
 from collections.abc import Collection
@@ -69,11 +70,29 @@ def new_aside(path: str | os.PathLike[str]) -> Path:
     target = require_usable_path(path, written=True)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name[:_STEM]}.{_place()}-{os.getpid()}-", suffix=".part")
+        handle, name = tempfile.mkstemp(dir=target.parent, prefix=_prefix(target.name), suffix=".part")
         os.close(handle)
     except OSError as error:
         raise _not_writable(target, error) from error
     return Path(name)
+
+
+def new_folder_aside(folder: Path) -> Path:
+    """Create an empty temporary folder in `folder`, for files that are to take their places together; named as by `new_aside`.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written.
+    """
+    try:
+        return Path(tempfile.mkdtemp(dir=folder, prefix=_prefix("results"), suffix=".part"))
+    except OSError as error:
+        raise _not_writable(folder, error) from error
+
+
+def _prefix(name: str) -> str:
+    return f".{name[:_STEM]}.{_place()}-{os.getpid()}-"
 
 
 def put_in_place(aside: Path, path: str | os.PathLike[str]) -> Path:
@@ -118,7 +137,11 @@ def remove_orphans(folder: Path, keep: Collection[str] = ()) -> None:
     with contextlib.suppress(OSError):
         for path in folder.iterdir():
             found = _PART.fullmatch(path.name)
-            if found is not None and path.name not in keep and not _in_use(path, found["place"], int(found["process"])):
+            if found is None or path.name in keep or _in_use(path, found["place"], int(found["process"])):
+                continue
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
                 path.unlink()
 
 

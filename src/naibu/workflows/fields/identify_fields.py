@@ -33,6 +33,7 @@ from naibu.viewer.tables import Cell, Table
 from naibu.workflows.fields.block_mesh import CELLS, block_mesh, blurred, labelled_object, names_of_labels
 from naibu.workflows.fields.known_zones import parse_known_zones
 from naibu.workflows.fields.measured_load_case import measured_load_case, relative_deformation
+from naibu.workflows.results.files_together import written_together
 from naibu.workflows.results.output_folder import output_folder
 
 if TYPE_CHECKING:
@@ -179,7 +180,7 @@ def identify_fields(
     )  # fmt: skip
     coarse = blurred(mesh, cell_of_voxel, inside, labels, names)
     result = FieldIdentification(found, body, stated.relative, (*found.identifiability, *coarse), coarse, inside, cell_of_voxel)
-    return result if folder is None else replace(result, files=tuple(_written(folder, result)))
+    return result if folder is None else replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))
 
 
 def zones_of_voxels(found: FieldEstimate, inside: Volume, cells: IntArray) -> IntArray:

@@ -28,6 +28,7 @@ from naibu.viewer.notebook import ShownInNotebook, empty_figure
 from naibu.viewer.result_figures import draw_slices
 from naibu.viewer.slices import Overlay, SliceView, slices_html
 from naibu.viewer.tables import Table
+from naibu.workflows.results.files_together import written_together
 from naibu.workflows.results.output_folder import output_folder
 from naibu.workflows.results.result_folder import read_any_model
 
@@ -210,7 +211,7 @@ def predict_field(
     if folder is None:
         return run
     inputs = input_record({"model": None if isinstance(model, IdentifiedBody) else _file_of(model), "field": field})
-    return replace(run, files=tuple(_written(folder, run, motions, dict(inputs))))
+    return replace(run, files=written_together(folder, FILES, lambda at: _written(at, run, motions, dict(inputs))))
 
 
 def parsed_sides(held: Sequence[str], moved: Sequence[str], *, argument: str = "moved") -> dict[str, tuple[float, float, float]]:

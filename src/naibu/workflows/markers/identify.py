@@ -32,6 +32,7 @@ from naibu.viewer.result_page.payload import Report
 from naibu.workflows.markers.cross_validation import left_out_in_turn
 from naibu.workflows.markers.experiments import Source, load_experiments, parse_known, provenance_of, require_element_size, require_loaded
 from naibu.workflows.parallel.worker_count import Workers
+from naibu.workflows.results.files_together import written_together
 from naibu.workflows.results.output_folder import output_folder
 from naibu.workflows.results.report_content import build_report
 from naibu.workflows.results.result_folder import IDENTIFICATION_FILES, series_file, write_identification
@@ -183,7 +184,8 @@ def identify(
     left_in_turn = [_with_states(e, states or {}) for e in loaded] if cross_validate else []
     result, trouble = _compared(calibration, model, verdict, left_in_turn, where, progress, kept)
     if folder is not None:
-        write_identification(folder, calibration, model, verdict, result.baselines, result.left_out)
+        names = [name for name in (*IDENTIFICATION_FILES, *_series(loaded, states or {})) if name != CHECKPOINT_FILE]
+        written_together(folder, names, lambda at: write_identification(at, calibration, model, verdict, result.baselines, result.left_out))
         if result.interrupted:
             kept.keep_values(model.parameters.values())
         else:
@@ -197,9 +199,12 @@ def _folder(
     out: str | os.PathLike[str], loaded: Sequence[Experiment], states: Mapping[str, Sequence[str]], resumes: bool, overwrite: bool
 ) -> Path:
     """Return the folder of the results, which holds none yet, or those of the search that goes on."""
-    series = [series_file(f"{e.name}/{s.name}") for e in loaded for s in _with_states(e, states).loaded_states]
     kept = "a search with other inputs or settings that can be resumed" if (Path(out) / CHECKPOINT_FILE).is_file() else ""
-    return output_folder(out, () if resumes else (*IDENTIFICATION_FILES, *series), overwrite=overwrite, what=kept)
+    return output_folder(out, () if resumes else (*IDENTIFICATION_FILES, *_series(loaded, states)), overwrite=overwrite, what=kept)
+
+
+def _series(loaded: Sequence[Experiment], states: Mapping[str, Sequence[str]]) -> list[str]:
+    return [series_file(f"{e.name}/{s.name}") for e in loaded for s in _with_states(e, states).loaded_states]
 
 
 def _outliers(calibration: Calibration) -> tuple[Outlier, ...]:

@@ -34,6 +34,7 @@ from naibu.viewer.result_figures import draw_slices
 from naibu.viewer.slices import slices_html
 from naibu.viewer.tables import Cell
 from naibu.workflows.measurement.sense_page import middle_slice, slice_view
+from naibu.workflows.results.files_together import written_together
 from naibu.workflows.results.output_folder import output_folder
 
 if TYPE_CHECKING:
@@ -268,7 +269,7 @@ def sense_pair(
         pair.reference, pair.deformed, method=method, mask=pair.mask, deformed_mask=pair.deformed_mask, progress=progress
     )
     run = SenseRun(measured, time.perf_counter() - began, figures(pair, measured), pair)
-    return run if folder is None else replace(run, files=tuple(_written(pair, run, folder)))
+    return run if folder is None else replace(run, files=written_together(folder, FILES, lambda at: _written(pair, run, at)))
 
 
 def figures(pair: Pair, measured: MeasuredDisplacement) -> dict[str, float | int | str | None]:
