@@ -36,12 +36,12 @@ def test_files_are_in_their_places_and_told_in_order(tmp_path: Path) -> None:
 
 def test_a_full_disk_keeps_all_earlier_results_or_what_was_finished(tmp_path: Path) -> None:
     write_atomically(tmp_path / "page.html", "old")
-    with pytest.raises(InputError, match="earlier results .* are as they were") as told:
+    with pytest.raises(InputError, match=r"earlier results .* are as they were") as told:
         written_together(tmp_path, NAMES, one_then_a_full_disk)
     assert str(told.value).startswith(f"{tmp_path / 'page.html'}: cannot be written")
     assert contents(tmp_path) == {"page.html": "old"}
     (tmp_path / "page.html").unlink()
-    with pytest.raises(InputError, match="No space left on device\\)$"):
+    with pytest.raises(InputError, match=r"No space left on device\)$"):
         written_together(tmp_path, NAMES, one_then_a_full_disk)
     assert contents(tmp_path) == {"table.csv": "new"}
 
