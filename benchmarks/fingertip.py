@@ -18,7 +18,7 @@ from naibu.applications.fingertip.decoder import ForceDecoder, Training, directi
 from naibu.applications.fingertip.fingertip import Fingertip, FingertipResolution
 from naibu.applications.fingertip.pressing import FingertipModel, Press, Pressing, rotated_loads
 from naibu.applications.fingertip.readings import ReadingChain
-from naibu.applications.fingertip.slip import tangential_sensitivity
+from naibu.applications.fingertip.slip import SlipDetector, train_slip_detector, true_tangential_share
 from naibu.applications.sensing_chip.design import assumed_chip
 from naibu.applications.sensing_chip.electronics import report_readout
 from naibu.applications.sensing_chip.filters import noise_gain
@@ -46,12 +46,14 @@ def convergence(meshes: tuple[tuple[int, int, int], ...]) -> ResultTable:
     return ResultTable("convergence", ("mesh", "nodes", "depth, mm", "F_x, mN", "F_z, mN", "M_y, N um"), tuple(rows))
 
 
-def decoding(training_mesh: FingertipResolution, test_mesh: FingertipResolution, chain: ReadingChain) -> tuple[ForceDecoder, ResultTable]:
-    """Print errors and intervals of decoded presses, without noise and with that of filtered readings; return the decoder and them."""
+def decoding(training_mesh: FingertipResolution, test_mesh: FingertipResolution, chain: ReadingChain) -> tuple[SlipDetector, ResultTable]:
+    """Print errors and intervals of decoded presses, without noise and with that of filtered readings; return detector and them."""
     table: list[tuple[float, ...]] = []
     tip, training = Fingertip(), Training()
     model = FingertipModel.of(tip, training_mesh)
-    decoder = train_decoder(tip, chain, training, [model.pressed(press) for press in training.presses(tip)])
+    pressings = [model.pressed(press) for press in training.presses(tip)]
+    decoder = train_decoder(tip, chain, training, pressings)
+    detector = train_slip_detector(decoder, chain, training, pressings, [model.pressed(press) for press in training.slides(tip)])
     other = FingertipModel.of(tip, test_mesh)
     rng, gain = np.random.default_rng(0), noise_gain(0.1)
     for noise in (0.0, gain):
@@ -75,7 +77,7 @@ def decoding(training_mesh: FingertipResolution, test_mesh: FingertipResolution,
         "noise", "tilt, degrees", "friction", "force, %", "its 95 %", "direction, degrees", "its 95 %", "place, mm", "its 95 %",
         "least share inside, %",
     )  # fmt: skip
-    return decoder, ResultTable("decoding", columns, tuple(table))
+    return detector, ResultTable("decoding", columns, tuple(table))
 
 
 def _errors(decoder: ForceDecoder, chain: ReadingChain, pressing: Pressing, noise: float, rng: np.random.Generator) -> FloatArray:
@@ -103,6 +105,28 @@ def reading_time(decoder: ForceDecoder) -> float:
     return took
 
 
+def slip(detector: SlipDetector, mesh: FingertipResolution, chain: ReadingChain) -> list[tuple[str, float]]:
+    """Print and return how far sideways shares of presses on another mesh that slide are off, with filtered noise."""
+    off = 100.0 * detector.sensitivity_error
+    print(f"\nchange of M over F_z per sideways share of the force: {detector.sensitivity_mm:.3f} mm, known within {off:.0f} %")
+    model, rng, gain = FingertipModel.of(Fingertip(), mesh), np.random.default_rng(0), noise_gain(0.1)
+    rows = [("change of the moment over F_z per sideways share, mm", round(detector.sensitivity_mm, 3))]
+    for press in SLIDES:
+        pressing = model.pressed(press)
+        on = pressing.along_rod_mn >= 300.0
+        truth = true_tangential_share(pressing)[on]
+        volts = chain.volts(rotated_loads(pressing.chip_loads[on], AZIMUTH))
+        loads = chain.measured_loads(volts + gain * chain.readout.noise_sd * rng.standard_normal(volts.shape))
+        found = detector.followed(np.arange(len(loads)) * 2.0, loads, noise_share=gain)
+        error = float(np.nanmax(np.abs(found.size - np.abs(truth - truth[0]))))
+        inside = (found.size_95[:, 0] <= np.abs(truth - truth[0])) & (np.abs(truth - truth[0]) <= found.size_95[:, 1])
+        shown = f"{press.tilt_deg:.0f} degrees, {press.force_mn:.0f} mN, friction {press.friction:g}"
+        told = found.slides(press.friction)[-1]
+        print(f"{shown}: largest error {error:.3f} of up to {np.abs(truth).max():.3f}, {inside.sum()} of {on.sum()} inside; slides: {told}")
+        rows.append((f"largest error of the sideways share ({shown})", round(error, 3)))
+    return rows
+
+
 def main() -> None:
     """Print all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -113,15 +137,9 @@ def main() -> None:
     converged = convergence(MESHES[:2] if options.quick else MESHES)
     chain = ReadingChain.of_chip(assumed_chip(), report_readout())
     of_training, of_test = (MESHES[1], MESHES[2]) if options.quick else (MESHES[3], MESHES[4])
-    decoder, decoded = decoding(FingertipResolution(*of_training), FingertipResolution(*of_test), chain)
-    rows: list[tuple[str, float]] = [("processor time of a reading, us", round(reading_time(decoder), 1))]
-    print("\nchange of M over F_z per sideways share of the force, mm:")
-    model = FingertipModel.of(Fingertip(), FingertipResolution(*of_training))
-    for press in SLIDES:
-        value = tangential_sensitivity(model.pressed(press), chain)
-        shown = f"{press.tilt_deg:.0f} degrees, {press.force_mn:.0f} mN, friction {press.friction:g}"
-        print(f"{shown}: {value:.3f}", flush=True)
-        rows.append((f"change of the moment over F_z per sideways share, mm ({shown})", round(float(value), 3)))
+    detector, decoded = decoding(FingertipResolution(*of_training), FingertipResolution(*of_test), chain)
+    rows: list[tuple[str, float]] = [("processor time of a reading, us", round(reading_time(detector.decoder), 1))]
+    rows += slip(detector, FingertipResolution(*of_test), chain)
     if options.record:
         write_record("fingertip", (converged, decoded, ResultTable("readings", ("figure", "value"), tuple(rows))))
 

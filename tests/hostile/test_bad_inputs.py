@@ -101,6 +101,7 @@ def recorded_readings(root: Path) -> Files:
         "kind": DECODER, "naibu": "0.2.0", "study": "finger.toml", "radius_mm": 10.0, "volts_per_load": [0.4, 1.2, 1.2],
         "noise": [0.16, 0.014, 0.014], "coefficients": coefficients, "unit": [3.3, 0.9], "spread": [0.04, 0.03, 0.04],
         "limits": [1.2, 8.4, 0.6], "model_error": 0.02,
+        "slip": {"coefficients": [1.0, *8 * [0.0]], "spread": 0.01, "sensitivity_mm": 0.27, "sensitivity_error": 0.1},
     }  # fmt: skip
     (root / "decoder.json").write_text(json.dumps(stored), encoding="utf-8")
     (root / "readings.csv").write_text("".join(f"{0.01 * k},{2.0 * (k > 20)},0.1,0\n" for k in range(40)), encoding="utf-8")
@@ -192,6 +193,7 @@ def test_inputs_written_by_hand(run: Run, files: Files, tmp_path: Path, row: dic
         ("noise", [-1.0, 1.0, 1.0]), ("noise", [0.0, 0.0, 0.0]), ("coefficients", [[1.0], [1.0], [1.0]]), ("coefficients", []),
         ("coefficients", [9 * [1e308]] * 3), ("unit", [0.0, 1.0]), ("spread", [-1.0, 0.0, 0.0]), ("limits", [5.0, 1.0, 1.0]),
         ("limits", [1.0, 5.0, -1.0]), ("model_error", 0.9), ("more", 5),
+        ("slip", {}), ("slip", None), ("slip", {"coefficients": 9 * [0.0], "spread": 0.0, "sensitivity_mm": -1.0}),
     ],
 )  # fmt: skip
 def test_decoders_that_cannot_be_are_refused(run: Run, files: Files, tmp_path: Path, key: str, value: object) -> None:

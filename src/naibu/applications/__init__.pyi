@@ -4,7 +4,7 @@ from .fingertip.fingertip import Fingertip, FingertipResolution, fingertip_mesh
 from .fingertip.offset import OffsetTracker
 from .fingertip.pressing import FingertipModel, Press, Pressing, rotated_loads
 from .fingertip.readings import ReadingChain
-from .fingertip.slip import SlipDetector, tangential_sensitivity, true_tangential_share
+from .fingertip.slip import SidewaysForces, SlipDetector, train_slip_detector, true_tangential_share
 from .ischemia.layer_identification import LayerEstimate, LayerParameter, identify_layers
 from .ischemia.layered_response import LayeredModes, SkinMotion, frequency_response, simulate_skin
 from .ischemia.response_times import ResponseTimes, response_times
@@ -68,6 +68,7 @@ __all__ = [
     "Readout",
     "ResponseTimes",
     "ScannedBreast",
+    "SidewaysForces",
     "SkinLayer",
     "SkinMotion",
     "SkinPatch",
@@ -120,8 +121,8 @@ __all__ = [
     "solve_chip",
     "study_designs",
     "surface_stress",
-    "tangential_sensitivity",
     "train_decoder",
+    "train_slip_detector",
     "true_contact",
     "true_tangential_share",
     "two_views",

@@ -109,6 +109,8 @@ def decode_forces(
     *,
     free_rows: Whole = 20,
     noise_share: float = 1.0,
+    friction: float | None = None,
+    touch_s: float = 1.0,
     out: Out = Path("naibu-forces"),
     overwrite: Overwrite = False,
 ) -> None:
@@ -125,6 +127,10 @@ def decode_forces(
         0 for readings without offset.
     noise_share
         Noise of the readings over that of the decoder's electronics: 1 unfiltered, 0.23 after a first-order filter with r = 0.1.
+    friction
+        Coefficient of static friction between what touches and the gel: says when the contact slides.
+    touch_s
+        How long after it begins a contact is taken to be undragged, s: sideways forces count from there.
     out
         Folder for forces.html, forces.json and forces.csv.
     overwrite
@@ -132,7 +138,9 @@ def decode_forces(
     """
     from naibu.workflows.applications.decode_forces import decode_forces as decoded
 
-    run = decoded(decoder, readings, out=out, free_rows=free_rows, noise_share=noise_share, overwrite=overwrite)
+    run = decoded(
+        decoder, readings, out=out, free_rows=free_rows, noise_share=noise_share, friction=friction, touch_s=touch_s, overwrite=overwrite
+    )
     print_table("naibu decode-forces", ("quantity", "value"), run.rows, left=True)
     wrote(*run.files)
     say(f"Page: {run.files[0]}   numbers: {run.files[1]}   table: {run.files[2]}")

@@ -1,4 +1,4 @@
-"""Forces decoded from readings of presses on another mesh, with another friction and modulus; slip; offsets."""
+"""Forces decoded from readings of presses on another mesh, with another friction and modulus; offsets."""
 
 from __future__ import annotations
 
@@ -11,13 +11,7 @@ from naibu.applications.fingertip.fingertip import Fingertip, FingertipResolutio
 from naibu.applications.fingertip.offset import OffsetTracker
 from naibu.applications.fingertip.pressing import FingertipModel, Press, Pressing, rotated_loads
 from naibu.applications.fingertip.readings import ReadingChain
-from naibu.applications.fingertip.slip import SlipDetector, tangential_sensitivity, true_tangential_share
 from naibu.core.errors import InputError
-
-
-@pytest.fixture(scope="module")
-def sliding(coarse: FingertipModel) -> Pressing:
-    return coarse.pressed(Press(15.0, 1000.0, friction=0.4, slide_mm=2.5))
 
 
 def test_intervals_hold_presses_of_another_mesh_friction_and_modulus(decoder: ForceDecoder, chain: ReadingChain) -> None:
@@ -88,25 +82,6 @@ def test_a_decoder_needs_its_presses(coarse: FingertipModel, chain: ReadingChain
         Training((5.0, 10.0, 20.0, 30.0))
     with pytest.raises(InputError, match="young_moduli_kpa is 3 to 2"):
         Training(young_moduli_kpa=(3.0, 2.0))
-
-
-def test_slip_is_told_when_the_tangential_share_reaches_the_friction(sliding: Pressing, chain: ReadingChain) -> None:
-    truth = true_tangential_share(sliding)
-    assert truth.max() == pytest.approx(0.4, abs=0.02) and (np.diff(truth[-3:]) < 0.03).all()
-    loads = chain.measured_loads(chain.volts(sliding.chip_loads))
-    first = int(np.flatnonzero(sliding.slide_mm)[0]) - 1
-    detector = SlipDetector(tangential_sensitivity(sliding, chain), 0.4)
-    told = detector.tangential_share(loads[first:], loads[first])
-    assert told[:, 0] == pytest.approx(truth[first:] - truth[first], abs=0.02) and np.abs(told[:, 1]).max() < 1e-9
-    slipping = detector.slips(loads[first:], loads[first])
-    assert not slipping[:2].any() and slipping[-1]
-
-
-def test_slip_needs_a_press(tilted: Pressing, chain: ReadingChain) -> None:
-    with pytest.raises(InputError, match="does not slide"):
-        tangential_sensitivity(tilted, chain)
-    with pytest.raises(InputError, match="without a press there is no slip"):
-        SlipDetector(0.3, 0.5).slips([[0.0, 1.0, 1.0]], [1.0, 0.0, 0.0])
 
 
 def test_the_offset_follows_a_drift_while_free_and_not_under_a_load() -> None:

@@ -44,7 +44,7 @@ def test_a_chip_is_written_as_page_numbers_and_solution(tmp_path: Path) -> None:
     tables = {t["title"]: t for t in json.loads(numbers.read_text(encoding="utf-8"))["tables"]}
     force, moment_x, moment_y = tables["Sensitivity"]["rows"]
     assert force[-1] == pytest.approx(0.2, rel=0.1)
-    touch = dict(zip(tables["Loads"]["columns"], tables["Loads"]["rows"][0], strict=True))
+    touch = {c: v for name in ("Loads", "Outputs") for c, v in zip(tables[name]["columns"], tables[name]["rows"][0], strict=True)}
     assert touch["bridge F_z, mV"] == pytest.approx(20.0 * force[-1], rel=1e-9)
     assert touch["amplified M_x, V"] == pytest.approx(500e-3 * 2.0 * moment_x[-1], rel=1e-3)
     assert touch["amplified M_y, V"] == pytest.approx(-500e-3 * moment_y[-1], rel=1e-3)

@@ -58,7 +58,7 @@ def written(folder: Path, text: str = STUDY) -> Path:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("finger")
     stopped = simulate(written(place), out=place / "out", progress=stop_at(2))
-    assert not stopped.finished and (stopped.frames, stopped.of, stopped.parts) == (2, 6, "presses")
+    assert not stopped.finished and (stopped.frames, stopped.of, stopped.parts) == (2, 8, "presses")
     run = simulate(place / "my_finger.toml", out=place / "out", resume=True)
     assert run.finished and not (place / "out" / "my_finger.checkpoint.json").exists()
     return place
@@ -89,7 +89,7 @@ def taken_apart(file: Path) -> tuple[list[str], list[float]]:
 
 def test_page_and_numbers_tell_what_was_pressed_and_decoded(folder: Path) -> None:
     tables = {t["title"]: t for t in json.loads((folder / "out" / "my_finger.json").read_text(encoding="utf-8"))["tables"]}
-    tilted = dict(zip(tables["Presses"]["columns"], tables["Presses"]["rows"][1], strict=True))
+    tilted = {c: v for name in ("Presses", "On the chip") for c, v in zip(tables[name]["columns"], tables[name]["rows"][1], strict=True)}
     assert tilted["force along the rod, N"] == pytest.approx(1.5, rel=0.01) and tilted["saturated"] == "none"
     # pressed from y: the lateral force turns the chip about x only
     assert tilted["M_x, N µm"] > 0.5 and tilted["M_y, N µm"] == 0.0

@@ -39,6 +39,7 @@ NORMAL_95 = 1.96
 PLANE_95 = 2.4477  # radius that holds 95 % of a normal distribution in the plane
 _LOADS = 24  # forces of every press that the polynomials are fitted to
 _LEAST_POSITION_MM = 1e-3
+_SLIDE, _SLIDE_FORCE = 0.15, 0.7  # of the radius, and of the largest force
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +86,12 @@ class Training:
         """Return the presses that must be computed: their forces suffice for every modulus in the range."""
         most = 1.02 * self.force_mn[1] * max(1.0, fingertip.young_modulus_kpa / self.young_moduli_kpa[0])
         return tuple(Press(tilt, most, friction) for friction in self.frictions for tilt in self.tilts_deg)
+
+    def slides(self, fingertip: Fingertip) -> tuple[Press, ...]:
+        """Return presses that are then dragged, to either side, with tilts between those of the others."""
+        friction, way, force = max(self.frictions), _SLIDE * fingertip.radius_mm, _SLIDE_FORCE * self.force_mn[1]
+        low, high = np.mean(self.tilts_deg[:2]), np.mean(self.tilts_deg[-2:])
+        return Press(float(low), force, friction, way), Press(float(high), force, friction, -way)
 
     def moduli(self) -> FloatArray:
         """Return the moduli (3,) that the decoder learns from, kPa."""
@@ -239,7 +246,7 @@ def train_decoder(fingertip: Fingertip, chain: ReadingChain, training: Training,
     wanted = training.presses(fingertip)
     if len(pressings) != len(wanted):
         raise InputError(f"pressings has {len(pressings)} presses, the training {len(wanted)}; give those of `presses`")
-    samples = [_samples(p.for_modulus(e), chain, training) for p in pressings for e in training.moduli()]
+    samples = [training_samples(p.for_modulus(e), chain, training) for p in pressings for e in training.moduli()]
     loads, force, tilt, place = (np.concatenate(column) for column in zip(*samples, strict=True))
     unit = np.array([float(np.exp(np.log(loads[:, 0]).mean())), fingertip.package_diameter_mm])
     ratio = np.hypot(loads[:, 1], loads[:, 2]) / (loads[:, 0] * unit[1])
@@ -247,15 +254,15 @@ def train_decoder(fingertip: Fingertip, chain: ReadingChain, training: Training,
     coefficients = np.empty((3, basis.shape[1]))
     spread = np.empty(3)
     coefficients[0] = np.linalg.lstsq(basis, np.log(force), rcond=None)[0]
-    spread[0] = _spread(basis @ coefficients[0] - np.log(force))
+    spread[0] = spread_95(basis @ coefficients[0] - np.log(force))
     for k, angle in ((1, tilt), (2, place)):
         coefficients[k] = np.linalg.lstsq(ratio[:, None] * basis, angle, rcond=None)[0]
-        spread[k] = _spread(ratio * (basis @ coefficients[k]) - angle)
+        spread[k] = spread_95(ratio * (basis @ coefficients[k]) - angle)
     limits = np.array([loads[:, 0].min(), loads[:, 0].max(), ratio.max()])
     return ForceDecoder(fingertip.radius_mm, chain.volts_per_load, chain.noise, coefficients, unit, spread, limits, training.model_error)
 
 
-def _samples(pressing: Pressing, chain: ReadingChain, training: Training) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def training_samples(pressing: Pressing, chain: ReadingChain, training: Training) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return loads as measured (k, 3), sizes of the force, mN, its tilts and those of the contact's centre (k,), rad."""
     along = np.geomspace(*training.force_mn, _LOADS)
     loads = chain.measured_loads(chain.volts(pressing.at_force(along)))
@@ -279,6 +286,6 @@ def true_contact(pressing: Pressing, along_rod_mn: FloatArray) -> tuple[FloatArr
     return np.linalg.norm(force, axis=1), np.arctan2(-force[:, 0], -force[:, 2]), np.arctan2(centre[:, 0], centre[:, 2])
 
 
-def _spread(residual: FloatArray) -> float:
+def spread_95(residual: FloatArray) -> float:
     """Return a standard deviation whose 95 % interval holds 99 % of the residuals."""
     return float(np.quantile(np.abs(residual), 0.99)) / NORMAL_95

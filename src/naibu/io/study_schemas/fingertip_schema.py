@@ -128,6 +128,15 @@ Three = Annotated[list[Number], Field(min_length=3, max_length=3)]
 Deviations = Annotated[list[Annotated[float, Field(ge=0.0, le=1e6)]], Field(min_length=3, max_length=3)]
 
 
+class StoredSlip(CheckedTable):
+    """How drag shows itself; units and meaning as in `naibu.applications.SlipDetector`."""
+
+    coefficients: Annotated[list[Term], Field(min_length=9, max_length=9)]
+    spread: Annotated[float, Field(ge=0.0, le=1e6)]
+    sensitivity_mm: Annotated[Positive, between(1e-6, 1e3)]
+    sensitivity_error: Annotated[float, Field(ge=0.0, le=1.0)]
+
+
 class StoredDecoder(CheckedTable):
     """Contents of a stored decoder; units and meaning as in `naibu.applications.ForceDecoder`."""
 
@@ -142,6 +151,7 @@ class StoredDecoder(CheckedTable):
     spread: Deviations
     limits: Annotated[list[Positive], Field(min_length=3, max_length=3)]
     model_error: Annotated[float, Field(ge=0.0, le=0.5)]
+    slip: StoredSlip
 
 
 def load_decoder(path: Path) -> StoredDecoder:

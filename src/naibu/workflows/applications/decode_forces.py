@@ -12,6 +12,7 @@ import numpy as np
 
 from naibu.applications.fingertip.decoder import DecodedForces, ForceDecoder
 from naibu.applications.fingertip.offset import OffsetTracker
+from naibu.applications.fingertip.slip import SidewaysForces, SlipDetector
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.io.files.atomic import write_atomically
@@ -23,6 +24,7 @@ from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
 from naibu.viewer.notebook import WrittenResult
 from naibu.viewer.tables import Cell, Table
+from naibu.workflows.applications.slip_report import slip_card, slip_section, slip_summary, slip_words
 from naibu.workflows.results.output_folder import output_folder
 
 if TYPE_CHECKING:
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
 
 _COLUMNS = (
     "time_s", "force_N", "force_low_N", "force_high_N", "tilt_deg", "tilt_low_deg", "tilt_high_deg", "azimuth_deg", "cone_95_deg",
-    "x_mm", "y_mm", "z_mm", "position_95_mm",
+    "x_mm", "y_mm", "z_mm", "position_95_mm", "sideways_x", "sideways_y", "sideways_low", "sideways_high", "slip",
 )  # fmt: skip
 
 
@@ -61,6 +63,8 @@ def decode_forces(
     out: str | os.PathLike[str],
     free_rows: int = 20,
     noise_share: float = 1.0,
+    friction: float | None = None,
+    touch_s: float = 1.0,
     overwrite: bool = False,
 ) -> DecodedRecord:
     """Decode a recording.
@@ -78,6 +82,10 @@ def decode_forces(
         touches. 0: the readings have no offset.
     noise_share : float
         Standard deviation of the noise in the readings over that of the decoder's electronics: 0.23 after the report's filter.
+    friction : float, optional
+        Coefficient of static friction between what touches and the gel: says when the contact slides.
+    touch_s : float
+        How long after it begins a contact is taken to be undragged, s: sideways forces count from there.
     overwrite : bool
         Whether results that the folder holds are replaced.
 
@@ -90,6 +98,10 @@ def decode_forces(
         raise InputError(f"noise_share is {noise_share:g}; give a number from 0.001 to 100, 1 for unfiltered readings")
     if free_rows < 0:
         raise InputError(f"free_rows is {free_rows}; give a number of rows, or 0 where there is no offset")
+    if friction is not None and not 0.01 <= friction <= 5.0:
+        raise InputError(f"friction is {friction:g}; give the coefficient of static friction, from 0.01 to 5")
+    if not 0.0 < touch_s < np.inf:
+        raise InputError(f"touch_s is {touch_s:g}; give seconds, more than 0")
     source, table = Path(decoder), Path(readings)
     stored = load_decoder(source)
     chosen = ForceDecoder(
@@ -108,11 +120,16 @@ def decode_forces(
     folder = output_folder(out, ("forces.html", "forces.json", "forces.csv"), overwrite=overwrite)
     volts, offsets = _without_offset(chosen, rows[:, 1:], free_rows, noise_share)
     found = chosen.decode(volts, noise_share=noise_share)
-    csv = write_atomically(folder / "forces.csv", _csv(rows[:, 0], found))
+    detector = SlipDetector(
+        chosen, np.array(stored.slip.coefficients), stored.slip.spread, stored.slip.sensitivity_mm, stored.slip.sensitivity_error
+    )
+    sideways = detector.followed(rows[:, 0], volts / chosen.volts_per_load, noise_share=noise_share, touch_s=touch_s)
+    csv = write_atomically(folder / "forces.csv", _csv(rows[:, 0], found, sideways, friction))
     settings: dict[str, Cell] = dict(input_record({"decoder": source, "readings": table}))
-    chapter = Chapter("forces", "Forces decoded from readings", (_section(rows[:, 0], found, offsets),), settings, _cards(found))
-    page, numbers = write_chapter(chapter, folder)
-    return DecodedRecord((page, numbers, csv), _summary(found))
+    sections = _section(rows[:, 0], found, offsets), slip_section(rows[:, 0], sideways, friction, touch_s)
+    cards = _cards(found) if friction is None else (*_cards(found), slip_card(rows[:, 0], sideways, friction))
+    page, numbers = write_chapter(Chapter("forces", "Forces decoded from readings", sections, settings, cards), folder)
+    return DecodedRecord((page, numbers, csv), (*_summary(found), *slip_summary(rows[:, 0], sideways, friction)))
 
 
 def _without_offset(decoder: ForceDecoder, volts: FloatArray, free_rows: int, noise_share: float) -> tuple[FloatArray, FloatArray]:
@@ -128,14 +145,15 @@ def _without_offset(decoder: ForceDecoder, volts: FloatArray, free_rows: int, no
     return left, offsets
 
 
-def _csv(times: FloatArray, found: DecodedForces) -> str:
+def _csv(times: FloatArray, found: DecodedForces, sideways: SidewaysForces, friction: float | None) -> str:
     columns = [
         times, 1e-3 * found.force_mn, *(1e-3 * found.force_95.T), found.tilt_deg, *found.tilt_95_deg.T, found.azimuth_deg,
-        found.cone_95_deg, *found.position_mm.T, found.position_95_mm,
+        found.cone_95_deg, *found.position_mm.T, found.position_95_mm, *sideways.share.T, *sideways.size_95.T,
     ]  # fmt: skip
     table = np.stack(columns, axis=1)
     table[~found.answered, 1:] = np.nan
-    lines = [",".join("" if np.isnan(v) else f"{v:.6g}" for v in row) for row in table]
+    words = slip_words(sideways, friction)
+    lines = [",".join([*("" if np.isnan(v) else f"{v:.6g}" for v in row), word]) for row, word in zip(table, words, strict=True)]
     return "\n".join([",".join(_COLUMNS), *lines]) + "\n"
 
 
@@ -149,7 +167,7 @@ def _summary(found: DecodedForces) -> tuple[tuple[str, str], ...]:
         ("readings answered", f"{int(ok.sum())} of {len(ok)}"),
         ("largest force, N", f"{1e-3 * found.force_mn[top]:.4g} ({low:.4g} to {high:.4g})"),
         ("its tilt, degrees", f"{found.tilt_deg[top]:.3g} ({found.tilt_95_deg[top, 0]:.3g} to {found.tilt_95_deg[top, 1]:.3g})"),
-        ("its azimuth, degrees", f"{found.azimuth_deg[top]:.4g}"),
+        ("its azimuth, degrees", f"{found.azimuth_deg[top] % 360.0:.4g}"),
     )
 
 
@@ -164,7 +182,9 @@ def _cards(found: DecodedForces) -> tuple[Card, ...]:
         Card("Largest force", f"{1e-3 * found.force_mn[top]:.3g} N", f"95 % interval {low:.3g} to {high:.3g} N"),
         Card("Its tilt", f"{found.tilt_deg[top]:.3g}°", f"95 % interval {tilt[0]:.3g} to {tilt[1]:.3g}°"),
         Card(
-            "Its azimuth", f"{found.azimuth_deg[top]:.3g}°" if tilt[0] > 0.0 else "not known", "" if tilt[0] > 0.0 else "the tilt may be 0"
+            "Its azimuth",
+            f"{found.azimuth_deg[top] % 360.0:.3g}°" if tilt[0] > 0.0 else "not known",
+            "" if tilt[0] > 0.0 else "the tilt may be 0",
         ),
         answered,
     )

@@ -11,6 +11,7 @@ from naibu.applications.fingertip.contact_theories import hertz_force, parallel_
 from naibu.applications.fingertip.decoder import DecodedForces, ForceDecoder, directions, true_contact
 from naibu.applications.fingertip.pressing import FingertipModel, Pressing, rotated_loads
 from naibu.applications.fingertip.readings import ReadingChain
+from naibu.applications.fingertip.slip import SlipDetector
 from naibu.applications.sensing_chip.filters import noise_gain
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.reproduction.chapter6 import fingertip_figures
@@ -40,6 +41,8 @@ class FingertipResults:
         Of every press: name, azimuth, what it did in the plane of its tilt, and the loads (n, 6) on the chip in its frame.
     decoder : ForceDecoder, optional
         Where the file asks for one.
+    detector : SlipDetector, optional
+        With it.
     filter_share : float
         r of the first-order filter.
     times_s, recorded_volts : ndarray, shape (t,) and (t, 3)
@@ -53,6 +56,7 @@ class FingertipResults:
     pressings: tuple[Pressing, ...]
     loads: tuple[FloatArray, ...]
     decoder: ForceDecoder | None
+    detector: SlipDetector | None
     filter_share: float
     times_s: FloatArray
     recorded_volts: FloatArray
@@ -88,20 +92,20 @@ def fingertip_cards(results: FingertipResults) -> tuple[Card, ...]:
 
 def _presses(study: PreparedFingertip, results: FingertipResults) -> Section:
     rows: list[tuple[Cell, ...]] = []
+    felt: list[tuple[Cell, ...]] = []
     all_volts = [results.chain.volts(loads) for loads in results.loads]
     for k, (pressing, loads, volts) in enumerate(zip(results.pressings, results.loads, all_volts, strict=True)):
         over = [name for name, at in zip(fingertip_figures.CHANNELS, np.any(results.chain.saturated(volts), axis=0), strict=True) if at]
         rows.append(
             (results.names[k], pressing.press.tilt_deg, results.azimuths_deg[k], pressing.press.friction,
-             1e-3 * float(pressing.along_rod_mn[-1]), float(pressing.depth_mm[-1]), float(pressing.contact_radius_mm[-1]),
-             *(float(v) for v in loads[-1, 2:5]), *(float(v) for v in volts[-1]), ", ".join(over) or "none")
+             1e-3 * float(pressing.along_rod_mn[-1]), float(pressing.depth_mm[-1]), float(pressing.contact_radius_mm[-1]))
         )  # fmt: skip
-    columns = (
-        "press", "tilt, degrees", "azimuth, degrees", "friction", "force along the rod, N", "depth, mm", "contact radius, mm",
-        "F_z on the chip, mN", "M_x, N µm", "M_y, N µm", "reading F_z, V", "reading M_x, V", "reading M_y, V", "saturated",
-    )  # fmt: skip
+        felt.append((results.names[k], *(float(v) for v in loads[-1, 2:5]), *(float(v) for v in volts[-1]), ", ".join(over) or "none"))
+    columns = ("press", "tilt, degrees", "azimuth, degrees", "friction", "force along the rod, N", "depth, mm", "contact radius, mm")
+    table = Table("Presses", columns, tuple(rows), caption=f"{study.fingertip.diameter_mm:g} mm fingertip, at the end of each press.")
     note = "At the end of each press, without noise. A saturated channel exceeds the converter's range: its reading is not to be used."
-    table = Table("Presses", columns, tuple(rows), caption=f"{study.fingertip.diameter_mm:g} mm fingertip.", note=note)
+    columns = ("press", "F_z, mN", "M_x, N µm", "M_y, N µm", "reading F_z, V", "reading M_x, V", "reading M_y, V", "saturated")
+    on_chip = Table("On the chip", columns, tuple(felt), note=note)
     last = results.pressings[-1]
     forces = [1e-3 * p.along_rod_mn for p in results.pressings]
     moments = {name: volts[:, 1:] for name, volts in zip(results.names, all_volts, strict=True)}
@@ -112,7 +116,7 @@ def _presses(study: PreparedFingertip, results: FingertipResults) -> Section:
                lambda canvas: fingertip_figures.readings_over_force(canvas, forces, all_volts, results.names), (11.0, 3.6)),
         Figure("Moments", "M_y over M_x.", lambda canvas: fingertip_figures.moments(canvas, moments), (7.0, 4.0)),
     )  # fmt: skip
-    return Section("Presses", (), (table,), figures)
+    return Section("Presses", (), (table, on_chip), figures)
 
 
 def _curve(results: FingertipResults, k: int) -> Table:
@@ -167,6 +171,9 @@ def _decoding(results: FingertipResults, decoder: ForceDecoder) -> Section:
     fit = f"The decoder leaves {left:.2g} % of the force and {tilt_left:.2g} degrees of the training unexplained (standard deviations)."
     if left > _POOR_PERCENT or tilt_left > _POOR_DEG:
         fit += " That is much: refine the mesh, or add tilts to the training."
+    if results.detector is not None:
+        moved, off = results.detector.sensitivity_mm, 100.0 * results.detector.sensitivity_error
+        fit += f" Drag moves the moment over F_z by {moved:.3g} mm times the sideways share of the force (known within {off:.2g} %)."
     return Section("Forces decoded from the readings", (fit,), (table,), (figure,))
 
 

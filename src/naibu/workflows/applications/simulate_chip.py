@@ -265,7 +265,7 @@ def _sections(chip: PreparedChip, analysis: ChipAnalysis) -> tuple[Section, ...]
     )
     full_scale = (limits[0], limits[0], limits[0], limits[1], limits[1], limits[1])
     rounded = tuple(float(f"{v:.3g}") for v in full_scale)
-    loads = (_loads_table(chip, analysis),) if chip.settings.load else ()
+    loads = _loads_tables(chip, analysis) if chip.settings.load else ()
     sections = [
         Section("Sensitivity and stiffness", (), (sensitivity_table(analysis), model_table(analysis)), (along, placement_figure(analysis))),
         Section("Crosstalk", (), crosstalk_tables(analysis, rounded)),
@@ -277,27 +277,25 @@ def _sections(chip: PreparedChip, analysis: ChipAnalysis) -> tuple[Section, ...]
     return tuple(sections)
 
 
-def _loads_table(chip: PreparedChip, analysis: ChipAnalysis) -> Table:
+def _loads_tables(chip: PreparedChip, analysis: ChipAnalysis) -> tuple[Table, ...]:
     rows: list[tuple[Cell, ...]] = []
+    outputs: list[tuple[Cell, ...]] = []
     for k, load in enumerate(chip.settings.load):
         used = require_bearable(chip.design, load.force_z_mN, load.moment_x_Num, load.moment_y_Num)
         corner = 100.0 * float(surface_stress(analysis.whole, _six(load)).max()) / chip.design.strength_kpa
         bridge = analysis.of_whole @ _six(load)
         volts = 1e-3 * np.array(chip.readout.gains) * bridge
         over = [name for name, v in zip(("F_z", "M_x", "M_y"), volts, strict=True) if abs(v) > chip.readout.adc_limit]
-        rows.append(
-            (_named(load, k), load.force_z_mN, load.moment_x_Num, load.moment_y_Num, 100.0 * used, corner,
-             *(float(v) for v in bridge), *(float(v) for v in volts), ", ".join(over) or "none")
-        )  # fmt: skip
-    columns = (
-        "load", "F_z, mN", "M_x, N µm", "M_y, N µm", "nominal, % of strength", "near corners, % of strength",
-        *(f"bridge {name}, mV" for name in ("F_z", "M_x", "M_y")), *(f"amplified {name}, V" for name in ("F_z", "M_x", "M_y")), "saturated",
-    )  # fmt: skip
-    return Table(
-        "Loads",
-        columns,
-        tuple(rows),
-        caption="Outputs by finite elements of the whole chip, without offset and noise.",
-        note="Near corners: largest tension of finite elements up to a quarter of the thickness from the beams' ends. In a sharp "
-        "corner itself it has no bound; where it exceeds the strength, corners must be rounded, or the load be less.",
+        rows.append((_named(load, k), load.force_z_mN, load.moment_x_Num, load.moment_y_Num, 100.0 * used, corner))
+        outputs.append((_named(load, k), *(float(v) for v in bridge), *(float(v) for v in volts), ", ".join(over) or "none"))
+    columns = ("load", "F_z, mN", "M_x, N µm", "M_y, N µm", "nominal, % of strength", "near corners, % of strength")
+    note = (
+        "Near corners: largest tension of finite elements up to a quarter of the thickness from the beams' ends. In a sharp corner itself "
+        "it has no bound; where it exceeds the strength, corners must be rounded, or the load be less."
+    )
+    names = [f"{what} {name}, {unit}" for what, unit in (("bridge", "mV"), ("amplified", "V")) for name in ("F_z", "M_x", "M_y")]
+    caption = "By finite elements of the whole chip, without offset and noise."
+    return (
+        Table("Loads", columns, tuple(rows), note=note),
+        Table("Outputs", ("load", *names, "saturated"), tuple(outputs), caption=caption),
     )

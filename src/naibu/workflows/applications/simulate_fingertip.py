@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from naibu._version import __version__
-from naibu.applications.fingertip.decoder import ForceDecoder, train_decoder
+from naibu.applications.fingertip.decoder import train_decoder
 from naibu.applications.fingertip.pressing import FingertipModel, Press, Pressing, rotated_loads
 from naibu.applications.fingertip.readings import ReadingChain
+from naibu.applications.fingertip.slip import SlipDetector, train_slip_detector
 from naibu.applications.sensing_chip.chip_mesh import ChipResolution
 from naibu.applications.sensing_chip.filters import first_order_filter
 from naibu.applications.sensing_chip.load_envelope import require_bearable
@@ -83,7 +84,8 @@ def simulate_fingertip(
     folder = output_folder(out, () if resume else names, overwrite=overwrite)
     checkpoint = FingertipCheckpoint.of(folder, study.name, study.source, study.digest)
     trained = study.training.presses(study.fingertip) if study.training else ()
-    run = _Computed((*trained, *study.presses), [])
+    slides = study.training.slides(study.fingertip) if study.training else ()
+    run = _Computed((*trained, *slides, *study.presses), [])
     run.done = checkpoint.read(run.presses) if resume else []
     model = FingertipModel.of(study.fingertip, study.resolution)
     try:
@@ -95,7 +97,7 @@ def simulate_fingertip(
         return SimulationRun((checkpoint.path,), len(run.done), len(run.presses), "presses")
     except InputError as error:
         raise InputError(f"{study.source}: {in_keys(str(error))}") from error
-    results = _results(study, model, run, len(trained))
+    results = _results(study, model, run, (len(trained), len(slides)))
     files = _written(study, results, folder)
     checkpoint.remove()
     return SimulationRun(files, len(run.presses), len(run.presses))
@@ -108,9 +110,11 @@ def _compute(
     count = len(run.presses)
     del run.done[count - 1 :]
     for k in range(len(run.done), count):
+        reached = [0.0]  # a press that slides has a second way
 
-        def tell(fraction: float, k: int = k) -> None:
-            report_progress(progress, f"simulate {study.name}: press {k + 1} of {count}", done=k + 0.99 * fraction, total=count)
+        def tell(fraction: float, k: int = k, reached: list[float] = reached) -> None:
+            reached[0] = max(reached[0], fraction)
+            report_progress(progress, f"simulate {study.name}: press {k + 1} of {count}", done=k + 0.99 * reached[0], total=count)
 
         tell(0.0)
         pressing = model.pressed(run.presses[k], keep_displacement=k == count - 1, callback=tell)
@@ -129,20 +133,24 @@ def _loads(study: PreparedFingertip, k: int, pressing: Pressing) -> FloatArray:
     return rotated_loads(pressing.chip_loads, study.azimuth_deg(k))
 
 
-def _results(study: PreparedFingertip, model: FingertipModel, run: _Computed, trained: int) -> FingertipResults:
+def _results(study: PreparedFingertip, model: FingertipModel, run: _Computed, counts: tuple[int, int]) -> FingertipResults:
+    trained, before = counts[0], sum(counts)
     mesh = study.chip.settings.mesh
     chain = ReadingChain.of_chip(
         study.chip.design, study.chip.readout, ChipResolution(mesh.along, mesh.across, mesh.through, mesh.below, mesh.frame)
     )
-    decoder = None
+    decoder = detector = None
     if study.training is not None:
         decoder = train_decoder(study.fingertip, chain, study.training, run.done[:trained])
-    pressings = tuple(run.done[trained:])
+        detector = train_slip_detector(decoder, chain, study.training, run.done[:trained], run.done[trained:before])
+    pressings = tuple(run.done[before:])
     loads = tuple(_loads(study, k, p) for k, p in enumerate(pressings))
     times, recorded = _recorded(study, chain, pressings[-1], loads[-1])
     names = tuple(study.named(k) for k in range(len(pressings)))
     azimuths = tuple(study.azimuth_deg(k) for k in range(len(pressings)))
-    return FingertipResults(model, chain, names, azimuths, pressings, loads, decoder, study.settings.readings.filter_share, times, recorded)
+    return FingertipResults(
+        model, chain, names, azimuths, pressings, loads, decoder, detector, study.settings.readings.filter_share, times, recorded
+    )
 
 
 def _recorded(study: PreparedFingertip, chain: ReadingChain, pressing: Pressing, loads: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -174,8 +182,8 @@ def _written(study: PreparedFingertip, results: FingertipResults, folder: Path) 
     times = way / (study.settings.press[-1].speed_mm_min / 60.0)
     write_vtkhdf_series(series, solid, times, {"displacement_mm": last.displacement_mm @ turn.T})
     files = [page, numbers, series, readings]
-    if results.decoder is not None:
-        files.append(_write_decoder(folder / f"{study.name}-decoder.json", study, results.decoder))
+    if results.detector is not None:
+        files.append(_write_decoder(folder / f"{study.name}-decoder.json", study, results.detector))
     return tuple(files)
 
 
@@ -184,7 +192,8 @@ def _turn(azimuth_deg: float) -> FloatArray:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _write_decoder(path: Path, study: PreparedFingertip, decoder: ForceDecoder) -> Path:
+def _write_decoder(path: Path, study: PreparedFingertip, detector: SlipDetector) -> Path:
+    decoder = detector.decoder
     arrays = ("volts_per_load", "noise", "coefficients", "unit", "spread", "limits")
     stored = {
         "kind": DECODER,
@@ -193,5 +202,11 @@ def _write_decoder(path: Path, study: PreparedFingertip, decoder: ForceDecoder) 
         "radius_mm": decoder.radius_mm,
         **{name: getattr(decoder, name).tolist() for name in arrays},
         "model_error": decoder.model_error,
+        "slip": {
+            "coefficients": detector.coefficients.tolist(),
+            "spread": detector.spread,
+            "sensitivity_mm": detector.sensitivity_mm,
+            "sensitivity_error": detector.sensitivity_error,
+        },
     }
     return write_atomically(path, json.dumps(stored, indent=1) + "\n")
