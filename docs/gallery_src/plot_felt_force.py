@@ -2,8 +2,8 @@
 A force that a soft fingertip feels
 ===================================
 
-A hemisphere of gel over a sensing chip is pressed by a tilted rod, then dragged. The chip reads one force and two moments; a decoder that was
-trained on other presses tells force and tilt with intervals, and how much of the force is sideways until the contact slides.
+A hemisphere of gel over a sensing chip is pressed by a tilted rod, then dragged. The chip reads one force and two moments; a decoder
+that was trained on other presses tells force and tilt with intervals, and how much of the force is sideways until the contact slides.
 """
 
 import matplotlib.pyplot as plt
