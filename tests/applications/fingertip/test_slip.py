@@ -73,6 +73,8 @@ def test_every_contact_counts_from_its_own_beginning(detector: SlipDetector, dra
     assert found.contact.tolist() == [0, 1, 1, 0, 2, 2]
     assert np.isnan(found.size[[0, 3]]).all() and found.size[2] > 0.2
     assert found.size[4:] == pytest.approx(0.0, abs=1e-6)  # nobody saw how it came there
+    faint = 0.8 * detector.decoder.limits[0] / first[0] * first  # not answered, but still touching
+    assert detector.followed(np.arange(4.0), np.array([first, faint, first, np.zeros(3)])).contact.tolist() == [1, 0, 1, 0]
 
 
 def test_noise_widens_the_interval_and_is_held_by_it(detector: SlipDetector, dragged: Pressing, chain: ReadingChain) -> None:

@@ -23,6 +23,7 @@ from naibu.core.errors import InputError
 
 LEAST_SLIDING_STATES = 3
 _ITERATIONS = 40  # to the ratio of a tilt
+_ENDS = 0.5  # of the least F_z that is answered
 _BEYOND = 1.5  # times the largest ratio of the training
 _TOUCH_S = 1.0
 SLIPS_FROM = 0.9  # of the friction coefficient
@@ -107,8 +108,8 @@ class SlipDetector:
     def followed(self, times_s: ArrayLike, loads: ArrayLike, *, noise_share: float = 1.0, touch_s: float = _TOUCH_S) -> SidewaysForces:
         """Return sideways forces of a recording.
 
-        A contact begins where a reading is answered by the decoder after one that is not. What its readings tell during `touch_s`, in the
-        mean, is where it touches; the rod is supposed to keep its direction from then on.
+        A contact begins where the decoder answers a reading, and ends where F_z is less than half of the decoder's least. What its readings
+        tell during `touch_s`, in the mean, is where it touches; the rod is supposed to keep its direction from then on.
 
         Parameters
         ----------
@@ -130,7 +131,9 @@ class SlipDetector:
         require_shape("times_s", times, (len(rows),))
         require_positive("touch_s", touch_s, "s")
         answered = np.isfinite(self.decoder.decode_loads(rows, noise_share)[:, 0])
-        begins = answered & ~np.concatenate([[False], answered[:-1]])
+        change = np.where(answered, 1, np.where(rows[:, 0] < _ENDS * self.decoder.limits[0], -1, 0))
+        touching = change[np.maximum.accumulate(np.where(change != 0, np.arange(len(rows)), 0))] > 0
+        begins = touching & ~np.concatenate([[False], touching[:-1]])
         contact = np.where(answered, np.cumsum(begins), 0)
         share, sd = np.full((len(rows), 2), np.nan), np.full(len(rows), np.nan)
         for k in range(1, int(contact.max(initial=0)) + 1):

@@ -104,8 +104,8 @@ def _presses(study: PreparedFingertip, results: FingertipResults) -> Section:
     columns = ("press", "tilt, degrees", "azimuth, degrees", "friction", "force along the rod, N", "depth, mm", "contact radius, mm")
     table = Table("Presses", columns, tuple(rows), caption=f"{study.fingertip.diameter_mm:g} mm fingertip, at the end of each press.")
     note = "At the end of each press, without noise. A saturated channel exceeds the converter's range: its reading is not to be used."
-    columns = ("press", "F_z, mN", "M_x, N µm", "M_y, N µm", "reading F_z, V", "reading M_x, V", "reading M_y, V", "saturated")
-    on_chip = Table("On the chip", columns, tuple(felt), note=note)
+    felt_columns = ("press", "F_z, mN", "M_x, N µm", "M_y, N µm", "reading F_z, V", "reading M_x, V", "reading M_y, V", "saturated")
+    on_chip = Table("On the chip", felt_columns, tuple(felt), note=note)
     last = results.pressings[-1]
     forces = [1e-3 * p.along_rod_mn for p in results.pressings]
     moments = {name: volts[:, 1:] for name, volts in zip(results.names, all_volts, strict=True)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -137,6 +138,10 @@ def place_in(outline: BreastOutline, name: str, point: Sequence[float] | None) -
 
 def _view(source: PathLike, name: str, pixel_mm: float | None) -> View:
     path = Path(source)
+    other = "MLO" if name == "CC" else "CC"
+    words = set(re.split("[^A-Z]+", path.stem.upper()))
+    if words & {other, f"L{other}", f"R{other}"} and not words & {name, f"L{name}", f"R{name}"}:
+        raise InputError(f"{path}: is named as a view {other}, given as {name}: are the views swapped? If they are not, rename the file")
     if path.suffix.lower() in _DICOM or is_dicom(path):
         mammogram = read_mammogram(path)
         if mammogram.view != name:

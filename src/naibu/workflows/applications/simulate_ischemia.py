@@ -33,6 +33,7 @@ from naibu.workflows.results.output_folder import output_folder
 
 ISCHEMIA = "ischemia"  # name of the study that naibu brings along
 ISCHEMIA_TITLE = "skin that turns pale under an air jet"
+_MOST_INDENTATION = 0.2  # of the height, beyond which strains are not small
 FRAMES = 60
 LONGEST_RECORD_S = 1e7
 DEEPEST = 100.0  # times the thickness: linear models sink deeper than skin, but not so deep
@@ -235,8 +236,13 @@ def _in_keys(message: str) -> str:
 def _cards(study: PreparedIschemia, motion: SkinMotion, estimate: LayerEstimate | None) -> tuple[Card, ...]:
     area = motion.pale_area(study.settings.pale.threshold_kPa)
     white = motion.times[area > 0.0]
+    deep = motion.indentation.max() > _MOST_INDENTATION * study.patch.height_mm
     cards = [
-        Card("Largest indentation", f"{motion.indentation.max():.3g} mm", f"{study.load.force_mn:g} mN for {study.load.duration_s:g} s"),
+        Card(
+            "Largest indentation",
+            f"{motion.indentation.max():.3g} mm",
+            f"{study.load.force_mn:g} mN for {study.load.duration_s:g} s" + ("; the linear model does not hold so far" if deep else ""),
+        ),
         Card("Largest pale area", f"{area.max():.3g} mm²", f"pressure above {study.settings.pale.threshold_kPa:g} kPa"),
     ]
     if len(white) and white[-1] > study.load.duration_s:
@@ -269,7 +275,7 @@ def _motion_section(study: PreparedIschemia, motion: SkinMotion) -> Section:
         "quantity does not change, or more slowly than the record is long.",
     )  # fmt: skip
     text: tuple[str, ...] = ()
-    if motion.indentation.max() > 0.2 * study.patch.height_mm:
+    if motion.indentation.max() > _MOST_INDENTATION * study.patch.height_mm:
         text = (
             f"The indentation of {motion.indentation.max():.3g} mm is more than a fifth of the height of the skin, "
             f"{study.patch.height_mm:g} mm: the "
