@@ -115,7 +115,7 @@ def _figures(model: FingertipModel, pressings: Sequence[Pressing], chain: Readin
         Figure("Figure 6.11", "Readings over the load at phi = 90 degrees.",
                lambda canvas: fingertip_figures.readings_over_force(canvas, [1e-3 * forces] * len(names), volts, names), (11.0, 3.6)),
         Figure("Figure 6.8", "Section in the plane of the tilt at 20 degrees and 3 N.",
-               lambda canvas: fingertip_figures.section(canvas, model, pressings[4]), (9.0, 4.4)),
+               lambda canvas: fingertip_figures.section(canvas, model, pressings[4]), (9.0, 5.0)),
     )  # fmt: skip
 
 
@@ -124,7 +124,7 @@ def _moments(pressings: Sequence[Pressing], chain: ReadingChain, switched: Seque
     curves = {
         f"phi = {phi:g}, theta = {TILTS[k]:g}": _volts(pressings[k], chain, AZIMUTH_OF_90 + phi - 90.0 + JIG_DEG[k], forces)[:, 1:]
         for k in (2, 4, 6)
-        for phi in (90.0, 270.0)
+        for phi in (0.0, 90.0, 180.0, 270.0)
     }
     loads, matrix = pressings[4].at_force(forces[-1:])[0], chain.sensitivities
     crosstalk = 100.0 * abs(float(matrix[2, 0] * loads[0] / (matrix[2, 4] * loads[4])))

@@ -45,7 +45,7 @@ def section(canvas: Canvas, model: FingertipModel, pressing: Pressing) -> None:
     axes.plot(*ends.T, "C1", linewidth=3.0, label="end of the rod")
     axes.set(xlabel="in the plane of the tilt (mm)", ylabel="above the base (mm)", aspect="equal")
     axes.autoscale_view()
-    axes.legend(fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.02), ncols=3)
+    canvas.legend(fontsize=8, loc="outside upper left", ncols=3)
 
 
 def readings_over_force(canvas: Canvas, forces_n: Sequence[FloatArray], volts: Sequence[FloatArray], names: Sequence[str]) -> None:

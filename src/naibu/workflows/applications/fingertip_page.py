@@ -111,7 +111,7 @@ def _presses(study: PreparedFingertip, results: FingertipResults) -> Section:
     moments = {name: volts[:, 1:] for name, volts in zip(results.names, all_volts, strict=True)}
     figures = (
         Figure("Finger", f"Section in the plane of the tilt under the last press, {results.names[-1]}.",
-               lambda canvas: fingertip_figures.section(canvas, results.model, last), (9.0, 4.6)),
+               lambda canvas: fingertip_figures.section(canvas, results.model, last), (9.0, 5.0)),
         Figure("Readings", "Without noise, over the force along the rod.",
                lambda canvas: fingertip_figures.readings_over_force(canvas, forces, all_volts, results.names), (11.0, 3.6)),
         Figure("Moments", "M_y over M_x.", lambda canvas: fingertip_figures.moments(canvas, moments), (7.0, 4.0)),

@@ -190,6 +190,11 @@ def simulate_ischemia(
     duration, end = study.load.duration_s, study.settings.time.end_s
     after = duration + np.concatenate([[0.0], np.geomspace(1e-3 * (end - duration), end - duration, 400)])
     motion = simulate_skin(modes, materials, study.load, np.unique(np.concatenate([np.linspace(0.0, duration, 400), after])))
+    if motion.indentation.max() > DEEPEST * study.patch.height_mm:
+        raise InputError(
+            f"{study.source}: [load] force_mN is {study.load.force_mn:g}: skin of {study.patch.height_mm:g} mm would sink by "
+            f"{motion.indentation.max():.3g} mm; check the force and the moduli, and their units"
+        )
     tell(2)
     lowest, highest = study.settings.frequency.range_Hz
     frequencies = np.geomspace(lowest, highest, study.settings.frequency.count)
