@@ -17,7 +17,7 @@ from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import LAWS
 from naibu.mechanics.finite_strain.newton import Newton
 from naibu.mechanics.finite_strain.problem import SolverSettings
-from naibu.mechanics.finite_strain.statics import solve
+from naibu.mechanics.finite_strain.statics import AHEAD, solve
 from naibu.mechanics.linear_algebra.direct import SuperLUSolver
 from naibu.mechanics.linear_algebra.multigrid import MultigridSolver
 from naibu.meshing.element_conversion import to_quadratic, to_tetra
@@ -310,3 +310,14 @@ def test_a_solve_gives_up_after_the_iterations_it_is_allowed():
     part = solve(problem(mesh, of("neo_hookean", 0.4), prescribed=support), settings=settings, throw=False)
     assert part.status is Status.ITERATION_LIMIT and part.states[-1].load < 1.0
     assert allowed <= part.iterations < allowed + settings.max_iterations
+
+
+def test_a_solve_near_a_known_one_gives_up_where_it_spends_more_than_its_share():
+    mesh = box((4, 5, 6), (2, 2, 2), centred=False)
+    support = roller(mesh).and_also(side_nodes(mesh, "z+"), (0, 0, -3.0), (False, False, True))
+    body = problem(mesh, of("neo_hookean", 0.4), prescribed=support)
+    whole = solve(body)
+    poor, allowed = [(state.load, 0.0 * state.displacement) for state in whole.states[1:]], whole.iterations // 2
+    part = solve(body, settings=SolverSettings(max_total_iterations=allowed), warm_start=poor, throw=False)
+    assert part.status is Status.ITERATION_LIMIT and part.states[-1].load > 0.0
+    assert allowed * (part.states[-1].load + AHEAD) <= part.iterations < allowed

@@ -16,6 +16,7 @@ from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
 from naibu.mechanics.linear_algebra.direct import PardisoSolver, SuperLUSolver, direct_solver, pardiso_library
 from naibu.mechanics.linear_algebra.iterative import RecycledCholesky
 from naibu.mechanics.linear_algebra.multigrid import MultigridSolver, rigid_body_modes
+from naibu.mechanics.linear_algebra.recycled_factors import RecycledFactors, gmres
 from naibu.mechanics.linear_algebra.solver_selection import choose_solver
 from naibu.meshing.surface import side_nodes
 
@@ -212,6 +213,38 @@ def test_recycled_cholesky_becomes_direct_where_the_tangent_is_indefinite_and_re
         RecycledCholesky(matrix).factorize(stiffness(constrained=np.zeros_like(CONSTRAINED), squeeze=0.0)).solve(b)
 
 
+@needs_pardiso
+def test_recycled_factors_serve_other_unsymmetric_matrices():
+    first, rng = unsymmetric(), np.random.default_rng(8)
+    solver, made = RecycledFactors(first), []
+    renewed = solver._renewed
+    solver._renewed = lambda matrix: made.append(matrix) or renewed(matrix)
+    for scatter in (0.0, 0.001, 0.002, 0.003):
+        matrix = first.copy()
+        matrix.data = first.data * rng.uniform(1.0 - scatter, 1.0 + scatter, first.data.shape)
+        b = rng.normal(size=(matrix.shape[0], 3)) * ~CONSTRAINED.reshape(-1, 1)
+        dense, factorization = matrix.toarray(), solver.factorize(matrix)
+        assert relative(factorization.solve(b), np.linalg.solve(dense, b)) < 1e-8
+        assert relative(factorization.solve(b[:, 0]), np.linalg.solve(dense, b[:, 0])) < 1e-8
+        for tolerance in (1e-2, 1e-6):
+            x = factorization.solve(b[:, 1], tolerance)
+            assert np.linalg.norm(dense @ x - b[:, 1]) <= 1.01 * tolerance * np.linalg.norm(b[:, 1])
+        assert not factorization.solve(0.0 * b[:, 0], 1e-2).any()
+    assert 0 < len(made) < 4
+    with pytest.raises(ConvergenceError, match=r"singular.*constrained"):
+        solver.factorize(stiffness(constrained=np.zeros_like(CONSTRAINED), squeeze=0.0)).solve(b[:, 0], 1e-2)
+
+
+def test_minimal_residuals_find_the_solution_in_as_many_iterations_as_there_are_eigenvalues():
+    values = np.repeat([1.0, 3.0, -2.0, 40.0], 6)
+    matrix = sp.bsr_matrix(np.diag(values))
+    b = np.random.default_rng(9).normal(size=24)
+    x, iterations = gmres(matrix, b, lambda r: r, 1e-12, 30)
+    assert iterations == 4
+    np.testing.assert_allclose(x, b / values, rtol=1e-10)
+    assert gmres(matrix, b, lambda r: r, 1e-12, 3)[0] is None
+
+
 @pytest.mark.parametrize("name", ["recycled_cholesky", "multigrid"])
 def test_iterative_solvers_refuse_unsymmetric_matrices(name):
     with pytest.raises(InputError, match="needs a symmetric matrix"):
@@ -230,4 +263,4 @@ def test_middle_sizes_recycle_their_factorization(monkeypatch):
     monkeypatch.setattr(solver_selection, "RECYCLING_FROM", 60)
     matrix = stiffness()
     assert isinstance(choose_solver(matrix, MESH.points, CONSTRAINED, symmetric=True), RecycledCholesky)
-    assert isinstance(choose_solver(matrix, MESH.points, CONSTRAINED, symmetric=False), PardisoSolver)
+    assert isinstance(choose_solver(matrix, MESH.points, CONSTRAINED, symmetric=False), RecycledFactors)

@@ -20,7 +20,7 @@ from naibu.meshing.primitives import box
 
 SIDE, YOUNG, POISSON, STRETCH = 30.0, 20.0, 0.45, 0.02
 MKL = [pytest.param(True, marks=pytest.mark.skipif(pardiso_library() is None, reason="oneMKL is not installed")), False]
-NEEDS_MKL = ("pardiso", "recycled_cholesky")
+NEEDS_MKL = ("pardiso", "recycled_cholesky", "recycled_lu")
 
 
 def bar(cells: int) -> tuple[Mesh, PrescribedDisplacement, np.ndarray]:

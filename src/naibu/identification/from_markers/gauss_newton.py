@@ -41,7 +41,7 @@ ROUGH = 0.1  # a search is rough while a step may lower the objective by more th
 PATH = SolverSettings(first_step=0.02, largest_step=0.15, tolerance=1e-6)
 NEARBY = replace(PATH, smallest_step=0.02, pseudo_transient=False)  # for a path close to a known one
 REFINED = replace(PATH, smallest_step=0.004, pseudo_transient=False)  # for one known on larger elements
-TRIAL_EFFORT = 1.2  # times the iterations of the dearest solution so far, which a step of the search may cost before it is given up
+TRIAL_EFFORT = 1.2  # times the iterations of the last solution, which a step of the search may cost before it is given up
 LEAST_EFFORT = 100  # iterations that a solution at least is taken to have cost
 
 
@@ -135,7 +135,7 @@ class Matcher:
     settings: MatchingSettings = field(default_factory=MatchingSettings)
     _solvers: dict[int, LinearSolver | None] = field(default_factory=dict)
     _penalties: dict[int, tuple[FloatArray, ...]] = field(default_factory=dict)
-    _dearest: dict[int, int] = field(default_factory=dict)
+    _effort: dict[int, int] = field(default_factory=dict)
     _resting: dict[int, Solution | None] = field(default_factory=dict)
 
     def evaluate(
@@ -190,7 +190,7 @@ class Matcher:
             solution = solve(problem, settings=settings, solver=self._solvers.get(index), warm_start=warm_start)
         except ConvergenceError as error:
             raise ConvergenceError(f"{load_case.name}: {error}") from error
-        self._dearest[index] = max(solution.iterations, self._dearest.get(index, 0))
+        self._effort[index] = solution.iterations
         resting = self._resting[index] = resting_state(solution, self._resting.get(index))
         newton = Newton(solution.problem, PATH, self._solvers.get(index))
         path = self._path_derivatives(load_case, values, solution, newton) if derivatives else ()
@@ -199,7 +199,7 @@ class Matcher:
 
     def _trial_settings(self, index: int, near: SolvedLoadCase | None, warm: bool) -> SolverSettings:
         """Settings of a step of the search: what a solution that starts from another one has not needed, it does without."""
-        limit = int(TRIAL_EFFORT * max(self._dearest.get(index, 0), LEAST_EFFORT))
+        limit = int(TRIAL_EFFORT * max(self._effort.get(index, 0), LEAST_EFFORT))
         rescued = near is not None and near.fit.solution.continued > 0
         return replace(NEARBY if warm and not rescued else PATH, pseudo_transient=rescued, max_total_iterations=limit)
 
@@ -378,7 +378,7 @@ class Matcher:
             if near is None or path is None:
                 return self.evaluate(values, warm_starts)
             solution = near.fit.solution
-            self._dearest[i], self._penalties[i] = solution.iterations, solution.states[-1].normal_stiffness
+            self._effort[i], self._penalties[i] = solution.iterations, solution.states[-1].normal_stiffness
             self._resting[i] = near.fit.resting
             out.append(self._observed(load_case, values, solution, near.fit.resting, path, near.fit.pose))
         return out

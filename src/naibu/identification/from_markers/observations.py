@@ -17,7 +17,7 @@ from naibu.identification.from_markers.specimen.marker_grid import FILLED_SD_MM
 from naibu.identification.from_markers.specimen.specimen_model import Specimen
 from naibu.mechanics.finite_strain.statics import Solution, WarmStart
 
-WARM_START_SPACING = 0.05  # of the load, between states that the next evaluation starts from
+WARM_START_SPACING = 0.1  # of the load, between states that the next evaluation starts from
 SAME = 1e-9  # relative difference of parameters and positions from rounding
 FAR = 0.05  # of the extent of the object, by which nodes move with a change of the parameters that is not small
 

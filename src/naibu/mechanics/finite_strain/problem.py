@@ -24,7 +24,8 @@ class SolverSettings:
     max_iterations : int
         Most Newton iterations of one load step before it is halved.
     max_total_iterations : int, optional
-        Newton iterations after which no further load step is begun; None for no limit.
+        Newton iterations after which no further load step is begun; with a warm start also when those of 30 % more load than is reached are
+        spent. None for no limit.
     pseudo_transient : bool
         Whether pseudo-transient continuation, which costs as much as many load steps, is tried where Newton's method fails even for small
         load steps: the body may snap through to another equilibrium.
@@ -33,7 +34,7 @@ class SolverSettings:
         rigid-body motions of a body that is not in contact yet.
     penetration : float
         Most that a rigid body may penetrate an element, as a fraction of the edge of its face; contact becomes stiffer until it holds.
-    linear_solver : {"automatic", "superlu", "pardiso", "recycled_cholesky", "multigrid"}
+    linear_solver : {"automatic", "superlu", "pardiso", "recycled_cholesky", "recycled_lu", "multigrid"}
         See `naibu.mechanics.linear_algebra.solver_selection`.
     """
 

@@ -21,6 +21,7 @@ MOST_RAISES = 8  # of the penalties of contact at a load
 PSEUDO_TRANSIENT_STEP = 0.3  # first load steps; longer ones are halved before pseudo-transient continuation is tried
 JUMP = 4.0  # times the displacement that was to be expected
 PSEUDO_FAILURES = 4  # of pseudo-transient continuation, each much longer than Newton's method, before no equilibrium is sought further
+AHEAD = 0.3  # of the load: a path near a known one, with limited iterations, may not spend those of more than this before it is there
 PATIENCE = 2  # load steps for which Newton's method fails, before frictional points on soft elements stick more softly
 WarmStart = tuple[float, FloatArray]  # a fraction of the load, and an initial guess of the displacement there (n, 3), mm
 
@@ -168,7 +169,8 @@ class _LoadPath:
             last, penalties = states[-1], self.newton.problem
             passed = next((h for h in reversed(self.warm_start) if h[0] <= last.load + 1e-9), None)
             ahead = next((h for h in self.warm_start if h[0] > last.load + 1e-9), None)
-            if settings.max_total_iterations is not None and self.newton.iterations >= settings.max_total_iterations:
+            most = settings.max_total_iterations
+            if most is not None and self.newton.iterations >= most * (min(1.0, last.load + AHEAD) if self.warm_start else 1.0):
                 self.status = Status.ITERATION_LIMIT
                 return None
             load = min(1.0, last.load + min(self.step, self.ceiling)) if ahead is None else min(ahead[0], last.load + self.step)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -86,10 +87,20 @@ class RecyclingSolver(ABC):
         return self._exact.factorize(matrix).solve(b)
 
 
+class Iteration(Protocol):
+    """An iterative solver with its usual relative tolerance."""
+
+    tolerance: float
+
+    def iterate(self, matrix: sp.bsr_matrix, b: FloatArray, tolerance: float) -> FloatArray:
+        """Solve for right-hand sides (n, r)."""
+        ...
+
+
 class ApproximateFactorization:
     """A matrix with a preconditioner that may stem from an earlier one; solves to the requested accuracy."""
 
-    def __init__(self, solver: RecyclingSolver, matrix: sp.bsr_matrix) -> None:
+    def __init__(self, solver: Iteration, matrix: sp.bsr_matrix) -> None:
         self._solver, self._matrix = solver, matrix
 
     def solve(self, b: FloatArray, relative_tolerance: float | None = None) -> FloatArray:

@@ -10,6 +10,8 @@ the values, and ``solve(b)`` of the factorization may be called for any number o
 ``"recycled_cholesky"``
     Conjugate gradients preconditioned by a single-precision Cholesky factor of an earlier matrix, for symmetric systems that change little
     from one to the next.
+``"recycled_lu"``
+    GMRES preconditioned by a single-precision LU factor of an earlier matrix, for unsymmetric systems that change little likewise.
 ``"multigrid"``
     Conjugate gradients preconditioned by smoothed aggregation with rigid-body modes, for large symmetric systems :cite:p:`vanek1996`.
 
@@ -28,8 +30,9 @@ from naibu.mechanics.linear_algebra.direct import PardisoSolver, SuperLUSolver, 
 from naibu.mechanics.linear_algebra.iterative import RecycledCholesky
 from naibu.mechanics.linear_algebra.multigrid import MultigridSolver
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
+from naibu.mechanics.linear_algebra.recycled_factors import RecycledFactors
 
-SolverName = Literal["automatic", "superlu", "pardiso", "recycled_cholesky", "multigrid"]
+SolverName = Literal["automatic", "superlu", "pardiso", "recycled_cholesky", "recycled_lu", "multigrid"]
 
 DIRECT_LIMIT = 200_000  # unknowns from which a factorization costs more than multigrid, even if it is recycled; a tenth of that for SuperLU
 SINGLE_LIMIT = 25_000  # unknowns from which multigrid solves a single system sooner, up to the Poisson's ratio below
@@ -58,9 +61,9 @@ def choose_solver(
         Constrained components.
     symmetric : bool
         Whether all matrices will be symmetric.
-    solver : {"automatic", "superlu", "pardiso", "recycled_cholesky", "multigrid"}
-        See the module. ``"automatic"`` is direct for unsymmetric and for small systems, recycled Cholesky up to `DIRECT_LIMIT` unknowns
-        (where oneMKL is installed), and multigrid above; without oneMKL multigrid begins at a tenth of that.
+    solver : {"automatic", "superlu", "pardiso", "recycled_cholesky", "recycled_lu", "multigrid"}
+        See the module. ``"automatic"`` is direct for small systems; recycled LU for larger unsymmetric ones, recycled Cholesky for
+        symmetric ones up to `DIRECT_LIMIT` unknowns (with oneMKL), and multigrid above; without oneMKL multigrid begins at a tenth of that.
     poisson_ratio : float, optional
         The largest in the body, if one system only is to be solved: multigrid then begins at `SINGLE_LIMIT` unknowns up to `COMPRESSIBLE`.
 
@@ -77,6 +80,8 @@ def choose_solver(
         return SuperLUSolver()
     if solver == "pardiso":
         return PardisoSolver(matrix, symmetric=symmetric)
+    if solver == "recycled_lu":
+        return RecycledFactors(matrix)
     if not symmetric:
         raise InputError(f"solver={solver!r} needs a symmetric matrix; with friction use 'pardiso', 'superlu' or 'automatic'")
     return RecycledCholesky(matrix) if solver == "recycled_cholesky" else MultigridSolver(points, constrained)
@@ -86,7 +91,7 @@ def _automatic(unknowns: int, symmetric: bool, poisson_ratio: float | None) -> S
     with_mkl = pardiso_library() is not None
     direct: SolverName = "pardiso" if with_mkl else "superlu"
     if not symmetric:
-        return direct
+        return "recycled_lu" if with_mkl and unknowns > RECYCLING_FROM else direct
     single = poisson_ratio is not None and poisson_ratio <= COMPRESSIBLE
     limit = DIRECT_LIMIT if with_mkl else DIRECT_LIMIT // 10
     if unknowns > (min(limit, SINGLE_LIMIT) if single else limit):
