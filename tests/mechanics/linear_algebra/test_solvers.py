@@ -261,6 +261,7 @@ def test_unknown_solvers_and_constraints_of_another_shape_are_refused():
 @needs_pardiso
 def test_middle_sizes_recycle_their_factorization(monkeypatch):
     monkeypatch.setattr(solver_selection, "RECYCLING_FROM", 60)
+    monkeypatch.setattr(solver_selection, "UNSYMMETRIC_FROM", 60)
     matrix = stiffness()
     assert isinstance(choose_solver(matrix, MESH.points, CONSTRAINED, symmetric=True), RecycledCholesky)
     assert isinstance(choose_solver(matrix, MESH.points, CONSTRAINED, symmetric=False), RecycledFactors)

@@ -38,6 +38,7 @@ DIRECT_LIMIT = 200_000  # unknowns from which a factorization costs more than mu
 SINGLE_LIMIT = 25_000  # unknowns from which multigrid solves a single system sooner, up to the Poisson's ratio below
 COMPRESSIBLE = 0.49  # beyond it the iterations of multigrid become many
 RECYCLING_FROM = 4_000  # unknowns from which a factorization is worth recycling
+UNSYMMETRIC_FROM = 1_000  # likewise for unsymmetric systems, of which LU factors cost twice as much
 
 
 def choose_solver(
@@ -91,7 +92,7 @@ def _automatic(unknowns: int, symmetric: bool, poisson_ratio: float | None) -> S
     with_mkl = pardiso_library() is not None
     direct: SolverName = "pardiso" if with_mkl else "superlu"
     if not symmetric:
-        return "recycled_lu" if with_mkl and unknowns > RECYCLING_FROM else direct
+        return "recycled_lu" if with_mkl and unknowns > UNSYMMETRIC_FROM else direct
     single = poisson_ratio is not None and poisson_ratio <= COMPRESSIBLE
     limit = DIRECT_LIMIT if with_mkl else DIRECT_LIMIT // 10
     if unknowns > (min(limit, SINGLE_LIMIT) if single else limit):
