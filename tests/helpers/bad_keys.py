@@ -24,6 +24,14 @@ CYLINDER = {"shape": "cylinder", "radius_mm": 4.0, "length_mm": 5.0, "axis": [0.
 PUSHED = {**BALL, "force": [[0.0, 0.0], [0.1, 5.0]], "direction": [0.0, 0.0, -1.0], "mass_g": 20.0}
 STEERED = {**BALL, "velocity": [[0.0, 0.0, 0.0, -5.0], [0.1, 0.0, 0.0, 0.0]]}
 TIED = {**BOX, "contact": "tied", "until_s": 0.1, "centre_mm": [10.0, 10.0, 22.5]}
+POINTS = {
+    **BOX,
+    "contact": "points",
+    "centre_mm": [10.0, 10.0, 22.5],
+    "points_mm": 2.5,
+    "path": [[0.0, 0.0, 0.0, 0.0], [0.1, 0.0, 0.0, -1.0]],
+}
+LAYERS = {"labels": "labels.mha", "density_g_per_cm3": 1.0}
 CELLS = {"cells": [3, 2, 2], "density_g_per_cm3": 1.0}
 
 
@@ -46,6 +54,8 @@ class BadKey:
     value: object
 
 
+MODULI: dict[str, Any] = {"parameters": None, "material": {"young_modulus_kPa": 12.0}}  # in place of the parameters of elements
+PRESSED = {"indenter": [POINTS], "floor": {}}
 STUDY_KEYS: tuple[tuple[dict[str, Any], Place, tuple[object, ...]], ...] = (
     ({}, ("object", "size_mm", 0), POSITIVE), ({}, ("object", "size_mm"), POSITIVE), ({}, ("object", "mass_g"), POSITIVE),
     ({"object": CELLS}, ("object", "cells", 1), COUNTS), ({"object": CELLS}, ("object", "density_g_per_cm3"), POSITIVE),
@@ -66,6 +76,49 @@ STUDY_KEYS: tuple[tuple[dict[str, Any], Place, tuple[object, ...]], ...] = (
     ({"indenter": [STEERED]}, ("indenter", 0, "velocity", 0, 3), ANY_SIGN),
     ({"indenter": [TIED], "floor": {}}, ("indenter", 0, "until_s"), FROM_ZERO), ({}, ("output", "every_s"), POSITIVE),
     ({}, ("output", "forces_every_s"), POSITIVE),
+    (MODULI, ("material", "young_modulus_kPa"), tuple(v for v in POSITIVE if v != "5" and v != "nan")),
+    (MODULI, ("material", "retardation_s"), FROM_ZERO),
+    (MODULI, ("material", "relaxation_s"), tuple(v for v in POSITIVE if v != float("inf"))), (MODULI, ("material", "K"), (40.0,)),
+    (MODULI | {"object": LAYERS}, ("material", "young_modulus_kPa", "1"), tuple(v for v in POSITIVE if not isinstance(v, str))),
+    (MODULI | {"object": LAYERS}, ("material", "young_modulus_kPa", "gel"), (5.0,)),
+    (PRESSED, ("indenter", 0, "points_mm"), POSITIVE), (PRESSED, ("indenter", 0, "mass_g"), (5.0,)),
+    (PRESSED, ("indenter", 0, "shape"), ("cone", "", 5)), (PRESSED, ("indenter", 0, "until_s"), FROM_ZERO),
+    (PRESSED, ("indenter", 0, "contact"), ("touching", "", 5, [])),
+)  # fmt: skip
+INDENTATION = """
+[solid]
+size_mm = [20.0, 20.0, 10.0]
+element_mm = 5.0
+held_below_mm = 1.0
+[[material]]
+young_modulus_kPa = 10.0
+poisson_ratio = 0.45
+[[indenter]]
+shape = "sphere"
+radius_mm = 4.0
+centre_mm = [10.0, 10.0, 14.0]
+travel_mm = [0.0, 0.0, -1.0]
+friction = 0.3
+[refinement]
+tolerance = 0.3
+max_unknowns = 2000
+fraction = 0.6
+[output]
+steps = 2
+"""
+BAR = {"shape": "bar", "radius_mm": 4.0, "length_mm": 30.0, "axis": [0.0, 1.0, 0.0], "centre_mm": [10.0, 10.0, 14.0]}
+BAR |= {"travel_mm": [0.0, 0.0, -1.0]}
+INDENTATION_KEYS: tuple[tuple[dict[str, Any], Place, tuple[object, ...]], ...] = (
+    ({}, ("solid", "size_mm", 0), POSITIVE), ({}, ("solid", "size_mm"), POSITIVE), ({}, ("solid", "element_mm"), POSITIVE),
+    ({}, ("solid", "held_below_mm"), FROM_ZERO), ({}, ("solid", "mesh"), ("nosuch.vtu", "", 5)),
+    ({}, ("material", 0, "young_modulus_kPa"), POSITIVE), ({}, ("material", 0, "poisson_ratio"), (*FROM_ZERO, 0.4995, 0.5)),
+    ({}, ("material", 0, "law"), ("mooney", "", 5)), ({}, ("material", 0, "region"), ("nosuch", "", 5)),
+    ({}, ("indenter", 0, "shape"), ("cone", "", 5)), ({}, ("indenter", 0, "radius_mm"), POSITIVE),
+    ({}, ("indenter", 0, "centre_mm", 2), ANY_SIGN), ({}, ("indenter", 0, "travel_mm", 2), ANY_SIGN),
+    ({}, ("indenter", 0, "travel_mm"), ANY_SIGN), ({}, ("indenter", 0, "friction"), FROM_ZERO),
+    ({"indenter": [BAR]}, ("indenter", 0, "length_mm"), POSITIVE), ({"indenter": [BAR]}, ("indenter", 0, "axis", 1), ANY_SIGN),
+    ({}, ("refinement", "tolerance"), POSITIVE), ({}, ("refinement", "max_unknowns"), (*COUNTS, 99)),
+    ({}, ("refinement", "fraction"), POSITIVE), ({}, ("refinement", "goal"), ("stress", "", 5)), ({}, ("output", "steps"), COUNTS),
 )  # fmt: skip
 META_KEYS: tuple[tuple[Place, tuple[object, ...]], ...] = (
     (("coordinates", "pixel_mm"), POSITIVE), (("coordinates", "xy_step_mm"), POSITIVE), (("coordinates", "step_mm"), POSITIVE),
@@ -84,11 +137,14 @@ META_KEYS: tuple[tuple[Place, tuple[object, ...]], ...] = (
 def bad_studies() -> Iterator[BadKey]:
     """Yield study files with one bad value each."""
     for changes, place, values in STUDY_KEYS:
-        base = tomllib.loads(STUDY) | copy.deepcopy(changes)
+        base = {name: table for name, table in (tomllib.loads(STUDY) | copy.deepcopy(changes)).items() if table is not None}
         if "floor" in changes:
             base["floor"] = {"contact": "sticking"}
         for value in values:
             yield BadKey(_changed(base, place, value), _key(place), value)
+    for changes, place, values in INDENTATION_KEYS:
+        for value in values:
+            yield BadKey(_changed(tomllib.loads(INDENTATION) | copy.deepcopy(changes), place, value), _key(place), value)
 
 
 def bad_descriptions(meta: str) -> Iterator[BadKey]:
@@ -106,7 +162,9 @@ def _changed(file: dict[str, Any], place: Place, value: object) -> dict[str, Any
     changed: Any = copy.deepcopy(file)
     inner = changed
     for step in place[:-1]:
-        inner = inner.setdefault(step, {}) if isinstance(inner, dict) else inner[step]
+        if isinstance(inner, dict) and not isinstance(inner.get(step), dict | list):
+            inner[step] = {}
+        inner = inner[step]
     inner[place[-1]] = value
     return dict(changed)
 

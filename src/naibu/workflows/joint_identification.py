@@ -32,7 +32,7 @@ from naibu.workflows.fields.block_mesh import labelled_object, names_of_labels
 from naibu.workflows.fields.identify_fields import FieldIdentification, identify_fields
 from naibu.workflows.fields.known_zones import KnownZones, parse_known_zones
 from naibu.workflows.markers.experiments import RATIO_REFERENCE_KPA, Source, load_experiments, parse_known
-from naibu.workflows.markers.identify import Identification, identify
+from naibu.workflows.markers.identify import Identification, identify, require_states
 from naibu.workflows.results.files_together import written_together
 from naibu.workflows.results.output_folder import output_folder
 
@@ -132,8 +132,14 @@ def identify_jointly(
     inside, labels = labelled_object(mask, zones)
     materials = {m for e in loaded_experiments for m in e.materials}
     zones_there = list(names_of_labels(labels, inside, zone_names or {}).values())
+    require_states(loaded_experiments, states or {})
     of_markers, of_fields = _divided(known, materials, set(zones_there))
     _require_one_scale(parse_known(of_markers), parse_known_zones(of_fields, zones_there))
+    if not materials & set(zones_there):
+        raise InputError(
+            f"no material of the experiments ({', '.join(sorted(materials))}) has the name of a zone of the fields "
+            f"({', '.join(sorted(zones_there))}), so that nothing is shared; name zones after materials with `zone_names`"
+        )
     from_fields = identify_fields(
         fields, mask=mask, zones=zones, zone_names=zone_names, known=of_fields, loaded=loaded, unit=unit, spacing_mm=spacing_mm,
         element_size_mm=element_size_mm, out=folder / FIELDS, overwrite=overwrite, progress=progress,

@@ -14,6 +14,7 @@ from naibu.io.field_formats import tecplot
 from naibu.io.tables.point_tables import PointTable, assembled, columns_of, read_point_table
 from naibu.io.tables.table_cells import unit_factor
 
+FARTHEST_MM = 1e5  # of a point from the origin, as in tables of markers
 NEEDED = "x_mm, y_mm, z_mm, ux_mm, uy_mm, uz_mm"
 
 
@@ -45,6 +46,8 @@ def read(source: Path, *, unit: str | None = None, spacing_mm: Sequence[float] |
     if not known.any():
         raise InputError(f"{source.name}: has no point whose coordinates are all known")
     points, vectors = table.points[known] * scale, table.vectors[known] * scale
+    if (far := float(np.abs(points).max())) > FARTHEST_MM:
+        raise InputError(f"{source.name}: a point lies {far:.3g} mm from the origin, {FARTHEST_MM:g} mm are possible; check the unit")
     valid = np.asarray(np.isfinite(vectors).all(axis=1) & (True if table.valid is None else table.valid[known]))
     return DisplacementField.from_arrays(points, vectors, sd_mm=_sd(source, table, known, scale, valid), valid=valid)
 

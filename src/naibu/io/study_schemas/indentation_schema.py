@@ -75,7 +75,7 @@ class RefinementTable(CheckedTable):
     goal: Literal["force", "energy", "none"] = "force"
     tolerance: Annotated[Positive, between(1e-4, 1.0)] = 0.05
     max_unknowns: Annotated[int, Field(ge=100, le=2_000_000)] = 20_000
-    fraction: Annotated[float, Field(gt=0.0, le=1.0)] = 0.6
+    fraction: Annotated[float, Field(ge=0.01, le=1.0)] = 0.6
 
 
 class StepsTable(CheckedTable):

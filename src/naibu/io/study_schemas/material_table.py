@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, model_validator
 
 from naibu.io.experiment_folder.schema import NotNegative, between
 
 _LEAST, _MOST = 1e-9, 1e9  # kPa
+_SHORTEST_S, _LONGEST_S = 1e-9, 1e6
 
 
 def _modulus(value: Any) -> Any:
@@ -29,6 +30,13 @@ def _modulus(value: Any) -> Any:
     return float(value)
 
 
+def _relaxation(value: float) -> float:
+    """Check a time of relaxation, s: infinite where stress does not relax."""
+    if value != np.inf and not _SHORTEST_S <= value <= _LONGEST_S:
+        raise ValueError(f"must lie between {_SHORTEST_S:g} and {_LONGEST_S:g}, or be inf where stress does not relax")
+    return value
+
+
 class MaterialTable(BaseModel):
     """``[material]``: instead of ``[parameters]``, of the elastic solid that the lattice stands for."""
 
@@ -36,7 +44,7 @@ class MaterialTable(BaseModel):
 
     young_modulus_kPa: Annotated[Any, AfterValidator(_modulus)]
     retardation_s: Annotated[NotNegative, between(0.0, 1e6)] = 0.0
-    relaxation_s: Annotated[float, Field(gt=0.0)] = np.inf
+    relaxation_s: Annotated[float, AfterValidator(_relaxation)] = np.inf
 
     @model_validator(mode="after")
     def _mapped(self) -> MaterialTable:

@@ -27,6 +27,8 @@ from naibu.viewer.tables import Cell, Table
 from naibu.workflows.applications.slip_report import slip_card, slip_section, slip_summary, slip_words
 from naibu.workflows.results.output_folder import output_folder
 
+MOST_VOLTS = 1e6
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
@@ -113,6 +115,8 @@ def decode_forces(
         raise InputError(
             f"{table}: row {int(np.flatnonzero(np.diff(rows[:, 0]) <= 0.0)[0]) + 2} is not later than the one before; sort them"
         )
+    if (beyond := np.abs(rows[:, 1:]).max()) > MOST_VOLTS:
+        raise InputError(f"{table}: a reading of {beyond:.3g} V is none of a fingertip (at most {MOST_VOLTS:g} V); check its columns")
     if free_rows > len(rows):
         raise InputError(
             f"free_rows is {free_rows}, and {table} has {len(rows)} rows; give at most so many, or 0 for readings without offset"

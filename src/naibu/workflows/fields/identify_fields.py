@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,8 @@ import numpy as np
 
 from naibu._version import __version__
 from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.displacement_field import DisplacementField
+from naibu.core.errors import InputError
 from naibu.core.progress import Progress
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.estimate import TOO_COARSE, identify_field
@@ -163,6 +166,7 @@ def identify_fields(
     paths = [fields] if isinstance(fields, str | os.PathLike) else list(fields)
     folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
     read = [read_field(path, unit=unit, spacing_mm=spacing_mm) for path in paths]
+    _require_different(paths, read)
     inside, labels = labelled_object(mask, zones)
     names = names_of_labels(labels, inside, zone_names or {})
     stated = parse_known_zones(known, list(names.values()))
@@ -181,6 +185,13 @@ def identify_fields(
     coarse = blurred(mesh, cell_of_voxel, inside, labels, names)
     result = FieldIdentification(found, body, stated.relative, (*found.identifiability, *coarse), coarse, inside, cell_of_voxel)
     return result if folder is None else replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))
+
+
+def _require_different(paths: Sequence[str | os.PathLike[str]], fields: Sequence[DisplacementField]) -> None:
+    """Refuse a field that is there twice: it would count as two measurements."""
+    for (first, a), (second, b) in combinations(zip(paths, fields, strict=True), 2):
+        if np.array_equal(a.vectors, b.vectors, equal_nan=True):
+            raise InputError(f"{first} and {second} hold the same displacements, which would count twice; name each field once")
 
 
 def zones_of_voxels(found: FieldEstimate, inside: Volume, cells: IntArray) -> IntArray:

@@ -43,9 +43,11 @@ def measured_load_case(
     Raises
     ------
     InputError
-        Hardly a measurement in the object, one that does not deform, or a side that does not exist.
+        A field in the plane, hardly a measurement in the object, one that does not deform, or a side that does not exist.
     """
     at = field.at_points()
+    if at.points.shape[1] != 3:
+        raise InputError(f"{name}: positions have {at.points.shape[1]} coordinates; moduli are identified from displacements in space")
     index = np.round(inside.to_index(at.points)).astype(int)[:, ::-1]
     within = ((index >= 0) & (index < inside.shape)).all(axis=1) & at.valid
     within[within] = cell_of_voxel[tuple(index[within].T)] >= 0

@@ -161,7 +161,7 @@ def identify(
     loaded = load_experiments(experiments)
     known_materials, chosen = parse_known(known), settings or ModelSettings()
     require_element_size(loaded, chosen.element_size_mm)
-    _check_states(loaded, states or {})
+    require_states(loaded, states or {})
     provenance = provenance_of(loaded, known, states or {}, chosen)
     doubts = check_markers(loaded, states)
     loaded, outliers = without_outliers(loaded, states)
@@ -215,7 +215,7 @@ def _outliers(calibration: Calibration) -> tuple[Outlier, ...]:
     return tuple(o for load_case, fit in pairs for o in outliers_of_fit(load_case, fit))
 
 
-def _check_states(loaded: Sequence[Experiment], states: Mapping[str, Sequence[str]]) -> None:
+def require_states(loaded: Sequence[Experiment], states: Mapping[str, Sequence[str]]) -> None:
     """Refuse states that no experiment has, or that show no load."""
     by_name = {e.name: e for e in loaded}
     for name, chosen in states.items():

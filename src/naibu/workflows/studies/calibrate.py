@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -133,6 +134,12 @@ def calibrate_study(
     for name, count in (("max_runs", max_runs), ("threads", threads)):
         if count < 1:
             raise InputError(f"{name} is {count}: must be at least 1")
+    if seed < 0:
+        raise InputError(f"seed is {seed}: must be 0 or more")
+    if force_sd_mn is not None and not forces:
+        raise InputError(f"force_sd_mn is {force_sd_mn:g}, but there are no records of forces; leave it out")
+    if twice := [shape for shape, count in Counter(map(str, shapes)).items() if count > 1]:
+        raise InputError(f"`shapes` names {twice[0]} twice, which would count as two measurements; name it once")
     if not shapes and not forces:
         raise InputError("`shapes` and `forces` are both missing; give captured points, records of force sensors, or both")
     prepared = prepared_study(study)

@@ -122,15 +122,21 @@ def simulate(
         An explicit method became unstable; the frames before are kept.
     """
     name = os.fspath(study)
-    if describes_sweep(study):
+    sweep = describes_sweep(study)
+    of_chip, of_skin, of_finger = describes_chip(study), describes_ischemia(study), describes_fingertip(study)
+    pressed = describes_indentation(study)
+    of_elements = of_chip or of_skin or of_finger or pressed or name == SQUARES_TOGETHER or name in SLUGS
+    if (sweep or of_elements) and checkpoint_every != CHECKPOINT_EVERY:
+        raise InputError(
+            f"checkpoint_every is {checkpoint_every}: frames between checkpoints are of lattices, and {name} is none; leave it out"
+        )
+    if sweep:
         if device != "cpu":
             raise InputError(f"device is {device!r}, and {name} is a sweep, whose runs are computed on 'cpu'; choose that")
         return simulate_sweep(study, out, resume=resume, overwrite=overwrite, workers=workers, cluster=cluster, progress=progress)
     if Workers(workers, cluster).elsewhere:
         raise InputError(f"`workers` and `cluster` share out the runs of a sweep, and {name} is one run; leave them out")
-    of_chip, of_skin, of_finger = describes_chip(study), describes_ischemia(study), describes_fingertip(study)
-    pressed = describes_indentation(study)
-    if not (of_chip or of_skin or of_finger or pressed) and name != SQUARES_TOGETHER and name not in SLUGS:
+    if not of_elements:
         return simulate_lattice(
             study, out, resume=resume, overwrite=overwrite, checkpoint_every=checkpoint_every, device=device, progress=progress
         )
