@@ -126,22 +126,7 @@ def calibrate_study(
     ConvergenceError
         The iterations did not settle.
     """
-    if method not in get_args(Method):
-        raise InputError(f"method is {method!r}; choose one of {', '.join(get_args(Method))}")
-    require_within("point_sd_mm", point_sd_mm, 1e-6, 1e3, "mm")
-    if force_sd_mn is not None:
-        require_within("force_sd_mn", force_sd_mn, 1e-6, 1e6, "mN")
-    for name, count in (("max_runs", max_runs), ("threads", threads)):
-        if count < 1:
-            raise InputError(f"{name} is {count}: must be at least 1")
-    if seed < 0:
-        raise InputError(f"seed is {seed}: must be 0 or more")
-    if force_sd_mn is not None and not forces:
-        raise InputError(f"force_sd_mn is {force_sd_mn:g}, but there are no records of forces; leave it out")
-    if twice := [shape for shape, count in Counter(map(str, shapes)).items() if count > 1]:
-        raise InputError(f"`shapes` names {twice[0]} twice, which would count as two measurements; name it once")
-    if not shapes and not forces:
-        raise InputError("`shapes` and `forces` are both missing; give captured points, records of force sensors, or both")
+    _check_arguments(shapes, forces, method, point_sd_mm, force_sd_mn, max_runs, threads, seed)
     prepared = prepared_study(study)
     if prepared.settings.material is not None and groups != "given":
         raise InputError(
@@ -171,6 +156,34 @@ def calibrate_study(
     numbers = {**_numbers(estimate), "misfit": misfit_numbers(problem, before, after), "warnings": list(warnings), "settings": options}
     written = write_atomically(folder / "calibration.json", json.dumps(numbers, indent=1, ensure_ascii=False) + "\n")
     return LatticeCalibration((page, written, target), estimate, warnings)
+
+
+def _check_arguments(
+    shapes: Sequence[str | os.PathLike[str]],
+    forces: Sequence[str | os.PathLike[str]],
+    method: str,
+    point_sd_mm: float,
+    force_sd_mn: float | None,
+    max_runs: int,
+    threads: int,
+    seed: int,
+) -> None:
+    if method not in get_args(Method):
+        raise InputError(f"method is {method!r}; choose one of {', '.join(get_args(Method))}")
+    require_within("point_sd_mm", point_sd_mm, 1e-6, 1e3, "mm")
+    if force_sd_mn is not None:
+        require_within("force_sd_mn", force_sd_mn, 1e-6, 1e6, "mN")
+    for name, count in (("max_runs", max_runs), ("threads", threads)):
+        if count < 1:
+            raise InputError(f"{name} is {count}: must be at least 1")
+    if seed < 0:
+        raise InputError(f"seed is {seed}: must be 0 or more")
+    if force_sd_mn is not None and not forces:
+        raise InputError(f"force_sd_mn is {force_sd_mn:g}, but there are no records of forces; leave it out")
+    if twice := [shape for shape, count in Counter(map(str, shapes)).items() if count > 1]:
+        raise InputError(f"`shapes` names {twice[0]} twice, which would count as two measurements; name it once")
+    if not shapes and not forces:
+        raise InputError("`shapes` and `forces` are both missing; give captured points, records of force sensors, or both")
 
 
 def _problem(
