@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from naibu.cli.identifying import ContactModel, Joined, Law, PixelScale, Unit, identify_from_both, identify_from_fields
+from naibu.cli.identifying import FIELD_FILES, ContactModel, Joined, Law, PixelScale, Unit, identify_from_both, identify_from_fields
 from naibu.cli.shell.console import GRAVE, INTERRUPTED, NOT_EXPLAINED, WARNING, print_table, progress_display, say
 from naibu.cli.shell.described import Flag, Known, ObjectOptions, Out, Overwrite, WorkerOptions, require_left_out
 from naibu.cli.shell.run_record import found, wrote
@@ -25,11 +25,6 @@ if TYPE_CHECKING:
 
 DEMO = ("ct_two_material_1", "ct_two_material_2", "ct_two_material_3")
 DEMO_KNOWN = "hardness 5=222 kPa"  # mean of the report's compression tests, Table 3.4
-# operands of identify that can only be displacement fields
-FIELD_FILES = (
-    *(".h5", ".hdf5", ".tfm", ".mha", ".mhd", ".nrrd", ".nhdr", ".nii", ".gz"),
-    *(".vtu", ".mat", ".csv", ".tsv", ".txt", ".xlsx", ".dat"),
-)
 
 
 @verb(START, "demo --open   # about a minute; opens the report")

@@ -18,6 +18,11 @@ ContactModel = Literal["coulomb", "stick", "springs"]
 PixelScale = Literal["given", "sought"]
 Joined = Literal["tied", "sliding"]
 Law = Literal["neo_hookean", "neo_hookean_isochoric", "mooney_rivlin", "yeoh", "saint_venant_kirchhoff"]
+# operands that can only be displacement fields
+FIELD_FILES = (
+    *(".h5", ".hdf5", ".tfm", ".mha", ".mhd", ".nrrd", ".nhdr", ".nii", ".gz"),
+    *(".vtu", ".mat", ".csv", ".tsv", ".txt", ".xlsx", ".dat"),
+)
 
 
 def identify_from_fields(
@@ -99,7 +104,8 @@ def identify_from_both(
     say(table.note, "dim")
     wrote(*result.files)
     found(usable=result.usable)
-    say(f"{time.perf_counter() - began:.0f} s. Results in {out}: open report.html; each kind by itself is in markers and fields.")
+    told = f"Results in {out}: open report.html; naibu predict takes model.json; each kind by itself is in markers and fields."
+    say(f"{time.perf_counter() - began:.0f} s. {told}")
     if not result.usable:
-        say("A model does not explain its data: the results are marked as not to be used.", GRAVE)
+        say("A model does not explain the data: the results are marked as not to be used.", GRAVE)
         sys.exit(NOT_EXPLAINED)

@@ -8,6 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from naibu.cli.identifying import FIELD_FILES
 from naibu.cli.shell.console import say
 from naibu.cli.shell.described import Flag, Out, Overwrite
 from naibu.cli.shell.run_record import found, wrote
@@ -42,7 +43,7 @@ def predict(
     Parameters
     ----------
     model
-        The model.json that 'naibu identify' wrote, or its folder.
+        The model.json that 'naibu identify' wrote, or its folder. One of markers and fields together predicts either.
     experiment
         Of markers: folder or name of a bundled dataset; its unloaded state is needed, the loaded one may be missing. With a model of
         displacement fields: a measured field; it may be left out where a side is moved.
@@ -64,11 +65,14 @@ def predict(
         Replace results, or files of your own, that the folder already holds.
     """
     from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
+    from naibu.workflows.joint_model import JointModel
     from naibu.workflows.results.result_folder import read_any_model
 
     of_markers = {"state": state, "height_mm": height_mm, "heights_from_markers": heights_from_markers or None}
     of_fields = {"hold": hold, "move": move}
-    if isinstance(read_any_model(model), IdentifiedBody):
+    read = read_any_model(model)
+    asks_fields = bool(hold or move) or Path(experiment or "").suffix.lower() in FIELD_FILES
+    if isinstance(read, IdentifiedBody) or (isinstance(read, JointModel) and asks_fields):
         _require_unset(of_markers, "goes with models of markers")
         _predict_field(model, experiment, hold or [], move or [], out, overwrite)
         return

@@ -113,6 +113,34 @@ def joint_estimate(estimates: Sequence[NormalEstimate]) -> JointEstimate:
     )
 
 
+def moved_along(
+    values: FloatArray, covariance: FloatArray, slope: FloatArray, own: NormalEstimate, together: NormalEstimate
+) -> tuple[FloatArray, FloatArray]:
+    """Return all parameters of a model, and their covariance, once what other data told of some of them is known too.
+
+    The model's own data tell nothing else, so that its other parameters follow those that are shared by their regression on them.
+
+    Parameters
+    ----------
+    values, covariance : ndarray, shape (n,), (n, n)
+        Parameters of the model as its own data tell them.
+    slope : ndarray, shape (k, n)
+        Derivatives of the shared parameters by them.
+    own : NormalEstimate
+        The k shared parameters as these data tell them.
+    together : NormalEstimate
+        What all data tell; what is not among it stays as it is.
+    """
+    kept = [i for i, name in enumerate(own.names) if name in together.names and 0.0 < own.standard_deviation(name) < UNDETERMINED]
+    at = np.array([together.names.index(own.names[i]) for i in kept], dtype=np.int64)
+    across = covariance @ slope[kept].T
+    spread = slope[kept] @ across
+    gain = np.linalg.solve(spread, across.T).T
+    moved = values + gain @ (together.values[at] - own.values[kept])
+    changed = covariance + gain @ (together.covariance[np.ix_(at, at)] - spread) @ gain.T
+    return np.asarray(moved, dtype=np.float64), np.asarray(0.5 * (changed + changed.T), dtype=np.float64)
+
+
 def _determined(e: NormalEstimate) -> NormalEstimate:
     sd = np.sqrt(np.diag(e.covariance))
     kept = np.flatnonzero(np.isfinite(sd) & (sd < UNDETERMINED) & (sd > 0.0))

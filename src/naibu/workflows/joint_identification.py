@@ -17,13 +17,10 @@ from naibu._version import __version__
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress
-from naibu.identification.from_fields.field_estimate import FieldEstimate
-from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
 from naibu.identification.from_markers.known_materials import KnownMaterials
-from naibu.identification.from_markers.specimen.parameter_names import poisson_ratio, young_modulus
+from naibu.identification.from_markers.specimen.parameter_names import young_modulus
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.joint_estimate import JointEstimate, NormalEstimate, joint_estimate
-from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.io.files.atomic import write_atomically
 from naibu.viewer.notebook import WrittenResult
 from naibu.viewer.page_frame import page_html
@@ -31,12 +28,14 @@ from naibu.viewer.tables import Cell, Table, table_html
 from naibu.workflows.fields.block_mesh import labelled_object, names_of_labels
 from naibu.workflows.fields.identify_fields import FieldIdentification, identify_fields
 from naibu.workflows.fields.known_zones import KnownZones, parse_known_zones
-from naibu.workflows.markers.experiments import RATIO_REFERENCE_KPA, Source, load_experiments, parse_known
+from naibu.workflows.joint_model import JointModel, joint_model, told_by_fields, told_by_markers
+from naibu.workflows.markers.experiments import Source, load_experiments, parse_known
 from naibu.workflows.markers.identify import Identification, identify, require_states
 from naibu.workflows.results.files_together import written_together
 from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.result_folder import MODEL_FILE, write_joint_model
 
-FILES = ("joint.json", "report.html")
+FILES = (MODEL_FILE, "joint.json", "report.html")
 MARKERS, FIELDS = "markers", "fields"  # folders of either kind
 WIDTH = 1.959964  # standard deviations of a 95 % interval
 _PLACES = (("markers", 1), ("fields", 4), ("both", 7))  # of estimate and interval in a row of the table
@@ -54,6 +53,8 @@ class JointIdentification(WrittenResult):
         From the displacement fields alone.
     joint : JointEstimate
         Both: logarithms of Young's moduli, kPa or ratios, and of ``1 - 2 nu``.
+    model : JointModel
+        Models of both kinds with these moduli, which predict.
     table : Table
         Moduli from either kind and from both, with 95 % intervals.
     notes : tuple of str
@@ -65,6 +66,7 @@ class JointIdentification(WrittenResult):
     markers: Identification
     fields: FieldIdentification
     joint: JointEstimate
+    model: JointModel
     table: Table
     notes: tuple[str, ...]
     files: tuple[Path, ...] = ()
@@ -76,9 +78,9 @@ class JointIdentification(WrittenResult):
 
     @property
     def usable(self) -> bool:
-        """Whether the models explain both kinds of data."""
+        """Whether the models explain both kinds of data, and these do not contradict each other."""
         judged = self.fields.estimate.verdict
-        return self.markers.verdict.ok and (judged is None or judged.ok)
+        return self.markers.verdict.ok and (judged is None or judged.ok) and not self.model.doubts
 
 
 def identify_jointly(
@@ -112,7 +114,7 @@ def identify_jointly(
     fields, mask, zones, zone_names, loaded, unit, spacing_mm
         As for `naibu.workflows.identify_fields`.
     out : path-like
-        Folder for ``joint.json`` and ``report.html``, and for the results of either kind in ``markers`` and ``fields``.
+        Folder for ``model.json``, ``joint.json`` and ``report.html``, and for the results of either kind in ``markers`` and ``fields``.
     known : sequence of str
         Materials and zones, each in one kind of data at least.
     element_size_mm : float
@@ -150,7 +152,9 @@ def identify_jointly(
     parts = (told_by_markers(from_markers.model), told_by_fields(from_fields.estimate))
     joint = joint_estimate(parts)
     table = table_of_moduli(parts, joint, relative=from_fields.relative)
-    result = JointIdentification(from_markers, from_fields, joint, table, _in_words(joint, parts))
+    model = joint_model(from_markers.calibration, from_markers.model, from_fields.body, from_fields.estimate, joint)
+    notes = (*_in_words(joint, parts), *(f"Doubtful: {doubt}." for doubt in model.doubts), *model.notes)
+    result = JointIdentification(from_markers, from_fields, joint, model, table, notes)
     return replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))
 
 
@@ -176,43 +180,6 @@ def _require_one_scale(materials: KnownMaterials | None, zones: KnownZones) -> N
         f"moduli from the experiments are {kinds[0]}, those from the fields {kinds[1]}: give `known` a modulus for a material of the "
         "experiments and for a zone of the fields, or name one that both have"
     )
-
-
-def told_by_markers(model: CalibratedModel) -> NormalEstimate:
-    """Return logarithms of Young's moduli, kPa or ratios, and of ``1 - 2 nu``, as experiments with markers tell them."""
-    free = [p.name for p in model.parameters.free]
-    told: list[tuple[str, float, float]] = []
-    for p in model.parameters.free:
-        if p.name.endswith(young_modulus("")):
-            unit = 1.0 if model.known_materials.scale_is_absolute else RATIO_REFERENCE_KPA
-            told.append((p.name, float(np.log(p.value / unit)), 1.0))
-        elif p.name.endswith(poisson_ratio("")):
-            left = 1.0 - 2.0 * p.value
-            told.append((p.name, float(np.log(left)), -2.0 * p.slope(p.value) / left))
-    at, scale = [free.index(name) for name, _, _ in told], np.array([slope for _, _, slope in told])
-    return NormalEstimate(
-        tuple(name for name, _, _ in told),
-        np.array([value for _, value, _ in told]),
-        model.covariance[np.ix_(at, at)] * np.outer(scale, scale),
-    )
-
-
-def told_by_fields(found: FieldEstimate) -> NormalEstimate:
-    """Return the same as displacement fields tell them."""
-    if found.uncertainty is None:
-        raise InputError("the fields have no covariance of moduli: a map cannot be joined with markers")
-    k = found.zones.count
-    ratio = np.exp(found.theta[k:])
-    young, poisson = young_and_poisson(found.theta)
-    # ln E = ln mu + ln(9 r / (3 r + 1)) and ln(1 - 2 nu) = ln(3 / (3 r + 1)), with r = kappa / mu
-    slope = np.block([[np.eye(k), np.diag(1.0 / (3.0 * ratio + 1.0))], [np.zeros((k, k)), np.diag(-3.0 * ratio / (3.0 * ratio + 1.0))]])
-    lost = np.isinf(np.diag(found.uncertainty.covariance))
-    finite = np.where(lost[:, None] | lost, 0.0, found.uncertainty.covariance)
-    covariance = slope @ finite @ slope.T
-    unknown = (np.abs(slope) @ lost.astype(float)) > 0.0
-    covariance[unknown, unknown] = np.inf
-    names = tuple([young_modulus(n) for n in found.zones.names] + [poisson_ratio(n) for n in found.zones.names])
-    return NormalEstimate(names, np.concatenate([np.log(young), np.log(1.0 - 2.0 * poisson)]), covariance)
 
 
 def table_of_moduli(parts: Sequence[NormalEstimate], joint: JointEstimate, *, relative: bool) -> Table:
@@ -266,9 +233,12 @@ def _written(folder: Path, result: JointIdentification) -> list[Path]:
         ],
         "in_words": list(result.notes),
     }
-    warning = "" if result.usable else "<p><strong>A model does not explain its data: not to be used.</strong></p>"
+    warning = "" if result.usable else "<p><strong>A model does not explain the data: not to be used.</strong></p>"
     links = f'<p><a href="{MARKERS}/report.html">Results from markers</a>, <a href="{FIELDS}/report.html">results from fields</a></p>'
     main = warning + "".join(f"<p>{escape(line)}</p>" for line in result.notes) + table_html(table) + links
     page = page_html("Moduli from markers and displacement fields", "", main, f"naibu {escape(__version__)}")
-    files = [write_atomically(folder / "joint.json", json.dumps(numbers, indent=1, ensure_ascii=False) + "\n")]
+    files = [
+        write_joint_model(folder, result.model),
+        write_atomically(folder / "joint.json", json.dumps(numbers, indent=1, ensure_ascii=False) + "\n"),
+    ]
     return [write_atomically(folder / "report.html", page), *files]

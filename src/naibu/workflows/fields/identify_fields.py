@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 FILES = ("model.json", "report.html", "zones.mha", "young_modulus.mha", "young_modulus_sd.mha", "poisson_ratio.mha", "identification.json")
 MOST_CARDS = 4
 CELLS_OF_MAP = 2500  # of the model by default
+POINTS_OF_CELL, LEAST_CELLS = 2, 64  # cells with fewer points leave to the motion of the surface what zones of uniform moduli would tell
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,7 +145,8 @@ def identify_fields(
     law : {"neo_hookean", "linear"}
         Finite or small strain.
     element_size_mm : float
-        Edge length of the cubes; 0 chooses it so that there are about 1200, or 2500 for a map.
+        Edge length of the cubes; 0 chooses it so that there are about 1200, or 2500 for a map; fewer where a cell
+        of zones would hold less than two points.
     unit, spacing_mm : str, sequence of float, optional
         Unit of fields that do not state theirs, or the size of a voxel along x, y, z, mm, of fields in voxels (see `naibu.io.read_field`).
     out : path-like, optional
@@ -171,7 +173,8 @@ def identify_fields(
     names = names_of_labels(labels, inside, zone_names or {})
     stated = parse_known_zones(known, list(names.values()))
     volume = float(inside.values.sum() * np.prod(inside.spacing_mm))
-    size = element_size_mm or (volume / (CELLS_OF_MAP if each_cell else CELLS)) ** (1.0 / 3.0)
+    most = CELLS_OF_MAP if each_cell else min(CELLS, max(int(field.valid.sum()) for field in read) // POINTS_OF_CELL)
+    size = element_size_mm or (volume / max(most, LEAST_CELLS)) ** (1.0 / 3.0)
     mesh, cell_of_voxel = block_mesh(inside, labels, names, size)
     cases = [measured_load_case(mesh, cell_of_voxel, inside, field, Path(p).stem, loaded) for p, field in zip(paths, read, strict=True)]
     found = identify_field(

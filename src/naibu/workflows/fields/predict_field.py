@@ -30,7 +30,7 @@ from naibu.viewer.slices import Overlay, SliceView, slices_html
 from naibu.viewer.tables import Table
 from naibu.workflows.results.files_together import written_together
 from naibu.workflows.results.output_folder import output_folder
-from naibu.workflows.results.result_folder import read_any_model
+from naibu.workflows.results.result_folder import read_identified_body
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -189,9 +189,7 @@ def predict_field(
     ConvergenceError
         There is no equilibrium.
     """
-    body = model if isinstance(model, IdentifiedBody) else read_any_model(model)
-    if not isinstance(body, IdentifiedBody):
-        raise InputError(f"{model}: was identified from markers; `held` and `moved` go with models of displacement fields")
+    body = model if isinstance(model, IdentifiedBody) else read_identified_body(model)
     motions = parsed_sides(held, moved)
     measured = None if field is None else read_field(field).at_points()
     if measured is None and not motions:

@@ -33,6 +33,7 @@ from naibu.mechanics.lattices.model.surface import surface_of
 from naibu.meshing.element_conversion import to_tetra
 from naibu.meshing.point_location import interpolation_operator
 from naibu.simulation.interactive_bodies import FiniteElementBody, InteractiveBody, LatticeBody, nodes_touching
+from naibu.workflows.joint_model import JointModel
 from naibu.workflows.markers.experiments import Source, load_experiment
 from naibu.workflows.results.result_folder import MODEL_FILE, read_any_model
 from naibu.workflows.studies.lattice_study import NAMED, PreparedStudy, prepared_study
@@ -127,6 +128,8 @@ def touchable(source: str | os.PathLike[str], *, experiment: Source | None = Non
         raise InputError(f"material goes with a mesh, and {source} is none; leave it out, or name one of {', '.join(MESH_READERS)}")
     if is_model:
         model = read_any_model(path)
+        if isinstance(model, JointModel):
+            model = model.fields if experiment is None else model.markers
         if isinstance(model, CalibratedModel):
             return _identified(model, experiment)
         if experiment is not None:

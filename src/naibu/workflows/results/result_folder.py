@@ -33,6 +33,8 @@ from naibu.viewer.json_values import jsonable
 from naibu.viewer.result_page.page import report_html
 from naibu.viewer.result_page.payload import Report, report_json
 from naibu.viewer.result_page.reading import report_from_json
+from naibu.workflows.joint_model import FORMAT as FORMAT_OF_BOTH
+from naibu.workflows.joint_model import JointModel
 from naibu.workflows.results.report_content import Accuracy, accuracy, build_report, prediction_report, search_sentence
 from naibu.workflows.results.search_checkpoint import CHECKPOINT_FILE
 
@@ -46,7 +48,7 @@ Baselines = Mapping[str, Mapping[str, float]]
 
 
 def read_model(path: str | os.PathLike[str]) -> CalibratedModel:
-    """Read a ``model.json`` of markers, or the one in a folder.
+    """Read a ``model.json`` of markers, also of markers with displacement fields, or the one in a folder.
 
     Raises
     ------
@@ -56,11 +58,25 @@ def read_model(path: str | os.PathLike[str]) -> CalibratedModel:
     found = read_any_model(path)
     if isinstance(found, IdentifiedBody):
         raise InputError(f"{path}: was identified from displacement fields; this takes a model identified from markers")
-    return found
+    return found.markers if isinstance(found, JointModel) else found
 
 
-def read_any_model(path: str | os.PathLike[str]) -> CalibratedModel | IdentifiedBody:
-    """Read a ``model.json`` of markers or of displacement fields, or the one in a folder.
+def read_identified_body(path: str | os.PathLike[str]) -> IdentifiedBody:
+    """Read a ``model.json`` of displacement fields, also of markers with them, or the one in a folder.
+
+    Raises
+    ------
+    InputError
+        No such file, or not a model of displacement fields.
+    """
+    found = read_any_model(path)
+    if isinstance(found, CalibratedModel):
+        raise InputError(f"{path}: was identified from markers; `held` and `moved` go with models of displacement fields")
+    return found.fields if isinstance(found, JointModel) else found
+
+
+def read_any_model(path: str | os.PathLike[str]) -> CalibratedModel | IdentifiedBody | JointModel:
+    """Read a ``model.json`` of markers, of displacement fields or of both, or the one in a folder.
 
     Raises
     ------
@@ -76,11 +92,18 @@ def read_any_model(path: str | os.PathLike[str]) -> CalibratedModel | Identified
         raise InputError(f"{error}; {mend}") from error
     if not isinstance(data, dict):
         raise InputError(f"{file}: holds a {type(data).__name__}, not a model; {mend}")
+    kinds: dict[Any, type[IdentifiedBody | JointModel]] = {FORMAT_OF_FIELDS: IdentifiedBody, FORMAT_OF_BOTH: JointModel}
+    named = data.get("format") if isinstance(data.get("format"), str) else None
     try:
         with guarded_reading(file, "a model"):
-            return IdentifiedBody.from_dict(data) if data.get("format") == FORMAT_OF_FIELDS else CalibratedModel.from_dict(data)
+            return kinds.get(named, CalibratedModel).from_dict(data)
     except InputError as error:
         raise InputError(f"{file}: {str(error).removeprefix(f'{file}: ')}; {mend}") from error
+
+
+def write_joint_model(folder: Path, model: JointModel) -> Path:
+    """Write the ``model.json`` of markers and displacement fields."""
+    return write_atomically(folder / MODEL_FILE, _text(model.to_dict()))
 
 
 def read_comparison(folder: Path, provenance: Mapping[str, Any]) -> ModelRow | None:
