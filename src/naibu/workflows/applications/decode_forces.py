@@ -24,7 +24,7 @@ from naibu.viewer.chapter import Chapter, Figure, Section
 from naibu.viewer.chapter_page import write_chapter
 from naibu.viewer.notebook import WrittenResult
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.applications.slip_report import slip_card, slip_section, slip_summary, slip_words
+from naibu.workflows.applications.slip_report import drawn_rows, slip_card, slip_section, slip_summary, slip_words
 from naibu.workflows.results.output_folder import output_folder
 
 MOST_VOLTS = 1e6
@@ -204,11 +204,13 @@ def _without_wrap(azimuth_deg: FloatArray) -> FloatArray:
 def _section(times: FloatArray, found: DecodedForces, offsets: FloatArray) -> Section:
     def draw(canvas: Canvas) -> None:
         force, tilt, azimuth = canvas.subplots(1, 3)
-        force.fill_between(times, *(1e-3 * found.force_95.T), alpha=0.3, linewidth=0)
-        force.plot(times, 1e-3 * found.force_mn, linewidth=0.8)
-        tilt.fill_between(times, *found.tilt_95_deg.T, alpha=0.3, linewidth=0)
-        tilt.plot(times, found.tilt_deg, linewidth=0.8)
-        azimuth.plot(times, _without_wrap(np.where(found.tilt_95_deg[:, 0] > 0.0, found.azimuth_deg, np.nan)), ".", markersize=2)
+        rows = drawn_rows(len(times))
+        at, azimuths = times[rows], _without_wrap(np.where(found.tilt_95_deg[:, 0] > 0.0, found.azimuth_deg, np.nan))
+        force.fill_between(at, *(1e-3 * found.force_95[rows].T), alpha=0.3, linewidth=0)
+        force.plot(at, 1e-3 * found.force_mn[rows], linewidth=0.8)
+        tilt.fill_between(at, *found.tilt_95_deg[rows].T, alpha=0.3, linewidth=0)
+        tilt.plot(at, found.tilt_deg[rows], linewidth=0.8)
+        azimuth.plot(at, azimuths[rows], ".", markersize=2)
         for axes, name in ((force, "force (N)"), (tilt, "tilt (degrees)"), (azimuth, "azimuth (degrees)")):
             axes.set(xlabel="time (s)", ylabel=name)
 
@@ -224,4 +226,9 @@ def _section(times: FloatArray, found: DecodedForces, offsets: FloatArray) -> Se
         tuple((n, float(a), float(b)) for n, a, b in zip(("F_z", "M_x", "M_y"), offsets[0], offsets[-1], strict=True)),
         note="Recalibrated while nothing touches; a drift under a load cannot be told from the load.",
     )  # fmt: skip
-    return Section("Forces", text, (summary, drift), (Figure("Forces", "With 95 % intervals.", draw, (11.0, 3.4)),))
+    return Section(
+        "Forces",
+        text,
+        (summary, drift),
+        (Figure("Forces", f"With 95 % intervals; {len(drawn_rows(len(times)))} of {len(times)} readings.", draw, (11.0, 3.4)),),
+    )

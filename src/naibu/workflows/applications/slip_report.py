@@ -7,13 +7,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from naibu.applications.fingertip.slip import SLIPS_FROM, SidewaysForces
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.viewer.cards import Card
 from naibu.viewer.chapter import Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
+
+_MOST_DRAWN = 1500
+
+
+def drawn_rows(count: int) -> IntArray:
+    """Return which of the readings figures show: all, or so many that a browser draws them at ease."""
+    return np.unique(np.linspace(0, count - 1, min(count, _MOST_DRAWN)).round().astype(np.int64))
 
 
 def slip_words(sideways: SidewaysForces, friction: float | None) -> list[str]:
@@ -49,7 +56,7 @@ def slip_summary(times: FloatArray, sideways: SidewaysForces, friction: float | 
 
 def slip_section(times: FloatArray, sideways: SidewaysForces, friction: float | None, touch_s: float) -> Section:
     """Return the section on drag and slip: one row a contact, and T / F over time."""
-    rows = tuple(_contact(times, sideways, k, friction) for k in range(1, int(sideways.contact.max(initial=0)) + 1))
+    contacts = tuple(_contact(times, sideways, k, friction) for k in range(1, int(sideways.contact.max(initial=0)) + 1))
     columns = (
         "contact",
         "from, s",
@@ -61,16 +68,17 @@ def slip_section(times: FloatArray, sideways: SidewaysForces, friction: float | 
         "part that sticks",
     )
     table = Table(
-        "Contacts", columns, rows,
+        "Contacts", columns, contacts,
         note=f"T: sideways force since the contact's first {touch_s:g} s. A contact slides from {SLIPS_FROM:g} of the friction coefficient "
-        "on. Part that sticks: least radius of the sticking middle over that of the contact, under Hertz's pressure (Mindlin): the rim "
-        "slips first.",
+        "on. Part that sticks: least radius of the sticking middle over that of the contact by Mindlin's theory of spheres (Hertz's "
+        "pressure), in which the rim slips first; the finite elements are too coarse to check it.",
     )  # fmt: skip
 
     def draw(canvas: Canvas) -> None:
         axes = canvas.add_subplot()
-        axes.fill_between(times, *sideways.size_95.T, alpha=0.3, linewidth=0)
-        axes.plot(times, sideways.size, linewidth=0.8, label="T / F")
+        rows = drawn_rows(len(times))
+        axes.fill_between(times[rows], *sideways.size_95[rows].T, alpha=0.3, linewidth=0)
+        axes.plot(times[rows], sideways.size[rows], linewidth=0.8, label="T / F")
         if friction is not None:
             axes.axhline(friction, color="0.3", linestyle=":", label="friction")
             axes.legend(fontsize=8)
