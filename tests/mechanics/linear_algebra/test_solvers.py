@@ -245,7 +245,7 @@ def test_minimal_residuals_find_the_solution_in_as_many_iterations_as_there_are_
     assert gmres(matrix, b, lambda r: r, 1e-12, 3)[0] is None
 
 
-@pytest.mark.parametrize("name", ["recycled_cholesky", "multigrid"])
+@pytest.mark.parametrize("name", ["recycled_cholesky", "multigrid", "petsc"])
 def test_iterative_solvers_refuse_unsymmetric_matrices(name):
     with pytest.raises(InputError, match="needs a symmetric matrix"):
         choose_solver(unsymmetric(), MESH.points, CONSTRAINED, symmetric=False, solver=name)

@@ -20,6 +20,7 @@ from naibu.meshing.primitives import box
 
 SIDE, YOUNG, POISSON, STRETCH = 30.0, 20.0, 0.45, 0.02
 MKL = [pytest.param(True, marks=pytest.mark.skipif(pardiso_library() is None, reason="oneMKL is not installed")), False]
+HERE = [name for name in get_args(SolverName) if name != "petsc"]  # that starts MPI: tests/mechanics/linear_algebra/test_petsc.py
 NEEDS_MKL = ("pardiso", "recycled_cholesky", "recycled_lu")
 
 
@@ -41,7 +42,7 @@ def without_mkl(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("with_mkl", MKL)
-@pytest.mark.parametrize("solver", get_args(SolverName))
+@pytest.mark.parametrize("solver", HERE)
 def test_every_solver_finds_a_uniform_stretch(monkeypatch: pytest.MonkeyPatch, solver: SolverName, with_mkl: bool) -> None:
     if not with_mkl:
         without_mkl(monkeypatch)

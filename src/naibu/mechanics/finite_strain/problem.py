@@ -34,7 +34,7 @@ class SolverSettings:
         rigid-body motions of a body that is not in contact yet.
     penetration : float
         Most that a rigid body may penetrate an element, as a fraction of the edge of its face; contact becomes stiffer until it holds.
-    linear_solver : {"automatic", "superlu", "pardiso", "recycled_cholesky", "recycled_lu", "multigrid"}
+    linear_solver : {"automatic", "superlu", "pardiso", "recycled_cholesky", "recycled_lu", "multigrid", "petsc"}
         See `naibu.mechanics.linear_algebra.solver_selection`.
     """
 

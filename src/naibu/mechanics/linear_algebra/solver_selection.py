@@ -14,6 +14,8 @@ the values, and ``solve(b)`` of the factorization may be called for any number o
     GMRES preconditioned by a single-precision LU factor of an earlier matrix, for unsymmetric systems that change little likewise.
 ``"multigrid"``
     Conjugate gradients preconditioned by smoothed aggregation with rigid-body modes, for large symmetric systems :cite:p:`vanek1996`.
+``"petsc"``
+    The same by PETSc :cite:p:`balay2022`, on all ranks of an MPI program.
 
 All solve to their relative tolerance whatever the preconditioner.
 """
@@ -29,10 +31,11 @@ from naibu.core.errors import InputError
 from naibu.mechanics.linear_algebra.direct import PardisoSolver, SuperLUSolver, pardiso_library
 from naibu.mechanics.linear_algebra.iterative import RecycledCholesky
 from naibu.mechanics.linear_algebra.multigrid import MultigridSolver
+from naibu.mechanics.linear_algebra.petsc import PetscSolver
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
 from naibu.mechanics.linear_algebra.recycled_factors import RecycledFactors
 
-SolverName = Literal["automatic", "superlu", "pardiso", "recycled_cholesky", "recycled_lu", "multigrid"]
+SolverName = Literal["automatic", "superlu", "pardiso", "recycled_cholesky", "recycled_lu", "multigrid", "petsc"]
 
 DIRECT_LIMIT = 200_000  # unknowns from which a factorization costs more than multigrid, even if it is recycled; a tenth of that for SuperLU
 SINGLE_LIMIT = 25_000  # unknowns from which multigrid solves a single system sooner, up to the Poisson's ratio below
@@ -62,7 +65,7 @@ def choose_solver(
         Constrained components.
     symmetric : bool
         Whether all matrices will be symmetric.
-    solver : {"automatic", "superlu", "pardiso", "recycled_cholesky", "recycled_lu", "multigrid"}
+    solver : {"automatic", "superlu", "pardiso", "recycled_cholesky", "recycled_lu", "multigrid", "petsc"}
         See the module. ``"automatic"`` is direct for small systems; recycled LU for larger unsymmetric ones, recycled Cholesky for
         symmetric ones up to `DIRECT_LIMIT` unknowns (with oneMKL), and multigrid above; without oneMKL multigrid begins at a tenth of that.
     poisson_ratio : float, optional
@@ -72,6 +75,8 @@ def choose_solver(
     ------
     InputError
         An unknown solver, one that needs oneMKL where it is not installed, or an iterative one for an unsymmetric matrix.
+    MissingDependencyError
+        ``"petsc"`` without petsc4py.
     """
     if solver not in get_args(SolverName):
         raise InputError(f"solver={solver!r} is not known; use one of {', '.join(get_args(SolverName))}")
@@ -85,7 +90,9 @@ def choose_solver(
         return RecycledFactors(matrix)
     if not symmetric:
         raise InputError(f"solver={solver!r} needs a symmetric matrix; with friction use 'pardiso', 'superlu' or 'automatic'")
-    return RecycledCholesky(matrix) if solver == "recycled_cholesky" else MultigridSolver(points, constrained)
+    if solver == "recycled_cholesky":
+        return RecycledCholesky(matrix)
+    return PetscSolver(points, constrained) if solver == "petsc" else MultigridSolver(points, constrained)
 
 
 def _automatic(unknowns: int, symmetric: bool, poisson_ratio: float | None) -> SolverName:
