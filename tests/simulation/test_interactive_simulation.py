@@ -13,7 +13,9 @@ from touched_lattice import SPACING, TOP, touched_lattice
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.rigid_transform import rotation_matrix
 from naibu.mechanics import Assembler, box_indenter, elements, material, plane_indenter, spherical_indenter
+from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeSession
 from naibu.meshing import box
+from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.simulation import FiniteElementBody, InteractiveBody, InteractiveSimulation, RealTimeLoop
 
 
@@ -54,8 +56,7 @@ def lattice_or_gel(kind: str) -> InteractiveBody:
     mesh = replace(mesh, points=mesh.points - mesh.points.min(axis=0))
     law = material(young_modulus=20.0, poisson_ratio=0.45)
     assembler = Assembler.from_materials(elements(mesh, "mean_dilatation"), mesh.regions, [law])
-    body = FiniteElementBody.of(mesh, assembler, supported=np.flatnonzero(mesh.points[:, 2] < 1e-9).astype(np.int64))
-    return replace(body, engine=replace(body.engine, background=False))  # repeatable
+    return FiniteElementBody.of(mesh, assembler, supported=np.flatnonzero(mesh.points[:, 2] < 1e-9).astype(np.int64), background=False)
 
 
 @pytest.mark.parametrize("kind", ["lattice", "gel"])
@@ -161,7 +162,7 @@ def test_a_cut_keeps_momentum_and_the_halves_part_under_tension() -> None:
     law = material(young_modulus=20.0, poisson_ratio=0.45)
     assembler = Assembler.from_materials(elements(mesh, "mean_dilatation"), mesh.regions, [law])
     lowest = np.flatnonzero(mesh.points[:, 2] < 1e-9)
-    touched = InteractiveSimulation(FiniteElementBody.of(mesh, assembler, supported=lowest), {})
+    touched = InteractiveSimulation(FiniteElementBody.of(mesh, assembler, supported=lowest, background=False), {})
     corner = int(np.argmax(mesh.points @ [1.0, 0.2, 1.0]))
     touched.grip(corner, 30.0)
     touched.pull(mesh.points[corner] + [0.0, 0.0, 4.0])
@@ -186,7 +187,9 @@ def test_a_body_moves_on_while_its_cut_is_prepared() -> None:
     mesh = box((20.0, 20.0, 20.0), (3, 3, 3), cell_type="tetra")
     law = material(young_modulus=20.0, poisson_ratio=0.45)
     assembler = Assembler.from_materials(elements(mesh, "mean_dilatation"), mesh.regions, [law])
-    body = FiniteElementBody.of(mesh, assembler, supported=np.flatnonzero(mesh.points[:, 2] < 1e-9), gravity=(0.0, 0.0, -9810.0))
+    body = FiniteElementBody.of(
+        mesh, assembler, supported=np.flatnonzero(mesh.points[:, 2] < 1e-9), gravity=(0.0, 0.0, -9810.0), background=False
+    )
     touched = InteractiveSimulation(body, {})
     through = [[[x, -20.0, 12.0], [x, 20.0, 12.0]] for x in (-20.0, 20.0)]
     touched.begin_cut(through, 4.0)
@@ -309,3 +312,35 @@ def test_commands_are_carried_out_by_the_thread_and_their_trouble_is_told_once()
         assert loop.latest()[0].tool == "sphere"
         assert "there is no tool 'hammer'" in loop.trouble()
         assert loop.trouble() == ""
+
+
+@pytest.mark.parametrize(("friction", "radius", "offset"), [(0.5, 6.0, 0.0), (0.2, 8.0, 1.0)])
+def test_a_sphere_dragged_across_a_cut_and_back_finds_a_balance_in_every_frame(friction: float, radius: float, offset: float) -> None:
+    """Points of the sphere and pairs of the two sides of the cut open and close by turns."""
+    size, n = 40.0, 5
+    mesh = box((size,) * 3, (n,) * 3, cell_type="tetra", centred=False)
+    law = material(young_modulus=10.0, poisson_ratio=0.45)
+    assembler = Assembler.from_materials(elements(mesh, "mean_dilatation"), mesh.regions, [law])
+    whole = FiniteElementBody.of(mesh, assembler, supported=np.flatnonzero(mesh.points[:, 2] < 1e-9), background=False)
+    middle = 0.5 * size + offset
+    blade = swept_blade([[[middle, y, size + 5.0], [middle, y, 0.5 * size]] for y in (-5.0, size + 5.0)])
+    body = whole.cut(whole.session().state(), blade, size / n)[0]
+    above = size + radius + 3.0
+    sphere = spherical_indenter((0.5 * size, 0.5 * size, above), radius, static_friction=friction, kinetic_friction=friction)
+    touched = InteractiveSimulation(body, {"sphere": sphere})
+    touched.take("sphere")
+    forces = []
+    for x, height in [(-3.5, 0.0), (-3.5, -9.0), *2 * [(3.5, -9.0), (-3.5, -9.0)], (-3.5, 0.0)]:
+        goal = np.array([0.5 * size + x, 0.5 * size, above + height])
+        touched.move(goal)
+        while np.abs(touched.last.tool_centre - goal).max() > 1e-9:
+            frame = touched.advance()
+            assert not frame.failed
+            forces.append(frame.force[2])
+    assert min(forces) < -200.0
+    session = touched._session
+    assert isinstance(session, RealTimeSession)
+    assert session.newton_steps <= 6
+    lips = body.engine.assembler.lips  # type: ignore[attr-defined]
+    gaps = lips.gaps(session.state().displacement)
+    assert gaps[np.isfinite(gaps)].min() > -0.02 * lips.edge.min()

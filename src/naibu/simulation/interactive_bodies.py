@@ -233,6 +233,7 @@ class FiniteElementBody:
         step_s: float = 1.0 / 60.0,
         normal_stiffness: float = 1000.0,
         tangential_stiffness: float = 200.0,
+        background: bool = True,
     ) -> FiniteElementBody:
         """Return the body of a mesh.
 
@@ -254,6 +255,8 @@ class FiniteElementBody:
             Length of a step, s.
         normal_stiffness, tangential_stiffness : float
             Penalties of the contact, kPa/mm.
+        background : bool
+            Whether a thread renews the tangents; otherwise runs are repeatable. See `naibu.mechanics.RealTimeEngine`.
 
         Raises
         ------
@@ -265,7 +268,7 @@ class FiniteElementBody:
         require_positive("density", density, "kg/mm3")
         faces = boundary_faces(mesh).faces
         mass = body_force(assembler.elements, np.full(mesh.n_cells, density), np.array([1.0, 0.0, 0.0]))[:, 0]
-        engine = RealTimeEngine(mesh.points, assembler, mass, faces, step_s, normal_stiffness, tangential_stiffness)
+        engine = RealTimeEngine(mesh.points, assembler, mass, faces, step_s, normal_stiffness, tangential_stiffness, background=background)
         triangles, cells = triangles_of_faces(faces), to_tetra(mesh).cells
         return cls(engine, mesh, density, as_vector("gravity", gravity), triangles, cells, supported, tuple(fixtures))
 
@@ -334,6 +337,7 @@ class FiniteElementBody:
             found.mesh, made, supported=np.flatnonzero(found.nodal(held) > 1.0 - 1e-9).astype(np.int64), fixtures=self.fixtures,
             density=self.density, gravity=self.gravity, step_s=self.engine.step, normal_stiffness=self.engine.normal_stiffness,
             tangential_stiffness=self.engine.tangential_stiffness,
+            background=not isinstance(self.engine, RealTimeEngine) or self.engine.background,
         )  # fmt: skip
         body = replace(body, forest=found.forest)
         return body, DynamicState(found.nodal(state.displacement), found.nodal(state.velocity)), found

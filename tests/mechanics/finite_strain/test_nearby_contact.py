@@ -30,7 +30,7 @@ def test_forces_and_gaps_are_those_of_all_points(indenter: RigidIndenter) -> Non
     whole = indenter_contacts([indenter], mesh.points, boundary_faces(mesh).faces, normal_stiffness=500.0, tangential_stiffness=90.0)[0]
     u = displaced(mesh.n_points)
     anchors = whole.local(displaced(mesh.n_points)[::-1], 1.0)
-    expected = whole.evaluate(u, anchors, 1.0)
+    expected = whole.evaluate(u, anchors, 1.0, curvature=False)
     assert 5 < (expected.gap < 0.0).sum() < len(expected.gap)
     near = NearbyContact.of(whole, anchors, local_positions(whole, u, 1.0)[1], 1.0)
     force = np.zeros_like(u)

@@ -7,7 +7,7 @@ edges, or that no longer face each other, do not touch.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -39,6 +39,8 @@ class CutLips:
         Edge of the triangles around a pair: the root of their mean area times two, mm.
     stiffness : ndarray, shape (p,)
         Penalties, kPa/mm.
+    normals : ndarray, shape (p, 3), optional
+        Of which the gaps are taken: those of an earlier position; zero for pairs that did not face each other there.
     """
 
     points: FloatArray
@@ -48,18 +50,43 @@ class CutLips:
     area: FloatArray
     edge: FloatArray
     stiffness: FloatArray
+    normals: FloatArray | None = None
+
+    def with_normals_of(self, displacement: FloatArray) -> CutLips:
+        """Return the same pairs with the normals, and the choice of pairs that touch, of a displacement (n, 3), mm.
+
+        In a time step whose normals are those of its beginning, the energy of the pairs is convex, their forces are its gradient, and no
+        pair comes in or drops out.
+        """
+        gap, normal = _state(self.points, self.faces, self.pairs, self.corner_pair, self.edge, np.ascontiguousarray(displacement))
+        return replace(self, normals=np.where(np.isfinite(gap)[:, None], normal, 0.0))
+
+    def only(self, which: IntArray) -> CutLips:
+        """Return some of the pairs (k,), which keep the normals that they have been given."""
+        assert self.normals is not None
+        return replace(
+            self, pairs=self.pairs[which], area=self.area[which], edge=self.edge[which], stiffness=self.stiffness[which],
+            normals=self.normals[which],
+        )  # fmt: skip
 
     def gaps(self, displacement: FloatArray) -> FloatArray:
         """Return the distances (p,), mm, along the normals: negative where the sides overlap, infinite where they face away."""
-        gap, _ = _state(self.points, self.faces, self.pairs, self.corner_pair, self.edge, np.ascontiguousarray(displacement))
-        return np.asarray(gap)
+        return self._gaps_and_normals(displacement)[0]
 
     def add(self, displacement: FloatArray, force: FloatArray) -> tuple[float, FloatArray]:
         """Add to internal forces (n, 3), mN; return the energy, mN mm, and the stiffness of every pair (p, 3, 3), mN/mm."""
-        gap, normal = _state(self.points, self.faces, self.pairs, self.corner_pair, self.edge, np.ascontiguousarray(displacement))
+        gap, normal = self._gaps_and_normals(displacement)
         blocks = np.zeros((len(self.pairs), 3, 3))
         energy = _pressed(gap, normal, self.pairs, self.area, self.edge, self.stiffness, force, blocks)
         return float(energy), blocks
+
+    def _gaps_and_normals(self, displacement: FloatArray) -> tuple[FloatArray, FloatArray]:
+        if self.normals is None:
+            return _state(self.points, self.faces, self.pairs, self.corner_pair, self.edge, np.ascontiguousarray(displacement))
+        first, second = self.pairs.T
+        apart = (self.points[second] - self.points[first]) + (displacement[second] - displacement[first])
+        gap = (self.normals * apart).sum(axis=1)
+        return np.where(self.normals.any(axis=1), gap, np.inf), self.normals
 
 
 def cut_lips(points: FloatArray, faces: IntArray, shear_modulus: FloatArray) -> CutLips | None:

@@ -139,6 +139,10 @@ class Assembler:
         """
         return self._run(displacement, direction, np.empty((0, 3, 3)))[1]
 
+    def in_step(self, displacement: FloatArray) -> Assembler:
+        """Return the assembler of a time step that begins at a displacement (n, 3), mm; here the same."""
+        return self
+
     def add_contact_of_lips(self, displacement: FloatArray, force: FloatArray) -> None:
         """Add the forces of the two sides of cuts on each other to internal forces (n, 3), mN; here there are none."""
 

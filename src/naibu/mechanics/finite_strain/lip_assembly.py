@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -29,6 +29,10 @@ class LipAssembler(Assembler):
         """Return the derivative (n, 3) of the internal forces along `direction` (m, 4) in the cells' parameters; lips have none."""
         return Assembler._run(self, displacement, direction, np.empty((0, 3, 3)))[1]
 
+    def in_step(self, displacement: FloatArray) -> LipAssembler:
+        """Return the assembler of a time step that begins at a displacement (n, 3), mm: lips have the normals that they have there."""
+        return self if self.lips is None else replace(self, lips=self.lips.with_normals_of(displacement))
+
     def add_contact_of_lips(self, displacement: FloatArray, force: FloatArray) -> None:
         """Add the forces of lips in contact to internal forces (n, 3), mN."""
         if self.lips is not None:
@@ -44,6 +48,11 @@ class LipAssembler(Assembler):
                 for b in range(2):
                     np.add.at(blocks, self._pairs[:, a, b], stiffness if a == b else -stiffness)
         return energy + more, force, smallest
+
+
+def lips_of(assembler: Assembler) -> tuple[CutLips, ...]:
+    """Return the sides of the cuts of an assembler; of one that has none, nothing."""
+    return (assembler.lips,) if isinstance(assembler, LipAssembler) and assembler.lips is not None else ()
 
 
 def with_lips(assembler: Assembler, points: FloatArray, faces: IntArray) -> Assembler:

@@ -48,9 +48,13 @@ class NearbyContact:
 
     @property
     def response(self) -> ContactResponse:
-        """Tractions and their derivatives at the last evaluation."""
+        """Tractions and their derivatives at the last evaluation, without the curvature of the body's surface.
+
+        Points that a step begins with lie deep in a body that has moved on, and their pressure times the curvature would make the tangent
+        indefinite; where points rest, penetrations are small, and so is what is left out.
+        """
         if self._response is None:
-            self._response = self.contact.evaluate(self._displacement, self.anchors, 1.0)
+            self._response = self.contact.evaluate(self._displacement, self.anchors, 1.0, curvature=False)
         return self._response
 
     def add_force(self, displacement: FloatArray, force: FloatArray) -> None:

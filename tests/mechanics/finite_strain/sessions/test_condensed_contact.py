@@ -35,7 +35,9 @@ class Wall:
 def test_springs_stop_at_a_wall_or_do_not_reach_it(begin: float) -> None:
     solver = SuperLUSolver()
     factors = UpdatedFactors(solver.factorize(sp.bsr_matrix(BODY * np.eye(12), blocksize=(3, 3))), 4)
-    tangent = EarlierTangent(factors, np.zeros((0, 0, 3)), np.zeros((0, 3, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64), solver)
+    tangent = EarlierTangent(
+        factors, np.zeros((0, 0, 3)), np.zeros((0, 3, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3, 3)), solver
+    )
     free = np.array([[0.0, 0.0, 2.0], [0.0, 0.3, 0.4], [0.1, 0.0, -4.0]])
     condensed = CondensedContact(tangent, np.array([0, 2, 3]))
     force = condensed.forces(free, Wall(), np.full((3, 3), begin), 1e-5, 1.0)

@@ -162,7 +162,7 @@ def test_an_indenter_of_5_m_per_s_rests_where_one_that_came_slowly_does() -> Non
     for steps in (1, 8):
         session = made.session(constrained=held, indenters=[indenter])
         session.step(motions=[IndenterVelocity((0.0, 0.0, -5000.0 / steps))], steps=steps)
-        assert depth(session, indenter, 8.0) < 0.02 * 10.0 + 1e-9  # of the edge of a face
+        assert depth(session, indenter, 8.0) < 0.03 * 10.0  # of the edge of a face; penalties follow after the step
         session.step(steps=40)
         rests.append((session.positions(), session.forces().indenters[-1, 0]))
     moved = np.abs(rests[1][0] - made.points).max()

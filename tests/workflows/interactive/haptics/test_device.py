@@ -15,8 +15,8 @@ from touched_lattice import TOP, touched_lattice
 from naibu.core.errors import InputError
 from naibu.mechanics import Assembler, elements, material
 from naibu.meshing import box
-from naibu.simulation import FiniteElementBody, ForceLimits, SimulatedDevice
-from naibu.workflows import TouchableModel, drive_live_simulation, live, touched_loop
+from naibu.simulation import FiniteElementBody, ForceLimits, InteractiveSimulation, SimulatedDevice
+from naibu.workflows import TouchableModel, drive_live_simulation, live, tools_for, touched_loop
 
 
 def device() -> SimulatedDevice:
@@ -58,13 +58,19 @@ def test_a_device_feels_finite_elements_between_their_steps() -> None:
         elements(mesh, "mean_dilatation"), mesh.regions, [material(young_modulus=10.0, poisson_ratio=0.45)]
     )
     body = FiniteElementBody.of(mesh, assembler, supported=np.flatnonzero(mesh.points[:, 2] < 1e-9).astype(np.int64))
+    pushed = InteractiveSimulation(body, tools_for(body))  # kernels are compiled, and a tangent made, before the device comes
+    pushed.take("sphere")
+    pushed.move((0.0, 0.0, 40.0))
+    while not pushed.last.force[2] < 0.0:
+        assert not pushed.advance().failed
+    pushed.close()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     limits = ForceLimits()
     with touched_loop(TouchableModel("Gel", (), body, "strain, %"), port) as loop:
         assert loop.hand is None  # beside the loop
-        record = drive_live_simulation(SimulatedDevice(lambda t: np.array([0.0, 0.0, -24.0 * min(t, 1.0)])), port, 2.0, loss=0.01, seed=1)
+        record = drive_live_simulation(SimulatedDevice(lambda t: np.array([0.0, 0.0, -24.0 * min(t, 1.0)])), port, 3.0, loss=0.01, seed=1)
         frame = loop.latest()[0]
     assert frame.force[2] < -50.0
     assert np.linalg.norm(record.forces, axis=1).max() > 50.0

@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent, add_earlier_forces, contact_change
+from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import LipsBesideTangent
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 from naibu.mechanics.linear_algebra.updated_factors import BlockChange, ChangedInverse
 
-EVALUATIONS = 16  # of the contact at most
+EVALUATIONS = 24  # of the contact at most
+PATIENCE = 3  # iterations that may make things worse: where a point closes, what is left grows before it vanishes
 USUAL = 6  # evaluations after which ten times the tolerance is enough
 HALVINGS = 5  # of a step that does not improve: points may stick and slip by turns
 FAST = 0.2  # of what was left: progress with which an earlier derivative of the contact goes on being used
@@ -83,9 +85,9 @@ class CondensedContact:
             left = y - free - (self._inverse @ force.ravel().astype(np.float32)).reshape(-1, 3)
             return force, left, float(np.abs(left).max(initial=0.0))
 
-        y, evaluations, fast = begin, 1, True
+        y, evaluations, unhelpful, fast = begin, 1, 0, True
         force, left, size = evaluated(y)
-        best, least = force, size
+        best, least, nearest = force, size, y
         while size > tolerance_mm * (1.0 if evaluations < USUAL else 10.0) and evaluations < EVALUATIONS:
             if self._changed is None or not fast:
                 self._changed = ChangedInverse.of(self._inverse, law.change())
@@ -94,12 +96,15 @@ class CondensedContact:
             for k in range(HALVINGS + 1):
                 force, left, size = evaluated(y - share * step)
                 evaluations += 1
-                if size < (1.0 - 0.1 * share) * before or k == HALVINGS:
+                if size < (1.0 - 0.1 * share) * before or unhelpful < PATIENCE or k == HALVINGS:
                     break
                 share *= 0.5
-            y, fast = y - share * step, size <= FAST * before
+            y, fast, unhelpful = y - share * step, size <= FAST * before, unhelpful + 1
             if size < least:
-                best, least = force, size
+                best, least, nearest, unhelpful = force, size, y, 0
+            elif unhelpful == PATIENCE:
+                y, fast = nearest, False
+                force, left, size = evaluated(y)
         return best
 
 
@@ -113,10 +118,10 @@ class ContactBesideTangent:
         The nodes concerned.
     displacement : ndarray, shape (n, 3)
         From which they move, mm.
-    contacts : sequence of NearbyContact
+    contacts : sequence of NearbyContact or LipsBesideTangent
         With points of these nodes only.
     places : sequence of ndarray
-        Of all points of every contact in the pattern of the surface.
+        Of all points, or pairs, of every contact in the pattern of the surface.
     pattern : BlockPattern
         Of the surface.
     tangent : EarlierTangent
@@ -129,7 +134,7 @@ class ContactBesideTangent:
 
     nodes: IntArray
     displacement: FloatArray
-    contacts: Sequence[NearbyContact]
+    contacts: Sequence[NearbyContact | LipsBesideTangent]
     places: Sequence[Int32Array]
     pattern: BlockPattern
     tangent: EarlierTangent
@@ -155,6 +160,6 @@ class ContactBesideTangent:
     def change(self) -> BlockChange:
         """Return minus the derivative of the forces at the last motion; its nodes are places among the k."""
         blocks = np.zeros((self.pattern.n_blocks, 3, 3))
-        for contact, places in zip(self.contacts, self.places, strict=True):
+        for contact, places in zip(self.contacts, self.places, strict=False):  # lips, which come last, are not always there
             contact.touching().add_stiffness(self.pattern, places, blocks)
         return contact_change(self.pattern, blocks, self.tangent, self.nodes, self._place, self.gripped, self.hold)

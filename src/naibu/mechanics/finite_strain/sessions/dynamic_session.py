@@ -99,7 +99,7 @@ class DynamicEngine:
     step: float = 1.0 / 60.0
     normal_stiffness: float = 1000.0
     tangential_stiffness: float = 200.0
-    iterations: int = 10
+    iterations: int = 15
     tolerance: float = 1e-3
     _extent: float = field(init=False)
     _modulus: float = field(init=False)
@@ -269,7 +269,8 @@ class DynamicSession(IndenterSession[DynamicEngine, DynamicState]):
         engine, start = self.engine, self.reached
         responses = [c.evaluate(u, a, 1.0) for c, a in zip(contacts, start.anchors, strict=True)]
         velocity = (u - start.displacement) / h
-        rest = engine.assembler.forces(u)[1] - self.external_force + engine.mass[:, None] * (velocity - start.velocity) / h
+        internal = engine.assembler.in_step(start.displacement).forces(u)[1]
+        rest = internal - self.external_force + engine.mass[:, None] * (velocity - start.velocity) / h
         of_indenters = np.zeros((len(contacts), 3))
         for k, (contact, response) in enumerate(zip(contacts, responses, strict=True)):
             of_indenters[k] = response.orientation @ response.force.sum(axis=0)

@@ -13,7 +13,7 @@ from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.cores import usable_cores
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
-from naibu.mechanics.linear_algebra.direct import pardiso_library, use_threads
+from naibu.mechanics.linear_algebra.direct import PardisoSolver, SuperLUSolver, pardiso_library, use_threads
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
 from naibu.mechanics.linear_algebra.updated_factors import BlockChange, UpdatedFactors
 
@@ -36,6 +36,8 @@ class EarlierTangent:
         Nodes that do not move in it.
     touched : ndarray, shape (t,), int64
         Nodes that these contacts concern.
+    lips : ndarray, shape (p, 3, 3)
+        Stiffness of the contact of the sides of cuts of then, mN/mm, which is none of `contact`.
     solver : LinearSolver
         What the factors belong to; they end when it factorizes another matrix.
     """
@@ -45,6 +47,7 @@ class EarlierTangent:
     contact: FloatArray
     held: IntArray
     touched: IntArray
+    lips: FloatArray
     solver: LinearSolver
 
 
@@ -126,14 +129,19 @@ class TangentThread:
 
 @dataclass(slots=True, eq=False)
 class SolverPool:
-    """Solvers of one pattern whose factors nobody uses any more."""
+    """Solvers for symmetric matrices of one pattern whose factors nobody uses any more; in single precision where that is possible."""
 
-    make: Callable[[], LinearSolver]
+    pattern: BlockPattern
     _spare: list[LinearSolver] = field(init=False, default_factory=list)
 
     def get(self) -> LinearSolver:
         """Return a solver that may factorize."""
-        return self._spare.pop() if self._spare else self.make()
+        if self._spare:
+            return self._spare.pop()
+        if pardiso_library() is None:
+            return SuperLUSolver()
+        empty = self.pattern.matrix(np.zeros((self.pattern.n_blocks, 3, 3)))
+        return PardisoSolver(empty, symmetric=True, single_precision=True)
 
     def put(self, solver: LinearSolver) -> None:
         """Take back a solver."""

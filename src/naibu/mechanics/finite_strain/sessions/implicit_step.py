@@ -18,7 +18,7 @@ from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
 
-HALVINGS = 6  # of a Newton step that inverts an element or goes too far
+HALVINGS = 12  # of a Newton step that inverts an element or goes too far
 ACCEPTED = 5.0  # tolerances: residual of a step that has used up its iterations
 
 LinearSolve = Callable[[sp.bsr_matrix, FloatArray], FloatArray]  # a matrix and a right side (n, 3) to the solution (n, 3)
@@ -31,7 +31,7 @@ class ImplicitStep:
     Attributes
     ----------
     assembler : Assembler
-        Elements and materials.
+        Elements and materials; the sides of cuts keep the normals that they have when the step begins.
     mass : ndarray, shape (n,)
         Lumped masses, kg.
     duration : float
@@ -73,6 +73,7 @@ class ImplicitStep:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "inertial", self.displacement + self.duration * self.velocity)
+        object.__setattr__(self, "assembler", self.assembler.in_step(self.displacement))
 
     def solved(self, u: FloatArray, linear: LinearSolve) -> FloatArray:
         """Return the displacement (n, 3) near `u`, whose constrained components are as prescribed, that balances momentum.
@@ -115,12 +116,12 @@ class ImplicitStep:
         return residual, self.tolerance * float(np.abs(internal).sum() + np.abs(self.external_force).sum()) + self.floor
 
     def tangent(self, u: FloatArray) -> sp.bsr_matrix:
-        """Return the matrix of a Newton step, mN/mm."""
+        """Return the matrix of a Newton step, mN/mm; see `NearbyContact.response` for what it leaves out."""
         pattern = self.assembler.pattern
         blocks = self.assembler.evaluate(self.deforming(u))[2]
         blocks *= 1.0 + self.retardation_s / self.duration
         for c, anchor, places in zip(self.contacts, self.anchors, self.positions, strict=True):
-            c.add_stiffness(c.evaluate(u, anchor, 1.0), pattern, places, blocks)
+            c.add_stiffness(c.evaluate(u, anchor, 1.0, curvature=False), pattern, places, blocks)
         blocks[pattern.diagonal()] += (self.mass / self.duration**2)[:, None, None] * np.eye(3)
         return with_dirichlet_rows(pattern.matrix(blocks), self.constrained)
 

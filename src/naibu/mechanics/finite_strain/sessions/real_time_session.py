@@ -22,14 +22,15 @@ from naibu.mechanics.contact.indenter_motion import parts_of_approach, slow_enou
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.pressure_elements import PressureElements
+from naibu.mechanics.finite_strain.lip_assembly import lips_of
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact, local_positions
 from naibu.mechanics.finite_strain.penalties import with_less_penetration
 from naibu.mechanics.finite_strain.sessions.condensed_contact import CondensedContact, ContactBesideTangent
 from naibu.mechanics.finite_strain.sessions.dynamic_session import PENETRATION, DynamicEngine, DynamicSession, DynamicState
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent, SolverPool, TangentThread
+from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import changing_lips, lips_about_to_change
 from naibu.mechanics.linear_algebra.anderson import AndersonMixing
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern, block_pattern, with_dirichlet_rows
-from naibu.mechanics.linear_algebra.direct import PardisoSolver, SuperLUSolver, pardiso_library
 from naibu.mechanics.linear_algebra.updated_factors import UpdatedFactors
 
 ITERATIONS = 5  # of a step at most
@@ -63,14 +64,17 @@ class RealTimeEngine(DynamicEngine):
     background: bool = True
     _elements: PressureElements = field(init=False)
     _surface: BlockPattern = field(init=False)
+    _pairs: Int32Array = field(init=False)  # of the sides of cuts, in this pattern
     _solvers: SolverPool = field(init=False)
     _rest: list[EarlierTangent] = field(init=False, default_factory=list)
 
     def __post_init__(self) -> None:
         DynamicEngine.__post_init__(self)
         object.__setattr__(self, "_elements", PressureElements.of(self.assembler))
-        object.__setattr__(self, "_surface", block_pattern(len(self.points), self.faces))
-        object.__setattr__(self, "_solvers", SolverPool(partial(_solver, self.assembler.pattern)))
+        pairs = np.concatenate([np.zeros((0, 2), np.int64), *(lips.pairs for lips in lips_of(self.assembler))])
+        object.__setattr__(self, "_surface", block_pattern(len(self.points), self.faces, pairs))
+        object.__setattr__(self, "_pairs", self._surface.positions(pairs))
+        object.__setattr__(self, "_solvers", SolverPool(self.assembler.pattern))
 
     def session(
         self,
@@ -82,13 +86,6 @@ class RealTimeEngine(DynamicEngine):
         """Begin a session; see `DynamicEngine.session`."""
         load = np.broadcast_to(np.asarray(0.0 if external_force is None else external_force, dtype=float), self.points.shape)
         return RealTimeSession(self, load, self.rest()).begun(state, constrained, indenters)
-
-
-def _solver(pattern: BlockPattern) -> PardisoSolver | SuperLUSolver:
-    """A solver for symmetric matrices of a pattern, in single precision where that is possible."""
-    if pardiso_library() is None:
-        return SuperLUSolver()
-    return PardisoSolver(pattern.matrix(np.zeros((pattern.n_blocks, 3, 3))), symmetric=True, single_precision=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,6 +131,7 @@ class RealTimeSession(DynamicSession):
     _pressure: FloatArray | None = field(init=False, default=None)
     _condensed: CondensedContact | None = field(init=False, default=None)
     _trial: _Trial | None = field(init=False, default=None)
+    _elements: PressureElements = field(init=False, repr=False)  # with the normals of the sides of cuts when the step begins
     _seen: FloatArray | None = field(init=False, default=None)
     _age: int = field(init=False, default=0)
 
@@ -201,6 +199,7 @@ class RealTimeSession(DynamicSession):
     def _quasi_newton(self, moving: FloatArray, contacts: tuple[Contact, ...]) -> _Trial | None:
         """Return the balance at the end of a step, or None."""
         tangent, start, h = self._current_tangent(), self.reached, self.engine.step
+        self._elements = replace(self._engine._elements, assembler=self.engine.assembler.in_step(start.displacement))
         inertial = start.displacement + h * start.velocity
         travel = [float(np.linalg.norm(c.stop - c.start)) for c in contacts]
         fastest = h * float(np.sqrt((start.velocity**2).sum(axis=1).max()))
@@ -287,7 +286,7 @@ class RealTimeSession(DynamicSession):
     def _tried(self, u: FloatArray, inertial: FloatArray, pressure: FloatArray) -> _Trial | None:
         """Return what is out of balance at a displacement; None where an element is inverted."""
         engine = self._engine
-        balance, mismatch, smallest = engine._elements.forces(u, pressure)
+        balance, mismatch, smallest = self._elements.forces(u, pressure)
         if not smallest > 0.0:
             return None
         contact = np.zeros_like(balance)
@@ -311,8 +310,9 @@ class RealTimeSession(DynamicSession):
             known = tangent.factors.covered(near.contact.nodes).all(axis=1)
             touches = (near.gap < 0.0) | ((after < 0.0) & known) | marked[near.contact.nodes].any(axis=1)
             active.append(near.only(touches))
-        for some in active:
-            marked[some.contact.nodes] = True
+        lips = [changing_lips(some, tangent, trial.displacement, free) for some in lips_of(self._elements.assembler)]
+        for concerned in (*(c.contact.nodes for c in active), *(c.lips.pairs for c in lips)):
+            marked[concerned] = True
         gripped = np.concatenate([*self.bodies[1:], np.zeros(0, np.int64)])
         marked[gripped] = True
         marked[tangent.held] = False
@@ -323,7 +323,8 @@ class RealTimeSession(DynamicSession):
                 condensed = self._condensed = CondensedContact(tangent, nodes)
             nodes = condensed.nodes
             hold = 1e3 * float(self._engine._elements.bulk.max()) * self.engine._extent
-            law = ContactBesideTangent(nodes, trial.displacement, active, self._places, self._engine._surface, tangent, gripped, hold)
+            places = [*self._places, self._engine._pairs]
+            law = ContactBesideTangent(nodes, trial.displacement, [*active, *lips], places, self._engine._surface, tangent, gripped, hold)
             begin = self._carried(trial.displacement) - trial.displacement if first else np.zeros_like(free)
             force = condensed.forces(free[nodes], law, begin[nodes], 1e-5 * self.engine._extent, 0.05 * self.engine._extent)
             tangent.factors.add_columns(nodes, force, x)
@@ -364,7 +365,9 @@ class RealTimeSession(DynamicSession):
             nodes.append(contact.nodes[near])
             order.append(np.maximum(gap[near], 0.0))
         ranked = np.concatenate(nodes)[np.argsort(np.concatenate(order), kind="stable")].ravel()
-        return np.asarray(ranked[np.sort(np.unique(ranked, return_index=True)[1])][:AHEAD], dtype=np.int64)
+        first = ranked[np.sort(np.unique(ranked, return_index=True)[1])][:AHEAD]
+        lips = [lips_about_to_change(some, self.reached.displacement) for some in lips_of(self._engine.assembler)]
+        return np.concatenate([first, *lips]).astype(np.int64)
 
     def _current_tangent(self) -> EarlierTangent:
         """Return the newest tangent; where there is none for these supports, it is made now."""
@@ -436,7 +439,9 @@ class RealTimeSession(DynamicSession):
         factors = UpdatedFactors(solver.factorize(with_dirichlet_rows(pattern.matrix(blocks), fixed)), len(u))
         factors.prepare(ahead)
         touched = np.unique(engine._surface.indices[(contact != 0.0).any(axis=(1, 2))]).astype(np.int64)
-        return EarlierTangent(factors, engine._elements.dilatation(u)[1], contact, held, touched, solver)
+        lips = [some.add(u, np.zeros_like(u))[1] for some in lips_of(engine.assembler)]
+        stiffness = np.concatenate([np.zeros((0, 3, 3)), *lips])
+        return EarlierTangent(factors, engine._elements.dilatation(u)[1], contact, held, touched, stiffness, solver)
 
     def _release(self, tangent: EarlierTangent | None) -> None:
         """Let the solver of a tangent factorize again, unless the tangent is kept for the next session."""

@@ -1,0 +1,101 @@
+"""Pairs of the two sides of cuts that open or close in a step, beside their stiffness in the tangent of an earlier state.
+
+A tangent of then holds closed what was closed then. Pairs whose state has changed since, or may change, are taken out of it, and their
+contact is solved as it is, condensed to their nodes like that of indenters (`naibu.mechanics.finite_strain.sessions.condensed_contact`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray, Int32Array, IntArray
+from naibu.mechanics.contact.cut_lips import CutLips
+from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
+from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
+
+MOST = 80  # pairs in a step
+AHEAD = 40  # pairs for which the inverse is prepared
+NEAR = 0.1  # of the edge: gaps, and penetrations, from which pairs are not expected to change
+
+
+@dataclass(slots=True, eq=False)
+class LipsBesideTangent:
+    """Change of the forces of pairs, less what an earlier tangent contains of it; used as `NearbyContact` is.
+
+    Attributes
+    ----------
+    lips : CutLips
+        These pairs, with normals.
+    points : ndarray, shape (k,), int64
+        Their numbers among all pairs.
+    displacement : ndarray, shape (n, 3)
+        From which the body moves, mm.
+    earlier : ndarray, shape (k, 3, 3)
+        Stiffness of the pairs in the tangent, mN/mm.
+    """
+
+    lips: CutLips
+    points: IntArray
+    displacement: FloatArray
+    earlier: FloatArray
+    _now: FloatArray = field(init=False)
+    _before: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._before = np.zeros_like(self.displacement)
+        self._now = self.lips.add(self.displacement, self._before)[1]
+
+    def add_force(self, displacement: FloatArray, force: FloatArray) -> None:
+        """Add the change of the forces up to a displacement (n, 3), mm, to `force` (n, 3), mN."""
+        first, second = self.lips.pairs.T
+        internal = -self._before
+        self._now = self.lips.add(displacement, internal)[1]
+        motion = displacement - self.displacement
+        known = np.einsum("pij,pj->pi", self.earlier, motion[first] - motion[second])
+        np.add.at(internal, first, -known)
+        np.add.at(internal, second, known)
+        force -= internal
+
+    def touching(self) -> LipsBesideTangent:
+        """Return the pairs whose stiffness may differ: all of them."""
+        return self
+
+    def add_stiffness(self, pattern: BlockPattern, positions: Int32Array, blocks: FloatArray) -> None:
+        """Add the difference of the stiffness at the last evaluation; `positions` (p, 2, 2) are those of all pairs in the pattern."""
+        places = positions[self.points]
+        for a in range(2):
+            for b in range(2):
+                np.add.at(blocks, places[:, a, b], (1.0 if a == b else -1.0) * (self._now - self.earlier))
+
+
+def changing_lips(lips: CutLips, tangent: EarlierTangent, displacement: FloatArray, free: FloatArray) -> LipsBesideTangent:
+    """Return the pairs that are, or may come to be, in another state than in a tangent.
+
+    Parameters
+    ----------
+    lips : CutLips
+        All pairs, with the normals of the step.
+    tangent : EarlierTangent
+        Which holds together what was closed then.
+    displacement : ndarray, shape (n, 3)
+        From which the body moves, mm.
+    free : ndarray, shape (n, 3)
+        How it would move by the tangent, mm.
+    """
+    before, after = lips.gaps(displacement), lips.gaps(displacement + free)
+    then = tangent.lips.any(axis=(1, 2))
+    known = tangent.factors.covered(lips.pairs).all(axis=1)
+    changed = (then != (before < 0.0)) | (known & (then != (after < 0.0)))
+    close = np.minimum(np.abs(before), np.abs(after)) / lips.edge
+    chosen = np.flatnonzero(changed | (known & (close < NEAR)))
+    chosen = np.sort(chosen[np.lexsort((close[chosen], ~changed[chosen]))][:MOST]).astype(np.int64)
+    return LipsBesideTangent(lips.only(chosen), chosen, displacement, tangent.lips[chosen])
+
+
+def lips_about_to_change(lips: CutLips, displacement: FloatArray) -> IntArray:
+    """Return the nodes (k,) of the pairs whose sides are nearest to opening or closing at a displacement (n, 3), mm, the nearest first."""
+    near = np.abs(lips.gaps(displacement)) / lips.edge
+    order = np.argsort(near, kind="stable")[:AHEAD]
+    return np.asarray(lips.pairs[order[near[order] < NEAR]].ravel(), dtype=np.int64)
