@@ -84,6 +84,9 @@ FAULTS = [
     (put("known", "scale_is_absolute", "yes"), "scale_is_absolute = 'yes'"),
     (put("load_cases", [1]), "load_cases = [1]"),
     (put("units", "SI"), "units = 'SI'"),
+    (put("settings", {}), "settings law = None: must be there"),
+    (put("settings", {"law": "yeoh", "contact": "coulomb"}), "settings joined = None: must be there"),
+    (put("reservation", 5), "reservation = 5: must be a text"),
 ]
 
 

@@ -10,6 +10,7 @@ from naibu.identification.from_markers.specimen.specimen_model import ContactMod
 from naibu.identification.stored_values import UNITS, check_covariance, require, require_number, rows_of, table_of
 from naibu.mechanics.finite_elements.hyperelasticity import LAWS
 
+NEEDED_SETTINGS = ("law", "contact", "joined")  # what parameters are parameters of
 DENSEST = 3e-5  # kg/mm3; nothing that is pressed by hand is denser, so the unit must be another
 
 
@@ -31,6 +32,7 @@ def check_stored_model(data: Mapping[str, Any]) -> None:
     for key, value in table_of(data, "noise").items():
         require_number(f"noise {key}", value, 0.0, 1e3)
     require_number("noise_factor", data.get("noise_factor"), 0.0, 1e12)
+    require(isinstance(data.get("reservation", ""), str), "reservation", data.get("reservation"), "must be a text")
     known = table_of(data, "known")
     for name, modulus in table_of(known, "young_moduli").items():
         require_number(f"young_moduli {name!r}", modulus, 1e-12, 1e12)
@@ -75,6 +77,8 @@ def _check_settings(settings: Mapping[str, Any]) -> None:
         "tangential_stiffness": (0.0, 1e12),
         "density": (0.0, DENSEST),
     }
+    for key in NEEDED_SETTINGS:
+        require(key in settings, f"settings {key}", None, "must be there: parameters mean nothing without it")
     for key, value in settings.items():
         if key in choices:
             require(value in choices[key], f"settings {key}", value, f"must be one of {', '.join(choices[key])}")
