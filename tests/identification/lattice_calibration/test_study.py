@@ -71,6 +71,32 @@ path = [[0.0, 0, 0, 0], [0.4, 12, 0, 0]]
 [output]
 every_s = 0.02
 """
+PRESSED = """
+[object]
+size_mm = [30, 30, 30]
+mass_g = 32.4
+[lattice]
+spacing_mm = 10.0
+[parameters]
+K = { short = 60.0, normal = 40.0, long = 25.0 }
+C1 = { short = 30.0, normal = 18.0, long = 12.0 }
+C2 = { short = 900.0, normal = 700.0, long = 500.0 }
+[simulation]
+duration_s = 1.2
+gravity_mm_per_s2 = 9810
+[floor]
+contact = "friction"
+static_friction = 0.5
+kinetic_friction = 0.4
+[[indenter]]
+name = "plate"
+shape = "box"
+size_mm = [90, 90, 10.0]
+centre_mm = [15.0, 15.0, 35.0]
+static_friction = 0.5
+kinetic_friction = 0.4
+path = [[0.0, 0, 0, 0], [1.0, 0, 0, -3.6], [1.2, 3.6, 0, -3.6]]
+"""
 
 
 @pytest.fixture
@@ -94,6 +120,16 @@ def test_the_forward_model_is_the_simulation(tmp_path: Path, text: str) -> None:
         assert np.abs(position - frame.state.lattice.position).max() < 2e-3
     force = np.array([frame.force.mean(axis=0) for frame in frames[1:]])
     assert np.abs(found.force - force).max() < 5e-3 * np.abs(force).max()
+
+
+def test_forces_in_contact_change_little_where_a_parameter_changes_by_a_millionth(tmp_path: Path) -> None:
+    """Force and shape are continuous in the parameters but for points that begin to slip, which what the solver leaves may decide."""
+    unknowns = StudyUnknowns.of(prepared_study(study_file(tmp_path, PRESSED)).study)
+    model = StudyModel.of(unknowns.study, [1.2], 60, 10, coarse=False)
+    found = [model.run(unknowns.parameters(unknowns.start * (1.0 + h * (np.arange(9) == k)))) for h, k in ((0.0, 0), (1e-6, 0), (1e-6, 3))]
+    for other in found[1:]:
+        assert np.abs(other.force - found[0].force).max() < 7e-3 * np.abs(found[0].force).max()
+        assert np.abs(other.positions - found[0].positions).max() < 0.05
 
 
 def test_derivatives_of_a_tied_study_are_differences(squeezed: LatticeStudy) -> None:

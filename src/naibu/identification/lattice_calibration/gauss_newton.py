@@ -30,7 +30,7 @@ from naibu.identification.lattice_calibration.least_squares import (
     next_step,
     noise_factors,
 )
-from naibu.identification.lattice_calibration.secant_search import SecantSearch
+from naibu.identification.lattice_calibration.mapped_search import MappedSearch
 from naibu.identification.lattice_calibration.shape_distance import closest_points
 from naibu.identification.lattice_calibration.unknowns import LatticeUnknowns, identifiability
 from naibu.identification.lattice_calibration.widened_covariance import widened_covariance
@@ -188,7 +188,7 @@ def calibrate_lattice(
     by the same derivatives, or by those of fine steps where that fails. Where the law does not reproduce points or forces to within their
     noise, the noise is taken as that much larger, each for itself, and the search goes on: neither then outweighs the other by being
     measured more precisely than the model can tell. Where derivatives are differences of simulations, as in contact, Broyden's updates
-    spare most of them (`SecantSearch`).
+    spare most of them (`MappedSearch`).
 
     Parameters
     ----------
@@ -233,7 +233,7 @@ def _searched(
     problem: InverseProblem, centre: FloatArray, prior_sd: float, max_iterations: int, reweigh: bool, at: Evaluations
 ) -> LatticeEstimate:
     if problem.shifts(np.exp(centre)) is not None:
-        return _searched_by_secants(problem, centre, prior_sd, max_iterations, reweigh, at)
+        return _searched_by_mapping(problem, centre, prior_sd, max_iterations, reweigh, at)
     theta, runs, count = centre.copy(), 0, 0
     here, used = problem, 0
     for _ in range(3 if reweigh else 1):
@@ -255,10 +255,10 @@ def _searched(
     return _estimate(here, point, covariance, count, runs + extra)
 
 
-def _searched_by_secants(
+def _searched_by_mapping(
     problem: InverseProblem, centre: FloatArray, prior_sd: float, max_iterations: int, reweigh: bool, at: Evaluations
 ) -> LatticeEstimate:
-    search = SecantSearch(problem, centre, prior_sd, at)
+    search = MappedSearch(problem, centre, prior_sd, at)
     search.run(max_iterations, reweigh=reweigh)
     covariance, extra = widened_covariance(search.problem, search.point, centre, prior_sd, at)
     found = _estimate(search.problem, search.point, covariance, search.iterations, search.runs + extra)

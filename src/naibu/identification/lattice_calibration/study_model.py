@@ -24,7 +24,7 @@ from naibu.mechanics.lattices.simulation.tied_bodies import tied_constraints
 
 QUICK_TOUCHING_S = 0.02  # like `QUICK_S`, in contact, where the first touch of moving indenters is no change of their motion
 
-ROUGH = 3e-3  # tolerance of the solver in long steps: its error is far less than what they differ from fine ones
+EXACT = 1e-7  # tolerance of the solver in contact: what it leaves decides where points begin to slip, and shapes and forces jump by that
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,9 +198,7 @@ class StudyModel:
         study = self.study
         lattice, external = self._lattice(trial)
         engines = {
-            e: LatticeEngine.of(
-                lattice, trial.parameters, step=e * study.step_s, tolerance=max(study.tolerance, ROUGH if self.coarse else 0.0)
-            )
+            e: LatticeEngine.of(lattice, trial.parameters, step=e * study.step_s, tolerance=min(study.tolerance, EXACT))
             for e in self._lengths()
         }
         state = next(iter(engines.values())).rest()

@@ -18,7 +18,7 @@ from naibu.mechanics.lattices.model.surface import surface_of
 from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy
 
 WINDOW_S = 0.02
-ROUGHNESS = 1e-4  # of chi-squared in contact
+ROUGHNESS = 2e-5  # of chi-squared in contact
 
 
 @dataclass(frozen=True, slots=True, eq=False)

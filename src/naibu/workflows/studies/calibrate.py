@@ -238,8 +238,9 @@ def _warnings(problem: StudyProblem, estimate: LatticeEstimate, before: Compared
     found = [] if estimate.finished else ["The search was interrupted: these are the best values so far, not the end of the search."]
     if not problem.unknowns.study.tied:
         found.append(
-            "In contact the intervals are not confirmed: in trials with known truth they were too narrow where classes of elements are "
-            "told apart (benchmarks/lattice_calibration.py). Take them as the least uncertainty."
+            "In contact the intervals are not confirmed: in trials with known truth they were far too narrow where classes of elements are "
+            "told apart (benchmarks/lattice_calibration.py), because points that begin to slip make shapes and forces jump, which counts "
+            "as information. Take them as the least uncertainty."
         )
     if not estimate.settled:
         found.append(
