@@ -4,8 +4,8 @@ A plate (or another tool) is led onto the body, into it, held and taken away, th
 thread that steps, so that other programs on the machine change them little; the work of the one that renews the tangents stands beside.
 `static` compares the rest under the tool with the offline solution of `QuasiStaticSession`.
 
-Run: ``OMP_NUM_THREADS=1 python benchmarks/live_bodies.py [--body demo|11|13] [--tool plate] [--speed 24] [--static | --cut]``; a number N
-is a box of 6 N^3 tetrahedra, nu 0.499.
+Run: ``OMP_NUM_THREADS=1 python benchmarks/live_bodies.py [--body demo|11|13] [--tool plate] [--speed 24] [--static | --cut | --drag]``; a
+number N is a box of 6 N^3 tetrahedra, nu 0.499.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.core.rigid_transform import RigidTransform
-from naibu.mechanics import Assembler, DynamicEngine, QuasiStaticEngine, elements, material
+from naibu.mechanics import Assembler, DynamicEngine, QuasiStaticEngine, elements, material, spherical_indenter
 from naibu.meshing import box, to_tetra
 from naibu.simulation import FiniteElementBody, InteractiveSimulation
 from naibu.workflows import tools_for, touchable
@@ -137,6 +137,37 @@ def cut(body: FiniteElementBody) -> None:
     simulation.close()
 
 
+def dragged(body: FiniteElementBody) -> None:
+    """Cut a body half through from above, drag a sphere 7 mm across the cut and back, twice, at several places, and print the frames.
+
+    Tangents are renewed at fixed steps, so that only the times differ from run to run.
+    """
+    radius, (low, high) = 8.0, (body.points.min(axis=0), body.points.max(axis=0))
+    middle, still = 0.5 * (low + high), replace(body, engine=replace(body.engine, background=False))
+    for friction, offset in ((0.3, 0.0), (1.0, 0.0), (0.3, 2.0), (0.2, 1.0)):
+        x = middle[0] + offset
+        at = np.array([middle[0] - 3.5, middle[1], high[2] + radius + 3.0])
+        sphere = spherical_indenter(at, radius, static_friction=friction, kinetic_friction=friction)
+        simulation = InteractiveSimulation(still, {"sphere": sphere})
+        simulation.cut([[[x, y, high[2] + 5.0], [x, y, middle[2]]] for y in (low[1] - 5.0, high[1] + 5.0)])
+        simulation.take("sphere")
+        ms, failed = [], 0
+        for way in [(0.0, -9.0), *2 * [(7.0, 0.0), (-7.0, 0.0)], (0.0, 9.0)]:
+            for _ in range(9):  # some 50 mm/s
+                at = at + np.array([way[0], 0.0, way[1]]) / 9
+                simulation.move(at)
+                processor = time.thread_time()
+                failed += bool(simulation.advance().failed)
+                ms.append(1e3 * (time.thread_time() - processor))
+        median, most, high_ms = np.median(ms), max(ms), np.quantile(ms, 0.9)
+        print(
+            f"friction {friction:g}, {offset:g} mm beside the cut, {len(simulation.body.cells)} cells: processor ms a frame: "
+            f"median {median:.1f}, p90 {high_ms:.1f}, worst {most:.1f}; failed {failed} of {len(ms)}",
+            flush=True,
+        )
+        simulation.close()
+
+
 def report(name: str, run: Run) -> None:
     median, high = np.median(run.ms), np.quantile(run.ms, 0.99)
     print(
@@ -152,11 +183,15 @@ def main() -> None:
     parser.add_argument("--speed", type=float, default=24.0, help="mm/s")
     parser.add_argument("--static", action="store_true")
     parser.add_argument("--cut", action="store_true", help="only time a cut")
+    parser.add_argument("--drag", action="store_true", help="only drag a sphere across a cut and back")
     given = parser.parse_args()
     body = body_named(given.body)
     print(f"{given.body}: {body.mesh.n_cells} cells, {body.mesh.n_points} nodes; {given.tool}, {given.speed:g} mm/s")
     if given.cut:
         cut(body)
+        return
+    if given.drag:
+        dragged(body)
         return
     fast = touched(body, given.tool, given.speed)
     report("earlier tangents", fast)
