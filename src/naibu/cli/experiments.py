@@ -27,7 +27,7 @@ DEMO = ("ct_two_material_1", "ct_two_material_2", "ct_two_material_3")
 DEMO_KNOWN = "hardness 5=222 kPa"  # mean of the report's compression tests, Table 3.4
 
 
-@verb(START, "demo --open   # about a minute; opens the report")
+@verb(START, "demo --open   # some minutes; opens the report")
 def demo(*, out: Out = Path("naibu-demo"), overwrite: Overwrite = False, where: WorkerOptions | None = None) -> None:
     """Calibrate both gels of the bundled two-material experiments, predict each experiment from the others, and write a report.
 
