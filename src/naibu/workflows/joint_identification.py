@@ -186,7 +186,7 @@ def table_of_moduli(parts: Sequence[NormalEstimate], joint: JointEstimate, *, re
     """Return the table of parameters: from markers, from fields, and from both, with 95 % intervals."""
     rows: list[tuple[Cell, ...]] = []
     for name in joint.together.names:
-        cells: list[Cell] = [name.replace(": ", ", ").replace("_", " ").replace("young", "Young's").replace("poisson", "Poisson's")]
+        cells: list[Cell] = [_readable(name)]
         for part in (*parts, joint.together):
             if name in part.names and np.isfinite(part.standard_deviation(name)):
                 cells += [
@@ -200,20 +200,25 @@ def table_of_moduli(parts: Sequence[NormalEstimate], joint: JointEstimate, *, re
     return Table("Moduli", columns, tuple(rows), note=f"Young's moduli in {unit}.")
 
 
+def _readable(name: str) -> str:
+    return name.replace(": ", ", ").replace("_", " ").replace("young", "Young's").replace("poisson", "Poisson's")
+
+
 def _physical(name: str, inner: FloatArray) -> FloatArray:
     values = np.exp(inner)
     return values if name.endswith(young_modulus("")) else np.sort(0.5 * (1.0 - values))[[1, 0, 2]]
 
 
 def _in_words(joint: JointEstimate, parts: Sequence[NormalEstimate]) -> tuple[str, ...]:
-    shared = ", ".join(joint.shared)
+    shared = "; ".join(_readable(name) for name in joint.shared)
     measure = f"chi squared {joint.chi_squared:.3g} with {joint.degrees_of_freedom} degrees of freedom"
     if not joint.contradicted:
         return (f"Markers and fields agree ({measure}) on what both tell: {shared}.",)
     apart = {n: abs(parts[0].value(n) - parts[1].value(n)) / math.hypot(*(p.standard_deviation(n) for p in parts)) for n in joint.shared}
     worst = max(apart, key=lambda n: apart[n])
+    named = _readable(worst)
     return (
-        f"Markers and fields contradict each other ({measure}), most about {worst}: {apart[worst]:.2g} standard deviations. Intervals of "
+        f"Markers and fields contradict each other ({measure}), most about {named}: {apart[worst]:.2g} standard deviations. Intervals of "
         f"what both tell together are {joint.widened:.2g} times as wide for it; question names, known values and loads.",
     )
 
