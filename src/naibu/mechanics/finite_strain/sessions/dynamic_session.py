@@ -99,7 +99,7 @@ class DynamicEngine:
     step: float = 1.0 / 60.0
     normal_stiffness: float = 1000.0
     tangential_stiffness: float = 200.0
-    iterations: int = 15
+    iterations: int = 10
     tolerance: float = 1e-3
     _extent: float = field(init=False)
     _modulus: float = field(init=False)

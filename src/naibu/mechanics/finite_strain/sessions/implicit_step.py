@@ -18,7 +18,7 @@ from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
 
-HALVINGS = 12  # of a Newton step that inverts an element or goes too far
+HALVINGS = 6  # of a Newton step that inverts an element or goes too far
 ACCEPTED = 5.0  # tolerances: residual of a step that has used up its iterations
 
 LinearSolve = Callable[[sp.bsr_matrix, FloatArray], FloatArray]  # a matrix and a right side (n, 3) to the solution (n, 3)
