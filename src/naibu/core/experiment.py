@@ -16,10 +16,21 @@ ShapeKind = Literal["box", "half_ellipsoid", "cylinder", "hemisphere"]
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """Outer shape of the object in its reference configuration; `size_mm` is its extent along x, y, z."""
+    """Outer shape of the object in its reference configuration.
+
+    Attributes
+    ----------
+    kind : str
+        ``"box"``, ``"half_ellipsoid"``, ``"cylinder"`` or ``"hemisphere"``.
+    size_mm : tuple of float
+        Its extent along x, y, z; of a half ellipsoid without the straight-sided part below it.
+    straight_base_mm : float, optional
+        Height of a straight-sided part below a half ellipsoid; None where nobody states it.
+    """
 
     kind: ShapeKind
     size_mm: tuple[float, float, float]
+    straight_base_mm: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

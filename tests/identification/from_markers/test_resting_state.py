@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Literal
+
 import numpy as np
 import pytest
 
+from naibu import datasets
 from naibu.core.experiment import Experiment, Loading
 from naibu.identification.from_markers.calibration import initial_parameters
 from naibu.identification.from_markers.gauss_newton import Matcher
@@ -14,6 +18,7 @@ from naibu.identification.from_markers.specimen.parameter_names import (
     friction,
     platen_position,
     poisson_ratio,
+    straight_base,
     young_modulus,
 )
 from naibu.identification.from_markers.specimen.resting_state import resting_state
@@ -71,3 +76,19 @@ def test_derivatives_count_what_the_reference_scan_has_seen() -> None:
     ends = [matcher.evaluate(values | {young_modulus("gel"): YOUNG * f}, poses=[fit.pose])[0].predicted for f in (1.05, 0.95)]
     difference = (ends[0] - ends[1]) / (0.1 * YOUNG)
     np.testing.assert_allclose(fit.jacobian[:, :, at], difference, atol=0.03 * np.abs(difference).max())
+
+
+def test_a_modulus_that_nobody_states_is_sought_where_only_the_weight_holds_an_object_of_known_height() -> None:
+    known, measured = KnownMaterials(), datasets.load("ct_half_ellipsoid")
+    somewhere = replace(measured, shape=replace(measured.shape, straight_base_mm=None))
+    gel = young_modulus(measured.materials[0])
+
+    def fixed(experiment: Experiment, known: KnownMaterials = known, **settings: Literal["given", "weighed"]) -> bool:
+        body = specimen(experiment, ModelSettings(element_size_mm=20.0, **settings))
+        parameters = {p.name: p for p in initial_parameters([body], {experiment.name: ["width_100"]}, known)}
+        assert parameters[straight_base(experiment)].fixed == (experiment is measured)
+        return parameters[gel].fixed
+
+    assert not fixed(measured) and fixed(somewhere)
+    assert not fixed(somewhere, modulus="weighed") and fixed(measured, modulus="given")
+    assert fixed(measured, KnownMaterials({measured.materials[0]: 100.0}))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +53,9 @@ HEADER = "marker,x_mm,y_mm,z_mm,status,note\n"
 CORNERS = [(x, y, z) for z in (10, 20) for y in (10, 20) for x in (10, 20)]
 INITIAL = HEADER + "".join(f"{n},{x},{y},{z},ok,\n" for n, (x, y, z) in enumerate(CORNERS, 1))
 PRESSED = HEADER + "".join(f"{n},{x},{y},{z * 0.8},ok,\n" for n, (x, y, z) in enumerate(CORNERS, 1))
-ADDED_KEYS = r'^(kind = "(plate|bar|side_plates|cylinder)"|(bar_width_mm|bar_axis|joined_at_mm|up_axis|size_axes|loaded) = ).*\n'
+ADDED_KEYS = (
+    r'^(kind = "(plate|bar|side_plates|cylinder)"|(bar_width_mm|bar_axis|joined_at_mm|up_axis|size_axes|straight_base_mm|loaded) = ).*\n'
+)
 
 
 @pytest.fixture
@@ -166,6 +169,8 @@ META_FAULTS = [
     ("height_stated_mm = 25", "height_stated_mm = -25", ["height_stated_mm", "-25", "greater than 0"]),
     ("height_stated_mm = 25", "width_stated_mm = 25", ["width_stated_mm = [25.0]", "height_stated_mm"]),
     ('shape = "cube"', 'shape = "cube"\njoined_at_mm = [30]', ["joined_at_mm = 30", "between 0 and 30 mm"]),
+    ('shape = "cube"', 'shape = "cube"\nstraight_base_mm = 5', ["straight_base_mm", "below a half ellipsoid; leave it out for a cube"]),
+    ('shape = "cube"', 'shape = "half ellipsoid"\nstraight_base_mm = -5', ["straight_base_mm", "-5"]),
     ('shape = "cube"', 'shape = "cube"\nsize_axes = ["x", "x", "z"]', ["size_axes", "twice"]),
     ('name = "pressed"', 'name = "initial"', ["name = 'initial'", "2 times", "its own"]),
     ('name = "pressed"', 'name = "pressed hard"', ["[[state]] number 2 name", "'pressed hard'", "letters"]),
@@ -352,8 +357,9 @@ def test_original_format_reads_the_same_and_tells_what_it_assumed(name: str, tmp
     assert original.loading.assumed and not bundled.loading.assumed
     for field in ("kind", "bar_width_mm", "bar_axis", "counter_material", "base_material"):
         assert getattr(original.loading, field) == getattr(bundled.loading, field)
-    for field in ("name", "shape", "layers", "joined_at_mm", "up_axis", "xy_scale", "xy_step_mm", "z_step_mm", "known_problems"):
+    for field in ("name", "layers", "joined_at_mm", "up_axis", "xy_scale", "xy_step_mm", "z_step_mm", "known_problems"):
         assert getattr(original, field) == getattr(bundled, field)
+    assert original.shape == replace(bundled.shape, straight_base_mm=None)  # which no words of the file tell
     for ours, theirs in zip(bundled.states, original.states, strict=True):
         assert (ours.name, ours.loaded, ours.stated_mm, ours.estimated_mm) == (
             theirs.name,

@@ -203,8 +203,10 @@ def initial_parameters(specimens: Sequence[Specimen], states: Mapping[str, Seque
         if s.settings.pixel_scale == "sought":
             found.setdefault(name := pixel_scale(s.experiment), Parameter(name, s.experiment.xy_scale, "", prior_sd=PIXEL_SCALE_SD))
         if s.has_unknown_base:
-            below = straight_base(s.experiment)
-            found.setdefault(below, Parameter(below, 0.1 * s.experiment.height_mm, "mm", prior_sd=0.4 * s.experiment.height_mm))
+            below, height = straight_base(s.experiment), s.experiment.height_mm
+            stated = s.experiment.shape.straight_base_mm
+            value = 0.1 * height if stated is None else stated
+            found.setdefault(below, Parameter(below, value, "mm", prior_sd=0.4 * height, fixed=stated is not None))
         for name in s.shift_names:
             found.setdefault(name, Parameter(name, 0.0, "mm", prior_sd=1.0))
         for state in states[s.experiment.name]:
@@ -215,7 +217,7 @@ def initial_parameters(specimens: Sequence[Specimen], states: Mapping[str, Seque
 
 def _material_parameters(s: Specimen, known_materials: KnownMaterials, reference: float) -> list[Parameter]:
     out = []
-    weighed = s.settings.modulus == "weighed" and s.experiment.loading.kind == "side_plates" and not known_materials.scale_is_absolute
+    weighed = _is_weighed(s, known_materials)
     for m in s.experiment.materials:
         given = known_materials.young_moduli.get(m)
         # without a known material in the body its modulus does not follow from displacements: one body of one material has no scale
@@ -225,6 +227,17 @@ def _material_parameters(s: Specimen, known_materials: KnownMaterials, reference
         out.append(Parameter(poisson_ratio(m), START_POISSON_RATIO, "", "incompressibility", prior_sd=1.0))
         out += [Parameter(shape_parameter(m, k), 0.0, "", prior_sd=0.3) for k in SHAPE_NAMES.get(s.settings.law, ())]
     return out
+
+
+def _is_weighed(s: Specimen, known_materials: KnownMaterials) -> bool:
+    """Whether the modulus is sought from the weight: between side plates nothing else holds an object on its table.
+
+    The unknown height of an object makes up for that of its modulus, so that by default the height must be known.
+    """
+    if s.experiment.loading.kind != "side_plates" or (known_materials.young_moduli and known_materials.scale_is_absolute):
+        return False
+    known_height = not s.has_unknown_base or s.experiment.shape.straight_base_mm is not None
+    return s.settings.modulus == "weighed" or (s.settings.modulus == "automatic" and known_height)
 
 
 def _batch_parameters(layers: Sequence[Layer], known_materials: KnownMaterials) -> list[Parameter]:

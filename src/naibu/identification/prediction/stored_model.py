@@ -69,7 +69,7 @@ def _check_settings(settings: Mapping[str, Any]) -> None:
         "contact": get_args(ContactModel),
         "joined": ("tied", "sliding"),
         "pixel_scale": ("given", "sought"),
-        "modulus": ("given", "weighed"),
+        "modulus": ("automatic", "given", "weighed"),
     }
     ranges = {
         "element_size_mm": (0.0, 1e4),

@@ -132,7 +132,10 @@ def _shape(path: Path, meta: Meta, up: Axis, assumed: list[str]) -> Shape:
     if len(set(axes)) != 3:
         raise InputError(f'{path}: [object] size_axes = {axes} names an axis twice; write each once, for example ["x", "y", "z"]')
     along = dict(zip(axes, size, strict=True))
-    return Shape(kind, (along["x"], along["y"], along["z"]))
+    base = meta.object.straight_base_mm
+    if base is not None and kind != "half_ellipsoid":
+        raise InputError(f"{path}: [object] straight_base_mm is the straight-sided part below a half ellipsoid; leave it out for a {words}")
+    return Shape(kind, (along["x"], along["y"], along["z"]), base)
 
 
 def _joints(path: Path, meta: Meta, height: float, assumed: list[str]) -> tuple[float, ...]:

@@ -75,6 +75,7 @@ class ObjectTable(_Table):
     size_mm: Annotated[list[Length], Field(min_length=3, max_length=3)]
     size_axes: Annotated[list[Axis], Field(min_length=3, max_length=3)] | None = None
     joined_at_mm: list[Length] | None = None
+    straight_base_mm: Height | None = None
     material: str = "gel"
     mass_g: Mass | None = None
     temperature_C: Celsius | None = None

@@ -197,6 +197,8 @@ def write_experiment_folder(
                 "check the number and its unit, mm"
             )
     size: dict[str, object] = {"shape": shape.kind, "size_mm": list(shape.size_mm)}
+    if shape.straight_base_mm is not None:
+        size["straight_base_mm"] = shape.straight_base_mm
     text = _document(
         {"title": title, "source": source, "dimensions": 2 if np.isnan(initial.points[:, 2]).all() else 3, "units": "mm"},
         ("[coordinates]", {"up_axis": up_axis, "xy_step_mm": xy_step_mm, "z_step_mm": z_step_mm, "xy_sd_mm": xy_sd_mm, "z_sd_mm": z_sd_mm}),

@@ -82,7 +82,8 @@ class CutLips:
 
     def _gaps_and_normals(self, displacement: FloatArray) -> tuple[FloatArray, FloatArray]:
         if self.normals is None:
-            return _state(self.points, self.faces, self.pairs, self.corner_pair, self.edge, np.ascontiguousarray(displacement))
+            gap, normals = _state(self.points, self.faces, self.pairs, self.corner_pair, self.edge, np.ascontiguousarray(displacement))
+            return gap, normals
         first, second = self.pairs.T
         apart = (self.points[second] - self.points[first]) + (displacement[second] - displacement[first])
         gap = (self.normals * apart).sum(axis=1)

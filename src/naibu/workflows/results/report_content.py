@@ -204,8 +204,11 @@ def parameter_rows(model: CalibratedModel, names: Sequence[str]) -> tuple[Parame
 def undetermined(model: CalibratedModel, names: Sequence[str], priors: ParameterSet | None = None) -> tuple[str, ...]:
     """Return, in words, what the data do not determine about the parameters `names`; `priors` tells what was assumed of them."""
     out = []
-    if model.settings.modulus == "weighed":
-        out.append("The stiffness follows from the weight that bends the object, at the density of water.")
+    if not model.known_materials.scale_is_absolute and not any(p.fixed for p in model.parameters if p.name.endswith(": young_modulus")):
+        out.append(
+            "The stiffness follows from the weight that bends the object, at the density of water; "
+            "whatever else holds it down, such as a base that sticks, would look like a smaller modulus."
+        )
     elif not model.known_materials.scale_is_absolute:
         out.append("Displacements alone do not give the absolute stiffness: the moduli are ratios to the material that sets the scale.")
     by_name: dict[str, Parameter] = {p.name: p for p in model.parameters}

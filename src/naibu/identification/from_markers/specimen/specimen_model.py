@@ -69,8 +69,9 @@ class ModelSettings:
         kg/mm3; weight is applied where an object is not pressed onto its base.
     pixel_scale : {"given", "sought"}
         Whether the true size of a pixel along x and y is that of the file, or an unknown of every experiment.
-    modulus : {"given", "weighed"}
-        Whether a modulus that nobody states stays at a reference value, or is sought between side plates from the weight.
+    modulus : {"automatic", "given", "weighed"}
+        Whether a modulus that nobody states stays at a reference value (given), or is sought between side plates from the weight
+        (weighed); automatic seeks it where the object's height is known.
     """
 
     law: str = "neo_hookean"
@@ -81,7 +82,7 @@ class ModelSettings:
     tangential_stiffness: float = 200.0
     density: float = 1e-6
     pixel_scale: Literal["given", "sought"] = "given"
-    modulus: Literal["given", "weighed"] = "given"
+    modulus: Literal["automatic", "given", "weighed"] = "automatic"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
