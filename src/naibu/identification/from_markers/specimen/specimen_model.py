@@ -70,8 +70,7 @@ class ModelSettings:
     pixel_scale : {"given", "sought"}
         Whether the true size of a pixel along x and y is that of the file, or an unknown of every experiment.
     modulus : {"automatic", "given", "weighed"}
-        Whether a modulus that nobody states stays at a reference value (given), or is sought between side plates from the weight
-        (weighed); automatic seeks it where the object's height is known.
+        Whether a modulus that nobody states is a reference value, or sought between side plates from a weight (automatic: of known height).
     """
 
     law: str = "neo_hookean"
