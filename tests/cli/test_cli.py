@@ -288,7 +288,7 @@ def test_predict_refuses(naibu: Run, press: Press, mistake: str) -> None:
         ("{", "", "JSON"),
         ('"naibu model 1"', '"naibu model 0"', "naibu model 0"),
         ('"covariance"', '"variance"', "covariance"),
-        ('"law"', '"Law"', "Law"),
+        ('"law"', '"Law"', "settings law = None: must be there"),
         ('"unit"', '"units"', "unit"),
         ('"prior_sd": 2.0', '"prior_sd": -2.0', "prior"),
     ],

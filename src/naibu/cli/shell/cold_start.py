@@ -134,7 +134,16 @@ def _watch(signals: socket.socket, compiling: Callable[[], bool]) -> None:
         while compiling() and time.monotonic() < deadline:
             time.sleep(0.02)
         if not compiling():
-            signal.raise_signal(number[0])
+            _send_again(number[0])
         else:
             os.write(2, b"Interrupted while kernels were compiled; every file written is complete.\n")
             os._exit(INTERRUPTED if number[0] == signal.SIGINT else TERMINATED)
+
+
+def _send_again(number: int) -> None:
+    """Send a signal to the main thread, so that it ends what this waits for, as a sleep."""
+    main = threading.main_thread().ident
+    if sys.platform != "win32" and main is not None:
+        signal.pthread_kill(main, number)
+    else:
+        signal.raise_signal(number)
