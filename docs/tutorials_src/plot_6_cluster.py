@@ -28,7 +28,7 @@ samples = ["ct_cube_bar", "ct_half_ellipsoid", "ct_cube_plate"]
 (place / "task.sh").write_text(f"""#!/bin/bash
 #SBATCH --array=0-2 --cpus-per-task=2 --mem=4G --time=01:00:00 --signal=B:TERM@120
 sample=$(sed -n "$((SLURM_ARRAY_TASK_ID + 1))p" samples.txt)
-exec {sys.executable} -m naibu identify "$sample" --element-size-mm 20 -o "results/$sample" --json --log "$sample.log" > "$sample.json"
+exec {sys.executable} -m naibu identify "$sample" --element-size-mm 14 -o "results/$sample" --json --log "$sample.log" > "$sample.json"
 """)
 print((place / "samples.txt").read_text())
 
