@@ -23,6 +23,7 @@ from naibu.identification.from_markers.specimen.parameter_names import (
 )
 from naibu.identification.from_markers.specimen.resting_state import resting_state
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings, specimen
+from naibu.identification.prediction.predictive_uncertainty import with_considered
 from naibu.mechanics.finite_strain.statics import solve
 from naibu.validation.specimens.marker_phantoms import Scanner, box_experiment, virtual_specimen
 
@@ -92,3 +93,11 @@ def test_a_modulus_that_nobody_states_is_sought_where_only_the_weight_holds_an_o
     assert not fixed(measured) and fixed(somewhere)
     assert not fixed(somewhere, modulus="weighed") and fixed(measured, modulus="given")
     assert fixed(measured, KnownMaterials({measured.materials[0]: 100.0}))
+
+
+def test_a_stated_height_that_a_modulus_follows_from_is_uncertain_in_predictions() -> None:
+    measured = datasets.load("ct_half_ellipsoid")
+    body = specimen(measured, ModelSettings(element_size_mm=20.0))
+    parameters = with_considered(body, initial_parameters([body], {measured.name: ["width_100"]}, KnownMaterials()))
+    (base,) = (p for p in parameters.free if p.name == straight_base(measured))
+    assert base.value == 20.0 and base.prior_sd == 1.0

@@ -23,12 +23,20 @@ from naibu.core.parameters import Parameter, ParameterSet
 from naibu.identification.from_markers.calibration import Calibration
 from naibu.identification.from_markers.gauss_newton import Matcher
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase
-from naibu.identification.from_markers.specimen.parameter_names import SHAPE_NAMES, friction, pixel_scale, shape_parameter, young_modulus
+from naibu.identification.from_markers.specimen.parameter_names import (
+    SHAPE_NAMES,
+    friction,
+    pixel_scale,
+    shape_parameter,
+    straight_base,
+    young_modulus,
+)
 from naibu.identification.from_markers.specimen.specimen_model import Specimen
 
 # standard deviations of what is taken for known, on the optimiser's scale
 SHAPE_SD: Mapping[str, float] = {"c01_fraction": 0.3, "c20_ratio": 0.3}
 FRICTION_SD = 1.0
+STRAIGHT_BASE_SD_MM = 1.0  # of a stated height, as of a mould
 STIFFNESS_SD = 0.7  # of the modulus of a gel whose scale is not known: its weight deforms it accordingly
 PIXEL_SCALE_SD = 0.005
 NEIGHBOURS = 1.3  # markers within this many spacings are neighbours
@@ -114,6 +122,8 @@ def with_considered(body: Specimen, parameters: ParameterSet) -> ParameterSet:
         doubtful = {friction(layer.material, experiment.loading.base_material): FRICTION_SD for layer in experiment.layers}
         if len(experiment.materials) == 1:
             doubtful[young_modulus(experiment.materials[0])] = STIFFNESS_SD
+        if body.has_unknown_base:
+            doubtful[straight_base(experiment)] = STRAIGHT_BASE_SD_MM
         freed = {
             p.name: Parameter(p.name, p.value, p.unit, p.scale, prior_sd=doubtful[p.name])
             for p in parameters

@@ -206,7 +206,7 @@ def undetermined(model: CalibratedModel, names: Sequence[str], priors: Parameter
     out = []
     if not model.known_materials.scale_is_absolute and not any(p.fixed for p in model.parameters if p.name.endswith(": young_modulus")):
         out.append(
-            "The stiffness follows from the weight that bends the object, at the density of water; "
+            "The stiffness follows from the weight that bends the object, at the density of water and the stated size; "
             "whatever else holds it down, such as a base that sticks, would look like a smaller modulus."
         )
     elif not model.known_materials.scale_is_absolute:
