@@ -21,6 +21,7 @@ COMMANDS: dict[str, tuple[str | None, str]] = {
     "speed": ("speed.py --quick --repeats 1", "speed.py --record"),
     "fe_linear": ("fe_linear.py --cells 12 --repeats 1 --peers naibu,naibu-direct,felupe,scikit-fem", "fe_linear.py --cells 40"),
     "fe_compression": ("fe_compression.py --cells 8 --repeats 1 --peers naibu,felupe,scikit-fem", "fe_compression.py"),
+    "fe_gradient": ("fe_gradient.py --cells 8 --repeats 1 --peers naibu", "fe_gradient.py --cells 40"),
     "lattice_steps": ("lattice_steps.py --sizes 8 --repeats 3", "lattice_steps.py"),
     "rheology_speed": (None, "rheology_speed.py"),
     "accuracy": (None, "accuracy.py --record"),
@@ -30,8 +31,10 @@ COMMANDS: dict[str, tuple[str | None, str]] = {
     "lattice_calibration": (None, "lattice_calibration.py 24 --cells 3 --unknown all --workers 2 --record"),
     "fingertip": (None, "fingertip.py --record"),
     "mammography": (None, "mammography.py --record"),
+    "mammography_population": (None, "mammography_population.py --out naibu-breasts-results --first 120 --breasts 50 --record"),
     "surface_cutting": (None, "surface_cutting.py"),
     "volume_cutting": (None, "volume_cutting.py"),
+    "large_volumes": (None, "large_volumes.py --sizes 160 256 --peers --record"),
     "sensing_chip": (None, "sensing_chip.py"),
 }
 

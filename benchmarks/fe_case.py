@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 SIDE, DEPTH, RADIUS = 60.0, 15.0, 15.0
 SOFT, STIFF, POISSON = 10.0, 30.0, 0.45
 STEPS, TOLERANCE = 5, 1e-8
+LOWERED = 3.0  # mm, of the linear problem
 
 
 @dataclass(frozen=True)
@@ -37,11 +38,15 @@ class Case:
 
 @dataclass(frozen=True)
 class Result:
-    """Displacement (n, 3), mm, force on the top, mN (none of linear problems), and number of linear systems solved."""
+    """Displacement (n, 3), mm, force on the top, mN (none of linear problems), and number of linear systems solved.
+
+    Programs that run in processes of their own measure themselves: seconds and MB.
+    """
 
     displacement: Array
     force: Array = field(default_factory=lambda: np.empty(0))
     iterations: int = 1
+    measured: tuple[float, float] | None = None
 
 
 def make_case(cells: int) -> Case:

@@ -38,16 +38,23 @@ HEADINGS = {
 
 @dataclass(frozen=True)
 class Peer:
-    """A row of the table: what stands there, how it runs, the modules it needs, and the cells of its warm-up (None: those of the run)."""
+    """A row of the table: what stands there, how it runs, the modules it needs, and the cells of its warm-up (None: those of the run).
+
+    A peer with an interpreter runs in processes of that Python, and its modules are sought there.
+    """
 
     label: str
     run: Callable[[Case], Result]
     modules: tuple[str, ...] = ()
     warm_up: int | None = 3
+    interpreter: str = ""
 
     def missing(self) -> list[str]:
         """Return the modules that are not installed."""
-        return [name for name in self.modules if importlib.util.find_spec(name) is None]
+        if not self.interpreter:
+            return [name for name in self.modules if importlib.util.find_spec(name) is None]
+        known = "import importlib.util, sys; sys.exit(importlib.util.find_spec(sys.argv[1]) is None)"
+        return [name for name in self.modules if subprocess.run([self.interpreter, "-c", known, name], check=False).returncode]
 
 
 def measure(peer: Peer, cells: int, out: Path) -> None:
@@ -58,6 +65,7 @@ def measure(peer: Peer, cells: int, out: Path) -> None:
     result = peer.run(case)
     seconds = time.perf_counter() - start
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform != "darwin" else 1024**2)
+    seconds, memory = result.measured or (seconds, memory)
     np.savez(out, u=result.displacement, force=result.force, numbers=[seconds, memory, result.iterations])
 
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import fe_linear_peers as peers
 import numpy as np
-from fe_case import Case, Result, pardiso, prescribed
+from fe_case import LOWERED, Case, Result, pardiso, prescribed
 from fe_driver import JAX_FEM, Peer, main
-from fe_linear_peers import LOWERED
+from fe_peers import DOLFINX, SYSTEM_PYTHON, run_dolfinx
 
 from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
@@ -45,6 +45,10 @@ PEERS = {
     "tatva": Peer("tatva, same Cholesky", peers.run_tatva, ("jax", "tatva"), warm_up=None),
     "jax-fem": Peer("JAX-FEM, same Cholesky", lambda case: peers.run_jax_fem(case, "pardiso"), JAX_FEM, warm_up=None),
     "jax-fem-bicgstab": Peer("JAX-FEM, its default BiCGSTAB", lambda case: peers.run_jax_fem(case, "own"), JAX_FEM, warm_up=None),
+    "dolfinx": Peer("DOLFINx, GAMG, one process", lambda case: run_dolfinx(case, "linear", "gamg"), DOLFINX, interpreter=SYSTEM_PYTHON),
+    "dolfinx-2": Peer(
+        "DOLFINx, GAMG, two processes", lambda case: run_dolfinx(case, "linear", "gamg", 2), DOLFINX, interpreter=SYSTEM_PYTHON
+    ),
     "torch-fem": Peer("torch-fem, its default CG with multigrid", lambda case: peers.run_torch_fem(case, "cg"), TORCH),
     "torch-fem-direct": Peer("torch-fem, its direct solver", lambda case: peers.run_torch_fem(case, "direct"), TORCH),
 }

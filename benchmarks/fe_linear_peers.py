@@ -14,11 +14,9 @@ from typing import Any
 
 import fe_peers
 import numpy as np
-from fe_case import POISSON, SIDE, SOFT, STIFF, Array, Case, Cholesky, Result, largest_residual, prescribed
+from fe_case import LOWERED, POISSON, SIDE, SOFT, STIFF, Array, Case, Cholesky, Result, largest_residual, prescribed
 
 from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
-
-LOWERED = 3.0  # mm
 
 
 def cholesky(matrix: Any, b: Any) -> Array:

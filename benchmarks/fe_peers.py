@@ -10,15 +10,22 @@ from __future__ import annotations
 
 import functools
 import logging
+import os
+import subprocess
 import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import scipy.sparse as sp
-from fe_case import DEPTH, SIDE, STEPS, TOLERANCE, Array, Case, Cholesky, Result, largest_residual, newton, prescribed
+from fe_case import DEPTH, LOWERED, SIDE, STEPS, TOLERANCE, Array, Case, Cholesky, Result, largest_residual, newton, prescribed
 
 from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
+
+DOLFINX = ("dolfinx", "petsc4py", "mpi4py")
+SYSTEM_PYTHON = os.environ.get("DOLFINX_PYTHON", "/usr/bin/python3")  # DOLFINx comes with systems, not as a wheel
+SMALL = 750  # cells of its warm-up
 
 
 @functools.cache
@@ -414,3 +421,27 @@ def run_sfepy(case: Case) -> Result:
     problem.remove_bcs()
     force = np.asarray(problem.evaluator.eval_residual(u)).reshape(-1, 3)
     return Result(u.reshape(-1, 3), force[case.top].sum(axis=0), direct.count)
+
+
+def run_dolfinx(case: Case, law: str, solver: str, processes: int = 1) -> Result:
+    """DOLFINx: see ``fe_dolfinx.py``, which measures itself."""
+    support = prescribed(case, DEPTH if law == "neo_hookean" else LOWERED)
+    problem: dict[str, Any] = {"law": law, "solver": solver, "steps": STEPS, "tolerance": TOLERANCE}
+    mesh: dict[str, Any] = {
+        "points": case.mesh.points,
+        "cells": case.mesh.cells,
+        "small": case.mesh.cells[:SMALL],
+        "shear": case.shear,
+        "lame": case.lame,
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        given, found = Path(folder) / "given.npz", Path(folder) / "found.npz"
+        np.savez(given, values=support.values, constrained=support.constrained, **mesh, **problem)
+        script = Path(__file__).with_name("fe_dolfinx.py")
+        command = ["mpirun", "--allow-run-as-root", "-n", str(processes), SYSTEM_PYTHON, str(script), str(given), str(found)]
+        clean = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")}
+        subprocess.run(command, check=True, env=clean | {"OMP_NUM_THREADS": "1"})
+        with np.load(found) as arrays:
+            seconds, memory, count = arrays["numbers"]
+            force = arrays["force"][case.top].sum(axis=0) if law == "neo_hookean" else np.empty(0)
+            return Result(arrays["u"], force, int(count), (float(seconds), float(memory)))

@@ -3,6 +3,8 @@
 Prints, for ever finer meshes, nodes, processor time and the loads on the chip under a press of 3 N at 20 degrees; then the errors and
 intervals of forces that a decoder, trained on the default mesh, gives for presses on a finer mesh with other tilts, frictions and moduli;
 the time of a reading; and how much the sensitivity to slip differs between presses.
+``--drags`` presses the fingertip of the live page, drags the rod, and prints how far the decoded force is off over the upper end of the
+sideways share: in poses from which the share that its intervals allow was chosen, and in others, on which it is tested (five minutes more).
 ``--quick`` does the same on coarse meshes, ``--record`` writes ``results/fingertip.json``.
 """
 
@@ -10,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 
 import numpy as np
 from records import ResultTable, write_record
@@ -23,11 +26,19 @@ from naibu.applications.sensing_chip.design import assumed_chip
 from naibu.applications.sensing_chip.electronics import report_readout
 from naibu.applications.sensing_chip.filters import noise_gain
 from naibu.core.arrays import FloatArray
+from naibu.mechanics import RealTimeEngine
+from naibu.simulation import InteractiveSimulation
+from naibu.simulation.interactive_bodies import FiniteElementBody
+from naibu.workflows import TouchableModel
+from naibu.workflows.interactive.touchable_fingertip import FORCE_DRAG, touchable_fingertip
 
 MESHES = ((2, 2, 8), (3, 2, 10), (4, 2, 12), (4, 3, 14), (5, 3, 16))
 TESTS = (Press(0.0, 3000.0, 0.5), Press(6.0, 3000.0, 0.35), Press(15.0, 3000.0, 0.8), Press(25.0, 3000.0, 0.3), Press(30.0, 3000.0, 0.6))
 SLIDES = (Press(15.0, 1000.0, 0.4, 2.0), Press(5.0, 600.0, 0.8, 2.0), Press(25.0, 2000.0, 0.6, -2.5))
 AZIMUTH = 37.0
+# tilt, azimuth, degrees, and way of the drag, mm
+DRAGS_CHOSEN = ((5.0, 80.0, 1.0), (10.0, 310.0, -1.2), (15.0, 160.0, 1.5), (20.0, 0.0, -0.7), (22.0, 215.0, 1.3), (28.0, 95.0, 1.0))
+DRAGS_TESTED = ((18.0, 250.0, 1.0), (25.0, 120.0, -1.0), (8.0, 30.0, 1.2), (12.0, 200.0, 0.6))
 
 
 def convergence(meshes: tuple[tuple[int, int, int], ...]) -> ResultTable:
@@ -127,13 +138,59 @@ def slip(detector: SlipDetector, mesh: FingertipResolution, chain: ReadingChain)
     return rows
 
 
+def drags() -> None:
+    """Print, of drags of the live fingertip, what its intervals must hold."""
+    made = touchable_fingertip("fingertip")
+    body = made.body
+    assert isinstance(body, FiniteElementBody) and isinstance(body.engine, RealTimeEngine) and made.sensor is not None
+    made = replace(made, body=replace(body, engine=replace(body.engine, background=False)))  # repeatable
+    print(f"largest |error of force| / upper end of the sideways share, of which intervals allow {FORCE_DRAG}")
+    print("tilt  azimuth   way mm   ratio               inside: force, tilt")
+    for name, poses in (("chosen on", DRAGS_CHOSEN), ("tested on", DRAGS_TESTED)):
+        for pose in poses:
+            found = _dragged(made, *pose)
+            ratio, inside = float(np.nanmax(found[:, 0] / found[:, 1])), 100.0 * found[:, 2:].mean(axis=0)
+            print(f"{pose[0]:4.0f} {pose[1]:8.0f} {pose[2]:8.1f} {ratio:10.3f}   {name}   {inside[0]:.0f} % {inside[1]:.0f} %", flush=True)
+
+
+def _dragged(made: TouchableModel, tilt: float, azimuth: float, way: float) -> FloatArray:
+    """Return of frames of a drag by `way`, mm, at 1 mm/s: relative error of force, upper end of the share, force and tilt inside (n, 4)."""
+    simulation = InteractiveSimulation(made.body, made.tools or {})
+    sensor = replace(made.sensor)
+    t, a = np.deg2rad(tilt), np.deg2rad(azimuth)
+    outwards = np.array([np.sin(t) * np.cos(a), np.sin(t) * np.sin(a), np.cos(t)])
+    across = np.array([np.cos(t) * np.cos(a), np.cos(t) * np.sin(a), -np.sin(t)])
+    simulation.take("rod")
+    reach, dragged, last, rows = 15.5, 0.0, 0.0, []
+    for k in range(200):
+        simulation.move(reach * outwards + dragged * across)
+        simulation.aim(-outwards)
+        frame = simulation.advance()
+        read = dict(zip((r.name for r in sensor.readings), sensor.at(frame).copy(), strict=True))
+        passed, last = frame.time_s - last, frame.time_s
+        reach = 14.2 if k == 30 else max(12.9, reach - 2.0 * passed) if k > 30 else reach
+        if k > 100:
+            dragged += float(np.clip(way - dragged, -passed, passed))
+        (value, low, high), true = read["decoded force"], read["force of the rod"][0]
+        if dragged != 0.0 and np.isfinite(value):
+            tilts = read["decoded tilt"]
+            rows.append((abs(value / true - 1.0), read["decoded sideways share"][2], low <= true <= high,
+                         tilts[1] <= read["tilt of the force"][0] <= tilts[2]))  # fmt: skip
+    simulation.close()
+    return np.array(rows, dtype=float)
+
+
 def main() -> None:
     """Print all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     part = parser.add_mutually_exclusive_group()
     part.add_argument("--quick", action="store_true", help="coarse meshes")
     part.add_argument("--record", action="store_true", help="write results/fingertip.json")
+    parser.add_argument("--drags", action="store_true", help="drag the rod on the fingertip of the live page instead")
     options = parser.parse_args()
+    if options.drags:
+        drags()
+        return
     converged = convergence(MESHES[:2] if options.quick else MESHES)
     chain = ReadingChain.of_chip(assumed_chip(), report_readout())
     of_training, of_test = (MESHES[1], MESHES[2]) if options.quick else (MESHES[3], MESHES[4])

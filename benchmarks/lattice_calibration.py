@@ -9,6 +9,9 @@ truths differ from the start by 35 % (standard deviation of logarithms), frictio
 Prints, for each parameter, the root mean square error as a logarithm, the mean half width of its interval, and in how many draws the
 interval held the truth; and time, processor time and simulations of a draw. ``--record`` writes ``results/lattice_calibration.json``.
 
+``--differences`` prints instead half widths of intervals at the truth of the first draw, from differences of several lengths:
+where they depend on the length, what the differences hold beside derivatives counts as information.
+
 Run: ``OMP_NUM_THREADS=1 python benchmarks/lattice_calibration.py 1 --cells 8`` (9^3 masses, the time) and ``... 24 --cells 3 --workers 2``.
 """
 
@@ -18,7 +21,7 @@ import argparse
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -26,10 +29,11 @@ import numpy as np
 from numpy.typing import NDArray
 from records import ResultTable, write_record
 
-from naibu.identification.lattice_calibration.gauss_newton import calibrate_lattice
+from naibu.identification.lattice_calibration.evaluation import residuals_at
+from naibu.identification.lattice_calibration.gauss_newton import PRIOR_SD, calibrate_lattice
 from naibu.identification.lattice_calibration.study_model import StudyModel
 from naibu.identification.lattice_calibration.study_problem import RecordedForces, StudyProblem
-from naibu.identification.lattice_calibration.study_unknowns import FRICTION, StudyUnknowns
+from naibu.identification.lattice_calibration.study_unknowns import FRICTION, SHIFT, StudyUnknowns
 from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy
 from naibu.workflows.studies.lattice_study import prepared_study
 
@@ -119,9 +123,9 @@ def truth_of(unknowns: StudyUnknowns, rng: np.random.Generator) -> Array:
     return truth
 
 
-def problem_of(unknowns: StudyUnknowns, truth: Array, pace: float, rng: np.random.Generator) -> StudyProblem:
-    """Record the truth with fine steps, and set up its identification."""
-    study = unknowns.study
+def problem_of(unknowns: StudyUnknowns, truth: Array, pace: float, rng: np.random.Generator, divided: int = 1) -> StudyProblem:
+    """Record the truth with steps of time that are shorter than those of the study by `divided`, and set up its identification."""
+    study = replace(unknowns.study, step_s=unknowns.study.step_s / divided, sample_steps=unknowns.study.sample_steps * divided)
     steps = round(study.frames * study.frame_s / study.step_s)
     captures = [t / pace for t in CAPTURE_S]
     model = StudyModel.of(study, captures, steps, 1, coarse=False)
@@ -133,7 +137,7 @@ def problem_of(unknowns: StudyUnknowns, truth: Array, pace: float, rng: np.rando
     times = np.arange(0.5 / SENSOR_HZ, steps * study.step_s, 1.0 / SENSOR_HZ)
     at = np.minimum((times / study.step_s).astype(int), steps - 1)
     force = made.force[at, 1] + FORCE_SD_MN * rng.standard_normal((len(times), 3))
-    return StudyProblem.of(unknowns, clouds, RecordedForces.of(study, [(1, times, force)]), point_sd_mm=POINT_SD_MM)
+    return StudyProblem.of(unknowns, clouds, RecordedForces.of(unknowns.study, [(1, times, force)]), point_sd_mm=POINT_SD_MM)
 
 
 def spread(triangles: Array, rng: np.random.Generator) -> Array:
@@ -143,18 +147,38 @@ def spread(triangles: Array, rng: np.random.Generator) -> Array:
     return np.asarray((triangles[rng.choice(len(area), POINTS, p=area / area.sum())] * weights[:, :, None]).sum(axis=1))
 
 
-def drawn(seed: int, *, cells: int, unknown: str, pace: float = 1.0, threads: int) -> Draw:
+def drawn(seed: int, *, cells: int, unknown: str, pace: float = 1.0, threads: int, divided: int = 1) -> Draw:
     """Calibrate one truth."""
     rng = np.random.default_rng([seed, 15])
     with tempfile.TemporaryDirectory() as folder:
         unknowns = unknowns_of(study_of(cells, unknown, pace, Path(folder)), unknown)
     truth = truth_of(unknowns, rng)
-    problem = problem_of(unknowns, truth, pace, rng)
+    problem = problem_of(unknowns, truth, pace, rng, divided)
     began, busy = time.perf_counter(), time.process_time()
     found = calibrate_lattice(problem, unknowns.start, threads=threads)
     wall, busy = time.perf_counter() - began, time.process_time() - busy
     half = 0.5 * np.diff(np.log(found.intervals()), axis=1)[:, 0]
     return Draw(unknowns.names, np.log(found.values / truth), half, wall, busy, found.runs, found.noise_factor, found.settled)
+
+
+def differences(*, cells: int, unknown: str, pace: float, threads: int) -> None:
+    """Print half widths of intervals at a truth by the length of the differences, long steps of time."""
+    rng = np.random.default_rng([0, 15])
+    with tempfile.TemporaryDirectory() as folder:
+        unknowns = unknowns_of(study_of(cells, unknown, pace, Path(folder)), unknown)
+    truth = truth_of(unknowns, rng)
+    problem = problem_of(unknowns, truth, pace, rng)
+    theta, lengths = np.log(truth), (0.5 * SHIFT, SHIFT, 2.0 * SHIFT, 4.0 * SHIFT)
+    trials = [theta, *(np.log(unknowns.held(truth * np.exp(h * row))) for h in lengths for row in np.eye(len(theta)))]
+    found = [np.concatenate(r) for r in residuals_at(problem, [(t, False) for t in trials], threads=threads)]
+    widths = []
+    for k, h in enumerate(lengths):
+        slopes = (np.array(found[1 + k * len(theta) : 1 + (k + 1) * len(theta)]) - found[0]) / np.expm1(h)
+        covariance = np.linalg.inv(slopes @ slopes.T + np.eye(len(theta)) / PRIOR_SD**2)
+        widths.append(1.96 * np.sqrt(np.diag(covariance)))
+    print("half widths with differences of " + ", ".join(f"{h:g}" for h in lengths))
+    for name, row in zip(unknowns.names, np.array(widths).T, strict=True):
+        print(f"{name:48s}" + "".join(f"{w:9.3f}" for w in row))
 
 
 def main() -> None:
@@ -164,19 +188,27 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=8, help="along an edge")
     parser.add_argument("--unknown", choices=("classes", "all", "pull-off", "surface-mass"), default="classes")
     parser.add_argument("--pace", type=float, default=1.0, help="how many times faster all is done than in 5 s")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first draw")
+    parser.add_argument("--divided", type=int, default=1, help="by how much steps of time of the truth are shorter than those of the model")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--workers", type=int, default=1, help="processes, one draw each")
     parser.add_argument("--record", action="store_true")
+    parser.add_argument("--differences", action="store_true", help="half widths by the length of differences")
     chosen = parser.parse_args()
-    one = partial(drawn, cells=chosen.cells, unknown=chosen.unknown, pace=chosen.pace, threads=chosen.threads if chosen.workers == 1 else 1)
+    if chosen.differences:
+        differences(cells=chosen.cells, unknown=chosen.unknown, pace=chosen.pace, threads=chosen.threads)
+        return
+    threads = chosen.threads if chosen.workers == 1 else 1
+    one = partial(drawn, cells=chosen.cells, unknown=chosen.unknown, pace=chosen.pace, threads=threads, divided=chosen.divided)
+    seeds = range(chosen.first, chosen.first + chosen.draws)
     found: list[Draw] = []
     with ProcessPoolExecutor(chosen.workers) as pool:
-        for draw in pool.map(one, range(chosen.draws)) if chosen.workers > 1 else map(one, range(chosen.draws)):
+        for draw in pool.map(one, seeds) if chosen.workers > 1 else map(one, seeds):
             found.append(draw)
             outside = [f"{n} {e:+.3f} ({h:.3f})" for n, e, h in zip(draw.names, draw.error, draw.half, strict=True) if abs(e) > h]
             state = "settled" if draw.settled else "NOT SETTLED"
             print(
-                f"draw {len(found) - 1}: {draw.wall_s:.1f} s, processor {draw.processor_s:.1f} s, {draw.runs} simulations, {state}, "
+                f"draw {seeds[len(found) - 1]}: {draw.wall_s:.1f} s, processor {draw.processor_s:.1f} s, {draw.runs} simulations, {state}, "
                 f"noise factors {draw.factors[0]:.2f} {draw.factors[1]:.2f}; not held: {', '.join(outside) or 'none'}",
                 flush=True,
             )

@@ -6,13 +6,15 @@ and that of a step in a long call, without what the call itself costs; `cpu` is 
 the clock, which on a shared machine counts what others do. Rows of sessions are single steps, called one by one, with all that a call
 costs. Jitter is that of a session's single steps while another process keeps a core busy, one after the other or a thousand in a second.
 
-Run: ``MKL_NUM_THREADS=1 OMP_NUM_THREADS=2 python benchmarks/lattice_steps.py [--sizes 8,16,32] [--repeats 20]``.
+Run: ``MKL_NUM_THREADS=1 OMP_NUM_THREADS=2 python benchmarks/lattice_steps.py [--sizes 8,16,32] [--repeats 20]
+[--construction]``.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import resource
 import subprocess
 import sys
 import time
@@ -155,10 +157,32 @@ def sizes(n: int, repeats: int) -> None:
         "conversion of the state, not in the rows",
     )
     few = max(5, steps // 5)
-    cpu, wall, iterations = timed(lattice, stiff, few, max(2, repeats // 4))
-    row("implicit, 1 thread", cpu, wall, f"{iterations:.1f} iterations")
-    row("implicit, session, 1 thread", *in_session(lattice, stiff, few, max(2, repeats // 4)))
+    for threads in thread_counts:
+        cpu, wall, iterations = timed(lattice, stiff, few, max(2, repeats // 4), threads=threads)
+        row(f"implicit, {threads} thread(s)", cpu, wall, f"{iterations:.1f} iterations")
+    row("implicit, session, 1 thread", *in_session(lattice, stiff, few, max(2, repeats // 4), threads=1))
     octrees(n, lattice, steps, repeats)
+
+
+def construction(n: int) -> None:
+    """Print the processor time of a classic lattice, its parameters and an explicit engine, and the memory after it."""
+
+    def built(n: int) -> list[float]:
+        times = [time.process_time()]
+        lattice = classic_lattice(box_mask((n,) * 3), SIDE_MM / n, total_mass_kg=MASS_KG)
+        times.append(time.process_time())
+        parameters = lattice_parameters(lattice, *(p * 8.0 / n for p in GENTLE))
+        times.append(time.process_time())
+        LatticeEngine.of(lattice, parameters, method="euler")
+        return [*times, time.process_time()]
+
+    built(4)  # compiles
+    found = np.diff(built(n))
+    print(
+        f"construction of {n + 1}^3: lattice {found[0]:.2f}, parameters {found[1]:.2f}, engine {found[2]:.2f}, all {found.sum():.2f} s",
+        end="",
+    )
+    print(f", most memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GB", flush=True)
 
 
 def octrees(n: int, lattice: Lattice, steps: int, repeats: int) -> None:
@@ -219,10 +243,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--sizes", default="8,16,32", help="voxels an edge")
     parser.add_argument("--repeats", type=int, default=20)
+    parser.add_argument("--construction", action="store_true", help="only how long lattices and engines take to be made")
     asked = parser.parse_args()
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
     print(f"{os.cpu_count()} cores, Numba threads {numba.get_num_threads()}, load {load:.1f} at the start")
     chosen = [int(n) for n in asked.sizes.split(",")]
+    if asked.construction:
+        for n in chosen:
+            construction(n)
+        return
     for n in chosen:
         sizes(n, asked.repeats)
     gradients(asked.repeats)
@@ -231,7 +260,7 @@ def main() -> None:
             for threads in (1, 2) if n > 8 else (1,):
                 jitter(n, rate, method="euler", threads=threads)
             if n < 32:
-                jitter(n, rate, method="implicit")
+                jitter(n, rate, method="implicit", threads=1)
     print(
         f"load {os.getloadavg()[0] if hasattr(os, 'getloadavg') else float('nan'):.1f} at the end, the busy process of the jitter included"
     )

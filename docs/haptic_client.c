@@ -40,13 +40,16 @@ int main(int argc, char **argv)
     struct force in, last = {.number = 0};
     double f[3] = {0}, moved[3] = {0}, work, left;
     uint32_t free_since = 0;                                                 /* first pose that said that no force acts */
+    uint32_t ready = 0;                                                      /* first pose after naibu had been prepared */
     int line = socket(AF_INET, SOCK_DGRAM, 0), answers = 0, acts = 0;
     to.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
     if (line < 0 || connect(line, (struct sockaddr *)&to, sizeof to)) { perror("naibu"); return 1; }
-    while (out.sequence < 1e3 * seconds) {
+    while (out.sequence - ready < 1e3 * seconds || (answers && !ready)) {
         while (recv(line, &in, sizeof in, MSG_DONTWAIT) == (ssize_t)sizeof in)
             if (!memcmp(in.magic, "NHF1", 4) && in.version == 2
                 && (acts ? (int32_t)(in.number - last.number) > 0 : (int32_t)(in.sequence - free_since) >= 0)) {
+                if (answers == 0 && in.flags & 16) puts("naibu is being prepared");
+                if (!ready && !(in.flags & 16)) ready = out.sequence;  /* flag 16: naibu waits, and exerts no force */
                 last = in; acts = 1; heard = now(); answers++;         /* dropped: overtaken answers, and those made before letting go */
             }
         if (acts && now() - heard > 0.02) { acts = 0; free_since = out.sequence + 1; }          /* no answer: let go */
@@ -58,7 +61,7 @@ int main(int argc, char **argv)
         out.applied = acts ? last.number : 0;                                       /* the answer whose force acts */
         out.time_s = now() - began;
         memcpy(moved, out.position_mm, sizeof moved);
-        read_device(out.time_s, &out);
+        read_device(ready ? 1e-3 * (out.sequence - ready) : 0.0, &out);
         for (int a = 0; a < 3; a++) moved[a] = out.position_mm[a] - moved[a];
         out.energy_mn_mm += dot(f, moved);                                          /* the device's account of what it got */
         if (send(line, &out, sizeof out, 0) < 0 && errno != ECONNREFUSED) { perror("naibu"); return 1; }
@@ -66,7 +69,7 @@ int main(int argc, char **argv)
         struct timespec rest = {0, (long)(1e9 * fmax(0.0, due - now()))};
         nanosleep(&rest, NULL);
     }
-    printf("%u poses, %d answers, last force %.1f %.1f %.1f mN, flags %u\n", out.sequence, answers, last.force_mn[0],
+    printf("%u poses, %d answers, last force %.1f %.1f %.1f mN, flags %u\n", out.sequence - ready, answers, last.force_mn[0],
            last.force_mn[1], last.force_mn[2], (unsigned)last.flags);
     close(line);
     return 0;

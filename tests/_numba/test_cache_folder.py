@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import numba
 import pytest
 
 import naibu
@@ -61,8 +62,11 @@ def nobody(installed: Path) -> int:
         pytest.skip("only root can become another user")
     if shutil.which("setpriv") is None:
         pytest.skip("setpriv is needed to become another user")
-    command = [*as_user(NOBODY), sys.executable, "-c", "import numba"]
-    if subprocess.run(command, cwd=installed, check=False, env={"PATH": os.environ["PATH"]}, capture_output=True).returncode:
+    # a virtual environment in a folder that others cannot enter lets them start the system's Python, with what is installed there
+    which = "import sys, numba; print(sys.implementation.cache_tag, numba.__file__)"
+    command = [*as_user(NOBODY), sys.executable, "-c", which]
+    found = subprocess.run(command, cwd=installed, check=False, env={"PATH": os.environ["PATH"]}, capture_output=True, text=True)
+    if found.returncode or found.stdout.strip() != f"{sys.implementation.cache_tag} {numba.__file__}":
         pytest.skip("other users cannot run this Python")
     return NOBODY
 
@@ -102,7 +106,8 @@ def test_a_user_with_a_home_keeps_kernels_there(installed: Path, nobody: int, te
 def test_kernels_that_an_administrator_compiled_serve_everybody(installed: Path, nobody: int, temporary: Path) -> None:
     assert ask(installed, None)[1]
     folder, compiled = ask(installed, nobody, TMPDIR=str(temporary))
-    assert Path(folder).parent == temporary and not compiled
+    assert Path(folder).parent == temporary
+    assert not compiled
 
 
 def test_a_named_folder_that_cannot_be_written_to_is_passed_over(installed: Path, nobody: int, temporary: Path) -> None:

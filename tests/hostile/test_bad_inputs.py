@@ -147,7 +147,9 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Run]:
 def faults(run: Run, words: list[str], expected: Iterable[str | set[str]]) -> list[str]:
     """Return what is wrong with the answer to a bad input: nothing, if it was refused in words, and nothing was written."""
     code, message = run(words)
-    message = "".join(line for line in message.splitlines(keepends=True) if not line.startswith("compiling kernels"))
+    message = "".join(
+        line for line in message.splitlines(keepends=True) if not line.startswith(("compiling kernels", "preparing the simulation"))
+    )
     found = []
     if code != cli.BAD_INPUT or not message.startswith("error: ") or "Traceback" in message or "error of its own" in message:
         found.append(f"exit code {code}: {message[:200]!r}")

@@ -12,7 +12,7 @@ from touched_lattice import SPACING, TOP, touched_lattice
 
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.rigid_transform import rotation_matrix
-from naibu.mechanics import Assembler, box_indenter, elements, material, plane_indenter, spherical_indenter
+from naibu.mechanics import Assembler, box_indenter, cylindrical_indenter, elements, material, plane_indenter, spherical_indenter
 from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeSession
 from naibu.meshing import box
 from naibu.meshing.cutting.swept_blade import swept_blade
@@ -88,6 +88,21 @@ def test_a_tool_that_was_turned_presses_like_one_that_was_made_so(kind: str) -> 
     np.testing.assert_allclose(rests[0].positions, rests[1].positions, atol=0.01 * moved)
     np.testing.assert_allclose(rests[0].force, rests[1].force, atol=0.01 * np.linalg.norm(rests[1].force))
     assert rests[0].penetration_mm == pytest.approx(rests[1].penetration_mm, abs=0.02)
+
+
+def test_a_tool_is_aimed_the_shortest_way() -> None:
+    """The rotation between two directions, also opposite ones, by SciPy's alignment of vectors where that is unique."""
+    touched = InteractiveSimulation(touched_lattice(), {"rod": cylindrical_indenter((20.0, 20.0, 70.0), 5.0, 10.0)})
+    touched.take("rod")
+    for direction in ((0.0, 0.0, 2.0), (1.0, -2.0, 0.5), (-1.0, 2.0, -0.5), (0.0, 1.0, 0.0)):
+        touched.aim(direction)
+        for _ in range(80):
+            frame = touched.advance()
+        unit = np.array(direction) / np.linalg.norm(direction)
+        np.testing.assert_allclose(frame.tool_rotation @ (0.0, 0.0, 1.0), unit, atol=1e-9)
+        np.testing.assert_allclose(frame.tool_rotation @ frame.tool_rotation.T, np.eye(3), atol=1e-9)
+    with pytest.raises(InputError, match="length of the direction"):
+        touched.aim((0.0, 0.0, 0.0))
 
 
 def test_a_gripped_node_follows_the_hand() -> None:
@@ -200,7 +215,7 @@ def test_a_body_moves_on_while_its_cut_is_prepared() -> None:
     before = touched._session.state().displacement
     assert touched.finish_cut(wait=True)
     after = touched._session.state().displacement
-    np.testing.assert_allclose(after.min(axis=0), before.min(axis=0), atol=1e-12)  # what it had become meanwhile is kept
+    np.testing.assert_allclose(after.min(axis=0), before.min(axis=0), atol=0.03)  # mm: what it had become meanwhile is kept
     assert touched.last.topology == 1
     assert len(touched.body.points) > mesh.n_points
     assert not touched.advance().failed
@@ -209,6 +224,30 @@ def test_a_body_moves_on_while_its_cut_is_prepared() -> None:
     with pytest.raises(InputError, match="distance_mm"):
         touched.finish_cut(wait=True)
     assert touched.last.topology == 1
+
+
+def test_a_nearly_incompressible_body_goes_on_in_real_time_behind_a_cut() -> None:
+    """The patches that share a volume strain are divided: unless that is settled before, Newton's method takes seconds at first."""
+    mesh = box((60.0, 60.0, 60.0), (11, 11, 11), cell_type="tetra")
+    assembler = Assembler.from_materials(
+        elements(mesh, "mean_dilatation"), mesh.regions, [material(young_modulus=70.0, poisson_ratio=0.499)]
+    )
+    body = FiniteElementBody.of(
+        mesh, assembler, supported=np.flatnonzero(mesh.points[:, 2] < 1e-9), gravity=(0.0, 0.0, -9810.0), background=False
+    )
+    touched = InteractiveSimulation(body, {})
+    for _ in range(30):
+        touched.advance()
+    touched.begin_cut([[[x, -5.0, 24.0], [x, 30.0, 24.0]] for x in (-5.0, 65.0)])
+    assert touched.finish_cut(wait=True)
+    before = touched.last.positions
+    for _ in range(5):
+        frame = touched.advance()
+    session = touched._session
+    assert isinstance(session, RealTimeSession)
+    assert (session.newton_steps, session.waits) == (0, 0)
+    assert session.unbalanced < 0.01 and not frame.failed
+    assert np.abs(frame.positions - before).max() < 0.1  # mm: the weight above keeps the cut closed
 
 
 def test_a_lattice_is_cut_while_it_is_touched() -> None:

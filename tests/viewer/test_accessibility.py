@@ -19,18 +19,18 @@ import pytest
 from browser import CHROMIUM, opened_browser
 
 from naibu.viewer.animation import MovingBody, animation_html
-from naibu.viewer.cards import Card
-from naibu.viewer.chapter import Chapter, Figure, Section
-from naibu.viewer.chapter_page import chapter_html
+from naibu.viewer.cards import Card, cards_html
+from naibu.viewer.chapters.chapter import Chapter, Figure, Section
+from naibu.viewer.chapters.chapter_page import chapter_html
 from naibu.viewer.live.page import live_html
 from naibu.viewer.live.scene import LiveScene
 from naibu.viewer.marker_view import MarkerView
 from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, motion_html
-from naibu.viewer.page_frame import asset
+from naibu.viewer.page_frame import asset, page_html
 from naibu.viewer.result_page.page import report_html
 from naibu.viewer.result_page.payload import Box, Correlation, ParameterRow, Report, ResidualSet, Scene, Step, VerdictNote
 from naibu.viewer.slices import Overlay, SliceView, slices_html
-from naibu.viewer.tables import Table
+from naibu.viewer.tables import Table, table_html
 
 TABLE = Table("Numbers", ("quantity", "value"), (("force, N", 1.5), ("depth, mm", None)), caption="what they are", note="a note")
 CARDS = (Card("Young's modulus", "10 kPa", "9 to 11 kPa"), Card("Force", "1.5 N"))
@@ -101,9 +101,14 @@ def live_view() -> str:
     return live_html(LiveScene("Touched gel", ["A sentence."], TETRAHEDRON, FACES, cells, [tool], [], none, "strain, %", 1 / 60))
 
 
+def plain_page() -> str:
+    """As of planned experiments, and of the index over chapters."""
+    return page_html("Planned experiment", f"{cards_html(CARDS)}<p class=lead>The best.</p>", table_html(TABLE), "naibu")
+
+
 PAGES: dict[str, Callable[[], str]] = {
     "report": report_page, "chapter": chapter_page, "motion": motion_page, "slices": slices_page, "animation": animation_page,
-    "live": live_view,
+    "live": live_view, "plain": plain_page,
 }  # fmt: skip
 
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from naibu.viewer.animation import MovingBody, animation_html
-from naibu.viewer.chapter import Chapter, Figure, Section
-from naibu.viewer.chapter_page import chapter_html
+from naibu.viewer.chapters.chapter import Chapter, Figure, Section
+from naibu.viewer.chapters.chapter_page import chapter_html
 from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, motion_html
 from naibu.viewer.result_page.page import report_html
 from naibu.viewer.result_page.payload import Box, Correlation, ParameterRow, Report, ResidualSet, Scene, Step

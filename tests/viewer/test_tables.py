@@ -39,6 +39,13 @@ def test_only_columns_of_numbers_are_aligned_right() -> None:
     assert html.count("<tr>") == 3 and html.count('<td class="num">') == 2
 
 
+def test_subscripts_of_forces_are_set_and_names_are_left_alone() -> None:
+    table = Table("Loads", ("F_z, mN", "file"), ((1.0, "M_x_of_A_z.csv <b>"),), note="V = π σ V_in / 2; F_RX")
+    page = table_html(table)
+    assert "F<sub>z</sub>, mN" in page and "V<sub>in</sub> / 2; F<sub>RX</sub>" in page
+    assert "M_x_of_A_z.csv &lt;b&gt;" in page
+
+
 def test_provenance_shows_every_entry_of_nested_mappings() -> None:
     html = provenance_table({"naibu": "0.1", "settings": {"law": "linear", "sizes": [8, 16]}, "seed": None})
     found = re.findall(r"<th scope=\"row\">([^<]*)</th><td>([^<]*)</td>", html)
@@ -49,3 +56,15 @@ def test_embedded_json_cannot_end_its_script_element() -> None:
     assert "</" not in embedded_json({"title": "</script><b>"})
     with pytest.raises(ValueError, match="not JSON compliant"):
         embedded_json({"value": math.nan})
+
+
+def test_rounding_beside_the_numbers_of_its_column_is_shown_as_zero() -> None:
+    html = table_html(Table("t", ("depth, mm", "small"), ((15.0, 3e-12), (2.2e-11, 1e-12))))
+    assert "10<sup>−11</sup>" not in html and html.count("10<sup>−12</sup>") == 2
+
+
+def test_columns_of_long_text_are_marked_for_narrow_screens() -> None:
+    why = "the report counts springs on faces twice, and ours once, as its Table 3 does"
+    html = table_html(Table("t", ("what", "why", "E, kPa"), (("one", why, 2.0), ("two", "", 3.0))))
+    assert html.count('<th scope="col" class="words">') == 1 and html.count('<td class="words">') == 2
+    assert table_html(Table("t", ("what",), ())).count("words") == 0

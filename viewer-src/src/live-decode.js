@@ -1,6 +1,6 @@
 // The inverse of naibu/viewer/live/scene.py: the scene from JSON, frames from bytes.
 const FLAGS = { paused: 1, driving: 2, recording: 4, replaying: 8, failed: 16 };
-const HEADER_BYTES = 104;
+const HEADER_BYTES = 108;
 
 const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
 
@@ -19,16 +19,17 @@ export function decodeScene(payload) {
   };
 }
 
-/** A frame: numbers of its header, positions (3 n) and, if they were asked for, values at the nodes (n). */
+/** A frame: numbers of its header, positions (3 n), values at the nodes (n) if they were asked for, and readings (3 k). */
 export function decodeFrame(buffer) {
   const view = new DataView(buffer);
   const magic = String.fromCharCode(...new Uint8Array(buffer, 0, 4));
-  if (magic !== "NLV2") throw new Error(`this is no frame of naibu: ${magic}`);
+  if (magic !== "NLV3") throw new Error(`this is no frame of naibu: ${magic}`);
   const nodes = view.getUint32(8, true);
   const float = (at) => view.getFloat32(at, true);
   const vector = (at) => [float(at), float(at + 4), float(at + 8)];
   const flags = view.getUint32(12, true);
   const valued = view.getUint32(24, true) === 1;
+  const afterNodes = HEADER_BYTES + (valued ? 16 : 12) * nodes;
   return {
     number: view.getUint32(4, true),
     ...Object.fromEntries(Object.entries(FLAGS).map(([name, bit]) => [name, Boolean(flags & bit)])),
@@ -46,5 +47,6 @@ export function decodeFrame(buffer) {
     rotation: [...vector(88), float(100)],
     positions: new Float32Array(buffer, HEADER_BYTES, 3 * nodes),
     values: valued ? new Float32Array(buffer, HEADER_BYTES + 12 * nodes, nodes) : null,
+    readings: new Float32Array(buffer, afterNodes, 3 * view.getUint32(104, true)),
   };
 }

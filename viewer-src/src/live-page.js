@@ -1,11 +1,12 @@
 // The live page: builds view and controls in #naibu-live, and leads the tools by mouse, touch, keyboard and gamepad.
 import { Vector3 } from "three";
-import { niceCeiling, tableGradient } from "./colormap.js";
+import { tableGradient } from "./colormap.js";
 import { canDrawOr, h } from "./elements.js";
-import { ForceCurve } from "./force-curve.js";
 import { decodeScene } from "./live-decode.js";
 import { LiveLink } from "./live-link.js";
 import { LiveView } from "./live-view.js";
+import { ReadingPlots } from "./reading-plots.js";
+import { TimeCurve } from "./time-curve.js";
 
 const MODES = { push: "Push", pull: "Pull", cut: "Cut", probe: "Probe" };
 const STROKE_PX = 6; // between two positions of the blade
@@ -36,7 +37,7 @@ class LivePage {
     this.view = new LiveView(this.stage);
     this.view.show(scene);
     this.view.listenToKeys(this.#keys());
-    this.curve = new ForceCurve(this.canvas);
+    this.curve = new TimeCurve(this.canvas, "force (N)");
     this.#listen();
     window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.view.applyTheme());
     this.setMode("push");
@@ -66,8 +67,9 @@ class LivePage {
       h("option", { value: "displacement" }, "displacement, mm"), h("option", { value: "strain" }, this.scene.strain));
     this.badge = h("p", { class: "badge", role: "status" }, "connecting");
     this.message = h("p", { class: "note trouble", role: "alert" });
-    this.canvas = h("canvas", { class: "force-curve", role: "img", "aria-label": "Force of the last ten seconds" });
+    this.canvas = h("canvas", { class: "time-curve", role: "img", "aria-label": "Force of the last ten seconds" });
     this.numbers = Object.fromEntries(["force", "pull", "penetration", "time", "rate", "probe"].map((name) => [name, h("dd", {}, "–")]));
+    this.plots = new ReadingPlots(this.scene.readings);
     const labels = { force: "force of the tool", pull: "force of the pull", penetration: "penetration", time: "simulated time", rate: "rate", probe: "probed point" };
     const list = h("dl", { class: "numbers" }, ...Object.entries(labels).flatMap(([name, text]) => [h("dt", {}, text), this.numbers[name]]));
     root.replaceChildren(
@@ -79,7 +81,8 @@ class LivePage {
         h("div", { class: "live-side" }, this.badge, this.message, list, this.canvas,
           h("div", { class: "bar" }, this.record, this.#button("▶ Replay", () => this.command("replay")),
             this.#button("Save as a page", () => { window.location.href = `/recording${window.location.search}`; }),
-            this.#button("Screenshot", () => this.#screenshot())))));
+            this.#button("Screenshot", () => this.#screenshot())))),
+      ...(this.scene.readings.length ? [this.plots.element] : []));
   }
 
   #viewControls() {
@@ -234,8 +237,9 @@ class LivePage {
     if (first && frame.driving && this.tool && frame.tool < 0) this.take(this.tool);
     this.view.setFrame(frame);
     this.#gamepad();
-    this.curve.add(frame.time, newtons(frame.gripped >= 0 ? frame.pull : frame.force));
-    this.curve.draw(niceCeiling);
+    this.curve.add(frame.time, [[newtons(frame.gripped >= 0 ? frame.pull : frame.force), NaN, NaN]]);
+    this.curve.draw();
+    this.plots.show(frame.time, frame.readings);
     this.ticks.replaceChildren(...[0, 1, 2, 3, 4].map((k) => h("span", {}, digits((k / 4) * this.view.top))));
     const { numbers } = this;
     numbers.force.textContent = frame.tool < 0 ? "–" : `${newtons(frame.force).toFixed(2)} N`;

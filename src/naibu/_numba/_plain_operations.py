@@ -37,3 +37,14 @@ def swap(array, index, old, new):  # type: ignore[no-untyped-def]  # pragma: no 
 @njit(cache=True)
 def nap(microseconds):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return at once: no other thread is waited for."""
+
+
+@njit(cache=True)
+def ticks():  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return 0: nothing is done in turn that would have to be timed."""
+    return 0
+
+
+@njit(cache=True)
+def relax():  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return at once: no other thread is waited for."""

@@ -1,6 +1,8 @@
 """Atomic operations on arrays of 64-bit integers in Numba kernels.
 
-`look`, `post`, `add` and `swap` read, write, add and compare-and-swap one element; `nap` sleeps for some microseconds. Where the intrinsics
+`look`, `post`, `add` and `swap` read, write, add and compare-and-swap one element; `nap` sleeps for some microseconds, `relax`
+belongs into loops that wait, `ticks` is a
+clock, ns. Where the intrinsics
 do not work with this version of Numba (`ATOMIC` is False), they are plain operations, for one thread only.
 """
 
@@ -20,4 +22,5 @@ else:
     ATOMIC = passes(_atomic_intrinsics.trial)
     _chosen = _atomic_intrinsics if ATOMIC else _plain_operations
 
-look, post, add, swap, nap = _chosen.look, _chosen.post, _chosen.add, _chosen.swap, _chosen.nap
+look, post, add, swap = _chosen.look, _chosen.post, _chosen.add, _chosen.swap
+nap, relax, ticks = _chosen.nap, _chosen.relax, _chosen.ticks

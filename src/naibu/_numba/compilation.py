@@ -18,12 +18,18 @@ import numba
 
 from naibu._numba.kernel_digest import kernel_digest, named_apart
 from naibu._numba.reports import report
-from naibu._numba.versions import passes
+from naibu._numba.versions import passes, tested
 
 try:
     from naibu._numba.kernel_files import KernelFile
 except Exception:  # whatever a changed interface raises
     KernelFile = None  # type: ignore[assignment,misc]
+
+# Options of kernels that neither make nor return arrays: references are not counted. Numba counts those of every array in a tuple, each
+# time that a kernel takes the tuple apart, which takes longer than many a step of a small lattice.
+# Kernels that they call take over that option; those that make arrays must not.
+UNCOUNTED: dict[str, Any] = {"_nrt": False} if tested() else {}
+COUNTED: dict[str, Any] = {"_nrt": True} if tested() else {}
 
 
 def njit(function: Callable[..., Any] | None = None, *, cache: bool = False, **options: Any) -> Any:

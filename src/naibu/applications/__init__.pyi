@@ -5,6 +5,7 @@ from .fingertip.offset import OffsetTracker
 from .fingertip.pressing import FingertipModel, Press, Pressing, rotated_loads
 from .fingertip.readings import ReadingChain
 from .fingertip.slip import SidewaysForces, SlipDetector, train_slip_detector, true_tangential_share
+from .fingertip.whole_fingertip import WholeFingertip
 from .ischemia.layer_identification import LayerEstimate, LayerParameter, identify_layers
 from .ischemia.layered_response import LayeredModes, SkinMotion, frequency_response, simulate_skin
 from .ischemia.response_times import ResponseTimes, response_times
@@ -20,12 +21,14 @@ from .mammography.mechanical_views import mechanical_views
 from .mammography.pair_construction import mammographic_pair, pair_of_shape
 from .mammography.pressed_view import PressedView
 from .mammography.two_views import TwoViews, two_views
+from .mammography.view_order import excess_above_nipple, may_be_swapped
 from .sensing_chip.bridge import closed_form_sensitivities, crosstalk, decoupled, half_bridge, sensitivity_matrix
 from .sensing_chip.chip_mesh import ChipMesh, ChipResolution, chip_mesh
 from .sensing_chip.closed_forms import CrossBeam, orthotropic_torsion_stiffness
 from .sensing_chip.design import ChipDesign, assumed_chip
 from .sensing_chip.design_study import DesignStudy, pareto_front, study_designs
 from .sensing_chip.electronics import Readout, report_readout
+from .sensing_chip.fillets import FilletedEnd, filleted_end, require_bearable_at_fillets
 from .sensing_chip.filters import RampKalman, first_order_filter, forward_backward_filter
 from .sensing_chip.finite_elements import ChipResponse, solve_chip
 from .sensing_chip.load_envelope import largest_stress, load_envelope, load_limits, require_bearable, surface_stress
@@ -44,6 +47,7 @@ __all__ = [
     "DecodedForces",
     "DesignStudy",
     "EpipolarCurve",
+    "FilletedEnd",
     "Fingertip",
     "FingertipModel",
     "FingertipResolution",
@@ -76,6 +80,7 @@ __all__ = [
     "SurfaceLoad",
     "Training",
     "TwoViews",
+    "WholeFingertip",
     "assumed_chip",
     "breast_in_scan",
     "breast_mask",
@@ -87,6 +92,8 @@ __all__ = [
     "decoupled",
     "directions",
     "doping_factor",
+    "excess_above_nipple",
+    "filleted_end",
     "fingertip_mesh",
     "first_order_filter",
     "forward_backward_filter",
@@ -101,6 +108,7 @@ __all__ = [
     "load_limits",
     "mammographic_pair",
     "mask_outline",
+    "may_be_swapped",
     "mechanical_views",
     "mechanically_compressed",
     "meshed",
@@ -113,6 +121,7 @@ __all__ = [
     "power_law",
     "report_readout",
     "require_bearable",
+    "require_bearable_at_fillets",
     "response_times",
     "rotated_loads",
     "sensitivity_matrix",

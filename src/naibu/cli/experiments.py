@@ -68,6 +68,7 @@ def identify(
     cell_map: Annotated[bool, Parameter(name="--map", negative=())] = False,
     unit: Unit | None = None,
     spacing_mm: tuple[float, float, float] | None = None,
+    node_spacing: tuple[float, float, float] | None = None,
     overwrite: Overwrite = False,
     where: WorkerOptions | None = None,
 ) -> None:
@@ -117,23 +118,14 @@ def identify(
         With fields in tables and meshes: their unit, where they do not state it; by default mm.
     spacing_mm
         With fields in voxels (SPAM, ALDVC): size of a voxel along x, y, z.
+    node_spacing
+        With TIFF files of SPAM: voxels from node to node along x, y, z.
     overwrite
         Replace results, or files of your own, that the folder already holds.
     """
     of_fields = [name for name in experiments if Path(name).suffix.lower() in FIELD_FILES]
     others = [name for name in experiments if name not in of_fields]
-    if of_fields and others:
-        require_left_out(
-            "goes with markers or fields, not with both", each_cell=cell_map, cross_validate=cross_validate, resume=not resume,
-            workers=where is not None, law=law != "neo_hookean",
-        )  # fmt: skip
-        identify_from_both(
-            others, of_fields, known=known or (), states=_states(others, state or []), contact=contact, joined=joined,
-            pixel_scale=pixel_scale, element_size_mm=element_size_mm, mask=mask, zones=zones, zone_name=zone_name or [],
-            loaded=loaded or (), unit=unit, spacing_mm=spacing_mm, out=out, overwrite=overwrite,
-        )  # fmt: skip
-        return
-    if mask is not None or zones is not None or all(Path(name).suffix.lower() in FIELD_FILES for name in experiments):
+    if not (of_fields and others) and (mask is not None or zones is not None or not others):
         require_left_out(
             "goes with markers, and these are displacement fields", states=bool(state), contact=contact != "coulomb",
             joined=joined != "tied", pixel_scale=pixel_scale != "given", cross_validate=cross_validate, resume=not resume,
@@ -141,20 +133,31 @@ def identify(
         )  # fmt: skip
         identify_from_fields(
             experiments, mask=mask, zones=zones, zone_name=zone_name or [], known=known or (), law=law, each_cell=cell_map,
-            loaded=loaded or (), element_size_mm=element_size_mm, unit=unit, spacing_mm=spacing_mm, out=out, overwrite=overwrite,
+            unit=unit, loaded=loaded or (), element_size_mm=element_size_mm, spacing_mm=spacing_mm, node_spacing=node_spacing, out=out,
+            overwrite=overwrite,
+        )  # fmt: skip
+        return
+    from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
+
+    settings = ModelSettings(law=law, contact=contact, joined=joined, element_size_mm=element_size_mm, pixel_scale=pixel_scale)
+    if of_fields and others:
+        require_left_out(
+            "goes with markers or fields, not with both", each_cell=cell_map, cross_validate=cross_validate, resume=not resume,
+            workers=where is not None, law=law != "neo_hookean",
+        )  # fmt: skip
+        identify_from_both(
+            others, of_fields, known=known or (), states=_states(others, state or []), settings=settings, mask=mask, zones=zones,
+            zone_name=zone_name or [], loaded=loaded or (), unit=unit, spacing_mm=spacing_mm, node_spacing=node_spacing, out=out,
+            overwrite=overwrite,
         )  # fmt: skip
         return
     require_left_out(
         "goes with displacement fields, and these are markers", zone_names=bool(zone_name), each_cell=cell_map, unit=unit is not None,
-        spacing_mm=spacing_mm is not None, loaded=bool(loaded),
+        spacing_mm=spacing_mm is not None, node_spacing=node_spacing is not None, loaded=bool(loaded),
     )  # fmt: skip
-    from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
-
-    settings = ModelSettings(law=law, contact=contact, joined=joined, element_size_mm=element_size_mm, pixel_scale=pixel_scale)
-    states = _states(experiments, state or [])
     _identify(
-        experiments, known=known or (), states=states, settings=settings, out=out, cross_validate=cross_validate, resume=resume,
-        overwrite=overwrite, where=where,
+        experiments, known=known or (), states=_states(experiments, state or []), settings=settings, out=out,
+        cross_validate=cross_validate, resume=resume, overwrite=overwrite, where=where,
     )  # fmt: skip
 
 

@@ -6,12 +6,15 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from naibu.cli.shell.console import GRAVE, NOT_EXPLAINED, print_table, progress_display, say
 from naibu.cli.shell.described import labels_of
 from naibu.cli.shell.run_record import found, wrote
 from naibu.core.errors import InputError
+
+if TYPE_CHECKING:
+    from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 
 Unit = Literal["mm", "cm", "m", "um", "inch"]
 ContactModel = Literal["coulomb", "stick", "springs"]
@@ -21,7 +24,7 @@ Law = Literal["neo_hookean", "neo_hookean_isochoric", "mooney_rivlin", "yeoh", "
 # operands that can only be displacement fields
 FIELD_FILES = (
     *(".h5", ".hdf5", ".tfm", ".mha", ".mhd", ".nrrd", ".nhdr", ".nii", ".gz"),
-    *(".vtu", ".mat", ".csv", ".tsv", ".txt", ".xlsx", ".dat"),
+    *(".vtu", ".mat", ".csv", ".tsv", ".txt", ".xlsx", ".dat", ".tif", ".tiff"),
 )
 
 
@@ -38,6 +41,7 @@ def identify_from_fields(
     element_size_mm: float,
     unit: Unit | None,
     spacing_mm: tuple[float, float, float] | None,
+    node_spacing: tuple[float, float, float] | None,
     out: Path,
     overwrite: bool,
 ) -> None:
@@ -50,7 +54,8 @@ def identify_from_fields(
     with progress_display() as progress:
         result = identify_fields(
             fields, mask=mask, zones=zones, zone_names=labels_of(zone_name), known=known, loaded=loaded, each_cell=each_cell,
-            element_size_mm=element_size_mm, unit=unit, spacing_mm=spacing_mm, out=out, overwrite=overwrite, progress=progress,
+            element_size_mm=element_size_mm, unit=unit, spacing_mm=spacing_mm, node_spacing=node_spacing, out=out,
+            overwrite=overwrite, progress=progress,
         )  # fmt: skip
     usable = result.estimate.verdict is None or result.estimate.verdict.ok
     for number, line in enumerate(result.notes):
@@ -72,30 +77,26 @@ def identify_from_both(
     *,
     known: Sequence[str],
     states: dict[str, list[str]] | None,
-    contact: ContactModel,
-    joined: Joined,
-    pixel_scale: PixelScale,
-    element_size_mm: float,
+    settings: ModelSettings,
     mask: Path | None,
     zones: Path | None,
     zone_name: Sequence[str],
     loaded: Sequence[str],
     unit: Unit | None,
     spacing_mm: tuple[float, float, float] | None,
+    node_spacing: tuple[float, float, float] | None,
     out: Path,
     overwrite: bool,
 ) -> None:
     """Identify moduli from experiments with markers and displacement fields together, and print them."""
-    from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
     from naibu.workflows.joint_identification import identify_jointly
 
     began = time.perf_counter()
-    settings = ModelSettings(contact=contact, joined=joined, element_size_mm=element_size_mm, pixel_scale=pixel_scale)
     with progress_display() as progress:
         result = identify_jointly(
             experiments, fields, known=known, states=states, settings=settings, mask=mask, zones=zones, zone_names=labels_of(zone_name),
-            loaded=loaded, unit=unit, spacing_mm=spacing_mm, element_size_mm=element_size_mm, out=out, overwrite=overwrite,
-            progress=progress,
+            loaded=loaded, unit=unit, spacing_mm=spacing_mm, node_spacing=node_spacing,
+            element_size_mm=settings.element_size_mm, out=out, overwrite=overwrite, progress=progress,
         )  # fmt: skip
     for line in result.notes:
         say(line, GRAVE if result.joint.contradicted else "bold")

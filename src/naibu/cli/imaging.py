@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
 from naibu.cli.shell.console import WARNING, print_table, progress_display, say
-from naibu.cli.shell.described import Flag, ObjectOptions, Out, Overwrite, PairOptions, Whole, require_left_out
+from naibu.cli.shell.described import Flag, ObjectOptions, Out, Overwrite, PairOptions, Whole, WorkerOptions, require_left_out
 from naibu.cli.shell.run_record import wrote
 from naibu.cli.shell.verbs import MARKERS, SCANS, verb
 from naibu.core.errors import InputError
+
+if TYPE_CHECKING:
+    from naibu.workflows.measurement.sense import SenseRun
+    from naibu.workflows.measurement.sense_blocks import MemoryPlan
 
 # other parts are imported where they are used: --help answers at once
 Method = Literal["default", "features", "sad-blocks", "ssd-blocks", "ncc-blocks", "horn-schunck", "lucas-kanade", "hybrid", "rigid"]
@@ -25,6 +29,7 @@ Unit = Literal["mm", "cm", "m", "um", "inch"]
     "sense free.mha pressed.mha -o moved --open",
     "sense free.nii.gz pressed.nii.gz -m object.nii.gz   # the object is known",
     "sense dicom_before dicom_after --json > summary.json",
+    "sense before.zarr after.zarr --memory-gb 6 --workers 2 -o moved   # larger than memory: block by block, --resume goes on",
 )
 def sense(
     reference: Path,
@@ -34,6 +39,9 @@ def sense(
     pair: PairOptions | None = None,
     out: Out = Path("naibu-sense"),
     multiscale: Flag = False,
+    memory_gb: float | None = None,
+    resume: Flag = False,
+    where: WorkerOptions | None = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Measure the displacement inside an object between two scans by digital volume correlation (DVC), with its uncertainty.
@@ -50,28 +58,74 @@ def sense(
         Folder for displacement.mha, standard_deviation.mha, displacement.vtu, field.h5, mask.mha (the object), initial.csv and pressed.csv
         (positions as markers), sense.json and report.html.
     multiscale
-        Also write scans, displacement and strain at several resolutions, as OME-Zarr for napari and neuroglancer (needs naibu[cluster]).
+        Also write scans, displacement and strain at several resolutions, as OME-Zarr for napari and neuroglancer (needs
+        naibu[cluster]); block by block without the strain.
+    memory_gb
+        Memory that may be taken, GB; by default half of what is free. Scans in Zarr, OME-Zarr, HDF5 or TIFF stacks that would take more are
+        measured block by block, on the workers, by the default method; all voxels are then written as Zarr, and the other files show coarse
+        voxels.
+    resume
+        Go on with an interrupted measurement block by block.
     overwrite
         Replace results, or files of your own, that the folder already holds.
     """
-    from naibu.workflows.measurement.multiscale_results import folder_for_multiscale, write_multiscale
-    from naibu.workflows.measurement.sense import read_pair, sense_pair
-
-    with progress_display() as progress:
-        scans = read_pair(reference, deformed, **(pair or PairOptions()).arguments)
-        folder = folder_for_multiscale(out, overwrite=overwrite) if multiscale else None
-        run = sense_pair(scans, method=method, out=out, overwrite=overwrite, progress=progress)
-        stores = () if folder is None else write_multiscale(scans, run, folder)
+    options, places = pair or PairOptions(), where or WorkerOptions()
+    plan = _memory_plan(reference, options, places, memory_gb, resume) if method == "default" else None
+    if plan is None:
+        require_left_out("goes with scans that are measured block by block", resume=resume, workers=places != WorkerOptions())
+        run, stores = _sense_in_memory((reference, deformed), method, options, out, multiscale, overwrite)
+    else:
+        run, stores = _sense_by_blocks((reference, deformed), plan, options, places, out, multiscale, overwrite, resume), ()
     print_table(f"{reference.name} -> {deformed.name}, {run.measured.method}", ("quantity", "value"), run.rows())
     for warning in run.measured.warnings:
         say(warning.replace("`mask`", "--mask"), WARNING)
     files = (*run.files, *stores)
     wrote(*files)
     say(f"{run.seconds:.1f} s. Page: {files[0]}   fields: {', '.join(str(p.name) for p in files[1:])}")
-    if min(scans.reference.shape) > 1:
+    if min(run.pair.reference.shape) > 1:
         say(
             f"Stiffness: naibu identify {out / 'field.h5'} --zones LABELS -k 'label 1=10 kPa', a volume of labels, one of them known", "dim"
         )
+
+
+def _memory_plan(reference: Path, options: PairOptions, places: WorkerOptions, memory_gb: float | None, resume: bool) -> MemoryPlan | None:
+    """Return the plan of a measurement block by block, or None where it is measured in memory."""
+    from naibu.workflows.measurement.sense_blocks import MemoryPlan, stored_shape
+
+    shape = stored_shape(reference, options.spacing_mm)
+    if shape is None:
+        return None
+    plan = MemoryPlan.of(shape, memory_gb, max(1, places.workers))
+    return plan if plan.by_blocks or resume else None
+
+
+def _sense_in_memory(
+    scans: tuple[Path, Path], method: Method, options: PairOptions, out: Path, multiscale: bool, overwrite: bool
+) -> tuple[SenseRun, tuple[Path, ...]]:
+    from naibu.workflows.measurement.multiscale_results import folder_for_multiscale, write_multiscale
+    from naibu.workflows.measurement.sense import read_pair, sense_pair
+
+    with progress_display() as progress:
+        pair = read_pair(*scans, **options.arguments)
+        folder = folder_for_multiscale(out, overwrite=overwrite) if multiscale else None
+        run = sense_pair(pair, method=method, out=out, overwrite=overwrite, progress=progress)
+        return run, () if folder is None else write_multiscale(pair, run, folder)
+
+
+def _sense_by_blocks(
+    scans: tuple[Path, Path], plan: MemoryPlan, options: PairOptions, places: WorkerOptions, out: Path, multiscale: bool, overwrite: bool,
+    resume: bool,
+) -> SenseRun:  # fmt: skip
+    from naibu.workflows.measurement.sense_blocks import sense_blocks
+
+    require_left_out("needs the scans in memory, and these are measured block by block", truth=options.truth is not None)
+    say(plan.told())
+    with progress_display() as progress:
+        return sense_blocks(
+            *scans, mask=options.mask, deformed_mask=options.deformed_mask, check_points=options.check_points,
+            spacing_mm=options.spacing_mm, out=out, plan=plan, multiscale=multiscale, overwrite=overwrite, resume=resume,
+            workers=places.workers, cluster=places.cluster, progress=progress,
+        )  # fmt: skip
 
 
 @verb(

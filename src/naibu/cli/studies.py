@@ -55,12 +55,18 @@ def reproduce(
     if chapter == "all":
         Workers(**(where or WorkerOptions()).arguments)  # what cannot be is refused before anything is said
         left = tuple(CHAPTERS) if overwrite else missing_chapters(out, seed)
-        minutes = processor_seconds(left) / 60.0
-        errors.print(
-            f"{len(left)} chapters are to be computed: about {minutes:.0f} minutes on one common core. Ctrl-C keeps those that are done."
-        )
-        with progress_display() as progress:
-            index, _ = reproduce_all(out, seed=seed, overwrite=overwrite, progress=progress, **(where or WorkerOptions()).arguments)
+        if left:
+            seconds = processor_seconds(left)
+            told = f"{seconds / 60.0:.0f} minutes" if seconds >= 90.0 else f"{seconds:.0f} s"
+            of = "1 chapter is" if len(left) == 1 else f"{len(left)} chapters are"
+            errors.print(f"{of} to be computed: about {told} of one common core. Ctrl-C keeps those that are done.", soft_wrap=True)
+        try:
+            with progress_display() as progress:
+                index, _ = reproduce_all(out, seed=seed, overwrite=overwrite, progress=progress, **(where or WorkerOptions()).arguments)
+        except KeyboardInterrupt:
+            kept = len(CHAPTERS) - len(missing_chapters(out, seed))
+            errors.print(f"Interrupted: {kept} of {len(CHAPTERS)} chapters are kept. The same command goes on.", soft_wrap=True)
+            sys.exit(INTERRUPTED)
         wrote(index)
         say(f"{time.perf_counter() - began:.0f} s. Index: {index}")
         return

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     "live                             # the gels of the demonstration",
     "live naibu-results               # the model that you identified",
     "live liver.vtu --young-modulus-kpa 5   # a mesh",
+    "live fingertip                   # a soft fingertip that decodes what presses it",
     "live dough-pressed-by-sphere --haptics-port 8766   # a lattice, led by a haptic device",
 )
 def live(
@@ -31,6 +32,7 @@ def live(
     poisson_ratio: float | None = None,
     port: Whole = 8765,
     haptics_port: Whole | None = None,
+    decoder: Path | None = None,
     browser: bool = True,
 ) -> None:
     """Touch a simulated body in the browser: push it, pull it, look inside and read the force.
@@ -40,8 +42,8 @@ def live(
     Parameters
     ----------
     source
-        demo, the gels that naibu demo identifies; model.json of an identification or its folder; a mesh (.vtu, .msh); or a lattice study,
-        STUDY.toml or a name from naibu simulate.
+        demo, the gels that naibu demo identifies; fingertip, a soft fingertip with a sensing chip; model.json of an identification or its
+        folder; a mesh (.vtu, .msh); or the file of a lattice or a fingertip, STUDY.toml, or the name of a lattice from naibu simulate.
     experiment
         Experiment whose body an identified model is made for, if not the first one that it was identified from.
     young_modulus_kpa
@@ -52,22 +54,27 @@ def live(
         Port of this computer; 0 takes a free one.
     haptics_port
         UDP port of this computer at which a haptic device leads the tool, such as 8766.
+    decoder
+        Of your own fingertip: NAME-decoder.json, which naibu simulate writes of it.
     browser
         Open the page in the browser.
     """
     from naibu.workflows.interactive.live import live as served
 
+    def preparing() -> None:
+        errors.print("preparing the simulation; the first run compiles kernels, a minute or two of one processor", soft_wrap=True)
+        if haptics_port is not None:
+            say(f"Haptic device: UDP, 127.0.0.1:{haptics_port}; answers carry flag 16, and no force, until the page is ready")
+
     def ready(address: str) -> None:
         say(f"Live page: {address}")
-        if haptics_port is not None:
-            say(f"Haptic device: UDP, 127.0.0.1:{haptics_port}")
         errors.print("Ctrl-C ends it.", soft_wrap=True)
         if browser:
             webbrowser.open(address)
 
     served(
         source, experiment=experiment, material=_material(young_modulus_kpa, poisson_ratio), port=port,
-        haptics_port=haptics_port, ready=ready,
+        haptics_port=haptics_port, decoder=decoder, preparing=preparing, ready=ready,
     )  # fmt: skip
 
 

@@ -121,6 +121,17 @@ def rotation_matrix(vector: FloatArray) -> FloatArray:
     return np.asarray(np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k))
 
 
+def rotation_between(start: FloatArray, stop: FloatArray) -> FloatArray:
+    """Return the rotation matrix (3, 3) that takes one unit vector (3,) to another by the smallest angle."""
+    across = np.cross(start, stop)
+    sine = float(np.linalg.norm(across))
+    if sine == 0.0:  # alike, or opposite: then about any axis across
+        across = np.cross(start, np.eye(3)[np.argmin(np.abs(start))])
+        sine = float(np.linalg.norm(across))
+        return rotation_matrix(across * ((0.0 if start @ stop > 0.0 else np.pi) / sine))
+    return rotation_matrix(across * (np.arctan2(sine, start @ stop) / sine))
+
+
 def left_jacobian(vector: FloatArray) -> FloatArray:
     """Return the left Jacobian J (3, 3) of a rotation vector v, rad (:cite:p:`chirikjian2011`).
 

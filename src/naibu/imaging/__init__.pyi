@@ -9,6 +9,7 @@ from .displacement.accuracy import (
     intensity_rms,
     inverse_displacement,
 )
+from .displacement.chunked_strain import ChunkedStrain
 from .displacement.strain import displacement_gradient, green_lagrange_strain, jacobian_determinant, small_strain
 from .feature_matching.correlation_matching import Candidates, candidate_matches
 from .feature_matching.harris import InterestPoints, interest_points
@@ -34,6 +35,7 @@ from .volume_correlation.settings import CorrelationSettings
 __all__ = [
     "Candidates",
     "ChunkedDisplacement",
+    "ChunkedStrain",
     "CorrelationResult",
     "CorrelationSettings",
     "DetectedMarkers",

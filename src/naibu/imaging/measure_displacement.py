@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from naibu.core.arrays import BoolArray, FloatArray
+from naibu.core.arrays import BoolArray, Float32Array, FloatArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress, report_progress
@@ -32,6 +32,7 @@ from naibu.imaging.preprocessing.object_mask import mask_in_view, mask_jumps
 from naibu.imaging.preprocessing.resampling import require_mask, resampled_to_grid
 from naibu.imaging.preprocessing.rigid_registration import rigid_from_points, total_displacement
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
+from naibu.imaging.volume_correlation.result import CorrelationResult
 
 Method = Literal["default", "features", "sad-blocks", "ssd-blocks", "ncc-blocks", "horn-schunck", "lucas-kanade", "hybrid", "rigid"]
 METHODS: tuple[Method, ...] = get_args(Method)
@@ -55,6 +56,9 @@ FACTS = {
     "convergence": "convergence",
     "unconverged_cells": "cells of the spline grid that have not converged",
     "unconverged_fraction": "the same, fraction of the cells in the object",
+    "coarse_factor": "block by block: voxels along an edge of the coarse voxels of this page",
+    "blocks": "block by block: number of blocks",
+    "passes": "block by block: passes through the volumes",
 }
 
 
@@ -83,6 +87,8 @@ class MeasuredDisplacement:
         What makes the result doubtful, in sentences for the user.
     blocks : DisplacementField, optional
         Displacement of small blocks of voxels with independent errors, to which models are fitted; the default method measures them.
+    strain_sd : ndarray, shape (nz, ny, nx), optional
+        Standard deviation of a component of the Green-Lagrange strain, root mean square over the components; the default method states it.
     """
 
     method: Method
@@ -94,6 +100,7 @@ class MeasuredDisplacement:
     facts: dict[str, float | int | str] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     blocks: DisplacementField | None = None
+    strain_sd: Float32Array | None = None
 
 
 def measure_displacement(
@@ -272,6 +279,21 @@ def _correlated(
     progress: Progress | None,
 ) -> MeasuredDisplacement:
     found = correlate_volumes(reference, deformed, mask=masks[0], deformed_mask=masks[1], progress=progress)
+    return measured_by(found, reference, inside)
+
+
+def measured_by(found: CorrelationResult, reference: Volume, inside: BoolArray) -> MeasuredDisplacement:
+    """Return the displacement that volume correlation found, with the facts of its measurement, at the voxels of the object.
+
+    Parameters
+    ----------
+    found : CorrelationResult
+        On the grid of the reference.
+    reference : Volume
+        That grid.
+    inside : ndarray, shape (nz, ny, nx), bool
+        Voxels of the object.
+    """
     unconverged, cells = int((~found.converged).sum()), int(np.isfinite(found.cell_covariance[..., 0, 0]).sum())
     facts: dict[str, float | int | str] = {
         "residual_sd": found.residual_sd,
@@ -293,7 +315,8 @@ def _correlated(
     field = DisplacementField.on_grid(reference, vectors, covariance=covariance, valid=valid)
     blocks = None if found.blocks is None else _in_object(found.blocks, found.volume, valid)
     doubts = _convergence_doubts(unconverged, cells)
-    return MeasuredDisplacement("default", field, inside, gradient, facts=facts, warnings=doubts, blocks=blocks)
+    strain_sd = np.where(valid, found.strain_sd(), np.float32(np.nan))
+    return MeasuredDisplacement("default", field, inside, gradient, facts=facts, warnings=doubts, blocks=blocks, strain_sd=strain_sd)
 
 
 def _in_object(blocks: DisplacementField, grid: Volume, valid: BoolArray) -> DisplacementField:

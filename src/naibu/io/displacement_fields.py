@@ -21,7 +21,7 @@ from naibu.core.arrays import FloatArray, require_lengths
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
-from naibu.io.field_formats import aldvc, field_tables, itk_transforms
+from naibu.io.field_formats import aldvc, field_tables, itk_transforms, spam_tiff
 from naibu.io.files.atomic import new_aside, put_in_place
 from naibu.io.files.hdf5_stream import Hdf5File
 from naibu.io.files.reading import guarded_reading, read_bytes, require_plausible, require_regular
@@ -83,7 +83,13 @@ def _store(root: Any, field: DisplacementField, provenance: str) -> None:
             root.create_dataset(name, data=values, compression="gzip", compression_opts=4, shuffle=True, track_times=False)
 
 
-def read_field(path: str | os.PathLike[str], *, unit: str | None = None, spacing_mm: Sequence[float] | None = None) -> DisplacementField:
+def read_field(
+    path: str | os.PathLike[str],
+    *,
+    unit: str | None = None,
+    spacing_mm: Sequence[float] | None = None,
+    node_spacing: Sequence[float] | None = None,
+) -> DisplacementField:
     """Read a displacement field; what other programs mean by their vectors is told in the page on displacement fields.
 
     Parameters
@@ -92,12 +98,15 @@ def read_field(path: str | os.PathLike[str], *, unit: str | None = None, spacing
         ``.h5`` as `write_field`, ``naibu sense`` and ``naibu track`` write it, or a transform of ITK, ANTs or 3D Slicer (also ``.tfm``); an
         image of vectors (``.mha``, ``.mhd``, ``.nrrd``, ``.nii``, ``.nii.gz``; a ``PREFIX1Warp.nii.gz`` of ANTs with the
         ``PREFIX0GenericAffine.mat`` beside it, which is applied after it); a mesh with displacements at its points (``.vtu``); a
-        result of ALDVC (``.mat``); or a table (``.csv``, ``.tsv``, ``.txt``, ``.xlsx``, Tecplot ``.dat``) with columns such as x_mm,
-        y_mm, z_mm, ux_mm, uy_mm, uz_mm and, where they are known, sd_x_mm, sd_y_mm, sd_z_mm.
+        result of ALDVC (``.mat``); one of the three components of SPAM in TIFF files (``-Xdisp.tif``); or a table (``.csv``,
+        ``.tsv``, ``.txt``, ``.xlsx``, Tecplot ``.dat``) with columns such as x_mm, y_mm,
+        z_mm, ux_mm, uy_mm, uz_mm and, where they are known, sd_x_mm, sd_y_mm, sd_z_mm.
     unit : str, optional
         Unit of tables and meshes, mm, cm, m, um or inch, where they do not state it; by default mm.
     spacing_mm : sequence of float, optional
-        Size of a voxel along x, y, z, mm, where lengths are in voxels: in tables of SPAM and results of ALDVC.
+        Size of a voxel along x, y, z, mm, where lengths are in voxels: in fields of SPAM and results of ALDVC.
+    node_spacing : sequence of float, optional
+        From node to node along x, y, z, in voxels, of TIFF files of SPAM.
 
     Raises
     ------
@@ -107,13 +116,15 @@ def read_field(path: str | os.PathLike[str], *, unit: str | None = None, spacing
     source = Path(path)
     ending = source.suffix.lower()
     require_lengths(spacing_mm=spacing_mm)
-    _require_fitting(source, ending, unit, spacing_mm)
+    _require_fitting(source, ending, unit, spacing_mm, node_spacing)
     with guarded_reading(path, "displacement field"):
         if ending in (".h5", ".hdf5"):
             return _stored(source)
         if ending in TABLES:
             require_regular(source)
             return field_tables.read(source, unit=unit, spacing_mm=spacing_mm)
+        if ending in spam_tiff.ENDINGS:
+            return spam_tiff.read(source, spacing_mm=spacing_mm, node_spacing=node_spacing)
         if ending == ".vtu":
             return _mesh(source, MM_PER_UNIT[unit or "mm"])
         if ending == ".mat":
@@ -125,18 +136,20 @@ def read_field(path: str | os.PathLike[str], *, unit: str | None = None, spacing
         return DisplacementField.on_grid(grid, vectors)
 
 
-def _require_fitting(source: Path, ending: str, unit: str | None, spacing_mm: Sequence[float] | None) -> None:
+def _require_fitting(
+    source: Path, ending: str, unit: str | None, spacing_mm: Sequence[float] | None, node_spacing: Sequence[float] | None
+) -> None:
     """Refuse a unit or a size of voxels where the file states its own."""
     if unit is not None and unit not in MM_PER_UNIT:
         raise InputError(f"unit = {unit!r} is not known; use one of {', '.join(dict.fromkeys(MM_PER_UNIT))}")
     if unit is not None and ending not in (*TABLES, ".vtu"):
         raise InputError(f"unit = {unit!r} goes with tables and meshes; {source.name} states its own: leave it out")
-    if spacing_mm is not None and ending not in (*TABLES, ".mat"):
+    if spacing_mm is not None and ending not in (*TABLES, *spam_tiff.ENDINGS, ".mat"):
         raise InputError(f"spacing_mm goes with fields in voxels; {source.name} states its own: leave it out")
     if unit is not None and spacing_mm is not None:
         raise InputError("`unit` and spacing_mm both say what a coordinate is; give one of them")
-    if ending in (".tif", ".tiff"):
-        raise InputError(f"{source.name}: TIFF files of SPAM do not say where their nodes lie; take the table beside them (.tsv)")
+    if node_spacing is not None and ending not in spam_tiff.ENDINGS:
+        raise InputError(f"node_spacing goes with TIFF files of SPAM; {source.name} states where its points lie: leave it out")
 
 
 def _mesh(source: Path, unit_mm: float) -> DisplacementField:

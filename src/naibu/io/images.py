@@ -55,10 +55,11 @@ _BOX_READERS: dict[str, Callable[[Path, ArrayLike, ArrayLike, ReadOptions], Volu
 }
 _STORES = (".zarr", ome_zarr.ENDING)  # folders that are one volume
 _VECTOR_WRITERS = {".mha": metaimage.write, ".mhd": metaimage.write, ".nrrd": nrrd.write, ome_zarr.ENDING: ome_zarr.write}
+_HDF5 = (".h5", ".hdf5")
 _OPENERS: dict[str, Callable[[Path], ChunkedVolume]] = {
     ".zarr": zarr_store.open_chunked,
     ome_zarr.ENDING: ome_zarr.open_levels,
-    **dict.fromkeys((".h5", ".hdf5"), hdf5.open_chunked),
+    **dict.fromkeys(_HDF5, hdf5.open_chunked),
 }
 
 
@@ -223,7 +224,7 @@ def open_volume(path: str | os.PathLike[str], *, spacing_mm: ArrayLike | None = 
         ``.zarr``, ``.ome.zarr``, ``.h5``, ``.hdf5``, ``.tif``, ``.tiff``, or a folder of TIFF slices. Volumes in HDF5 cannot be sent to the
         workers of a cluster; Zarr can.
     spacing_mm : array_like, shape (3,), optional
-        Voxel spacing along x, y, z, mm, for TIFF files that do not state it.
+        Voxel spacing along x, y, z, mm, for TIFF and HDF5 files that do not state it.
 
     Raises
     ------
@@ -244,7 +245,15 @@ def open_volume(path: str | os.PathLike[str], *, spacing_mm: ArrayLike | None = 
             raise InputError(
                 f"{source.name}: only Zarr, HDF5 and TIFF volumes can be opened out of core; convert it once with write_volume to .zarr"
             )
-        return _OPENERS[ending](source)
+        return hdf5.open_chunked(source, spacing) if ending in _HDF5 else _OPENERS[ending](source)
+
+
+def can_be_opened(path: str | os.PathLike[str]) -> bool:
+    """Return whether `open_volume` opens files of this kind, so that they need not be read whole."""
+    source = Path(path)
+    if source.is_dir() and _ending(source) not in _OPENERS:
+        return not _is_dicom(source)
+    return _ending(source) in (*_OPENERS, ".tif", ".tiff")
 
 
 def _reader(source: Path) -> Callable[[Path, ReadOptions], Volume]:

@@ -29,7 +29,7 @@ class Mammogram:
     laterality : str
         ``"L"`` or ``"R"``.
     thickness_mm, angle_deg : float or None
-        Distance of the plates, and positioner angle without its sign, where the file states them.
+        Distance of the plates, and positioner angle, where the file states them.
     wall_at_right : bool or None
         On which side of the image the chest wall lies, where the file states that.
     """
@@ -72,7 +72,7 @@ def read_mammogram(path: str | os.PathLike[str]) -> Mammogram:
         view,
         laterality,
         _number(data, "BodyPartThickness"),
-        None if (angle := _number(data, "PositionerPrimaryAngle")) is None else abs(angle),
+        _number(data, "PositionerPrimaryAngle"),
         None if not orientation else orientation[0].startswith("P"),
     )
 

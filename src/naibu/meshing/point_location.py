@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, identity
 from scipy.spatial import cKDTree
 
 from naibu.core.arrays import FloatArray, IntArray, as_points
@@ -98,7 +98,10 @@ def interpolation_operator(mesh: Mesh, points_mm: ArrayLike, *, tolerance_mm: fl
     InputError
         See `locate`.
     """
-    return operator_of(mesh, locate(mesh, points_mm, tolerance_mm=tolerance_mm))
+    points = _checked(points_mm, mesh.dimension)
+    if np.array_equal(points, mesh.points):  # as of a computed displacement: nothing to search
+        return csr_array(identity(len(points), format="csr"))
+    return operator_of(mesh, locate(mesh, points, tolerance_mm=tolerance_mm))
 
 
 def operator_of(mesh: Mesh, location: Location) -> csr_array:

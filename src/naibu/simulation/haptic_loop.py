@@ -24,7 +24,7 @@ HOLDS = 1  # button that lets the device move without its tool
 VELOCITY_S = 3e-3  # over which the velocity of the device is averaged
 ROUNDING_MN = 1e-6
 LEAVES_S = 1.0  # without a packet for so long, a device is gone
-CONTACT, LIMITED, STALE, DAMPED = 1, 2, 4, 8
+CONTACT, LIMITED, STALE, DAMPED, WAITS = 1, 2, 4, 8, 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +73,8 @@ class DeviceForce:
     force_mn : ndarray, shape (3,)
         Force on the device, mN.
     flags : int
-        Sum of `CONTACT`, `LIMITED` (magnitude or step), `STALE` (no pose has come for a while) and `DAMPED` (passivity).
+        Sum of `CONTACT`, `LIMITED` (magnitude or step), `STALE` (no pose has come for a while), `DAMPED` (passivity) and `WAITS` (the
+        simulation is being prepared, paused or shown again: no force).
     energy_mn_mm : float
         What the account of the device may come to at most, mN mm; it applies no more of any force than that permits.
     """
@@ -205,7 +206,7 @@ class HapticHand:
         """Keep in touch with the device for the time of a step, without force, while the simulation waits."""
         if self._listen(step_s):
             self._tool = None
-            self._answer(np.zeros(3), step_s, 0)
+            self._answer(np.zeros(3), step_s, WAITS)
 
     def _listen(self, step_s: float) -> bool:
         """Read the poses that have come; False where no device is there."""

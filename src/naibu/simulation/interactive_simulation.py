@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray, as_vector, require_positive
 from naibu.core.errors import ConvergenceError, InputError
-from naibu.core.rigid_transform import rotation_matrix
+from naibu.core.rigid_transform import rotation_between, rotation_matrix
 from naibu.mechanics.contact.indenter_motion import IndenterVelocity
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.meshing.cutting.swept_blade import swept_blade
@@ -68,7 +68,7 @@ class Frame:
     topology : int
         Counts the cuts, undone ones included.
     unbalanced : float
-        Out-of-balance force that the next frames take up, as a fraction of all forces.
+        Out-of-balance forces that the next frames take up, as a fraction of all forces, or of those of contact where that is more.
     """
 
     body: InteractiveBody
@@ -192,6 +192,20 @@ class InteractiveSimulation:
             A rotation that is no vector of finite numbers.
         """
         self._rotation_target = rotation_matrix(as_vector("rotation", rotation)) @ self._rotation_target
+
+    def aim(self, direction: ArrayLike) -> None:
+        """Turn the tool until its third axis, that of a cylinder, has a direction (3,), the shortest way from where it is to be.
+
+        Raises
+        ------
+        InputError
+            A direction that is no vector of finite numbers, or has no length.
+        """
+        wanted = as_vector("direction", direction)
+        length = require_positive("length of the direction", float(np.linalg.norm(wanted)))
+        if self._tool:
+            axis = self.tools[self._tool].geometry.axes[2] @ self._rotation_target.T
+            self._rotation_target = rotation_between(axis, wanted / length) @ self._rotation_target
 
     def grip(self, node: int, radius_mm: float = 0.0) -> None:
         """Grip a node of the surface, and those around it within a radius at rest, mm, to pull them.
@@ -415,21 +429,9 @@ class InteractiveSimulation:
         if self._tool:
             depth = max(0.0, -float(placed(self.tools[self._tool], self._centre, self._rotation).gap(positions[self._surface]).min()))
         return Frame(
-            self.body,
-            number,
-            time_s,
-            positions,
-            self._tool,
-            self._centre,
-            self._rotation,
-            force,
-            pull,
-            depth,
-            self._gripped,
-            failed,
-            self._topology,
-            self.body.unbalanced(self._session),
-        )
+            self.body, number, time_s, positions, self._tool, self._centre, self._rotation, force, pull, depth, self._gripped, failed,
+            self._topology, self.body.unbalanced(self._session),
+        )  # fmt: skip
 
 
 def placed(tool: RigidIndenter, centre: FloatArray, rotation: FloatArray | None = None) -> RigidIndenter:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass
 from html import escape
@@ -12,6 +13,9 @@ from naibu.viewer.json_values import jsonable
 
 Cell = str | float | int | None
 UNITS = {"mm": "mm", "mm2": "mm²", "mm3": "mm³", "deg": "degrees", "percent": "%"}  # by the last word of a key
+_LONG_TEXT = 60  # characters of a cell: in a narrow column it would be many lines high
+_ROUNDING = 1e-11  # of the largest number of a column
+_SUBSCRIPT = re.compile(r"\b([A-Z])_(x|y|z|in|R[XYZ])\b")  # of forces, moments and voltages
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,19 +65,32 @@ def table_html(table: Table, *, shortest: bool = False) -> str:
         Whether numbers are written as `cell_text` writes them with this option.
     """
     numeric = [_is_numeric(table, i) for i in range(len(table.columns))]
-    kind = [' class="num"' if n else "" for n in numeric]
-    head = "".join(f'<th scope="col"{k}>{escape(c)}</th>' for c, k in zip(table.columns, kind, strict=True))
+    wordy = [any(isinstance(value, str) and len(value) > _LONG_TEXT for value in column) for column in zip(*table.rows, strict=True)]
+    kind = [' class="num"' if n else ' class="words"' if w else "" for n, w in zip(numeric, wordy or numeric, strict=True)]
+    head = "".join(f'<th scope="col"{k}>{text_html(c)}</th>' for c, k in zip(table.columns, kind, strict=True))
     body = ""
+    finite = [[abs(v) for v in column if isinstance(v, float | int) and math.isfinite(v)] for column in zip(*table.rows, strict=True)]
+    largest = [max(column, default=0.0) for column in finite]
     for row in table.rows:
-        cells = [cell_text(value, shortest=shortest) for value in row]
+        cells = [cell_text(_rounded(value, most), shortest=shortest) for value, most in zip(row, largest, strict=True)]
         first = f'<th scope="row"{kind[0]}>{cells[0]}</th>' if cells else ""
         rest = "".join(f"<td{k}>{v}</td>" for v, k in zip(cells[1:], kind[1:], strict=True))
         body += f"<tr>{first}{rest}</tr>"
     inner = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-    note = f'<p class="note">{escape(table.note)}</p>' if table.note else ""
-    caption = f' <span class="what">{escape(table.caption)}</span>' if table.caption else ""
+    note = f'<p class="note">{text_html(table.note)}</p>' if table.note else ""
+    caption = f' <span class="what">{text_html(table.caption)}</span>' if table.caption else ""
     # the heading is outside of the scrolling part, so that a phone shows all of it
-    return f'<p class="caption">{escape(table.title)}{caption}</p>{scrollable(table.title, inner)}{note}'
+    return f'<p class="caption">{text_html(table.title)}{caption}</p>{scrollable(table.title, inner)}{note}'
+
+
+def _rounded(value: Cell, largest: float) -> Cell:
+    """Return 0 for what is but rounding beside the largest number of its column."""
+    return 0.0 if isinstance(value, float) and abs(value) < _ROUNDING * largest else value
+
+
+def text_html(text: str) -> str:
+    """Return text as HTML, with the subscripts of quantities: ``F_z`` and ``V_in`` are set as they are printed."""
+    return _SUBSCRIPT.sub(r"\1<sub>\2</sub>", escape(text))
 
 
 def cell_text(value: Cell, *, shortest: bool = False) -> str:
@@ -90,7 +107,7 @@ def cell_text(value: Cell, *, shortest: bool = False) -> str:
     if value is None:
         return "–"
     if isinstance(value, str):
-        return escape(value)
+        return text_html(value)
     if isinstance(value, int):
         return str(value).replace("-", "−")
     if not math.isfinite(value):

@@ -22,6 +22,7 @@ from naibu.identification.from_markers.specimen.parameter_names import young_mod
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.joint_estimate import JointEstimate, NormalEstimate, joint_estimate
 from naibu.io.files.atomic import write_atomically
+from naibu.viewer.cards import Card, cards_html
 from naibu.viewer.notebook import WrittenResult
 from naibu.viewer.page_frame import page_html
 from naibu.viewer.tables import Cell, Table, table_html
@@ -97,6 +98,7 @@ def identify_jointly(
     loaded: Sequence[str] = (),
     unit: str | None = None,
     spacing_mm: Sequence[float] | None = None,
+    node_spacing: Sequence[float] | None = None,
     element_size_mm: float = 0.0,
     overwrite: bool = False,
     progress: Progress | None = None,
@@ -111,7 +113,7 @@ def identify_jointly(
     ----------
     experiments, settings, states
         As for `naibu.workflows.identify`.
-    fields, mask, zones, zone_names, loaded, unit, spacing_mm
+    fields, mask, zones, zone_names, loaded, unit, spacing_mm, node_spacing
         As for `naibu.workflows.identify_fields`.
     out : path-like
         Folder for ``model.json``, ``joint.json`` and ``report.html``, and for the results of either kind in ``markers`` and ``fields``.
@@ -144,7 +146,7 @@ def identify_jointly(
         )
     from_fields = identify_fields(
         fields, mask=mask, zones=zones, zone_names=zone_names, known=of_fields, loaded=loaded, unit=unit, spacing_mm=spacing_mm,
-        element_size_mm=element_size_mm, out=folder / FIELDS, overwrite=overwrite, progress=progress,
+        node_spacing=node_spacing, element_size_mm=element_size_mm, out=folder / FIELDS, overwrite=overwrite, progress=progress,
     )  # fmt: skip
     from_markers = identify(
         loaded_experiments, known=of_markers, settings=settings, states=states, out=folder / MARKERS, overwrite=overwrite, progress=progress
@@ -223,6 +225,18 @@ def _in_words(joint: JointEstimate, parts: Sequence[NormalEstimate]) -> tuple[st
     )
 
 
+def _cards(result: JointIdentification) -> tuple[Card, ...]:
+    """Return what both kinds of data tell of every parameter that both or either determines."""
+    absolute = result.model.markers.known_materials.scale_is_absolute
+    cards = []
+    for name, *values in result.table.rows:
+        estimate, low, high = values[6:]
+        if isinstance(estimate, float):
+            unit = " kPa" if absolute and str(name).endswith("modulus") else ""
+            cards.append(Card(str(name), f"{estimate:.3g}{unit}", f"{low:.3g} to {high:.3g} (95 %), from markers and fields"))
+    return tuple(cards)
+
+
 def _written(folder: Path, result: JointIdentification) -> list[Path]:
     table = result.table
     numbers = {
@@ -240,8 +254,9 @@ def _written(folder: Path, result: JointIdentification) -> list[Path]:
     }
     warning = "" if result.usable else "<p><strong>A model does not explain the data: not to be used.</strong></p>"
     links = f'<p><a href="{MARKERS}/report.html">Results from markers</a>, <a href="{FIELDS}/report.html">results from fields</a></p>'
-    main = warning + "".join(f"<p>{escape(line)}</p>" for line in result.notes) + table_html(table) + links
-    page = page_html("Moduli from markers and displacement fields", "", main, f"naibu {escape(__version__)}")
+    main = "".join(f"<p>{escape(line)}</p>" for line in result.notes) + table_html(table) + links
+    header = cards_html(_cards(result)) + warning
+    page = page_html("Moduli from markers and displacement fields", header, main, f"naibu {escape(__version__)}")
     files = [
         write_joint_model(folder, result.model),
         write_atomically(folder / "joint.json", json.dumps(numbers, indent=1, ensure_ascii=False) + "\n"),

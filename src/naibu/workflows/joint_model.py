@@ -118,6 +118,13 @@ def _slope_of_theta(theta: FloatArray) -> FloatArray:
     return np.block([[np.eye(k), np.diag(1.0 / (3.0 * ratio + 1.0))], [np.zeros((k, k)), np.diag(-3.0 * ratio / (3.0 * ratio + 1.0))]])
 
 
+def _theta_of(scales: FloatArray) -> FloatArray:
+    """Return ln mu and ln(kappa / mu) (2 k,) of ln E and ln(1 - 2 nu) (2 k,) of k zones."""
+    young, incompressibility = scales.reshape(2, -1)
+    ratio = np.exp(-incompressibility) - 1.0 / 3.0
+    return np.concatenate([young + np.log((3.0 * ratio + 1.0) / (9.0 * ratio)), np.log(ratio)])
+
+
 def _finite(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return what data tell nothing of, and the covariance of the rest."""
     lost = np.isinf(np.diag(covariance))
@@ -168,9 +175,14 @@ def joint_model(
     )
     assert found.uncertainty is not None  # `told_by_fields` refuses it
     of_theta, own_fields = _finite(found.uncertainty.covariance)[1], told_by_fields(found)
-    theta, spread = moved_along(found.theta, of_theta, _slope_of_theta(found.theta), own_fields, joint.together)
+    # in the scales of the joint estimate, which a linear step in theta would miss
+    slope = _slope_of_theta(found.theta)
+    scales, spread = moved_along(own_fields.values, slope @ of_theta @ slope.T, np.eye(len(slope)), own_fields, joint.together)
+    theta = _theta_of(scales)
+    back = np.linalg.inv(_slope_of_theta(theta))
+    reservation = _both(fields.reservation, *doubts)
     of_fields = replace(
-        fields, theta=theta, covariance=None if fields.covariance is None else spread, reservation=_both(fields.reservation, *doubts)
+        fields, theta=theta, covariance=None if fields.covariance is None else back @ spread @ back.T, reservation=reservation
     )
     return JointModel(of_markers, of_fields, tuple(doubts), tuple(notes))
 

@@ -16,9 +16,12 @@ from naibu.core.errors import InputError
 from naibu.core.progress import Progress
 from naibu.io.files.atomic import write_atomically
 from naibu.reproduction.chapters import CHAPTERS, PROCESSOR_S
-from naibu.viewer.chapter import Chapter
-from naibu.viewer.chapter_page import chapter_html, chapter_numbers_text, write_chapter
+from naibu.viewer.cards import cards_html
+from naibu.viewer.chapters.chapter import Chapter
+from naibu.viewer.chapters.chapter_page import chapter_html, chapter_numbers_text, write_chapter
+from naibu.viewer.chapters.comparisons import Comparison, comparison_cards, comparison_table
 from naibu.viewer.page_frame import page_html
+from naibu.viewer.tables import scrollable, table_html
 from naibu.workflows.parallel.run_tasks import run_tasks
 from naibu.workflows.parallel.task import Outcome, Task
 from naibu.workflows.parallel.worker_count import Workers
@@ -186,15 +189,17 @@ def _finished(folder: Path, name: str, seed: int) -> dict[str, Any] | None:
 
 
 def _index(done: list[ReproducedChapter], seed: int) -> str:
+    numbers = {c.name: json.loads(c.numbers.read_text(encoding="utf-8")) for c in done}
+    found = {name: tuple(Comparison(**each) for each in content.get("comparisons", ())) for name, content in numbers.items()}
+    cards = cards_html(comparison_cards([each for comparisons in found.values() for each in comparisons]))
     links = "".join(f'<li><a href="#{c.name}">{escape(c.title)}</a></li>' for c in done)
-    sections = "\n".join(_entry(c) for c in done)
+    sections = "\n".join(_entry(c, found[c.name], numbers[c.name]["tables"]) for c in done)
     contents = f'<nav aria-label="Contents"><ul>{links}</ul></nav>'
-    return page_html("The 2008 report, reproduced", contents, sections, f"naibu {__version__}, seed {seed}.")
+    return page_html("The 2008 report, reproduced", cards + contents, sections, f"naibu {__version__}, seed {seed}.")
 
 
-def _entry(chapter: ReproducedChapter) -> str:
-    """Return the section of a chapter: its link, its tables, and the notes that tell of assumptions, misprints and differences."""
-    tables = json.loads(chapter.numbers.read_text(encoding="utf-8"))["tables"]
+def _entry(chapter: ReproducedChapter, comparisons: tuple[Comparison, ...], tables: list[dict[str, Any]]) -> str:
+    """Return the section of a chapter: its link, what agrees, and its tables with the notes that tell of assumptions and misprints."""
     rows = "".join(
         f"<tr><td>{escape(t['section'])}</td><td>{escape(t['title'])}</td><td>{escape(t['note'] or t['caption'])}</td></tr>" for t in tables
     )
@@ -203,5 +208,7 @@ def _entry(chapter: ReproducedChapter) -> str:
         f'<section id="{chapter.name}" class="long" aria-labelledby="h-{chapter.name}">'
         f'<h2 id="h-{chapter.name}">{escape(chapter.title)}</h2>'
         f'<p><a href="{chapter.page.name}">Page with all tables and figures</a>, <a href="{chapter.numbers.name}">numbers</a></p>'
-        f"<table>{head}<tbody>{rows}</tbody></table></section>"
+        + (table_html(comparison_table(comparisons)) if comparisons else "")
+        + f"<details><summary>All {len(tables)} tables</summary>"
+        + f"{scrollable('Tables of ' + chapter.title, f'<table>{head}<tbody>{rows}</tbody></table>')}</details></section>"
     )

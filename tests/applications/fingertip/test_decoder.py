@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from naibu.applications.fingertip._decoder_kernels import LOG_POWERS, RATIO_POWERS, TERMS, terms
+from naibu.applications.fingertip._decoder_kernels import LOG_POWERS, RATIO_POWERS, TERMS, TILT_OUT, terms
 from naibu.applications.fingertip.decoder import ForceDecoder, Training, directions, train_decoder, true_contact
 from naibu.applications.fingertip.fingertip import Fingertip, FingertipResolution
 from naibu.applications.fingertip.offset import OffsetTracker
@@ -51,6 +53,16 @@ def test_readings_beyond_the_training_are_not_answered(decoder: ForceDecoder, ch
     found = decoder.decode(loads * chain.volts_per_load)
     assert found.answered.tolist() == [False] * 4 + [True]
     assert found.tilt_deg[-1] == 0.0 and np.isnan(found.position_mm[0]).all()
+
+
+def test_polynomials_that_turn_the_finger_over_are_no_answer(decoder: ForceDecoder) -> None:
+    low, high, ratio = decoder.limits
+    load = np.array([[np.sqrt(low * high), 0.0, 0.9 * ratio * np.sqrt(low * high) * decoder.unit[1]]])
+    assert decoder.decode_loads(load)[0, TILT_OUT] > 0.0
+    for row in (1, 2):  # of the tilt, of the contact's angle
+        steeper = decoder.coefficients.copy()
+        steeper[row] *= 20.0
+        assert np.isnan(replace(decoder, coefficients=steeper).decode_loads(load)).all()
 
 
 def test_the_kernel_evaluates_the_polynomials_and_propagates_their_derivatives(decoder: ForceDecoder) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from naibu.applications.ischemia.layer_identification import identify_layers
+from naibu.applications.ischemia.layer_identification import SEARCHED, identify_layers
 from naibu.applications.ischemia.layered_response import LayeredModes, simulate_skin
 from naibu.applications.ischemia.skin import SkinLayer, SkinPatch, SurfaceLoad, meshed
 from naibu.core.errors import InputError
@@ -45,6 +45,27 @@ def test_the_layers_are_found_and_what_is_not_determined_is_said(modes: LayeredM
     assert (0, "series_viscosity") not in determined  # the soft layer hardly flows within two seconds
 
 
+def test_a_record_under_the_load_only_leaves_the_flow_undetermined(modes: LayeredModes, record: np.ndarray) -> None:
+    under = TIMES < 0.4
+    measured = record[under] + 0.02 * np.random.default_rng(5).standard_normal(int(under.sum()))
+    found = identify_layers(modes, LOAD, TIMES[under], measured, 0.02, known=[(0, "voigt_viscosity"), (1, "voigt_viscosity")])
+    determined = {(p.layer, p.name): p.determined for p in found.parameters}
+    assert determined[1, "young_modulus"]
+    assert not determined[0, "series_viscosity"] and not determined[1, "series_viscosity"]
+    truth = {(i, n): getattr(m, n) for i, m in enumerate((LOWER, UPPER)) for n in ("young_modulus", "voigt_viscosity", "series_viscosity")}
+    assert all(p.low < truth[p.layer, p.name] < p.high for p in found.parameters)
+
+
+def test_an_end_of_the_range_that_is_searched_determines_nothing(modes: LayeredModes) -> None:
+    # skin far stiffer than any that the search tries
+    single = LayeredModes.of(meshed(SkinPatch((SkinLayer(1.0, UPPER),), 4.0), 0.5, across=8, upwards=6))
+    stiff = replace(UPPER, young_modulus=1e2 * SEARCHED * UPPER.young_modulus)
+    measured = simulate_skin(single, (stiff,), LOAD, TIMES).indentation
+    (found,) = identify_layers(single, LOAD, TIMES, measured, 1e-4, known=[(0, "voigt_viscosity"), (0, "series_viscosity")]).parameters
+    assert found.value == pytest.approx(SEARCHED * UPPER.young_modulus) and found.high < 4.0 * found.low
+    assert not found.determined
+
+
 def test_a_record_of_another_process_is_not_explained(modes: LayeredModes, record: np.ndarray) -> None:
     # a load that fades away slowly, as an air jet whose pressure remains for a while, seen by a precise instrument
     fading = record + 0.4 * np.where(TIMES > 0.47, np.exp(-(TIMES - 0.47) / 0.05), 0.0) * np.sin(30.0 * TIMES)
@@ -67,6 +88,7 @@ def test_one_layer_cannot_stand_for_two(modes: LayeredModes, record: np.ndarray)
         ({"indentation_mm": np.full_like(TIMES, np.nan)}, "finite numbers"),
         ({"known": [(2, "young_modulus")]}, "layers are 0 to 1"),
         ({"start": (UPPER,)}, "for each of the 2 layers, not 1"),
+        ({"indentation_mm": 0.1 * np.random.default_rng(2).standard_normal(len(TIMES))}, "lies within its noise"),
     ],
 )
 def test_bad_input_is_named(changes: dict[str, object], what: str, modes: LayeredModes) -> None:

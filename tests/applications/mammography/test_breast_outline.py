@@ -47,6 +47,18 @@ def test_points_in_a_polygon() -> None:
     assert inside_polygon(square, [[1.0, 1.0], [3.0, 1.0], [1.0, -0.1]]).tolist() == [True, False, False]
 
 
+def test_a_straight_part_does_not_cross_itself_by_rounding() -> None:
+    """Four points along one edge of a mesh: rounding, of 1e-16 mm², puts the ends of the outer two parts on either side of each other."""
+    edge = [
+        [76.17732338378659, -3.6772473371173264],
+        [76.42188092287677, 0.8547918854473675],
+        [76.61227233291916, 4.383046794952934],
+        [76.74836266871793, 6.905016642811887],
+    ]
+    outline = breast_outline([[0.0, -100.0], [60.0, -60.0], *edge, [60.0, 60.0], [0.0, 100.0]])
+    assert outline.depth_mm == pytest.approx(edge[-1][0])
+
+
 @pytest.mark.parametrize(
     ("points", "told"),
     [

@@ -70,6 +70,13 @@ def test_an_understated_noise_widens_the_interval_and_is_no_fault_of_the_model()
     assert np.ptp(bold.intervals()[0]) == pytest.approx(np.ptp(honest.intervals()[0]), rel=0.15)
 
 
+def test_noise_that_hides_the_deformation_explains_little() -> None:
+    """Half of the push in noise, stated as nearly so much."""
+    found = measured(sd_mm=2.0, extra=lambda points: 2.3 * np.random.default_rng(8).standard_normal(points.shape)).verdict
+    assert found is not None and found.noise_factor < 1.25 and found.unexplained > 0.25
+    assert found.explanation is Explanation.IN_PART
+
+
 def test_errors_that_neighbours_share_widen_the_interval() -> None:
     """Waves of 12 mm, as large as the noise: neighbouring points err alike."""
 
@@ -113,3 +120,18 @@ def test_finite_strain_begins_though_little_is_measured_near_corners() -> None:
     found = measured(law="neo_hookean")
     assert found.status.ok and found.young_modulus[0] == pytest.approx(5.0, rel=0.1)
     assert any("small strain" in line for line in found.identifiability)
+
+
+def test_points_that_hold_the_misfit_are_named() -> None:
+    """Four per cent of the points are wrong by a quarter of the push; a wrong Poisson's ratio is spread over all."""
+
+    def wrong(points: np.ndarray) -> np.ndarray:
+        return np.where(np.arange(len(points))[:, None] % 25 == 0, (1.0, -1.0, 1.0), 0.0)
+
+    bad = measured(cells=4, extra=wrong).verdict
+    body, _ = solved()
+    mesh, _ = body.model(4, "hexahedron")
+    other = measured(cells=4, zones=Zones.of(mesh, known={"known": (10.0, 0.1)})).verdict
+    assert bad is not None and bad.explanation is not Explanation.EXPLAINED
+    assert "75 % of the misfit is that of" in bad.reasons[0]
+    assert other is not None and "of the points" not in " ".join(other.reasons)

@@ -1,6 +1,7 @@
 """Platen positions from the outermost markers, on gels whose plates stand elsewhere than stated."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,14 +9,16 @@ import pytest
 from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, Loading
 from naibu.core.markers import Markers
+from naibu.core.parameters import ParameterSet
 from naibu.identification.from_markers.calibration import initial_parameters
 from naibu.identification.from_markers.known_materials import KnownMaterials
-from naibu.identification.from_markers.observations import NoiseModel
+from naibu.identification.from_markers.observations import NoiseModel, SamePath
 from naibu.identification.from_markers.specimen.parameter_names import friction, poisson_ratio, young_modulus
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings, specimen
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.platen_position import Gauge, outermost_markers
 from naibu.identification.prediction.prediction import predict_state
+from naibu.mechanics.finite_strain.statics import LoadState
 from naibu.validation.specimens.marker_phantoms import Scanner, box_experiment, virtual_specimen
 
 TRUTH = {young_modulus("gel"): 200.0, poisson_ratio("gel"): 0.48, friction("gel", "table"): 0.2, friction("gel", "acrylic"): 0.3}
@@ -51,6 +54,31 @@ def test_the_distance_of_side_plates_follows_from_the_outermost_columns(squeezed
     # a distance from markers is known better than a stated one, and the error of the stated one is within its interval
     assert np.median(found.sd_model_mm) < 0.5 * np.median(stated.sd_model_mm)
     assert np.nanmean(np.abs(stated.residual) < 1.96 * stated.sd_mm) > 0.95
+
+
+def test_a_path_to_another_end_is_that_of_a_solution_from_rest(squeezed: Experiment) -> None:
+    model = model_of(squeezed)
+    found = predict_state(model, squeezed, "pressed", heights_from_markers=True)  # from the path to the stated distance
+    given = predict_state(model, squeezed, "pressed", platen_position_mm=found.platen_position_mm)
+    np.testing.assert_allclose(found.points, given.points, atol=0.01)
+
+
+def test_states_of_a_path_are_met_where_the_body_was_in_them() -> None:
+    rate = np.array([[1.0, 0.0, -2.0]])
+    states = tuple(LoadState(x, x * rate, (), (np.full(2, 10.0 * x),)) for x in (0.0, 0.25, 0.5, 0.98, 1.0))
+    solution = SimpleNamespace(states=states)
+    near = [SamePath(SimpleNamespace(solution=solution), ParameterSet.of([]), reached=x) for x in (0.8, 0.99, 1.25, 1.0)]
+    assert [[load for load, _ in n.warm_start({})] for n in near] == [
+        pytest.approx([0.2, 0.4, 0.784, 0.8]),  # the rest of the way is not known
+        pytest.approx([0.2475, 0.495, 1.0]),
+        pytest.approx([0.3125, 0.625, 1.0]),
+        pytest.approx([0.25, 0.5, 1.0]),
+    ]
+    for n in near:
+        for load, displacement in n.warm_start({}):
+            np.testing.assert_allclose(displacement, load / n.reached * rate)
+        assert n.stiffness[1.0] == (pytest.approx(np.full(2, 10.0)),)
+        assert n.stiffness[0.25 * n.reached] == (pytest.approx(np.full(2, 2.5)),)
 
 
 def test_columns_without_known_markers_give_way_to_the_next_ones(squeezed: Experiment) -> None:

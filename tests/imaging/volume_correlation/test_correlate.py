@@ -14,6 +14,7 @@ from scipy import ndimage
 from naibu.core.errors import InputError
 from naibu.core.rigid_transform import rotation_matrix
 from naibu.core.volume import Volume
+from naibu.imaging.displacement.strain import green_lagrange_strain_of
 from naibu.imaging.measure_displacement import measure_displacement
 from naibu.imaging.preprocessing.object_mask import object_mask
 from naibu.imaging.preprocessing.resampling import positions
@@ -241,6 +242,18 @@ def test_the_covariance_covers_the_truth() -> None:
     assert 0.9 <= covered.mean() <= 0.999
     # and is no wider than it must be: errors are a fair fraction of it
     assert np.sqrt((e**2).sum() / np.einsum("nii->", found.covariance_at(inside))) > 0.3
+
+
+def test_the_standard_deviation_of_strain_covers_the_truth_and_is_not_far_from_its_error() -> None:
+    _, _, found = waved()
+    x, h = positions(found.volume), 1e-4
+    move = waves()[0]
+    gradient = np.stack([(move(x + h * e) - move(x - h * e)) / (2 * h) for e in np.eye(3)], axis=-1)
+    inside = found.valid & (depth(x) > 2.0)
+    off = green_lagrange_strain_of(found.gradient()[inside]) - green_lagrange_strain_of(gradient[inside])
+    ratio = np.sqrt((off**2).mean(axis=(-2, -1))) / found.strain_sd()[inside]
+    assert 0.4 < np.sqrt((ratio**2).mean()) < 1.2
+    assert np.isnan(found.strain_sd()[~found.valid]).all()
 
 
 def test_gain_and_offset_of_a_scan_do_not_matter() -> None:

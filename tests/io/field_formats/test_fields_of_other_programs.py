@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import h5py
 import nibabel
 import numpy as np
 import pytest
+import tifffile
 from scipy.io import savemat
 
 from naibu.core.errors import InputError
@@ -162,8 +164,70 @@ def test_spam_counts_in_voxels_and_marks_what_converged(tmp_path: Path) -> None:
     np.testing.assert_allclose(field.points, POINTS * (0.1, 0.1, 0.4))
     np.testing.assert_allclose(field.vectors[:2], MOVED[:2] * (0.1, 0.1, 0.4))
     assert field.valid.tolist() == [True, True, False]
-    with pytest.raises(InputError, match=r"take the table beside them \(\.tsv\)"):
-        read_field(tmp_path / "01-02-ldic-Zdisp.tif")
+    guess = [header, *("\t".join(f"{v:.7f}" for v in [*row[:-2], 1, row[-1]]) for row in rows)]  # spam-pixelSearch, spam-passPhiField
+    (tmp_path / "guess.tsv").write_text("\n".join(guess) + "\n")
+    with pytest.raises(InputError, match=r"no node has the returnStatus 2.*take what spam-ldic writes"):
+        read_field(tmp_path / "guess.tsv", spacing_mm=(0.1, 0.1, 0.4))
+
+
+def spam_image(file: Path, values: np.ndarray) -> None:
+    """Write one component, by the call that SPAM makes."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        tifffile.imwrite(file, values.astype("<f4"))
+
+
+def spam_images(folder: Path, scan: tuple[int, int, int], ns: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Write what ``spam-ldic -ns Z Y X -tif`` writes of a scan of (z, y, x) voxels, and return nodes and displacements, x, y, z, voxels.
+
+    Nodes as by its ``makeGrid``; displacements differ along all axes, so that no exchange goes unnoticed. Four nodes along x are marked
+    as colours by tifffile.
+    """
+    nodes = np.mgrid[ns[0] : scan[0] : ns[0], ns[1] : scan[1] : ns[1], ns[2] : scan[2] : ns[2]]
+    z, y, x = nodes
+    moved = {"X": 0.01 * x + 0.001 * y, "Y": 0.02 * y - 0.003 * z, "Z": 0.05 * z + 0.002 * x}
+    status = np.full(z.shape, 2.0)
+    status[0, 1, 2] = -1
+    for axis, values in moved.items():
+        spam_image(folder / f"01-02-ldic-{axis}disp.tif", values)
+    spam_image(folder / "01-02-ldic-returnStatus.tif", status)
+    return np.stack([n.ravel() for n in (x, y, z)], axis=1), np.stack([moved[a].ravel() for a in "XYZ"], axis=1)
+
+
+def test_images_of_spam_lie_at_the_nodes_of_its_grid(tmp_path: Path) -> None:
+    nodes, moved = spam_images(tmp_path, (31, 45, 50), (10, 15, 12))
+    size = np.array([0.1, 0.2, 0.4])
+    known = {"spacing_mm": tuple(size), "node_spacing": (12, 15, 10)}
+    field = read_field(tmp_path / "01-02-ldic-Zdisp.tif", **known)
+    np.testing.assert_allclose(field.points, nodes * size)
+    good = np.delete(np.arange(len(nodes)), 1 * 4 + 2)  # the node of z 10, y 30, x 36
+    assert field.valid.sum() == len(good) and field.valid[good].all()
+    np.testing.assert_allclose(field.vectors[good], (moved * size)[good], rtol=1e-6)
+    np.testing.assert_array_equal(read_field(tmp_path / "01-02-ldic-Xdisp.tif", **known).vectors, field.vectors)
+    (tmp_path / "01-02-ldic-returnStatus.tif").unlink()  # as spam-filterPhiField, which writes none
+    assert read_field(tmp_path / "01-02-ldic-Ydisp.tif", **known).valid.all()
+
+
+def test_images_of_spam_that_do_not_tell_enough(tmp_path: Path) -> None:
+    spam_images(tmp_path, (31, 45, 50), (10, 15, 12))
+    one, known = tmp_path / "01-02-ldic-Zdisp.tif", {"spacing_mm": (1.0, 1.0, 1.0), "node_spacing": (12, 15, 10)}
+    with pytest.raises(InputError, match=r"give spacing_mm, the size of a voxel.* and node_spacing, the voxels from node to node"):
+        read_field(one)
+    with pytest.raises(InputError, match="node_spacing is 0; give a number from 1 to 10000 voxels"):
+        read_field(one, spacing_mm=(1.0, 1.0, 1.0), node_spacing=(0.0, 15, 10))
+    with pytest.raises(InputError, match="node_spacing goes with TIFF files of SPAM"):
+        read_field(tmp_path / "field.h5", node_spacing=(12, 15, 10))
+    with pytest.raises(InputError, match=r"is one of SPAM's -Zdisp\.tif"):
+        read_field(tmp_path / "01-02-ldic-returnStatus.tif", **known)
+    spam_image(tmp_path / "01-02-ldic-returnStatus.tif", np.ones((3, 2, 4)))
+    with pytest.raises(InputError, match="no node has the returnStatus 2"):
+        read_field(one, **known)
+    spam_image(tmp_path / "01-02-ldic-returnStatus.tif", np.full((3, 2, 5), 2.0))
+    with pytest.raises(InputError, match=r"must have one shape: .*returnStatus.tif \(3, 2, 5\)"):
+        read_field(one, **known)
+    (tmp_path / "01-02-ldic-Zdisp.tif").unlink()
+    with pytest.raises(InputError, match="SPAM leaves out Z of images in the plane"):
+        read_field(tmp_path / "01-02-ldic-Xdisp.tif", **known)
 
 
 def test_aldvc_counts_from_one_node_after_the_other(tmp_path: Path) -> None:

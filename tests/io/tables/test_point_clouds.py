@@ -98,3 +98,12 @@ def test_what_is_no_cloud_is_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=words):
             read_point_cloud(tmp_path / name, **arguments)  # type: ignore[arg-type]
+
+
+def test_copies_of_a_point_are_left_out_and_counted(tmp_path: Path) -> None:
+    twice = np.concatenate([POINTS[:2], POINTS])
+    cloud = read_point_cloud(written(tmp_path / "twice.csv", twice))
+    assert cloud.copies == 2
+    np.testing.assert_array_equal(cloud.points, POINTS[[0, 1, 2, 3, 4, 5, 6]])
+    np.testing.assert_array_equal(cloud.rows, [1, 2, 5, 6, 7, 8, 9])
+    assert read_point_cloud(written(tmp_path / "once.csv")).copies == 0

@@ -11,7 +11,7 @@ from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.mechanics.finite_elements.assembly import Assembler, body_force
 from naibu.mechanics.finite_elements.elements import TETRAHEDRA_PER_PATCH, elements
-from naibu.mechanics.finite_elements.hyperelasticity import LAWS
+from naibu.mechanics.finite_elements.hyperelasticity import LAWS, material
 from naibu.mechanics.linear_algebra.block_matrix import block_pattern
 from naibu.meshing.primitives import box
 from naibu.meshing.quality import signed_volumes
@@ -67,6 +67,19 @@ def test_patch_uniform_deformation_gives_uniform_stress(law, kind, formulation):
     assert smallest == pytest.approx(np.linalg.det(f))
     if law != "linear_elastic":
         assert energy == pytest.approx(float(principal_energy(m, np.linalg.svd(f)[1])) * body.elements.volume)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("law", ["neo_hookean_isochoric", "yeoh"])
+def test_laws_that_coincide_are_assembled_alike(law, kind):
+    """A Mooney-Rivlin solid without its second part is neo-Hookean, and so is Yeoh's with one; different kernels compute them."""
+    mesh, moduli = distorted(kind), {"young_modulus": 20.0, "poisson_ratio": 0.49}
+    u = shaken(mesh.points, 3, 0.1)
+    energy, force, blocks, smallest = assembler(mesh, material(law, **moduli)).evaluate(u)
+    others = assembler(mesh, material("mooney_rivlin", **moduli)).evaluate(u)
+    assert (energy, smallest) == (pytest.approx(others[0]), pytest.approx(others[3]))
+    np.testing.assert_allclose(force, others[1], rtol=0, atol=1e-11 * np.abs(others[1]).max())
+    np.testing.assert_allclose(blocks, others[2], rtol=0, atol=1e-11 * np.abs(others[2]).max())
 
 
 @pytest.mark.parametrize(("kind", "formulation"), CASES)

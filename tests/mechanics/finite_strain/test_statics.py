@@ -321,3 +321,26 @@ def test_a_solve_near_a_known_one_gives_up_where_it_spends_more_than_its_share()
     part = solve(body, settings=SolverSettings(max_total_iterations=allowed), warm_start=poor, throw=False)
     assert part.status is Status.ITERATION_LIMIT and part.states[-1].load > 0.0
     assert allowed * (part.states[-1].load + AHEAD) <= part.iterations < allowed
+
+
+def test_a_loose_tolerance_on_the_way_moves_the_end_by_less_than_itself():
+    mesh, body = pressed()
+    loads = [(k / 8.0, np.zeros(mesh.points.shape)) for k in range(1, 9)]  # both ways in the same load steps
+    exact = solve(body, settings=SolverSettings(tolerance=1e-9), warm_start=loads)
+    quick = solve(body, settings=SolverSettings(tolerance=1e-9, path_tolerance=1e-3), warm_start=loads)
+    assert [s.load for s in quick.states] == [s.load for s in exact.states]
+    assert quick.residual <= 1e-9
+    assert quick.iterations < exact.iterations
+    assert relative(quick.displacement, exact.displacement) < 1e-3
+
+
+def test_a_path_with_known_penalties_is_followed_again_without_raising_them():
+    body = pressed()[1]
+    soft = body.with_changes(contacts=tuple(replace(c, normal_stiffness=0.002 * c.normal_stiffness) for c in body.contacts))
+    found = solve(soft, settings=SolverSettings(penetration=1e-3))
+    known = {s.load: s.normal_stiffness for s in found.states[1:]}
+    assert any((known[1.0][k] > c.normal_stiffness).any() for k, c in enumerate(soft.contacts))
+    path = [(s.load, s.displacement) for s in found.states[1:]]
+    again = solve(soft, settings=SolverSettings(penetration=1e-3), warm_start=path, stiffness=known)
+    assert again.iterations <= len(path)
+    np.testing.assert_allclose(again.displacement, found.displacement, atol=1e-5)

@@ -1,5 +1,6 @@
 """Linear solvers: they agree with each other and with dense algebra, refuse singular systems, and can be reused."""
 
+import os
 import subprocess
 import sys
 
@@ -174,6 +175,43 @@ def test_a_solver_left_at_exit_makes_no_noise():
     assert out.stderr == ""
 
 
+FEWER_THREADS = """
+import threading
+import numpy as np
+import scipy.sparse as sp
+from naibu.mechanics.linear_algebra.direct import PardisoSolver, use_threads
+
+line = sp.diags([-1.0, 2.0, -1.0], [-1, 0, 1], shape=(11, 11))
+grid = sp.kronsum(sp.kronsum(line, line), line)
+matrix = sp.bsr_matrix(sp.kron(grid, np.eye(3) + 0.1) + 0.01 * sp.eye(3 * 11**3), blocksize=(3, 3))
+
+
+def fewer():
+    use_threads(1)
+    for _ in range(3):
+        solver.factorize(matrix)
+        assert np.abs(matrix @ solver.solve(np.ones(matrix.shape[0])) - 1).max() < 1e-2
+
+
+for _ in range(10):
+    solver = PardisoSolver(matrix, symmetric=True, single_precision=True)
+    use_threads(2)
+    solver.factorize(matrix)
+    thread = threading.Thread(target=fewer)
+    thread.start()
+    thread.join()
+print("done")
+"""
+
+
+@needs_pardiso
+def test_pardiso_may_factorize_with_fewer_threads_than_before():
+    """It analysed the pattern for two threads; factorized by one, solutions were wrong or the process ended."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("OMP_", "MKL_"))}
+    result = subprocess.run([sys.executable, "-c", FEWER_THREADS], capture_output=True, text=True, timeout=120, env=environment)
+    assert (result.returncode, result.stdout, result.stderr) == (0, "done\n", "")
+
+
 @needs_pardiso
 def test_recycled_cholesky_serves_other_tangents_and_many_columns():
     made = []
@@ -247,7 +285,7 @@ def test_minimal_residuals_find_the_solution_in_as_many_iterations_as_there_are_
 
 @pytest.mark.parametrize("name", ["recycled_cholesky", "multigrid", "petsc"])
 def test_iterative_solvers_refuse_unsymmetric_matrices(name):
-    with pytest.raises(InputError, match="needs a symmetric matrix"):
+    with pytest.raises(InputError, match="needs a symmetric matrix; with friction use 'recycled_lu'"):
         choose_solver(unsymmetric(), MESH.points, CONSTRAINED, symmetric=False, solver=name)
 
 

@@ -146,7 +146,9 @@ def test_large_bodies_are_solved_by_multigrid(monkeypatch, with_mkl: bool) -> No
     exact = LinearBody.of(mesh).solve(30.0, 10.0, support, weight)
     made = []
     monkeypatch.setattr(solver_selection, "DIRECT_LIMIT", 1000)
-    monkeypatch.setattr(solver_selection, "MultigridSolver", lambda *given: made.append(MultigridSolver(*given)) or made[-1])
+    monkeypatch.setattr(
+        solver_selection, "MultigridSolver", lambda *given, **options: made.append(MultigridSolver(*given, **options)) or made[-1]
+    )
     found = LinearBody.of(mesh).solve(30.0, 10.0, support, weight)
     assert len(made) == 1
     assert found == pytest.approx(exact, abs=1e-6 * np.abs(exact).max())

@@ -27,12 +27,12 @@ from naibu.reproduction.chapter1.matching import (
     under_noise,
 )
 from naibu.reproduction.chapter1.tables import chapter1
-from naibu.viewer.chapter import Chapter
-from naibu.viewer.chapter_page import chapter_numbers, write_chapter
+from naibu.viewer.chapters.chapter import Chapter
+from naibu.viewer.chapters.chapter_page import chapter_numbers, write_chapter
 from naibu.viewer.tables import Table
 
 PAPER = {t["id"]: t["rows"] for t in datasets.paper_tables()["tables"]}
-SIZES = {"pixels": 96, "slices": 15, "plane_points": (100, 120), "space_points": (300, 900), "draws": 1}
+SIZES = {"pixels": 96, "slices": 15, "plane_points": (100, 120), "space_points": (300, 900), "draws": 1, "paper_slices": (8,)}
 within_leg = st.tuples(*[st.floats(-38.0, 38.0)] * 2, st.floats(-28.0, 28.0))
 
 

@@ -11,6 +11,7 @@ from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDispla
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.mechanics.small_strain.rheology import three_element
+from naibu.reproduction.agreement.read_tables import Tables
 from naibu.reproduction.chapter2.simulations import NAMES, SQUARES, agar_block, agar_block_3d, agar_under_bar, pushed_square, run
 from naibu.reproduction.chapter2.tables import (
     COMPARED,
@@ -21,8 +22,9 @@ from naibu.reproduction.chapter2.tables import (
     marker_errors,
     ultrasound_trial,
 )
+from naibu.reproduction.chapters import AGREEMENT
 from naibu.validation.analytic.viscoelastic import ramp_stress, released_strain, residual_strain
-from naibu.viewer.chapter import Chapter
+from naibu.viewer.chapters.chapter import Chapter
 from naibu.viewer.tables import Table
 
 
@@ -130,6 +132,7 @@ def test_fitted_push_finds_the_push() -> None:
 
 def test_tables_show_what_they_say(chapter: Chapter) -> None:
     titles = ["Three squares", "Agar under a weight", "What the ultrasound markers determine of the agar", "Agar under a bar"]
+    titles += ["One cross-section every 0.6 s"]
     assert [s.title.split(",")[0] for s in chapter.sections] == titles
     for section in chapter.sections:
         for t in section.tables:
@@ -176,3 +179,8 @@ def test_the_markers_tell_the_poisson_ratio_and_not_the_moduli(chapter: Chapter)
         assert low < estimate < high
     text = " ".join(next(s for s in chapter.sections if found in s.tables).paragraphs)
     assert "series_viscosity" in text and "do not determine" in text
+
+
+def test_statements_of_the_report_find_their_tables(chapter: Chapter) -> None:
+    found = AGREEMENT["ch2"](Tables(chapter.sections))
+    assert len(found) >= 4 and {"agrees"} <= {c.verdict for c in found}

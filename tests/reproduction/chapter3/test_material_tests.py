@@ -18,7 +18,7 @@ from naibu.reproduction.chapter3.material_tests import (
     table_3_5,
 )
 from naibu.reproduction.chapter3.poisson_readings import GELS, constrained_block, marker_ratios, matching_pairs, readings
-from naibu.viewer.chapter import Section
+from naibu.viewer.chapters.chapter import Section
 
 PAPER = {t["id"]: t["rows"] for t in datasets.paper_tables()["tables"]}
 

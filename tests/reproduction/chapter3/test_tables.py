@@ -26,8 +26,8 @@ from naibu.reproduction.chapter3.experiment import EXPERIMENT, experiment_sectio
 from naibu.reproduction.chapter3.noise import noise_section, noise_study
 from naibu.reproduction.chapter3.square import error_accumulation, square_section
 from naibu.reproduction.chapter3.tables import chapter3
-from naibu.viewer.chapter import Section
-from naibu.viewer.chapter_page import write_chapter
+from naibu.viewer.chapters.chapter import Section
+from naibu.viewer.chapters.chapter_page import write_chapter
 from naibu.viewer.tables import Table
 
 PAPER = {t["id"]: t["rows"] for t in datasets.paper_tables()["tables"]}

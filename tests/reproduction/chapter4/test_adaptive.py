@@ -6,8 +6,10 @@ import pytest
 from naibu.meshing.primitives import box
 from naibu.meshing.quality import signed_volumes
 from naibu.meshing.refinement.forest import BisectionForest
+from naibu.reproduction.agreement.read_tables import Tables
 from naibu.reproduction.chapter4.adaptive import chapter4_adaptive, cuboid
 from naibu.reproduction.chapter4.adaptive_figures import cross_section
+from naibu.reproduction.chapters import AGREEMENT
 
 
 def column(table, name):
@@ -68,3 +70,8 @@ def test_cross_sections_cover_the_body():
         x, y = polygon.T
         area += 0.5 * abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1)))
     assert area == pytest.approx(1e4)
+
+
+def test_statements_of_the_report_find_their_tables(chapter) -> None:
+    found = AGREEMENT["ch4-adaptive"](Tables(chapter.sections))
+    assert len(found) >= 4 and {"agrees"} <= {c.verdict for c in found}

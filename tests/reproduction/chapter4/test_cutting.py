@@ -8,7 +8,7 @@ import pytest
 
 from naibu.reproduction.chapter4.cutting import DEPTH_MM, DISTANCE_MM, SHAKE_MM, chapter4_cut, shaken_path
 from naibu.validation import hand_surface
-from naibu.viewer.chapter import Chapter
+from naibu.viewer.chapters.chapter import Chapter
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,11 @@ import pytest
 from naibu import datasets
 from naibu.applications.fingertip.fingertip import FingertipResolution
 from naibu.applications.sensing_chip.chip_mesh import ChipResolution
+from naibu.reproduction.agreement.read_tables import Tables
 from naibu.reproduction.chapter6.tables import chapter6
-from naibu.viewer.chapter import Chapter
-from naibu.viewer.chapter_page import chapter_html
+from naibu.reproduction.chapters import AGREEMENT
+from naibu.viewer.chapters.chapter import Chapter
+from naibu.viewer.chapters.chapter_page import chapter_html
 from naibu.viewer.tables import Table
 
 (STRENGTH, SENSITIVITY) = next(t["rows"] for t in datasets.paper_tables()["tables"] if t["id"] == "6.1")
@@ -77,7 +79,7 @@ def test_the_gain_leaves_a_two_hundredth_of_the_range(chapter: Chapter) -> None:
 
 def test_every_figure_is_drawn(chapter: Chapter) -> None:
     page = chapter_html(chapter)
-    assert page.count("data:image/svg+xml") == sum(len(section.figures) for section in chapter.sections) == 11
+    assert page.count("data:image/svg+xml") == sum(len(section.figures) for section in chapter.sections) == 12
     assert all(np.isfinite(v) for row in table(chapter, "Designs").rows for v in row[1:])
 
 
@@ -96,3 +98,8 @@ def test_nothing_bends_with_everything_turned_off(chapter: Chapter) -> None:
     assert max(rows["none (dead load, small strains)"][3:]) < 4.0
     # the dead load is the rod's: the same force reaches the chip in the same model
     assert rows["geometry and law (dead load)"][:3] == pytest.approx(rows["all"][:3], rel=1e-3)
+
+
+def test_statements_of_the_report_find_their_tables(chapter: Chapter) -> None:
+    found = AGREEMENT["ch6"](Tables(chapter.sections))
+    assert len(found) >= 4 and {"agrees"} <= {c.verdict for c in found}

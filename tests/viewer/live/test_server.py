@@ -9,6 +9,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from naibu.core.errors import InputError
 from naibu.viewer.live.commands import LiveCommand
-from naibu.viewer.live.scene import DRIVING, HEADER, LiveFrame, LiveScene
+from naibu.viewer.live.scene import DRIVING, HEADER, LiveFrame, LiveReading, LiveScene, frame_bytes
 from naibu.viewer.live.server import COMMANDS_PER_S, LONGEST_MESSAGE, LiveServer
 from naibu.viewer.motion_page import RigidShape
 
@@ -117,13 +118,27 @@ def test_a_frame_holds_what_the_simulation_says(running: Running) -> None:
         data = link.recv(timeout=20)
     assert isinstance(data, bytes)
     header = np.frombuffer(data[: HEADER.itemsize], HEADER)[0]
-    assert header["magic"] == b"NLV2"
+    assert header["magic"] == b"NLV3"
     assert header["nodes"] == 4
     assert header["flags"] & DRIVING
     assert header["force"].tolist() == [0.0, 0.0, -5.0]
     values = np.frombuffer(data[HEADER.itemsize :], "<f4")
     np.testing.assert_array_equal(values[:12].reshape(4, 3), POINTS + 1.0)
     np.testing.assert_array_equal(values[12:], np.arange(4.0))
+
+
+def test_readings_follow_the_values_at_the_nodes() -> None:
+    readings = np.array([[1.5, 1.0, 2.0], [7.0, np.nan, np.nan]])
+    frame = replace(Source().frame(), readings=readings)
+    for values in (None, np.arange(4.0)):
+        data = frame_bytes(frame, False, values)
+        header = np.frombuffer(data[: HEADER.itemsize], HEADER)[0]
+        assert header["readings"] == 2
+        np.testing.assert_array_equal(np.frombuffer(data[-24:], "<f4").reshape(2, 3), readings)
+        assert len(data) == HEADER.itemsize + 4 * (12 + (0 if values is None else 4) + 6)
+    scene = replace(Source().scene, readings=(LiveReading("F_z", "mN", "force"),))
+    sent = json.loads(json.dumps(scene.payload()))["readings"]
+    assert sent == [{"name": "F_z", "unit": "mN", "plot": "force", "explanation": "", "states": []}]
 
 
 def test_the_first_page_drives_the_others_watch_until_it_leaves(running: Running) -> None:

@@ -21,6 +21,7 @@ from naibu.core.arrays import BoolArray
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.io.images import write_volume
+from naibu.workflows.applications.mammogram_inputs import positioner_angle, read_views
 from naibu.workflows.applications.mammography import NOTICE, relate_views
 
 TURN = np.linspace(-np.pi / 2, np.pi / 2, 121)
@@ -49,6 +50,20 @@ def test_page_and_numbers_from_tables_and_from_masks(tmp_path: Path) -> None:
     masks = relate_views(tmp_path / "cc.tif", tmp_path / "mlo.tif", point_cc=(50.0, 110.0), pixel_mm=0.5, out=tmp_path / "m", **common)  # type: ignore[arg-type]
     again = json.loads(masks.files[1].read_text(encoding="utf-8"))
     np.testing.assert_allclose(again["curve_in_mlo_mm"], numbers["curve_in_mlo_mm"], atol=1.5)
+
+
+def test_outlines_under_neutral_names_that_may_be_swapped_are_told(tmp_path: Path) -> None:
+    straight, hanging = tmp_path / "first.csv", tmp_path / "second.csv"
+    for path, upper, lower in ((straight, 80.0, 80.0), (hanging, 95.0, 75.0)):
+        along = np.where(TURN > 0.0, upper, lower) * np.sin(TURN)
+        np.savetxt(path, np.column_stack([110.0 * np.cos(TURN), along]), delimiter=",")
+    common = {"thickness_mm": (60.0,), "angle_deg": 45.0, "point_cc": (50.0, 10.0), "draws": 20}
+    runs = [
+        relate_views(cc, mlo, out=tmp_path / str(k), **common) for k, (cc, mlo) in enumerate(((straight, hanging), (hanging, straight)))
+    ]  # type: ignore[arg-type]
+    told = [any("views are swapped" in w for w in run.warnings) for run in runs]
+    assert told == [False, True]
+    assert "views are swapped" in runs[1].files[0].read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(
@@ -160,6 +175,15 @@ def test_tags_that_are_missing_or_cannot_be_are_told(
     assert not list((tmp_path / "out").glob("*"))
 
 
+@pytest.mark.parametrize(
+    ("of_cc", "of_mlo", "between"), [(0, -45, 45.0), (0, 315, 45.0), (-3, 47, 50.0), (None, 50, 50.0), (358, 43, 45.0)]
+)
+def test_the_angle_between_the_views_is_told_from_both_tags(tmp_path: Path, of_cc: int | None, of_mlo: int, between: float) -> None:
+    cc = written_mammogram(tmp_path / "cc.dcm", "CC", ellipse(110.0, 80.0), PositionerPrimaryAngle=of_cc)
+    mlo = written_mammogram(tmp_path / "mlo.dcm", "MLO", ellipse(112.0, 85.0), PositionerPrimaryAngle=of_mlo)
+    assert positioner_angle(read_views(cc, mlo, None), None) == between
+
+
 def test_mammograms_given_as_the_other_view_and_empty_ones_are_told(tmp_path: Path, mammograms: tuple[Path, Path]) -> None:
     with pytest.raises(InputError, match="are the views swapped"):
         relate_views(mammograms[1], mammograms[0], point_cc=(50.0, 110.0), draws=20, out=tmp_path / "out")
@@ -193,7 +217,7 @@ def test_a_point_of_a_scan_is_shown_in_both_views(tmp_path: Path) -> None:
         relate_views(out=tmp_path / "other", **common)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="outside of the unloaded breast"):
         relate_views(side="right", out=tmp_path / "other", **{**common, "point_mr": (-12.0, -40.0, 20.0)})  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="point_mr is given without mr"):
+    with pytest.raises(InputError, match="point_mr is given without `mr`"):
         relate_views(*written(tmp_path), point_mr=(0.0, 0.0, 0.0), out=tmp_path / "other")
 
 

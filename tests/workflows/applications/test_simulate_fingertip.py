@@ -173,6 +173,7 @@ def test_presses_that_the_gel_or_the_chip_does_not_bear_are_refused(tmp_path: Pa
         ("decoder", '{"kind": "naibu fingertip decoder"}', "naibu cannot be used"),
         ("readings", "0,1,2\n", "it needs rows of 4"),
         ("readings", "0,1,2,3\n0,1,2,3\n", "row 2 is not later than the one before"),
+        ("readings", "0,1000,2,3\n1,1,2,3\n", "Are its readings in V"),
         ("readings", "0,1,2,3\n1,1,2,3\n", "free_rows is 20, and .* has 2 rows"),
     ],
 )

@@ -135,6 +135,8 @@ def test_a_record_with_too_few_rows_is_named(tmp_path: Path) -> None:
         ("0.1,0.1\n0.2,1e300\n", "in skin of 1 mm"),
         ("0.1,0.1\n0.2,0.11\n0.3,0.1\n", "noise_mm = 0.02"),
         ("0.1,nan\n", "nan"),
+        ("10,1\n20,1.5\n470,2\n3000,0.2\n", "begins at 10 s, when the load of 0.47 s is over"),
+        ("0.1,-1\n0.2,-1.5\n", "an indentation of -1.5 mm"),
     ],
 )
 def test_records_that_cannot_be_are_refused_before_the_work(tmp_path: Path, rows: str, said: str) -> None:

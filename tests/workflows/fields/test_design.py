@@ -109,6 +109,10 @@ def test_the_command_line_and_what_it_refuses(
     stated = ["--known", "pad=10 kPa", "--expect", "gel=5 kPa", "--push", "z+=0,0,-2"]
     assert run(*labels, *stated, "--plates-only") == 0
     assert "Best: z+=0,0,-2" in capsys.readouterr().out and (tmp_path / "out" / "design.html").exists()
+    (row,) = json.loads((tmp_path / "out" / "design.json").read_text(encoding="utf-8"))["rows"]
+    expected = np.hypot(row["SD, %"], row["systematic error, %"])
+    page = (tmp_path / "out" / "design.html").read_text(encoding="utf-8")
+    assert f"to {expected:.2g} % (standard deviation {row['SD, %']:.2g} %, systematic error" in page
 
 
 def test_what_is_missing_or_wrong_is_told() -> None:

@@ -18,7 +18,7 @@ from naibu.core.volume import Volume
 from naibu.io.displacement_fields import write_field
 from naibu.io.images import read_volume, write_volume
 from naibu.validation.specimens.quadratic_body import QuadraticBody, Solved
-from naibu.workflows.fields.block_mesh import block_mesh, blurred
+from naibu.workflows.fields.block_mesh import block_mesh, blurred, misplaced
 from naibu.workflows.fields.identify_fields import identify_fields, table_of_assumptions
 from naibu.workflows.fields.known_zones import parse_known_zones
 
@@ -120,7 +120,7 @@ def test_cells_end_where_zones_meet_in_a_plane(folder: Path) -> None:
         numbers[2:first, 2:22, 2:22], numbers[first:22, 2:22, 2:22] = 1, 2
         for size in (5.0, 6.7, 8.0, 13.0):
             mesh, cells = block_mesh(inside, numbers, names, size)
-            assert not blurred(mesh, cells, inside, numbers, names)
+            assert misplaced(mesh, cells, inside, numbers, names) == (0.0, 0.0)
             heights = np.unique(mesh.points[:, 2].round(6))
             assert labels.to_physical(np.array([0.0, 0.0, first - 0.5]))[2] in heights
             assert 0.5 * size < np.diff(heights).min() and np.diff(heights).max() < 1.6 * size
@@ -135,7 +135,11 @@ def test_zones_that_end_inside_of_cubes_are_told(folder: Path) -> None:
     numbers = np.where(inside.values > 0, np.where(z + 0.5 * x < 18.0, 1, 2), 0).astype(np.int64)
     for size, told in ((8.0, True), (2.0, False)):
         mesh, cells = block_mesh(inside, numbers, names, size)
-        assert bool(blurred(mesh, cells, inside, numbers, names)) == told
+        left_out, wrong = misplaced(mesh, cells, inside, numbers, names)
+        assert left_out == 0.0 and (wrong > 0.01) == told
+        for corrected, words in ((False, "not in the intervals"), (True, "part of their standard deviations")):
+            assert [words in sentence for sentence in blurred(left_out, wrong, corrected=corrected)] == [True] * told
+    assert "at its surface" in blurred(0.02, 0.0, corrected=True)[0]
 
 
 def test_blocks_fill_the_object_along_its_own_axes() -> None:

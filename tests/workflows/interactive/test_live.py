@@ -2,44 +2,22 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
-import uvicorn
 from browser import CHROMIUM, opened_browser
 from matplotlib.image import imread
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from touched_lattice import touched_lattice
+from served_models import served
 
 from naibu.core.errors import InputError
 from naibu.io.vtk_files import write_vtu
 from naibu.meshing import box
-from naibu.simulation import InteractiveSimulation, RealTimeLoop
-from naibu.viewer.live.server import LiveServer
-from naibu.workflows import MeshMaterial, TouchableModel, live, tools_for, touchable
+from naibu.simulation import InteractiveSimulation
+from naibu.workflows import MeshMaterial, live, tools_for, touchable
 from naibu.workflows.interactive.live import LiveSimulation
-
-
-@contextmanager
-def served(model: TouchableModel | None = None, port: int = 0) -> Iterator[tuple[str, LiveSimulation]]:
-    """Serve a model, by default a small lattice; yields the address and the simulation."""
-    model = model or TouchableModel("Cube", ("a small lattice",), touched_lattice(), "mean elongation, %")
-    with RealTimeLoop(InteractiveSimulation(model.body, tools_for(model.body))) as loop:
-        simulation = LiveSimulation(model, loop)
-        pages = LiveServer(simulation, "secret")
-        bound = uvicorn.Config(pages.app(0), host="127.0.0.1", port=port, log_level="critical").bind_socket()
-        chosen = bound.getsockname()[1]
-        server = uvicorn.Server(uvicorn.Config(pages.app(chosen), log_level="critical", lifespan="off", ws="websockets-sansio"))
-        thread = threading.Thread(target=server.run, kwargs={"sockets": [bound]}, daemon=True)
-        thread.start()
-        yield f"http://127.0.0.1:{chosen}/?token=secret", simulation
-        server.should_exit = True
-        thread.join(timeout=10)
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")

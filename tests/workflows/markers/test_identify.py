@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import _thread
 import csv
 import json
 import os
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from html import escape
 from pathlib import Path
@@ -23,6 +24,7 @@ from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.experiment import Experiment
 from naibu.core.status import Status
+from naibu.identification.from_markers.calibration import Calibration
 from naibu.identification.prediction import cross_validation as folds
 from naibu.identification.verdict import Explanation
 from naibu.io.experiment_folder.state_csv import parse_state_csv
@@ -301,12 +303,19 @@ def test_a_checkpoint_of_something_else_is_not_used(press: Press, tmp_path: Path
 
 
 def test_an_interruption_while_comparing_loses_nothing(press: Press, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*arguments: object) -> None:
-        raise KeyboardInterrupt
+    given = 0
 
-    monkeypatch.setattr(identify, "baselines", interrupted)
+    def interrupted(calibration: Calibration) -> Iterator[tuple[str, str, float]]:
+        nonlocal given
+        _thread.interrupt_main()
+        for given in range(1, 3000):  # a minute
+            yield calibration.load_cases[0].name, "rigid", float(given)
+            time.sleep(0.02)
+
+    monkeypatch.setattr(identify, "baselines_of", interrupted)
     found = identified(press.folder, tmp_path)
     assert found.interrupted and CHECKPOINT_FILE in names(tmp_path)
+    assert found.baselines[found.calibration.load_cases[0].name] == {"rigid": given} and given < 2999
     assert (tmp_path / MODEL_FILE).read_bytes() == (press.results / MODEL_FILE).read_bytes()
 
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from naibu.cli import main
+from naibu.imaging.displacement.chunked_strain import COMPONENTS
 from naibu.io.images import read_displacement, read_volume, write_volume
 from naibu.validation.specimens.textured_sphere import squeezed_ball
-from naibu.workflows.measurement.multiscale_results import FILES, STRAINS
+from naibu.workflows.measurement.multiscale_results import FILES
 
 zarr = pytest.importorskip("zarr")
 
@@ -38,7 +39,7 @@ def test_scans_displacement_and_strain_open_in_viewers(
     stored = zarr.open_group(str(out / "displacement.ome.zarr"), mode="r")["0"][...]
     np.testing.assert_array_equal(np.moveaxis(stored, 0, -1), vectors.astype(np.float32))
     strain = zarr.open_group(str(out / "strain.ome.zarr"), mode="r")
-    assert strain["0"].shape == (6, *before.shape) and [c["label"] for c in strain.attrs["omero"]["channels"]] == list(STRAINS)
+    assert strain["0"].shape == (6, *before.shape) and [c["label"] for c in strain.attrs["omero"]["channels"]] == list(COMPONENTS)
     known = np.isfinite(strain["0"][...])
     assert known.any() and not known.all()
     capsys.readouterr()

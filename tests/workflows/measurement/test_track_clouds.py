@@ -77,6 +77,18 @@ def test_clouds_that_do_not_correspond_are_refused(gel: Cloud, tables: tuple[Pat
     assert not (tmp_path / "out" / "field.h5").exists()
 
 
+def test_clouds_with_every_point_twice_are_linked(gel: Cloud, tables: tuple[Path, Path], tmp_path: Path) -> None:
+    """They had been refused, for want of a structure in common."""
+    files = tmp_path / "free.npy", tmp_path / "pressed.npy"
+    for file, points in zip(files, (gel.reference, gel.deformed), strict=True):
+        np.save(file, PIXEL * np.concatenate([points, points]))
+    once, twice = track_clouds(*tables, out=tmp_path / "once"), track_clouds(*files, out=tmp_path / "twice")
+    assert len(twice.motion.links) == len(once.motion.links)
+    told = dict(twice.rows)
+    assert told["copies of a point left out, reference"] == len(gel.reference) == told["particles, reference"]
+    assert not any("copies" in name for name, _ in once.rows)
+
+
 def test_the_verb(tables: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(sys, "argv", ["naibu", "track", *map(str, tables), "--out", str(tmp_path / "out")])
     with pytest.raises(SystemExit) as end:

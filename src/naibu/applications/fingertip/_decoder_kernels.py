@@ -24,6 +24,8 @@ def terms(log_load: FloatArray, ratio: FloatArray) -> FloatArray:
 def decode_readings(loads, coefficients, unit, spread, noise, error, limits, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Decode F_z, M_x, M_y (n, 3) into `out` (n, OUTPUTS); NaN where F_z or the ratio lies beyond `limits` (3,).
 
+    NaN also where direction or contact lie a right angle or more from the base's normal, as polynomials beyond their training may say.
+
     `coefficients` (3, TERMS) are of log force, of tilt over ratio, and of the contact's angle over ratio; `unit` are the F_z and the length
     that scale them; `spread` (3,), `noise` (2,) and `error` are standard deviations: of the fits, of F_z and the moments, relative of both.
     """
@@ -49,6 +51,8 @@ def decode_readings(loads, coefficients, unit, spread, noise, error, limits, out
                     du += (i + 1) * power * (coefficients[k, 3 * i + 3] + w * (coefficients[k, 3 * i + 4] + w * coefficients[k, 3 * i + 5]))
                 power *= u
             value[k], along[k], across[k] = v, du, dw
+        if not (ratio * value[TILT] < 0.5 * np.pi and ratio * value[POSITION] < 0.5 * np.pi):
+            continue
         of_load = np.sqrt((noise[0] / normal) ** 2 + error * error)
         of_moment = np.sqrt((noise[1] / (normal * unit[1])) ** 2 + (ratio * error) ** 2)
         slope = 2.0 * ratio * across[FORCE]

@@ -116,7 +116,7 @@ class FingertipResolution:
             require_within(name, getattr(self, name), least, most)
 
 
-def fingertip_mesh(fingertip: Fingertip, resolution: FingertipResolution | None = None) -> Mesh:
+def fingertip_mesh(fingertip: Fingertip, resolution: FingertipResolution | None = None, *, whole: bool = False) -> Mesh:
     """Mesh the half of a fingertip with y >= 0: whatever presses it in the plane y = 0 deforms it symmetrically.
 
     Parameters
@@ -125,6 +125,8 @@ def fingertip_mesh(fingertip: Fingertip, resolution: FingertipResolution | None 
         Dimensions.
     resolution : FingertipResolution, optional
         Numbers of cells.
+    whole : bool
+        Whether the other half is meshed, too.
 
     Returns
     -------
@@ -144,7 +146,7 @@ def fingertip_mesh(fingertip: Fingertip, resolution: FingertipResolution | None 
     outside = (1.0 - share) * half_axes * direction + share * fingertip.radius_mm * direction
     points = np.where((grid.shell <= 1)[:, None], half_axes * unit, outside)
     points[np.abs(points) < _ROUND] = 0.0
-    kept = points[grid.cells].mean(axis=1)[:, 1] > 0.0
+    kept = (points[grid.cells].mean(axis=1)[:, 1] > 0.0) | whole
     regions = np.where(grid.shell[grid.cells].max(axis=1) <= 1, PACKAGE, GEL)[kept]
     used, cells = np.unique(grid.cells[kept], return_inverse=True)
     return Mesh.from_arrays(points[used], cells.reshape(-1, 8), "hexahedron", regions=regions, region_names=("gel", "package"))

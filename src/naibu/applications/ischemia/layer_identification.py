@@ -20,6 +20,7 @@ from naibu.mechanics.small_strain.rheology import Rheology
 PARAMETERS = ("young_modulus", "voigt_viscosity", "series_viscosity")
 WIDE = 4.0  # a 95 % interval whose ends differ by more than this factor determines nothing
 SEARCHED = 1e3  # factor around the first guess
+_EVALUATIONS = 2000  # along a valley that the record hardly tells apart it takes hundreds
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +38,8 @@ class LayerParameter:
     low, high : float
         95 % interval.
     determined : bool
-        Whether the record determines it: the ends of the interval differ by less than a factor of 4.
+        Whether the record determines it: the ends of the interval differ by less than a factor of 4, and lie inside of the range that is
+        searched, a thousandth to a thousand times the first guess.
     """
 
     layer: int
@@ -107,7 +109,7 @@ def identify_layers(
     Raises
     ------
     InputError
-        Fewer measurements than parameters, values that are not finite, or a known parameter that does not exist.
+        Fewer measurements than parameters, values that are not finite or lie within their noise, or a known parameter that does not exist.
     ConvergenceError
         The search found no minimum.
     """
@@ -124,17 +126,21 @@ def identify_layers(
     names = [(i, n) for i, m in enumerate(first) for n in PARAMETERS if (i, n) not in set(known) and np.isfinite(getattr(m, n))]
     if len(t) <= len(names):
         raise InputError(f"indentation_mm has {len(t)} values for {len(names)} parameters; record more instants, or state `known` ones")
+    if float(((measured / noise_mm) ** 2).sum()) <= chi2.ppf(0.999, len(t)):
+        raise InputError(f"indentation_mm lies within its noise, noise_mm = {noise_mm:g}, about 0: nothing can be identified from it")
     fit = _Fit(_of_indentation(modes, load), load, t, measured, noise_mm, first, tuple(names))
     best = fit.search(np.zeros(len(names)))
     error = fit.discretisation_error(best, replace(fit, summed=_of_indentation(LayeredModes.of(refined(modes.meshed)), load)))
-    intervals = [(low - e, high + e) for (low, high), e in zip((fit.interval(best.x, i) for i in range(len(names))), error, strict=True)]
+    profiles = [fit.interval(best.x, i) for i in range(len(names))]
+    intervals = [(low - e, high + e) for (low, high), e in zip(profiles, error, strict=True)]
     materials = fit.materials(best.x)
     parameters = []
-    for (layer, name), (low, high) in zip(names, intervals, strict=True):
+    for (layer, name), (low, high), profile in zip(names, intervals, profiles, strict=True):
         value = float(getattr(materials[layer], name))
         guess = float(getattr(first[layer], name))
         ends = guess * float(np.exp(low)), guess * float(np.exp(high))
-        parameters.append(LayerParameter(layer, name, value, *ends, bool(ends[1] < WIDE * ends[0])))
+        closed = max(abs(end) for end in profile) < np.log(SEARCHED)
+        parameters.append(LayerParameter(layer, name, value, *ends, bool(closed and ends[1] < WIDE * ends[0])))
     fitted = fit.indentation(best.x)
     residuals = measured - fitted
     return LayerEstimate(
@@ -190,7 +196,7 @@ class _Fit:
         bound = np.log(SEARCHED)
         if len(free) == 0:
             return _Minimum(logs, 0.5 * float((self.residuals(logs) ** 2).sum()), np.zeros((len(self.times), 0)))
-        found = least_squares(of_free, np.clip(logs[free], -bound, bound), bounds=(-bound, bound), x_scale=1.0, max_nfev=200)
+        found = least_squares(of_free, np.clip(logs[free], -bound, bound), bounds=(-bound, bound), x_scale=1.0, max_nfev=_EVALUATIONS)
         if not found.success:
             raise ConvergenceError(f"the search for the layers' parameters did not converge: {found.message}; state `known` parameters")
         logs[free] = found.x

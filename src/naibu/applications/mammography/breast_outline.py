@@ -13,6 +13,7 @@ from naibu.meshing.surface import level_extents
 
 _DEPTHS_MM = (15.0, 300.0)  # from the chest wall to the nipple; beyond, another unit is likelier
 _WIDTHS_MM = (30.0, 500.0)
+_ROUNDING = 32.0 * float(np.finfo(float).eps)  # of products of coordinates, over the square of the largest
 _AT_WALL = 0.05  # part of the depth within which the ends of an outline must lie at the chest wall
 _MOST_POINTS = 1000
 _SECTIONS = 60
@@ -190,8 +191,8 @@ def _opened(points: FloatArray, what: str) -> tuple[FloatArray, bool]:
     away = max(abs(float(x[i] - wall_x)) for i in (0, -1))
     if away > _AT_WALL * span:
         raise InputError(
-            f"{what}: its ends lie at {x[0]:.4g} and {x[-1]:.4g} mm, up to {away:.3g} mm from the chest wall at "
-            f"{wall_x:.4g} mm; both must lie "
+            f"{what}: its ends lie at {x[0]:.1f} and {x[-1]:.1f} mm, up to {away:.3g} mm from the chest wall at "
+            f"{wall_x:.1f} mm; both must lie "
             "at the chest wall, and the first coordinate must be perpendicular to it"
         )
     return points, at_right
@@ -202,8 +203,10 @@ def _require_no_crossing(points: FloatArray, what: str) -> None:
 
     def side(p: FloatArray, q: FloatArray, r: FloatArray) -> FloatArray:
         found: FloatArray = (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
-        return found
+        return np.where(np.abs(found) > rounding, found, 0.0)
 
+    # parts of a straight line do not cross, though rounding puts their ends on either side
+    rounding = _ROUNDING * float(np.abs(points).max()) ** 2
     p, q, r, s = a[:, None], b[:, None], a[None], b[None]
     crossing = (side(p, q, r) * side(p, q, s) < 0.0) & (side(r, s, p) * side(r, s, q) < 0.0)
     if crossing.any():

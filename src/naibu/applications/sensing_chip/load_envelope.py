@@ -6,6 +6,8 @@ to 8 GPa for beams of this size :cite:p:`petersen1982,wilson1996`. The stresses 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -62,11 +64,40 @@ def load_envelope(design: ChipDesign, *, azimuth_deg: float = 0.0, count: int = 
     ndarray, shape (count, 2)
         F_z, mN, and size of the moment, mN mm, from the force alone to the moment alone.
     """
-    ratio = np.linspace(0.0, 0.5 * np.pi, count)
-    limits = load_limits(design)
+    return envelope_along_rays(
+        load_limits(design), design.strength_kpa, lambda *load: largest_stress(design, *load), azimuth_deg=azimuth_deg, count=count
+    )
+
+
+def envelope_along_rays(
+    limits: FloatArray,
+    strength_kpa: float,
+    stress: Callable[[FloatArray, FloatArray, FloatArray], FloatArray],
+    *,
+    azimuth_deg: float,
+    count: int,
+) -> FloatArray:
+    """Return where a stress in proportion to the load reaches the strength, on rays from the force alone to the moment alone.
+
+    Parameters
+    ----------
+    limits : ndarray, shape (3,)
+        Largest F_z, mN, M_x and M_y, mN mm, each alone, which set the directions of the rays.
+    strength_kpa : float
+        Stress that is borne.
+    stress : callable
+        Largest stress, kPa, under F_z, M_x and M_y, each (count,).
+    azimuth_deg, count
+        See `load_envelope`.
+
+    Returns
+    -------
+    ndarray, shape (count, 2)
+        F_z, mN, and size of the moment, mN mm.
+    """
+    ratio, turn = np.linspace(0.0, 0.5 * np.pi, count), np.deg2rad(azimuth_deg)
     force, moment = limits[0] * np.cos(ratio), limits[1] * np.sin(ratio)
-    turn = np.deg2rad(azimuth_deg)
-    scale = design.strength_kpa / largest_stress(design, force, moment * np.cos(turn), moment * np.sin(turn))
+    scale = strength_kpa / stress(force, moment * np.cos(turn), moment * np.sin(turn))
     return np.stack([scale * force, scale * moment], axis=1)
 
 

@@ -33,6 +33,7 @@ from naibu.identification.from_fields.forward.sensitivities import (
     logarithms,
     young_and_poisson,
 )
+from naibu.identification.from_fields.forward.zones_within_cells import RegionAt, moduli_within_cells
 from naibu.identification.from_fields.gauss_newton import (
     Bounds,
     Found,
@@ -43,7 +44,7 @@ from naibu.identification.from_fields.gauss_newton import (
     first_point,
     search,
 )
-from naibu.identification.from_fields.mesh_error import COARSE, EXTRAPOLATED, changes_on_finer_mesh, doubt_of, refitted
+from naibu.identification.from_fields.mesh_error import COARSE, EXTRAPOLATED, ModuliOn, changes_on_finer_mesh, doubt_of, refitted
 from naibu.identification.from_fields.regions.border_refinement import (
     MOST_REGIONS,
     CorrectedRegions,
@@ -58,13 +59,15 @@ from naibu.identification.from_fields.truncated_newton import truncated_step
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, report, resolution, resolution_report
 from naibu.identification.from_fields.verdict import inflation, verdict
 from naibu.identification.load_case import require_load_cases
-from naibu.identification.verdict import Explanation
+from naibu.identification.verdict import Explanation, Verdict
 
 FEW = 12  # zones up to which no penalty is needed by default
 START_POISSON_RATIO = 0.4
 TOO_COARSE = "The elements are too coarse for extrapolation to be trusted, and intervals are wide: use smaller ones."
 MOST_UNKNOWNS = 120_000  # nodal displacements of the quadratic elements with which regions of a map are refitted
 SEARCH_AT_WEIGHT = SearchSettings(max_iterations=15, tolerance=1e-3)
+AT_BOUND = 3.7  # standard deviation of ln(kappa / mu) where it is at its bound: half of the way down to that of a Poisson's ratio of 0
+WITHIN = 0.5  # change of a logarithm where zones end inside of cells, from which a linear correction is worth nothing
 UNEXPLAINED = 3.0  # standard deviations of chi squared by which regions may fit worse than the regularised field
 
 
@@ -80,6 +83,7 @@ def identify_field(
     bounds: Bounds | None = None,
     start: tuple[FloatArray, FloatArray] | None = None,
     elements: FieldElements = "accurate",
+    region_at: RegionAt | None = None,
     progress: Progress | None = None,
 ) -> FieldEstimate:
     """Find the moduli of zones from displacement fields measured in one or more load cases, no force being known.
@@ -109,6 +113,9 @@ def identify_field(
         Accurate gives tetrahedra mid-edge nodes and hexahedra the mean dilatation of their points, and extrapolates moduli of regions to
         vanishing element size from a mesh of half the element size. As given serves data computed with the very elements of `mesh`. Maps of
         the moduli of many tetrahedra use them as given; the regions made of such a map are refitted with accurate ones.
+    region_at : callable, optional
+        Number of the region of `mesh` at points (k, d), mm, negative outside of the body: where zones that are named in `zones` end inside
+        of cells, what this changes is found on the mesh of half the element size, and corrected for. Maps do not use it.
     progress : callable, optional
         Gets a report after every step, its stage in words (`naibu.core.progress`); the same words are in `FieldEstimate.steps`.
 
@@ -126,7 +133,7 @@ def identify_field(
     name = automatic if regularization == "automatic" else regularization
     of_map: FieldElements = "as_given" if name is not None and mesh.cell_type == "tetra" else elements
     model = FieldModel(mesh, load_cases, zones, law, of_map)
-    recipe = _Recipe(model, tuple(load_cases), law, elements, bounds or Bounds(), [], progress)
+    recipe = _Recipe(model, tuple(load_cases), law, elements, bounds or Bounds(), [], progress, region_at if name is None else None)
     point = recipe.start(start)
     return recipe.free(point) if name is None else recipe.regularized(point, name, weight, segmented)
 
@@ -142,6 +149,7 @@ class _Recipe:
     bounds: Bounds
     steps: list[str]
     progress: Progress | None
+    region_at: RegionAt | None
 
     def record(self, text: str, objective: float | None = None) -> None:
         """Keep a step in words, and report it."""
@@ -343,10 +351,14 @@ class _Recipe:
         of_known = covariance_of(others, len(theta))
         of_mesh, total, coarse = np.full(len(theta), np.nan), of_noise.with_added(of_known), False
         if shift is not None:
-            of_mesh, covariance = doubt_of(shift) if corrected is None else corrected.doubt
+            of_mesh, covariance = doubt_of(shift, mixed=self.region_at is not None) if corrected is None else corrected.doubt
             total = total.with_added(covariance)
             coarse = float(np.abs(shift).max()) > COARSE if corrected is None else not corrected.converged
+        at_bound = theta >= self.bounds.box(model.zones.count)[1] - 1e-9  # where derivatives say nothing of how much less it may be
+        total = total.with_added(np.diag(np.where(at_bound, AT_BOUND**2, 0.0)))
         judged = verdict(model.observed, residuals, freedom)
+        if self.region_at is not None and shift is not None:
+            judged = _judged_within(judged, shift)
         budget = ErrorBudget(of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), shared)
         sure = judged.explanation is Explanation.EXPLAINED and not coarse
         how_well = report(model.zones, theta, total, budget=budget, usable=judged.ok, sure=sure)
@@ -363,7 +375,10 @@ class _Recipe:
     def _extrapolated(self, at: Linearised, quadratic: Concentrated) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray | None]:
         """Return theta and whitened residuals at vanishing element size, and the change of theta; None where it was not estimated."""
         fitted, model = at.point.theta, at.model
-        changes = changes_on_finer_mesh(at, self.law) if self.elements == "accurate" else None
+        within: ModuliOn | None = None
+        if (where := self.region_at) is not None:
+            within = lambda mesh, _: moduli_within_cells(mesh, model.zones, fitted, where)  # noqa: E731
+        changes = changes_on_finer_mesh(at, self.law, within) if self.elements == "accurate" else None
         if changes is None:
             return fitted, tuple(o.residual(u) for o, u in zip(model.observed, at.point.states, strict=True)), None
         finer = refitted(at, quadratic, changes)
@@ -372,3 +387,12 @@ class _Recipe:
         most = 100.0 * float(np.abs(young / before - 1.0).max())
         self.record(f"half the element size: Young's modulus changes by up to {most:.2g} % when extrapolated to vanishing size")
         return theta, finer.residuals, theta - fitted
+
+
+def _judged_within(judged: Verdict, shift: FloatArray) -> Verdict:
+    """Return the verdict on zones that end inside of cells, where half the size of these changed moduli by `shift`."""
+    worst = float(np.abs(shift).max())
+    if worst <= WITHIN:
+        return judged
+    reason = f"zones end inside of elements, and with half their size moduli would change {np.exp(worst):.2g} times: use smaller ones"
+    return replace(judged, explanation=Explanation.NOT_EXPLAINED, reasons=(reason, *judged.reasons))

@@ -56,16 +56,19 @@ class Refit:
         return sum(float(r @ r) for r in self.residuals)
 
 
-def doubt_of(shift: FloatArray) -> tuple[FloatArray, FloatArray]:
+def doubt_of(shift: FloatArray, *, mixed: bool = False) -> tuple[FloatArray, FloatArray]:
     """Return standard deviations (2 count,) and covariance (2 count, 2 count) of extrapolated logarithms that changed by `shift`.
 
-    The error of all moduli has one cause and one sign, unless elements are so coarse that changes say little of what is left.
+    The error of all moduli has one cause and one sign, unless elements are so coarse that changes say little of what is left. Where zones
+    end inside of cells (`mixed`), it has no order of convergence: what is left may be as large as the change to half the size.
     """
     worst = float(np.abs(shift).max(initial=0.0))
+    part = 1.0 if mixed else DOUBT
     if worst > COARSE:
-        sd = np.full_like(shift, DOUBT / EXTRAPOLATED * worst)
+        sd = np.full_like(shift, part / EXTRAPOLATED * worst)
         return sd, np.diag(sd**2)
-    return DOUBT / EXTRAPOLATED * np.abs(shift), (DOUBT / EXTRAPOLATED) ** 2 * np.outer(shift, shift)
+    sd = part / EXTRAPOLATED * np.abs(shift)
+    return sd, np.diag(sd**2) if mixed else (part / EXTRAPOLATED) ** 2 * np.outer(shift, shift)
 
 
 def refitted(

@@ -21,6 +21,7 @@ WITHIN_NOISE = 1.25  # residuals over the noise that need no explanation even if
 NOISE_UNDERSTATED = 2.0  # residuals over the stated noise that may still be noise, if neighbours do not share them
 SMALL, LARGE = 0.02, 0.25  # of the deformation: so little needs no explanation, so much must not be left
 SHARED = 0.15
+OUTLIERS, OF_MISFIT = 0.1, 0.75  # fewer points that hold so much of the misfit are named; of normal errors half of them do
 BLOCKS, POINTS_PER_BLOCK, FEWEST_BLOCKS = 64, 6, 16
 
 
@@ -41,8 +42,18 @@ def verdict(observed: Sequence[Observed], residuals: Sequence[FloatArray], degre
     reasons: tuple[str, ...] = ()
     if how is not Explanation.EXPLAINED:
         alike = ", and neighbouring points share it" * (shared > SHARED)
-        reasons = (f"{lead}{alike}" + ": question law, zones and known values" * (how is Explanation.IN_PART),)
+        few = _told_outliers(
+            np.concatenate([(r.reshape(len(o.points), -1) ** 2).sum(axis=1) for o, r in zip(observed, residuals, strict=True)])
+        )
+        reasons = (f"{lead}{alike}{few}" + ": question law, zones and known values" * (how is Explanation.IN_PART),)
     return Verdict(how, reasons, lead, factor, unexplained, shared)
+
+
+def _told_outliers(misfit: FloatArray) -> str:
+    """Say which part of the points holds nearly all of the misfit (n,), where it is small."""
+    worst = np.cumsum(np.sort(misfit)[::-1])
+    part = float(np.searchsorted(worst, OF_MISFIT * worst[-1]) + 1) / len(misfit)
+    return f", {100 * OF_MISFIT:.0f} % of the misfit is that of {100 * part:.2g} % of the points, which may be wrong" * (part < OUTLIERS)
 
 
 def _explanation(factor: float, unexplained: float, shared: float, *, noise_stated: bool) -> Explanation:
@@ -51,7 +62,8 @@ def _explanation(factor: float, unexplained: float, shared: float, *, noise_stat
     if not noise_stated:
         return Explanation.EXPLAINED if unexplained <= SMALL else Explanation.IN_PART
     unshared = factor <= NOISE_UNDERSTATED and shared <= SHARED
-    return Explanation.EXPLAINED if factor <= WITHIN_NOISE or unshared else Explanation.IN_PART
+    explained = unexplained <= LARGE and (factor <= WITHIN_NOISE or unshared)
+    return Explanation.EXPLAINED if explained else Explanation.IN_PART
 
 
 def _deformation(o: Observed) -> float:

@@ -38,7 +38,7 @@ Checkpoint = Callable[[Mapping[str, float]], None]
 UNEVEN = 0.01  # points that slip over an edge make the objective uneven; a step that promises less than this and fails ends the search
 ENOUGH = 2  # steps in succession that gain less than that, and less than half of what they promise, after which the search ends
 ROUGH = 0.1  # a search is rough while a step may lower the objective by more than this fraction
-PATH = SolverSettings(first_step=0.02, largest_step=0.15, tolerance=1e-6)
+PATH = SolverSettings(first_step=0.02, largest_step=0.15, tolerance=1e-6, path_tolerance=1e-4)
 NEARBY = replace(PATH, smallest_step=0.02, pseudo_transient=False)  # for a path close to a known one
 REFINED = replace(PATH, smallest_step=0.004, pseudo_transient=False)  # for one known on larger elements
 TRIAL_EFFORT = 1.2  # times the iterations of the last solution, which a step of the search may cost before it is given up
@@ -145,11 +145,12 @@ class Matcher:
         poses: Sequence[RigidTransform | None] = (),
         *,
         trial: bool = False,
+        derivatives: bool = True,
     ) -> list[LoadCaseFit]:
         """Solve all load cases at `values`, from `warm_starts` where given; `poses` replace those that register the markers best.
 
         A `trial` is given up early where it costs much more than the solutions before: a shorter step of the search costs less. Its fits
-        have no derivatives, which `differentiated` adds.
+        have no derivatives, nor have others without `derivatives`; `differentiated` adds them.
 
         Raises
         ------
@@ -160,14 +161,18 @@ class Matcher:
         def one(i: int) -> LoadCaseFit:
             near = warm_starts[i] if warm_starts else None
             estimates, pose = near.warm_start(values) if near else [], poses[i] if poses else None
-            settings = self._trial_settings(i, near, bool(estimates)) if trial else PATH
+            settings, wanted = self._trial_settings(i, near, bool(estimates)) if trial else PATH, derivatives and not trial
             if near and near.between is not None:
                 try:
-                    return self._evaluate_one(i, values, estimates, pose, REFINED, derivatives=not trial)
+                    return self._evaluate_one(i, values, estimates, pose, REFINED, derivatives=wanted)
                 except ConvergenceError:
                     estimates = []
-            return self._evaluate_one(i, values, estimates, pose, settings, derivatives=not trial)
+            return self._evaluate_one(i, values, estimates, pose, settings, derivatives=wanted, stiffness=near.stiffness if near else None)
 
+        return self._side_by_side(one)
+
+    def _side_by_side(self, one: Callable[[int], LoadCaseFit]) -> list[LoadCaseFit]:
+        """Call a function with the number of every load case, on all cores."""
         if len(self.load_cases) == 1:
             return [one(0)]
         with ThreadPoolExecutor(min(len(self.load_cases), usable_cores()), initializer=use_one_thread) as pool:
@@ -175,19 +180,15 @@ class Matcher:
 
     def _evaluate_one(
         self,
-        index: int,
-        values: Mapping[str, float],
-        warm_start: Sequence[WarmStart],
-        pose: RigidTransform | None,
-        settings: SolverSettings,
-        *,
-        derivatives: bool,
-    ) -> LoadCaseFit:
+        index: int, values: Mapping[str, float], warm_start: Sequence[WarmStart], pose: RigidTransform | None, settings: SolverSettings,
+        *, derivatives: bool, stiffness: Mapping[float, tuple[FloatArray, ...]] | None = None,
+    ) -> LoadCaseFit:  # fmt: skip
         load_case = self.load_cases[index]
         # as stiff as contact had to be before: the objective does not jump, and no evaluation finds it anew
-        problem = with_normal_stiffness(load_case.specimen.problem(values, load_case.state), self._penalties.get(index, ()))
+        problem = load_case.specimen.problem(values, load_case.state)
+        problem = problem if stiffness else with_normal_stiffness(problem, self._penalties.get(index, ()))
         try:
-            solution = solve(problem, settings=settings, solver=self._solvers.get(index), warm_start=warm_start)
+            solution = solve(problem, settings=settings, solver=self._solvers.get(index), warm_start=warm_start, stiffness=stiffness)
         except ConvergenceError as error:
             raise ConvergenceError(f"{load_case.name}: {error}") from error
         self._effort[index] = solution.iterations
@@ -199,18 +200,19 @@ class Matcher:
 
     def _trial_settings(self, index: int, near: SolvedLoadCase | None, warm: bool) -> SolverSettings:
         """Settings of a step of the search: what a solution that starts from another one has not needed, it does without."""
-        limit = int(TRIAL_EFFORT * max(self._effort.get(index, 0), LEAST_EFFORT))
-        rescued = near is not None and near.fit.solution.continued > 0
-        return replace(NEARBY if warm and not rescued else PATH, pseudo_transient=rescued, max_total_iterations=limit)
+        rescued, most = near is not None and near.fit.solution.continued > 0, TRIAL_EFFORT * max(self._effort.get(index, 0), LEAST_EFFORT)
+        return replace(NEARBY if warm and not rescued else PATH, pseudo_transient=rescued, max_total_iterations=int(most))
 
     def differentiated(self, fits: Sequence[LoadCaseFit], values: Mapping[str, float]) -> list[LoadCaseFit]:
         """Return fits at `values` with derivatives with respect to the free parameters of this matcher; nothing is solved anew."""
-        out = []
-        for i, (load_case, fit) in enumerate(zip(self.load_cases, fits, strict=True)):
+
+        def one(i: int) -> LoadCaseFit:
+            load_case, fit = self.load_cases[i], fits[i]
             newton = Newton(fit.solution.problem, PATH, self._solvers.get(i))
             path = self._path_derivatives(load_case, values, fit.solution, newton)
-            out.append(self._observed(load_case, values, fit.solution, fit.resting, path, fit.pose))
-        return out
+            return self._observed(load_case, values, fit.solution, fit.resting, path, fit.pose)
+
+        return self._side_by_side(one)
 
     def _path_derivatives(
         self, load_case: MarkerLoadCase, values: Mapping[str, float], solution: Solution, newton: Newton

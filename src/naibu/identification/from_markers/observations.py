@@ -19,6 +19,7 @@ from naibu.mechanics.finite_strain.statics import Solution, WarmStart
 
 WARM_START_SPACING = 0.1  # of the load, between states that the next evaluation starts from
 SAME = 1e-9  # relative difference of parameters and positions from rounding
+NEAR_THE_END = 0.03  # of the load: a state so close to the end of a path tells where the end is, and is no step on the way to it
 FAR = 0.05  # of the extent of the object, by which nodes move with a change of the parameters that is not small
 
 
@@ -160,6 +161,11 @@ class SolvedLoadCase:
         estimates = _warm_start(self.fit, change)
         return estimates if self.between is None else [(load, np.asarray(self.between @ u)) for load, u in estimates]
 
+    @property
+    def stiffness(self) -> dict[float, tuple[FloatArray, ...]]:
+        """Penalties of contact of the estimates of `warm_start`, by their loads, where they are to be kept."""
+        return {}
+
     def path_at(self, values: Mapping[str, float], names: Sequence[str], points: FloatArray) -> tuple[FloatArray, ...] | None:
         """Return the derivatives (n, 3, p) of the states with respect to the parameters `names`; None where they are not those at `values`.
 
@@ -182,6 +188,41 @@ class SolvedLoadCase:
             return None
         columns = [free[name] for name in names]
         return tuple(derivative[:, :, columns] for derivative in self.fit.path)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SamePath(SolvedLoadCase):
+    """A solved load case as one to start from where its body moves along the same path, but elsewhere to its end.
+
+    Attributes
+    ----------
+    reached : float
+        How far the body moved in the solved load case, as a fraction of the way to the other end.
+    """
+
+    reached: float = 1.0
+
+    def warm_start(self, values: Mapping[str, float]) -> list[WarmStart]:
+        """Return its states at the loads at which the body is where it was in them, and what they tell of the other end."""
+        states, loads = self.fit.solution.states, self._loads
+        known = [(x, s.displacement) for x, s in zip(loads[1:], states[1:], strict=True) if x < 1.0 - NEAR_THE_END]
+        if loads[-1] < 1.0 - NEAR_THE_END:  # the rest of the way is a step of its own
+            return known
+        after = min(max(1, int(np.searchsorted(loads, 1.0))), len(states) - 1)
+        share = (1.0 - loads[after - 1]) / (loads[after] - loads[after - 1])
+        before, behind = states[after - 1].displacement, states[after].displacement
+        return [*known, (1.0, before + share * (behind - before))]
+
+    @property
+    def stiffness(self) -> dict[float, tuple[FloatArray, ...]]:
+        """Penalties of contact of the states by their loads; those of the last at the other end."""
+        states = self.fit.solution.states
+        by_load = {x: s.normal_stiffness for x, s in zip(self._loads[1:], states[1:], strict=True)}
+        return by_load | {1.0: states[-1].normal_stiffness}
+
+    @property
+    def _loads(self) -> list[float]:
+        return [float(state.load * self.reached) for state in self.fit.solution.states]
 
 
 def _warm_start(previous: LoadCaseFit, change: FloatArray) -> list[WarmStart]:

@@ -33,7 +33,7 @@ from naibu.identification.lattice_calibration.least_squares import (
 from naibu.identification.lattice_calibration.mapped_search import MappedSearch
 from naibu.identification.lattice_calibration.shape_distance import closest_points
 from naibu.identification.lattice_calibration.unknowns import LatticeUnknowns, identifiability
-from naibu.identification.lattice_calibration.widened_covariance import widened_covariance
+from naibu.identification.lattice_calibration.widened_covariance import smoothed_information, widened_covariance
 from naibu.mechanics.lattices.model.lattice import Lattice
 
 Index = Literal["shape", "force", "joint"]
@@ -260,9 +260,14 @@ def _searched_by_mapping(
 ) -> LatticeEstimate:
     search = MappedSearch(problem, centre, prior_sd, at)
     search.run(max_iterations, reweigh=reweigh)
-    covariance, extra = widened_covariance(search.problem, search.point, centre, prior_sd, at)
-    found = _estimate(search.problem, search.point, covariance, search.iterations, search.runs + extra)
-    return replace(found, settled=search.settled)
+    shifts = problem.shifts(np.exp(search.theta))
+    assert shifts is not None
+    if not search.settled:  # derivatives there say nothing of where the least misfit is
+        unknown = prior_sd**2 * np.eye(len(centre))
+        return replace(_estimate(search.problem, search.point, unknown, search.iterations, search.runs), settled=False)
+    information, smoothing = smoothed_information(search.problem, search.point, float(np.abs(shifts).max()), prior_sd, at)
+    covariance, extra = widened_covariance(search.problem, search.point, centre, prior_sd, at, information)
+    return _estimate(search.problem, search.point, covariance, search.iterations, search.runs + smoothing + extra)
 
 
 def _estimate(

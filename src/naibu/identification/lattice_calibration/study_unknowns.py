@@ -24,7 +24,9 @@ FRICTION = (0.01, 0.99)  # range of the report :cite:p:`hirai2008`
 FRICTION_START = {"static_friction": 0.5, "kinetic_friction": 0.4}  # of bodies whose friction is stated to be 0
 PULL_OFF = {"pull_stiffness": "mN/mm", "pull_damping": "mN s/mm", "pull_speed": "mm/s"}
 SURFACE_MASS = "mass of a surface node over that of a core node"
-SHIFT = 0.015  # of a logarithm, for differences where no tangent is integrated: above what the solver leaves, below the curvature
+# of a logarithm, for differences where no tangent is integrated: above what the solver leaves, below the curvature. In
+# contact what jumps counts as information the more, the shorter they are (benchmarks/lattice_calibration.py --differences)
+SHIFT = 0.015
 
 
 @dataclass(frozen=True, slots=True, eq=False)

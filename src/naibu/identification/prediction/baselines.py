@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from naibu.core.arrays import FloatArray
-from naibu.core.errors import ConvergenceError, InputError
+from naibu.core.errors import ConvergenceError, InputError, NaibuError
 from naibu.core.experiment import Experiment
 from naibu.core.parameters import MAX_POISSON_RATIO
 from naibu.core.rigid_transform import registration
@@ -52,18 +52,38 @@ def baselines(load_case: MarkerLoadCase, values: Mapping[str, float]) -> dict[st
     InputError
         A platen position out of reach.
     """
+    residual = load_case.measured - _linear(load_case, values)
+    return {**_of_maps(load_case), "linear": rms(residual) if np.isfinite(residual).any() else np.nan}
+
+
+def _of_maps(load_case: MarkerLoadCase) -> dict[str, float]:
     free, measured = load_case.specimen.marker_points, load_case.measured
     return {
         "rigid": rms(measured - registration(free, measured).applied(free)),
         "affine": rms(measured - affine(free, measured)),
-        "linear": rms(residual) if np.isfinite(residual := measured - _linear(load_case, values)).any() else np.nan,
     }
 
 
-def equilibrium_gap_baseline(calibration: Calibration) -> dict[str, float]:
-    """Return the root mean square distance, mm, of every load case with the moduli of the equilibrium gap between the markers.
+def baselines_of(calibration: Calibration) -> Iterator[tuple[str, str, float]]:
+    """Give load case, name and distance, mm, of the baselines of all load cases, one after the other.
 
-    The boundary conditions, friction and known materials are those of the calibration. Empty where the equilibrium gap has no solution
+    Those of `baselines`, without the linear one where it does not apply, and "equilibrium gap", see `equilibrium_gap_baseline`.
+    """
+    values = calibration.match.parameters.values()
+    for load_case in calibration.load_cases:
+        try:
+            found = baselines(load_case, values)
+        except NaibuError:
+            found = _of_maps(load_case)
+        yield from ((load_case.name, name, distance) for name, distance in found.items())
+    for label, distance in equilibrium_gap_baseline(calibration):
+        yield label, "equilibrium gap", distance
+
+
+def equilibrium_gap_baseline(calibration: Calibration) -> Iterator[tuple[str, float]]:
+    """Give the root mean square distance, mm, of every load case with the moduli of the equilibrium gap between the markers.
+
+    The boundary conditions, friction and known materials are those of the calibration. Nothing where the equilibrium gap has no solution
     (no lattice, one material); without the load cases that cannot be solved with its moduli.
     """
     experiments = {t.specimen.experiment.name: t.specimen.experiment for t in calibration.load_cases}
@@ -71,12 +91,11 @@ def equilibrium_gap_baseline(calibration: Calibration) -> dict[str, float]:
     try:
         found = equilibrium_gap(list(experiments.values()), calibration.known_materials, states)
     except (InputError, np.linalg.LinAlgError):
-        return {}
+        return
     values = calibration.match.parameters.values()
     for name, (modulus, ratio) in found.items():
         values[young_modulus(name)] = modulus
         values[poisson_ratio(name)] = min(ratio, MAX_POISSON_RATIO - 1e-4)
-    out = {}
     for load_case in calibration.load_cases:
         near = calibration.warm_starts[load_case.name].warm_start(values)
         try:
@@ -85,8 +104,7 @@ def equilibrium_gap_baseline(calibration: Calibration) -> dict[str, float]:
             continue
         body = load_case.specimen.reshaped(values)
         moved = body.marker_points + body.at_markers(displacement)
-        out[load_case.name] = rms(load_case.measured - registration(moved, load_case.measured).applied(moved))
-    return out
+        yield load_case.name, rms(load_case.measured - registration(moved, load_case.measured).applied(moved))
 
 
 def affine(points: FloatArray, measured: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, State
 from naibu.core.parameters import ParameterSet
 from naibu.identification.from_markers.gauss_newton import Matcher
-from naibu.identification.from_markers.observations import LoadCaseFit, SolvedLoadCase
+from naibu.identification.from_markers.observations import LoadCaseFit, SamePath
 from naibu.identification.from_markers.specimen.parameter_names import platen_position
 from naibu.identification.from_markers.specimen.specimen_model import Specimen
 from naibu.identification.prediction.calibrated_model import CalibratedModel
@@ -19,6 +19,7 @@ from naibu.identification.prediction.calibrated_model import CalibratedModel
 LAYER_GAP = 0.4  # a new marker layer starts where the height jumps by this fraction of the markers' spacing
 ENOUGH = 3  # known markers that an outermost layer or column needs; else the next one inwards is taken
 LEAST_RATE = 0.1  # change of the distance of the outermost markers for a change of the platen position of 1 mm
+ACCURATE_MM = 1e-3  # of a platen position that markers tell
 SD_MM = {"given": 0.5, "same experiment": 1.0, "stated": 1.5, "unknown": 5.0}
 
 
@@ -155,8 +156,32 @@ def outermost_markers(body: Specimen, state: State, sd_mm: FloatArray) -> Gauge:
     return Gauge(low, high, None if sides else axis, distance, float(np.sqrt(variance)))
 
 
-def fitted_platen_position(matcher: Matcher, fit: LoadCaseFit, name: str, gauge: Gauge) -> tuple[ParameterSet, LoadCaseFit]:
+def fitted_platen_position(
+    matcher: Matcher, fit: LoadCaseFit, name: str, gauge: Gauge, rate: float | None = None
+) -> tuple[ParameterSet, LoadCaseFit, float]:
     """Choose the platen position `name` with which the two groups of markers of a gauge are as far apart as measured.
+
+    The body moves along one path, whose states are kept: only its end changes. The positions follow from the secant method.
+
+    Parameters
+    ----------
+    matcher : Matcher
+        Of the state; the platen position is among its free parameters.
+    fit : LoadCaseFit
+        The solution at the parameters of the matcher.
+    name : str
+        Of the platen position.
+    gauge : Gauge
+        The groups.
+    rate : float, optional
+        Change of their distance for a change of the platen position of 1 mm; by default that of `fit`, which is differentiated for it.
+
+    Returns
+    -------
+    parameters : ParameterSet
+    fit : LoadCaseFit
+        Without derivatives.
+    rate : float
 
     Raises
     ------
@@ -165,18 +190,25 @@ def fitted_platen_position(matcher: Matcher, fit: LoadCaseFit, name: str, gauge:
     ConvergenceError
         The state cannot be solved.
     """
-    k = [p.name for p in matcher.parameters.free].index(name)
-    parameters = matcher.parameters
+    parameters, start = matcher.parameters, matcher.load_cases[0].specimen.experiment.full_platen_position_mm
+    if rate is None:
+        differentiated = matcher.differentiated([fit], parameters.values())[0]
+        k = [p.name for p in parameters.free].index(name)
+        rate = float(gauge.derivatives(fit.predicted, differentiated.jacobian)[k])
     for _ in range(8):
-        rate = float(gauge.derivatives(fit.predicted, fit.jacobian)[k])
         if rate < LEAST_RATE:
             raise InputError("the distance of the outermost markers does not tell the platen position; give platen_position_mm")
-        change = float(np.clip((gauge.measured_mm - gauge.distance(fit.predicted)) / rate, -5.0, 5.0))
-        if abs(change) < 1e-3:
+        position, distance = parameters.values()[name], gauge.distance(fit.predicted)
+        change = float(np.clip((gauge.measured_mm - distance) / rate, -5.0, 5.0))
+        if abs(change) < ACCURATE_MM:
             break
-        before, parameters = parameters, parameters.with_values({name: parameters.values()[name] + change})
-        fit = matcher.evaluate(parameters.values(), [SolvedLoadCase(fit, before)], [fit.pose])[0]
-    return parameters, fit
+        reached = (position - start) / (position + change - start) if position + change < start else 0.0
+        near = SamePath(fit, parameters, reached=reached) if reached > 0.0 else None
+        parameters = parameters.with_values({name: position + change})
+        fit = matcher.evaluate(parameters.values(), [near], [fit.pose], derivatives=False)[0]
+        if abs(change) > 10.0 * ACCURATE_MM:
+            rate = (gauge.distance(fit.predicted) - distance) / change
+    return parameters, fit, rate
 
 
 def source_of_platen_position(gauge: Gauge, position_mm: float) -> str:

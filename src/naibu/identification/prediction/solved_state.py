@@ -75,14 +75,14 @@ def solve_state(
         The state cannot be solved.
     """
     narrow = parameters.changed({p.name: replace(p, fixed=True) for p in parameters.free if p.name != platen})
-    coarse, start = None, warm_start
+    coarse, start, rate = None, warm_start, None
     if warm_start is not None and markers is not None and (known := warm_start.parameters.values().get(platen)) is not None:
         narrow = narrow.with_values({platen: known})  # the markers tell it anyhow; from there the solution is near
     if warm_start is None and load_case.specimen.mesh.n_points >= WORTHWHILE:
-        coarse, start = _solved_on_larger_elements(load_case, narrow, platen, markers)
+        coarse, start, rate = _solved_on_larger_elements(load_case, narrow, platen, markers)
     if coarse is not None:
         narrow = coarse.parameters
-    narrow, fit, gauge = _solved(load_case, narrow, platen, markers, start)
+    narrow, fit, gauge, _ = _solved(Matcher([load_case], narrow), platen, markers, start, rate)
     wide = parameters.with_values({platen: narrow.values()[platen]})
     fit = Matcher([load_case], wide).differentiated([fit], wide.values())[0]
     return SolvedState(load_case, wide, fit, gauge, coarse)
@@ -90,23 +90,29 @@ def solve_state(
 
 def _solved_on_larger_elements(
     load_case: MarkerLoadCase, parameters: ParameterSet, platen: str, markers: State | None
-) -> tuple[SolvedLoadCase | None, SolvedLoadCase | None]:
-    """Return the solution on larger elements, and the same on those of the load case; none where they cannot take the deformation."""
+) -> tuple[SolvedLoadCase | None, SolvedLoadCase | None, float | None]:
+    """Return the solution on larger elements, and the same on those of the load case; none where they cannot take the deformation.
+
+    The last is how the distance of the outermost markers changes with the platen position there.
+    """
     try:
         body = coarsened(load_case.specimen)
-        found, fit, _ = _solved(replace(load_case, specimen=body), parameters, platen, markers, None)
+        matcher = Matcher([replace(load_case, specimen=body)], parameters)
+        found, fit, _, rate = _solved(matcher, platen, markers, None)
+        fit = matcher.differentiated([fit], found.values())[0]
     except (ConvergenceError, InputError):  # nothing is lost: the elements of the load case are solved from rest, or say why not
-        return None, None
+        return None, None, None
     coarse = SolvedLoadCase(fit, found)
-    return coarse, on_finer_mesh(coarse, body, load_case.specimen)
+    return coarse, on_finer_mesh(coarse, body, load_case.specimen), rate
 
 
 def _solved(
-    load_case: MarkerLoadCase, parameters: ParameterSet, platen: str, markers: State | None, start: SolvedLoadCase | None
-) -> tuple[ParameterSet, LoadCaseFit, Gauge | None]:
-    matcher = Matcher([load_case], parameters)
-    fit = matcher.evaluate(parameters.values(), [start])[0]
+    matcher: Matcher, platen: str, markers: State | None, start: SolvedLoadCase | None, rate: float | None = None
+) -> tuple[ParameterSet, LoadCaseFit, Gauge | None, float | None]:
+    load_case, parameters = matcher.load_cases[0], matcher.parameters
+    fit = matcher.evaluate(parameters.values(), [start], derivatives=False)[0]
     if markers is None:
-        return parameters, fit, None
+        return parameters, fit, None, None
     gauge = outermost_markers(load_case.specimen, markers, fit.sd)
-    return *fitted_platen_position(matcher, fit, platen, gauge), gauge
+    found, fit, rate = fitted_platen_position(matcher, fit, platen, gauge, rate)
+    return found, fit, gauge, rate

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from naibu.core.arrays import BoolArray, FloatArray, IntArray
+from naibu.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.bone_mask import otsu_thresholds
 from naibu.imaging.preprocessing.field_of_view import Box, in_box
 
 # empirical: upper bound of the threshold, in fractions from the mean of the air to that of the object: skin is darker than the mean
 DIMMEST = 0.3
+SMOOTHING = 1.0  # voxels: standard deviation of the Gaussian before the threshold
 CLOSING = 2  # empirical, voxels: radius of the morphological closing that bridges noise at the surface
 # empirical: radii of the throats through which cavities may be open, in fractions of the cube root of the volume of the bright region; a
 # cavity has room for a ball so much larger than its throat, or it is a gap of the outline
@@ -49,18 +50,36 @@ def object_mask(volume: Volume, *, margin: int = 0) -> BoolArray:
     Cavities are found in three dimensions: air is outside if it is connected to air on a face of the volume that no outline encloses within
     that face. A cavity may be open to the outside, as lungs are by the trachea, through a throat much narrower than itself.
     """
-    values = np.asarray(volume.values, dtype=np.float32)
-    reach = tuple(1.0 if n > 1 else 0.0 for n in volume.shape)
-    smooth = ndimage.gaussian_filter(values, reach)
-    limit = float(otsu_thresholds(smooth, 2)[0])
-    air, body = float(smooth[smooth < limit].mean()), float(smooth[smooth >= limit].mean())
-    found = smooth > min(limit, air + DIMMEST * (body - air))
+    smooth = _smoothed(volume)
+    found = smooth > _limit(smooth)
     labels, _ = ndimage.label(found)
     found = labels == 1 + np.argmax(np.bincount(labels.ravel())[1:])
     pad = CLOSING + 1
     found = ndimage.binary_closing(np.pad(found, pad), iterations=CLOSING)[pad:-pad, pad:-pad, pad:-pad]
     found = _with_cavities(found, volume)
     return np.asarray(ndimage.binary_dilation(found, iterations=margin) if margin else found)
+
+
+def object_threshold(volume: Volume) -> float:
+    """Return the intensity above which `object_mask` takes smoothed voxels for bright.
+
+    Raises
+    ------
+    InputError
+        Volume without contrast.
+    """
+    return _limit(_smoothed(volume))
+
+
+def _smoothed(volume: Volume) -> Float32Array:
+    reach = tuple(SMOOTHING if n > 1 else 0.0 for n in volume.shape)
+    return np.asarray(ndimage.gaussian_filter(np.asarray(volume.values, dtype=np.float32), reach))
+
+
+def _limit(smooth: Float32Array) -> float:
+    limit = float(otsu_thresholds(smooth, 2)[0])
+    air, body = float(smooth[smooth < limit].mean()), float(smooth[smooth >= limit].mean())
+    return min(limit, air + DIMMEST * (body - air))
 
 
 def mask_in_view(volume: Volume, view: Box, *, margin: int = 0) -> BoolArray:

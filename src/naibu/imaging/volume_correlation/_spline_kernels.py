@@ -199,6 +199,12 @@ def _gather(c: AnyArray, cell: AnyArray, local: AnyArray) -> None:
             local[a, i] = c[z + (a >> 4), y + ((a >> 2) & 3), x + (a & 3), i] - c[z + 1, y + 1, x + 1, i]
 
 
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _clear(load: AnyArray) -> None:
+    """Fill load with zeros; within a parallel kernel that would become a loop of its own, which takes seconds to compile."""
+    load[:] = F(0)
+
+
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
 def assemble(
     big: AnyArray,
@@ -232,7 +238,7 @@ def assemble(
                 for a in range(3):
                     box[2 * a], box[2 * a + 1] = starts[a][cell[4 - a]], starts[a][cell[4 - a] + 1]
                 _gather(c, cell, local)
-                load[:] = F(0)
+                _clear(load)
                 found = _moments(products, force, which, box, weights[0], weights[1], weights[2], m1, m2, m3, f1, f2, load)
                 _add_bending(local, stiffness, bending[m], load, bending_energy[m])
                 if dilatation[m] > 0:
@@ -267,34 +273,45 @@ def product(big: AnyArray, neighbours: AnyArray, x: AnyArray, y: AnyArray) -> No
             y[p, 0], y[p, 1], y[p, 2] = s0, s1, s2
 
 
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _add_scaled(w: Any, x: AnyArray, y: AnyArray) -> None:
+    """Add w x to y (k,); loops around it have bounds that the compiler does not know, so that it is not unrolled many times."""
+    for k in range(len(x)):
+        y[k] += w * x[k]
+
+
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
 def products_of_many(big: AnyArray, neighbours: AnyArray, x: AnyArray, y: AnyArray) -> None:
     """Fill y (n, 3, s) with A x of s vectors at once; x (n + 1, 3, s)."""
-    n, samples = big.shape[0], x.shape[2]
+    n = big.shape[0]
     for t in prange(CHUNKS):
-        sums = np.empty((3, samples), F)
         for p in range(t * n // CHUNKS, (t + 1) * n // CHUNKS):
-            sums[:] = F(0)
-            for o in range(343):
-                q = neighbours[p, o]
-                if q == n:
-                    continue
-                for j in range(3):
-                    a0, a1, a2 = big[p, 0, 3 * o + j], big[p, 1, 3 * o + j], big[p, 2, 3 * o + j]
-                    for s in range(samples):
-                        v = x[q, j, s]
-                        sums[0, s] += a0 * v
-                        sums[1, s] += a1 * v
-                        sums[2, s] += a2 * v
-            y[p] = sums
+            _row_products(big[p], neighbours[p], x, y[p])
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _row_products(rows: AnyArray, neighbours: AnyArray, x: AnyArray, sums: AnyArray) -> None:
+    """Fill sums (3, s) with the products of three rows (3, 1029)."""
+    n, samples = len(x) - 1, x.shape[2]
+    sums[:] = F(0)
+    for o in range(len(neighbours)):
+        q = neighbours[o]
+        if q == n:
+            continue
+        for j in range(x.shape[1]):
+            a0, a1, a2 = rows[0, 3 * o + j], rows[1, 3 * o + j], rows[2, 3 * o + j]
+            for s in range(samples):
+                v = x[q, j, s]
+                sums[0, s] += a0 * v
+                sums[1, s] += a1 * v
+                sums[2, s] += a2 * v
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
 def _add_forces(
     forces: AnyArray, which: AnyArray, box: AnyArray, wx: AnyArray, wy: AnyArray, wz: AnyArray, f1: AnyArray, f2: AnyArray, load: AnyArray
 ) -> None:
-    """Add the forces (voxels, 3, s) in a cell to load (64, 3, s)."""
-    samples = forces.shape[2]
+    """Add the forces (voxels, 3 s) in a cell to load (64, 3 s)."""
     for z in range(box[4], box[5]):
         f2[:] = F(0)
         for y in range(box[2], box[3]):
@@ -302,43 +319,47 @@ def _add_forces(
             for x in range(box[0], box[1]):
                 p = which[z, y, x]
                 if p >= 0:
-                    for a in range(4):
-                        for k in range(3):
-                            for s in range(samples):
-                                f1[a, k, s] += wx[x, a] * forces[p, k, s]
-            for a in range(4):
-                for q in range(4):
-                    for k in range(3):
-                        for s in range(samples):
-                            f2[4 * a + q, k, s] += wy[y, a] * f1[q, k, s]
-        for a in range(4):
-            for q in range(16):
-                for k in range(3):
-                    for s in range(samples):
-                        load[16 * a + q, k, s] += wz[z, a] * f2[q, k, s]
+                    for a in range(wx.shape[1]):
+                        _add_scaled(wx[x, a], forces[p], f1[a])
+            for a in range(len(f2)):
+                _add_scaled(wy[y, a >> 2], f1[a & 3], f2[a])
+        for a in range(len(load)):
+            _add_scaled(wz[z, a >> 4], f2[a & 15], load[a])
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _scatter(load: AnyArray, cell: AnyArray, slot: AnyArray, loads: AnyArray) -> None:
+    """Add the load (64, 3 s) of a cell to loads (n, 3 s)."""
+    for a in range(len(load)):
+        _add_scaled(F(1), load[a], loads[slot[cell[2] + (a >> 4), cell[3] + ((a >> 2) & 3), cell[4] + (a & 3)]])
 
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
 def add_forces(
     loads: AnyArray, tasks: AnyArray, cells: AnyArray, slot: AnyArray, forces: AnyArray, which: AnyArray, starts: Any, weights: Any
 ) -> None:
-    """Add the loads of forces (voxels, 3, s) to loads (n, 3, s)."""
-    samples = forces.shape[2]
+    """Add the loads of forces (voxels, 3 s) to loads (n, 3 s)."""
+    many = forces.shape[1]
     for colour in range(len(tasks) - 1):
         for task in prange(tasks[colour], tasks[colour + 1]):
-            f1, f2, load = np.empty((4, 3, samples), F), np.empty((16, 3, samples), F), np.empty((64, 3, samples), F)
-            box = np.empty(6, np.int64)
+            f1, f2, load, box = np.empty((4, many), F), np.empty((16, many), F), np.empty((64, many), F), np.empty(6, np.int64)
             for m in range(cells[task, 0], cells[task, 1]):
                 cell = cells[m]
                 for a in range(3):
                     box[2 * a], box[2 * a + 1] = starts[a][cell[4 - a]], starts[a][cell[4 - a] + 1]
-                load[:] = F(0)
+                _clear(load)
                 _add_forces(forces, which, box, weights[0], weights[1], weights[2], f1, f2, load)
-                for a in range(64):
-                    n = slot[cell[2] + (a >> 4), cell[3] + ((a >> 2) & 3), cell[4] + (a & 3)]
-                    for i in range(3):
-                        for s in range(samples):
-                            loads[n, i, s] += load[a, i, s]
+                _scatter(load, cell, slot, loads)
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _add_dilatation(cof: AnyArray, gradients: AnyArray, t: Any, draws: AnyArray, load: AnyArray) -> None:
+    """Add t times draws (s,) of the dilatation at a Gauss point with gradients (3, 64) to load (64, 3 s)."""
+    samples = len(draws)
+    for a in range(len(load)):
+        for i in range(len(cof)):
+            w = t * (cof[i, 0] * gradients[0, a] + cof[i, 1] * gradients[1, a] + cof[i, 2] * gradients[2, a])
+            _add_scaled(w, draws, load[a, i * samples : (i + 1) * samples])
 
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
@@ -346,35 +367,52 @@ def add_noise(
     loads: AnyArray, tasks: AnyArray, cells: AnyArray, slot: AnyArray, c: AnyArray, bending_draws: AnyArray, dilatation: AnyArray,
     gradients: AnyArray, dilatation_draws: AnyArray,
 ) -> None:  # fmt: skip
-    """Add the loads of random draws from the penalties to loads (n, 3, s).
+    """Add the loads of random draws from the penalties to loads (n, 3 s).
 
-    bending_draws (m, 3, 64, s): random loads of bending; dilatation_draws (m, 8, s): random dilatations.
+    bending_draws (m, 64, 3 s): random loads of bending; dilatation_draws (m, 8, s): random dilatations.
     """
-    samples = loads.shape[2]
     for colour in range(len(tasks) - 1):
         for task in prange(tasks[colour], tasks[colour + 1]):
-            load, local, cof = np.empty((64, 3, samples), F), np.empty((64, 3), F), np.empty((3, 3), F)
+            local, cof = np.empty((64, 3), F), np.empty((3, 3), F)
             for m in range(cells[task, 0], cells[task, 1]):
-                cell = cells[m]
-                for a in range(64):
-                    for i in range(3):
-                        for s in range(samples):
-                            load[a, i, s] = bending_draws[m, i, a, s]
+                load = bending_draws[m]
                 if dilatation[m] > 0:
-                    _gather(c, cell, local)
-                    for q in range(gradients.shape[0]):
+                    _gather(c, cells[m], local)
+                    for q in range(len(gradients)):
                         _cofactor(local, gradients, q, cof)
-                        t = F(np.sqrt(dilatation[m]))
-                        for a in range(64):
-                            for i in range(3):
-                                w = t * (cof[i, 0] * gradients[q, 0, a] + cof[i, 1] * gradients[q, 1, a] + cof[i, 2] * gradients[q, 2, a])
-                                for s in range(samples):
-                                    load[a, i, s] += w * dilatation_draws[m, q, s]
-                for a in range(64):
-                    n = slot[cell[2] + (a >> 4), cell[3] + ((a >> 2) & 3), cell[4] + (a & 3)]
-                    for i in range(3):
-                        for s in range(samples):
-                            loads[n, i, s] += load[a, i, s]
+                        _add_dilatation(cof, gradients[q], F(np.sqrt(dilatation[m])), dilatation_draws[m, q], load)
+                _scatter(load, cells[m], slot, loads)
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _energy_of_samples(xl: AnyArray, stiffness: AnyArray, d: AnyArray) -> Any:
+    """Return the sum over samples of x . K x of xl (64, s)."""
+    e = F(0)
+    for a in range(len(xl)):
+        d[:] = F(0)
+        for b in range(len(xl)):
+            _add_scaled(stiffness[a, b], xl[b], d)
+        e += _squares(d, xl[a])
+    return e
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _squares(d: AnyArray, x: AnyArray) -> Any:
+    e = F(0)
+    for s in range(len(d)):
+        e += d[s] * x[s]
+    return e
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _dilatation_of_samples(cof: AnyArray, gradients: AnyArray, xl: AnyArray, d: AnyArray) -> Any:
+    """Return the sum over samples xl (3, 64, s) of their squared linear dilatation at a Gauss point with gradients (3, 64)."""
+    d[:] = F(0)
+    for i in range(len(xl)):
+        for a in range(xl.shape[1]):
+            w = cof[i, 0] * gradients[0, a] + cof[i, 1] * gradients[1, a] + cof[i, 2] * gradients[2, a]
+            _add_scaled(w, xl[i, a], d)
+    return _squares(d, d)
 
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
@@ -394,31 +432,15 @@ def sample_energies(
         cell = cells[m]
         local, xl, cof, d = np.empty((64, 3), F), np.empty((3, 64, samples), F), np.empty((3, 3), F), np.empty(samples, F)
         _gather(c, cell, local)
-        for a in range(64):
+        for a in range(xl.shape[1]):
             n = slot[cell[2] + (a >> 4), cell[3] + ((a >> 2) & 3), cell[4] + (a & 3)]
-            for i in range(3):
+            for i in range(len(xl)):
                 for s in range(samples):
                     xl[i, a, s] = x[n, i, s]
-        for i in range(3):
-            e = F(0)
-            for a in range(64):
-                d[:] = F(0)
-                for b in range(64):
-                    k = stiffness[a, b]
-                    for s in range(samples):
-                        d[s] += k * xl[i, b, s]
-                for s in range(samples):
-                    e += d[s] * xl[i, a, s]
-            bending_energy[m, i] = e / samples
+        for i in range(len(xl)):
+            bending_energy[m, i] = _energy_of_samples(xl[i], stiffness, d) / samples
         e = F(0)
-        for q in range(gradients.shape[0]):
+        for q in range(len(gradients)):
             _cofactor(local, gradients, q, cof)
-            d[:] = F(0)
-            for i in range(3):
-                for a in range(64):
-                    w = cof[i, 0] * gradients[q, 0, a] + cof[i, 1] * gradients[q, 1, a] + cof[i, 2] * gradients[q, 2, a]
-                    for s in range(samples):
-                        d[s] += w * xl[i, a, s]
-            for s in range(samples):
-                e += d[s] * d[s]
+            e += _dilatation_of_samples(cof, gradients[q], xl, d)
         dilatation_energy[m] = e / samples

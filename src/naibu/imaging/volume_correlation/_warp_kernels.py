@@ -218,6 +218,14 @@ def shrink_gradients(
         products[p, 3], products[p, 4], products[p, 5] = w * y * y, w * y * z, w * z * z
 
 
+@njit(cache=True)
+def add_to_cells(cell: IntArray, values: AnyArray, sums: AnyArray) -> None:
+    """Add values (n, k) of voxels to the sums (m, k) of their cells (n,)."""
+    for p in range(len(cell)):
+        for k in range(values.shape[1]):
+            sums[cell[p], k] += values[p, k]
+
+
 @njit(cache=True, inline="always")
 def _corners(x: Any, y: Any, z: Any, low: AnyArray, step: AnyArray, n: IntArray, ids: IntArray, w: AnyArray) -> None:
     px, py, pz = (x - low[0]) / step[0], (y - low[1]) / step[1], (z - low[2]) / step[2]

@@ -9,12 +9,16 @@ volume correlation :cite:p:`leclerc2011`.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+
 import numpy as np
 from scipy import ndimage
 
-from naibu.core.arrays import AnyFloatArray, FloatArray
+from naibu.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray, IntArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.volume import Volume
+from naibu.imaging.volume_correlation._warp_kernels import add_to_cells
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise
 
@@ -25,6 +29,39 @@ RIM = 2  # voxels from the surface, where air is mixed in, that are left out
 FAR = 9.0  # mean square of a step, in variances, from which the splines are too far off for one step
 DRAWS = 8  # of correlated noise: one factor for all blocks follows from them
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BlockSums:
+    """Sums over the voxels of small blocks, from which the displacement of each follows.
+
+    Attributes
+    ----------
+    matrix : ndarray, shape (k, 3, 3)
+        Normal matrices.
+    force : ndarray, shape (k, 3)
+        Forces of the residuals.
+    drawn : ndarray, shape (k, 3, d)
+        Forces of random residuals.
+    count : ndarray, shape (k,)
+        Voxels.
+    middle : ndarray, shape (k, 3)
+        Mean index x, y, z of the voxels, weighted by their information.
+    displacement : ndarray, shape (k, 3)
+        Mean displacement by the splines, weighted likewise, mm.
+    """
+
+    matrix: FloatArray
+    force: FloatArray
+    drawn: FloatArray
+    count: FloatArray
+    middle: FloatArray
+    displacement: FloatArray
+
+    @classmethod
+    def joined(cls, parts: Sequence[BlockSums]) -> BlockSums:
+        """Return the blocks of all parts."""
+        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
 
 def block_displacements(volume: Volume, fit: CorrelationFit, noise: ResidualNoise, seed: int) -> DisplacementField:
@@ -41,33 +78,64 @@ def block_displacements(volume: Volume, fit: CorrelationFit, noise: ResidualNois
     seed : int
         Of these draws.
     """
-    inner = ndimage.binary_erosion(np.pad(fit.level.mask, 1), iterations=RIM)[1:-1, 1:-1, 1:-1][fit.level.mask] & fit.seen
-    edge = max(LEAST_EDGE, int(np.ceil((max(int(inner.sum()), 1) / BLOCKS) ** (1.0 / 3.0))))
-    index = fit.level.index.astype(np.int64)
-    _, block = np.unique((index - index.min(axis=0)) // edge, axis=0, return_inverse=True)
-    block = block.ravel()
-    count = np.bincount(block, inner).astype(float)
+    inner = below_surface(np.pad(fit.level.mask, RIM))[fit.level.mask] & fit.seen
+    rng = np.random.default_rng(seed)
+    sums = sums_of_blocks(fit, inner, block_edge(int(inner.sum())), (noise.draw(rng) for _ in range(DRAWS)))
+    return displacement_of_blocks(volume, sums, fit.level.spacing, noise.scale)
+
+
+def below_surface(mask: BoolArray) -> BoolArray:
+    """Return which voxels are far enough from the surface; the mask is given with two more voxels at every face, the result without."""
+    inside = (slice(RIM, -RIM),) * 3
+    return np.asarray(ndimage.binary_erosion(mask, iterations=RIM)[inside])
+
+
+def block_edge(voxels: int) -> int:
+    """Return the edge of the blocks, voxels, for so many voxels in all."""
+    return max(LEAST_EDGE, int(np.ceil((max(voxels, 1) / BLOCKS) ** (1.0 / 3.0))))
+
+
+def sums_of_blocks(fit: CorrelationFit, inner: BoolArray, edge: int, draws: Iterable[Float32Array]) -> BlockSums:
+    """Return the sums over blocks of `edge` voxels, of the listed voxels that are `inner` (n,), with those of random residuals (n,)."""
+    block = _numbers(fit.level.mask, edge)[inner]
+    count = np.bincount(block).astype(float)
 
     def sums(values: AnyFloatArray) -> FloatArray:
-        columns = (np.asarray(values, dtype=float).reshape(len(block), -1) * inner[:, None]).T
-        return np.stack([np.bincount(block, c, minlength=len(count)) for c in columns], axis=1)
+        out = np.zeros((len(count), int(np.prod(values.shape[1:]))))
+        add_to_cells(block, np.ascontiguousarray(values.reshape(len(values), -1)[inner]), out)
+        return out
 
     matrix = np.empty((len(count), 3, 3))
     for (i, j), total in zip(UPPER, sums(fit.products).T, strict=True):
         matrix[:, i, j] = matrix[:, j, i] = total
-    values, vectors = np.linalg.eigh(matrix)
-    longest = MOST_SD * float(np.prod(fit.level.spacing) ** (1.0 / 3.0))
-    good = (count >= LEAST_VOXELS) & (values[:, 0] > longest**-2.0)
-    inverse = np.einsum("nik,nk,njk->nij", vectors[good], 1.0 / values[good], vectors[good])
     weight = fit.products[:, [0, 3, 5]].sum(axis=1, dtype=float)
-    share = (weight / np.maximum(sums(weight)[:, 0], 1e-300)[block])[:, None]
-    middle, mean = sums(share * fit.level.index)[good], sums(share * fit.displacement)[good]
-    total = sums(fit.force)[good]
-    step = noise.scale * np.einsum("nij,nj->ni", inverse, total)  # robust weights fall as residuals grow: forces rise less than A says
-    rng, drawn = np.random.default_rng(seed), 0.0
-    for _ in range(DRAWS):
-        force = sums((np.sqrt(fit.weight) * noise.draw(rng))[:, None] * fit.gradient)[good]
-        drawn += float(np.einsum("ni,nij,nj->n", force, inverse, force).mean()) / (3.0 * DRAWS)
-    near, r = np.einsum("ni,ni->n", step, total) < 3.0 * FAR * drawn, volume.direction
-    covariance = r @ (drawn * inverse[near]) @ r.T
-    return DisplacementField.from_arrays(volume.to_physical(middle[near]), (mean + step)[near] @ r.T, covariance=covariance)
+    total_weight = np.zeros(len(inner))
+    total_weight[inner] = sums(weight)[block, 0]
+    share = (weight / np.maximum(total_weight, 1e-300))[:, None]
+    root = np.sqrt(fit.weight)
+    drawn = np.stack([sums((root * draw)[:, None] * fit.gradient) for draw in draws], axis=2)
+    kept = count >= LEAST_VOXELS
+    found = matrix, sums(fit.force), drawn, count, sums(share * fit.level.index), sums(share * fit.displacement)
+    return BlockSums(*(values[kept] for values in found))
+
+
+def _numbers(mask: BoolArray, edge: int) -> IntArray:
+    """Return the number of the block of `edge` voxels in which every voxel (n,) of a mask lies."""
+    nz, ny, _ = (-(-n // edge) for n in mask.shape)
+    z, y, x = np.ogrid[tuple(slice(n) for n in mask.shape)]
+    return np.asarray((((x // edge) * ny + y // edge) * nz + z // edge)[mask])
+
+
+def displacement_of_blocks(volume: Volume, sums: BlockSums, spacing: FloatArray, scale: float) -> DisplacementField:
+    """Return the displacement of blocks with information in all directions; `scale` is that of `ResidualNoise`."""
+    values, vectors = np.linalg.eigh(sums.matrix)
+    longest = MOST_SD * float(np.prod(spacing) ** (1.0 / 3.0))
+    good = values[:, 0] > longest**-2.0
+    inverse = np.einsum("nik,nk,njk->nij", vectors[good], 1.0 / values[good], vectors[good])
+    total, drawn = sums.force[good], sums.drawn[good]
+    step = scale * np.einsum("nij,nj->ni", inverse, total)  # robust weights fall as residuals grow: forces rise less than A says
+    variance = float(np.einsum("nid,nij,njd->nd", drawn, inverse, drawn).mean()) / 3.0 if good.any() else 0.0
+    near, r = np.einsum("ni,ni->n", step, total) < 3.0 * FAR * variance, volume.direction
+    covariance = r @ (variance * inverse[near]) @ r.T
+    moved = (sums.displacement[good] + step)[near] @ r.T
+    return DisplacementField.from_arrays(volume.to_physical(sums.middle[good][near]), moved, covariance=covariance)

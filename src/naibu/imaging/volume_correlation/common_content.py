@@ -12,6 +12,7 @@ import numpy as np
 
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray
 from naibu.core.errors import InputError
+from naibu.imaging.volume_correlation._warp_kernels import add_to_cells
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
 
 # correlation of the image intensity gradients of the registered volumes, below which nothing was matched: two volumes of noise or of
@@ -97,16 +98,29 @@ def common_content(fit: CorrelationFit, depth_mm: Float32Array) -> CommonContent
     depth_mm : ndarray, shape (n,)
         Distance of the listed voxels from the surface of the object, mm.
     """
+    return content_of(fit, content_sums(fit, depth_mm))
+
+
+def content_sums(fit: CorrelationFit, depth_mm: Float32Array) -> FloatArray:
+    """Return sums (m, 8) over the voxels of every cell, from which `content_of` follows."""
     inside = depth_mm > SURFACE * float(fit.system.grid.step_mm.mean())
     traces = np.stack([fit.agreement[:, axes].sum(axis=1) for axes in ([0, 3, 5], [6, 9, 11])], axis=1)
     every = np.column_stack([traces, np.ones(len(traces))])
-    sums = [np.stack([fit.cell_sums(v) for v in rows.T], axis=1) for rows in (every, every * inside[:, None])]
+    residual = fit.residual * np.sqrt(fit.weight)
+    columns = [*every.T, *(every * inside[:, None]).T, _lagged(fit, residual), residual**2]
+    sums = np.zeros((len(fit.system.cells), len(columns)))
+    add_to_cells(fit.cell_of_voxel, np.stack(columns, axis=1), sums)
+    return sums
+
+
+def content_of(fit: CorrelationFit, cells: FloatArray) -> CommonContent:
+    """Return what cells have in common from the sums (m, 8) of `content_sums`."""
+    sums = cells[:, :3], cells[:, 3:6]
     judged = fit.windowed(sums[0], WINDOWS[0])
     for width in WINDOWS[::-1]:
         deep = fit.windowed(sums[1], width) * (2.0 * np.sqrt(np.pi) * width) ** 3
         judged = np.where(deep[:, 2:] > LEAST_VOXELS, deep, judged)
-    residual = fit.residual * np.sqrt(fit.weight)
-    structure = [fit.windowed(fit.cell_sums(v), WINDOWS[0]) for v in (_lagged(fit, residual), residual**2)]
+    structure = [fit.windowed(v, WINDOWS[0]) for v in cells[:, 6:].T]
     return CommonContent(judged[:, 0] / np.maximum(judged[:, 1], 1e-30), structure[0] / np.maximum(structure[1], 1e-30))
 
 

@@ -35,7 +35,7 @@ from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.inclusion_candidates import LEAST_VOLUME, inclusion_candidates
 from naibu.imaging.volume_correlation.intensity_comparison import ComparisonSettings
 from naibu.imaging.volume_correlation.normal_equations import SplineSystem
-from naibu.imaging.volume_correlation.residual_noise import ResidualNoise
+from naibu.imaging.volume_correlation.residual_noise import ResidualNoise, lost_to_robustness
 from naibu.imaging.volume_correlation.result import CorrelationResult, collected
 from naibu.imaging.volume_correlation.rigid_inclusions import RigidInclusion, rigid_inclusions_among
 from naibu.imaging.volume_correlation.rigid_initialization import RigidInitialization, correlated_shift
@@ -136,7 +136,7 @@ def correlate_volumes(
     Outer planes of NaN or of one intensity are padding: they are excluded from the comparison, and the displacement of what they hide is
     not answered (see `naibu.imaging.preprocessing.field_of_view`).
     """
-    correlation = _Correlation(reference, deformed, (mask, deformed_mask), settings, progress)
+    correlation = Correlation(reference, deformed, (mask, deformed_mask), settings, progress)
     correlation.initialize()
     correlation.refine()
     correlation.find_inclusions(rigid_mask)
@@ -144,8 +144,8 @@ def correlate_volumes(
     return correlation.result()
 
 
-class _Correlation:
-    """State of a correlation that its steps hand on."""
+class Correlation:
+    """State of a correlation that its steps hand on: `initialize`, `refine`, `find_inclusions`, `adapt`, `result`."""
 
     def __init__(
         self,
@@ -156,6 +156,7 @@ class _Correlation:
         progress: Progress | None,
     ) -> None:
         mask, deformed_mask = masks
+        self.mask_given = mask is not None
         self.volume, self.settings, self.progress = reference, settings, progress
         _check_shape(reference, deformed)
         self.views = fields_of_view(reference, deformed)
@@ -183,9 +184,11 @@ class _Correlation:
         self.starts = [self.c]
 
     def level(self, stride: tuple[int, ...], smoothing: float) -> ImageLevel:
+        """Return the voxels at a resolution."""
         return ImageLevel(self.reference, self.deformed, self.mask, self.spacing, stride, smoothing, self.views)
 
     def comparison(self, level: int) -> ComparisonSettings:
+        """Return how intensities are compared on a level."""
         s, fine = self.settings, level > 1
         # on the coarsest level a local gain would explain what has moved
         cell = s.gain_cell * float(self.step.mean()) if s.local_gain and level else 0.0
@@ -278,28 +281,38 @@ class _Correlation:
         labels[view] = inclusion_candidates(shown, self.mask[view], size)
         return labels
 
+    def follow_inclusions(self) -> None:
+        """Fit with the rigid inclusions, and tell cells near them from others."""
+        fit = self.fit
+        if self.inclusions:
+            self.c = fit.iterate(self.c, self.bending, self.dilatation * fit.system.gauss_volume, Iterations(INCLUSION_STEPS))
+        self.kinds = _kinds(fit, self.inclusions)
+        self.most_dilatation = self.dilatation / (FIRST_DILATATION * self.dilatation_factor)
+
     def adapt(self) -> None:
         """Choose the weights of the penalties by the data, and fit once more."""
         fit, system, s = self.fit, self.fit.system, self.settings
-        if self.inclusions:
-            self.c = fit.iterate(self.c, self.bending, self.dilatation * system.gauss_volume, Iterations(INCLUSION_STEPS))
+        self.follow_inclusions()
         if not s.adaptive_weight:
             return
-        kinds, width = _kinds(fit, self.inclusions), WEIGHT_WINDOW * float(self.step.mean())
-        most = self.dilatation / (FIRST_DILATATION * self.dilatation_factor)
         for k in range(ADAPTATIONS):
             report_progress(self.progress, "weights of the penalties", done=k, total=ADAPTATIONS)
             samples = fit.samples(self.c, self.bending, self.dilatation * system.gauss_volume, ADAPTATION_SAMPLES, None, s.seed)
-            self.bending, dilatation = chosen_weights(fit, samples, self.c, self.bending, self.dilatation, width, kinds)
-            before = self.dilatation
-            if s.dilatation_penalty:
-                # never more than assumed: what little volume changes may not be noise alone
-                self.dilatation = float(np.clip(dilatation, LEAST_WEIGHT * before, most))
+            settled = self.reweigh(samples)
             iterations = Iterations(ADAPTED_STEPS, unsettled=UNSETTLED)
             self.c = fit.iterate(self.c, self.bending, self.dilatation * system.gauss_volume, iterations)
-            # a field that was penalised too much shows only in part how much volume changes
-            if self.dilatation > 0.5 * before:
+            if settled:
                 break
+
+    def reweigh(self, samples: Float32Array) -> bool:
+        """Choose the weights of the penalties given random coefficients (n, 3, s), and return whether another round changes little."""
+        width, before = WEIGHT_WINDOW * float(self.step.mean()), self.dilatation
+        self.bending, dilatation = chosen_weights(self.fit, samples, self.c, self.bending, before, width, self.kinds)
+        if self.settings.dilatation_penalty:
+            # never more than assumed: what little volume changes may not be noise alone
+            self.dilatation = float(np.clip(dilatation, LEAST_WEIGHT * before, self.most_dilatation))
+        # a field that was penalised too much shows only in part how much volume changes
+        return self.dilatation > 0.5 * before
 
     def depth_mm(self, level: ImageLevel) -> Float32Array:
         """Return the distance (n,) of the listed voxels of the finest level from the surface, mm; the ends of the volume are none."""
@@ -317,25 +330,47 @@ class _Correlation:
         fit.reliability = None
         fit.compare(self.c)
         fit.system.assembled(self.c, fit.products, fit.force, self.bending, dilatation)
-        if fit.seen.mean() < LEAST_OVERLAP:
-            raise InputError(
-                f"only {fit.seen.mean():.1%} of the object lies in the deformed volume after its motion: the volumes do not overlap, or do "
-                "not show the same object"
-            )
+        require_overlap(float(fit.seen.mean()))
         refuse_unrelated(fit)
         content = common_content(fit, self.depth_mm(fit.level))
         content.refuse_chance(system.inner)
-        if fit.moving_fraction > MOST_MOVING:
-            raise InputError(
-                f"no displacement fits the volumes: {fit.moving_fraction:.0%} of the object had not converged after the last step; check "
-                "that both show the same object, and give masks of it if there is much else in them"
-            )
+        require_convergence(fit.moving_fraction)
         for inclusion in self.inclusions:
             inclusion.draws.clear()
-        noise = ResidualNoise(fit.level.mask, fit.residual * np.sqrt(fit.weight), _lost_to_robustness(fit))
+        noise = ResidualNoise(fit.level.mask, fit.residual * np.sqrt(fit.weight), lost_to_robustness(*fit.robust_sums))
         samples = fit.samples(self.c, self.bending, dilatation, self.settings.samples, noise, self.settings.seed + 1)
         found = collected(self.volume, fit, self.c, samples, self.bending, self.dilatation, content.matched)
         return replace(found, blocks=block_displacements(self.volume, fit, noise, self.settings.seed + 2))
+
+
+def require_overlap(seen: float) -> None:
+    """Refuse an object of which only a small fraction is seen in the deformed volume.
+
+    Raises
+    ------
+    InputError
+        Such an object.
+    """
+    if seen < LEAST_OVERLAP:
+        raise InputError(
+            f"only {seen:.1%} of the object lies in the deformed volume after its motion: the volumes do not overlap, or do not show the "
+            "same object"
+        )
+
+
+def require_convergence(moving: float) -> None:
+    """Refuse a field of which so many cells still moved in the last step that nothing was found.
+
+    Raises
+    ------
+    InputError
+        Such a field.
+    """
+    if moving > MOST_MOVING:
+        raise InputError(
+            f"no displacement fits the volumes: {moving:.0%} of the object had not converged after the last step; check that both show the "
+            "same object, and give masks of it if there is much else in them"
+        )
 
 
 def _check_shape(reference: Volume, deformed: Volume) -> None:
@@ -413,11 +448,3 @@ def _kinds(fit: CorrelationFit, inclusions: list[RigidInclusion]) -> IntArray:
     fraction = (np.bincount(flat, rigid, minlength=len(count)) / np.maximum(count, 1)).reshape(shape)
     near = ndimage.binary_dilation(fraction > 0, np.ones((3, 3, 3), dtype=bool))
     return np.asarray(np.where(fraction > 0.95, 2, np.where(near, 1, 0))[tuple(system.cells[:, 2:].T)], dtype=np.int64)
-
-
-def _lost_to_robustness(fit: CorrelationFit) -> float:
-    """Return the mean weight over the mean derivative of the robust force: the factor by which the normal matrix is too large."""
-    w = fit.weight.astype(float)
-    # with q = sqrt(w / w at r = 0): the derivative of r q^2 is q^2 (4 q - 3)
-    q = 1 / (1 + (fit.residual.astype(float) / (fit.settings.robust * fit.residual_sd)) ** 2)
-    return float(w.sum() / max(float((w * (4 * q - 3)).sum()), 0.2 * float(w.sum())))

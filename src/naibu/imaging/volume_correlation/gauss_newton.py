@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from naibu.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray, IntArray
-from naibu.imaging.volume_correlation._warp_kernels import shrink_gradients
+from naibu.imaging.volume_correlation._warp_kernels import add_to_cells, shrink_gradients
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.intensity_comparison import ComparisonSettings, IntensityComparison
 from naibu.imaging.volume_correlation.normal_equations import SplineSystem
@@ -82,15 +82,15 @@ class CorrelationFit(IntensityComparison):
         self.system, self.inclusions, self.noisy = system, inclusions, noisy
         self.reliability: Float32Array | None = None
         self.last_step = np.zeros((system.n, 3), np.float32)
+        self.still_mm = STILL * float(np.prod(level.spacing) ** (1 / 3))
 
     @cached_property
     def cell_of_voxel(self) -> IntArray:
         """Number of the cell of every listed voxel (n,)."""
-        system, level = self.system, self.level
-        where = (level.index.astype(np.int64) - level.low[::-1]).T
+        system = self.system
         number = np.full(tuple(int(n) for n in system.grid.cells[::-1]), -1, np.int64)
         number[tuple(system.cells[:, 2:].T)] = np.arange(len(system.cells))
-        return np.asarray(number[tuple(system.cell_of[a][where[a]] for a in (2, 1, 0))])
+        return np.asarray(number[np.ix_(*(system.cell_of[a] for a in (2, 1, 0)))][self.level.mask])
 
     @property
     def last_steps_mm(self) -> FloatArray:
@@ -100,7 +100,7 @@ class CorrelationFit(IntensityComparison):
     @property
     def moving(self) -> BoolArray:
         """Cells (m,) that have not converged: the last step moved them by a tenth of a voxel or more."""
-        return np.asarray(self.last_steps_mm > STILL * float(np.prod(self.level.spacing) ** (1 / 3)))
+        return np.asarray(self.last_steps_mm > self.still_mm)
 
     @property
     def moving_fraction(self) -> float:
@@ -139,10 +139,11 @@ class CorrelationFit(IntensityComparison):
     def compare(self, c: FloatArray) -> None:
         """Warp, weight the residuals at coefficients c, and let rigid inclusions replace those of their voxels."""
         self.system.warped(c, self.value, self.reference_gradient, self.gradient, self.displacement)
+        self.match()
         self.weigh()
         if self.noisy:
             if self.reliability is None:
-                self.reliability = self._reliability()
+                self.reliability = self.reliability_of(self.cell_agreement())
             shrink_gradients(self.reliability, self.cell_of_voxel, self.weight, self.residual, self.gradient, self.products, self.force)
         for inclusion in self.inclusions:
             inclusion.follow(self)
@@ -155,13 +156,19 @@ class CorrelationFit(IntensityComparison):
         sigma = (width,) * 3 + (0,) * (values.ndim - 1)
         return np.asarray(ndimage.gaussian_filter(dense, sigma, mode="constant")[at])
 
-    def _reliability(self) -> Float32Array:
+    def cell_agreement(self) -> FloatArray:
+        """Return the products of gradients (m, 12) summed over the voxels of every cell."""
+        sums = np.zeros((len(self.system.cells), 12))
+        add_to_cells(self.cell_of_voxel, self.agreement, sums)
+        return sums
+
+    def reliability_of(self, sums: FloatArray) -> Float32Array:
         """Return the matrix (m, 3, 3) by which a gradient in every cell is multiplied to leave out what is noise in it.
 
-        It is the local regression of the gradient of one volume on that of the other :cite:p:`fuller1987`. Noise would else count as
-        information, above all in directions in which the image varies little, such as along a surface.
+        From the sums (m, 12) of `cell_agreement`. It is the local regression of the gradient of one volume on that of the other
+        :cite:p:`fuller1987`. Noise would else count as information, above all in directions in which the image varies little, such as along
+        a surface.
         """
-        sums = np.stack([self.cell_sums(self.agreement[:, k]) for k in range(12)], axis=-1)
         common, own = (_symmetric(v) for v in np.split(self.windowed(sums, AGREEMENT_WINDOW), 2, axis=-1))
         trace = np.trace(own, axis1=1, axis2=2)[:, None, None]
         root = np.linalg.cholesky(own + (REGULAR * trace + 1e-30) * np.eye(3))

@@ -56,7 +56,7 @@ class ImageLevel:
         mask: BoolArray,
         spacing: FloatArray,
         stride: ArrayLike,
-        sigma: float,
+        sigma: float | FloatArray,
         views: tuple[Box, Box] | None = None,
     ) -> None:
         every = np.asarray(stride, dtype=int)[::-1]
@@ -141,14 +141,27 @@ class GainMap:
 
     def local(self, value: Float32Array, weight: Float32Array, variance: float) -> tuple[Float32Array, Float32Array]:
         """Return gain and offset (n,) at the listed voxels, the most probable ones given the residual's variance."""
-        gain, offset, spread = self.everywhere(value, weight)
+        matrix, load = self.normal_equations(value, weight)
+        return self.values(most_probable_gain(matrix / variance, load / variance, self.everywhere(value, weight)))
+
+    def normal_equations(self, value: Float32Array, weight: Float32Array) -> tuple[FloatArray, FloatArray]:
+        """Return matrix (2 k, 2 k) and right side (2 k,) of gain and offset at the k points of the lattice, by least squares."""
         n = int(np.prod(self.n))
         left, right = np.zeros((2, 2 * n, 2 * n)), np.zeros((2, 2 * n))
         gain_normal_equations(self.level.intensity, value, weight, self.level.index, self.low, self.step, self.n, left, right)
-        matrix, load = left.sum(axis=0) / variance, right.sum(axis=0) / variance
-        first = np.tile([gain, offset], n)
-        prior = np.tile([(GAIN_SD * gain) ** -2, (GAIN_SD * gain * max(spread, 1e-30)) ** -2], n)
-        solution = first + linalg.solve(matrix + np.diag(prior), load - matrix @ first, assume_a="pos")
-        a, b = np.empty(len(value), np.float32), np.empty(len(value), np.float32)
+        return left.sum(axis=0), right.sum(axis=0)
+
+    def values(self, solution: FloatArray) -> tuple[Float32Array, Float32Array]:
+        """Return gain and offset (n,) at the listed voxels from those of the lattice (2 k,)."""
+        a, b = np.empty(len(self.level.index), np.float32), np.empty(len(self.level.index), np.float32)
         gain_values(solution, self.level.index, self.low, self.step, self.n, a, b)
         return a, b
+
+
+def most_probable_gain(matrix: FloatArray, load: FloatArray, everywhere: tuple[float, float, float]) -> FloatArray:
+    """Return gain and offset (2 k,) on a lattice from normal equations, and from gain, offset and SD of the intensities of all voxels."""
+    gain, offset, spread = everywhere
+    n = len(load) // 2
+    first = np.tile([gain, offset], n)
+    prior = np.tile([(GAIN_SD * gain) ** -2, (GAIN_SD * gain * max(spread, 1e-30)) ** -2], n)
+    return np.asarray(first + linalg.solve(matrix + np.diag(prior), load - matrix @ first, assume_a="pos"))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from naibu.core.arrays import BoolArray, Float32Array
+from naibu.core.arrays import AnyFloatArray, BoolArray, Float32Array
 from naibu.imaging.volume_correlation._warp_kernels import OUTSIDE, weighted_residuals
 from naibu.imaging.volume_correlation.image_level import GainMap, ImageLevel
 
@@ -72,8 +72,8 @@ class IntensityComparison:
         """Which displaced voxels lie in the deformed volume (n,)."""
         return np.asarray(self.value > 0.9 * OUTSIDE)
 
-    def weigh(self) -> None:
-        """Match gain and offset, and weight the residuals at the present displacement."""
+    def match(self) -> None:
+        """Match gain and offset of the volumes at the present displacement."""
         seen, gain = self.seen, GainMap(self.level, self.settings.gain_cell_mm or 1.0)
         if self.residual_sd == 0.0:
             self.gain[:], self.offset[:], _ = gain.everywhere(self.value, self.robust_weight)
@@ -81,6 +81,9 @@ class IntensityComparison:
         if self.settings.gain_cell_mm:
             self.gain, self.offset = gain.local(self.value, self.robust_weight, self.residual_sd**2)
         self._update_residual_sd(seen)
+
+    def weigh(self) -> None:
+        """Weight the residuals at the present displacement, gain and offset."""
         s = self.settings
         scalars = np.array(
             [self.residual_sd**-2, (s.jitter_sd_voxels * self.level.spacing.mean()) ** 2, s.robust**-2, s.reference_fraction]
@@ -89,6 +92,14 @@ class IntensityComparison:
             self.level.intensity, self.value, self.gain, self.offset, self.reference_gradient, self.gradient, scalars.astype(np.float32),
             self.products, self.force, self.weight, self.residual, self.agreement,
         )  # fmt: skip
+
+    @property
+    def robust_sums(self) -> tuple[float, float]:
+        """Sums of the weights, and of the derivatives of weight times residual: robust forces rise less than residuals do."""
+        w = self.weight.astype(float)
+        # with q = sqrt(w / w at r = 0): the derivative of r q^2 is q^2 (4 q - 3)
+        q = 1 / (1 + (self.residual.astype(float) / (self.settings.robust * self.residual_sd)) ** 2)
+        return float(w.sum()), float((w * (4 * q - 3)).sum())
 
     @property
     def gradient_correlation(self) -> float:
@@ -105,8 +116,16 @@ class IntensityComparison:
         self.force -= strength * (self.displacement - first)
 
     def _update_residual_sd(self, seen: BoolArray) -> None:
-        r = np.where(seen, self.level.intensity - self.gain * self.value - self.offset, 0)
+        r = self.differences(seen)
         rest = r[seen] if seen.any() else self.level.intensity
         spread = float(np.sqrt(np.mean(rest**2))) if self.settings.far else MAD * float(np.median(np.abs(rest)))
         self.residual_sd = max(spread, ROUNDING * float(np.ptp(self.level.intensity)))
+        self.weigh_robustly(r, seen)
+
+    def differences(self, seen: BoolArray) -> AnyFloatArray:
+        """Return the residuals (n,) at the present gain and offset, 0 where nothing is seen."""
+        return np.where(seen, self.level.intensity - self.gain * self.value - self.offset, 0)
+
+    def weigh_robustly(self, r: AnyFloatArray, seen: BoolArray) -> None:
+        """Renew the robust weights of residuals r (n,)."""
         self.robust_weight = np.where(seen, 1 / (1 + (r / (self.settings.robust * self.residual_sd)) ** 2) ** 2, 0).astype(np.float32)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from naibu.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from naibu.core.arrays import BoolArray, Float32Array, FloatArray, Int32Array, IntArray
 from naibu.imaging.volume_correlation._spline_kernels import add_forces, add_noise, assemble, product, products_of_many, sample_energies
 from naibu.imaging.volume_correlation._warp_kernels import warp_voxels
 from naibu.imaging.volume_correlation.image_level import ImageLevel
@@ -127,10 +127,34 @@ class SplineSystem:
         )  # fmt: skip
 
     def assembled(
-        self, c: FloatArray, products: Float32Array, force: Float32Array, bending: FloatArray, dilatation: FloatArray
+        self,
+        c: FloatArray,
+        products: Float32Array,
+        force: Float32Array,
+        bending: FloatArray,
+        dilatation: FloatArray,
+        given: Float32Array | None = None,
     ) -> Float32Array:
-        """Assemble the matrix, and return the right side (n, 3), at coefficients c; bending (m, 3) and dilatation (m,) are weights."""
-        self.matrix[:] = 0
+        """Assemble the matrix, and return the right side (n, 3), at coefficients c; bending (m, 3) and dilatation (m,) are weights.
+
+        To the matrix one that is given (n, 3, 1029) is added.
+        """
+        right = self.summed(c, products, force, bending, dilatation, given)
+        middle = 3 * (REACH**3 // 2)
+        self.inverse = np.linalg.inv(self.matrix[:, :, middle : middle + 3].astype(float)).astype(np.float32)
+        return right
+
+    def summed(
+        self,
+        c: FloatArray,
+        products: Float32Array,
+        force: Float32Array,
+        bending: FloatArray,
+        dilatation: FloatArray,
+        given: Float32Array | None = None,
+    ) -> Float32Array:
+        """Do what `assembled` does, without the preconditioner, which a part of the cells alone may not have."""
+        self.matrix[:] = 0 if given is None else given
         right = np.zeros((self.n, 3), np.float32)
         self.bending_energy[:], self.dilatation_energy[:] = 0, 0
         assemble(
@@ -138,8 +162,6 @@ class SplineSystem:
             self.weights, bending.astype(np.float32), self.stiffness, dilatation.astype(np.float32), self.gauss, self.ratio, self.pairs,
             self.bending_energy, self.dilatation_energy,
         )  # fmt: skip
-        middle = 3 * (REACH**3 // 2)
-        self.inverse = np.linalg.inv(self.matrix[:, :, middle : middle + 3].astype(float)).astype(np.float32)
         return right
 
     def solved(self, load: Float32Array, tolerance: float, most: int = 100) -> tuple[Float32Array, int]:
@@ -185,10 +207,12 @@ class SplineSystem:
         np.add.at(loads, self.slot[at], each)
         return loads.astype(np.float32)
 
-    def force_loads(self, forces: Float32Array) -> Float32Array:
-        """Return loads (n, 3, s) of forces (voxels, 3, s) on the voxels."""
+    def force_loads(self, forces: Float32Array, number: Int32Array | None = None) -> Float32Array:
+        """Return loads (n, 3, s) of forces (voxels, 3, s) on the voxels, or on those that are numbered in their box, others being -1."""
         loads = np.zeros((self.n, 3, forces.shape[2]), np.float32)
-        add_forces(loads, self.tasks, self.cells, self.slot, forces, self.level.number, self.starts, self.weights)
+        which = self.level.number if number is None else number
+        flat = forces.reshape(len(forces), -1)
+        add_forces(loads.reshape(self.n, -1), self.tasks, self.cells, self.slot, flat, which, self.starts, self.weights)
         return loads
 
     def add_penalty_noise(
@@ -198,8 +222,9 @@ class SplineSystem:
         count, m = loads.shape[2], len(self.cells)
         drawn = rng.standard_normal((m, 3, 64, count), dtype=np.float32)
         drawn *= np.sqrt(bending)[:, :, None, None].astype(np.float32)
+        bent = np.ascontiguousarray(np.matmul(self.root, drawn).transpose(0, 2, 1, 3)).reshape(m, 64, 3 * count)
         add_noise(
-            loads, self.tasks, self.cells, self.slot, c.astype(np.float32), np.matmul(self.root, drawn), dilatation.astype(np.float32),
+            loads.reshape(self.n, -1), self.tasks, self.cells, self.slot, c.astype(np.float32), bent, dilatation.astype(np.float32),
             self.gauss, rng.standard_normal((m, 8, count), dtype=np.float32),
         )  # fmt: skip
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy import fft
 
@@ -30,23 +32,44 @@ class ResidualNoise:
 
     def __init__(self, mask: BoolArray, weighted: Float32Array, scale: float = 1.0) -> None:
         self.mask, self.scale = mask, scale
-        self.shape = [fft.next_fast_len(n + int(4 * CORRELATED), real=True) for n in mask.shape]
-        box = np.zeros(mask.shape, np.float32)
-        box[mask] = weighted
-        inside = self._correlation(mask.astype(np.float32))
-        lag = [np.minimum(np.arange(n), n - np.arange(n)) for n in self.shape]
-        near = np.exp(-0.5 * sum(np.meshgrid(*[(g / CORRELATED) ** 2 for g in lag], indexing="ij")))
-        correlation = self._correlation(box) / np.maximum(inside, 0.05 * inside[0, 0, 0]) * near
-        power = np.maximum(fft.rfftn(correlation, workers=2).real, 0)
-        self.amplitude = np.sqrt(power).astype(np.float32)
-
-    def _correlation(self, box: Float32Array) -> AnyFloatArray:
-        spectrum = fft.rfftn(box, self.shape, workers=2)
-        return np.asarray(fft.irfftn(np.abs(spectrum) ** 2, self.shape, workers=2))
+        self.shape = padded_shape(mask.shape)
+        self.amplitude = amplitude_of(*lagged_products(mask, weighted))
 
     def draw(self, rng: np.random.Generator) -> Float32Array:
         """Return random residuals (n,) of the voxels."""
-        white = rng.standard_normal(self.shape, dtype=np.float32)
-        coloured = fft.irfftn(fft.rfftn(white, workers=2) * self.amplitude, self.shape, workers=2)
         nz, ny, nx = self.mask.shape
-        return np.asarray(self.scale * coloured[:nz, :ny, :nx][self.mask], dtype=np.float32)
+        return np.asarray(self.scale * coloured(self.amplitude, self.shape, rng)[:nz, :ny, :nx][self.mask], dtype=np.float32)
+
+
+def lost_to_robustness(weights: float, derivatives: float) -> float:
+    """Return the factor by which the normal matrix is too large, from `IntensityComparison.robust_sums`."""
+    return weights / max(derivatives, 0.2 * weights)
+
+
+def padded_shape(shape: Sequence[int]) -> list[int]:
+    """Return a size for Fourier transforms in which a box does not meet itself within four windows."""
+    return [fft.next_fast_len(int(n + 4 * CORRELATED), real=True) for n in shape]
+
+
+def lagged_products(mask: BoolArray, weighted: Float32Array) -> tuple[AnyFloatArray, AnyFloatArray]:
+    """Return the sums of products of residuals (n,) in a box, by their distance along z, y, x, and the number of such pairs; periodic."""
+    box = np.zeros(mask.shape, np.float32)
+    box[mask] = weighted
+    shape = padded_shape(mask.shape)
+    spectra = (fft.rfftn(v, shape, workers=2) for v in (box, mask.astype(np.float32)))
+    products, pairs = (fft.irfftn(np.abs(s) ** 2, shape, workers=2) for s in spectra)
+    return products, pairs
+
+
+def amplitude_of(products: AnyFloatArray, pairs: AnyFloatArray) -> Float32Array:
+    """Return the amplitudes of a Fourier transform with the autocorrelation of `lagged_products`, whose size is that of the field."""
+    lag = [np.minimum(np.arange(n), n - np.arange(n)) for n in products.shape]
+    near = np.exp(-0.5 * sum(np.meshgrid(*[(g / CORRELATED) ** 2 for g in lag], indexing="ij")))
+    correlation = products / np.maximum(pairs, 0.05 * pairs[0, 0, 0]) * near
+    return np.asarray(np.sqrt(np.maximum(fft.rfftn(correlation, workers=2).real, 0)), dtype=np.float32)
+
+
+def coloured(amplitude: Float32Array, shape: Sequence[int], rng: np.random.Generator) -> Float32Array:
+    """Return a random periodic field of the given amplitudes."""
+    white = rng.standard_normal(tuple(shape), dtype=np.float32)
+    return np.asarray(fft.irfftn(fft.rfftn(white, workers=2) * amplitude, shape, workers=2), dtype=np.float32)

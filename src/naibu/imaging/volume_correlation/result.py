@@ -41,6 +41,9 @@ class CorrelationResult:
         Coefficients of the splines, mm along the axes of the volume.
     cell_covariance : ndarray, shape (CZ, CY, CX, 3, 3)
         Covariance of the displacement in every cell of the grid, mm^2 along x, y, z; NaN where there is no object.
+    cell_strain_sd : ndarray, shape (CZ, CY, CX)
+        Standard deviation of a component of the Green-Lagrange strain in the middle of every cell, root mean square over the components;
+        NaN where there is no object.
     bending, dilatation : ndarray, shape (CZ, CY, CX, 3), and float
         Weights of the penalties: of squared second derivatives, for each component along the axes of the volume, 1/mm, and of the squared
         dilatation, 1/mm^3; NaN where there is no object.
@@ -64,6 +67,7 @@ class CorrelationResult:
     grid: SplineGrid
     coefficients: FloatArray
     cell_covariance: FloatArray
+    cell_strain_sd: FloatArray
     bending: FloatArray
     dilatation: float
     residual_sd: float
@@ -129,6 +133,14 @@ class CorrelationResult:
         out[self.valid] = self._covariance(np.argwhere(self.valid)[:, ::-1] * self.volume.spacing_mm)
         return out
 
+    def strain_sd(self) -> Float32Array:
+        """Return the standard deviation of a component of strain (nz, ny, nx) at the voxels; NaN where it is not valid, 0 in inclusions."""
+        out = np.full(self.volume.shape, np.nan, np.float32)
+        local = np.argwhere(self.valid)[:, ::-1] * self.volume.spacing_mm
+        out[self.valid] = np.sqrt(self._between_cells(self.cell_strain_sd**2, local))
+        out[self.valid & (self.inclusions > 0)] = 0.0
+        return out
+
     def at_points(self, *, step: int | tuple[int, int, int] | None = None) -> DisplacementField:
         """Return the displacement field at listed voxels, with covariance, as identification takes it.
 
@@ -178,22 +190,26 @@ class CorrelationResult:
         return out
 
     def _cells_at(self, local_mm: FloatArray) -> FloatArray:
-        """Interpolate the covariance of cells, among those that have one."""
-        n = np.array(self.cell_covariance.shape[2::-1])
+        return self._between_cells(self.cell_covariance, local_mm)
+
+    def _between_cells(self, values: FloatArray, local_mm: FloatArray) -> FloatArray:
+        """Interpolate values (CZ, CY, CX, ...) of cells, among those that have one."""
+        n = np.array(values.shape[2::-1])
         t = (local_mm - self.grid.origin_mm) / self.grid.step_mm - 0.5
         low = np.floor(t).astype(int)
-        out, total = np.zeros((len(t), 3, 3)), np.zeros(len(t))
-        known = np.isfinite(self.cell_covariance[..., 0, 0])
-        filled = np.where(known[..., None, None], self.cell_covariance, 0.0)
+        further = (1,) * (values.ndim - 3)
+        out, total = np.zeros((len(t), *values.shape[3:])), np.zeros(len(t))
+        known: BoolArray = np.asarray(np.isfinite(values).reshape(*values.shape[:3], -1).all(axis=-1))
+        filled = np.where(known.reshape(*known.shape, *further), values, 0.0)
         for q in range(8):
             bit = np.array([q & 1, (q >> 1) & 1, q >> 2])
             at = low + bit
             inside = ((at >= 0) & (at < n)).all(axis=1)
             x, y, z = np.clip(at, 0, n - 1).T
             w = np.where(inside & known[z, y, x], np.maximum(np.prod(np.where(bit, t - low, 1 - (t - low)), axis=1), 1e-9), 0.0)
-            out += w[:, None, None] * filled[z, y, x]
+            out += w.reshape(-1, *further) * filled[z, y, x]
             total += w
-        out[total > 0] /= total[total > 0, None, None]
+        out[total > 0] /= total[total > 0].reshape(-1, *further)
         out[total == 0] = np.nan
         return out
 
@@ -241,15 +257,18 @@ def collected(
     for full, listed in zip(maps, (fit.gain, fit.offset), strict=True):
         full[box][level.mask] = listed
         full[~valid] = np.nan
-    variance = _bias_variance(fit, c, bending) + np.where(fit.moving, (REMAINING * fit.last_steps_mm) ** 2, 0.0)
+    smoothed = fit.system.solved(fit.system.bending_load(c, bending), BIAS_TOLERANCE)[0]
+    remaining = np.where(fit.moving, (REMAINING * fit.last_steps_mm) ** 2, 0.0)
+    variance = _bias_variance(fit, smoothed) + remaining
     spread = sampled_covariance(fit, samples) + variance[:, None, None] * np.eye(3)
     covariance = _per_cell(system.grid, fit, spread)
+    strain_sd = np.sqrt(_strain_variance(fit, c, samples, smoothed) + remaining / float(system.grid.step_mm.min()) ** 2)
     converged = np.ones(tuple(int(n) for n in system.grid.cells[::-1]), dtype=bool)
     converged[tuple(system.cells[:, 2:].T)] = ~fit.moving | ~system.inner
     return CorrelationResult(
         DisplacementField.on_grid(volume, vectors, valid=valid), system.grid, c, volume.direction @ covariance @ volume.direction.T,
-        _per_cell(system.grid, fit, bending), dilatation, fit.residual_sd, maps[0], maps[1], converged, inclusions, motions,
-        _status(system.grid, volume, converged),
+        _per_cell(system.grid, fit, strain_sd), _per_cell(system.grid, fit, bending), dilatation, fit.residual_sd, maps[0], maps[1],
+        converged, inclusions, motions, _status(system.grid, volume, converged),
     )  # fmt: skip
 
 
@@ -280,11 +299,48 @@ def sampled_covariance(fit: CorrelationFit, samples: Float32Array) -> FloatArray
     return np.asarray((wide[:, 1:] / wide[:, :1]).reshape(-1, 3, 3))
 
 
-def _bias_variance(fit: CorrelationFit, c: FloatArray, bending: FloatArray) -> FloatArray:
-    """Return the variance (m,), mm^2 along every axis, of the bias by the bending penalty, as in the notes of `collected`."""
-    again = fit.system.solved(fit.system.bending_load(c, bending), BIAS_TOLERANCE)[0]
-    length = np.linalg.norm(fit.system.at_middles(again, every=True), axis=1)
-    return np.asarray(BIAS**2 * fit.windowed(length**2, SHARED) / fit.windowed(np.ones_like(length), SHARED))
+def _bias_variance(fit: CorrelationFit, smoothed: Float32Array) -> FloatArray:
+    """Return the variance (m,), mm^2 along every axis, of the bias by the bending penalty, as in the notes of `collected`.
+
+    `smoothed` (n, 3) are the coefficients of what smoothing once more takes away.
+    """
+    length = np.linalg.norm(fit.system.at_middles(smoothed, every=True), axis=1)
+    return BIAS**2 * _averaged(fit, length**2)
+
+
+def _strain_variance(fit: CorrelationFit, c: FloatArray, samples: Float32Array, smoothed: Float32Array) -> FloatArray:
+    """Return the mean square error (m,) of a component of the Green-Lagrange strain in the middles of the cells.
+
+    Both parts are as those of the displacement: the samples, and the bias, whose direction is unknown, three times.
+    """
+    system = fit.system
+    deformation = np.eye(3) + _gradients_at_middles(fit, c)
+    full = np.zeros((*system.active.shape, 3))
+
+    def mean_square(coefficients: Float32Array) -> FloatArray:
+        full[system.active] = coefficients
+        change = np.swapaxes(deformation, -1, -2) @ _gradients_at_middles(fit, full)
+        return np.asarray(((0.5 * (change + np.swapaxes(change, -1, -2))) ** 2).mean(axis=(-2, -1)))
+
+    drawn = sum((mean_square(samples[..., s]) for s in range(samples.shape[2])), start=np.zeros(len(system.cells)))
+    return _averaged(fit, drawn / samples.shape[2] + 3.0 * BIAS**2 * mean_square(smoothed))
+
+
+def _gradients_at_middles(fit: CorrelationFit, c: FloatArray) -> FloatArray:
+    """Return du_i/dx_j (m, 3, 3) of splines c (NZ, NY, NX, 3) in the middles of the cells, along the axes of the volume."""
+    grid = fit.system.grid
+    middles = [grid.origin_mm[a] + (np.arange(grid.cells[a]) + 0.5) * grid.step_mm[a] for a in range(3)]
+    plain = [grid.matrix(a, middles[a]) for a in range(3)]
+    at = tuple(fit.system.cells[:, 2:].T)
+    out = np.empty((len(fit.system.cells), 3, 3))
+    for j in range(3):
+        out[..., j] = separable([grid.matrix(a, middles[a], 1) if a == j else plain[a] for a in range(3)], c)[at]
+    return out
+
+
+def _averaged(fit: CorrelationFit, values: FloatArray) -> FloatArray:
+    """Return values (m,) of the cells averaged with those of their neighbours."""
+    return np.asarray(fit.windowed(values, SHARED) / fit.windowed(np.ones_like(values), SHARED))
 
 
 def _some_voxels(fit: CorrelationFit) -> tuple[IntArray, IntArray]:

@@ -173,6 +173,10 @@ class RigidInclusion:
         if not self.started:
             self.start(comparison.displacement[self.voxels])
         self.fit(comparison)
+        self.hold(comparison)
+
+    def hold(self, comparison: IntensityComparison) -> None:
+        """Replace the intensity data of its voxels by its present motion in the normal equations."""
         at = self.voxels
         comparison.products[at] = 0
         for k in (0, 3, 5):

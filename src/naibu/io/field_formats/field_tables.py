@@ -11,6 +11,7 @@ from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.io.field_formats import tecplot
+from naibu.io.field_formats.spam_tiff import require_converged
 from naibu.io.tables.point_tables import PointTable, assembled, columns_of, read_point_table
 from naibu.io.tables.table_cells import unit_factor
 
@@ -49,6 +50,8 @@ def read(source: Path, *, unit: str | None = None, spacing_mm: Sequence[float] |
     if (far := float(np.abs(points).max())) > FARTHEST_MM:
         raise InputError(f"{source.name}: a point lies {far:.3g} mm from the origin, {FARTHEST_MM:g} mm are possible; check the unit")
     valid = np.asarray(np.isfinite(vectors).all(axis=1) & (True if table.valid is None else table.valid[known]))
+    if table.in_voxels and table.valid is not None:
+        require_converged(source, valid)
     return DisplacementField.from_arrays(points, vectors, sd_mm=_sd(source, table, known, scale, valid), valid=valid)
 
 

@@ -9,6 +9,8 @@ from pathlib import Path
 
 from naibu.core.errors import InputError
 
+PART = 2**24  # bytes that are read at a time: volumes may be larger than memory
+
 
 def sha256(path: str | os.PathLike[str]) -> str:
     """Return the SHA-256 of a file, or of the files of a folder in order of their names, as hexadecimal digits.
@@ -21,7 +23,9 @@ def sha256(path: str | os.PathLike[str]) -> str:
     source, digest = Path(path), hashlib.sha256()
     try:
         for file in sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [source]:
-            digest.update(file.read_bytes())
+            with file.open("rb") as stream:
+                while part := stream.read(PART):
+                    digest.update(part)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     return digest.hexdigest()

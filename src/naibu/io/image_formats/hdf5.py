@@ -1,6 +1,7 @@
 """Image volumes in HDF5, chunked, so that parts of a volume larger than memory can be read.
 
 The file contains a dataset ``values`` (nz, ny, nx) with the attributes ``spacing_mm``, ``origin_mm`` (x, y, z) and ``direction`` (3, 3).
+Where the spacing of voxels is given, the only dataset with three axes of numbers of another program's file is read, too.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike
 
-from naibu.core.arrays import AnyArray
+from naibu.core.arrays import AnyArray, FloatArray
 from naibu.core.chunked_volume import ChunkedVolume
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
@@ -29,7 +30,7 @@ _ATTRIBUTES = ("spacing_mm", "origin_mm", "direction")
 
 def read(path: Path, options: ReadOptions) -> Volume:
     """Read a volume (see `naibu.io.images.read_volume`)."""
-    with _dataset(path) as stored:
+    with _dataset(path, options.spacing_mm) as stored:
         return _volume(path, stored, (0, 0, 0), stored.shape[::-1], options)
 
 
@@ -41,7 +42,7 @@ def read_box(path: Path, low: ArrayLike, high: ArrayLike, options: ReadOptions) 
     InputError
         The box is not inside the volume, or the file contains no volume.
     """
-    with _dataset(path) as stored:
+    with _dataset(path, options.spacing_mm) as stored:
         a, b = np.asarray(low, dtype=int), np.asarray(high, dtype=int)
         size = np.array(stored.shape[::-1])
         if (a < 0).any() or (b > size).any() or (a >= b).any():
@@ -49,17 +50,24 @@ def read_box(path: Path, low: ArrayLike, high: ArrayLike, options: ReadOptions) 
         return _volume(path, stored, tuple(a.tolist()), tuple(b.tolist()), options)
 
 
-def open_chunked(path: Path) -> ChunkedVolume:
+def open_chunked(path: Path, spacing_mm: FloatArray | None = None) -> ChunkedVolume:
     """Open a volume without reading its voxels; the file stays open as long as the volume exists.
+
+    Parameters
+    ----------
+    path : Path
+        File.
+    spacing_mm : ndarray, shape (3,), optional
+        Distance of voxels along x, y, z, mm, for files that do not state it.
 
     Raises
     ------
     InputError
         No such file, or one without a volume.
     """
-    with _dataset(path) as checked:
-        frame = {name: np.asarray(checked.attrs[name], dtype=float) for name in _ATTRIBUTES}
-    return ChunkedVolume.from_array(h5py.File(path, "r")["values"], **frame)
+    with _dataset(path, spacing_mm) as checked:
+        name, frame = checked.name, _frame(checked, spacing_mm)
+    return ChunkedVolume.from_array(h5py.File(path, "r")[name], **frame)
 
 
 def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Path:
@@ -84,7 +92,7 @@ def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Pa
 
 
 @contextmanager
-def _dataset(path: Path) -> Iterator[Any]:
+def _dataset(path: Path, spacing_mm: FloatArray | None) -> Iterator[Any]:
     """Open the dataset with the values of a file."""
     require_regular(path)
     try:
@@ -97,8 +105,7 @@ def _dataset(path: Path) -> Iterator[Any]:
             raise InputError(f"{path.name}: its values are a link to {link.filename!r}; copy them into the file")
         stored = file.get("values")
         if not isinstance(stored, h5py.Dataset) or any(name not in stored.attrs for name in _ATTRIBUTES):
-            expected = f"a dataset 'values' with the attributes {', '.join(_ATTRIBUTES)}"
-            raise InputError(f"{path.name}: contains no volume: naibu expects {expected}; the file has {sorted(file)}")
+            stored = _foreign(path, file, spacing_mm)
         if stored.file.filename != file.filename:
             raise InputError(f"{path.name}: its values stand in {stored.file.filename!r}, to which a link leads; copy them into the file")
         if stored.ndim != 3:
@@ -109,8 +116,33 @@ def _dataset(path: Path) -> Iterator[Any]:
         yield stored
 
 
+def _foreign(path: Path, file: h5py.File, spacing_mm: FloatArray | None) -> h5py.Dataset:
+    """Return the only dataset with three axes of numbers of another program's file, for which the spacing has to be given."""
+    found: list[h5py.Dataset] = []
+    file.visititems(lambda _, item: found.append(item) if isinstance(item, h5py.Dataset) and _is_volume(item) else None)
+    names = ", ".join(repr(item.name) for item in found) or str(sorted(file))
+    if len(found) != 1:
+        expected = f"a dataset 'values' with the attributes {', '.join(f'`{name}`' for name in _ATTRIBUTES)}, or one with three axes"
+        raise InputError(f"{path.name}: contains no volume: naibu expects {expected}; the file has {names}")
+    if spacing_mm is None:
+        raise InputError(f"{path.name}: does not state the distance of the voxels of {names}; give it as spacing_mm")
+    return found[0]
+
+
+def _is_volume(item: h5py.Dataset) -> bool:
+    return item.ndim == 3 and item.dtype.kind in "biuf"
+
+
+def _frame(stored: Any, spacing_mm: FloatArray | None) -> dict[str, FloatArray]:
+    """Return spacing and position of the voxels, as the file states them or as they were given."""
+    if all(name in stored.attrs for name in _ATTRIBUTES):
+        return {name: np.asarray(stored.attrs[name], dtype=float) for name in _ATTRIBUTES}
+    return {"spacing_mm": np.asarray(spacing_mm, dtype=float), "origin_mm": np.zeros(3), "direction": np.eye(3)}
+
+
 def _volume(path: Path, stored: Any, low: tuple[int, ...], high: tuple[int, ...], options: ReadOptions) -> Volume:
     box = tuple(slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))
-    axes = np.asarray(stored.attrs["direction"], dtype=float) * np.asarray(stored.attrs["spacing_mm"], dtype=float)
-    origin = np.asarray(stored.attrs["origin_mm"], dtype=float) + axes @ np.asarray(low, dtype=float)
+    frame = _frame(stored, options.spacing_mm)
+    axes = frame["direction"] * frame["spacing_mm"]
+    origin = frame["origin_mm"] + axes @ np.asarray(low, dtype=float)
     return volume_with_axes(path.name, stored[box], origin, axes, options.unit_mm or 1.0)

@@ -148,6 +148,12 @@ def create_chunked(
     return group.create_array("values", shape=shape, chunks=chunks, dtype=np.dtype(dtype), config={"write_empty_chunks": True})
 
 
+def open_array(path: Path) -> Any:
+    """Open the array of a volume from `create_chunked`, to be assigned to by slices."""
+    # the configuration is not kept in the store: a chunk of zeros would not be written
+    return _zarr().open_group(str(path), mode="r+")["values"].with_config({"write_empty_chunks": True})
+
+
 def write(path: Path, values: AnyArray, grid: Volume, *, compressed: bool) -> Path:
     """Write intensities (nz, ny, nx), or vectors (nz, ny, nx, 3); chunks are always compressed (lossless).
 

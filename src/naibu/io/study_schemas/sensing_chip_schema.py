@@ -36,6 +36,7 @@ class ChipTable(CheckedTable):
     block_height_um: Micrometres = 400.0
     frame_width_um: Micrometres = 500.0
     pillar_width_um: Micrometres
+    fillet_um: Micrometres | None = None
     pillar_mass_mg: Annotated[Positive, between(1e-6, 1e6)] = 0.1
 
 

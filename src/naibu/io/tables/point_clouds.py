@@ -23,11 +23,15 @@ POINT_FILES = (*TEXT, *EXCEL, *ARRAYS)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointCloud:
-    """Points (n, d) and, where the file states them, standard deviations of their coordinates (n, d), mm; rows in the file (n,), from 1."""
+    """Points (n, d) and, where the file states them, standard deviations of their coordinates (n, d), mm; rows in the file (n,), from 1.
+
+    `copies` counts the points that were left out because another one has the same coordinates.
+    """
 
     points: FloatArray
     sd: FloatArray | None
     rows: IntArray
+    copies: int = 0
 
     def __len__(self) -> int:
         return len(self.points)
@@ -53,7 +57,7 @@ def read_point_cloud(
     Returns
     -------
     PointCloud
-        Points with finite coordinates; rows with blank cells or NaN are left out.
+        Points with finite coordinates; rows with blank cells or NaN are left out, and copies of a point.
 
     Raises
     ------
@@ -86,7 +90,8 @@ def read_point_cloud(
     points = np.ascontiguousarray(found[known])
     if np.abs(points).max() > LENGTHS_MM[1]:
         raise InputError(f"{source}: has a coordinate of {np.abs(points).max():.3g} mm: no object is so large; give the `unit`")
-    return PointCloud(points, None if sd is None else sd[known], np.flatnonzero(known) + 1)
+    first = np.sort(np.unique(points, axis=0, return_index=True)[1])
+    return PointCloud(points[first], None if sd is None else sd[known][first], np.flatnonzero(known)[first] + 1, len(points) - len(first))
 
 
 def _array(source: Path, ending: str, variable: str | None) -> FloatArray:

@@ -73,7 +73,8 @@ def read_point_table(path: Path, *, unit: str | None = None, displacements: bool
     if _is_numeric(rows[0][1]):
         columns = len(rows[0][1])
         if columns not in (2, 3):
-            raise InputError(f"{path}: has no names of columns, and {columns} of them; name them in the first line: x_mm, y_mm, z_mm")
+            names = "x_mm, y_mm, z_mm" + displacements * ", ux_mm, uy_mm, uz_mm"
+            raise InputError(f"{path}: has no names of columns, and {columns} of them; name them in the first line: {names}")
         rows = [(0, list("xyz"[:columns])), *rows]
     start, where = _header(path, rows)
     header, body = rows[start][1], rows[start + 1 :]

@@ -9,6 +9,9 @@ from numba import prange
 
 from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
+from naibu.mechanics.finite_elements._hex8_kernels import are_hexahedra_of_first_invariant
+from naibu.mechanics.finite_elements._hex8_kernels import assemble_large as _hexahedra_large
+from naibu.mechanics.finite_elements._hex8_kernels import assemble_small as _hexahedra_small
 from naibu.mechanics.finite_elements._tet4_kernels import ThreadPartition, partition, thread_count
 from naibu.mechanics.finite_elements._tet4_kernels import assemble_large as _tetrahedra_large
 from naibu.mechanics.finite_elements._tet4_kernels import assemble_small as _tetrahedra_small
@@ -150,7 +153,15 @@ class Assembler:
         force = np.zeros((self.elements.n_points, 3))
         if self._partition is not None:
             return self._run_tetrahedra(self._partition, np.ascontiguousarray(displacement), parameters, force, blocks)
-        assemble = _assemble_large if len(self.elements.connectivity) > LARGE else _assemble_small
+        large = len(self.elements.connectivity) > LARGE
+        if are_hexahedra_of_first_invariant(self.elements, self.law_codes):
+            hexahedra = _hexahedra_large if large else _hexahedra_small
+            energy, smallest = hexahedra(
+                self._order, self._colour_start, self.elements.connectivity, self.elements.gradients, self.elements.weights,
+                self.elements.cell_of_point, self.law_codes, parameters, np.ascontiguousarray(displacement), self._positions, force, blocks,
+            )  # fmt: skip
+            return float(energy), force, float(smallest)
+        assemble = _assemble_large if large else _assemble_small
         energy, smallest = assemble(
             self._order, self._colour_start, self.elements.connectivity, self.elements.gradients, self.elements.weights,
             self.elements.cell_of_point, self.elements.shared_dilatation, self.law_codes, parameters,

@@ -20,6 +20,7 @@ from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 
 NEO_HOOKEAN, MOONEY_RIVLIN, YEOH, SAINT_VENANT_KIRCHHOFF, NEO_HOOKEAN_ISOCHORIC, LINEAR_ELASTIC = range(6)
+OF_FIRST_INVARIANT = (NEO_HOOKEAN, YEOH, NEO_HOOKEAN_ISOCHORIC)  # and of J, alone
 MAX_PARAMETERS = 4
 
 
@@ -115,6 +116,21 @@ def small_strain_shear_moduli(law_codes: IntArray, parameters: FloatArray) -> Fl
     """Return the shear moduli (m,), kPa, of linearised laws (m,) with parameters (m, k), kPa."""
     second = np.where(law_codes == MOONEY_RIVLIN, parameters[:, 1], 0.0)
     return np.asarray(np.where((law_codes == MOONEY_RIVLIN) | (law_codes == YEOH), 2.0, 1.0) * (parameters[:, 0] + second))
+
+
+def small_strain_bulk_moduli(law_codes: IntArray, parameters: FloatArray) -> FloatArray:
+    """Return the bulk moduli (m,), kPa, of linearised laws (m,) with parameters (m, k), kPa."""
+    shear, out = small_strain_shear_moduli(law_codes, parameters), np.zeros(len(law_codes))
+    for law in LAWS.values():
+        last = parameters[:, law.parameter_names.index(law.volumetric)]
+        out = np.where(law_codes == law.code, last + (0.0 if law.volumetric == "bulk_modulus" else 2.0 / 3.0) * shear, out)
+    return np.asarray(out)
+
+
+def largest_poisson_ratio(law_codes: IntArray, parameters: FloatArray) -> float:
+    """Return the largest Poisson's ratio of linearised laws (m,) with parameters (m, k), kPa."""
+    mu, kappa = small_strain_shear_moduli(law_codes, parameters), small_strain_bulk_moduli(law_codes, parameters)
+    return float(np.max((3.0 * kappa - 2.0 * mu) / (6.0 * kappa + 2.0 * mu)))
 
 
 def law_named(name: str) -> Law:

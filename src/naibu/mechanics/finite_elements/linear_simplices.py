@@ -150,18 +150,54 @@ def parameter_forces(body: Simplices, displacement: FloatArray) -> tuple[FloatAr
     They are ``J_lambda u`` and ``J_mu u`` of :func:`connection_matrices`, without the matrices:
     the columns of the equilibrium-gap equations.
     """
-    gradient = body.displacement_gradients(displacement)
-    weighted = body.gradients * body.measures[:, None, None]
-    trace = np.einsum("maa->m", gradient)
-    return trace[:, None, None] * weighted, np.einsum("mab,mkb->mka", gradient + np.swapaxes(gradient, 1, 2), weighted)
+    of_lame, of_shear = np.empty(body.gradients.shape), np.empty(body.gradients.shape)
+    _parameter_forces(body.cells, body.gradients, body.measures, displacement, (0,) * body.dimension, of_lame, of_shear)
+    return of_lame, of_shear
+
+
+@njit(cache=True)
+def _parameter_forces(cells, gradients, measures, u, zeros, of_lame, of_shear):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set the forces of all cells; `zeros` is a tuple of d zeros, whose length the compiler knows."""
+    for c in range(len(cells)):
+        _cell_forces(cells[c], gradients[c], measures[c], u, zeros, of_lame[c], of_shear[c])
+
+
+@njit(cache=True)
+def _cell_forces(nodes, gradients, measure, u, zeros, of_lame, of_shear):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set the forces at the vertices of one cell, for lambda = 1 and for mu = 1: volume times the trace, and times twice the strain."""
+    d = len(zeros)
+    of_shear[:], trace = 0.0, 0.0
+    for a in range(d):
+        for b in range(d):
+            twice_strain = 0.0
+            for k in range(d + 1):
+                twice_strain += u[nodes[k], a] * gradients[k, b] + u[nodes[k], b] * gradients[k, a]
+            if a == b:
+                trace += 0.5 * twice_strain
+            for k in range(d + 1):
+                of_shear[k, a] += measure * twice_strain * gradients[k, b]
+    for k in range(d + 1):
+        for a in range(d):
+            of_lame[k, a] = measure * trace * gradients[k, a]
 
 
 def elastic_forces(body: Simplices, lame_lambda: ArrayLike, shear_modulus: ArrayLike, displacement: FloatArray) -> FloatArray:
     """Return the nodal elastic forces (n, d), mN, of a displacement (n, d), mm; moduli in kPa, one number or one a cell."""
-    lame, shear = parameter_forces(body, displacement)
-    return body.scattered(
-        per_cell(lame_lambda, body.n_cells)[:, None, None] * lame + per_cell(shear_modulus, body.n_cells)[:, None, None] * shear
-    )
+    lame, shear = per_cell(lame_lambda, body.n_cells), per_cell(shear_modulus, body.n_cells)
+    out = np.zeros((body.n_points, body.dimension))
+    _add_elastic_forces(body.cells, body.gradients, body.measures, lame, shear, displacement, (0,) * body.dimension, out)
+    return out
+
+
+@njit(cache=True)
+def _add_elastic_forces(cells, gradients, measures, lame, shear, u, zeros, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    d = len(zeros)
+    of_lame, of_shear = np.empty((d + 1, d)), np.empty((d + 1, d))
+    for c in range(len(cells)):
+        _cell_forces(cells[c], gradients[c], measures[c], u, zeros, of_lame, of_shear)
+        for k in range(d + 1):
+            for a in range(d):
+                out[cells[c, k], a] += lame[c] * of_lame[k, a] + shear[c] * of_shear[k, a]
 
 
 def per_cell(value: ArrayLike, n_cells: int, name: str = "a parameter") -> FloatArray:

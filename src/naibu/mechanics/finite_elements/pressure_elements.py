@@ -25,7 +25,7 @@ from naibu.mechanics.finite_elements._pressure_kernels import (
     forces_with_pressures,
 )
 from naibu.mechanics.finite_elements.assembly import Assembler
-from naibu.mechanics.finite_elements.hyperelasticity import LAWS, small_strain_shear_moduli
+from naibu.mechanics.finite_elements.hyperelasticity import small_strain_bulk_moduli
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +77,8 @@ class PressureElements:
         connectivity = e.connectivity if e.shared_dilatation else e.connectivity[group]
         count = np.bincount(owner, minlength=len(connectivity))
         volume = np.asarray(np.bincount(owner, weights, minlength=len(connectivity)), dtype=float)
-        bulk = np.bincount(owner, weights * _bulk_moduli(assembler)[cells], minlength=len(connectivity)) / volume
+        of_cell = small_strain_bulk_moduli(assembler.law_codes, assembler.parameters)
+        bulk = np.bincount(owner, weights * of_cell[cells], minlength=len(connectivity)) / volume
         start = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
         return cls(
             assembler, start, np.ascontiguousarray(connectivity), np.ascontiguousarray(local), np.ascontiguousarray(gradients), weights,
@@ -120,13 +121,3 @@ class PressureElements:
         out = np.empty(len(self.bulk))
         along_group_derivatives(self.connectivity, derivative, step, out)
         return np.asarray(self.bulk / self.volume * out + mismatch)
-
-
-def _bulk_moduli(assembler: Assembler) -> FloatArray:
-    """Bulk moduli (m,) of all cells at small strain, kPa."""
-    codes, parameters = assembler.law_codes, assembler.parameters
-    shear, out = small_strain_shear_moduli(codes, parameters), np.zeros(len(codes))
-    for law in LAWS.values():
-        last = parameters[:, law.parameter_names.index(law.volumetric)]
-        out = np.where(codes == law.code, last + (0.0 if law.volumetric == "bulk_modulus" else 2.0 / 3.0) * shear, out)
-    return np.asarray(out)

@@ -13,6 +13,28 @@ from naibu.mechanics.finite_strain._nearby_kernels import add_forces, local
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ContactTangent:
+    """Where the stiffness of a contact is added.
+
+    Attributes
+    ----------
+    pattern : BlockPattern
+        Of the tangent.
+    positions : ndarray, shape (p, k, k), int32
+        Blocks of the nodes of all points in the pattern.
+    blocks : ndarray, shape (n_blocks, 3, 3)
+        Of the tangent, mN/mm; changed.
+    curvature : bool
+        See `Contact.evaluate`.
+    """
+
+    pattern: BlockPattern
+    positions: Int32Array
+    blocks: FloatArray
+    curvature: bool
+
+
 @dataclass(slots=True, eq=False)
 class NearbyContact:
     """Points of a contact that lie near its body.
@@ -38,13 +60,13 @@ class NearbyContact:
 
     def only(self, which: BoolArray) -> NearbyContact:
         """Return the points that are marked (p,)."""
-        return self if which.all() else NearbyContact(_points(self.contact, which), self.anchors[which], self.points[which])
+        return self if which.all() else NearbyContact(at_points(self.contact, which), self.anchors[which], self.points[which])
 
     @classmethod
     def of(cls, contact: Contact, anchors: FloatArray, gap: FloatArray, margin_mm: float) -> NearbyContact:
         """Return the points whose gaps (p,) are below a margin, mm."""
         near = np.flatnonzero(gap < margin_mm).astype(np.int64)
-        return cls(_points(contact, near), anchors[near], near)
+        return cls(at_points(contact, near), anchors[near], near)
 
     @property
     def response(self) -> ContactResponse:
@@ -86,7 +108,8 @@ class NearbyContact:
             self.contact.add_stiffness(symmetric, pattern, positions[self.points], blocks)
 
 
-def _points(contact: Contact, which: IntArray | BoolArray) -> Contact:
+def at_points(contact: Contact, which: IntArray | BoolArray) -> Contact:
+    """Return the contact of some of its points only: their numbers, or which of them (p,)."""
     return replace(
         contact, nodes=contact.nodes[which], shape=contact.shape[which], rest=contact.rest[which], area=contact.area[which],
         normal_stiffness=contact.normal_stiffness[which], tangential_stiffness=contact.tangential_stiffness[which],
@@ -116,6 +139,18 @@ def add_contact_forces(contact: Contact, anchors: FloatArray, displacement: Floa
         c.friction_coefficient, c.tied, displacement, c.start + load * (c.stop - c.start), c.orientation(load), anchors, gap, force,
     )  # fmt: skip
     return gap
+
+
+def add_contact(
+    contact: Contact, anchors: FloatArray, displacement: FloatArray, load: float, force: FloatArray, tangent: ContactTangent
+) -> None:
+    """Add the forces of a contact to `force` (n, 3), mN, and its stiffness to a tangent; arguments as for `add_contact_forces`."""
+    gap = add_contact_forces(contact, anchors, displacement, load, force)
+    touching = np.arange(len(gap)) if contact.tied else np.flatnonzero(gap < 0.0)  # few of all points
+    if len(touching):
+        some = at_points(contact, touching)
+        response = some.evaluate(displacement, anchors[touching], load, curvature=tangent.curvature)
+        some.add_stiffness(response, tangent.pattern, tangent.positions[touching], tangent.blocks)
 
 
 def local_positions(contact: Contact, displacement: FloatArray, load: float) -> tuple[FloatArray, FloatArray]:

@@ -15,7 +15,8 @@ import scipy.sparse as sp
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError
 from naibu.mechanics.contact.penalty_contact import ContactResponse
-from naibu.mechanics.finite_strain.nearby_contact import add_contact_forces
+from naibu.mechanics.finite_elements.hyperelasticity import largest_poisson_ratio
+from naibu.mechanics.finite_strain.nearby_contact import ContactTangent, add_contact, add_contact_forces
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
 from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
 from naibu.mechanics.linear_algebra.iterative import ApproximateFactorization
@@ -121,7 +122,8 @@ class Newton:
         ConvergenceError
             An inverted element, or a singular tangent.
         """
-        residual, scale, matrix, responses = self._tangent(u, anchors, load)
+        residual, scale, matrix = self._tangent(u, anchors, load)
+        responses = [c.evaluate(u, a, load) for c, a in zip(self.problem.contacts, anchors, strict=True)]
         return residual, scale, self._factorized(matrix), responses
 
     def adjoint(self, u: FloatArray, anchors: tuple[FloatArray, ...], load: float, derivatives: FloatArray) -> FloatArray:
@@ -139,54 +141,53 @@ class Newton:
 
     def _tangent(
         self, u: FloatArray, anchors: tuple[FloatArray, ...], load: float, *, curvature: bool = True
-    ) -> tuple[FloatArray, float, sp.bsr_matrix, list[ContactResponse]]:
-        """Return residual, force scale, the tangent of all nodes, constrained or not, and contact responses."""
+    ) -> tuple[FloatArray, float, sp.bsr_matrix]:
+        """Return residual, force scale, and the tangent of all nodes, constrained or not."""
         p = self.problem
         _, internal, blocks, smallest = p.assembler.evaluate(u)
         if not smallest > 0.0:
             raise ConvergenceError(f"an element is inverted (det F = {smallest:.3g})")
         contact = np.zeros_like(internal)
-        responses = []
         for c, a, positions in zip(p.contacts, anchors, p._positions, strict=True):
-            response = c.evaluate(u, a, load, curvature=curvature)
-            contact += c.scattered(response.force, len(u), response.orientation)
-            c.add_stiffness(response, p.assembler.pattern, positions, blocks)
-            responses.append(response)
+            add_contact(c, a, u, load, contact, ContactTangent(p.assembler.pattern, positions, blocks, curvature))
         residual, scale = self._balance(internal, contact)
-        return residual, scale, p.assembler.pattern.matrix(blocks), responses
+        return residual, scale, p.assembler.pattern.matrix(blocks)
 
     def _factorized(self, matrix: sp.bsr_matrix, pseudo_stiffness: float = 0.0) -> Factorization:
         p = self.problem
         matrix = with_dirichlet_rows(matrix, p.prescribed.constrained, self.settings.anchor_stiffness + pseudo_stiffness)
         if self.solver is None:
+            body = p.assembler
             self.solver = choose_solver(
-                matrix, p.points, p.prescribed.constrained, symmetric=not p.unsymmetric, solver=self.settings.linear_solver
-            )
+                matrix, p.points, p.prescribed.constrained, symmetric=not p.unsymmetric, solver=self.settings.linear_solver,
+                poisson_ratio=None if p.contacts else largest_poisson_ratio(body.law_codes, body.parameters),
+            )  # fmt: skip
         return self.solver.factorize(matrix)
 
     def solve(self, u: FloatArray, anchors: tuple[FloatArray, ...], load: float) -> tuple[FloatArray, float] | None:
         """Return displacement (n, 3) mm and relative residual in equilibrium, starting from `u`; None where Newton's method fails."""
-        poor, previous = 0, 0.0
+        poor, previous, tolerance = 0, 0.0, self.settings.tolerance_at(load)
         extent = float(np.ptp(self.problem.points, axis=0).max())
         try:
             u = self._predicted(u, anchors, load)
             for _ in range(self.settings.max_iterations):
-                residual, scale, matrix, _ = self._tangent(u, anchors, load)
+                residual, scale, matrix = self._tangent(u, anchors, load)
                 norm = float(np.abs(residual).sum())
-                if norm <= self.settings.tolerance * scale:
+                if norm <= tolerance * scale:
                     return u, norm / scale
                 self.iterations += 1
                 tangent = self._factorized(matrix)
-                step = -solved(tangent, residual, self._forcing(norm, previous, scale))
-                self.rigid_motion = float(np.abs(step).max()) > RIGID_MOTION * extent
-                found = self.line_search(u, step, anchors, load, residual)
+                step = -solved(tangent, residual, self._forcing(norm, previous, scale, tolerance))
+                longest = float(np.abs(step).max())
+                self.rigid_motion = longest > RIGID_MOTION * extent
+                found = self.line_search(u, step, anchors, load, residual) if longest <= extent else None
                 poor += found is None or found[1] < 0.15
-                if found is None or poor > 2 or np.abs(step).max() > extent:
+                if found is None or poor > 2:
                     return None  # a shorter load step costs less than many poor iterations
                 u, previous, left = found[0], norm, found[2]
-                if left > self.settings.tolerance and left < NEAR * norm / scale:
+                if left > tolerance and left < NEAR * norm / scale:
                     u, left = self._with_same_tangent(tangent, u, left, anchors, load)
-                if left <= self.settings.tolerance:
+                if left <= tolerance:
                     return u, left
         except ConvergenceError:
             return None
@@ -207,7 +208,7 @@ class Newton:
             if not (smallest > 0.0 and now < WORTHWHILE * left):
                 break
             u, left = trial, now
-            if left <= self.settings.tolerance:
+            if left <= self.settings.tolerance_at(load):
                 break
         self.iterations += left < before  # all of them replace one
         return u, left
@@ -232,7 +233,7 @@ class Newton:
                     drag, failed, calm = 4.0 * drag, drag, CALM
                     continue
                 u, residual = found
-                if residual <= self.settings.tolerance:
+                if residual <= self.settings.tolerance_at(load):
                     self.continued += 1
                     return u, residual
                 calm -= 1
@@ -250,13 +251,13 @@ class Newton:
         u, viscous = start, None
         norms: list[float] = []
         for _ in range(STEP_ITERATIONS):
-            residual, scale, matrix, _ = self._tangent(u, anchors, load)
+            residual, scale, matrix = self._tangent(u, anchors, load)
             mean = float(matrix.diagonal().mean())  # contact changes it
             if viscous is None:
                 viscous = Drag(start, drag * mean)
             unbalanced = residual + viscous.force(u)
             norm, static = float(np.abs(unbalanced).sum()), float(np.abs(residual).sum())
-            if norm <= max(self.settings.tolerance * scale, _COARSE * static):
+            if norm <= max(self.settings.tolerance_at(load) * scale, _COARSE * static):
                 return u, static / scale
             norms.append(norm)
             if len(norms) == PATIENCE and norm > 0.5 * norms[0]:
@@ -269,10 +270,10 @@ class Newton:
             u = found[0]
         return None
 
-    def _forcing(self, norm: float, previous: float, scale: float) -> float:
+    def _forcing(self, norm: float, previous: float, scale: float, tolerance: float) -> float:
         """Relative tolerance of a linear solve: coarse far from convergence, and never finer than the last iteration needs."""
         expected = 0.5 * (norm / previous) ** 1.5 if previous else _COARSE
-        return min(_COARSE, max(expected, 0.3 * self.settings.tolerance * scale / norm, 1e-9))
+        return min(_COARSE, max(expected, 0.3 * tolerance * scale / norm, 1e-9))
 
     def _predicted(self, u: FloatArray, anchors: tuple[FloatArray, ...], load: float) -> FloatArray:
         """Return the predictor: the constrained nodes displaced as `load` prescribes, the others by the tangent at `u`.
@@ -284,7 +285,7 @@ class Newton:
         jump = target - u
         if np.abs(jump).max() <= 1e-9 * float(np.ptp(p.points, axis=0).max()):
             return target
-        residual, _, matrix, _ = self._tangent(u, anchors, load)
+        residual, _, matrix = self._tangent(u, anchors, load)
         residual += (matrix @ jump.ravel()).reshape(-1, 3)
         residual[p.prescribed.constrained] = 0.0
         self.iterations += 1

@@ -28,8 +28,12 @@ def with_suited_penalties(problem: Problem) -> Problem:
     """Return the problem with stiffer normal contact on elements that are stiff themselves."""
     if not problem.contacts:
         return problem
-    shear = node_shear_moduli(problem.assembler)
-    return problem.with_changes(contacts=tuple(_stiff_enough(c, shear) for c in problem.contacts))
+    return problem.with_changes(contacts=stiff_enough(problem.contacts, node_shear_moduli(problem.assembler)))
+
+
+def stiff_enough(contacts: Sequence[Contact], shear: FloatArray) -> tuple[Contact, ...]:
+    """Return contacts with higher normal penalties where they are too soft for the shear moduli (n,), kPa, of the nodes' elements."""
+    return tuple(_stiff_enough(c, shear) for c in contacts)
 
 
 def with_softer_sticking(problem: Problem) -> Problem | None:

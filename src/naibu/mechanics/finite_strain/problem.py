@@ -21,6 +21,8 @@ class SolverSettings:
         Fractions of the whole load.
     tolerance : float
         Newton's method has converged when the residual is below this fraction of the contact and support forces.
+    path_tolerance : float, optional
+        The same before the full load, where a looser one suffices: only friction remembers these states. `tolerance` by default.
     max_iterations : int
         Most Newton iterations of one load step before it is halved.
     max_total_iterations : int, optional
@@ -42,12 +44,17 @@ class SolverSettings:
     largest_step: float = 0.12
     smallest_step: float = 1e-3
     tolerance: float = 1e-7
+    path_tolerance: float | None = None
     max_iterations: int = 16
     max_total_iterations: int | None = None
     pseudo_transient: bool = True
     anchor_stiffness: float = 1e-9
     penetration: float = 0.01
     linear_solver: SolverName = "automatic"
+
+    def tolerance_at(self, load: float) -> float:
+        """Return the tolerance at a fraction of the load."""
+        return self.tolerance if self.path_tolerance is None or load >= 1.0 - 1e-12 else self.path_tolerance
 
 
 @dataclass(frozen=True, slots=True, eq=False)

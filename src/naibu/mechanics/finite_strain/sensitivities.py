@@ -12,10 +12,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.rigid_transform import left_jacobian, rotation_matrix
 from naibu.mechanics.contact.penalty_contact import Contact, ContactResponse
 from naibu.mechanics.finite_elements.assembly import Assembler
+from naibu.mechanics.finite_strain.nearby_contact import at_points, local_positions
 from naibu.mechanics.finite_strain.newton import Newton
 from naibu.mechanics.finite_strain.penalties import with_normal_stiffness
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
@@ -84,6 +85,7 @@ def sensitivities(
     solver = newton or Newton(problem, SolverSettings())
     count = len(directions)
     out = [np.zeros((*problem.points.shape, count))]
+    problem, states, directions = _of_points_that_touch(problem, states, directions)
     reshaped = {k: _Reshaped.along(problem, d.points) for k, d in enumerate(directions) if d.points is not None}
     moving = [_BodyDirections.gather(i, c, directions) for i, c in enumerate(problem.contacts)]
     d_anchors = [m.at_rest(c) for m, c in zip(moving, problem.contacts, strict=True)]
@@ -110,6 +112,36 @@ def sensitivities(
             for c, response, change in zip(problem.contacts, responses, explicit, strict=True)
         ]
     return out
+
+
+def _of_points_that_touch(
+    problem: Problem, states: tuple[LoadState, ...], directions: list[Direction]
+) -> tuple[Problem, tuple[LoadState, ...], list[Direction]]:
+    """Return the same with those points only of every contact that touch in some state: of the others nothing depends."""
+    some = []
+    for c in problem.contacts:
+        gaps = [local_positions(c, state.displacement, state.load)[1] for state in states[1:]]
+        some.append(np.flatnonzero(np.min(gaps, axis=0, initial=np.inf) < 0.0) if not c.tied else np.arange(len(c.nodes)))
+    contacts = tuple(at_points(c, points) for c, points in zip(problem.contacts, some, strict=True))
+    on_path = tuple(
+        replace(
+            s,
+            anchors=tuple(a[points] for a, points in zip(s.anchors, some, strict=True)),
+            normal_stiffness=tuple(k[points] for k, points in zip(s.normal_stiffness, some, strict=False)),
+        )
+        for s in states
+    )
+    along = []
+    for d in directions:
+        if d.contact >= 0:
+            points = some[d.contact]
+            d = replace(d, friction=_at(d.friction, points), tangential_stiffness=_at(d.tangential_stiffness, points))
+        along.append(d)
+    return replace(problem, contacts=contacts, _positions=()), on_path, along
+
+
+def _at(values: FloatArray | None, points: IntArray) -> FloatArray | None:
+    return None if values is None else values[points]
 
 
 def _of_law(assembler: Assembler, law: int | None) -> Assembler:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -12,7 +12,13 @@ from naibu.core.errors import ConvergenceError
 from naibu.core.status import Status
 from naibu.mechanics.finite_strain.failure_reasons import failure_reason
 from naibu.mechanics.finite_strain.newton import Newton
-from naibu.mechanics.finite_strain.penalties import relative_penetrations, stiffened, with_softer_sticking, with_suited_penalties
+from naibu.mechanics.finite_strain.penalties import (
+    relative_penetrations,
+    stiffened,
+    with_normal_stiffness,
+    with_softer_sticking,
+    with_suited_penalties,
+)
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
 
@@ -102,6 +108,7 @@ def solve(
     callback: Callable[[float], None] | None = None,
     solver: LinearSolver | None = None,
     warm_start: Sequence[WarmStart] = (),
+    stiffness: Mapping[float, tuple[FloatArray, ...]] | None = None,
     start: LoadState | None = None,
 ) -> Solution:
     """Solve for static equilibrium, following the load in steps from the reference configuration, or from a state.
@@ -121,6 +128,8 @@ def solve(
     warm_start : sequence of (load, displacement)
         Displacements (n, 3), mm, of a similar problem at increasing loads up to 1: load steps then end at these loads and start from these
         displacements.
+    stiffness : mapping, optional
+        Penalties of the points (p,) of every contact, kPa/mm, with which the states of the warm start were found, by their loads.
     start : LoadState, optional
         Equilibrium without load, with the history variables of its contacts; the reference configuration by default.
 
@@ -137,6 +146,7 @@ def solve(
     rest = LoadState(0.0, np.zeros_like(problem.points), tuple(c.anchors_at_rest() for c in problem.contacts))
     first = rest if start is None else LoadState(0.0, start.displacement, start.anchors)
     path = _LoadPath(newton, [first], warm_start, *((1.0, 1.0) if warm_start else (chosen.first_step, chosen.largest_step)))
+    path.stiffness = stiffness or {}
     softer = path.follow(callback)
     if softer is not None:
         newton.problem, known = softer, [(state.load, state.displacement) for state in path.states[1:]]
@@ -160,6 +170,7 @@ class _LoadPath:
     seen: str = ""
     rejected: int = 0
     pseudo_failed: int = 0
+    stiffness: Mapping[float, tuple[FloatArray, ...]] = field(default_factory=dict)
     smooth_from: int = 0  # the first state after the last jump: nothing is extrapolated across it
 
     def follow(self, callback: Callable[[float], None] | None) -> Problem | None:
@@ -169,6 +180,8 @@ class _LoadPath:
             last, penalties = states[-1], self.newton.problem
             passed = next((h for h in reversed(self.warm_start) if h[0] <= last.load + 1e-9), None)
             ahead = next((h for h in self.warm_start if h[0] > last.load + 1e-9), None)
+            if ahead is not None:
+                self.newton.problem = with_normal_stiffness(penalties, self.stiffness.get(ahead[0], ()))
             most = settings.max_total_iterations
             if most is not None and self.newton.iterations >= most * (min(1.0, last.load + AHEAD) if self.warm_start else 1.0):
                 self.status = Status.ITERATION_LIMIT

@@ -62,6 +62,7 @@ def use_threads(count: int) -> None:
 
 MKL_MB = 400  # of address space for the libraries, twice of what they took here
 MKL_THREAD_MB = 80  # for the stack and the heap of a thread
+SINGULAR = {np.float64: 1e14, np.float32: 1e9}  # growth of a solution, beyond which it is rounding
 _NO_MEMORY = -2  # PARDISO's number of this error
 
 
@@ -104,9 +105,18 @@ class PardisoSolver:
         self._float = np.float32 if single_precision else np.float64
         self._handle = np.zeros(64, dtype=np.int64)
         self._parameters = np.zeros(64, dtype=np.int32)
-        self._set_parameters()
         self._values = np.zeros(len(self._ja), dtype=self._float)
-        self._analysed = False
+        self._threads = 0  # of the analysis; 0 before it
+
+    def _analyse(self, threads: int) -> None:
+        self._set_parameters()
+        self._call(11, *self._nothing())
+        self._threads = threads
+
+    def _nothing(self) -> tuple[AnyFloatArray, AnyFloatArray, int]:
+        """Return right side, solution and number of columns of a phase that has none."""
+        empty: AnyFloatArray = np.zeros(1, dtype=self._float)
+        return empty, empty, 1
 
     def _set_parameters(self) -> None:
         iparm = self._parameters
@@ -126,22 +136,39 @@ class PardisoSolver:
             The matrix is singular.
         """
         self._values = matrix.data.ravel()[self._take].astype(self._float, copy=False)
-        empty: AnyFloatArray = np.zeros(1, dtype=self._float)
-        if not self._analysed:
-            self._call(11, empty, empty, 1)
-            self._analysed = True
-        error = self._call(22, empty, empty, 1)
+        threads = int(self._library.MKL_Get_Max_Threads())
+        if threads < self._threads:  # PARDISO then leaves parts out, or ends the process: an analysis is for so many threads or more
+            self._release()
+        if not self._threads:
+            self._analyse(threads)
+        error = self._call(22, *self._nothing())
         if error == -4 and self._type == 2:  # not positive definite: use the indefinite factorization
             self._release()
             self._type = -2
-            self._set_parameters()
-            self._call(11, empty, empty, 1)
-            error = self._call(22, empty, empty, 1)
+            self._analyse(threads)
+            error = self._call(22, *self._nothing())
         perturbed = int(self._parameters[13])  # vanishing pivots, which PARDISO silently replaces by tiny ones
         if error != 0 or perturbed:
             what = f"PARDISO error {error}, {perturbed} vanishing pivots"
             raise ConvergenceError(f"the linear system is singular ({what}): are all rigid-body motions constrained?")
+        if self._type != 2:  # a Cholesky factorization has seen that all pivots are positive, however badly the matrix is scaled
+            self._require_regular()
         return self
+
+    def _require_regular(self) -> None:
+        """Refuse a matrix whose solutions grow beyond rounding: which pivots count as vanishing depends on the processor.
+
+        Raises
+        ------
+        ConvergenceError
+            It is.
+        """
+        probe = np.random.default_rng(0).uniform(0.5, 1.0, self._n)
+        growth = float(np.abs(self.solve(probe)).max()) * float(np.abs(self._values).max())
+        if not growth < SINGULAR[self._float]:
+            raise ConvergenceError(
+                f"the linear system is singular (solutions grow {growth:.1g} times): are all rigid-body motions constrained?"
+            )
 
     def solve(self, b: FloatArray) -> FloatArray:
         """Return x for b of shape (n,) or (n, r)."""
@@ -171,12 +198,13 @@ class PardisoSolver:
         return error.value
 
     def _release(self) -> None:
-        if self._analysed:
-            self._call(-1, np.zeros(1), np.zeros(1), 1)
+        if self._threads:
+            self._call(-1, *self._nothing())
             self._handle[:] = 0
+            self._threads = 0
 
     def __del__(self) -> None:
-        if getattr(self, "_library", None) is not None and hasattr(self, "_analysed") and not sys.is_finalizing():
+        if getattr(self, "_library", None) is not None and hasattr(self, "_threads") and not sys.is_finalizing():
             self._release()
 
 

@@ -43,6 +43,10 @@ class RecyclingSolver(ABC):
     def preconditioner(self, matrix: sp.bsr_matrix) -> Callable[[FloatArray], FloatArray]:
         """Return a map from residuals (n, r) to corrections made for `matrix`."""
 
+    def multiplication(self, matrix: sp.bsr_matrix) -> Callable[[FloatArray], FloatArray]:
+        """Return the product of `matrix` with vectors (n, r)."""
+        return lambda x: np.asarray(matrix @ x)
+
     def factorize(self, matrix: sp.bsr_matrix) -> Factorization:
         """Prepare for `matrix`, keeping the preconditioner of an earlier one while it is still efficient."""
         if self._rebuild and self._exact is None:
@@ -71,7 +75,7 @@ class RecyclingSolver(ABC):
                 self._build(matrix)
             if self._apply is None:
                 break
-            x, iterations = conjugate_gradients(matrix, b, self._apply, tolerance, self.max_iterations)
+            x, iterations = conjugate_gradients(self.multiplication(matrix), b, self._apply, tolerance, self.max_iterations)
             if x is not None:
                 digits = max(-np.log10(tolerance), 0.1)
                 self._spent += iterations
@@ -110,7 +114,11 @@ class ApproximateFactorization:
 
 
 def conjugate_gradients(
-    matrix: sp.bsr_matrix, b: FloatArray, precondition: Callable[[FloatArray], FloatArray], tolerance: float, max_iterations: int
+    multiply: Callable[[FloatArray], FloatArray],
+    b: FloatArray,
+    precondition: Callable[[FloatArray], FloatArray],
+    tolerance: float,
+    max_iterations: int,
 ) -> tuple[FloatArray | None, int]:
     """Return the solution (n, r) and the number of iterations; None where they do not converge or something is not positive definite.
 
@@ -129,7 +137,7 @@ def conjugate_gradients(
             return None, iteration
         p = z + p * (new / rz if iteration else 0.0)
         rz = np.where(active, new, 1.0)
-        q = matrix @ p
+        q = multiply(p)
         curvature = np.einsum("ij,ij->j", p, q)
         if not (curvature[active] > 0.0).all():
             return None, iteration

@@ -1,16 +1,17 @@
-"""Smoothed-aggregation algebraic multigrid with rigid-body modes :cite:p:`vanek1996`, by pyamg :cite:p:`bell2022`."""
+"""Conjugate gradients preconditioned by smoothed aggregation of the rigid-body modes :cite:p:`vanek1996`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
-import pyamg
 import scipy.sparse as sp
 
 from naibu.core.arrays import BoolArray, FloatArray, require_shape
+from naibu.mechanics.linear_algebra import _cycle_kernels as cycle
 from naibu.mechanics.linear_algebra.iterative import RecyclingSolver
+from naibu.mechanics.linear_algebra.row_chunks import RowChunks
+from naibu.mechanics.linear_algebra.smoothed_aggregation import SmoothedAggregation
 
 
 class MultigridSolver(RecyclingSolver):
@@ -26,6 +27,8 @@ class MultigridSolver(RecyclingSolver):
         Of the residual of each solve.
     max_iterations : int
         After which a hierarchy is built anew, and after a second time the solve fails.
+    falls_back : bool
+        Whether such a system is then solved by a direct solver.
 
     Raises
     ------
@@ -33,45 +36,42 @@ class MultigridSolver(RecyclingSolver):
         `constrained` has another shape than `points`.
     """
 
-    name = "CG + smoothed aggregation (pyamg)"
+    name = "CG + smoothed aggregation"
 
-    def __init__(self, points: FloatArray, constrained: BoolArray, *, relative_tolerance: float = 1e-8, max_iterations: int = 400) -> None:
+    def __init__(
+        self,
+        points: FloatArray,
+        constrained: BoolArray,
+        *,
+        relative_tolerance: float = 1e-8,
+        max_iterations: int = 400,
+        falls_back: bool = False,
+    ) -> None:
         super().__init__(relative_tolerance=relative_tolerance, max_iterations=max_iterations)
-        self._modes = rigid_body_modes(points)
+        self.falls_back = falls_back
         require_shape("constrained", constrained, points.shape)
-        self._modes[constrained.ravel()] = 0.0
+        self._modes = np.where(constrained.ravel()[:, None], 0.0, rigid_body_modes(points))
+        self._aggregation: SmoothedAggregation | None = None
 
     def preconditioner(self, matrix: sp.bsr_matrix) -> Callable[[FloatArray], FloatArray]:
         """Return one V-cycle of a hierarchy made for `matrix`."""
-        hierarchy = pyamg.smoothed_aggregation_solver(
-            matrix, B=self._modes, strength=("symmetric", {"theta": 0.0}),
-            smooth=("jacobi", {"omega": 4.0 / 3.0}), improve_candidates=None, max_coarse=600, coarse_solver="splu",
-            presmoother=("block_gauss_seidel", {"sweep": "forward"}), postsmoother=("block_gauss_seidel", {"sweep": "backward"}),
-        )  # fmt: skip
+        if self._aggregation is None or not self._aggregation.fits(matrix):
+            self._aggregation = SmoothedAggregation(matrix, self._modes)
+        return self._aggregation.hierarchy(matrix).correction
 
-        return lambda r: np.stack([v_cycle(hierarchy, 0, np.ascontiguousarray(column)) for column in r.T], axis=1)
+    def multiplication(self, matrix: sp.bsr_matrix) -> Callable[[FloatArray], FloatArray]:
+        """Return the product of `matrix` with vectors (n, r), by all threads."""
+        d, chunks = matrix.blocksize[0], RowChunks(matrix.indptr)
 
+        def multiply(vectors: FloatArray) -> FloatArray:
+            out = np.empty(vectors.shape)
+            for column in range(vectors.shape[1]):
+                x, y = np.ascontiguousarray(vectors[:, column]).reshape(-1, d), np.empty((len(vectors) // d, d))
+                chunks.run(cycle.product, matrix.indptr, matrix.indices, matrix.data, x, y, sizes=((0,) * d, (0,) * d))
+                out[:, column] = y.ravel()
+            return out
 
-def v_cycle(hierarchy: Any, number: int, b: FloatArray) -> FloatArray:
-    """Return the correction of one V-cycle from level `number` down, from zero; pyamg's own computes two residuals more.
-
-    Parameters
-    ----------
-    hierarchy : pyamg.multilevel.MultilevelSolver
-        Levels with their smoothers, and the solver of the coarsest.
-    number : int
-        The level; 0 is the finest.
-    b : ndarray, shape (n,)
-        Its residual.
-    """
-    level = hierarchy.levels[number]
-    if number == len(hierarchy.levels) - 1:
-        return np.asarray(hierarchy.coarse_solver(level.A, b), dtype=float).ravel()
-    x = np.zeros_like(b)
-    level.presmoother(level.A, x, b)
-    x += level.P @ v_cycle(hierarchy, number + 1, level.R @ (b - level.A @ x))
-    level.postsmoother(level.A, x, b)
-    return x
+        return multiply
 
 
 def rigid_body_modes(points: FloatArray) -> FloatArray:

@@ -37,9 +37,11 @@ from naibu.mechanics.linear_algebra.recycled_factors import RecycledFactors
 
 SolverName = Literal["automatic", "superlu", "pardiso", "recycled_cholesky", "recycled_lu", "multigrid", "petsc"]
 
-DIRECT_LIMIT = 200_000  # unknowns from which a factorization costs more than multigrid, even if it is recycled; a tenth of that for SuperLU
-SINGLE_LIMIT = 25_000  # unknowns from which multigrid solves a single system sooner, up to the Poisson's ratio below
-COMPRESSIBLE = 0.49  # beyond it the iterations of multigrid become many
+DIRECT_LIMIT = 200_000  # unknowns from which a factorization costs more than multigrid whatever the body; a tenth of that for SuperLU
+SERIES_LIMIT = 20_000  # unknowns from which multigrid solves systems that change little one after the other sooner, up to the ratio below
+SINGLE_LIMIT = 4_000  # likewise a single system
+COMPRESSIBLE = 0.49  # Poisson's ratio, beyond which the iterations of multigrid become many
+SINGLE_TOLERANCE = 1e-10  # relative, of a single system: digits cost little
 RECYCLING_FROM = 4_000  # unknowns from which a factorization is worth recycling
 UNSYMMETRIC_FROM = 1_000  # likewise for unsymmetric systems, of which LU factors cost twice as much
 
@@ -52,6 +54,7 @@ def choose_solver(
     symmetric: bool,
     solver: SolverName = "automatic",
     poisson_ratio: float | None = None,
+    single: bool = False,
 ) -> LinearSolver:
     """Return a linear solver for matrices of the pattern of `matrix`.
 
@@ -66,10 +69,13 @@ def choose_solver(
     symmetric : bool
         Whether all matrices will be symmetric.
     solver : {"automatic", "superlu", "pardiso", "recycled_cholesky", "recycled_lu", "multigrid", "petsc"}
-        See the module. ``"automatic"`` is direct for small systems; recycled LU for larger unsymmetric ones, recycled Cholesky for
-        symmetric ones up to `DIRECT_LIMIT` unknowns (with oneMKL), and multigrid above; without oneMKL multigrid begins at a tenth of that.
+        See the module. ``"automatic"`` is direct for small systems and recycled LU for larger unsymmetric ones. Symmetric ones are solved
+        by recycled Cholesky (with oneMKL) up to `DIRECT_LIMIT` unknowns, or a tenth of that without oneMKL, and by multigrid above; up to a
+        Poisson's ratio of `COMPRESSIBLE` multigrid begins at `SERIES_LIMIT`, and for single systems at `SINGLE_LIMIT`.
     poisson_ratio : float, optional
-        The largest in the body, if one system only is to be solved: multigrid then begins at `SINGLE_LIMIT` unknowns up to `COMPRESSIBLE`.
+        The largest in the body, if it is known and nothing but the body makes the matrix.
+    single : bool
+        Whether one system only is to be solved.
 
     Raises
     ------
@@ -81,7 +87,7 @@ def choose_solver(
     if solver not in get_args(SolverName):
         raise InputError(f"solver={solver!r} is not known; use one of {', '.join(get_args(SolverName))}")
     if solver == "automatic":
-        solver = _automatic(matrix.shape[0], symmetric, poisson_ratio)
+        solver = _automatic(matrix.shape[0], symmetric, poisson_ratio, single)
     if solver == "superlu":
         return SuperLUSolver()
     if solver == "pardiso":
@@ -89,19 +95,26 @@ def choose_solver(
     if solver == "recycled_lu":
         return RecycledFactors(matrix)
     if not symmetric:
-        raise InputError(f"solver={solver!r} needs a symmetric matrix; with friction use 'pardiso', 'superlu' or 'automatic'")
+        raise InputError(
+            f"solver={solver!r} needs a symmetric matrix; with friction use 'recycled_lu', 'pardiso', 'superlu' or 'automatic'"
+        )
     if solver == "recycled_cholesky":
         return RecycledCholesky(matrix)
-    return PetscSolver(points, constrained) if solver == "petsc" else MultigridSolver(points, constrained)
+    if solver == "petsc":
+        return PetscSolver(points, constrained)
+    return MultigridSolver(
+        points, constrained, relative_tolerance=SINGLE_TOLERANCE if single else 1e-8, falls_back=matrix.shape[0] <= DIRECT_LIMIT
+    )
 
 
-def _automatic(unknowns: int, symmetric: bool, poisson_ratio: float | None) -> SolverName:
+def _automatic(unknowns: int, symmetric: bool, poisson_ratio: float | None, single: bool) -> SolverName:
     with_mkl = pardiso_library() is not None
     direct: SolverName = "pardiso" if with_mkl else "superlu"
     if not symmetric:
         return "recycled_lu" if with_mkl and unknowns > UNSYMMETRIC_FROM else direct
-    single = poisson_ratio is not None and poisson_ratio <= COMPRESSIBLE
     limit = DIRECT_LIMIT if with_mkl else DIRECT_LIMIT // 10
-    if unknowns > (min(limit, SINGLE_LIMIT) if single else limit):
+    if poisson_ratio is not None and poisson_ratio <= COMPRESSIBLE:
+        limit = min(limit, SINGLE_LIMIT if single else SERIES_LIMIT)
+    if unknowns > limit:
         return "multigrid"
     return "recycled_cholesky" if with_mkl and unknowns > RECYCLING_FROM else direct

@@ -34,6 +34,12 @@ class BlockChange:
     columns: IntArray
     blocks: FloatArray
 
+    def times(self, motion: FloatArray) -> FloatArray:
+        """Return the product (m, 3) with a vector (m, 3) of all m nodes, of which `nodes` are places."""
+        out = np.zeros_like(motion)
+        np.add.at(out, self.nodes[self.rows], np.einsum("bij,bj->bi", self.blocks, motion[self.nodes[self.columns]]))
+        return out
+
 
 @dataclass(slots=True, eq=False)
 class UpdatedFactors:

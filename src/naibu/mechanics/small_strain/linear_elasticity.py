@@ -120,7 +120,9 @@ class LinearBody:
         require_shape("constrained", constrained, self.points.shape)
         require_constrained(self.points, constrained)
         matrix = with_dirichlet_rows(stiffness, constrained)
-        chosen = choose_solver(matrix, self.points, constrained, symmetric=True, solver=solver, poisson_ratio=poisson_ratio)
+        chosen = choose_solver(
+            matrix, self.points, constrained, symmetric=True, solver=solver, poisson_ratio=poisson_ratio, single=poisson_ratio is not None
+        )
         return chosen.factorize(matrix)
 
     def solve(

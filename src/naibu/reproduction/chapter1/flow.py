@@ -20,7 +20,7 @@ from naibu.imaging.preprocessing.rigid_registration import total_displacement
 from naibu.reproduction.chapter1 import figures as drawn
 from naibu.reproduction.chapter1.calf_phantom import CalfCase, Tissue
 from naibu.reproduction.chapter1.matching import REPORT_PIXEL_MM, judged, picked_registration
-from naibu.viewer.chapter import Figure, Section
+from naibu.viewer.chapters.chapter import Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 Flow = Callable[[Volume, Volume], DisplacementField]

@@ -93,7 +93,13 @@ def picked_registration(case: CalfCase) -> RigidRegistration:
 
 
 def candidates_of(
-    reference: Volume, deformed: Volume, counts: tuple[int, int], rigid: RigidTransform | None, *, reach: float = 1.0
+    reference: Volume,
+    deformed: Volume,
+    counts: tuple[int, int],
+    rigid: RigidTransform | None,
+    *,
+    reach: float = 1.0,
+    boxes: tuple[tuple[int, int, int], tuple[int, int, int]] = (MATCH, SEARCH),
 ) -> tuple[Candidates, InterestPoints, InterestPoints]:
     """Return candidate pairs, and the interest points of the reference and the deformed volume.
 
@@ -107,10 +113,12 @@ def candidates_of(
         Motion to the centres of the search boxes; without it these do not grow.
     reach : float
         Factor on the search box along x and y.
+    boxes : tuple of tuple of int
+        Half the boxes that are matched and searched, in pixels of the report.
     """
     finer = REPORT_PIXEL_MM / reference.spacing_mm[0]
-    match = (*(max(round(m * finer), 2) for m in MATCH[:2]), MATCH[2])
-    search = (*(round(s * finer * reach) for s in SEARCH[:2]), SEARCH[2])
+    match = (*(max(round(m * finer), 2) for m in boxes[0][:2]), boxes[0][2])
+    search = (*(round(s * finer * reach) for s in boxes[1][:2]), boxes[1][2])
     border = np.array(match)
     before, after = (interest_points(v, count=n, border=border) for v, n in zip((reference, deformed), counts, strict=True))
     growth = 0.0 if rigid is None else GROWTH

@@ -27,8 +27,9 @@ from naibu.reproduction.chapter1.matching import (
     picked_registration,
     under_noise,
 )
+from naibu.reproduction.chapter1.paper_matches import PAPER_SLICES, paper_section
 from naibu.reproduction.printed_tables import printed_table
-from naibu.viewer.chapter import Chapter, Figure, Section
+from naibu.viewer.chapters.chapter import Chapter, Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 DEFAULT_NAME = "naibu's default"
@@ -74,6 +75,7 @@ def chapter1(
     plane_points: tuple[int, int] = (200, 240),
     space_points: tuple[int, int] = (1000, 5000),
     draws: int = 4,
+    paper_slices: tuple[int, ...] = PAPER_SLICES,
 ) -> Chapter:
     """Reproduce chapter 1 and section 3.5 on a phantom in place of the volumes of the report, which are lost.
 
@@ -87,12 +89,15 @@ def chapter1(
         Interest points of the reference and the deformed state, in the image and in the volumes.
     draws : int
         Realisations of noise, for the table of matches under noise.
+    paper_slices : tuple of int
+        Scanned slices of the volumes in which the paper's 500 points are matched.
     """
     calf = examined(calf_case(seed, pixels=pixels, slices=slices), plane_points, space_points)
     sections = (
         _case_section(calf),
         _plane_section(calf, draws, seed),
         _space_section(calf),
+        paper_section(seed, pixels=pixels, slices=paper_slices),
         flow_section(calf.case, calf.image, {DEFAULT_NAME: calf.default}),
     )
     nz, ny, nx = calf.case.reference.shape

@@ -15,7 +15,7 @@ from naibu.mechanics.prescribed_motion import PrescribedMotion
 from naibu.mechanics.small_strain.rheology import elastic
 from naibu.mechanics.small_strain.supports import Support
 from naibu.reproduction.chapter2.simulations import AGAR, AGAR_PUSH_MM, AGAR_SIZE_MM, WEIGHT_MM, agar_block_3d
-from naibu.viewer.chapter import Section
+from naibu.viewer.chapters.chapter import Section
 from naibu.viewer.tables import Cell, Table
 
 STEP_MM = 0.5  # resolution of the printed coordinates

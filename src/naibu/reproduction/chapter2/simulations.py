@@ -211,7 +211,14 @@ def agar_block_3d(
     return Study("agar block, 3-D", mesh, material, series, _nearest(mesh, (-shift_mm, 0.0, height)))
 
 
-def agar_under_bar(*, push_mm: float = 1.0, strip_mm: float = 15.0, material: Rheology = AGAR, cell_mm: float = 2.5) -> Study:
+def agar_under_bar(
+    *,
+    push_mm: float = 1.0,
+    strip_mm: float = 15.0,
+    material: Rheology = AGAR,
+    cell_mm: float = 2.5,
+    path_s: tuple[float, float, float] | None = None,
+) -> Study:
     """Indent the cross-section of the MR block under the bar, in plane strain; displacements are proportional to `push_mm`.
 
     Parameters
@@ -224,14 +231,18 @@ def agar_under_bar(*, push_mm: float = 1.0, strip_mm: float = 15.0, material: Rh
         Material; as printed for the block of section 2.4, which is the same agar.
     cell_mm : float
         Edge length of the cells, mm.
+    path_s : tuple of float
+        When the bar has gone down, begins to rise and is at its first height again, s; by default it goes down within 1 s and stays.
     """
     width, height = MR_SIZE_MM
     mesh = rectangle((width, height), (round(width / cell_mm), round(height / cell_mm)))
     x, y = mesh.points.T
     top = np.flatnonzero((y == height) & (np.abs(x) <= 0.5 * strip_mm + 1e-9))
-    path = PrescribedMotion.through([0.0, 1.0], [(0.0, 0.0), (0.0, -push_mm)])
+    depths, ends = ([0.0, push_mm], [0.0, 1.0]) if path_s is None else ([0.0, push_mm, push_mm, 0.0], [0.0, *path_s])
+    path = PrescribedMotion.through(ends, [(0.0, -depth) for depth in depths])
     supports = [Support("floor", np.flatnonzero(y == 0.0)), Support("bar", top, motion=path)]
-    series = simulate_motion(LinearBody.of(mesh), material, None, supports, [0.0, 1.0], step=0.5)
+    times = ends if path_s is None else np.arange(0.0, path_s[-1] + 1.0, 0.1)
+    series = simulate_motion(LinearBody.of(mesh), material, None, supports, times, step=0.5 if path_s is None else 0.1)
     return Study("agar under a bar", mesh, material, series, _nearest(mesh, (0.0, height)))
 
 

@@ -10,6 +10,7 @@ from naibu.core.arrays import BoolArray, FloatArray
 from naibu.mechanics.small_strain.rheology import Rheology
 from naibu.reproduction.chapter2 import figures as drawn
 from naibu.reproduction.chapter2.agar_identification import agar_section
+from naibu.reproduction.chapter2.image_sequence import sequence_section
 from naibu.reproduction.chapter2.marker_measurements import (
     MARKER_HEIGHT_MM,
     TRIALS,
@@ -31,7 +32,7 @@ from naibu.reproduction.chapter2.simulations import (
     pushed_square,
 )
 from naibu.validation.analytic.viscoelastic import released_strain, residual_strain
-from naibu.viewer.chapter import Chapter, Figure, Section
+from naibu.viewer.chapters.chapter import Chapter, Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 COMPARED = (2, 3, 4)  # markers
@@ -44,7 +45,7 @@ def chapter2(seed: int = 0, *, step_s: float = 0.05, divisions: int = 10, cell_m
     Parameters
     ----------
     seed : int
-        Not used: nothing here is random.
+        Of the noise of the virtual scanner.
     step_s, divisions : float and int
         Time step of the squares, s, and their cells per edge.
     cell_mm : float
@@ -52,7 +53,7 @@ def chapter2(seed: int = 0, *, step_s: float = 0.05, divisions: int = 10, cell_m
     """
     readings = {name: ultrasound_trial(name) for name in TRIALS}
     agar = agar_section({name: (seen.start, seen.displacement) for name, seen in readings.items()}, cell_mm=max(cell_mm, 5.0))
-    sections = (_squares(step_s, divisions), _ultrasound(cell_mm), agar, _magnetic_resonance())
+    sections = (_squares(step_s, divisions), _ultrasound(cell_mm), agar, _magnetic_resonance(), sequence_section(seed))
     settings: dict[str, Cell] = {"seed": seed, "step_s": step_s, "divisions": divisions, "cell_mm": cell_mm, **ASSUMED}
     return Chapter("ch2", "Chapter 2: internal deformation of viscoelastic objects, simulated and measured", sections, settings)
 

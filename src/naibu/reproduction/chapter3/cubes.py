@@ -14,7 +14,7 @@ from naibu.reproduction.chapter3 import figures as drawn
 from naibu.reproduction.chapter3.bodies import LAYERS, PushedBody, Split, cube, shape_error_percent
 from naibu.reproduction.chapter3.cell_identification import SIDE_MM, SIDEWAYS, CellResult, identify_cells
 from naibu.reproduction.printed_tables import printed_table
-from naibu.viewer.chapter import Figure, Section
+from naibu.viewer.chapters.chapter import Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 SPLITS: tuple[Split, ...] = get_args(Split)

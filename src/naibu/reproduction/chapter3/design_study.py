@@ -15,7 +15,7 @@ from naibu.identification.from_fields.forward.sensitivities import FieldModel, l
 from naibu.identification.from_fields.gauss_newton import Objective, first_point, search
 from naibu.meshing.point_location import interpolation_operator
 from naibu.reproduction.chapter3.bodies import PushedBody, cube
-from naibu.viewer.chapter import Figure, Section
+from naibu.viewer.chapters.chapter import Figure, Section
 from naibu.viewer.tables import Table
 
 if TYPE_CHECKING:

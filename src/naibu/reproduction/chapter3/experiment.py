@@ -20,7 +20,7 @@ from naibu.reproduction.chapter3 import figures as drawn
 from naibu.reproduction.chapter3.bodies import LAYERS, Split, cube, split_hexahedra
 from naibu.reproduction.chapter3.cubes import mean_error_percent
 from naibu.reproduction.printed_tables import printed_table
-from naibu.viewer.chapter import Figure, Section
+from naibu.viewer.chapters.chapter import Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 if TYPE_CHECKING:

@@ -28,7 +28,7 @@ from naibu.reproduction.chapter3.poisson_readings import (
     readings,
 )
 from naibu.reproduction.printed_tables import printed_table
-from naibu.viewer.chapter import Figure, Section
+from naibu.viewer.chapters.chapter import Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 if TYPE_CHECKING:

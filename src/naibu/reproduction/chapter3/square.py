@@ -13,7 +13,7 @@ from naibu.identification.equilibrium_gap.incremental import IncrementalStep, in
 from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
 from naibu.reproduction.chapter3.bodies import SQUARE, PushedBody, square
 from naibu.reproduction.printed_tables import printed_table
-from naibu.viewer.chapter import Figure, Section
+from naibu.viewer.chapters.chapter import Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 if TYPE_CHECKING:

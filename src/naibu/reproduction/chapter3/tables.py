@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from naibu.core.errors import InputError
+from naibu.reproduction.chapter3.ct_images import images_of_markers
 from naibu.reproduction.chapter3.cubes import identifiability_section, layer_section, uniform_section
 from naibu.reproduction.chapter3.design_study import design_section
 from naibu.reproduction.chapter3.experiment import MARKER_SD_MM, experiment_section
 from naibu.reproduction.chapter3.material_tests import table_3_4, table_3_5
 from naibu.reproduction.chapter3.noise import NOISE_MM, noise_section
 from naibu.reproduction.chapter3.square import square_section
-from naibu.viewer.chapter import Chapter, Section
+from naibu.viewer.chapters.chapter import Chapter, Section
 
 
 def chapter3(seed: int = 0, *, draws: int = 20) -> Chapter:
@@ -38,6 +39,7 @@ def chapter3(seed: int = 0, *, draws: int = 20) -> Chapter:
         table_3_4(),
         table_3_5(),
         _images_section(),
+        images_of_markers(seed),
         experiment_section(),
         design_section(draws=draws, seed=seed),
     )

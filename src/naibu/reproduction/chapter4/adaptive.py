@@ -16,10 +16,11 @@ from naibu.meshing.primitives import box
 from naibu.meshing.refinement.marking import EdgeStretch, edge_stretches
 from naibu.meshing.surface import boundary_faces
 from naibu.reproduction.chapter4 import adaptive_figures
+from naibu.reproduction.chapter4.spring_levels import levels_section
 from naibu.reproduction.printed_tables import printed_table
 from naibu.simulation.adaptive.conditions import Conditions, Selection, face_force, weight
 from naibu.simulation.adaptive.lattice import AdaptiveLattice, SpringMaterial
-from naibu.viewer.chapter import Chapter, Figure, Section
+from naibu.viewer.chapters.chapter import Chapter, Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 SIDE_MM, E_KPA, DENSITY = 100.0, 50.0, 1e-7  # the side is not printed
@@ -81,7 +82,8 @@ def chapter4_adaptive(seed: int = 0, *, records: int = RECORDS, forces: tuple[fl
     forces : tuple of float
         Forces at the end of the cuboid, mN; the report prints none. The figures are those of the one that comes nearest to its table.
     """
-    sections = (bending_section(records, forces), stability_section(seed, records), contact_section(records))
+    levels = levels_section(cuboid(2), 2, E_KPA)
+    sections = (bending_section(records, forces), stability_section(seed, records), contact_section(records), levels)
     settings: dict[str, Cell] = {
         "seed": seed, "side_mm": SIDE_MM, "young_modulus_kpa": E_KPA, "density_kg_mm3": DENSITY, "step_s": STEP_S,
         "damping_ratio": MATERIAL.damping_ratio, "refine_above": CRITERION.refine_above, "coarsen_below": CRITERION.coarsen_below,

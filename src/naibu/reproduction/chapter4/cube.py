@@ -23,7 +23,7 @@ from naibu.validation.specimens.lattice_twin import (
     dough_parameters,
     virtual_capture,
 )
-from naibu.viewer.chapter import Chapter, Figure, Section
+from naibu.viewer.chapters.chapter import Chapter, Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 MODELS = ("classic", "type 0", "type 1", "type 2")

@@ -16,7 +16,7 @@ from naibu.reproduction.chapter4 import cutting_figures as figures
 from naibu.simulation.surface_opening import opening
 from naibu.simulation.surface_springs import CutSprings
 from naibu.validation.specimens.hand import hand_surface
-from naibu.viewer.chapter import Chapter, Figure, Section
+from naibu.viewer.chapters.chapter import Chapter, Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 EDGE_MM, NOISE_MM = 3.0, 0.1  # of the scanned hand

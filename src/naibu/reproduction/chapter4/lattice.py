@@ -13,7 +13,7 @@ from naibu.reproduction.chapter4.lattice_figures import final_shapes, force_wave
 from naibu.reproduction.chapter4.patterns import ONE_SET, START, PatternStudy, pattern_study, with_interval_factor
 from naibu.reproduction.printed_tables import printed_table
 from naibu.validation.specimens.lattice_twin import FORCE_SD_MN, POINT_SD_MM, POINTS, TRUTH, dough_lattice, dough_twin
-from naibu.viewer.chapter import Chapter, Figure, Section
+from naibu.viewer.chapters.chapter import Chapter, Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 PRINTED_FORCE_N = {"a": 3803.6, "b": 538.7, "c": 7448.3, "d": 979.5}  # captions of Figure 14 of the ICAT paper
@@ -147,7 +147,7 @@ def _pattern_table(number: str, which: str, letters: str, joint: tuple[str, ...]
         f"{2 * 1000 * FORCE_SD_MN * np.sqrt(8.0 / np.pi) / 1e3:.0f} N. Joint: by displacement, on shape and force together."
     )
     caption = f"Patterns ({letters[0]}) to ({letters[-1]}), {which} load case."
-    return Table(number, columns, tuple(rows), caption=caption, note=note)
+    return Table(f"Table {number[-1]} (ICAT 2007)", columns, tuple(rows), caption=caption, note=note)
 
 
 def _entry(found: ReportIndices, quantity: str, time: Cell) -> Cell:

@@ -14,7 +14,7 @@ from naibu.reproduction.chapter5.half_ellipsoid import (
     phantom_markers,
     phantom_shape,
 )
-from naibu.viewer.chapter import Section
+from naibu.viewer.chapters.chapter import Section
 from naibu.viewer.tables import Cell, Table
 
 _EDGE = 0.2  # of elements in a half ball of radius 1: markers on the table move by 0.2 mm with finer ones

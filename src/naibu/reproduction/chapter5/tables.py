@@ -11,7 +11,7 @@ from naibu.mechanics.small_strain.rheology import Rheology
 from naibu.reproduction.chapter5 import figures, ischemia
 from naibu.reproduction.chapter5.ischemia import DURATION_S, JET_RADIUS_MM, LOWER, SAME, THRESHOLD_KPA, UPPER, Response
 from naibu.reproduction.chapter5.mammography import mammography_section
-from naibu.viewer.chapter import Chapter, Figure, Section
+from naibu.viewer.chapters.chapter import Chapter, Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 FREQUENCIES_HZ = np.geomspace(0.1, 100.0, 25)
@@ -63,9 +63,9 @@ def _model() -> Section:
     material = SAME["C1 = 30 Pa s"]
     cases = {
         "printed grid, bricks with averaged dilatation": (ischemia.printed_grid_modes(), 0.0),
-        "20 x 14 cells over a half, plane strain": (ischemia.modes_of("plane_strain", JET_RADIUS_MM), JET_RADIUS_MM),
-        "10 x 8 cells over a half, plane strain": (ischemia.modes_of("plane_strain", JET_RADIUS_MM, across=10, upwards=8), JET_RADIUS_MM),
-        "20 x 14 cells, axisymmetric": (ischemia.modes_of("axisymmetric", JET_RADIUS_MM), JET_RADIUS_MM),
+        "20 × 14 cells over a half, plane strain": (ischemia.modes_of("plane_strain", JET_RADIUS_MM), JET_RADIUS_MM),
+        "10 × 8 cells over a half, plane strain": (ischemia.modes_of("plane_strain", JET_RADIUS_MM, across=10, upwards=8), JET_RADIUS_MM),
+        "20 × 14 cells, axisymmetric": (ischemia.modes_of("axisymmetric", JET_RADIUS_MM), JET_RADIUS_MM),
         "three-dimensional": (ischemia.modes_of("three_dimensional", JET_RADIUS_MM, across=5, upwards=6), JET_RADIUS_MM),
     }
     rows: list[tuple[Cell, ...]] = [("printed grid, triangles, with inertia", *_row(ischemia.printed_grid("", material, material)))]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -17,13 +17,13 @@ from naibu.applications.sensing_chip.piezoresistance import Piezoresistance, n_t
 from naibu.core.arrays import FloatArray
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
+    from matplotlib.projections.polar import PolarAxes
 
 MODELS = ("finite elements, rigid block and clamps", "finite elements, whole chip")
 _MPA = 1e-3  # kPa in MPa
 _UM = 1e3  # mm in um
-_WORK = (("F_z", 2, 5000.0, "mN"), ("M_y", 4, 800.0, "N µm"))
+_WORK = (("$F_z$", 2, 5000.0, "mN"), ("$M_y$", 4, 800.0, "N µm"))
 
 
 def stress_along_beam(canvas: Canvas, analysis: ChipAnalysis) -> None:
@@ -55,7 +55,7 @@ def placement(canvas: Canvas, analysis: ChipAnalysis) -> None:
     found = [sensitivity_by_place(response, x) for response in (analysis.beams, analysis.whole)]
     own = (analysis.of_whole[0, 2], analysis.of_whole[2, 4])
     places = (design.force_resistor_mm, design.moment_resistor_mm)
-    for k, (axes, name, unit) in enumerate(zip(canvas.subplots(1, 2), ("F_z", "M_y"), ("mV/mN", "mV/(N µm)"), strict=True)):
+    for k, (axes, name, unit) in enumerate(zip(canvas.subplots(1, 2), ("$F_z$", "$M_y$"), ("mV/mN", "mV/(N µm)"), strict=True)):
         axes.plot(_UM * x, closed[k], "k--", label="closed form")
         for values, label in zip(found, MODELS, strict=True):
             axes.plot(_UM * x, values[k], label=label)
@@ -75,22 +75,24 @@ def envelope(canvas: Canvas, design: ChipDesign, loads: Sequence[tuple[float, fl
     axes.plot(*diagonal, "C1-", label=f"strength {design.strength_kpa * 1e-6:g} GPa, moment about a diagonal")
     if loads:
         axes.plot(*np.array(loads).T, "kx", label=marked)
-    axes.set(xlabel="F_z (mN)", ylabel="moment (N µm)", xlim=(0, None), ylim=(0, None))
+    axes.set(xlabel="$F_z$ (mN)", ylabel="moment (N µm)", xlim=(0, None), ylim=(0, None))
     axes.legend(fontsize=8)
 
 
 def piezoresistance_by_direction(canvas: Canvas) -> None:
     """Draw the longitudinal and transverse coefficients in the (001) plane of p- and n-type silicon, as Kanda did."""
     angle = np.linspace(0.0, 2.0 * np.pi, 361)
-    for k, (name, silicon) in enumerate((("p-type", p_type_silicon()), ("n-type", n_type_silicon()))):
-        axes: Axes = canvas.add_subplot(1, 2, k + 1, projection="polar")
+    # numbers of the circles lie between the lobes
+    for k, (name, silicon, clear_deg) in enumerate((("p-type", p_type_silicon(), 78.0), ("n-type", n_type_silicon(), 45.0))):
+        axes = cast("PolarAxes", canvas.add_subplot(1, 2, k + 1, projection="polar"))
         along, across = _coefficients(silicon, angle)
         for values, colour, label in ((along, "C0", "longitudinal"), (across, "C1", "transverse")):
             axes.plot(angle, np.where(values >= 0.0, values, np.nan), colour, label=f"{label}, positive")
             axes.plot(angle, np.where(values < 0.0, -values, np.nan), colour + "--", label=f"{label}, negative")
         axes.set_xticks(np.deg2rad([0, 45, 90, 135, 180, 225, 270, 315]), ["[100]", "[110]", "[010]", "", "", "", "", ""])
         axes.set_title(f"{name} silicon (1/TPa)")
-    canvas.axes[0].legend(fontsize=6, loc="lower left", bbox_to_anchor=(-0.3, -0.15))
+        axes.set_rgrids([250, 500, 750, *([1000] if k else [])], angle=clear_deg, fontsize=8)
+    canvas.legend(*canvas.axes[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=4)
 
 
 def _coefficients(silicon: Piezoresistance, angle: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -117,7 +119,7 @@ def filters(canvas: Canvas, compared: FilterComparison) -> None:
         axes.set_xlabel("time (s)")
     for axes, title in zip(panels, ("record", "rise", "release"), strict=True):
         axes.set_title(title)
-    panels[0].set_ylabel("reading of F_z (V)")
+    panels[0].set_ylabel("reading of $F_z$ (V)")
     panels[0].legend(fontsize=7)
     panels[2].legend(fontsize=7)
 
@@ -128,14 +130,14 @@ def designs(canvas: Canvas, study: DesignStudy, own: DesignStudy) -> None:
     image = left.scatter(
         study.force_sensitivity, 1e-3 * study.force_resonance, c=study.force_limit, s=3, norm="log", cmap="viridis", rasterized=True
     )
-    canvas.colorbar(image, ax=left, label="largest F_z (mN)")
+    canvas.colorbar(image, ax=left, label="largest $F_z$ (mN)")
     front = np.flatnonzero(study.front("force_sensitivity", "force_resonance"))
     front = front[np.argsort(study.force_sensitivity[front])]
     left.plot(study.force_sensitivity[front], 1e-3 * study.force_resonance[front], "r-", linewidth=1.0, label="Pareto front")
     left.plot(own.force_sensitivity, 1e-3 * own.force_resonance, "k*", markersize=9, label="this chip")
-    left.set(xscale="log", yscale="log", xlabel="sensitivity to F_z (mV/mN)", ylabel="resonance of F_z (kHz)")
+    left.set(xscale="log", yscale="log", xlabel="sensitivity to $F_z$ (mV/mN)", ylabel="resonance along z (kHz)")
     left.legend(fontsize=8)
     for name, values in (("length", study.length_mm), ("width", study.width_mm), ("thickness", study.thickness_mm)):
         right.plot(study.force_sensitivity[front], _UM * values[front], ".-", linewidth=0.8, label=name)
-    right.set(xscale="log", xlabel="sensitivity to F_z (mV/mN)", ylabel="of the beams on the front (µm)")
+    right.set(xscale="log", xlabel="sensitivity to $F_z$ (mV/mN)", ylabel="size of the beams on the front (µm)")
     right.legend(fontsize=8)

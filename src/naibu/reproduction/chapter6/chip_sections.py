@@ -19,7 +19,7 @@ from naibu.applications.sensing_chip.finite_elements import LOADS, solve_chip
 from naibu.applications.sensing_chip.load_envelope import load_limits
 from naibu.core.arrays import FloatArray
 from naibu.reproduction.chapter6 import chip_figures
-from naibu.viewer.chapter import Figure, Section
+from naibu.viewer.chapters.chapter import Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 UNITS = ("mN", "mN", "mN", "N µm", "N µm", "N µm")

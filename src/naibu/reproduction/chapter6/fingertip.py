@@ -14,7 +14,7 @@ from naibu.applications.fingertip.readings import ReadingChain
 from naibu.applications.sensing_chip.filters import first_order_filter
 from naibu.core.arrays import FloatArray
 from naibu.reproduction.chapter6 import fingertip_figures
-from naibu.viewer.chapter import Figure, Section
+from naibu.viewer.chapters.chapter import Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 if TYPE_CHECKING:
@@ -60,29 +60,29 @@ def _basic(model: FingertipModel, pressings: Sequence[Pressing], chain: ReadingC
     volts = [_volts(p, chain, AZIMUTH_OF_90, full)[0] for p in pressings]
     jig = [_volts(p, chain, AZIMUTH_OF_90 + error, full)[0, 1] for p, error in zip(pressings, JIG_DEG, strict=True)]
     rows: tuple[tuple[Cell, ...], ...] = tuple(
-        (tilt, seconds, *(float(v) for v in v3), float(v3[0] / volts[0][0]), error, float(m_x))
+        (tilt, seconds, *(round(float(v), 6) for v in v3), float(v3[0] / volts[0][0]), error, float(m_x))
         for tilt, seconds, v3, error, m_x in zip(TILTS, duration, volts, JIG_DEG, jig, strict=True)
     )
     table = Table(
         "Figures 6.9 and 6.11 at 3 N",
-        ("theta, degrees", "time to 3 N, s", "F_z, V", "M_x, V", "M_y, V", "F_z over that at 0", "error of the jig's azimuth, degrees",
+        ("θ, degrees", "time to 3 N, s", "F_z, V", "M_x, V", "M_y, V", "F_z over that at 0", "error of the jig's azimuth, degrees",
          "M_x with it, V"),
-        rows, caption="phi = 90 degrees, 3 mm/min, gains 2000, 500 and 500.",
+        rows, caption="φ = 90 degrees, 3 mm/min, gains 2000, 500 and 500.",
         note="The report prints curves, no numbers. The errors of the jig are assumed; they show what lifts M_x as in (c), (d), (f).",
     )  # fmt: skip
     drop = 100.0 * (1.0 - volts[-1][0] / volts[0][0])
     spread = 100.0 * (max(duration) / min(duration) - 1.0)
     text = (
-        "A hemisphere of 20 mm, E = 220 kPa, with the assumed chip under an assumed package of 0.9 x 0.35 mm at its base; the "
+        "A hemisphere of 20 mm, E = 220 kPa, with the assumed chip under an assumed package of 0.9 × 0.35 mm at its base; the "
         "rod's flat end is perpendicular to its axis, which points to the centre of the hemisphere; friction 0.5 (assumed).",
-        f"Agrees: the load over time hardly depends on theta (the time to 3 N by {spread:.2g} %); M_y grows with theta, M_x does not, "
+        f"Agrees: the load over time hardly depends on θ (the time to 3 N by {spread:.2g} %); M_y grows with θ, M_x does not, "
         "and the channels do not disturb each other. An error of the jig of 1 to 2 degrees lifts M_x as the report suspects.",
         f"Differs in part: F_z is called constant; here it falls by {drop:.2g} % from 0 to 30 degrees, "
-        "more than the force along the base's normal does, 1 - cos 30 degrees = 13 %. That a central load gives the same F_z at every "
+        "more than the force along the base's normal does, 1 − cos 30 degrees = 13 %. That a central load gives the same F_z at every "
         "angle does not follow from its "
         "direction.",
-        "Printed inconsistently: in chapter 6 a press at phi = 90 degrees gives M_y, in the papers one at 60 degrees from the x axis gives "
-        "more M_x than M_y. A lateral force along y turns the chip about x; with the papers' angle chapter 6's phi counts from the y axis.",
+        "Printed inconsistently: in chapter 6 a press at φ = 90 degrees gives M_y, in the papers one at 60 degrees from the x axis gives "
+        "more M_x than M_y. A lateral force along y turns the chip about x; with the papers' angle chapter 6's φ counts from the y axis.",
     )
     return Section("Fingertip: basic compression tests (Figs 6.8 to 6.11)", text, (table,), _figures(model, pressings, chain, seed))
 
@@ -105,14 +105,14 @@ def _figures(model: FingertipModel, pressings: Sequence[Pressing], chain: Readin
         loads = np.stack([np.interp(times * SPEED, pressing.depth_mm, column) for column in pressing.chip_loads.T], axis=1)
         read = chain.converted(rotated_loads(loads, AZIMUTH_OF_90), rng)
         for axes, values, title in zip(canvas.subplots(1, 2), (read, first_order_filter(read, SHARE)), ("read", "filtered"), strict=True):
-            axes.plot(times, values, linewidth=0.5, label=fingertip_figures.CHANNELS)
+            axes.plot(times, values, linewidth=0.5, label=[f"${name}$" for name in fingertip_figures.CHANNELS])
             axes.set(title=title, xlabel="time (s)", ylabel="reading (V)")
             axes.legend(fontsize=7)
 
     return (
         Figure("Figure 6.9", "Load over time at the rod's 3 mm/min.", force_over_time, (6.0, 3.6)),
         Figure("Figure 6.10", "Readings at 20 degrees, and after the filter with r = 0.1.", filtered, (9.0, 3.4)),
-        Figure("Figure 6.11", "Readings over the load at phi = 90 degrees.",
+        Figure("Figure 6.11", "Readings over the load at φ = 90 degrees.",
                lambda canvas: fingertip_figures.readings_over_force(canvas, [1e-3 * forces] * len(names), volts, names), (11.0, 3.6)),
         Figure("Figure 6.8", "Section in the plane of the tilt at 20 degrees and 3 N.",
                lambda canvas: fingertip_figures.section(canvas, model, pressings[4]), (9.0, 5.0)),
@@ -122,7 +122,7 @@ def _figures(model: FingertipModel, pressings: Sequence[Pressing], chain: Readin
 def _moments(pressings: Sequence[Pressing], chain: ReadingChain, switched: Sequence[SwitchedPress]) -> Section:
     forces = np.linspace(0.0, FULL_MN, 31)
     curves = {
-        f"phi = {phi:g}, theta = {TILTS[k]:g}": _volts(pressings[k], chain, AZIMUTH_OF_90 + phi - 90.0 + JIG_DEG[k], forces)[:, 1:]
+        f"φ = {phi:g}, θ = {TILTS[k]:g}": _volts(pressings[k], chain, AZIMUTH_OF_90 + phi - 90.0 + JIG_DEG[k], forces)[:, 1:]
         for k in (2, 4, 6)
         for phi in (0.0, 90.0, 180.0, 270.0)
     }
@@ -172,7 +172,7 @@ def _to_60_newtons(strong: Sequence[Pressing], chain: ReadingChain) -> Section:
     )  # fmt: skip
     table = Table(
         "Papers, 40 mm fingertip to 60 N",
-        ("theta, degrees", "depth, mm", "F_z on the chip, mN", "F_z, V", "M_x, V", "M_y, V", "beyond the converter"),
+        ("θ, degrees", "depth, mm", "F_z on the chip, mN", "F_z, V", "M_x, V", "M_y, V", "beyond the converter"),
         rows, caption="Contact at 60 degrees from the x axis, gains 2000, 500, 500 (the papers: 3000 for all).",
     )  # fmt: skip
     text = (

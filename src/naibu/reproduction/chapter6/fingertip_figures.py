@@ -53,7 +53,7 @@ def readings_over_force(canvas: Canvas, forces_n: Sequence[FloatArray], volts: S
     for k, axes in enumerate(canvas.subplots(1, 3)):
         for force, reading, name in zip(forces_n, volts, names, strict=True):
             axes.plot(force, reading[:, k], ".-", markersize=3, linewidth=1.0, label=name)
-        axes.set(xlabel="force along the rod (N)", ylabel=f"reading of {CHANNELS[k]} (V)")
+        axes.set(xlabel="force along the rod (N)", ylabel=f"reading of ${CHANNELS[k]}$ (V)")
     spans = np.array([axes.get_ylim() for axes in canvas.axes[1:]])
     for axes in canvas.axes[1:]:
         axes.set_ylim(float(spans.min()), float(spans.max()))
@@ -62,7 +62,11 @@ def readings_over_force(canvas: Canvas, forces_n: Sequence[FloatArray], volts: S
 
 def moments(canvas: Canvas, curves: Mapping[str, FloatArray], unit: str = "V") -> None:
     """Draw M_y over M_x: curves (n, 2)."""
+    from matplotlib import colormaps
+
     axes = canvas.add_subplot()
+    if len(curves) > 10:  # the colours of the ordinary cycle
+        axes.set_prop_cycle(color=colormaps["tab20"](range(20)))
     for name, values in curves.items():
         axes.plot(*values.T, ".-", markersize=3, linewidth=1.0, label=name)
     axes.axhline(0.0, color="0.7", linewidth=0.5)
@@ -70,8 +74,8 @@ def moments(canvas: Canvas, curves: Mapping[str, FloatArray], unit: str = "V") -
     span = 1.1 * max((float(np.abs(values).max()) for values in curves.values()), default=1.0) or 1.0
     axes.set_aspect("equal")
     axes.set(xlim=(-span, span), ylim=(-span, span))
-    axes.set(xlabel=f"M_x ({unit})", ylabel=f"M_y ({unit})")
-    axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.02, 0.5))
+    axes.set(xlabel=f"$M_x$ ({unit})", ylabel=f"$M_y$ ({unit})")
+    axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.02, 0.5))
 
 
 def decoded(canvas: Canvas, found: Sequence[DecodedForces], forces: Sequence[FloatArray], tilts: Sequence[FloatArray]) -> None:

@@ -9,6 +9,7 @@ from naibu.applications.sensing_chip.closed_forms import CrossBeam, orthotropic_
 from naibu.applications.sensing_chip.design import ChipDesign, beam_points
 from naibu.applications.sensing_chip.design_study import DesignStudy, study_designs
 from naibu.applications.sensing_chip.electronics import report_readout
+from naibu.applications.sensing_chip.fillets import filleted_end
 from naibu.applications.sensing_chip.load_envelope import largest_stress, load_limits, surface_stress
 from naibu.reproduction.chapter6 import chip_figures
 from naibu.reproduction.chapter6.chip_sections import (
@@ -19,11 +20,13 @@ from naibu.reproduction.chapter6.chip_sections import (
     sensitivity_table,
     study_section,
 )
+from naibu.reproduction.chapter6.fillet_section import fillet_figure, fillet_table
 from naibu.reproduction.printed_tables import printed_table
-from naibu.viewer.chapter import Figure, Section
+from naibu.viewer.chapters.chapter import Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 SHARE = 0.1  # r of equation (6.1)
+FILLETS_MM = (0.01, 0.02, 0.04)  # radii, which the report does not print
 
 
 def chip_sections(analysis: ChipAnalysis, seed: int) -> tuple[Section, ...]:
@@ -60,18 +63,18 @@ def designs_around(design: ChipDesign, count: int = 21) -> DesignStudy:
 def _assumptions(d: ChipDesign) -> Section:
     um = 1e3
     rows: tuple[tuple[Cell, ...], ...] = (
-        ("beams L x w x t, µm", f"{um * d.beam_length_mm:g} x {um * d.beam_width_mm:g} x {um * d.beam_thickness_mm:g}", "sensitivities"),
+        ("beams L × w × t, µm", f"{um * d.beam_length_mm:g} × {um * d.beam_width_mm:g} × {um * d.beam_thickness_mm:g}", "sensitivities"),
         ("block half width c, µm", um * d.block_half_width_mm, "c = L / 2"),
         ("resistors of F_z, of M_x and M_y: distance from the clamp, µm", f"{um * d.force_resistor_mm:g}, {um * d.moment_resistor_mm:g}",
          "sensitivities; both printed limits stress the beams alike"),
         ("supply, V", d.supply_voltage, "usual"),
-        ("piezoresistance of <110>, along and across, 1/TPa", "718, -663", "lightly doped p-type silicon (Smith 1954)"),
+        ("piezoresistance of <110>, along and across, 1/TPa", "718, −663", "lightly doped p-type silicon (Smith 1954)"),
         ("Young's modulus of <110>, shear modulus, GPa", "169, 50.9", "silicon (Wortman and Evans 1965)"),
         ("strength, GPa", 1e-6 * d.strength_kpa, "etched silicon beams bear 1 to 8 GPa"),
         ("block height, frame, pillar, µm", f"{um * d.block_height_mm:g}, {um * d.frame_width_mm:g}, {um * d.pillar_width_mm:g}",
-         "chip of 2 x 2 mm²"),
+         "chip of 2 × 2 mm²"),
         ("layout of the bridges of M_x and M_y", "four resistors each", "Fig. 7(b) names no places"),
-        ("converter's range, V; readings a second", "+-10; 100", "AD12-16(PCI)EV has 12 bits"),
+        ("converter's range, V; readings a second", "±10; 100", "AD12-16(PCI)EV has 12 bits"),
     )  # fmt: skip
     text = (
         "Chapter 6 and the papers in it print equations, a table of strength and sensitivity, gains and the noise. They do not print the "
@@ -115,25 +118,25 @@ def _misprints(forms: CrossBeam, moment: float) -> Table:
     x0 = float(forms.stress_free_point(theta))
     printed_x0 = length / (2 * c + length) * ((length + 3 * c) / 3 + length * c * theta / (3 * t))
     rows: tuple[tuple[Cell, ...], ...] = (
-        ("(8)", "dx = c theta^2", "dx = c theta^2 / 2", "dx, µm", 1e3 * c * theta**2, 0.5e3 * c * theta**2),
+        ("(8)", "dx = c θ²", "dx = c θ² / 2", "dx, µm", 1e3 * c * theta**2, 0.5e3 * c * theta**2),
         (
             "(11)",
-            "F_RX = w t E c theta^2 / I",
-            "w t E c theta^2 / (2 L)",
+            "F_RX = w t E c θ² / I",
+            "w t E c θ² / (2 L)",
             "unit of area / I: no force",
             None,
             edge * float(forms.width) * t,
         ),
-        ("(18)", "E c theta^2 / L", "E c theta^2 / (2 L)", "stress, MPa", 2e-3 * edge, 1e-3 * edge),
-        ("(20)", "... + E c theta^2 / L", "... + E c theta^2 / (2 L)", "stress at x = 0, MPa", 1e-3 * (smallest + edge), 1e-3 * smallest),
-        ("(21)", "... + E c theta^2 / L", "... + E c theta^2 / (2 L)", "stress at x = L, MPa", 1e-3 * (largest + edge), 1e-3 * largest),
-        ("(22)", "... + L c theta / (3 t)", "... - L c theta / (6 t)", "stress-free point, µm", 1e3 * printed_x0, 1e3 * x0),
+        ("(18)", "E c θ² / L", "E c θ² / (2 L)", "stress, MPa", 2e-3 * edge, 1e-3 * edge),
+        ("(20)", "... + E c θ² / L", "... + E c θ² / (2 L)", "stress at x = 0, MPa", 1e-3 * (smallest + edge), 1e-3 * smallest),
+        ("(21)", "... + E c θ² / L", "... + E c θ² / (2 L)", "stress at x = L, MPa", 1e-3 * (largest + edge), 1e-3 * largest),
+        ("(22)", "... + L c θ / (3 t)", "... − L c θ / (6 t)", "stress-free point, µm", 1e3 * printed_x0, 1e3 * x0),
     )
     return Table(
         "Misprints",
         ("equation", "printed", "corrected", "quantity at M_y = 800 N µm", "printed", "corrected"),
         rows,
-        note="F_RX is in mN. The corrected (8) still neglects that a bent beam is shorter, by (3 c^2 / (5 L) + c / 10 + L / 15) theta^2: "
+        note="F_RX is in mN. The corrected (8) still neglects that a bent beam is shorter, by (3 c² / (5 L) + c / 10 + L / 15) θ²: "
         f"with it the stretch adds {1e-3 * whole:.3g} MPa rather than {1e-3 * edge:.3g}, "
         "which finite elements at finite strain confirm within "
         "1 %. For c = L / 2 the printed (8) is, by accident, within 4 % of that. All of this is below 1 % of the stress.",
@@ -167,7 +170,7 @@ def _checked(analysis: ChipAnalysis) -> Table:
         ("(12), (13) T_RY, mN m per rad", 1e-3 * float(forms.end_torque), 1e-3 * abs(d[4]) / rotation, None),
         ("(12) with both shear moduli", 1e-3 * torsion / design.beam_length_mm, 1e-3 * abs(d[4]) / rotation, None),
         (
-            "(15) theta, mrad at 800 N µm",
+            "(15) θ, mrad at 800 N µm",
             *(8e5 / float(k) for k in (forms.moment_stiffness, beams.moment_stiffness, whole.moment_stiffness)),
         ),
         ("(19) stress at 0.3 L, MPa at 800 N µm", closed_moment[0], *of_moment[0]),
@@ -197,7 +200,7 @@ def _stress_free(analysis: ChipAnalysis, which: str) -> float:
 
 def _piezoresistance(design: ChipDesign) -> Section:
     text = (
-        "Piezoresistors of p-type silicon along <110> change their resistance by 718 parts per million per MPa along, and -663 across the "
+        "Piezoresistors of p-type silicon along <110> change their resistance by 718 parts per million per MPa along, and −663 across the "
         "current. Along <100> they would be eleven times less sensitive. Since the longitudinal strain of <110> beams in a (001) wafer "
         "contracts them sideways by only 0.064, little transverse stress arises at the clamps, and it costs a few per cent of the signal.",
     )
@@ -261,7 +264,7 @@ def _specification(analysis: ChipAnalysis) -> Section:
             ("both together", None, at[2], None, *surface[2], None),
         ),
         note="The stress at the resistors follows from the printed sensitivity, the supply and the piezoresistance alone, whatever the "
-        "dimensions: V = pi sigma V_in / 2. It is a lower bound of the largest stress. Finite elements: largest tension on the beams up to "
+        "dimensions: V = π σ V_in / 2. It is a lower bound of the largest stress. Finite elements: largest tension on the beams up to "
         "a quarter of the thickness from their ends, where it is below the nominal stress; nearer to the sharp corners it rises without "
         "bound, so that they must be rounded. Either limit is nominally borne by good etched silicon, both together are not trusted: "
         f"{at[2]:.2g} GPa. A combined load must stay below the line F_z / {limits[0]:.0f} mN + M / {limits[1]:.0f} N µm = 1.",
@@ -272,12 +275,18 @@ def _specification(analysis: ChipAnalysis) -> Section:
         lambda canvas: chip_figures.envelope(canvas, design, [(force, moment)], marked="5000 mN and 800 N µm"),
         (7.0, 4.2),
     )
+    ends = tuple(filleted_end(design, radius) for radius in FILLETS_MM)
+    rounded = ends[1].load_limits(analysis.beams)
     text = (
         "With the assumed dimensions the closed forms give the printed sensitivities; finite elements of the same chip keep that to F_z, "
         "whose "
         "resistors lie away from the ends, and lower those to moments, whose resistors lie where frame and block yield.",
+        f"Rounded corners bound the stress: with fillets of {1e3 * ends[1].fillet_mm:g} µm the beams bear {rounded[0]:.0f} mN "
+        f"or {rounded[1]:.0f} N µm at the assumed strength. The printed limits need stronger silicon, or larger fillets.",
         "By the symmetry of the chip no bridge reads the load of another. Lateral forces, which it does not measure, tilt the block on its "
         "elastic frame and enter the moments by 1.5 % of full scale. A mask that is off by 2 µm adds twist and lateral force by less.",
     )
-    tables = (sensitivity_table(analysis, (s_f, s_m, s_m)), strength_table, *crosstalk_tables(analysis, (5e3, 5e3, 5e3, 8e2, 8e2, 8e2)))
-    return Section("Specification (Table 6.1)", text, tables, (placement_figure(analysis), figure))
+    fillets, borne = fillet_table(analysis, ends), fillet_figure(analysis, ends, [(force, moment)], marked="5000 mN and 800 N µm")
+    cross = crosstalk_tables(analysis, (5e3, 5e3, 5e3, 8e2, 8e2, 8e2))
+    tables = (sensitivity_table(analysis, (s_f, s_m, s_m)), strength_table, fillets, *cross)
+    return Section("Specification (Table 6.1)", text, tables, (placement_figure(analysis), figure, borne))

@@ -10,7 +10,7 @@ from naibu.applications.sensing_chip.design import assumed_chip
 from naibu.applications.sensing_chip.electronics import report_readout
 from naibu.reproduction.chapter6.fingertip import fingertip_sections
 from naibu.reproduction.chapter6.sensing_chip import SHARE, chip_sections
-from naibu.viewer.chapter import Chapter
+from naibu.viewer.chapters.chapter import Chapter
 
 
 def chapter6(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from naibu.core.arrays import AnyArray, Float32Array, FloatArray, IntArray
 from naibu.viewer.live.cut_outline import cut_outline
 from naibu.viewer.motion_page import RigidShape
 
-MAGIC = b"NLV2"
+MAGIC = b"NLV3"
 HEADER = np.dtype(
     [
         ("magic", "S4"),
@@ -32,9 +32,35 @@ HEADER = np.dtype(
         ("real_time", "<f4"),
         ("unbalanced", "<f4"),
         ("rotation", "<f4", 4),
+        ("readings", "<u4"),
     ]
 )
 PAUSED, DRIVING, RECORDING, REPLAYING, FAILED = 1, 2, 4, 8, 16
+
+
+@dataclass(frozen=True, slots=True)
+class LiveReading:
+    """A quantity that frames carry beside positions, and the page shows as a number and a curve.
+
+    Attributes
+    ----------
+    name : str
+        What is read.
+    unit : str
+        Its unit; empty for none.
+    plot : str
+        Name of the axes in which its curve is drawn, a few words; curves of one plot have one unit.
+    explanation : str
+        What is to be known of it; shown with the number.
+    states : tuple of str
+        What the values 0 and 1 mean, where it is no quantity but a state: one of them is shown, and no curve.
+    """
+
+    name: str
+    unit: str
+    plot: str
+    explanation: str = ""
+    states: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,6 +95,8 @@ class LiveScene:
         Number of the scene; frames with another one belong to another scene.
     cuttable : bool
         Whether the body can be cut.
+    readings : sequence of LiveReading
+        What frames carry, in that order.
     """
 
     title: str
@@ -85,6 +113,7 @@ class LiveScene:
     marker_weights: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
     topology: int = 0
     cuttable: bool = False
+    readings: Sequence[LiveReading] = ()
 
     def payload(self) -> dict[str, object]:
         """Return the scene for JSON; ``viewer-src/src/live-decode.js`` is the inverse."""
@@ -106,6 +135,7 @@ class LiveScene:
             "frame_s": self.frame_s,
             "topology": self.topology,
             "cuttable": self.cuttable,
+            "readings": [asdict(reading) for reading in self.readings],
         }
 
 
@@ -136,9 +166,11 @@ class LiveFrame:
     topology : int
         Number of the scene that the nodes belong to.
     unbalanced : float
-        Out-of-balance force that the next frames take up, as a fraction of all forces.
+        Out-of-balance forces that the next frames take up, as a fraction of all forces, or of those of contact where that is more.
     rotation : tuple of float
         Of the tool since it was made, as a quaternion, scalar last.
+    readings : ndarray, shape (k, 3)
+        Value and both ends of the 95 % interval of every reading of the scene; NaN where there is none.
     """
 
     number: int
@@ -157,10 +189,11 @@ class LiveFrame:
     topology: int = 0
     unbalanced: float = 0.0
     rotation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    readings: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
 
 def frame_bytes(frame: LiveFrame, driving: bool, values: FloatArray | None = None) -> bytes:
-    """Return a frame as bytes: header, positions and, where wanted, values at the nodes in single precision."""
+    """Return a frame as bytes: header, positions, where wanted values at the nodes, and readings, in single precision."""
     header = np.zeros(1, HEADER)
     for name, value in (
         ("magic", MAGIC), ("frame", frame.number), ("nodes", len(frame.positions)), ("flags", frame.flags | (DRIVING if driving else 0)),
@@ -168,12 +201,13 @@ def frame_bytes(frame: LiveFrame, driving: bool, values: FloatArray | None = Non
         ("topology", frame.topology), ("time_s", frame.time_s),
         ("force", frame.force), ("pull", frame.pull), ("centre", frame.centre), ("penetration", frame.penetration_mm),
         ("steps_per_s", frame.steps_per_s), ("real_time", frame.real_time), ("unbalanced", frame.unbalanced),
-        ("rotation", frame.rotation),
+        ("rotation", frame.rotation), ("readings", len(frame.readings)),
     ):  # fmt: skip
         header[name] = value
     parts: list[Float32Array] = [np.asarray(frame.positions, dtype="<f4")]
     if values is not None:
         parts.append(np.asarray(values, dtype="<f4"))
+    parts.append(np.asarray(frame.readings, dtype="<f4"))
     return header.tobytes() + b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
 
 

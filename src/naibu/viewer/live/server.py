@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import asyncio
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from socket import socket as Socket
 from time import monotonic
 from typing import Protocol
 
@@ -182,39 +184,49 @@ class LiveServer:
         await socket.send_bytes(frame_bytes(frame, driving, values))
 
 
-def serve(server: LiveServer, port: int, ready: Callable[[str], None]) -> None:
-    """Serve the page on the loopback interface until Ctrl-C.
-
-    Parameters
-    ----------
-    server : LiveServer
-        What is served.
-    port : int
-        Port; 0 takes a free one.
-    ready : callable
-        Called with the address, token included, once the page can be opened.
+@contextmanager
+def bound_port(port: int) -> Iterator[Socket]:
+    """Keep a port of the loopback interface for `serve`; 0 takes a free one.
 
     Raises
     ------
     InputError
         The port is taken.
     """
-    socket = uvicorn.Config(_nothing, host="127.0.0.1", port=port, log_level="critical")
+    config = uvicorn.Config(_nothing, host="127.0.0.1", port=port, log_level="critical")
     try:
-        bound = socket.bind_socket()
+        bound = config.bind_socket()
     except SystemExit as error:
         raise InputError(f"port {port} is taken or not allowed; choose another, or 0 for a free one") from error
-    bound.listen()  # what connects from now on waits for the server
+    try:
+        yield bound
+    finally:
+        bound.close()
+
+
+def serve(server: LiveServer, bound: Socket, ready: Callable[[str], None]) -> None:
+    """Serve the page on the loopback interface until Ctrl-C.
+
+    Parameters
+    ----------
+    server : LiveServer
+        What is served.
+    bound : socket
+        Of `bound_port`.
+    ready : callable
+        Called with the address, token included, once the page can be opened.
+    """
+    try:
+        bound.listen()  # what connects from now on waits for the server
+    except OSError as error:  # two may bind a port that nobody listens at yet
+        raise InputError(f"port {bound.getsockname()[1]} is taken; choose another, or 0 for a free one") from error
     chosen = bound.getsockname()[1]
     config = uvicorn.Config(
         server.app(chosen), log_level="warning", lifespan="off", ws="websockets-sansio", ws_max_size=LONGEST_MESSAGE,
         timeout_graceful_shutdown=1, server_header=False, date_header=False,
     )  # fmt: skip
     ready(f"http://127.0.0.1:{chosen}/?token={server.token}")
-    try:
-        uvicorn.Server(config).run(sockets=[bound])
-    finally:
-        bound.close()
+    uvicorn.Server(config).run(sockets=[bound])
 
 
 async def _nothing(*_: object) -> None:

@@ -12,22 +12,22 @@ import numpy as np
 
 from naibu.applications.fingertip.decoder import DecodedForces, ForceDecoder
 from naibu.applications.fingertip.offset import OffsetTracker
-from naibu.applications.fingertip.slip import SidewaysForces, SlipDetector
+from naibu.applications.fingertip.slip import SidewaysForces
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
-from naibu.io.study_schemas.fingertip_schema import load_decoder
 from naibu.io.tables.number_table import read_numbers
 from naibu.viewer.cards import Card
-from naibu.viewer.chapter import Chapter, Figure, Section
-from naibu.viewer.chapter_page import write_chapter
+from naibu.viewer.chapters.chapter import Chapter, Figure, Section
+from naibu.viewer.chapters.chapter_page import write_chapter
 from naibu.viewer.notebook import WrittenResult
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.applications.slip_report import drawn_rows, slip_card, slip_section, slip_summary, slip_words
+from naibu.workflows.applications.stored_decoder import stored_detector
 from naibu.workflows.results.output_folder import output_folder
 
-MOST_VOLTS = 1e6
+MOST_VOLTS = 100.0  # several times what amplifiers give: readings in mV are told
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -105,18 +105,15 @@ def decode_forces(
     if not 0.0 < touch_s < np.inf:
         raise InputError(f"touch_s is {touch_s:g}; give seconds, more than 0")
     source, table = Path(decoder), Path(readings)
-    stored = load_decoder(source)
-    chosen = ForceDecoder(
-        stored.radius_mm, np.array(stored.volts_per_load), np.array(stored.noise), np.array(stored.coefficients), np.array(stored.unit),
-        np.array(stored.spread), np.array(stored.limits), stored.model_error,
-    )  # fmt: skip
+    detector = stored_detector(source)
+    chosen = detector.decoder
     rows = read_numbers(table, ("time, s", "F_z, V", "M_x, V", "M_y, V"), units=("s", "V", "V", "V"))
     if (np.diff(rows[:, 0]) <= 0.0).any():
         raise InputError(
             f"{table}: row {int(np.flatnonzero(np.diff(rows[:, 0]) <= 0.0)[0]) + 2} is not later than the one before; sort them"
         )
     if (beyond := np.abs(rows[:, 1:]).max()) > MOST_VOLTS:
-        raise InputError(f"{table}: a reading of {beyond:.3g} V is none of a fingertip (at most {MOST_VOLTS:g} V); check its columns")
+        raise InputError(f"{table}: a reading of {beyond:.3g} V is none of a fingertip (at most {MOST_VOLTS:g} V). Are its readings in V?")
     if free_rows > len(rows):
         raise InputError(
             f"free_rows is {free_rows}, and {table} has {len(rows)} rows; give at most so many, or 0 for readings without offset"
@@ -124,9 +121,6 @@ def decode_forces(
     folder = output_folder(out, ("forces.html", "forces.json", "forces.csv"), overwrite=overwrite)
     volts, offsets = _without_offset(chosen, rows[:, 1:], free_rows, noise_share)
     found = chosen.decode(volts, noise_share=noise_share)
-    detector = SlipDetector(
-        chosen, np.array(stored.slip.coefficients), stored.slip.spread, stored.slip.sensitivity_mm, stored.slip.sensitivity_error
-    )
     sideways = detector.followed(rows[:, 0], volts / chosen.volts_per_load, noise_share=noise_share, touch_s=touch_s)
     csv = write_atomically(folder / "forces.csv", _csv(rows[:, 0], found, sideways, friction))
     settings: dict[str, Cell] = dict(input_record({"decoder": source, "readings": table}))

@@ -16,7 +16,7 @@ from naibu.applications.sensing_chip.filters import noise_gain
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.reproduction.chapter6 import fingertip_figures
 from naibu.viewer.cards import Card
-from naibu.viewer.chapter import Figure, Section
+from naibu.viewer.chapters.chapter import Figure, Section
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.applications.fingertip_study import PreparedFingertip
 

@@ -90,6 +90,8 @@ def plate_distances(views: tuple[View, View] | None, given: Sequence[float] | No
 def positioner_angle(views: tuple[View, View] | None, given: float | None) -> float:
     """Return the angle of MLO against CC, degrees, as given, else from the tags.
 
+    Tags state the angle of each view; where CC has none, it is taken as 0. Signs and whole turns differ between makers: 315 is -45.
+
     Raises
     ------
     InputError
@@ -101,7 +103,8 @@ def positioner_angle(views: tuple[View, View] | None, given: float | None) -> fl
     if stated is None:
         where = "" if views is None else f", and {views[1].source} has no PositionerPrimaryAngle (0018,1510)"
         raise InputError(f"angle_deg is missing{where}: give the positioner angle of MLO against CC")
-    return stated
+    of_cc = 0.0 if views is None or views[0].mammogram is None else views[0].mammogram.angle_deg or 0.0
+    return abs((stated - of_cc + 180.0) % 360.0 - 180.0)
 
 
 def read_scan(mask: PathLike, side: str | None, views: tuple[View, View] | None) -> ScannedBreast:

@@ -25,12 +25,13 @@ from naibu.applications.mammography.epipolar import (
 from naibu.applications.mammography.geometric_model import CompressionParameters
 from naibu.applications.mammography.mechanical_model import MechanicalParameters
 from naibu.applications.mammography.pair_construction import mammographic_pair, pair_of_shape
+from naibu.applications.mammography.view_order import may_be_swapped
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.io.files.atomic import write_atomically
 from naibu.viewer.cards import Card
-from naibu.viewer.chapter import Chapter, Figure, Section
-from naibu.viewer.chapter_page import chapter_html
+from naibu.viewer.chapters.chapter import Chapter, Figure, Section
+from naibu.viewer.chapters.chapter_page import chapter_html
 from naibu.viewer.notebook import WrittenResult
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.applications.mammogram_inputs import place_in, plate_distances, positioner_angle, read_scan, read_views
@@ -39,6 +40,10 @@ from naibu.workflows.applications.mammography_motion import breast_page
 from naibu.workflows.results.output_folder import output_folder
 
 NOTICE = "Research software, not a medical device: not for diagnosis, biopsy or treatment."
+_SWAPPED = (
+    "More of the breast lies laterally of the nipple in CC than above it in MLO, as where the views are swapped or hung upside down: check "
+    "both files. The fit of the outlines does not tell: both orders fit alike."
+)
 _NAME = "mammography"
 _BREAST = "breast.html"
 _SHOWN = 9  # points of a curve in the 3-D view
@@ -144,16 +149,18 @@ def relate_views(
             views[0].outline, views[1].outline, plates, angle, model=model, uncertainty=uncertainty, draws=draws, seed=seed
         )
     found = _found(pair, (point_cc, point_mlo), None if scan is None else _scanned_point(scan, point_mr))
+    untold = views is not None and any(view.mammogram is None for view in views)  # no tag says which view a file shows
+    warnings = _warnings(found) + ([_SWAPPED] if untold and may_be_swapped(*pair.outlines) else [])
     settings: dict[str, Cell] = {
         "CC": str(cc), "MLO": str(mlo), "MR": str(mr), "model": model, "thickness_mm": ", ".join(f"{t:g}" for t in plates),
         "angle_deg": angle, "unresolved_mm": unresolved_mm, "draws": draws, "draws without a breast": pair.refused, "seed": seed,
     }  # fmt: skip
-    chapter = Chapter(_NAME, "One point in two mammographic views", _sections(found, model, uncertainty), settings, _cards(found))
-    numbers = {"naibu": __version__, "notice": NOTICE, "settings": settings, **_numbers(found)}
+    chapter = Chapter(_NAME, "One point in two mammographic views", _sections(found, warnings, model, uncertainty), settings, _cards(found))
+    numbers = {"naibu": __version__, "notice": NOTICE, "settings": settings, **_numbers(found, warnings)}
     page = write_atomically(folder / f"{_NAME}.html", chapter_html(chapter))
     table = write_atomically(folder / f"{_NAME}.json", json.dumps(numbers, indent=1, allow_nan=False) + "\n")
     breast = write_atomically(folder / _BREAST, breast_page(pair.nominal, angle, found.shown, NOTICE, dict(settings)))
-    return MammographyRun((page, table, breast), tuple(_rows(found)), tuple(_warnings(found)))
+    return MammographyRun((page, table, breast), tuple(_rows(found)), tuple(warnings))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,7 +191,7 @@ def _require_points(cc: object, mlo: object, mr: object, points: tuple[object, o
     if all(point is None for point in points):
         raise InputError("point_cc is missing: give a point in CC, in MLO, in both, or in a scan")
     if points[2] is not None and mr is None:
-        raise InputError("point_mr is given without mr: give the mask of the breast in the scan")
+        raise InputError("point_mr is given without `mr`: give the mask of the breast in the scan")
     if cc is None and (points[0] is not None or points[1] is not None):
         raise InputError("point_cc or point_mlo is given without cc and mlo: give both views")
 
@@ -253,8 +260,8 @@ def _warnings(found: _Found) -> list[str]:
     return told
 
 
-def _numbers(found: _Found) -> dict[str, Any]:
-    numbers: dict[str, Any] = {"results": dict(_rows(found)), "warnings": _warnings(found)}
+def _numbers(found: _Found, warnings: list[str]) -> dict[str, Any]:
+    numbers: dict[str, Any] = {"results": dict(_rows(found)), "warnings": warnings}
     for k, other in enumerate(("mlo", "cc")):
         curve, outline = found.curves[k], found.pair.outlines[1 - k]
         if curve is not None:
@@ -278,7 +285,7 @@ def _numbers(found: _Found) -> dict[str, Any]:
     return numbers
 
 
-def _sections(found: _Found, model: str, uncertainty: ModelUncertainty) -> tuple[Section, ...]:
+def _sections(found: _Found, warnings: list[str], model: str, uncertainty: ModelUncertainty) -> tuple[Section, ...]:
     views = Figure(
         "Views",
         "Outlines, points, epipolar curves and the bands that hold the true place with 95 % probability, if the "
@@ -296,7 +303,7 @@ def _sections(found: _Found, model: str, uncertainty: ModelUncertainty) -> tuple
     )
     results = Table("Results", ("quantity", "value"), tuple(_rows(found)), caption="Intervals are of 95 %.")
     return (
-        Section("Notice", tuple(_warnings(found))),
+        Section("Notice", tuple(warnings)),
         Section(
             "Both views",
             ("The breast in 3-D, between the plates of both views: breast.html beside this page.",),

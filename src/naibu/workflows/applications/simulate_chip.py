@@ -16,6 +16,7 @@ from naibu.applications.sensing_chip.chip_mesh import ChipResolution
 from naibu.applications.sensing_chip.design import ChipDesign
 from naibu.applications.sensing_chip.design_study import DesignStudy, study_designs
 from naibu.applications.sensing_chip.electronics import Readout
+from naibu.applications.sensing_chip.fillets import FilletedEnd, filleted_end, require_bearable_at_fillets, require_fillet
 from naibu.applications.sensing_chip.finite_elements import LOADS
 from naibu.applications.sensing_chip.load_envelope import load_limits, require_bearable, surface_stress
 from naibu.core.arrays import FloatArray
@@ -35,9 +36,10 @@ from naibu.reproduction.chapter6.chip_sections import (
     sensitivity_table,
     study_section,
 )
+from naibu.reproduction.chapter6.fillet_section import fillet_figure, fillet_table
 from naibu.viewer.cards import Card
-from naibu.viewer.chapter import Chapter, Figure, Section
-from naibu.viewer.chapter_page import write_chapter
+from naibu.viewer.chapters.chapter import Chapter, Figure, Section
+from naibu.viewer.chapters.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.results.output_folder import output_folder
 
@@ -47,6 +49,7 @@ _MM = 1e-3  # um in mm
 # arguments of a design by the keys of the file
 _KEYS = {
     **{f"{name}_mm": f"[chip] {name}_um" for name in ("beam_length", "beam_width", "beam_thickness", "block_height", "pillar_width")},
+    "fillet_mm": "[chip] fillet_um",
     "block_half_width_mm": "half of [chip] block_width_um",
     "force_resistor_mm": "[resistors] force_from_end_um",
     "moment_resistor_mm": "[resistors] moment_from_end_um",
@@ -121,6 +124,8 @@ def prepared_chip(source: str | os.PathLike[str]) -> PreparedChip:
     try:
         design = _design(settings)
         readout = _readout(settings)
+        if settings.chip.fillet_um is not None:
+            require_fillet(design, _MM * settings.chip.fillet_um)
         for load in settings.load:
             require_bearable(design, load.force_z_mN, load.moment_x_Num, load.moment_y_Num)
         study = None if settings.study is None else _study(design, settings.study)
@@ -208,8 +213,10 @@ def simulate_chip(
     mesh, shift = chip.settings.mesh, chip.settings.resistors.mask_shift_um
     resolution = ChipResolution(mesh.along, mesh.across, mesh.through, mesh.below, mesh.frame)
     analysis = analysed_chip(chip.design, resolution, shift_mm=(_MM * shift[0], _MM * shift[1]), progress=progress)
+    end = _filleted(chip, analysis)
     settings: dict[str, Cell] = {"study": chip.source, "sha256": chip.digest, "nodes": analysis.whole.chip.mesh.n_points}
-    page, numbers = write_chapter(Chapter(chip.name, chip.title, _sections(chip, analysis), settings, _cards(chip, analysis)), folder)
+    chapter = Chapter(chip.name, chip.title, _sections(chip, analysis, end), settings, _cards(chip, analysis, end))
+    page, numbers = write_chapter(chapter, folder)
     solution = folder / f"{chip.name}.vtu"
     values: dict[str, FloatArray] = {}
     for name, load in _shown_loads(chip).items():
@@ -217,6 +224,20 @@ def simulate_chip(
         values |= {f"displacement_mm {name}": displacement, f"stress_kPa {name}": stress}
     write_vtu(solution, analysis.whole.chip.mesh, values)
     return page, numbers, solution
+
+
+def _filleted(chip: PreparedChip, analysis: ChipAnalysis) -> FilletedEnd | None:
+    """Solve the rounded corners, where the file has any, and refuse loads that these do not bear."""
+    radius = chip.settings.chip.fillet_um
+    if radius is None:
+        return None
+    end = filleted_end(chip.design, _MM * radius)
+    for k, load in enumerate(chip.settings.load):
+        try:
+            require_bearable_at_fillets(end, analysis.beams, _six(load))
+        except InputError as error:
+            raise InputError(f"{chip.source}: [[load]] {_named(load, k)}: {error}") from error
+    return end
 
 
 def _shown_loads(chip: PreparedChip) -> dict[str, FloatArray]:
@@ -234,13 +255,15 @@ def _six(load: LoadTable) -> FloatArray:
     return np.array([0.0, 0.0, load.force_z_mN, load.moment_x_Num, load.moment_y_Num, 0.0])
 
 
-def _cards(chip: PreparedChip, analysis: ChipAnalysis) -> tuple[Card, ...]:
-    limits, found = load_limits(chip.design), analysis.sensitivities
+def _cards(chip: PreparedChip, analysis: ChipAnalysis, end: FilletedEnd | None) -> tuple[Card, ...]:
+    found = analysis.sensitivities
+    limits = load_limits(chip.design) if end is None else end.load_limits(analysis.beams)
+    where = "nominal stress; sharp corners bear less" if end is None else f"with fillets of {1e3 * end.fillet_mm:g} µm"
     measurable, noise = chip.readout.measurable(found), chip.readout.load_noise(found)
     return (
         Card("Sensitivity to F_z", f"{found[0]:.3g} mV/mN", "finite elements of the whole chip"),
         Card("Sensitivity to M_x, M_y", f"{found[1]:.3g}, {found[2]:.3g} mV/(N µm)", "finite elements of the whole chip"),
-        Card("Largest force, moment borne", f"{1e-3 * limits[0]:.3g} N, {limits[1]:.3g} N µm", "each alone, nominal stress"),
+        Card("Largest force, moment borne", f"{1e-3 * limits[0]:.3g} N, {limits[1]:.3g} N µm", f"each alone, {where}"),
         Card(
             "Force that is read",
             f"{noise[0]:.2g} to {measurable[0]:.3g} mN",
@@ -250,7 +273,7 @@ def _cards(chip: PreparedChip, analysis: ChipAnalysis) -> tuple[Card, ...]:
     )
 
 
-def _sections(chip: PreparedChip, analysis: ChipAnalysis) -> tuple[Section, ...]:
+def _sections(chip: PreparedChip, analysis: ChipAnalysis, end: FilletedEnd | None) -> tuple[Section, ...]:
     design, limits = chip.design, load_limits(chip.design)
     text = (
         f"Each load alone is borne up to {1e-3 * limits[0]:.3g} N, or {limits[1]:.4g} N µm. The stresses are nominal; the strength of "
@@ -260,16 +283,19 @@ def _sections(chip: PreparedChip, analysis: ChipAnalysis) -> tuple[Section, ...]
     safe = Figure(
         "Safe loads", "Largest force and moment together.", lambda canvas: chip_figures.envelope(canvas, design, points), (7.0, 4.2)
     )
+    corners: tuple[tuple[Table, ...], tuple[Figure, ...]] = ((), ())
+    if end is not None:
+        corners = (fillet_table(analysis, (end,)),), (fillet_figure(analysis, (end,), points),)
     along = Figure(
         "Stress", "Along beam A; shaded: resistors.", lambda canvas: chip_figures.stress_along_beam(canvas, analysis), (10.0, 3.8)
     )
     full_scale = (limits[0], limits[0], limits[0], limits[1], limits[1], limits[1])
     rounded = tuple(float(f"{v:.3g}") for v in full_scale)
-    loads = _loads_tables(chip, analysis) if chip.settings.load else ()
+    loads = _loads_tables(chip, analysis, end) if chip.settings.load else ()
     sections = [
         Section("Sensitivity and stiffness", (), (sensitivity_table(analysis), model_table(analysis)), (along, placement_figure(analysis))),
         Section("Crosstalk", (), crosstalk_tables(analysis, rounded)),
-        Section("Loads", text, loads, (safe,)),
+        Section("Loads", text, (*loads, *corners[0]), (safe, *corners[1])),
         readout_section(analysis, chip.readout, chip.settings.readout.filter_share, seed=0),
     ]
     if chip.study is not None:
@@ -277,7 +303,7 @@ def _sections(chip: PreparedChip, analysis: ChipAnalysis) -> tuple[Section, ...]
     return tuple(sections)
 
 
-def _loads_tables(chip: PreparedChip, analysis: ChipAnalysis) -> tuple[Table, ...]:
+def _loads_tables(chip: PreparedChip, analysis: ChipAnalysis, end: FilletedEnd | None) -> tuple[Table, ...]:
     rows: list[tuple[Cell, ...]] = []
     outputs: list[tuple[Cell, ...]] = []
     for k, load in enumerate(chip.settings.load):
@@ -286,13 +312,16 @@ def _loads_tables(chip: PreparedChip, analysis: ChipAnalysis) -> tuple[Table, ..
         bridge = analysis.of_whole @ _six(load)
         volts = 1e-3 * np.array(chip.readout.gains) * bridge
         over = [name for name, v in zip(("F_z", "M_x", "M_y"), volts, strict=True) if abs(v) > chip.readout.adc_limit]
-        rows.append((_named(load, k), load.force_z_mN, load.moment_x_Num, load.moment_y_Num, 100.0 * used, corner))
+        fillet = () if end is None else (100.0 * require_bearable_at_fillets(end, analysis.beams, _six(load)),)
+        rows.append((_named(load, k), load.force_z_mN, load.moment_x_Num, load.moment_y_Num, 100.0 * used, corner, *fillet))
         outputs.append((_named(load, k), *(float(v) for v in bridge), *(float(v) for v in volts), ", ".join(over) or "none"))
-    columns = ("load", "F_z, mN", "M_x, N µm", "M_y, N µm", "nominal, % of strength", "near corners, % of strength")
+    columns: tuple[str, ...] = ("load", "F_z, mN", "M_x, N µm", "M_y, N µm", "nominal, % of strength", "near corners, % of strength")
     note = (
         "Near corners: largest tension of finite elements up to a quarter of the thickness from the beams' ends. In a sharp corner itself "
-        "it has no bound; where it exceeds the strength, corners must be rounded, or the load be less."
+        "it has no bound; fillet_um rounds it, and what the rounded corner bears is told then."
     )
+    if end is not None:
+        columns, note = (*columns, "in the fillets, % of strength"), note.split(" In a sharp")[0]
     names = [f"{what} {name}, {unit}" for what, unit in (("bridge", "mV"), ("amplified", "V")) for name in ("F_z", "M_x", "M_y")]
     caption = "By finite elements of the whole chip, without offset and noise."
     return (

@@ -24,8 +24,8 @@ from naibu.core.progress import Progress, report_progress
 from naibu.io.files.atomic import write_atomically
 from naibu.io.study_schemas.fingertip_schema import DECODER
 from naibu.io.vtk_files import write_vtkhdf_series
-from naibu.viewer.chapter import Chapter
-from naibu.viewer.chapter_page import write_chapter
+from naibu.viewer.chapters.chapter import Chapter
+from naibu.viewer.chapters.chapter_page import write_chapter
 from naibu.viewer.tables import Cell
 from naibu.workflows.applications.fingertip_checkpoint import FingertipCheckpoint
 from naibu.workflows.applications.fingertip_page import FingertipResults, fingertip_cards, fingertip_sections

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from naibu.applications.ischemia.layer_identification import LayerEstimate, identify_layers
+from naibu.applications.ischemia.layer_identification import WIDE, LayerEstimate, identify_layers
 from naibu.applications.ischemia.layered_response import LayeredModes, SkinMotion, frequency_response, simulate_skin, skin_displacements
 from naibu.applications.ischemia.response_times import ResponseTimes, response_times
 from naibu.applications.ischemia.skin import SkinLayer, SkinPatch, SurfaceLoad, meshed
@@ -26,8 +26,8 @@ from naibu.io.vtk_files import write_vtkhdf_series
 from naibu.mechanics.small_strain.rheology import Rheology, three_element
 from naibu.reproduction.chapter5 import figures
 from naibu.viewer.cards import Card
-from naibu.viewer.chapter import Chapter, Figure, Section
-from naibu.viewer.chapter_page import write_chapter
+from naibu.viewer.chapters.chapter import Chapter, Figure, Section
+from naibu.viewer.chapters.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.results.output_folder import output_folder
 
@@ -36,10 +36,12 @@ ISCHEMIA_TITLE = "skin that turns pale under an air jet"
 _MOST_INDENTATION = 0.2  # of the height, beyond which strains are not small
 FRAMES = 60
 LONGEST_RECORD_S = 1e7
+_SIGMAS = 6.0  # of the noise, that a skin which is pressed does not bulge
 DEEPEST = 100.0  # times the thickness: linear models sink deeper than skin, but not so deep
 _KEYS = {
     "radius_mm of the load": "[load] radius_mm",
     "indentation_mm has": "[record] file has",
+    "indentation_mm lies within its noise, noise_mm": "[record] file lies within its noise, noise_mm",
     "state `known` ones": "state `known` ones in [[layer]]",
 }
 
@@ -132,7 +134,7 @@ def prepared_ischemia(source: str | os.PathLike[str]) -> PreparedIschemia:
             f"{os.fspath(source)}: [time] end_s = {settings.time.end_s:g} must come after the load, which lasts {load.duration_s:g} s"
         )
     patch = SkinPatch(layers, skin.width_mm, skin.geometry, skin.depth_mm, skin.sides)
-    record = None if settings.record is None else _record(Path(source), settings.record, patch.height_mm)
+    record = None if settings.record is None else _record(Path(source), settings.record, patch.height_mm, load.duration_s)
     name = ISCHEMIA if own else Path(source).stem
     return PreparedIschemia(
         name, settings.title or name, os.fspath(source), hashlib.sha256(content).hexdigest(), settings, patch,
@@ -211,7 +213,7 @@ def simulate_ischemia(
     return page, numbers, series
 
 
-def _record(source: Path, table: RecordTable, height_mm: float) -> FloatArray:
+def _record(source: Path, table: RecordTable, height_mm: float, duration_s: float) -> FloatArray:
     """Read a measured indentation (t, 2): times, s, and indentation, mm, which lies beside the study."""
     file = file_beside(source, table.file)
     record = read_numbers(file, ("time, s", "indentation, mm"))
@@ -220,9 +222,15 @@ def _record(source: Path, table: RecordTable, height_mm: float) -> FloatArray:
         raise InputError(
             f"{file}: has times from {times.min():g} to {times.max():g} s; give instants after the load began, at 0, in seconds"
         )
-    if np.abs(indentation).max() > DEEPEST * height_mm:
-        deepest = indentation[np.abs(indentation).argmax()]
+    deepest = indentation[np.abs(indentation).argmax()]
+    if abs(deepest) > DEEPEST * height_mm:
         raise InputError(f"{file}: has an indentation of {deepest:g} mm in skin of {height_mm:g} mm; is it in mm?")
+    if times.min() >= duration_s:
+        raise InputError(
+            f"{file}: begins at {times.min():g} s, when the load of {duration_s:g} s is over; give instants under the load, too, in seconds"
+        )
+    if deepest < -_SIGMAS * table.noise_mm:
+        raise InputError(f"{file}: has an indentation of {deepest:g} mm, outwards; positive is into the skin")
     if np.ptp(indentation) <= table.noise_mm:
         raise InputError(
             f"{file}: its indentation changes by {np.ptp(indentation):g} mm, not more than [record] noise_mm = {table.noise_mm:g}; "
@@ -322,7 +330,9 @@ def _layers_section(study: PreparedIschemia, estimate: LayerEstimate) -> Section
     )
     table = Table(
         "Identified layers", ("layer", "parameter", "estimate", "95 % from", "to", "determined"), rows,
-        caption="From the measured indentation.", note="Not determined: the interval spans more than a factor of 4.",
+        caption="From the measured indentation.",
+        note=f"Not determined: the interval spans more than a factor of {WIDE:g}, or ends where the search does, at a thousandth or a "
+        "thousand times the first guess.",
     )  # fmt: skip
     return Section("Identified layers", (verdict,), (table,))
 

@@ -9,7 +9,7 @@ import numpy as np
 from naibu.applications.fingertip.slip import SLIPS_FROM, SidewaysForces
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.viewer.cards import Card
-from naibu.viewer.chapter import Figure, Section
+from naibu.viewer.chapters.chapter import Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 if TYPE_CHECKING:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -39,8 +40,8 @@ LEAST_POINTS, MOST_POINTS = 30, 200_000
 MOST_PLANS = 60
 ALL = "all of them together"
 COLUMNS = (
-    "push", "points", "noise, mm", "zone", "Young's modulus, kPa", "standard deviation, %", "of it from noise, %", "95 % from", "to",
-    "systematic error, %", "Poisson's ratio", "standard deviation of it",
+    "push", "points", "noise, mm", "zone", "Young's modulus, kPa", "SD, %", "of it from noise, %", "95 % from", "to",
+    "systematic error, %", "Poisson's ratio", "SD of it",
 )  # fmt: skip
 
 
@@ -84,6 +85,11 @@ class Planned:
     poisson_ratio: float
     poisson_ratio_sd: float
 
+    @property
+    def error(self) -> float:
+        """Root mean square of the relative error of Young's modulus to be expected, systematic and random."""
+        return math.hypot(self.young_modulus_sd, self.bias)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Design:
@@ -105,7 +111,7 @@ class Design:
 
     def table(self) -> Table:
         """Return the rows as a table."""
-        return Table("Expected accuracy", COLUMNS, tuple(_cells(row) for row in self.rows))
+        return Table("Expected accuracy", COLUMNS, tuple(_cells(row) for row in self.rows), note="SD: standard deviation.")
 
 
 def design(
@@ -286,12 +292,12 @@ def _notes(rows: Sequence[Planned], plates_only: bool) -> tuple[str, ...]:
     worst: dict[tuple[str, int, float], Planned] = {}
     for row in rows:
         key = row.push, row.points, row.noise_mm
-        if key not in worst or row.young_modulus_sd > worst[key].young_modulus_sd:
+        if key not in worst or row.error > worst[key].error:
             worst[key] = row
-    best = min(worst.values(), key=lambda row: row.young_modulus_sd)
+    best = min(worst.values(), key=lambda row: row.error)
     lines = [
         f"Best: {best.push}, {best.points} points, noise {best.noise_mm:g} mm: the least known modulus, that of {best.zone}, to "
-        f"{100 * best.young_modulus_sd:.2g} % (standard deviation)."
+        f"{100 * best.error:.2g} % (standard deviation {100 * best.young_modulus_sd:.2g} %, systematic error {100 * best.bias:+.2g} %)."
     ]
     if best.young_modulus_sd > 0.0 and best.noise_sd < 0.5 * best.young_modulus_sd:
         lines.append("There, elements and what is not known of known zones weigh more than noise: more points will help little.")

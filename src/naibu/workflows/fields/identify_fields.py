@@ -33,7 +33,16 @@ from naibu.viewer.notebook import ShownInNotebook, empty_figure
 from naibu.viewer.result_figures import draw_slices
 from naibu.viewer.slices import Overlay, SliceView, slices_html
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.fields.block_mesh import CELLS, block_mesh, blurred, labelled_object, names_of_labels
+from naibu.workflows.fields.block_mesh import (
+    BLURRED,
+    CELLS,
+    blurred,
+    labelled_object,
+    mesh_that_shows,
+    misplaced,
+    names_of_labels,
+    region_in,
+)
 from naibu.workflows.fields.known_zones import parse_known_zones
 from naibu.workflows.fields.measured_load_case import measured_load_case, relative_deformation
 from naibu.workflows.results.files_together import written_together
@@ -116,6 +125,7 @@ def identify_fields(
     element_size_mm: float = 0.0,
     unit: str | None = None,
     spacing_mm: Sequence[float] | None = None,
+    node_spacing: Sequence[float] | None = None,
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
@@ -146,9 +156,11 @@ def identify_fields(
         Finite or small strain.
     element_size_mm : float
         Edge length of the cubes; 0 chooses it so that there are about 1200, or 2500 for a map; fewer where a cell
-        of zones would hold less than two points.
+        of zones would hold less than two points, more where a zone would share less than three quarters with its cubes.
     unit, spacing_mm : str, sequence of float, optional
         Unit of fields that do not state theirs, or the size of a voxel along x, y, z, mm, of fields in voxels (see `naibu.io.read_field`).
+    node_spacing : sequence of float, optional
+        From node to node along x, y, z, in voxels, of TIFF files of SPAM.
     out : path-like, optional
         Folder for ``model.json``, which predicts and can be touched; ``young_modulus.mha``, ``young_modulus_sd.mha`` and
         ``poisson_ratio.mha`` on the grid of the mask (0 outside; -1 where there is no standard deviation); ``zones.mha`` (from 1 in the
@@ -167,7 +179,7 @@ def identify_fields(
     """
     paths = [fields] if isinstance(fields, str | os.PathLike) else list(fields)
     folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
-    read = [read_field(path, unit=unit, spacing_mm=spacing_mm) for path in paths]
+    read = [read_field(path, unit=unit, spacing_mm=spacing_mm, node_spacing=node_spacing) for path in paths]
     _require_different(paths, read)
     inside, labels = labelled_object(mask, zones)
     names = names_of_labels(labels, inside, zone_names or {})
@@ -175,17 +187,21 @@ def identify_fields(
     volume = float(inside.values.sum() * np.prod(inside.spacing_mm))
     most = CELLS_OF_MAP if each_cell else min(CELLS, max(int(field.valid.sum()) for field in read) // POINTS_OF_CELL)
     size = element_size_mm or (volume / max(most, LEAST_CELLS)) ** (1.0 / 3.0)
-    mesh, cell_of_voxel = block_mesh(inside, labels, names, size)
+    sought = () if each_cell else set(names.values()) - set(stated.values)
+    mesh, cell_of_voxel = mesh_that_shows(inside, labels, names, sought, size, exactly=element_size_mm > 0.0)
     cases = [measured_load_case(mesh, cell_of_voxel, inside, field, Path(p).stem, loaded) for p, field in zip(paths, read, strict=True)]
+    left_out, wrong = misplaced(mesh, cell_of_voxel, inside, labels, names)
+    within = None if each_cell or wrong < BLURRED else region_in(inside, labels, names)
     found = identify_field(
-        mesh, cases, Zones.of(mesh, known=stated.values, known_sd=stated.doubts, each_cell=each_cell), law=law, progress=progress
-    )
+        mesh, cases, Zones.of(mesh, known=stated.values, known_sd=stated.doubts, each_cell=each_cell), law=law,
+        region_at=within, progress=progress,
+    )  # fmt: skip
     inputs = input_record({"mask": mask, "zones": zones} | {f"field {k + 1}": p for k, p in enumerate(paths)})
     body = IdentifiedBody.of(
         found, axes=inside.direction, law=law, relative=stated.relative, strain=max(relative_deformation(c.field) for c in cases),
         load_cases=cases, provenance={"naibu": __version__, "known": list(known), "loaded": list(loaded), "inputs": dict(inputs)},
     )  # fmt: skip
-    coarse = blurred(mesh, cell_of_voxel, inside, labels, names)
+    coarse = blurred(left_out, wrong, corrected=within is not None and found.mesh_shift is not None)
     result = FieldIdentification(found, body, stated.relative, (*found.identifiability, *coarse), coarse, inside, cell_of_voxel)
     return result if folder is None else replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))
 

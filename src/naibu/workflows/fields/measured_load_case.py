@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from naibu.core.arrays import IntArray
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
@@ -16,6 +16,8 @@ from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
 from naibu.identification.from_fields.identified.sides import loaded_nodes
 from naibu.meshing.point_location import locate
 
+FEWEST_POINTS = 20
+THINNEST = 0.1  # of a cell: points that span less along a direction do not tell how displacements change along it
 MOST_POINTS = 10_000  # measurements of a load case: neighbours in a field say the same
 LEAST_DEFORMATION, LARGEST_DEFORMATION = 1e-6, 0.5  # RMS of what a rigid motion leaves, part of the extent of the object
 
@@ -43,24 +45,52 @@ def measured_load_case(
     Raises
     ------
     InputError
-        A field in the plane, hardly a measurement in the object, one that does not deform, or a side that does not exist.
+        A field in the plane, hardly a measurement in the object, all of them in a plane, an object that does not deform, or a side that
+        does not exist.
     """
     at = field.at_points()
     if at.points.shape[1] != 3:
         raise InputError(f"{name}: positions have {at.points.shape[1]} coordinates; moduli are identified from displacements in space")
+    if not at.valid.any():
+        raise InputError(f"{name}: none of its {len(at.points)} points has a displacement")
     index = np.round(inside.to_index(at.points)).astype(int)[:, ::-1]
     within = ((index >= 0) & (index < inside.shape)).all(axis=1) & at.valid
     within[within] = cell_of_voxel[tuple(index[within].T)] >= 0
     near = np.flatnonzero(within)  # cells end inside of voxels
     chosen = near[locate(mesh, at.points[near], tolerance_mm=np.inf).distance_mm <= 1e-6] if len(near) else near
-    if len(chosen) < 20:
-        raise InputError(f"{name}: {len(chosen)} measurements of the field lie in the object; are field and mask from one reference scan?")
+    if len(chosen) < FEWEST_POINTS:
+        raise InputError(
+            f"{name}: {len(chosen)} measurements of the field lie in the object, {FEWEST_POINTS} are needed; it spans "
+            f"{_spans(at.points[at.valid])} mm, the object {_spans(mesh.points)} mm: are both in mm, and from one reference scan?"
+        )
+    _require_space(name, mesh, at.points[chosen])
+    # copies of a measurement, such as those of nodes that cells of a mesh do not share, count once
+    chosen = chosen[np.sort(np.unique(np.column_stack([at.points[chosen], at.vectors[chosen]]), axis=0, return_index=True)[1])]
     every = -(-len(chosen) // MOST_POINTS)
     chosen = np.random.default_rng(0).permutation(chosen)[: len(chosen) // every]
     covariance = None if at.covariance is None else at.covariance[chosen]
     some = DisplacementField.from_arrays(at.points[chosen], at.vectors[chosen], covariance=covariance)
     _require_deformation(name, some)
     return FieldLoadCase.of(name, some, mesh, loaded=loaded_nodes(mesh, inside.direction, sides))
+
+
+def _spans(points: FloatArray) -> str:
+    """Return from where to where points reach along every axis, in words."""
+    return ", ".join(
+        f"{axis} {low:.4g} to {high:.4g}" for axis, low, high in zip("xyz", points.min(axis=0), points.max(axis=0), strict=True)
+    )
+
+
+def _require_space(name: str, mesh: Mesh, points: FloatArray) -> None:
+    """Refuse measurements in a plane, on a line or at a point, which are often lengths in another unit."""
+    edge = float(np.linalg.norm(mesh.points[mesh.cells[:, 1]] - mesh.points[mesh.cells[:, 0]], axis=1).mean())
+    directions = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    least = float(np.ptp(points @ directions.T, axis=0).min())
+    if least < THINNEST * edge:
+        raise InputError(
+            f"{name}: the {len(points)} measurements in the object span only {least:.3g} mm along one direction, and cells are "
+            f"{edge:.3g} mm large; moduli need displacements in three dimensions. They lie at {_spans(points)} mm: are they in mm?"
+        )
 
 
 def relative_deformation(field: DisplacementField) -> float:

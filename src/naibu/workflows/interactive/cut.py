@@ -138,6 +138,7 @@ def cut(
         "area_of_the_blade_path_mm2": blade.area_mm2, "largest_distance_from_the_blade_mm": found.deviation_mm,
         **({} if distance is None else {"allowed_distance_mm": 0.5 * distance}), "largest_opening_mm": opening,
         "source": str(source), "naibu": __version__, "pull_percent": pull_percent,
+        **({"doubt": model.doubt} if model.doubt else {}),
         "pulled_along": "xyz"[int(np.abs(turn[:, axis]).argmax())], "inputs_sha256": {Path(path).name: sha256(path)},
     }  # fmt: skip
     files = _written(folder, model, after.faces, found, numbers, times, moved)
@@ -263,6 +264,7 @@ def _page(
         f"{found.deviation_mm:.2g} mm at most and opens by {numbers['largest_opening_mm']:.3g} mm where its ends along "
         f"{numbers['pulled_along']} are pulled apart by {numbers['pull_percent']:g} %.",
         model.sentences[0],
+        *([model.doubt] if model.doubt else []),
     )
     rows = [(quantity_of(name), value) for name, value in numbers.items() if isinstance(value, int | float)]
     piece = np.zeros(found.mesh.n_points)

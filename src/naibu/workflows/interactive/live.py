@@ -17,21 +17,23 @@ from naibu.core.errors import InputError
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.simulation.haptic_loop import LONGEST_STEP_S, HapticHand
 from naibu.simulation.haptic_thread import HapticThread
-from naibu.simulation.interactive_bodies import FiniteElementBody, InteractiveBody
+from naibu.simulation.interactive_bodies import InteractiveBody
 from naibu.simulation.interactive_simulation import FRAME_S, Frame, InteractiveSimulation, placed
 from naibu.simulation.local_contact import LocalContact
 from naibu.simulation.real_time_loop import RealTimeLoop
 from naibu.viewer.live.commands import LiveCommand
 from naibu.viewer.live.scene import FAILED, PAUSED, RECORDING, REPLAYING, LiveFrame, LiveScene
-from naibu.viewer.live.server import LiveServer, serve
+from naibu.viewer.live.server import LiveServer, bound_port, serve
 from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, motion_html
+from naibu.workflows.applications.fingertip_study import FINGERTIP, describes_fingertip
 from naibu.workflows.interactive.haptics.endpoint import HapticEndpoint
+from naibu.workflows.interactive.preparation import compile_for, settle, waiting_device
+from naibu.workflows.interactive.touchable_fingertip import touchable_fingertip
 from naibu.workflows.interactive.touchable_models import MeshMaterial, TouchableModel, tools_for, touchable
 from naibu.workflows.markers.experiments import Source
 
 GRIP_RADIUS = 0.08  # of the extent of the body
 PAGE_BYTES = 5_000_000
-WARM_FRAMES = 6  # before the page is ready
 SWITCH_S = 2e-4  # in which the page leaves the interpreter to the physics of a haptic device
 
 
@@ -60,7 +62,8 @@ class LiveSimulation:
             [_shape(f"support {k + 1}", fixture) for k, fixture in enumerate(body.fixtures)],
             np.array([f.centre for f in body.fixtures], dtype=float).reshape(-1, 3),
             self.model.strain, self.loop.simulation.frame_s, self.model.marker_nodes[: None if whole else 0],
-            self.model.marker_weights[: None if whole else 0], topology, cuttable=True,
+            self.model.marker_weights[: None if whole else 0], topology, cuttable=self.model.cuttable,
+            readings=() if self.model.sensor is None else self.model.sensor.readings,
         )  # fmt: skip
 
     def frame(self) -> LiveFrame:
@@ -73,6 +76,7 @@ class LiveSimulation:
             frame.penetration_mm, pace.steps_per_s, pace.real_time, flags,
             lambda: frame.body.strain(frame.positions), frame.topology, frame.unbalanced,
             tuple(Rotation.from_matrix(frame.tool_rotation).as_quat().tolist()),
+            np.zeros((0, 3)) if self.model.sensor is None else self.model.sensor.at(frame),
         )  # fmt: skip
 
     def command(self, command: LiveCommand) -> None:
@@ -86,7 +90,7 @@ class LiveSimulation:
             case "replay":
                 loop.replay()
             case kind:
-                loop.submit(_order(kind, command))
+                loop.submit(_order(kind, command, self.model))
 
     def trouble(self) -> str:
         """Return what was wrong with the last command that failed, once."""
@@ -131,6 +135,8 @@ def live(
     material: MeshMaterial | None = None,
     port: int = 8765,
     haptics_port: int | None = None,
+    decoder: str | os.PathLike[str] | None = None,
+    preparing: Callable[[], None] | None = None,
     ready: Callable[[str], None],
 ) -> None:
     """Serve the live page of a model until Ctrl-C.
@@ -138,7 +144,7 @@ def live(
     Parameters
     ----------
     source : str or path-like
-        See `naibu.workflows.interactive.touchable_models.touchable`.
+        ``"fingertip"`` or the file of one; or see `naibu.workflows.interactive.touchable_models.touchable`.
     experiment : path, str or Experiment, optional
         Whose body an identified model is made for; by default the first one that it was identified from.
     material : MeshMaterial, optional
@@ -147,6 +153,11 @@ def live(
         Of the loopback interface; 0 takes a free one.
     haptics_port : int, optional
         UDP port of the loopback interface for a haptic device, which then leads the tool.
+    decoder : path-like, optional
+        Of a fingertip: ``NAME-decoder.json`` of its simulation.
+    preparing : callable, optional
+        Called before kernels are compiled and factors made, which takes a minute on a first run. From then on a haptic device is
+        answered, without force until all is ready.
     ready : callable
         Called with the address of the page once it can be opened.
 
@@ -159,34 +170,80 @@ def live(
         raise InputError(f"port must lie between 0 and 65535, not {port}")
     if haptics_port is not None and not 1 <= haptics_port <= 65535:
         raise InputError(f"haptics_port must lie between 1 and 65535, not {haptics_port}")
-    model = touchable(source, experiment=experiment, material=material)
-    with touched_loop(model, haptics_port) as loop:
-        serve(LiveServer(LiveSimulation(model, loop)), port, ready)
+    with bound_port(port) as bound, _haptic_hand(haptics_port) as hand:
+        with waiting_device(hand):
+            if preparing is not None:
+                preparing()
+            model = _touchable(source, experiment, material, decoder)
+            simulation = _prepared(model, hand)
+        with _stepped(simulation, hand) as loop:
+            serve(LiveServer(LiveSimulation(model, loop)), bound, ready)
+
+
+def _touchable(
+    source: str | os.PathLike[str], experiment: Source | None, material: MeshMaterial | None, decoder: str | os.PathLike[str] | None
+) -> TouchableModel:
+    if not describes_fingertip(source):
+        if decoder is not None:
+            raise InputError(f"`decoder` goes with a fingertip, and {source} is none; leave it out, or name {FINGERTIP} or the file of one")
+        return touchable(source, experiment=experiment, material=material)
+    if experiment is not None:
+        raise InputError(f"`experiment` goes with an identified model, and {source} is a fingertip; leave it out")
+    if material is not None:
+        raise InputError(f"material goes with a mesh, and {source} is a fingertip, whose file tells its gel; leave it out")
+    return touchable_fingertip(source, decoder)
 
 
 @contextmanager
 def touched_loop(model: TouchableModel, haptics_port: int | None = None) -> Iterator[RealTimeLoop]:
     """Simulate a model in a thread of its own, with an endpoint for a haptic device at a port, until the context ends.
 
+    Kernels are compiled before; a device that comes meanwhile gets answers without force.
+
     Raises
     ------
     InputError
         A port that is taken.
     """
+    with _haptic_hand(haptics_port) as hand:
+        with waiting_device(hand):
+            simulation = _prepared(model, hand)
+        with _stepped(simulation, hand) as loop:
+            yield loop
+
+
+@contextmanager
+def _haptic_hand(port: int | None) -> Iterator[HapticHand | None]:
+    """The hand of a device that may come to a port; None where there is none."""
+    if port is None:
+        yield None
+        return
+    with HapticEndpoint(port) as endpoint:
+        yield HapticHand(endpoint)
+
+
+def _prepared(model: TouchableModel, hand: HapticHand | None) -> InteractiveSimulation:
+    """Return the simulation of a model, all compiled and factorized; its frames are single steps where a device can feel them."""
     body = model.body
+    with threadpool_limits(1, user_api="blas"):
+        compile_for(body)
+        simulation = InteractiveSimulation(body, model.tools or tools_for(body), body.step_s if _single(body, hand) else FRAME_S)
+        settle(simulation)
+    return simulation
+
+
+@contextmanager
+def _stepped(simulation: InteractiveSimulation, hand: HapticHand | None) -> Iterator[RealTimeLoop]:
+    """Step a simulation in a thread of its own, and serve a device, until the context ends."""
+    single = _single(simulation.body, hand)
     with ExitStack() as stack:
         stack.enter_context(threadpool_limits(1, user_api="blas"))  # threads of small matrices wait for one another where cores are busy
-        hand = None
-        if haptics_port is not None:
-            hand = HapticHand(stack.enter_context(HapticEndpoint(haptics_port)))
+        if hand is not None:
             stack.callback(sys.setswitchinterval, sys.getswitchinterval())
             sys.setswitchinterval(SWITCH_S)
             stack.callback(gc.unfreeze)
             gc.collect()
             gc.freeze()  # a collection over all that was imported takes more than 5 ms
-        single = hand is not None and body.step_s <= LONGEST_STEP_S
-        simulation = InteractiveSimulation(body, tools_for(body), body.step_s if single else FRAME_S)
-        _warm(simulation)
         loop = stack.enter_context(RealTimeLoop(simulation, hand=hand if single else None))
         if hand is not None and not single:
             contact = LocalContact(simulation.tools, simulation.fastest_mm_s, body_step_s=simulation.frame_s)
@@ -194,14 +251,12 @@ def touched_loop(model: TouchableModel, haptics_port: int | None = None) -> Iter
         yield loop
 
 
-def _warm(simulation: InteractiveSimulation) -> None:
-    """Compile and factorize what frames need, by the first ones, in which the body settles on its supports."""
-    if isinstance(simulation.body, FiniteElementBody):
-        for _ in range(WARM_FRAMES):
-            simulation.advance()
+def _single(body: InteractiveBody, hand: HapticHand | None) -> bool:
+    """Whether frames are single steps of the body, which are short enough to be felt."""
+    return hand is not None and body.step_s <= LONGEST_STEP_S
 
 
-def _order(kind: str, command: LiveCommand) -> Callable[[InteractiveSimulation], None]:
+def _order(kind: str, command: LiveCommand, model: TouchableModel) -> Callable[[InteractiveSimulation], None]:
     """Return what a command does to the simulation."""
 
     def carry_out(simulation: InteractiveSimulation) -> None:
@@ -210,6 +265,8 @@ def _order(kind: str, command: LiveCommand) -> Callable[[InteractiveSimulation],
                 simulation.take(command.name)
             case "move":
                 simulation.move(command.vector)
+                if model.aimed_at is not None:
+                    simulation.aim(np.subtract(model.aimed_at, command.vector))
             case "turn":
                 simulation.turn(command.vector)
             case "grip":
@@ -222,6 +279,8 @@ def _order(kind: str, command: LiveCommand) -> Callable[[InteractiveSimulation],
                 simulation.reset()
             case "undo":
                 simulation.undo()
+            case "cut" if not model.cuttable:
+                raise InputError(f"{model.title}: this body is not cut; touch it")
             case "cut":
                 simulation.begin_cut(command.edges)
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -33,6 +35,8 @@ from naibu.mechanics.lattices.model.surface import surface_of
 from naibu.meshing.element_conversion import to_tetra
 from naibu.meshing.point_location import interpolation_operator
 from naibu.simulation.interactive_bodies import FiniteElementBody, InteractiveBody, LatticeBody, nodes_touching
+from naibu.simulation.interactive_simulation import Frame
+from naibu.viewer.live.scene import LiveReading
 from naibu.workflows.joint_model import JointModel
 from naibu.workflows.markers.experiments import Source, load_experiment
 from naibu.workflows.results.result_folder import MODEL_FILE, read_any_model
@@ -75,6 +79,17 @@ class MeshMaterial:
             raise InputError(f"poisson_ratio must lie between -0.9 and 0.499, not {self.poisson_ratio:g}")
 
 
+class Sensor(Protocol):
+    """What reads a body while it is touched."""
+
+    @property
+    def readings(self) -> tuple[LiveReading, ...]:
+        """What is read."""
+
+    def at(self, frame: Frame) -> FloatArray:
+        """Return value and ends of the 95 % interval of every reading at a frame (k, 3), NaN where there is none."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TouchableModel:
     """A body to touch, and what is said about it.
@@ -91,6 +106,16 @@ class TouchableModel:
         Name and unit of its strain.
     marker_nodes, marker_weights : ndarray, shape (q, c)
         Nodes and weights that interpolate the markers inside; without rows where there are none.
+    doubt : str
+        What is said, last of the sentences, where identification did not call the model usable; empty where it did.
+    tools : mapping of str to RigidIndenter, optional
+        What touches it; by default those of `tools_for`.
+    aimed_at : tuple of float, optional
+        Point, mm, at which the axes of the tools point wherever they are led.
+    cuttable : bool
+        Whether it can be cut.
+    sensor : Sensor, optional
+        What reads it.
     """
 
     title: str
@@ -99,6 +124,11 @@ class TouchableModel:
     strain: str
     marker_nodes: IntArray = field(default_factory=lambda: np.zeros((0, 8), np.int64))
     marker_weights: FloatArray = field(default_factory=lambda: np.zeros((0, 8)))
+    doubt: str = ""
+    tools: Mapping[str, RigidIndenter] | None = None
+    aimed_at: tuple[float, float, float] | None = None
+    cuttable: bool = True
+    sensor: Sensor | None = None
 
 
 def touchable(source: str | os.PathLike[str], *, experiment: Source | None = None, material: MeshMaterial | None = None) -> TouchableModel:
@@ -206,7 +236,7 @@ def _identified(model: CalibratedModel, source: Source | None) -> TouchableModel
         f"of {experiment.name}.",
         f"It stands on its table with friction {min(coefficient, STICKING):.2g}; {1.0 / touched.step_s:.0f} steps a second.",
     )
-    return TouchableModel(f"{experiment.name}, touched", said, touched, "equivalent strain, %", nodes, weights)
+    return _doubted(TouchableModel(f"{experiment.name}, touched", said, touched, "equivalent strain, %", nodes, weights), model)
 
 
 def _identified_from_fields(path: Path, model: IdentifiedBody) -> TouchableModel:
@@ -219,10 +249,17 @@ def _identified_from_fields(path: Path, model: IdentifiedBody) -> TouchableModel
     said = (
         f"Finite elements of the identified moduli, neo-Hookean: {model.mesh.n_cells} cells; Young's modulus{listed} ({unit}).",
         "The nodes of least z are held.",
-        *([f"The model is doubtful: {model.reservation}"] if model.reservation else []),
     )
     name = path.name if path.is_dir() else path.resolve().parent.name
-    return TouchableModel(f"{name}, touched", said, body, "equivalent strain, %")
+    return _doubted(TouchableModel(f"{name}, touched", said, body, "equivalent strain, %"), model)
+
+
+def _doubted(made: TouchableModel, model: CalibratedModel | IdentifiedBody) -> TouchableModel:
+    """Say it where identification did not call its model usable."""
+    if not model.reservation:
+        return made
+    doubt = f"The model is doubtful: {model.reservation}"
+    return replace(made, sentences=(*made.sentences, doubt), doubt=doubt)
 
 
 def _table_friction(body: Specimen, values: dict[str, float]) -> float:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,19 +14,17 @@ from typing import TYPE_CHECKING, Any
 from naibu.core.errors import ConvergenceError, InputError, NaibuError
 from naibu.core.experiment import Experiment
 from naibu.core.progress import Progress
-from naibu.core.rigid_transform import registration
 from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration, calibrate
 from naibu.identification.from_markers.checks.marker_checks import check_markers
 from naibu.identification.from_markers.checks.marker_outliers import Outlier, distrusted, outliers_of_fit, without_outliers
 from naibu.identification.from_markers.checks.verdict import verdict_of
-from naibu.identification.from_markers.observations import MarkerLoadCase
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
-from naibu.identification.prediction.baselines import affine, baselines, equilibrium_gap_baseline
+from naibu.identification.prediction.baselines import baselines_of
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.cross_validation import LeftOut
-from naibu.identification.prediction.prediction import rms
 from naibu.identification.verdict import Verdict
+from naibu.mechanics.linear_algebra.direct import use_one_thread
 from naibu.viewer.notebook import ShownInNotebook, empty_figure
 from naibu.viewer.result_figures import draw_estimates
 from naibu.viewer.result_page.page import report_html
@@ -243,30 +243,28 @@ def _compared(
     kept: SearchCheckpoint,
 ) -> tuple[Identification, NaibuError | None]:
     """Compute what the calibration is compared with; what goes wrong here is returned, so that the model is written first."""
-    compared: dict[str, dict[str, float]] = {}
     left_out: tuple[LeftOut, ...] = ()
-    interrupted = calibration.match.status is Status.INTERRUPTED
     trouble: NaibuError | None = None
-    values = model.parameters.values()
+    if calibration.match.status is Status.INTERRUPTED:
+        return Identification(model, calibration, {}, left_out, True, verdict), trouble
+    compared: dict[str, dict[str, float]] = {t.name: {} for t in calibration.load_cases}
+    interrupted = threading.Event()
+    with ThreadPoolExecutor(1, initializer=use_one_thread) as pool:  # beside calibrations that wait for one another
+        try:
+            described = pool.submit(_describe, calibration, compared, interrupted)
+            if left_in_turn:
+                left_out, trouble = left_out_in_turn(left_in_turn, calibration, where, progress, kept)
+            described.result()
+        except KeyboardInterrupt:
+            interrupted.set()
+        except NaibuError as error:
+            trouble = trouble or error
+    return Identification(model, calibration, compared, left_out, interrupted.is_set(), verdict), trouble
 
-    try:
-        if not interrupted:
-            compared = {t.name: _baselines(t, values) for t in calibration.load_cases}
-            for label, distance in equilibrium_gap_baseline(calibration).items():
-                compared[label]["equilibrium gap"] = distance
-        if not interrupted and left_in_turn:
-            left_out, trouble = left_out_in_turn(left_in_turn, calibration, where, progress, kept)
-    except KeyboardInterrupt:
-        interrupted = True
-    except NaibuError as error:
-        trouble = error
-    return Identification(model, calibration, compared, left_out, interrupted, verdict), trouble
 
-
-def _baselines(load_case: MarkerLoadCase, values: Mapping[str, float]) -> dict[str, float]:
-    """Simple descriptions of a state; without the linear one where it does not apply."""
-    try:
-        return baselines(load_case, values)
-    except NaibuError:
-        free, measured = load_case.specimen.marker_points, load_case.measured
-        return {"rigid": rms(measured - registration(free, measured).applied(free)), "affine": rms(measured - affine(free, measured))}
+def _describe(calibration: Calibration, compared: dict[str, dict[str, float]], stop: threading.Event) -> None:
+    """Fill the distances of simple descriptions in, until there are no more or it shall stop."""
+    for label, name, distance in baselines_of(calibration):
+        compared[label][name] = distance
+        if stop.is_set():
+            return

@@ -16,8 +16,8 @@ from naibu.core.progress import Progress, ProgressReport, report_progress
 from naibu.imaging.displacement.accuracy import end_point_error
 from naibu.imaging.measure_displacement import Method
 from naibu.imaging.preprocessing.resampling import warped
-from naibu.viewer.chapter import Chapter, Figure, Section
-from naibu.viewer.chapter_page import write_chapter
+from naibu.viewer.chapters.chapter import Chapter, Figure, Section
+from naibu.viewer.chapters.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.measurement.sense import FIGURES, Pair, SenseRun, sense_pair
 from naibu.workflows.results.output_folder import output_folder
@@ -139,7 +139,7 @@ def _verdict(pair: Pair, runs: dict[Method, SenseRun]) -> str:
     """Return which method was nearest to the truth; where none is known, that nothing is decided."""
     name = next((n for n in ("p95_error_mm", "p95_check_point_error_mm") if all(n in run.figures for run in runs.values())), None)
     if name is None:
-        return "Which method is best cannot be told: the true displacement is not known (see --truth and --check-points)."
+        return "Which method is best cannot be told: the true displacement is not known (a truth or check points may be given)."
     best = min(runs, key=lambda method: _figure_of(runs[method], name))
     mean = name.replace("p95", "mean")
     return (
@@ -170,15 +170,15 @@ def _table(pair: Pair, runs: dict[Method, SenseRun]) -> tuple[tuple[str, ...], t
     shared = [name for name in next(iter(runs.values())).figures if name not in OMITTED]
     best = runs.get("default")
     names = (FIGURES[name] for name in shared)
-    columns = ["method", "time, s", *names, *(["mean distance from the default, mm"] if best is not None else [])]
+    apart = ["mean distance from the default, mm", "95th percentile of it, mm"] if best is not None else []
+    columns = ["method", "time, s", *names, *apart]
     rows = []
     for name, run in runs.items():
-        row: list[Cell] = [name, run.seconds, *(run.figures[c] for c in shared)]
+        row: list[Cell] = [name, float(f"{run.seconds:.2g}"), *(run.figures[c] for c in shared)]
         if best is not None:
             u = best.measured.displacement.vectors
-            row.append(
-                None if run is best else end_point_error(run.measured.displacement.vectors, u, best.measured.mask & known(u)).mean_mm
-            )
+            e = end_point_error(run.measured.displacement.vectors, u, best.measured.mask & known(u))
+            row += [None, None] if run is best else [e.mean_mm, e.p95_mm]
         rows.append(tuple(row))
     return tuple(columns), tuple(rows)
 

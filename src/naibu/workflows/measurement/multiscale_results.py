@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from naibu.imaging.displacement.chunked_strain import COMPONENTS
 from naibu.imaging.displacement.strain import green_lagrange_strain_of
 from naibu.io.image_formats.ome_zarr import write_levels
 from naibu.workflows.measurement.sense import Pair, SenseRun
 from naibu.workflows.results.output_folder import output_folder
 
 FILES = ("reference.ome.zarr", "deformed.ome.zarr", "displacement.ome.zarr", "strain.ome.zarr")
-STRAINS = ("xx", "yy", "zz", "xy", "xz", "yz")
 
 
 def folder_for_multiscale(out: str | os.PathLike[str], *, overwrite: bool) -> Path:
@@ -49,12 +49,12 @@ def write_multiscale(pair: Pair, run: SenseRun, folder: Path) -> tuple[Path, ...
         The package zarr is not installed.
     """
     measured, grid = run.measured, pair.reference
-    a, b = np.array([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]).T
+    a, b = np.array([["xyz".index(axis) for axis in name] for name in COMPONENTS]).T
     strain = green_lagrange_strain_of(measured.gradient)[..., a, b].astype(np.float32)
     strain[~measured.mask] = np.nan
     return (
         write_levels(folder / FILES[0], pair.reference.values, grid),
         write_levels(folder / FILES[1], pair.deformed.values, pair.deformed),
         write_levels(folder / FILES[2], measured.displacement.vectors.astype(np.float32), grid, channels=("x", "y", "z")),
-        write_levels(folder / FILES[3], strain, grid, channels=STRAINS),
+        write_levels(folder / FILES[3], strain, grid, channels=COMPONENTS),
     )

@@ -57,6 +57,7 @@ FIGURES = {
     "residual_rms": "intensity residual RMS",
     "folded_fraction": "folded fraction",
     "median_sd_mm": "stated SD, median, mm",
+    "median_strain_sd": "stated SD of a component of strain, median",
     "mean_error_mm": "mean error, mm",
     "median_error_mm": "median error, mm",
     "p95_error_mm": "95th percentile of the error, mm",
@@ -154,14 +155,15 @@ def read_pair(
     if truth is not None:
         known, grid = read_displacement(truth)
         _same(grid, a, Path(truth), Path(reference))
-    points = None if check_points is None else _common_points(*check_points)
+    points = None if check_points is None else common_points(*check_points)
     files = {"reference": reference, "deformed": deformed, "mask": mask, "deformed_mask": deformed_mask, "truth": truth}
     tables = dict(zip(("reference_check_points", "deformed_check_points"), check_points or (), strict=False))
     names = (Path(reference).name, Path(deformed).name)
     return Pair(a, b, masks[0], input_record(files | tables), names, known, points, masks[1])
 
 
-def _common_points(reference: str | os.PathLike[str], deformed: str | os.PathLike[str]) -> tuple[FloatArray, FloatArray]:
+def common_points(reference: str | os.PathLike[str], deformed: str | os.PathLike[str]) -> tuple[FloatArray, FloatArray]:
+    """Return the points (n, 3), mm, that two tables have in common, in both configurations."""
     a, b = import_markers(reference), import_markers(deformed)
     _, i, j = np.intersect1d(a.ids, b.ids, return_indices=True)
     known = np.isfinite(a.points[i]).all(axis=1) & np.isfinite(b.points[j]).all(axis=1)
@@ -268,7 +270,12 @@ def sense_pair(
     measured = measure_displacement(
         pair.reference, pair.deformed, method=method, mask=pair.mask, deformed_mask=pair.deformed_mask, progress=progress
     )
-    run = SenseRun(measured, time.perf_counter() - began, figures(pair, measured), pair)
+    return recorded(pair, measured, time.perf_counter() - began, folder)
+
+
+def recorded(pair: Pair, measured: MeasuredDisplacement, seconds: float, folder: Path | None) -> SenseRun:
+    """Return a measured displacement with its figures, and write it where a folder is given (see `sense_pair`)."""
+    run = SenseRun(measured, seconds, figures(pair, measured), pair)
     return run if folder is None else replace(run, files=written_together(folder, FILES, lambda at: _written(pair, run, at)))
 
 
@@ -284,6 +291,7 @@ def figures(pair: Pair, measured: MeasuredDisplacement) -> dict[str, float | int
         "residual_rms": intensity_rms(pair.reference, pair.deformed, u, region=measured.mask, frame="reference"),
         "folded_fraction": folded_fraction(u, pair.reference, measured.mask),
         "median_sd_mm": None if sd is None else float(np.nanmedian(sd[inside])),
+        "median_strain_sd": None if measured.strain_sd is None else float(np.nanmedian(measured.strain_sd[inside])),
     }
     if pair.truth is not None:
         e = end_point_error(u, pair.truth, measured.mask)
@@ -354,6 +362,8 @@ def _vtu(path: Path, grid: Volume, measured: MeasuredDisplacement) -> Path:
     }
     if (covariance := measured.displacement.covariance) is not None:
         data["displacement_covariance_mm2"] = covariance[some].reshape(-1, 3, 3)[used]
+    if measured.strain_sd is not None:
+        data["strain_standard_deviation"] = measured.strain_sd[some].ravel()[used].astype(np.float64)
     write_vtu(path, mesh, data)
     return path
 

@@ -36,6 +36,8 @@ def slice_view(pair: Pair, run: SenseRun) -> SliceView:
     ]
     if (sd := measured.displacement.largest_sd_mm) is not None:
         overlays.append(Overlay("standard deviation of the displacement, mm", np.where(measured.mask, sd, np.nan)[box]))
+    if measured.strain_sd is not None:
+        overlays.append(Overlay("standard deviation of a component of strain", np.where(measured.mask, measured.strain_sd, np.nan)[box]))
     images = [("reference", pair.reference.values), ("deformed", pair.deformed.values), ("deformed, warped back", back)]
     return SliceView(
         title=f"Displacement from {pair.names[0]} to {pair.names[1]}",
@@ -77,15 +79,21 @@ def _cards(run: SenseRun, principal: FloatArray) -> tuple[Card, ...]:
         Card("Standard deviation of it", "not stated" if sd is None else f"{sd:.2g} mm", "median, along the least certain direction"),
     ]
     if len(principal):
-        low, high = np.median(principal[:, 0]), np.median(principal[:, 2])
-        cards.append(Card("Principal strains, median", f"{low:+.1%} and {high:+.1%}", "smallest and largest, Green-Lagrange"))
-    share = f["measured_fraction"]
-    rest = "the rest is left unanswered" if isinstance(share, float) and share < 1.0 else "all of it"
-    cards.append(Card("Part of the object measured", f"{share:.1%}", rest))
+        low, high = (f"{100.0 * np.median(principal[:, k]):+.1f}".replace("-", "−") for k in (0, 2))
+        known = f["median_strain_sd"]
+        certain = f"; standard deviation of a component {100.0 * known:.2g} %" if isinstance(known, float) else ""
+        cards.append(Card("Principal strains, median", f"{low}, {high} %", f"smallest and largest, Green-Lagrange{certain}"))
+    if isinstance(share := f["measured_fraction"], float):
+        rest = "the rest is left unanswered" if share < 1.0 else "all of it"
+        cards.append(Card("Part of the object measured", f"{100.0 * share:.1f} %", rest))
     before, after = f["initial_residual_rms"], f["residual_rms"]
     if isinstance(before, float) and isinstance(after, float) and before > 0.0:
         cards.append(
-            Card("Difference of the scans explained", f"{1.0 - (after / before) ** 2:.0%}", "of its mean square, inside the object")
+            Card(
+                "Difference of the scans explained",
+                f"{100.0 * (1.0 - (after / before) ** 2):.0f} %",
+                "of its mean square, inside the object",
+            )
         )
     if (error := f.get("p95_error_mm", f.get("p95_check_point_error_mm"))) is not None:
         cards.append(Card("Error against the truth, 95th percentile", f"{error:.3g} mm"))
@@ -99,14 +107,22 @@ def _box(mask: BoolArray, margin: int = 4) -> tuple[slice, ...]:
 
 def _sentences(run: SenseRun) -> list[str]:
     f = run.figures
+    folds = isinstance(f["folded_fraction"], float) and f["folded_fraction"] > 0.0
+    share, doubts = f["measured_fraction"], folds + len(run.measured.warnings)
+    where = f"{100.0 * share:.1f} % of the object" if isinstance(share, float) and share < 0.995 else "the whole object"
+    reserved = (
+        "without reservation" if not doubts else "with one reservation, below" if doubts == 1 else f"with {doubts} reservations, below"
+    )
     sentences = [
+        f"Measured in {where}, {reserved}.",
         f"Method {run.measured.method}, {run.seconds:.1f} s. The object moved by {f['median_displacement_mm']:.2f} mm (median), at most "
         f"{f['largest_displacement_mm']:.2f} mm; the intensity residual inside it fell from {f['initial_residual_rms']:.4g} to "
-        f"{f['residual_rms']:.4g} (root mean square)."
+        f"{f['residual_rms']:.4g} (root mean square).",
     ]
     if f["median_sd_mm"] is not None:
         sentences.append(
-            f"The standard deviation of the displacement is {f['median_sd_mm']:.3f} mm (along the least certain direction, median)."
+            f"The standard deviation of the displacement is {f['median_sd_mm']:.3f} mm (along the least certain direction, median)"
+            + (f", that of a component of strain {f['median_strain_sd']:.2g}." if f["median_strain_sd"] is not None else ".")
         )
     else:
         sentences.append("This method states no uncertainty.")
@@ -115,7 +131,7 @@ def _sentences(run: SenseRun) -> list[str]:
             f"The displacement of {1.0 - f['measured_fraction']:.1%} of the object was not measured: that part lies outside one of the "
             "scans, or in its padding, or the scans show no common texture there."
         )
-    if isinstance(f["folded_fraction"], float) and f["folded_fraction"] > 0.0:
+    if folds:
         sentences.append(f"The field folds at {f['folded_fraction']:.2%} of the voxels: it is wrong there.")
     return sentences + [text.replace("`", "") for text in run.measured.warnings]
 

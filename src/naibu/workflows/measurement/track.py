@@ -18,7 +18,7 @@ from naibu.io.files.paths import require_usable_path
 from naibu.io.files.provenance import input_record
 from naibu.io.images import read_volume
 from naibu.io.tables.marker_tables import write_experiment_folder, write_markers
-from naibu.viewer.chapter_page import write_chapter
+from naibu.viewer.chapters.chapter_page import write_chapter
 from naibu.viewer.notebook import ShownInNotebook, empty_figure
 from naibu.viewer.result_figures import draw_marker_motion
 from naibu.viewer.tables import Cell, Table

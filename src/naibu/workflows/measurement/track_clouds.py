@@ -25,8 +25,8 @@ from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
 from naibu.io.images import write_volume
 from naibu.io.tables.point_clouds import POINT_FILES, PointCloud, read_point_cloud
-from naibu.viewer.chapter import Chapter, Figure, Section
-from naibu.viewer.chapter_page import write_chapter
+from naibu.viewer.chapters.chapter import Chapter, Figure, Section
+from naibu.viewer.chapters.chapter_page import write_chapter
 from naibu.viewer.notebook import ShownInNotebook, WrittenResult, empty_figure
 from naibu.viewer.result_figures import draw_marker_motion
 from naibu.viewer.tables import Cell, Table
@@ -155,9 +155,11 @@ def _rows(clouds: Sequence[PointCloud], motion: ParticleMotion) -> tuple[tuple[s
     size, sd = np.linalg.norm(field.vectors[trusted], axis=1), field.standard_deviation
     assert sd is not None
     confidence = motion.links.confidence
+    copies = [(f"copies of a point left out, {state}", c.copies) for state, c in zip(("reference", "deformed"), clouds, strict=True)]
     rows: list[tuple[str, Cell]] = [
         ("particles, reference", len(clouds[0])),
         ("particles, deformed", len(clouds[1])),
+        *(row for row in copies if row[1]),
         ("linked", len(motion.links)),
         ("of these trusted", int(trusted.sum())),
         ("expected wrong links, at most", round(float(np.sum(1.0 - confidence[trusted])), 1)),

@@ -12,7 +12,7 @@ from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.volume import Volume
 from naibu.imaging.markers.tracking import TrackedMarkers
 from naibu.viewer.cards import Card
-from naibu.viewer.chapter import Chapter, Figure, Section
+from naibu.viewer.chapters.chapter import Chapter, Figure, Section
 from naibu.viewer.marker_view import MarkerView
 from naibu.viewer.result_page.payload import Scene, Step
 from naibu.viewer.tables import Cell, Table
@@ -98,7 +98,7 @@ def _cards(tracked: TrackedMarkers) -> tuple[Card, ...]:
         Card("Markers trusted", f"{trusted[worst]} of {len(tracked.ids)}", f"in {tracked.names[1 + worst]}, where they are fewest"),
         Card("Suspect, missing", f"{int((tracked.flags == 'suspect').sum())}, {int((~known).sum())}", "over all states; not used"),
         Card("Displacement, median", f"{np.median(moved[known]):.3g} mm", f"at most {moved[known].max():.3g} mm"),
-        Card("Standard deviation of a position", f"{xy_sd:.2g} mm", f"across z; {z_sd:.2g} mm along z"),
+        Card("Standard deviation of a position", f"{xy_sd:#.2g} mm", f"across z; {z_sd:#.2g} mm along z"),
     )
 
 

@@ -20,8 +20,8 @@ from naibu.imaging.markers.settings import SequenceSettings
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
 from naibu.io.images import read_volume
-from naibu.viewer.chapter import Chapter, Figure, Section
-from naibu.viewer.chapter_page import write_chapter
+from naibu.viewer.chapters.chapter import Chapter, Figure, Section
+from naibu.viewer.chapters.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.results.output_folder import output_folder
 

@@ -28,7 +28,7 @@ from naibu.io.study_schemas.lattice_study_schema import StudyFile
 from naibu.io.study_schemas.study_writing import study_document
 from naibu.io.tables.captured_shapes import CapturedSurface, read_captured_shapes
 from naibu.io.tables.force_records import ForceRecord, read_force_records
-from naibu.viewer.chapter_page import chapter_html
+from naibu.viewer.chapters.chapter_page import chapter_html
 from naibu.viewer.notebook import WrittenResult
 from naibu.workflows.results.output_folder import output_folder
 from naibu.workflows.studies.calibration_page import Compared, calibration_chapter, held_intervals, misfit_numbers
@@ -238,14 +238,15 @@ def _warnings(problem: StudyProblem, estimate: LatticeEstimate, before: Compared
     found = [] if estimate.finished else ["The search was interrupted: these are the best values so far, not the end of the search."]
     if not problem.unknowns.study.tied:
         found.append(
-            "In contact the intervals are not confirmed: in trials with known truth they were far too narrow where classes of elements are "
-            "told apart (benchmarks/lattice_calibration.py), because points that begin to slip make shapes and forces jump, which counts "
-            "as information. Take them as the least uncertainty."
+            "In contact the intervals are not confirmed: what jumps tell as points begin to slip is taken out of them, but in trials with "
+            "known truth some were still too narrow where classes of elements are told apart (benchmarks/lattice_calibration.py). Take "
+            "them as the least uncertainty."
         )
     if not estimate.settled:
         found.append(
             "The search did not come to rest: long and short steps of time differ by more than the noise, or contacts jump between "
-            "sticking and sliding. Intervals do not hold; begin nearer (the calibrated study), or identify fewer parameters."
+            "sticking and sliding. Intervals are those of the weak prior, as if nothing "
+            "were known; begin nearer (the calibrated study), or identify fewer parameters."
         )
     for what, factor in zip(("points", "forces"), estimate.noise_factor, strict=True):
         if factor > 1.3:

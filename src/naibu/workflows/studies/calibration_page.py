@@ -13,7 +13,7 @@ from naibu.identification.lattice_calibration.estimate import LatticeEstimate
 from naibu.identification.lattice_calibration.shape_distance import closest_points
 from naibu.identification.lattice_calibration.study_problem import StudyProblem
 from naibu.io.tables.force_records import ForceRecord
-from naibu.viewer.chapter import Chapter, Figure, Section
+from naibu.viewer.chapters.chapter import Chapter, Figure, Section
 from naibu.viewer.tables import Cell, Table
 
 if TYPE_CHECKING:

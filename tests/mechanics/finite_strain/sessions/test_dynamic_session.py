@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,9 @@ from naibu.mechanics import (
     IndenterForce,
     IndenterVelocity,
     QuasiStaticEngine,
+    RealTimeEngine,
     body_force,
+    box_indenter,
     elements,
     material,
     plane_indenter,
@@ -53,8 +57,6 @@ def test_a_free_body_falls_by_the_steps_of_backward_euler() -> None:
 def test_without_forces_energy_never_grows_and_momentum_stays() -> None:
     made = engine(step=2e-3)
     squeezed = -0.1 * (made.points - made.points.mean(axis=0)) * np.array([1.0, 0.0, 0.0])
-    from dataclasses import replace
-
     session = made.session(state=replace(made.rest(), displacement=squeezed))
     energies = [made.energy(session.state())]
     for _ in range(12):
@@ -83,6 +85,31 @@ def test_it_settles_where_the_static_solver_finds_equilibrium(friction: float) -
     assert np.abs(session.positions() - static.positions()).max() < 0.01 * moved
     assert session.forces().indenters[0, 0, 2] == pytest.approx(expected.indenters[0, 0, 2], rel=0.01)
     assert -session.forces().bodies[0, 0, 2] == pytest.approx(session.forces().indenters[0, 0, 2], rel=1e-3)
+
+
+@pytest.mark.parametrize("kind", [DynamicEngine, RealTimeEngine])
+@pytest.mark.parametrize("width", [28.0, 60.0])
+def test_a_body_under_a_plate_with_much_too_soft_penalties_ends_where_the_static_solver_does(
+    kind: type[DynamicEngine], width: float
+) -> None:
+    """The penalties rise by up to a factor of 256 on the way; the static solver's are stiff from the beginning."""
+    made = engine(divisions=4, poisson_ratio=0.499)
+    plate = box_indenter((0.0, 0.0, SIZE + 2.5), (width, width, 4.8), static_friction=0.3, kinetic_friction=0.3)
+    held, forces = [lowest(made.points)], []
+    statics = QuasiStaticEngine(made.points, made.assembler, made.faces, normal_stiffness=1.2e4).session(
+        constrained=held, indenters=[plate]
+    )
+    for part in (0.25, 0.5, 0.75, 1.0):
+        found = statics.step(motions=[RigidTransform.of(np.eye(3), (0.0, 0.0, -9.6 * part))])
+        forces.append(found.indenters[-1, 0, 2])
+    options = {"background": False} if kind is RealTimeEngine else {}
+    soft = kind(made.points, made.assembler, made.mass, made.faces, made.step, normal_stiffness=20.0, **options)
+    with soft.session(constrained=held, indenters=[plate]) as session:
+        for part, expected in enumerate(forces):
+            session.step(motions=[IndenterVelocity((0.0, 0.0, -16.0))], steps=9)
+            force = session.step(motions=[IndenterVelocity((0.0, 0.0, 0.0))], steps=8).indenters[-1, 0, 2]
+            assert force == pytest.approx(expected, rel=0.08 if part == 0 else 0.02)
+        assert session.state().normal_stiffness[0].max() >= 4.0 * soft.normal_stiffness
 
 
 def test_a_sphere_that_stops_at_once_is_followed_in_shorter_steps_where_needed() -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from naibu.mechanics.lattices.cpu import coarse_space
-from naibu.mechanics.lattices.cpu._coarse_kernels import _from_nodes, _to_nodes, gather, turn_with
-from naibu.mechanics.lattices.cpu._pcg_kernels import multiply
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
+from naibu.mechanics.lattices.cpu.implicit import coarse_space
+from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import _from_nodes, _to_nodes, gather, turn_with
+from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import multiply
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters, box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.octree import octree_lattice
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState
@@ -140,7 +140,7 @@ def test_the_coarse_matrix_is_the_lattices_own(name, monkeypatch):
     lattice, parameters = SPECIMENS[name]
     engine = LatticeEngine.of(lattice, parameters)
     engine.run(engine.rest(), 1)  # stores the directions at rest
-    (first, second, rows), _ = engine.kernel
+    blocks, _ = engine.kernel
     with engine.scratch() as (_, inner):  # that of the run
         pass
     base, weights, smoother = inner[8][3][0], inner[8][4], inner[3]
@@ -149,7 +149,7 @@ def test_the_coarse_matrix_is_the_lattices_own(name, monkeypatch):
     c[:, : int(weights[0].max()) + 1] = np.random.default_rng(3).normal(size=(3, int(weights[0].max()) + 1))
     p, q = np.zeros(3 * pad, np.float32), np.zeros(3 * pad, np.float32)
     p.reshape(3, pad)[:, :n] = (c[:, weights[0]] * weights[1]).sum(axis=2)
-    energy = multiply(first, second, rows, inner[0], inner[1], inner[2], p, q)
+    energy = multiply(blocks, inner[0], inner[1], inner[2], p, q)
     shift = 1e-5 * (p.reshape(3, pad)[:, :n] ** 2 / smoother[:n]).sum()
     assert np.einsum("ai,aibj,bj", c, base, c) == pytest.approx(energy + shift, rel=1e-5)
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from itertools import combinations
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import label
 
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.mechanics.lattices.cpu.element_blocks import Blocks
@@ -374,3 +378,40 @@ def test_bad_input_is_named(call, said):
 
 def engine(**options):
     return LatticeEngine.of(BOX, lattice_parameters(BOX, 1.0, 1.0, 1.0), **options)
+
+
+def irregular_masks():
+    rng = np.random.default_rng(5)
+    yield box_mask((1, 1, 1))
+    yield box_mask((4, 3, 5))
+    yield l_shape()
+    for _ in range(4):
+        mask = rng.random(rng.integers(3, 8, 3)) < 0.6
+        mask[1] = True  # keeps most of it together
+        pieces, _ = label(mask, np.ones((3, 3, 3)))
+        yield pieces == pieces[1, 0, 0]
+    corner = np.zeros((2, 2, 2), dtype=bool)  # two voxels that share one corner
+    corner[0, 0, 0] = corner[1, 1, 1] = True
+    yield corner
+
+
+@pytest.mark.parametrize("mask", list(irregular_masks()))
+def test_nodes_and_elements_are_those_of_every_voxel_by_itself(mask):
+    lattice = classic_lattice(mask, 0.5, density=1e-6)
+    corners = [[tuple(at + step) for step in np.ndindex(2, 2, 2)] for at in np.argwhere(mask)]
+    nodes = sorted({c for own in corners for c in own}, key=lambda c: c[::-1])
+    number = {c: k for k, c in enumerate(nodes)}
+    around = Counter(c for own in corners for c in own)
+    surface = np.array([around[c] < 8 for c in nodes])
+    pairs = sorted({tuple(sorted((number[a], number[b]))) for own in corners for a, b in combinations(own, 2)})
+    np.testing.assert_array_equal(lattice.points, 0.5 * np.array(nodes))
+    np.testing.assert_array_equal(lattice.elements, pairs)
+    np.testing.assert_array_equal(lattice.surface_node, surface)
+    np.testing.assert_array_equal(lattice.element_zone, surface[lattice.elements].any(axis=1))
+    np.testing.assert_array_equal(
+        lattice.element_class + 1, np.count_nonzero(np.diff(lattice.points[lattice.elements], axis=1)[:, 0], axis=1)
+    )
+    np.testing.assert_allclose(lattice.node_mass, [around[c] * 0.5**3 / 8 * 1e-6 for c in nodes])
+    for at, cell in zip(np.argwhere(mask), lattice.cells, strict=True):
+        np.testing.assert_array_equal(lattice.points[cell[[0, 6]]], 0.5 * np.array([at, at + 1]))
+        np.testing.assert_array_equal(lattice.points[cell[[1, 3, 4]]], 0.5 * (at + np.eye(3)))

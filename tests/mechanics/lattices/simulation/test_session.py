@@ -20,7 +20,7 @@ Z = LATTICE.points[:, 2]
 CONSTRAINED = ConstrainedNodes.of(np.flatnonzero(Z < 1), 0) + ConstrainedNodes.of(np.flatnonzero(Z > 49), 1, axes=(2, 0))
 FEWER = ConstrainedNodes.of(np.flatnonzero(Z < 1), 0)
 PUSH = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, -30.0]])
-OPTIONS = [{"method": "implicit", "step": 2e-3}] + [
+OPTIONS = [{"method": "implicit", "step": 2e-3, "threads": threads} for threads in (1, 2, 3)] + [
     {"method": method, "step": 1e-4, "threads": threads, "precision": precision}
     for method in ("euler", "symplectic_euler")
     for threads in (1, 2, 3)
@@ -65,18 +65,30 @@ def test_sessions_of_one_engine_do_not_disturb_one_another():
     np.testing.assert_array_equal(one.state().position, alone.state.position)
 
 
-def test_who_takes_a_part_changes_nothing():
+@pytest.mark.parametrize("options", [{"method": "euler", "step": 1e-4}, {"method": "implicit", "step": 2e-3}], ids=str)
+def test_who_computes_a_part_changes_nothing(options):
     """Runs with workers, and with the pool at rest, give the same to the last bit."""
     found = []
     for alone in (False, True):
-        session = LatticeSession.of(engine(method="euler", step=1e-4, threads=4), constrained=CONSTRAINED)
-        if alone:
-            session.stepper.control[thread_pool.ALONE] = 10_000
+        session = LatticeSession.of(engine(**options, threads=4), constrained=CONSTRAINED)
         for _ in range(20):
             session.step(PUSH, steps=10)
+            session.stepper.control[thread_pool.ALONE] = 10_000 if alone else 0
         found.append(session.state())
     np.testing.assert_array_equal(found[0].position, found[1].position)
     np.testing.assert_array_equal(found[0].velocity, found[1].velocity)
+
+
+@pytest.mark.parametrize("constrained", [CONSTRAINED, ConstrainedNodes.none()], ids=["held", "free"])
+def test_implicit_steps_in_parts_differ_by_rounding(constrained):
+    made = [engine(step=2e-3, threads=threads) for threads in (1, 2, 5)]
+    push = PUSH if len(constrained.node) else np.zeros((0, 3))
+    one, *more = (e.run(e.rest(), 30, constrained, push, [0.0, 2e-3, -1e-3]) for e in made)
+    moved = np.abs(one.state.position - LATTICE.points).max()
+    for other in more:
+        np.testing.assert_allclose(other.state.position, one.state.position, atol=1e-5 * moved)
+        np.testing.assert_allclose(other.reaction, one.reaction, atol=1e-4 * np.abs(one.reaction).max(initial=0.0))
+        assert other.iterations == pytest.approx(one.iterations, rel=0.05)
 
 
 def test_helpers_are_asked_only_while_steps_take_most_of_the_time():
@@ -96,21 +108,54 @@ def test_helpers_are_asked_only_while_steps_take_most_of_the_time():
     assert asked == [False, True, True, False, True]
 
 
-def test_the_team_rests_longer_after_each_stall_and_forgets_them():
+WINDOW = thread_pool.WINDOW_NS  # longer than any number of steps that a window asks for
+
+
+def taken(control, alone, together):
+    """Take a step whose time is that alone or that together, and return whether it was alone."""
+    rests = bool(control[thread_pool.ALONE])
+    thread_pool.adapt(control, 10, 0, alone if rests else together)
+    return rests
+
+
+def test_the_faster_way_is_kept_and_the_other_one_tried_rarely():
+    """With a free core nearly all steps are taken together; where those take longer, as with one core, nearly all alone."""
+    for together, least, most in ((0.6, 0.0, 0.05), (1.6, 0.95, 1.0)):
+        control = thread_pool.new_control(2)
+        alone = [taken(control, WINDOW, int(together * WINDOW)) for _ in range(8_000)]
+        assert least <= np.mean(alone[200:]) <= most
+        assert 0 < np.sum(alone[200:]) < len(alone[200:])  # the other way is tried
+        turned = [taken(control, WINDOW, int(WINDOW / together)) for _ in range(8_000)]  # a core becomes free, or another process takes it
+        assert (np.mean(turned[4_000:]) > 0.5) == (together < 1.0)
+
+
+def test_a_stall_is_answered_at_once():
+    control = thread_pool.new_control(2)
+    thread_pool.adapt(control, 10, thread_pool.STALL - 1, WINDOW // 10)
+    assert not control[thread_pool.ALONE]
+    thread_pool.adapt(control, 10, thread_pool.STALL, 5 * WINDOW)
+    assert control[thread_pool.ALONE] == 1  # a window, to know how long steps alone take
+    assert [taken(control, WINDOW // 2, 5 * WINDOW) for _ in range(4)] == [True, True, False, False]
+    assert control[thread_pool.ALONE] == thread_pool.LEAST_REST
+
+
+def test_without_a_clock_stalls_tell():
     control = thread_pool.new_control(2)
     rests = []
-    for _ in range(9):
-        thread_pool.adapt(control, thread_pool.STALL)
+    for _ in range(4):
+        thread_pool.adapt(control, 10, thread_pool.STALL, 0)
         rests.append(int(control[thread_pool.ALONE]))
         while control[thread_pool.ALONE]:
-            thread_pool.adapt(control, 0)
-    assert rests == [200, 600, 1400, 3000, 6200, 12600, 12800, 12800, 12800]
-    for _ in range(7_000):
-        thread_pool.adapt(control, 0)
-    thread_pool.adapt(control, thread_pool.STALL)
-    assert control[thread_pool.ALONE] == 2 * (12800 >> 7) + 200
-    thread_pool.adapt(thread_pool.new_control(2), thread_pool.STALL - 1)
-    assert not thread_pool.new_control(2)[thread_pool.ALONE]
+            thread_pool.adapt(control, 10, 0, 0)
+    assert rests == [8, 24, 56, 120]
+
+
+def test_no_worker_is_asked_where_there_is_one_core(monkeypatch):
+    monkeypatch.setattr(thread_pool.os, "sched_getaffinity", lambda _: {0}, raising=False)
+    with LatticeSession.of(engine(method="euler", step=1e-4, threads=2), constrained=CONSTRAINED) as session:
+        session.step(PUSH, steps=20)
+        session.step(PUSH, steps=20)
+        assert not session.stepper.control[thread_pool.WORKING]
 
 
 def test_a_helper_that_is_late_is_waited_for_and_stalls_the_team():
@@ -132,8 +177,7 @@ def test_a_helper_that_is_late_is_waited_for_and_stalls_the_team():
     naps = nogil_wait(control)
     helper.join()
     assert control[thread_pool.DONE] == 2
-    thread_pool.adapt(control, naps)
-    assert control[thread_pool.ALONE] > 0
+    assert naps >= thread_pool.STALL
 
 
 @thread_pool.njit(nogil=True)

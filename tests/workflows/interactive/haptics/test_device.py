@@ -16,7 +16,9 @@ from naibu.core.errors import InputError
 from naibu.mechanics import Assembler, elements, material
 from naibu.meshing import box
 from naibu.simulation import FiniteElementBody, ForceLimits, InteractiveSimulation, SimulatedDevice
+from naibu.simulation.haptic_loop import WAITS, DeviceForce, DevicePose
 from naibu.workflows import TouchableModel, drive_live_simulation, live, tools_for, touched_loop
+from naibu.workflows.interactive.haptics.packets import pose_bytes, read_force
 
 
 def device() -> SimulatedDevice:
@@ -75,6 +77,31 @@ def test_a_device_feels_finite_elements_between_their_steps() -> None:
     assert frame.force[2] < -50.0
     assert np.linalg.norm(record.forces, axis=1).max() > 50.0
     assert record.steps_mn.max() <= limits.step_mn * (1 + 1e-9)
+
+
+def test_a_device_is_told_that_the_simulation_is_being_prepared() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
+        line.bind(("127.0.0.1", 0))
+        port = line.getsockname()[1]
+    told: list[DeviceForce] = []
+
+    class Enough(Exception):
+        pass
+
+    def preparing() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
+            line.connect(("127.0.0.1", port))
+            line.settimeout(10.0)
+            for sequence in (1, 2):
+                line.send(pose_bytes(DevicePose(sequence, 1e-3 * sequence, np.array([0.0, 0.0, -9.0]))))
+                told.append(read_force(line.recv(200)))
+        raise Enough
+
+    with pytest.raises(Enough):
+        live("no-such-model", port=0, haptics_port=port, preparing=preparing, ready=lambda _: None)
+    assert all(answer.flags & WAITS for answer in told)
+    assert told[1].number > told[0].number
+    assert not np.any([answer.force_mn for answer in told])
 
 
 def test_what_cannot_be_served_is_refused() -> None:

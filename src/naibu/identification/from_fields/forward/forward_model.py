@@ -87,7 +87,8 @@ class Observed:
         valid = field.valid
         whiten, noise, exact = whitening(field, load_case.name)
         where = interpolation_operator(computed, field.points[valid]) if d == 3 else _at_nodes(mesh, field.points[valid], load_case.name)
-        operator = (sp.block_diag(list(whiten), format="csr") @ sp.kron(where, sp.identity(d), format="csr")).tocsr()
+        blocks = np.arange(len(whiten) + 1)
+        operator = (sp.bsr_matrix((whiten, blocks[:-1], blocks)).tocsr() @ sp.kron(where, sp.identity(d), format="csr")).tocsr()
         data = np.einsum("nij,nj->ni", whiten, field.vectors[valid]).ravel()
         unknown = np.flatnonzero(load_case.loaded.ravel()).astype(np.int64)
         if computed is mesh:
@@ -143,7 +144,10 @@ def _surface_prior(mesh: Mesh, loaded: IntArray) -> sp.csr_matrix:
     """Return the graph Laplacian over the edges between loaded nodes, each weighted by (SURFACE_STRAIN length)^-2."""
     d, k = mesh.dimension, mesh.cells.shape[1]
     a, b = np.triu_indices(k, 1)
-    edges = np.unique(np.sort(mesh.cells[:, np.stack([a, b], axis=1)].reshape(-1, 2), axis=1), axis=0)
+    edges = mesh.cells[:, np.stack([a, b], axis=1)].reshape(-1, 2)
+    at_node = np.zeros(mesh.n_points, dtype=bool)
+    at_node[loaded // d] = True
+    edges = np.unique(np.sort(edges[at_node[edges].all(axis=1)], axis=1), axis=0)
     weight = (SURFACE_STRAIN * np.linalg.norm(mesh.points[edges[:, 0]] - mesh.points[edges[:, 1]], axis=1)) ** -2.0
     place = np.full(mesh.n_points * d, -1)
     place[loaded] = np.arange(len(loaded))

@@ -184,17 +184,27 @@ class FieldModel:
         return Linearised(self, point, columns, stiffness)
 
 
-def modulus_columns(law: FieldLaw, zones: Zones, lame: FloatArray, shear: FloatArray, u: FloatArray) -> sp.csr_matrix:
+def modulus_columns(law: FieldLaw, zones: Zones, lame: FloatArray, shear: FloatArray, u: FloatArray) -> sp.csc_matrix:
     """Return the nodal forces (n d, 2 count), mN, of a relative change of mu at constant kappa / mu, then of kappa, of every zone."""
     unit_lame, unit_shear = law.unit_forces(u)
     _, k, d = unit_lame.shape
-    unknown = zones.of_cell != KNOWN
-    of_bulk = (lame + 2.0 / 3.0 * shear)[unknown, None, None] * unit_lame[unknown]
-    of_both = lame[unknown, None, None] * unit_lame[unknown] + shear[unknown, None, None] * unit_shear[unknown]
-    rows = ((law.cells[unknown] * d)[:, :, None] + np.arange(d)).ravel()
-    columns = np.repeat(zones.of_cell[unknown], k * d)
-    index = np.concatenate([rows, rows]), np.concatenate([columns, columns + zones.count])
-    return sp.csr_matrix((np.concatenate([of_both.ravel(), of_bulk.ravel()]), index), shape=(law.n_points * d, 2 * zones.count))
+    unknown = np.flatnonzero(zones.of_cell != KNOWN)
+    of_zone = unknown[np.argsort(zones.of_cell[unknown], kind="stable")]  # the cells of every zone, one zone after the other
+    cells = law.cells.astype(np.int32)  # fewer than 2^31 forces: 10^8 cells
+    if not np.array_equal(of_zone, np.arange(len(cells))):
+        lame, shear, unit_lame, unit_shear = (a[of_zone] for a in (lame, shear, unit_lame, unit_shear))
+        cells = cells[of_zone]
+    values, rows = np.empty((2, len(of_zone), k, d)), np.empty((2, len(of_zone), k, d), dtype=np.int32)
+    np.multiply(lame[:, None, None], unit_lame, out=values[0])
+    values[0] += shear[:, None, None] * unit_shear
+    np.multiply((lame + 2.0 / 3.0 * shear)[:, None, None], unit_lame, out=values[1])
+    rows[:] = d * cells[:, :, None] + np.arange(d, dtype=np.int32)
+    sizes = k * d * np.bincount(zones.of_cell[unknown], minlength=zones.count)
+    start = np.concatenate([[0], np.cumsum(np.tile(sizes, 2))]).astype(np.int32)
+    out = sp.csc_matrix((values.ravel(), rows.ravel(), start), shape=(law.n_points * d, 2 * zones.count))
+    if len(unknown) > zones.count:  # cells of a zone share nodes
+        out.sum_duplicates()
+    return out
 
 
 @dataclass(slots=True, eq=False)
@@ -203,14 +213,14 @@ class Linearised:
 
     model: FieldModel
     point: Point
-    columns: list[sp.csr_matrix]
+    columns: list[sp.csc_matrix]
     stiffness: list[sp.bsr_matrix]
     _transposed: list[sp.csr_matrix] = field(default_factory=list)
     _border: list[sp.csr_matrix] = field(default_factory=list)
     _gradient: Gradient | None = None
 
     def __post_init__(self) -> None:
-        self._transposed = [c.T.tocsr() for c in self.columns]
+        self._transposed = [c.T for c in self.columns]
         rows: dict[tuple[int, bytes], sp.csr_matrix] = {}
         for o, matrix in zip(self.model.observed, self.stiffness, strict=True):
             key = id(matrix), o.loaded.tobytes()

@@ -43,7 +43,7 @@ MOST_TRIES, MOST_WAVES = 4, 400
 FEW_LINKS, FEW_LINKED = 8, 0.5
 LEAST_LINKED = 0.1  # fraction of the markers that links which have grown must reach
 UNEVEN = 3.0  # degrees of freedom of residuals that are compared with those of all links, not with those around
-LIKELY = 0.5  # probability, which errs on the safe side, below which a link that has grown is dropped
+LIKELY = 2.0 / 3.0  # probability below which a link that has grown is dropped: it is not twice as probably right as wrong
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -363,7 +363,7 @@ def _reported(found: RefinedLinks, reference_points: FloatArray, deformed: Float
 
 
 def _likely(links: Links) -> Links:
-    """Return the links that are not more likely wrong than right."""
+    """Return the links that are at least twice as probably right as wrong."""
     kept = links.confidence >= LIKELY
     reference, deformed = links.pairs[~kept].T
     return Links(

@@ -22,10 +22,11 @@ from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import LipsBesid
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 from naibu.mechanics.linear_algebra.updated_factors import BlockChange, ChangedInverse
 
-EVALUATIONS = 24  # of the contact at most
-PATIENCE = 3  # iterations that may make things worse: where a point closes, what is left grows before it vanishes
+EVALUATIONS = 40  # of the contact at most
+PATIENCE = 3  # steps that hardly help before they are searched: where a point closes, what is left grows before it vanishes
+CHANGES = 12  # derivatives at most
+SEARCHES = 5  # motions tried along a step
 USUAL = 6  # evaluations after which ten times the tolerance is enough
-HALVINGS = 5  # of a step that does not improve: points may stick and slip by turns
 FAST = 0.2  # of what was left: progress with which an earlier derivative of the contact goes on being used
 
 
@@ -35,8 +36,11 @@ class ContactLaw(Protocol):
     def __call__(self, motion: FloatArray) -> FloatArray:
         """Return the forces (k, 3), mN, at a motion (k, 3), mm."""
 
-    def change(self) -> BlockChange:
-        """Return minus the derivative of the forces at the last motion; its nodes are places among the k."""
+    def change(self, symmetric: bool = False) -> BlockChange:
+        """Return minus the derivative of the forces at the last motion; its nodes are places among the k.
+
+        Symmetric, it lacks the growth of friction with pressure.
+        """
 
 
 @dataclass(slots=True, eq=False)
@@ -66,6 +70,11 @@ class CondensedContact:
     def forces(self, free: FloatArray, law: ContactLaw, begin: FloatArray, tolerance_mm: float, longest_mm: float) -> FloatArray:
         """Return the forces g (k, 3), mN, under which ``y = free + W g(y)``; the best that is found in a few iterations.
 
+        A step of Newton's method that hardly helps is searched for where the forces that are out of balance do no more work on it, as in
+        `naibu.mechanics.finite_strain.sessions.implicit_step`: with contact, and friction of known limit, a convex energy is least there,
+        and points that stick and slip by turns end the search. The growth of friction with pressure may lead a step uphill; the next one
+        goes without it.
+
         Parameters
         ----------
         free : ndarray, shape (k, 3)
@@ -79,33 +88,84 @@ class CondensedContact:
         longest_mm : float
             Motion in one iteration at most, mm: no node may pass through an indenter.
         """
-
-        def evaluated(y: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-            force = law(y)
-            left = y - free - (self._inverse @ force.ravel().astype(np.float32)).reshape(-1, 3)
-            return force, left, float(np.abs(left).max(initial=0.0))
-
-        y, evaluations, unhelpful, fast = begin, 1, 0, True
-        force, left, size = evaluated(y)
-        best, least, nearest = force, size, y
-        while size > tolerance_mm * (1.0 if evaluations < USUAL else 10.0) and evaluations < EVALUATIONS:
+        at = self._tried(begin, None, free, law)
+        best, evaluations, changes, unhelpful, fast, symmetric = at, 1, 0, 0, True, False
+        while at.size > tolerance_mm * (1.0 if evaluations < USUAL else 10.0) and evaluations < EVALUATIONS:
             if self._changed is None or not fast:
-                self._changed = ChangedInverse.of(self._inverse, law.change())
-            step, before = self._changed.solve(left), size
-            share = min(1.0, longest_mm / float(np.abs(step).max()))
-            for k in range(HALVINGS + 1):
-                force, left, size = evaluated(y - share * step)
-                evaluations += 1
-                if size < (1.0 - 0.1 * share) * before or unhelpful < PATIENCE or k == HALVINGS:
+                if changes == CHANGES:
                     break
-                share *= 0.5
-            y, fast, unhelpful = y - share * step, size <= FAST * before, unhelpful + 1
-            if size < least:
-                best, least, nearest, unhelpful = force, size, y, 0
-            elif unhelpful == PATIENCE:
-                y, fast = nearest, False
-                force, left, size = evaluated(y)
-        return best
+                self._changed, changes = ChangedInverse.of(self._inverse, law.change(symmetric)), changes + 1
+            step, before = self._changed.solve(at.left), at.size
+            target = at.force + self._changed.change.times(step)  # which exerted on the body leads to the end of the step
+            share = min(1.0, longest_mm / float(np.abs(step).max()))
+            if at.exerted is None or unhelpful < PATIENCE:
+                at = self._tried(at.motion - share * step, target if share == 1.0 else None, free, law)
+                evaluations += 1
+            elif at.work(step) <= 0.0 and not symmetric:
+                symmetric, fast = True, False
+                continue
+            else:
+                at, tried = self._searched(at, step, target, share, free, law)
+                evaluations += tried
+                symmetric = symmetric and at.size > 0.5 * before
+            fast, unhelpful = at.size <= FAST * before, unhelpful + (at.size > 0.5 * before)
+            if at.size < best.size:
+                best = at
+        return best.force
+
+    def _tried(self, motion: FloatArray, exerted: FloatArray | None, free: FloatArray, law: ContactLaw) -> _Motion:
+        force = law(motion)
+        left = motion - free - (self._inverse @ force.ravel().astype(np.float32)).reshape(-1, 3)
+        return _Motion(motion, exerted, force, left, float(np.abs(left).max(initial=0.0)))
+
+    def _searched(
+        self, at: _Motion, step: FloatArray, target: FloatArray, share: float, free: FloatArray, law: ContactLaw
+    ) -> tuple[_Motion, int]:
+        """Return where the forces out of balance do little work on a step, and how many motions were tried."""
+        assert at.exerted is not None
+        before = low_work = at.work(step)
+        low, high, high_work = 0.0, 0.0, 0.0
+        for k in range(SEARCHES):
+            found = self._tried(at.motion - share * step, at.exerted + share * (target - at.exerted), free, law)
+            work = found.work(step)
+            if abs(work) <= 0.5 * abs(before) or found.size < 0.5 * at.size or (work > 0.0 and high == 0.0) or k == SEARCHES - 1:
+                break
+            if work > 0.0:
+                low, low_work = share, work
+            else:
+                high, high_work = share, work
+            share = low + (high - low) * min(max(low_work / (low_work - high_work), 0.1), 0.9)
+        return found, k + 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Motion:
+    """A motion of the nodes concerned, mm.
+
+    Attributes
+    ----------
+    motion : ndarray, shape (k, 3)
+        y, mm.
+    exerted : ndarray, shape (k, 3), optional
+        Forces under which the body moves so, mN, where they are known.
+    force : ndarray, shape (k, 3)
+        g(y), mN.
+    left : ndarray, shape (k, 3)
+        y - free - W g(y), mm.
+    size : float
+        Its largest component.
+    """
+
+    motion: FloatArray
+    exerted: FloatArray | None
+    force: FloatArray
+    left: FloatArray
+    size: float
+
+    def work(self, step: FloatArray) -> float:
+        """Return the work of the forces out of balance on a step (k, 3), mm, that is subtracted; mN mm."""
+        assert self.exerted is not None
+        return float((step * (self.exerted - self.force)).sum())
 
 
 @dataclass(slots=True, eq=False)
@@ -157,9 +217,10 @@ class ContactBesideTangent:
             contact.add_force(moved, force)
         return np.asarray(force[self.nodes])
 
-    def change(self) -> BlockChange:
-        """Return minus the derivative of the forces at the last motion; its nodes are places among the k."""
+    def change(self, symmetric: bool = False) -> BlockChange:
+        """Return minus the derivative of the forces at the last motion; see `ContactLaw`."""
         blocks = np.zeros((self.pattern.n_blocks, 3, 3))
-        for contact, places in zip(self.contacts, self.places, strict=False):  # lips, which come last, are not always there
-            contact.touching().add_stiffness(self.pattern, places, blocks)
+        for contact, places in zip(self.contacts, self.places, strict=True):
+            touching = contact.touching()
+            (touching.add_symmetric_stiffness if symmetric else touching.add_stiffness)(self.pattern, places, blocks)
         return contact_change(self.pattern, blocks, self.tangent, self.nodes, self._place, self.gripped, self.hold)

@@ -24,14 +24,15 @@ from naibu.mechanics.contact.indenter_motion import IndenterForce, IndenterMotio
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.assembly import Assembler
-from naibu.mechanics.finite_strain.penalties import relative_penetrations, with_less_penetration
+from naibu.mechanics.finite_strain.penalties import node_shear_moduli, relative_penetrations, stiff_enough, with_less_penetration
 from naibu.mechanics.finite_strain.sessions.implicit_step import ImplicitStep
 from naibu.mechanics.finite_strain.sessions.indenter_session import IndenterSession
+from naibu.mechanics.finite_strain.sessions.session_checks import dead_load
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
 from naibu.mechanics.linear_algebra.recycled_lu import RecycledLU
 
 SUBDIVISIONS = 5  # of a step that does not converge: halves, quarters, ...
-PENETRATION = 0.02  # of the edge of a face, to which the penalties limit how deep indenters go into it
+PENETRATION = 0.01  # of the edge of a face, to which the penalties limit how deep indenters go into it, as in statics
 MOST_RAISES = 6  # of the penalties in a step
 
 
@@ -80,7 +81,7 @@ class DynamicEngine:
     step : float
         Length of a step, s.
     normal_stiffness, tangential_stiffness : float
-        Penalties of the contact, kPa/mm.
+        Penalties of the contact, kPa/mm; on elements for which the normal one is too soft it is raised as in statics.
     iterations : int
         Newton iterations of a step at most.
     tolerance : float
@@ -103,6 +104,7 @@ class DynamicEngine:
     tolerance: float = 1e-3
     _extent: float = field(init=False)
     _modulus: float = field(init=False)
+    _shear: FloatArray = field(init=False)  # moduli of the elements at every node
 
     def __post_init__(self) -> None:
         require_shape("mass", self.mass, (len(self.points),))
@@ -112,6 +114,7 @@ class DynamicEngine:
             raise InputError(f"mass must be positive at every node, not {self.mass.min():g} kg; remove nodes that no element uses")
         object.__setattr__(self, "_extent", float(np.ptp(self.points, axis=0).max()))
         object.__setattr__(self, "_modulus", float(self.assembler.parameters[:, 0].max()))
+        object.__setattr__(self, "_shear", node_shear_moduli(self.assembler))
 
     def rest(self) -> DynamicState:
         """Return the body in the reference configuration, at rest."""
@@ -144,8 +147,7 @@ class DynamicEngine:
 
         It raises what `DynamicSession.constrain`, `press` and `restore` raise.
         """
-        load = np.broadcast_to(np.asarray(0.0 if external_force is None else external_force, dtype=float), self.points.shape)
-        return DynamicSession(self, load, self.rest()).begun(state, constrained, indenters)
+        return DynamicSession(self, dead_load(external_force, self.points), self.rest()).begun(state, constrained, indenters)
 
 
 @dataclass(slots=True, eq=False)
@@ -173,6 +175,7 @@ class DynamicSession(IndenterSession[DynamicEngine, DynamicState]):
     def press(self, indenters: Sequence[RigidIndenter]) -> None:
         """Bring these indenters, and no others, into play from the next step on; see `IndenterSession.press`."""
         IndenterSession.press(self, indenters)
+        self._templates = stiff_enough(self._templates, self.engine._shear)
         self.reached = replace(self.reached, normal_stiffness=())
         self._positions = tuple(self.engine.assembler.pattern.positions(c.nodes) for c in self._templates)
 

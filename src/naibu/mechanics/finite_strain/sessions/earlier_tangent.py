@@ -53,7 +53,10 @@ class EarlierTangent:
 
 @dataclass(slots=True, eq=False)
 class TangentThread:
-    """A thread that makes one tangent at a time; use it as a context manager, or close it."""
+    """A thread that makes one tangent at a time; use it as a context manager, or close it.
+
+    It factorizes with a solver of its own while steps solve with another: PARDISO permits that, and a lock would let steps wait.
+    """
 
     _work: Callable[[], EarlierTangent] | None = field(init=False, default=None)
     _done: EarlierTangent | None = field(init=False, default=None)

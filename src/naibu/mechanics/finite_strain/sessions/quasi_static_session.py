@@ -23,6 +23,7 @@ from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDispla
 from naibu.mechanics.finite_strain.penalties import with_normal_stiffness
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
 from naibu.mechanics.finite_strain.sessions.indenter_session import IndenterSession
+from naibu.mechanics.finite_strain.sessions.session_checks import dead_load
 from naibu.mechanics.finite_strain.statics import LoadState, Solution, solve
 
 IN_FEW_STEPS = SolverSettings(first_step=0.5, largest_step=1.0)
@@ -118,8 +119,7 @@ class QuasiStaticEngine:
         InputError
             As `QuasiStaticSession.constrain`, `press` and `restore`.
         """
-        load = np.broadcast_to(np.asarray(0.0 if external_force is None else external_force, dtype=float), self.points.shape)
-        return QuasiStaticSession(self, load, self.rest()).begun(state, constrained, indenters)
+        return QuasiStaticSession(self, dead_load(external_force, self.points), self.rest()).begun(state, constrained, indenters)
 
 
 @dataclass(slots=True, eq=False)

@@ -10,7 +10,7 @@ of Woodbury. Anderson's acceleration does the rest. A step that these iterations
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -24,29 +24,31 @@ from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.pressure_elements import PressureElements
 from naibu.mechanics.finite_strain.lip_assembly import lips_of
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact, local_positions
-from naibu.mechanics.finite_strain.penalties import with_less_penetration
 from naibu.mechanics.finite_strain.sessions.condensed_contact import CondensedContact, ContactBesideTangent
 from naibu.mechanics.finite_strain.sessions.dynamic_session import PENETRATION, DynamicEngine, DynamicSession, DynamicState
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent, SolverPool, TangentThread
-from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import changing_lips, lips_about_to_change
+from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import changing_lips
+from naibu.mechanics.finite_strain.sessions.nodes_ahead import nodes_ahead
+from naibu.mechanics.finite_strain.sessions.session_checks import dead_load
+from naibu.mechanics.finite_strain.sessions.trial_displacement import FELT, PASSABLE, Trial
 from naibu.mechanics.linear_algebra.anderson import AndersonMixing
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern, block_pattern, with_dirichlet_rows
 from naibu.mechanics.linear_algebra.updated_factors import UpdatedFactors
 
 ITERATIONS = 5  # of a step at most
-USUAL = 2  # of a step whose out-of-balance force is then below PASSABLE
+USUAL = 2  # of a step whose balance is then passable
 DEPTH = 4  # earlier iterations that are mixed
-FINISHED = 1e-2  # out-of-balance force, as a fraction of all forces, at which a step ends
-SETTLED = 1e-3  # below which no iteration is worth while
-PASSABLE = 5e-2
-VOLUME_ERROR = 3e-4  # difference of the volume strain and that of its pressure
-ACCEPTED = 0.2  # out-of-balance force of a step that has used up its iterations; the next steps take up what is left
+FAINT = 1e-5  # strain of the body under contact forces too small to be told from none
+ACCEPTED = 0.06  # of a step that has used up its iterations; where it was 0.2, some later steps found no balance and took seconds
 BUDGET_S = 0.01  # of a processor for a step, after which a passable balance is taken; one that is worse goes on, and real time is lost
 DIVERGED = 1e6  # out-of-balance force from which a step is tried from another beginning
+FURTHER, NEARER = 5, 0.7  # more of them, where the others reduced the error to so much of what it was before
+FEW = 200  # nodes of contact at most with which they cost less than a tangent of the step's own
+UNLIKELY = 0.3  # error at the end of the motion from which the body at rest is tried
+SPARE = 8  # nodes for which a step that took no iteration prepares the inverse, if they are about to be in contact and it is not known
 JUMP = 10.0  # its growth from which earlier iterations are forgotten, as where contacts close
-AHEAD = 240  # nodes in contact, or about to be, for which the inverse is prepared
-REACH = 0.2  # extents of the body around an indenter in which they are sought
-STIFFEST = 16.0  # times the penalty of the engine, to which penalties rise: stiffer ones need more iterations
+STIFFEST = 16.0  # times the first penalty, to which penalties rise: stiffer ones need more iterations
+RAISE = 1.3  # of a penalty in a step; where it leaps, pressure and limit of friction do, and the surface slips to another equilibrium
 PERIOD = 10  # steps after which a tangent is renewed without a thread
 
 
@@ -84,23 +86,7 @@ class RealTimeEngine(DynamicEngine):
         indenters: Sequence[RigidIndenter] = (),
     ) -> RealTimeSession:
         """Begin a session; see `DynamicEngine.session`."""
-        load = np.broadcast_to(np.asarray(0.0 if external_force is None else external_force, dtype=float), self.points.shape)
-        return RealTimeSession(self, load, self.rest()).begun(state, constrained, indenters)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Trial:
-    """A displacement and its pressures, and what is out of balance there."""
-
-    displacement: FloatArray
-    pressure: FloatArray
-    balance: FloatArray  # all forces but those of contact, those on constrained nodes included
-    contact: FloatArray
-    mismatch: FloatArray
-    error: float
-
-    def better(self, other: _Trial | None) -> _Trial:
-        return self if other is None or self.error <= other.error else other
+        return RealTimeSession(self, dead_load(external_force, self.points), self.rest()).begun(state, constrained, indenters)
 
 
 @dataclass(slots=True, eq=False)
@@ -116,7 +102,8 @@ class RealTimeSession(DynamicSession):
     iterations : int
         Quasi-Newton iterations so far.
     unbalanced : float
-        Out-of-balance force at the end of the last step, as a fraction of the sum of all forces; the next steps take it up.
+        Sum of the nodes' out-of-balance forces at the end of the last step, which the next steps take up, as a fraction of the sum of all
+        forces or of those of contact, whichever is more.
     """
 
     newton_steps: int = field(init=False, default=0)
@@ -130,10 +117,11 @@ class RealTimeSession(DynamicSession):
     _places: tuple[Int32Array, ...] = field(init=False, default=())
     _pressure: FloatArray | None = field(init=False, default=None)
     _condensed: CondensedContact | None = field(init=False, default=None)
-    _trial: _Trial | None = field(init=False, default=None)
+    _trial: Trial | None = field(init=False, default=None)
     _elements: PressureElements = field(init=False, repr=False)  # with the normals of the sides of cuts when the step begins
     _seen: FloatArray | None = field(init=False, default=None)
     _age: int = field(init=False, default=0)
+    _spare: bool = field(init=False, default=False)  # whether the last step took no iteration
 
     def press(self, indenters: Sequence[RigidIndenter]) -> None:
         """Bring these indenters, and no others, into play; see `DynamicSession.press`."""
@@ -145,6 +133,10 @@ class RealTimeSession(DynamicSession):
         """Go on from a state; see `DynamicSession.restore`."""
         DynamicSession.restore(self, state)
         self._pressure, self._near, self._gaps, self._trial = None, (), (), None
+
+    def keep_tangent(self) -> None:
+        """Have the tangent of the state reached at hand for the next sessions of the engine, in place of that of the body at rest."""
+        self._engine._rest[:] = [self._untouched(self.reached.displacement)]
 
     def close(self) -> None:
         """End the thread and release the factors."""
@@ -172,9 +164,11 @@ class RealTimeSession(DynamicSession):
         u = self._balanced(h, moving, contacts)
         if u is None or self.unbalanced > PASSABLE:
             return contacts, u
-        stiffer = with_less_penetration(contacts, self._depths(contacts, u), PENETRATION) or contacts
-        most = STIFFEST * self.engine.normal_stiffness
-        return tuple(replace(c, normal_stiffness=np.minimum(c.normal_stiffness, most)) for c in stiffer), u
+        out = []
+        for c, first, depth in zip(contacts, self._templates, self._depths(contacts, u), strict=True):
+            raised = np.minimum(RAISE * c.normal_stiffness, STIFFEST * first.normal_stiffness)
+            out.append(replace(c, normal_stiffness=np.where(depth > PENETRATION, raised, c.normal_stiffness)))
+        return tuple(out), u
 
     def _balanced(self, h: float, moving: FloatArray, contacts: tuple[Contact, ...]) -> FloatArray | None:
         """Return the displacement that balances momentum after a time `h`; by Newton's method where it is not found in real time."""
@@ -196,7 +190,7 @@ class RealTimeSession(DynamicSession):
             depth[near.points] = -near.gap / near.contact.element_size
         return depths
 
-    def _quasi_newton(self, moving: FloatArray, contacts: tuple[Contact, ...]) -> _Trial | None:
+    def _quasi_newton(self, moving: FloatArray, contacts: tuple[Contact, ...]) -> Trial | None:
         """Return the balance at the end of a step, or None."""
         tangent, start, h = self._current_tangent(), self.reached, self.engine.step
         self._elements = replace(self._engine._elements, assembler=self.engine.assembler.in_step(start.displacement))
@@ -212,8 +206,7 @@ class RealTimeSession(DynamicSession):
         pressure = self._pressure
         if pressure is None:
             pressure = self._engine._elements.bulk * self._engine._elements.dilatation(start.displacement)[0]
-
-        deadline = time.thread_time() + BUDGET_S if self._engine.background else np.inf
+        before, deadline = self.iterations, (time.thread_time() + BUDGET_S if self._engine.background else np.inf)
         best = self._from_guesses(tangent, moving, inertial, pressure, deadline)
         if best is None or best.error > ACCEPTED:
             self.waits += 1
@@ -222,34 +215,54 @@ class RealTimeSession(DynamicSession):
             return None
         for near in self._near:  # gaps and responses are those of the last trial
             near.add_force(best.displacement, np.zeros_like(best.displacement))
-        self.unbalanced = best.error
+        self.unbalanced, self._spare = max(best.error, best.felt), self.iterations == before
         return best
 
     def _from_guesses(
         self, tangent: EarlierTangent, moving: FloatArray, inertial: FloatArray, pressure: FloatArray, deadline: float
-    ) -> _Trial | None:
-        """Return the best that is found from where the motion leads, or else from where the body is."""
-        start, best = self.reached, None
-        for guess in (inertial, start.displacement):
-            target = np.where(self._constrained, start.displacement, guess)
-            for nodes, speed in zip(self.bodies, moving, strict=True):
-                target[nodes] = start.displacement[nodes] + self.engine.step * speed
-            first = self._tried(target, inertial, pressure)
-            if first is not None:
-                best = self._iterated(tangent, first, inertial, deadline).better(best)
-                if best.error <= ACCEPTED:
-                    break
+    ) -> Trial | None:
+        """Return the best that is found from the guesses, one after the other until a balance is accepted."""
+        best = None
+        for first, near, most in self._guesses(tangent, moving, inertial, pressure):
+            best = self._iterated(near, first, inertial, deadline, most).better(best)
+            if best.error <= ACCEPTED:
+                break
         return best
 
-    def _iterated(self, tangent: EarlierTangent, trial: _Trial, inertial: FloatArray, deadline: float) -> _Trial:
-        """Return the best that the iterations find from a beginning, in the time of a processor that there is."""
-        mixing, best = AndersonMixing(DEPTH), trial
-        for k in range(ITERATIONS):
-            wrong = float(np.abs(trial.mismatch / self._engine._elements.bulk).max())
-            passable = trial.error <= PASSABLE and wrong <= 10.0 * VOLUME_ERROR
-            if trial.error <= (FINISHED if k else SETTLED) and wrong <= VOLUME_ERROR:
+    def _guesses(
+        self, tangent: EarlierTangent, moving: FloatArray, inertial: FloatArray, pressure: FloatArray
+    ) -> Iterator[tuple[Trial, EarlierTangent, int]]:
+        """Yield where the motion leads and where the body is, with the tangent; before them its rest, if nearer: tools leave it fast."""
+        first = self._guessed(inertial, moving, inertial, pressure)
+        if first is None or first.error > UNLIKELY:
+            for kept in self._engine._rest:
+                rest = self._guessed(np.zeros_like(inertial), moving, inertial, np.zeros_like(pressure))
+                if rest is not None and np.array_equal(kept.held, tangent.held) and (first is None or rest.error < first.error):
+                    yield rest, kept, USUAL
+        if first is not None:
+            yield first, tangent, ITERATIONS + FURTHER
+        still = self._guessed(self.reached.displacement, moving, inertial, pressure)
+        if still is not None:
+            yield still, tangent, ITERATIONS + FURTHER
+
+    def _guessed(self, guess: FloatArray, moving: FloatArray, inertial: FloatArray, pressure: FloatArray) -> Trial | None:
+        """Return what is out of balance at a guess of the displacement (n, 3), mm, with bodies where they are led."""
+        start = self.reached.displacement
+        target = np.where(self._constrained, start, guess)
+        for nodes, speed in zip(self.bodies, moving, strict=True):
+            target[nodes] = start[nodes] + self.engine.step * speed
+        return self._tried(target, inertial, pressure)
+
+    def _iterated(self, tangent: EarlierTangent, trial: Trial, inertial: FloatArray, deadline: float, most: int) -> Trial:
+        """Return the best that at most so many iterations find from a beginning, in the time of a processor that there is."""
+        mixing, best, begun, bulk = AndersonMixing(DEPTH), trial, trial.error, self._engine._elements.bulk
+        for k in range(most):
+            many = self._condensed is not None and len(self._condensed.nodes) > FEW
+            if k == ITERATIONS and (best.error <= ACCEPTED or best.error > NEARER * begun or many):
+                break
+            if trial.finished(bulk, begun=k > 0):
                 return trial
-            if passable and k and (k >= USUAL or time.thread_time() > deadline):
+            if k and trial.passable(bulk) and ((k >= USUAL and trial.felt <= FELT) or time.thread_time() > deadline):
                 return trial
             after = self._improved(tangent, trial, inertial, mixing)
             if after is None or after.error > DIVERGED:
@@ -260,7 +273,7 @@ class RealTimeSession(DynamicSession):
             best = trial.better(best if k else None)
         return best
 
-    def _improved(self, tangent: EarlierTangent, trial: _Trial, inertial: FloatArray, mixing: AndersonMixing) -> _Trial | None:
+    def _improved(self, tangent: EarlierTangent, trial: Trial, inertial: FloatArray, mixing: AndersonMixing) -> Trial | None:
         """Return the end of one quasi-Newton iteration; None where it inverts an element."""
         elements = self._engine._elements
         self.iterations += 1
@@ -283,7 +296,7 @@ class RealTimeSession(DynamicSession):
                 return after
         return None
 
-    def _tried(self, u: FloatArray, inertial: FloatArray, pressure: FloatArray) -> _Trial | None:
+    def _tried(self, u: FloatArray, inertial: FloatArray, pressure: FloatArray) -> Trial | None:
         """Return what is out of balance at a displacement; None where an element is inverted."""
         engine = self._engine
         balance, mismatch, smallest = self._elements.forces(u, pressure)
@@ -293,11 +306,13 @@ class RealTimeSession(DynamicSession):
         for near in self._near:
             near.add_force(u, contact)
         residual, allowed = self._implicit_step(engine.step, ()).balance(u, balance, contact)
-        scale = float(allowed / engine.tolerance + np.abs(contact).sum())
+        wrong, touching = float(np.abs(residual).sum()), float(np.abs(contact).sum())
         balance += (engine.mass / engine.step**2)[:, None] * (u - inertial) - self.external_force
-        return _Trial(u, pressure, balance, contact, mismatch, float(np.abs(residual).sum()) / scale)
+        error = wrong / (float(allowed) / engine.tolerance + touching)
+        felt = wrong / (touching + FAINT * engine._modulus * engine._extent**2) if touching else 0.0
+        return Trial(u, pressure, balance, contact, mismatch, error, felt)
 
-    def _with_contact(self, tangent: EarlierTangent, trial: _Trial, balance: FloatArray, first: bool) -> FloatArray:
+    def _with_contact(self, tangent: EarlierTangent, trial: Trial, balance: FloatArray, first: bool) -> FloatArray:
         """Return the step (n, 3), mm, that brings a balance (n, 3), mN, without contact to zero, with contacts as they then are."""
         balance[self._constrained] = 0.0
         x = -tangent.factors.solve(balance.ravel())
@@ -323,21 +338,17 @@ class RealTimeSession(DynamicSession):
                 condensed = self._condensed = CondensedContact(tangent, nodes)
             nodes = condensed.nodes
             hold = 1e3 * float(self._engine._elements.bulk.max()) * self.engine._extent
-            places = [*self._places, self._engine._pairs]
+            places = [*self._places, *([self._engine._pairs] if lips else [])]
             law = ContactBesideTangent(nodes, trial.displacement, [*active, *lips], places, self._engine._surface, tangent, gripped, hold)
-            begin = self._carried(trial.displacement) - trial.displacement if first else np.zeros_like(free)
+            begin = np.zeros_like(free)  # but nodes that indenters touch are carried along by them
+            for near, gaps in zip(self._near if first else (), self._gaps, strict=False):
+                carried = near.contact.nodes[gaps[near.points] < 0.0]
+                way = near.contact.stop - near.contact.start
+                begin[carried] = self.reached.displacement[carried] + way - trial.displacement[carried]
             force = condensed.forces(free[nodes], law, begin[nodes], 1e-5 * self.engine._extent, 0.05 * self.engine._extent)
             tangent.factors.add_columns(nodes, force, x)
         free[self._constrained] = 0.0
         return free
-
-    def _carried(self, trial: FloatArray) -> FloatArray:
-        """Return the displacement (n, 3), mm, of a trial, with the nodes that indenters touch carried along by them."""
-        out = trial.copy()
-        for near, gaps in zip(self._near, self._gaps, strict=True):
-            nodes = near.contact.nodes[gaps[near.points] < 0.0]
-            out[nodes] = self.reached.displacement[nodes] + near.contact.stop - near.contact.start
-        return out
 
     def _accepted(self, h: float, u: FloatArray, contacts: tuple[Contact, ...], spin: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Keep the end of a step; returns the forces of the bodies and of the indenters, mN."""
@@ -353,47 +364,38 @@ class RealTimeSession(DynamicSession):
             anchors.append(local)
         self.reached = self._behind(h, u, contacts, spin, tuple(anchors))
         self._pressure, self._gaps = trial.pressure, tuple(gaps)
-        self._renew(self._soon_touched(contacts, gaps))
+        ahead = self._soon_touched(contacts, gaps)
+        self._renew(ahead)
+        if self._spare and self._earlier is not None:
+            self._earlier.factors.prepare(ahead[~self._earlier.factors.covered(ahead)][:SPARE])
         return np.array([(trial.balance - trial.contact)[nodes].sum(axis=0) for nodes in self.bodies]).reshape(-1, 3), of_indenters
 
     def _soon_touched(self, contacts: Sequence[Contact], gaps: Sequence[FloatArray]) -> IntArray:
-        """Nodes in contact, and those about to be, the nearest first."""
-        nodes, order = [np.zeros((0, self.engine.faces.shape[1]), np.int64)], [np.zeros(0)]
-        reach = REACH * self.engine._extent
-        for contact, gap in zip(contacts, gaps, strict=True):
-            near = np.flatnonzero(gap < reach)
-            nodes.append(contact.nodes[near])
-            order.append(np.maximum(gap[near], 0.0))
-        ranked = np.concatenate(nodes)[np.argsort(np.concatenate(order), kind="stable")].ravel()
-        first = ranked[np.sort(np.unique(ranked, return_index=True)[1])][:AHEAD]
-        lips = [lips_about_to_change(some, self.reached.displacement) for some in lips_of(self._engine.assembler)]
-        return np.concatenate([first, *lips]).astype(np.int64)
+        engine = self._engine
+        return nodes_ahead(contacts, gaps, engine.faces.shape[1], engine._extent, engine.assembler, self.reached.displacement)
 
     def _current_tangent(self) -> EarlierTangent:
         """Return the newest tangent; where there is none for these supports, it is made now."""
-        done = self._thread.take()
-        if done is not None:
+        if (done := self._thread.take()) is not None:
             self._take(done)
-        held = self._held()
         for known in (self._earlier, *self._engine._rest):
-            if known is not None and np.array_equal(known.held, held):
+            if known is not None and np.array_equal(known.held, self._held()):
                 self._earlier = known
                 return known
-        gaps = [local_positions(c, self.reached.displacement, 0.0)[1] for c in self._templates]
-        touched = self._soon_touched(self._templates, gaps)
-        self._engine._rest[:] = [self._made(np.zeros_like(self.engine.points), (), (), held, touched)]
-        self._earlier = self._engine._rest[0]
+        self._engine._rest[:] = [self._untouched(np.zeros_like(self.engine.points))]
+        self._earlier, self._seen = self._engine._rest[0], np.zeros_like(self.engine.points)
         return self._earlier
+
+    def _untouched(self, u: FloatArray) -> EarlierTangent:
+        """Return the tangent at a displacement without contacts of indenters."""
+        gaps = [local_positions(c, self.reached.displacement, 0.0)[1] for c in self._templates]
+        return self._made(u, (), (), self._held(), self._soon_touched(self._templates, gaps))
 
     def _renew(self, ahead: IntArray) -> None:
         """Have a tangent made of the state reached, if anything has changed since the last one."""
         u = self.reached.displacement
         still = self._seen is not None and float(np.abs(u - self._seen).max()) < 1e-4 * self.engine._extent
-        still &= (
-            self._earlier is not None
-            and self.unbalanced <= PASSABLE
-            and bool(self._earlier.factors.covered(ahead[: len(ahead) // 3]).all())
-        )
+        still &= self._earlier is not None and self.unbalanced <= PASSABLE and bool(self._earlier.factors.covered(ahead).all())
         self._age += 1
         if still or not self._thread.idle or (not self._engine.background and self._age < PERIOD):
             return
@@ -439,9 +441,8 @@ class RealTimeSession(DynamicSession):
         factors = UpdatedFactors(solver.factorize(with_dirichlet_rows(pattern.matrix(blocks), fixed)), len(u))
         factors.prepare(ahead)
         touched = np.unique(engine._surface.indices[(contact != 0.0).any(axis=(1, 2))]).astype(np.int64)
-        lips = [some.add(u, np.zeros_like(u))[1] for some in lips_of(engine.assembler)]
-        stiffness = np.concatenate([np.zeros((0, 3, 3)), *lips])
-        return EarlierTangent(factors, engine._elements.dilatation(u)[1], contact, held, touched, stiffness, solver)
+        lips = np.concatenate([np.zeros((0, 3, 3)), *(some.add(u, np.zeros_like(u))[1] for some in lips_of(engine.assembler))])
+        return EarlierTangent(factors, engine._elements.dilatation(u)[1], contact, held, touched, lips, solver)
 
     def _release(self, tangent: EarlierTangent | None) -> None:
         """Let the solver of a tangent factorize again, unless the tangent is kept for the next session."""

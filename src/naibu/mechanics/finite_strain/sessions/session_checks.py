@@ -30,6 +30,24 @@ def checked_bodies(constrained: Sequence[ArrayLike], n_points: int, bodies: int)
     return chosen + tuple(np.zeros(0, np.int64) for _ in range(bodies - len(chosen)))
 
 
+def dead_load(external_force: ArrayLike | None, points: FloatArray) -> FloatArray:
+    """Return a load (n, 3), mN, on the nodes of points (n, 3), mm: None is none, and one force that of every node.
+
+    Raises
+    ------
+    InputError
+        A load of another shape, or that is not finite.
+    """
+    load = np.asarray(0.0 if external_force is None else external_force, dtype=float)
+    try:
+        spread = np.broadcast_to(load, points.shape)
+    except ValueError as error:
+        raise InputError(f"external_force has shape {load.shape}; give one force (3,) or those of all nodes {points.shape}") from error
+    if not np.isfinite(load).all():
+        raise InputError("external_force has values that are not finite; replace them")
+    return spread
+
+
 def checked_velocities(
     indenters: Sequence[RigidIndenter], motions: Sequence[IndenterMotion], centres: FloatArray, rotations: FloatArray, duration_s: float
 ) -> tuple[FloatArray, FloatArray]:

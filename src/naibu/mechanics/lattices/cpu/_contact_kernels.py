@@ -9,55 +9,59 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import njit
-from naibu.mechanics.lattices.cpu._coarse_kernels import begin_with
 from naibu.mechanics.lattices.cpu._contact_history import keep, pull_off, update_multipliers
 from naibu.mechanics.lattices.cpu._contact_operator import FACES, NODES, add_contact, close_operator
 from naibu.mechanics.lattices.cpu._contact_points import SLIDE, assemble, look, near_faces
-from naibu.mechanics.lattices.cpu._implicit_kernels import (
+from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import begin_with
+from naibu.mechanics.lattices.cpu.implicit._implicit_kernels import (
     add_momenta,
     add_reactions,
     advance,
     extrapolated_velocity,
     improved_velocity,
 )
+from naibu.mechanics.lattices.cpu.implicit._solver_parts import OPERATOR
 
 AGREED = 1e-4  # error of the pressures, as a fraction of their sum, at which a step is settled
 AGREED_FRICTION = 2e-3  # likewise of the friction, of the sum of its limits
 
 
 @njit(cache=True)
-def _settle(engine, held, contact, base, right, ahead, smoother, most):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _settle(engine, contact, base, right, ahead, smoother, most):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Solve a step until its contacts agree with the solution; return iterations, passes, what the solver lost, and whether they agree.
 
     The first pass reduces the residual by the tolerance; those that follow, whose contacts differ little, reduce theirs to the same size.
 
-    `engine` are what `extrapolated_velocity` takes; `contact` what `look` takes behind the step, and what is scratch; `base` the right side
-    without contact (3 pad,); `ahead` what the velocity changed by in the step before
-    (3 pad,), and the share of it that was added to v. Returns last the share that was right.
+    `engine` are the data of the step, with `right` among them, and the limits of the solver; `contact` what `look` takes behind the step,
+    and what is scratch; `base` the right side without contact (3 pad,); `ahead` what the velocity changed by in the step before (3 pad,),
+    and the share of it that was added to v. Returns last the share that was right.
     """
-    blocks, tables, x, v, y, mass, work, inner, step, solver = engine
+    data, solver = engine
+    v, (_, r, _, _), inner = data[0][3], data[0][4], data[0][5]
+    x, step = data[1][0], data[1][6]
     count, indenters, motion, surface, history, lists, slid, points, slot, diagonal = contact
-    operator, r = inner[9], work[1]
+    operator = inner[OPERATOR]
     iterations, lost, goal, share = 0, 0.0, 0.0, 0.0
-    look(count, x, v, step, indenters, motion, surface, history, lists, slid, points, True)
-    for attempt in range(most):
-        if attempt:  # the residual of the same solution with other contacts
-            add_contact(operator[0], operator[1], operator[5][FACES], 1.0, v, r)
-            for i in range(len(r)):
-                r[i] -= right[i]
-        right[:] = base
-        assemble(count, step, surface, lists, points[0], right, operator)
-        close_operator(operator, smoother, slot, diagonal)
-        if attempt:
-            for i in range(len(r)):
-                r[i] += right[i]
-            add_contact(operator[0], operator[1], operator[5][FACES], -1.0, v, r)
-            done, lost = improved_velocity(blocks, tables, x, v, mass, work, inner, held, goal, solver[1])
-        else:
-            done, lost, goal, share = extrapolated_velocity(blocks, tables, x, v, ahead, y, mass, right, work, inner, held, step, solver)
-        iterations += done
-        wrong, wrong_friction, total, limits = look(count, x, v, step, indenters, motion, surface, history, lists, slid, points, False)
-        if wrong <= AGREED * total and wrong_friction <= AGREED_FRICTION * limits + 1e-300:
+    for attempt in range(-1, most):  # before the first solution, points are linearized about the velocity as it is
+        if attempt >= 0:
+            if attempt:  # the residual of the same solution with other contacts
+                add_contact(operator[0], operator[1], operator[5][FACES], 1.0, v, r)
+                for i in range(len(r)):
+                    r[i] -= right[i]
+            right[:] = base
+            assemble(count, step, surface, lists, points[0], right, operator)
+            close_operator(operator, smoother, slot, diagonal)
+            if attempt:
+                for i in range(len(r)):
+                    r[i] += right[i]
+                add_contact(operator[0], operator[1], operator[5][FACES], -1.0, v, r)
+                done, lost = improved_velocity(data, goal, solver[1])
+            else:
+                done, lost, goal, share = extrapolated_velocity(data, ahead, solver)
+            iterations += done
+        begins = attempt < 0
+        wrong, wrong_friction, total, limits = look(count, x, v, step, indenters, motion, surface, history, lists, slid, points, begins)
+        if not begins and wrong <= AGREED * total and wrong_friction <= AGREED_FRICTION * limits + 1e-300:
             return iterations, attempt + 1, lost, True, share
     return iterations, most, lost, False, share
 
@@ -65,44 +69,58 @@ def _settle(engine, held, contact, base, right, ahead, smoother, most):  # type:
 @njit(cache=True)
 def _move_indenters(axes, centres, velocity, spin, step, traction, first):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Move and turn indenters by a step, and the friction at their points with them."""
-    centres += step * velocity
-    k = np.empty((3, 3))
+    unit, turn, old = np.empty(3), np.empty((3, 3)), np.empty(3)
     for q in range(len(centres)):
-        angle = step * np.sqrt(spin[q, 0] ** 2 + spin[q, 1] ** 2 + spin[q, 2] ** 2)
-        if angle > 0.0:  # Rodrigues' rotation of the axes, which are rows
-            k[:] = 0.0
-            k[2, 1], k[0, 2], k[1, 0] = spin[q, 0] * step / angle, spin[q, 1] * step / angle, spin[q, 2] * step / angle
-            turn = k - k.T
-            turned = (np.eye(3) + np.sin(angle) * turn + (1.0 - np.cos(angle)) * (turn @ turn)).T
-            axes[q] = axes[q] @ turned
-            for p in range(first[q], first[q + 1]):
-                if traction[p, 0] != 0.0 or traction[p, 1] != 0.0 or traction[p, 2] != 0.0:
-                    traction[p] = traction[p] @ turned
+        rate = np.sqrt(spin[q, 0] ** 2 + spin[q, 1] ** 2 + spin[q, 2] ** 2)
+        for a in range(3):
+            centres[q, a] += step * velocity[q, a]
+            unit[a] = spin[q, a] / rate if rate > 0.0 else 0.0
+        if rate == 0.0:
+            continue
+        sine, versine = np.sin(step * rate), 1.0 - np.cos(step * rate)
+        for a in range(3):  # Rodrigues' rotation
+            b, c = (a + 1) % 3, (a + 2) % 3
+            turn[a, a] = 1.0 - versine * (unit[b] ** 2 + unit[c] ** 2)
+            turn[c, b] = versine * unit[b] * unit[c] + sine * unit[a]
+            turn[b, c] = versine * unit[b] * unit[c] - sine * unit[a]
+        for a in range(3):
+            _turn(turn, axes[q, a], old)
+        for p in range(first[q], first[q + 1]):
+            if traction[p, 0] != 0.0 or traction[p, 1] != 0.0 or traction[p, 2] != 0.0:
+                _turn(turn, traction[p], old)
+
+
+@njit(cache=True)
+def _turn(turn, vector, old):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Turn a vector (3,) by a rotation (3, 3); `old` is scratch."""
+    for a in range(3):
+        old[a] = vector[a]
+    for a in range(3):
+        vector[a] = turn[a, 0] * old[0] + turn[a, 1] * old[1] + turn[a, 2] * old[2]
 
 
 @njit(cache=True, nogil=True)
-def contact_steps(  # type: ignore[no-untyped-def]  # pragma: no cover
-    blocks, tables, state, mass, external, work, inner, indenters, surface, history, scratch, held, motion, step, solver, reactions, most
-):
+def contact_steps(data, contact, weight, motion, solver, reactions, most):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Take len(velocity) steps in contact; state, `history`, axes and centres are changed, reactions filled.
 
-    `state` are x, v, y and lengths; `inner` those of the solver, with the operator of the contact; `indenters` shapes (geometry, axes),
-    centres (k, 3), friction (k, 2), pull-off (k, 3), curvature and depth from which the foundation is stiffer (k, 2); `surface` nodes of
-    the faces (f, 4), inverse areas (f, 4), foundation (f, 4), shape functions with inverse thickness (q, 5) and weights (p,) at the
-    points, and where points (k + 1,) and shape functions (k + 1,) of each indenter begin; `history` the arrays of `ContactState`;
-    `scratch` what `near_faces` lists, linearizations and what they exert, which points slide, slots of the nodes, their diagonal blocks,
-    four numbers a node (4, k, n), the mean acceleration in the step before (3, n) and how much of it lasted (1,), which are changed;
-    `held` node, direction, weight and body of constrained components; `motion` velocities of the bodies that move these (steps, bodies, 3),
-    velocities and angular velocities of the indenters (steps, k, 3); `reactions` those of the bodies and of the indenters; `most` the most
-    passes. Returns iterations, passes and the steps whose contacts did not settle.
+    `data` are those of an implicit step, with the operator of the contact; `contact` are indenters, surface, history, scratch and vectors:
+    shapes (geometry, axes), centres (k, 3), friction (k, 2), pull-off (k, 3), curvature and depth from which the foundation is stiffer
+    (k, 2) of the indenters; nodes of the faces (f, 4), inverse areas (f, 4), foundation (f, 4), shape functions with inverse thickness
+    (q, 5) and weights (p,) at the points, and where points (k + 1,) and shape functions (k + 1,) of each indenter begin; the arrays of
+    `ContactState`; what `near_faces` lists, linearizations and what they exert, which points slide, slots of the nodes, their diagonal
+    blocks, four numbers a node (4, k, n), the mean acceleration in the step before (3, n) and how much of it lasted (1,), which are
+    changed; and room for two vectors (3 pad,). Constrained components of `data` move by their weights times the velocities of their bodies;
+    `motion` are these (steps, bodies, 3), and velocities and angular velocities of the indenters (steps, k, 3); `solver` the limits of the
+    solver; `reactions` those of the bodies and of the indenters; `most` the most passes. Returns iterations, passes and the steps whose
+    contacts did not settle.
     """
-    x, v, y, lengths = state
+    (_, _, mass, v, work, inner, now), (x, _, _, before, right, external, step) = data
+    indenters, surface, history, scratch, (base, change) = contact
     (_, axes), centres, _, _, _ = indenters
     held_velocity, velocity, spin = motion
     lists, points, slid, slot, diagonal, nodal, trend, trust = scratch
-    operator, first = inner[9], surface[5]
-    now = (held[0], held[1], np.zeros(len(held[0])), held[3])
-    right, before, base, change = np.empty_like(x), np.empty_like(x), np.empty_like(x), np.zeros_like(x)
+    operator, first = inner[OPERATOR], surface[5]
+    change[:] = 0.0
     pad = len(mass)
     iterations, passes, unsettled = 0, 0, 0
     begin_with(inner, now)
@@ -111,8 +129,8 @@ def contact_steps(  # type: ignore[no-untyped-def]  # pragma: no cover
         base[:] = 0.0
         for i in range(len(external)):
             base[i] = step * external[i]
-        for h in range(len(held[0])):
-            now[2][h] = held[2][h] * (held[1][h] * held_velocity[n, held[3][h]]).sum()
+        for h in range(len(weight)):
+            now[2][h] = weight[h] * (now[1][h] * held_velocity[n, now[3][h]]).sum()
         moving = (velocity[n], spin[n])
         _move_indenters(axes, centres, velocity[n], spin[n], step, history[4], first)
         count = near_faces(x, v, step, indenters, moving, surface, lists)
@@ -122,13 +140,12 @@ def contact_steps(  # type: ignore[no-untyped-def]  # pragma: no cover
             k, each = lists[0][entry], surface[6][lists[0][entry] + 1] - surface[6][lists[0][entry]]
             for p in range(first[k] + lists[1][entry] * each, first[k] + (lists[1][entry] + 1) * each):
                 slid[p] = history[0][p] == SLIDE
-        contact = (count, indenters, moving, surface, history, lists, slid, points, slot, diagonal)
-        engine = (blocks, tables, x, v, y, mass, work, inner, step, solver)
+        found = (count, indenters, moving, surface, history, lists, slid, points, slot, diagonal)
         for a in range(3):
             for i in range(trend.shape[1]):
                 change[a * pad + i] = step * trend[a, i]
                 v[a * pad + i] += trust[0] * change[a * pad + i]
-        done, tries, lost, agreed, share = _settle(engine, now, contact, base, right, (change, trust[0]), inner[3], most)
+        done, tries, lost, agreed, share = _settle((data, solver), found, base, right, (change, trust[0]), inner[3], most)
         trust[0] = min(max(share, 0.0), 1.0)
         for a in range(3):
             for i in range(trend.shape[1]):
@@ -137,6 +154,6 @@ def contact_steps(  # type: ignore[no-untyped-def]  # pragma: no cover
         add_reactions(now, work[1], len(mass), step, reactions[0][n])
         keep(count, indenters, surface, history, lists, slid, points[1], reactions[1][n])
         update_multipliers(count, surface, history[5], lists, points[1], nodal)
-        advance(blocks, tables, x, v, before, y, lengths, mass, work[0], step, lost)
+        advance(data, lost)
     operator[5][FACES], operator[5][NODES] = 0, 0
     return iterations, passes, unsettled

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from naibu._numba.compilation import njit
+from naibu._numba.compilation import COUNTED, njit
 from naibu.core.arrays import AnyArray
 
 FACES, NODES = range(2)
@@ -25,7 +25,7 @@ def new_operator(faces: int, nodes: int) -> Operator:
     )  # fmt: skip
 
 
-@njit(cache=True, fastmath={"contract", "nsz", "reassoc"})
+@njit(cache=True, fastmath={"contract", "nsz", "reassoc"}, **COUNTED)
 def add_contact(corners, blocks, count, sign, p, q):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add to q (3 pad,) `sign` times what the blocks of `count` faces give for p, and return p times that."""
     pad = len(p) // 3

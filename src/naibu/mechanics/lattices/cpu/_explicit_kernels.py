@@ -3,15 +3,15 @@
 # arrays of nodes hold x, y and z one after the other, each with `pad` places; y is the extension of the Voigt parts, as blocks store it
 from __future__ import annotations
 
-from naibu._numba.compilation import njit
+from naibu._numba.compilation import UNCOUNTED, njit
 from naibu._numba.simd import WIDTH, inverse_root, load, splat, store
-from naibu._numba.thread_pool import ALONE, JOB, PARTS, adapt, claim, finish, next_part, publish, wait
+from naibu._numba.thread_pool import JOB, begin_step, end_job, end_step, finish, first_part, following_part, next_part
 
 _FAST = {"contract", "nsz"}
 FORCES = 0  # the first job of a step; the second one moves the nodes
 
 
-@njit(cache=True, fastmath=_FAST)
+@njit(cache=True, fastmath=_FAST, **UNCOUNTED)
 def element_forces(first, second, rows, tables, x, v, y, f, pad, begin, end):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add the forces of blocks to f and move their extensions on by a step of Euler's; tables are A, B, D dt and G dt."""
     ta, tb, td, tg = tables
@@ -42,7 +42,7 @@ def element_forces(first, second, rows, tables, x, v, y, f, pad, begin, end):  #
         store(f2, i, load(f2, i) + fz)
 
 
-@njit(cache=True, fastmath=_FAST)
+@njit(cache=True, fastmath=_FAST, **UNCOUNTED)
 def drive(constrained, velocity, v, f, mass, step, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Change the forces on constrained nodes so that they take on the velocity of their bodies (bodies, 3), mm/s, along the directions.
 
@@ -61,7 +61,7 @@ def drive(constrained, velocity, v, f, mass, step, reaction):  # type: ignore[no
             f[a * pad + i] += lack * direction[h, a]
 
 
-@njit(cache=True, fastmath=_FAST)
+@njit(cache=True, fastmath=_FAST, **UNCOUNTED)
 def move(x, v, f, inverse_mass, step, forward, pad, begin, end):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Move nodes by a step: by the velocity before it if `forward` (Euler's method as in the report), by that after it if not."""
     dt = splat(step)
@@ -74,7 +74,7 @@ def move(x, v, f, inverse_mass, step, forward, pad, begin, end):  # type: ignore
             store(xa, i, load(xa, i) + dt * (old if forward else new))
 
 
-@njit(cache=True, fastmath=_FAST)
+@njit(cache=True, fastmath=_FAST, **UNCOUNTED)
 def _gather(forces, external, low, high, begin, end, p, pad):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add to the forces of part p what other parts and external forces exert on the nodes begin to end."""
     f = forces[p]
@@ -89,7 +89,7 @@ def _gather(forces, external, low, high, begin, end, p, pad):  # type: ignore[no
                 f[place] += external[place]
 
 
-@njit(cache=True, fastmath=_FAST)
+@njit(cache=True, fastmath=_FAST, **UNCOUNTED)
 def _part(job, p, data):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Do part p of a step's first job, the forces of its blocks, or of the second, the motion of its nodes; see `explicit_steps`."""
     (
@@ -119,24 +119,17 @@ def _part(job, p, data):  # type: ignore[no-untyped-def]  # pragma: no cover
     move(x, v, f, inverse_mass, step, forward, pad, nodes[p], nodes[p + 1])
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _share(control, job, data):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Have all parts of a job done; return how many naps it took to wait for workers."""
-    alone, part = control[PARTS] == 1 or control[ALONE] > 0, 0
-    if not alone:
-        publish(control, job)
-        part = claim(control)
-    while 0 <= part < control[PARTS]:
+    """Have all parts of a job done."""
+    part = first_part(control, job)
+    while part >= 0:
         _part(job, part, data)
-        if alone:
-            part += 1
-        else:
-            finish(control)
-            part = claim(control)
-    return 0 if alone else wait(control)
+        part = following_part(control, part)
+    end_job(control)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, **UNCOUNTED)
 def explicit_worker(control, data):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Take parts of the jobs of `explicit_steps` while there are some."""
     part = next_part(control)
@@ -146,7 +139,7 @@ def explicit_worker(control, data):  # type: ignore[no-untyped-def]  # pragma: n
         part = next_part(control)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, **UNCOUNTED)
 def explicit_steps(control, data, velocity, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Take len(velocity) steps, alone or with workers, who change nothing in the result; reaction (steps, bodies, 3) is filled.
 
@@ -160,11 +153,15 @@ def explicit_steps(control, data, velocity, reaction):  # type: ignore[no-untype
     """
     now, fractions = data[7]
     for n in range(len(velocity)):
-        now[:] = velocity[n]
-        naps = 0
+        for k in range(len(now)):
+            for a in range(3):
+                now[k, a] = velocity[n, k, a]
+        begin_step(control)
         for job in range(2):
-            naps += _share(control, job, data)
-        adapt(control, naps)
-        reaction[n] = 0.0
-        for p in range(len(fractions)):
-            reaction[n] += fractions[p]
+            _share(control, job, data)
+        end_step(control, 1)
+        for k in range(len(now)):
+            for a in range(3):
+                reaction[n, k, a] = 0.0
+                for p in range(len(fractions)):
+                    reaction[n, k, a] += fractions[p, k, a]

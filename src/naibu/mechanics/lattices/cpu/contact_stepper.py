@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from naibu._numba.packed_tuples import packed
 from naibu.core.arrays import AnyArray, FloatArray
 from naibu.mechanics.contact.indenter_geometry import GeometryArrays, packed_geometries
 from naibu.mechanics.contact.indenter_motion import SHARE, step_parts
@@ -15,7 +16,8 @@ from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.lattices.cpu._contact_kernels import contact_steps
 from naibu.mechanics.lattices.cpu._contact_operator import new_operator
 from naibu.mechanics.lattices.cpu._contact_points import COLUMNS, RESULTS, rest_at
-from naibu.mechanics.lattices.cpu.scratch import KernelTuple
+from naibu.mechanics.lattices.cpu.implicit._solver_parts import POOL
+from naibu.mechanics.lattices.cpu.scratch import KernelTuple, PackedArguments
 from naibu.mechanics.lattices.cpu.stepper import MOST_ITERATIONS, ImplicitStepper
 from naibu.mechanics.lattices.model.contact_state import ContactState
 from naibu.mechanics.lattices.model.contact_surface import ContactSurface
@@ -74,7 +76,7 @@ class ContactStepper:
     scratch: KernelTuple
     _fastest: FloatArray = field(init=False)  # (k,), mm/s, at which no indenter passes through the surface in a step
     _finer: dict[int, ImplicitStepper] = field(default_factory=dict)
-    _foundation: dict[int, FloatArray] = field(default_factory=dict)
+    _arguments: dict[int, tuple[KernelTuple, PackedArguments, PackedArguments]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._fastest = SHARE / self.base.step * np.array([p.geometry.inradius for p in self.indenters])
@@ -95,8 +97,8 @@ class ContactStepper:
         if not own.begun:
             own.begun[...] = True
             corners, spread, *rest = points
-            shapes = ((geometry, own.axes), own.centres, friction, pull, form)
-            rest_at(base.position, shapes, (corners, spread, surface.foundation(base.step), *rest), own.compression)
+            faces = (corners, spread, surface.foundation(base.step), *rest)
+            rest_at(base.position, packed(*stepper._shapes()), packed(*faces), own.compression)
         stepper._look_everywhere()
         return stepper
 
@@ -151,23 +153,31 @@ class ContactStepper:
         reactions: tuple[FloatArray, FloatArray],
     ) -> tuple[int, int, int]:  # fmt: skip
         """Take steps of a stepper that shares the state."""
-        contact = self.contact
-        if parts not in self._foundation:
-            self._foundation[parts] = self.surface.foundation(base.step)
-        history = (contact.mode, contact.touched, contact.compression, contact.extension, contact.friction, contact.multiplier)
-        indenters = ((self.geometry, contact.axes), contact.centres, self.friction, self.pull, self.form)
-        corners, spread, *rest = self.points
-        (blocks, tables), (work, inner) = base.kernel, base.scratch
-        operator, *own = self.scratch
-        scratch = (*own, contact.acceleration, contact.lasting)
         for values in reactions:
             values[:] = 0.0
-        found: tuple[int, int, int] = contact_steps(
-            blocks, tables, (base.position, base.velocity, base.extension, base.length), base.mass, base.external, work,
-            (*inner[:9], operator), indenters, (corners, spread, self._foundation[parts], *rest), history, scratch,
-            base.constrained, (held_velocity, velocity, spin), base.step, (base.tolerance, MOST_ITERATIONS), reactions, self.passes,
-        )  # fmt: skip
+        data, own = self._arguments_of(base, parts)
+        motion, limits = (held_velocity, velocity, spin), (base.tolerance, MOST_ITERATIONS)
+        found: tuple[int, int, int] = contact_steps(data, own, base.constrained[2], motion, limits, reactions, self.passes)
         return found
+
+    def _arguments_of(self, base: ImplicitStepper, parts: int) -> tuple[PackedArguments, PackedArguments]:
+        """Return what the kernels read of a stepper that shares the state, and of the contact."""
+        known = self._arguments.get(parts)
+        if known is None or known[0] is not base.constrained:
+            (node, direction, _, body), (operator, *own), contact = base.constrained, self.scratch, self.contact
+            data = base.arguments(base.scratch[1][POOL], operator, (node, direction, np.zeros(len(node)), body))
+            history = (contact.mode, contact.touched, contact.compression, contact.extension, contact.friction, contact.multiplier)
+            corners, spread, *rest = self.points
+            surface = (corners, spread, self.surface.foundation(base.step), *rest)
+            vectors = tuple(np.zeros_like(base.position) for _ in range(2))
+            scratch = (*own, contact.acceleration, contact.lasting)
+            known = base.constrained, data, packed(self._shapes(), surface, history, scratch, vectors)
+            self._arguments[parts] = known
+        return known[1], known[2]
+
+    def _shapes(self) -> KernelTuple:
+        """Return the indenters as the kernels read them."""
+        return (self.geometry, self.contact.axes), self.contact.centres, self.friction, self.pull, self.form
 
     def _look_everywhere(self) -> None:
         """Forget how far indenters are from faces, and find the faces that hold something of a contact."""

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from naibu._numba.simd import WIDTH, aligned
-from naibu.core.arrays import AnyFloatArray, FloatArray, IntArray
-from naibu.mechanics.lattices.cpu.coarse_space import coarse_space
+from naibu.core.arrays import AnyFloatArray, BoolArray, FloatArray, IntArray
+from naibu.mechanics.lattices.cpu._block_kernels import add_to_keys, cover, in_order, mark_filled, number_kinds, tabulate
+from naibu.mechanics.lattices.cpu.implicit.coarse_space import coarse_space
 from naibu.mechanics.lattices.cpu.scratch import KernelTuple, ScratchPool
 from naibu.mechanics.lattices.model.coefficients import explicit_coefficients, implicit_coefficients
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
-
-_STRIDE = 4  # a neighbour along y, z or a diagonal, and the two beside it along x, overlap
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,50 +39,83 @@ class Blocks:
     @classmethod
     def of(cls, lattice: Lattice) -> Blocks:
         """Cover the elements of a lattice by blocks."""
-        i, j = np.sort(lattice.elements, axis=1).T
-        tile = i // WIDTH
-        order = np.lexsort((j - i, tile))
-        change = np.flatnonzero(np.diff(tile[order], prepend=-1) | np.diff((j - i)[order], prepend=-1))
-        block = np.repeat(np.arange(len(change)), np.diff(change, append=len(order)))
-        first, gap = WIDTH * tile[order][change], (j - i)[order][change]
-        turn = _spread(first)
-        place = np.empty(len(turn), dtype=np.int64)
-        place[turn] = np.arange(len(turn))
-        position = np.empty(len(order), dtype=np.int64)
-        position[order] = WIDTH * place[block] + i[order] % WIDTH
-        return cls(first[turn], (first + gap)[turn], position, lattice.n_nodes)
+        pairs, m = np.ascontiguousarray(lattice.elements), lattice.n_elements
+        order = None
+        if not in_order(pairs):
+            order = np.argsort(pairs.min(axis=1) // WIDTH, kind="stable")
+            pairs = pairs[order]
+        gaps, first, second, lane = (np.empty(m, dtype=np.int64) for _ in range(4))  # of all but the lanes only a part is touched
+        count = cover(pairs, gaps, first, second, lane)
+        if order is not None:
+            sorted_lane = lane.copy()
+            lane[order] = sorted_lane
+        for array in (first, second):
+            array.resize(count, refcheck=False)
+        return cls(first, second, lane, lattice.n_nodes)
 
     @property
     def n_blocks(self) -> int:
         """Number of blocks."""
         return len(self.first)
 
-    def stored(self, values: FloatArray, dtype: type[np.floating] = np.float64) -> AnyFloatArray:
-        """Return values (m,) as they lie in blocks (8 nb,), zero where there is no element."""
-        result = np.zeros(WIDTH * self.n_blocks, dtype=dtype)
-        result[self.lane] = values
-        return result
+    def parts(self, count: int, end: int) -> tuple[IntArray, IntArray, IntArray]:
+        """Return where blocks and nodes, up to `end`, of parts begin (count + 1,), and where the nodes end that they reach (count,)."""
+        nodes = np.append(np.round(np.arange(count) * self.n_nodes / count / WIDTH).astype(np.int64) * WIDTH, end)
+        cuts = np.searchsorted(self.first, nodes)
+        reached = [self.second[i:j].max(initial=0) + WIDTH for i, j in pairwise(cuts)]
+        return cuts, nodes, np.maximum(np.array(reached), nodes[1:])
 
-    def patterns(self, *columns: FloatArray, dtype: type[np.floating] = np.float64) -> tuple[IntArray, list[AnyFloatArray]]:
-        """Return where the coefficients of every block start, (nb,), in tables that hold equal ones once; zero in empty lanes.
+    def patterns(self, *columns: FloatArray) -> tuple[IntArray, list[FloatArray]]:
+        """Return where the values of every block start, (nb,), in tables that hold equal ones once; zero in empty lanes.
 
-        Most blocks of a lattice with few parameters share theirs, so that the tables stay in the fast cache.
+        Most blocks of a lattice with few parameters share theirs, so that the tables stay in the fast cache. Blocks are told apart by one
+        number each, made from the bits of their values; should two kinds share a number, blocks are sorted.
         """
-        wide = np.concatenate([self.stored(column).reshape(-1, WIDTH) for column in columns], axis=1)
-        rows = np.ascontiguousarray(wide).view([("", wide.dtype)] * wide.shape[1]).ravel()
-        _, chosen, number = np.unique(rows, return_index=True, return_inverse=True)
-        kept = wide[chosen]
-        tables = [np.ascontiguousarray(kept[:, WIDTH * c : WIDTH * (c + 1)]).astype(dtype).ravel() for c in range(len(columns))]
-        return WIDTH * number.ravel().astype(np.int64), tables
+        filled = np.zeros(self.n_blocks, dtype=np.uint8)
+        mark_filled(self.lane, filled)
+        bits = [np.ascontiguousarray(column, dtype=np.float64).view(np.uint64) for column in columns]
+        kind, count = _kinds(self._keys(filled, bits))
+        kept = np.zeros(count, dtype=np.uint8)
+        kept[kind] = filled
+        tables = [np.zeros(WIDTH * count, dtype=np.uint64) for _ in columns]
+        alike = np.array_equal(kept[kind], filled)
+        if not (alike and all(tabulate(self.lane, kind, own, table) for own, table in zip(bits, tables, strict=True))):
+            kind, tables = self._sorted_patterns(filled, bits)
+        kind *= WIDTH
+        return kind, [table.view(np.float64) for table in tables]
+
+    def parameter_patterns(self, parameters: LatticeParameters) -> tuple[IntArray, LatticeParameters, BoolArray]:
+        """Return where the parameters of every block start (nb,), those that differ, and which of these stand in empty lanes.
+
+        Coefficients of steps are worked out from them once, and not for every element. Those of empty lanes are finite.
+        """
+        rows, (k, c1, c2) = self.patterns(parameters.stiffness, parameters.voigt_damping, parameters.series_damping)
+        empty = c2 == 0.0  # C2 of elements is positive
+        c2[empty] = np.inf
+        return rows, LatticeParameters(k, c1, c2, np.full(len(k), 0.5)), empty
+
+    def _keys(self, filled: NDArray[np.uint8], bits: list[NDArray[np.uint64]]) -> NDArray[np.uint64]:
+        """Return a number for each block, the same for equal ones."""
+        keys = filled.astype(np.uint64)
+        for own in bits:
+            keys *= np.uint64(0x9FB21C651E98DF25)
+            add_to_keys(self.lane, own, keys)
+        return keys
+
+    def _sorted_patterns(self, filled: NDArray[np.uint8], bits: list[NDArray[np.uint64]]) -> tuple[IntArray, list[NDArray[np.uint64]]]:
+        """Return the kind of every block and the tables, from whole blocks."""
+        wide = np.zeros((len(bits), WIDTH * self.n_blocks), dtype=np.uint64)
+        wide[:, self.lane] = bits
+        rows = np.column_stack([filled, *wide.reshape(len(bits), -1, WIDTH)])
+        kept, kind = np.unique(rows, axis=0, return_inverse=True)
+        return kind.ravel().astype(np.int64), [np.ascontiguousarray(own).ravel() for own in np.split(kept[:, 1:], len(bits), axis=1)]
 
 
-def _spread(first: IntArray) -> IntArray:
-    """Return an order of blocks that keeps `first` sorted but sets apart blocks whose second nodes overlap.
-
-    These are neighbours by their distance; a processor stalls where it loads what it has just stored in other pieces.
-    """
-    rank = np.arange(len(first)) - np.searchsorted(first, first)
-    return np.lexsort((rank // _STRIDE, rank % _STRIDE, first))
+def _kinds(keys: NDArray[np.uint64]) -> tuple[IntArray, int]:
+    """Return the number of its kind for every key, and how many kinds there are."""
+    kind = np.empty(len(keys), dtype=np.int64)
+    places = np.zeros(2 << len(keys).bit_length(), dtype=np.int64)
+    return kind, int(number_kinds(keys, places, kind))
 
 
 def explicit_tables(parameters: LatticeParameters, step: float, forward: bool) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -103,27 +136,26 @@ def explicit_kernel(
 
     A part has blocks and nodes; the nodes that its blocks touch begin and end at the last two.
     """
-    rows, tables = blocks.patterns(*explicit_tables(parameters, step, forward), dtype=mass.dtype.type)
+    rows, own, empty = blocks.parameter_patterns(parameters)
+    tables = [np.where(empty, 0.0, table).astype(mass.dtype.type) for table in explicit_tables(own, step, forward)]
     inverse = np.divide(1.0, mass, out=np.zeros_like(mass), where=mass > 0.0)
-    first, second = blocks.first, blocks.second
-    nodes = np.append(np.round(np.arange(threads) * blocks.n_nodes / threads / WIDTH).astype(np.int64) * WIDTH, len(mass) - WIDTH)
-    cuts = np.searchsorted(first, nodes)
-    low = np.minimum(first[np.minimum(cuts[:-1], len(first) - 1)], nodes[:-1]) if len(first) else nodes[:-1]
-    ends = [second[i:j].max(initial=0) + WIDTH for i, j in pairwise(cuts)]
-    return (first, second, rows), tuple(tables), (mass, inverse), (cuts, nodes, low, np.maximum(np.array(ends), nodes[1:]))
+    cuts, nodes, high = blocks.parts(threads, len(mass) - WIDTH)
+    return (blocks.first, blocks.second, rows), tuple(tables), (mass, inverse), (cuts, nodes, nodes[:-1], high)
 
 
 def implicit_kernel(
-    lattice: Lattice, parameters: LatticeParameters, step: float, blocks: Blocks, mass: AnyFloatArray
+    lattice: Lattice, parameters: LatticeParameters, step: float, blocks: Blocks, mass: AnyFloatArray, threads: int
 ) -> tuple[KernelTuple, ScratchPool]:
     """Return what implicit steps need: blocks and tables, which they read only, and the pool of their scratch arrays."""
-    a, b, decay, g = implicit_coefficients(parameters, step)
-    rows, tables = blocks.patterns(a, b, decay, g, parameters.stiffness, step**2 * a)
+    rows, own, empty = blocks.parameter_patterns(parameters)
+    tables = [np.where(empty, 0.0, table) for table in (*implicit_coefficients(own, step), own.stiffness)]
+    tables.append(step**2 * tables[0])
+    stiff = tables[5][rows[blocks.lane // WIDTH] + blocks.lane % WIDTH]
     single, places, pad = np.float32, WIDTH * blocks.n_blocks, len(mass)
-    diagonal = np.bincount(lattice.elements.ravel(), np.repeat(step**2 * a / 3.0, 2), minlength=lattice.n_nodes) + lattice.node_mass
+    diagonal = np.bincount(lattice.elements.ravel(), np.repeat(stiff / 3.0, 2), minlength=lattice.n_nodes) + lattice.node_mass
     smoother, light = aligned((pad,), single), aligned((pad,), single)
     smoother[: lattice.n_nodes] = 1.0 / diagonal
     light[:] = mass
-    coarse = coarse_space(lattice, step**2 * a, diagonal, smoother, pad, 1)
+    coarse = coarse_space(lattice, stiff, diagonal, smoother, pad, threads)
     pool = ScratchPool(tables[5].astype(single), light, smoother, coarse, places)
     return ((blocks.first, blocks.second, rows), tuple(tables)), pool

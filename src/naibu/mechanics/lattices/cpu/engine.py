@@ -58,7 +58,7 @@ class LatticeEngine:
     tolerance : float
         Of the implicit solver, relative to the residual that the old velocity leaves.
     threads : int
-        Threads of the explicit steps.
+        Threads of a step; in contact with indenters there is one.
     kernel : tuple
         What the kernels read: blocks and tables of coefficients; of explicit methods also the masses and the parts of the threads.
     mass : ndarray, shape (pad,)
@@ -104,7 +104,7 @@ class LatticeEngine:
         tolerance : float
             Of the implicit solver: 0.01 changes displacements by some 1e-5, forces by 2e-5 of their size. Stability does not depend on it.
         threads : int
-            Of explicit steps; by default those of Numba from 20 000 elements, else one.
+            Of a step; by default those of Numba from 20 000 elements, else one. Results depend on them by rounding.
 
         Raises
         ------
@@ -116,7 +116,7 @@ class LatticeEngine:
         kind = np.float32 if precision == "single" else np.float64
         blocks = Blocks.of(lattice)
         if threads is None:
-            threads = numba.get_num_threads() if method != "implicit" and lattice.n_elements >= THREADED_FROM else 1
+            threads = numba.get_num_threads() if lattice.n_elements >= THREADED_FROM else 1
         pad = -(-lattice.n_nodes // WIDTH) * WIDTH + WIDTH
         mass = aligned((pad,), kind)
         mass[: lattice.n_nodes] = lattice.node_mass
@@ -215,8 +215,10 @@ class LatticeEngine:
             external = self.by_component(force, x.dtype)
         if self.method != "implicit":
             return ExplicitStepper(x, v, y, None, self.kernel, external, self.step, self.method == "euler")
-        own = scratch or self.scratch.made()
-        return ImplicitStepper(x, v, y, self.stored_lengths(state), self.kernel, own, external, self.step, self.mass, self.tolerance)
+        own, division = scratch or self.scratch.made(), self.blocks.parts(min(self.threads, MOST_PARTS), len(self.mass))
+        return ImplicitStepper(
+            x, v, y, self.stored_lengths(state), self.kernel, own, external, self.step, self.mass, self.tolerance, division
+        )
 
     def surface(self) -> ContactSurface:
         """Return the faces that indenters may touch; found when they are first asked for."""
@@ -226,7 +228,7 @@ class LatticeEngine:
 
     def divided(self, stepper: ImplicitStepper, parts: int) -> ImplicitStepper:
         """Return a stepper of the same arrays whose steps are shorter by a whole number."""
-        kernel, scratch = implicit_kernel(self.lattice, self.parameters, self.step / parts, self.blocks, self.mass)
+        kernel, scratch = implicit_kernel(self.lattice, self.parameters, self.step / parts, self.blocks, self.mass, 1)
         return replace(stepper, kernel=kernel, scratch=scratch.made(), step=self.step / parts)
 
     def energy(self, state: LatticeState) -> float:
@@ -307,7 +309,7 @@ def _kernel(
     lattice: Lattice, parameters: LatticeParameters, step: float, method: Method, blocks: Blocks, mass: AnyFloatArray, threads: int
 ) -> tuple[KernelTuple, ScratchPool]:
     if method == "implicit":
-        return implicit_kernel(lattice, parameters, step, blocks, mass)
+        return implicit_kernel(lattice, parameters, step, blocks, mass, min(threads, MOST_PARTS))
     return explicit_kernel(parameters, step, blocks, mass, min(threads, MOST_PARTS), method == "euler"), ScratchPool.empty()
 
 

@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from naibu._numba.simd import aligned
-from naibu.core.arrays import AnyArray, AnyFloatArray
+from naibu._numba.simd import WIDTH, aligned
+from naibu._numba.thread_pool import new_control
+from naibu.core.arrays import AnyArray, AnyFloatArray, FloatArray
 from naibu.mechanics.lattices.cpu._contact_operator import new_operator
 
 KernelTuple = tuple[Any, ...]  # arrays and numbers as kernels take them, in nested tuples, whose types Numba works out
+PackedArguments = Any  # of `naibu._numba.packed_tuples.packed`
 Scratch = tuple[KernelTuple, KernelTuple]
 
 
@@ -31,7 +33,7 @@ class ScratchPool:
     light, smoother : ndarray, shape (pad,)
         Nodal masses and inverse diagonal of the matrix; copied into every set, since contact changes them during a step.
     coarse : tuple
-        Of `naibu.mechanics.lattices.cpu.coarse_space.coarse_space`; copied into every set, since it holds vectors and an inverse.
+        Of `naibu.mechanics.lattices.cpu.implicit.coarse_space.coarse_space`; copied into every set, since it holds vectors and an inverse.
     places : int
         Places for elements in the blocks.
     """
@@ -60,12 +62,14 @@ class ScratchPool:
         self._spare.append(scratch)
 
     def made(self) -> Scratch:
-        """Return a new set, for the exclusive use of the caller."""
+        """Return a new set, for the exclusive use of the caller, whose steps are in one part."""
         pad, single = len(self.light), np.float32
         work = (aligned((3, self.places), float), *(aligned((3 * pad,), float) for _ in range(3)))
         vectors = tuple(aligned((3 * pad,), single) for _ in range(4))
         own = (_copied(self.light), _copied(self.smoother))
-        inner = (self.table, aligned((3, self.places), single), *own, *vectors, _copied_tuple(self.coarse), new_operator(0, 0))
+        blocks, nodes = np.array([0, self.places // WIDTH]), np.array([0, pad])
+        pool = (new_control(1), (blocks, nodes, nodes[1:], nodes), work[3].reshape(1, -1), vectors[3].reshape(1, -1), *new_sums(1))
+        inner = (self.table, aligned((3, self.places), single), *own, *vectors, _copied_tuple(self.coarse), new_operator(0, 0), pool)
         return work, inner
 
     def __getstate__(self) -> tuple[AnyFloatArray, AnyFloatArray, AnyFloatArray, KernelTuple, int]:
@@ -76,6 +80,11 @@ class ScratchPool:
         """Begin without any set."""
         self.table, self.light, self.smoother, self.coarse, self.places = state
         self._spare = []
+
+
+def new_sums(parts: int) -> tuple[FloatArray, FloatArray]:
+    """Return room for the sums of each part, a cache line each, and for the numbers that they all read."""
+    return np.zeros((parts, 8)), np.zeros(8)
 
 
 def _copied_tuple(arrays: KernelTuple) -> KernelTuple:

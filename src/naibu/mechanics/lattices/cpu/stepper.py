@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from naibu._numba.thread_pool import ALONE, PARTS, STOP, new_control, start_workers, stop_workers
+from naibu._numba.packed_tuples import packed
+from naibu._numba.simd import aligned
+from naibu._numba.thread_pool import IDLE, PARTS, STOP, new_control, start_workers, stop_workers
 from naibu.core.arrays import AnyFloatArray, FloatArray, IntArray
 from naibu.mechanics.lattices.cpu._explicit_kernels import explicit_steps, explicit_worker
-from naibu.mechanics.lattices.cpu._implicit_kernels import implicit_steps
-from naibu.mechanics.lattices.cpu.scratch import KernelTuple, Scratch
+from naibu.mechanics.lattices.cpu.implicit._implicit_kernels import implicit_steps
+from naibu.mechanics.lattices.cpu.implicit._solver_parts import OPERATOR, POOL
+from naibu.mechanics.lattices.cpu.implicit._step_parts import implicit_worker
+from naibu.mechanics.lattices.cpu.scratch import KernelTuple, PackedArguments, Scratch, new_sums
 
 MOST_ITERATIONS = 20_000
+_EXPLICIT_CALL, _IMPLICIT_CALL = 64, 8  # steps of a call of a kernel with workers
 
 
 @dataclass(slots=True, eq=False)
@@ -58,7 +64,7 @@ class ExplicitStepper(Stepper):
     step: float
     forward: bool
     control: IntArray = field(default_factory=lambda: new_control(1))
-    data: KernelTuple = ()
+    data: PackedArguments = ()
 
     def constrain(self, entries: KernelTuple, bodies: int) -> None:
         """Constrain nodes from now on."""
@@ -72,7 +78,7 @@ class ExplicitStepper(Stepper):
         driven = (np.zeros((bodies, 3)), np.zeros((count, bodies, 3)))
         state, how = (self.position, self.velocity, self.extension), (kind(self.step), self.forward)
         forces = np.zeros((count, len(self.position)), kind)
-        self.data = (blocks, (*parts, mine), tables, state, masses, self.external, constrained, driven, forces, how)
+        self.data = packed(blocks, (*parts, mine), tables, state, masses, self.external, constrained, driven, forces, how)
         self.control = new_control(count)
         if count > 1:  # returns at once, compiled, lest workers compile while steps wait
             stop_workers(self.control)
@@ -82,10 +88,9 @@ class ExplicitStepper(Stepper):
         """Take steps and fill the reactions."""
         if self.control[STOP]:  # closed in between; workers may still be on their way out
             self.control = new_control(int(self.control[PARTS]))
-        if alone:
-            self.control[ALONE] = max(self.control[ALONE], len(velocity))
-        start_workers(explicit_worker, self.control, self.data)
-        explicit_steps(self.control, self.data, velocity, reaction)
+        for own in _calls(self.control, alone, len(velocity), _EXPLICIT_CALL):
+            start_workers(explicit_worker, self.control, self.data)
+            explicit_steps(self.control, self.data, velocity[own], reaction[own])
         return 0, 0
 
     def close(self) -> None:
@@ -95,7 +100,13 @@ class ExplicitStepper(Stepper):
 
 @dataclass(slots=True, eq=False)
 class ImplicitStepper(Stepper):
-    """Implicit steps with scratch arrays of their own."""
+    """Implicit steps with scratch arrays of their own, in parts that workers can take.
+
+    Attributes
+    ----------
+    division : tuple of ndarray
+        Blocks, nodes and reached nodes of the parts, of `Blocks.parts`.
+    """
 
     kernel: KernelTuple
     scratch: Scratch
@@ -103,21 +114,60 @@ class ImplicitStepper(Stepper):
     step: float
     mass: AnyFloatArray
     tolerance: float
+    division: KernelTuple
     constrained: KernelTuple = ()
+    control: IntArray = field(default_factory=lambda: new_control(1))
+    data: PackedArguments = ()
+    _weight: FloatArray = field(default_factory=lambda: np.zeros(0))
+    _pool: KernelTuple = ()
+    _entries: KernelTuple = ()
 
     def constrain(self, entries: KernelTuple, bodies: int) -> None:
         """Constrain nodes from now on."""
-        self.constrained = entries
+        self.close()
+        self.constrained = entries = tuple(np.ascontiguousarray(values) for values in entries)
+        inner, (cuts, nodes, high) = self.scratch[1], self.division
+        count, own, pool = len(high), entries, inner[POOL]
+        if count > 1:
+            order = np.argsort(entries[0], kind="stable")
+            own = tuple(np.ascontiguousarray(values[order]) for values in entries)
+            rows = tuple(aligned((count, len(self.position)), kind) for kind in (np.float64, np.float32))
+            pool = (new_control(count), (cuts, nodes, high, np.searchsorted(own[0], nodes)), *rows, *new_sums(count))
+        self.control, self._pool, self._weight = pool[0], pool, own[2]
+        self._entries = (own[0], own[1], np.zeros(len(own[0])), own[3])
+        self.data = self.arguments(pool, inner[OPERATOR], self._entries)
+        if count > 1:  # returns at once, compiled, lest workers compile while steps wait
+            stop_workers(self.control)
+            implicit_worker(self.control, self.data)
+
+    def arguments(self, pool: KernelTuple, operator: KernelTuple, entries: KernelTuple) -> PackedArguments:
+        """Return what the kernels of a step read, with a pool of threads, what contact adds, and what is constrained with its speeds."""
+        (blocks, tables), (work, inner) = self.kernel, self.scratch
+        before, right = (aligned(self.position.shape, float) for _ in range(2))
+        solver = (blocks, tables, self.mass, self.velocity, work, (*inner[:OPERATOR], operator, pool), entries)
+        return packed(solver, (self.position, self.extension, self.length, before, right, self.external, self.step))
 
     def advance(self, velocity: FloatArray, reaction: FloatArray, *, alone: bool = False) -> tuple[int, int]:
         """Take steps and fill the reactions."""
-        (blocks, tables), (work, inner) = self.kernel, self.scratch
-        state, solver = (self.position, self.velocity, self.extension, self.length), (self.tolerance, MOST_ITERATIONS)
         reaction[:] = 0.0
-        found: tuple[int, int] = implicit_steps(
-            blocks, tables, state, self.mass, self.external, work, inner, self.constrained, velocity, self.step, solver, reaction
-        )
-        return found
+        limits, found = (self.tolerance, MOST_ITERATIONS), np.zeros(2, dtype=np.int64)
+        if self.control[STOP]:  # closed in between; workers may still be on their way out
+            self.control = new_control(int(self.control[PARTS]))
+            self._pool = (self.control, *self._pool[1:])
+            self.data = self.arguments(self._pool, self.scratch[1][OPERATOR], self._entries)
+        for own in _calls(self.control, alone, len(velocity), _IMPLICIT_CALL):
+            start_workers(implicit_worker, self.control, self.data)
+            found += implicit_steps(self.data, self._weight, velocity[own], limits, reaction[own])
+        return int(found[0]), int(found[1])
 
     def close(self) -> None:
-        """There are no workers to send away."""
+        """Stop the workers."""
+        stop_workers(self.control)
+
+
+def _calls(control: IntArray, alone: bool, steps: int, most: int) -> Iterator[slice]:
+    """Divide steps into calls of a kernel, between which workers can begin."""
+    control[IDLE] = alone
+    size = steps if alone or control[PARTS] == 1 else most
+    for begin in range(0, max(steps, 1), max(size, 1)):
+        yield slice(begin, min(begin + size, steps))

@@ -1,6 +1,7 @@
 """Kernels of the linear-implicit step :cite:p:`baraff1998` of a lattice, for NVIDIA Warp.
 
-The method is that of `naibu.mechanics.lattices.cpu._implicit_kernels`. This module needs Warp. Elements are computed at both their nodes
+The method is that of `naibu.mechanics.lattices.cpu.implicit._implicit_kernels`. This module needs Warp. Elements are
+computed at both their nodes
 (see `naibu.mechanics.lattices.gpu._explicit_kernels`); their directions are computed anew from the positions in each product with the
 matrix, which costs less than reading them. Rows of the table are a, b, E and g. All is in double precision. Energies of elements are
 counted by halves, once at each end.

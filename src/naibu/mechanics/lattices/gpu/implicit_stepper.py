@@ -1,6 +1,6 @@
 """The linear-implicit step of a lattice on a device of Warp.
 
-The safeguards are those of `naibu.mechanics.lattices.cpu._implicit_kernels`.
+The safeguards are those of `naibu.mechanics.lattices.cpu.implicit._implicit_kernels`.
 Sums and scalars of the solver stay on the device, which is given several iterations at once; those beyond the end change nothing.
 """
 

@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from naibu.core.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from naibu.core.errors import InputError
 from naibu.core.rigid_transform import RigidTransform
+from naibu.mechanics.lattices.model.voxel_elements import VoxelElements
 
 CLASSES = ("short", "normal", "long")  # edges, face diagonals and space diagonals of a cube
 ZONES = ("core", "surface")
@@ -46,7 +47,7 @@ class Lattice:
         Edge of the finest voxels, mm; the mean length of elements where there are none.
     scale : ndarray, shape (m,)
         How many times stiffer, and more viscous, than between the finest voxels an element is to be so that the solid answers as the
-        classic lattice does: see `naibu.mechanics.lattices.model.octree.octree_lattice`. One in classic lattices.
+        classic lattice does: see `naibu.mechanics.lattices.model.octree.octree_lattice`. One in classic lattices, read-only.
     cells : ndarray, shape (c, 8), int64, optional
         Nodes of the cubes in VTK's order of a hexahedron; None of lattices of any other shape.
     faces : ndarray, shape (f, 3) or (f, 4), int64, optional
@@ -105,6 +106,7 @@ class LatticeParameters:
         C2 of the dashpot in line with both, mN s/mm; infinite for Kelvin-Voigt elements, which leave no residual displacement.
     voigt_fraction : ndarray, shape (m,)
         Part `a` of the length at rest that the Voigt part takes. It changes neither force nor shape: only the extension Z - a L enters.
+        Read-only where it is one number.
     """
 
     stiffness: FloatArray
@@ -149,14 +151,17 @@ def classic_lattice(
     """
     filled = checked_mask(mask)
     require_positive(spacing_mm, "the spacing", "mm")
-    cells = np.argwhere(filled)
-    corners, nodes = _corner_numbers(cells, filled.shape, np.ones(len(cells), dtype=np.int64))
-    pairs = cell_elements(corners)
-    volumes = np.full(len(cells), spacing_mm**3)
-    masses = lumped_masses(corners, volumes, len(nodes), total_mass_kg=total_mass_kg, density=density, lumping=lumping)
-    surface = np.bincount(corners.ravel(), minlength=len(nodes)) < 8
-    level = np.zeros(len(pairs), dtype=np.int8)
-    return assembled(nodes, corners, pairs, level, masses, surface, spacing_mm, origin, frame=frame)
+    found = VoxelElements.of(filled)
+    n, m = len(found.nodes), len(found.pairs)
+    volumes = np.full(len(found.cells), spacing_mm**3)
+    masses = lumped_masses(found.cells, volumes, n, total_mass_kg=total_mass_kg, density=density, lumping=lumping)
+    if not found.connected:
+        require_connected(found.pairs, n, np.asarray(found.nodes * spacing_mm, dtype=np.float64))
+    points = np.asarray(origin, dtype=float) + spacing_mm * found.nodes
+    level, placed = np.zeros(m, dtype=np.int8), frame or RigidTransform.identity()
+    kind, zone, spacing = found.element_class, found.element_zone, float(spacing_mm)
+    scale = np.broadcast_to(1.0, m)  # takes no memory
+    return Lattice(points, found.pairs, masses, kind, zone, level, found.surface, spacing, scale, found.cells, placed)
 
 
 def box_mask(shape: tuple[int, int, int]) -> BoolArray:
@@ -195,25 +200,6 @@ def require_positive(value: float, what: str, unit: str) -> None:
         raise InputError(f"{what} must be positive and finite, not {value:g} {unit}")
 
 
-def _corner_numbers(cells: IntArray, shape: tuple[int, ...], sizes: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the numbers (k, 8) of the corners of cubes at `cells` (k, 3), of edges `sizes` (k,), and the grid positions (n, 3)."""
-    steps = np.array([(a, b, c) for c in (0, 1) for b in (0, 1) for a in (0, 1)])
-    at = cells[:, None, :] + sizes[:, None, None] * steps
-    nx, ny = shape[0] + 1, shape[1] + 1
-    keys, numbers = np.unique(at[..., 0] + nx * (at[..., 1] + ny * at[..., 2]), return_inverse=True)
-    nodes = np.stack([keys % nx, keys // nx % ny, keys // (nx * ny)], axis=1)
-    return numbers.reshape(at.shape[:2]), nodes
-
-
-def cell_elements(corners: IntArray) -> IntArray:
-    """Return the 28 pairs of corners of all cubes (k, 8), each pair once, the smaller number first: (m, 2)."""
-    first, second = np.triu_indices(8, 1)
-    i, j, count = corners[:, first].ravel(), corners[:, second].ravel(), int(corners.max()) + 1
-    keys = np.sort(np.minimum(i, j) * count + np.maximum(i, j))  # one number a pair: rows, or unique with hashes, take ten times as long
-    keys = keys[np.append(True, np.diff(keys) != 0)]
-    return np.stack([keys // count, keys % count], axis=1)
-
-
 def lumped_masses(
     corners: IntArray, volumes: FloatArray, n_nodes: int, *, total_mass_kg: float | None, density: float | None, lumping: str
 ) -> FloatArray:
@@ -237,7 +223,9 @@ def lumped_masses(
         return np.full(n_nodes, total / n_nodes)
     if lumping != "volume":
         raise InputError(f"masses are lumped by 'volume' or 'equal', not by {lumping!r}")
-    per_node = np.bincount(corners.ravel(), np.repeat(volumes / 8.0, corners.shape[1]), minlength=n_nodes)
+    per_node, eighth = np.zeros(n_nodes), volumes / 8.0
+    for own in corners.T:
+        per_node += np.bincount(own, eighth, minlength=n_nodes)
     return np.asarray(total * per_node / volumes.sum())
 
 
@@ -250,7 +238,7 @@ def assembled(
     surface: BoolArray,
     spacing_mm: float,
     origin: ArrayLike,
-    scale: FloatArray | None = None,
+    scale: FloatArray,
     frame: RigidTransform | None = None,
 ) -> Lattice:
     """Return the lattice of nodes at grid positions (n, 3) and elements (m, 2), classed by their directions.
@@ -265,9 +253,8 @@ def assembled(
     kind = (np.count_nonzero(offset, axis=1) - 1).astype(np.int8)
     zone = (surface[pairs[:, 0]] | surface[pairs[:, 1]]).astype(np.int8)
     points = np.asarray(origin, dtype=float) + spacing_mm * nodes
-    factors = np.ones(len(pairs)) if scale is None else scale
     cells, placed = corners[:, _HEXAHEDRON], frame or RigidTransform.identity()
-    return Lattice(points, pairs, masses, kind, zone, level, surface, float(spacing_mm), factors, cells, placed)
+    return Lattice(points, pairs, masses, kind, zone, level, surface, float(spacing_mm), scale, cells, placed)
 
 
 def require_connected(pairs: IntArray, n_nodes: int, points: FloatArray) -> None:
@@ -321,22 +308,33 @@ def lattice_parameters(
     k = _per_element(lattice, stiffness, "K")
     c1 = _per_element(lattice, voigt_damping, "C1")
     c2 = _per_element(lattice, series_damping, "C2")
-    a = _per_element(lattice, voigt_fraction, "a")
+    a = (
+        np.broadcast_to(voigt_fraction, lattice.n_elements)
+        if isinstance(voigt_fraction, float)
+        else _per_element(lattice, voigt_fraction, "a")
+    )
     if scaled:
-        k, c1, c2 = k * lattice.scale, c1 * lattice.scale, c2 * lattice.scale
-    for name, unit, values, valid in (
-        ("K", " mN/mm", k, np.isfinite(k) & (k >= 0.0)),
-        ("C1", " mN s/mm", c1, np.isfinite(c1) & (c1 >= 0.0)),
-        ("C2", " mN s/mm", c2, c2 > 0.0),
-        ("a", "", a, (a > 0.0) & (a < 1.0)),
+        for values in (k, c1, c2):
+            values *= lattice.scale
+    for name, unit, values, bounds, rule in (
+        ("K", " mN/mm", k, (0.0, np.inf, "[)"), "must be finite and not negative"),
+        ("C1", " mN s/mm", c1, (0.0, np.inf, "[)"), "must be finite and not negative"),
+        ("C2", " mN s/mm", c2, (0.0, np.inf, "(]"), "must be positive (infinite for none)"),
+        ("a", "", a, (0.0, 1.0, "()"), "must lie between 0 and 1"),
     ):
-        if not valid.all():
-            bad = int(np.argmin(valid))
-            rule = {"C2": "must be positive (infinite for none)", "a": "must lie between 0 and 1"}.get(
-                name, "must be finite and not negative"
-            )
-            raise InputError(f"{name} of element {bad} is {values[bad]:g}{unit}; it {rule}: {int((~valid).sum())} of {len(valid)} are not")
+        if _within(values.min(), bounds) and _within(values.max(), bounds):  # NaN passes on to both
+            continue
+        valid = _within(values, bounds)
+        bad = int(np.argmin(valid))
+        raise InputError(f"{name} of element {bad} is {values[bad]:g}{unit}; it {rule}: {int((~valid).sum())} of {len(valid)} are not")
     return LatticeParameters(k, c1, c2, a)
+
+
+def _within(values: FloatArray, bounds: tuple[float, float, str]) -> BoolArray:
+    """Return which values lie in an interval, open or closed at its ends."""
+    low, high, ends = bounds
+    above = values >= low if ends[0] == "[" else values > low
+    return np.asarray(above & (values <= high if ends[1] == "]" else values < high))
 
 
 def _per_element(lattice: Lattice, value: ByClass, name: str) -> FloatArray:

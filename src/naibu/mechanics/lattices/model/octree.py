@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from naibu.core.errors import InputError
 from naibu.core.rigid_transform import RigidTransform
-from naibu.mechanics.lattices.model.lattice import Lattice, _corner_numbers, assembled, checked_mask, lumped_masses, require_positive
+from naibu.mechanics.lattices.model.lattice import Lattice, assembled, checked_mask, lumped_masses, require_positive
 from naibu.mechanics.lattices.model.octree_compliance_correction import response_factors
 from naibu.mechanics.lattices.model.octree_energy_scaling import OctreeGrid, edge_factors, energy_factors
 
@@ -109,6 +109,16 @@ def octree_factors(grid: OctreeGrid, scaling: str = "response", class_stiffness:
         return edge_factors(grid)
     factors = energy_factors(grid)
     return response_factors(grid, factors, stiffness) if scaling == "response" else factors
+
+
+def _corner_numbers(cells: IntArray, shape: tuple[int, ...], sizes: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the numbers (k, 8) of the corners of cubes at `cells` (k, 3), of edges `sizes` (k,), and the grid positions (n, 3)."""
+    steps = np.array([(a, b, c) for c in (0, 1) for b in (0, 1) for a in (0, 1)])
+    at = cells[:, None, :] + sizes[:, None, None] * steps
+    nx, ny = shape[0] + 1, shape[1] + 1
+    keys, numbers = np.unique(at[..., 0] + nx * (at[..., 1] + ny * at[..., 2]), return_inverse=True)
+    nodes = np.stack([keys % nx, keys // nx % ny, keys // (nx * ny)], axis=1)
+    return numbers.reshape(at.shape[:2]), nodes
 
 
 def _finest_first(corners: IntArray, nodes: IntArray, sizes: IntArray) -> tuple[IntArray, IntArray]:

@@ -17,10 +17,11 @@ from naibu._numba.compilation import njit
 from naibu._numba.simd import WIDTH, aligned, inverse_root, load, splat, store
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
-from naibu.mechanics.lattices.cpu._coarse_kernels import begin_with
-from naibu.mechanics.lattices.cpu._implicit_kernels import add_momenta, add_reactions, advance, constrain, new_velocity
-from naibu.mechanics.lattices.cpu._pcg_kernels import multiply, residual_norm, solve
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
+from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import begin_with
+from naibu.mechanics.lattices.cpu.implicit._implicit_kernels import add_momenta, add_reactions, advance, new_velocity
+from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import multiply, residual_norm, solve
+from naibu.mechanics.lattices.cpu.implicit._step_parts import constrain_part
 from naibu.mechanics.lattices.model.coefficients import implicit_coefficients
 from naibu.mechanics.lattices.model.lattice import LatticeParameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState, checked_velocity, require_constrained, require_numbers
@@ -299,14 +300,14 @@ def _driven_steps(  # type: ignore[no-untyped-def]  # pragma: no cover
     x, v, y, lengths = state
     xd, vd, yd = tangents
     first, second, rows = blocks
-    axes, r, aside, q = work
+    axes, r, _, q = work
     node, fraction, body = loads
-    own = (tables[1], tables[2], tables[3], tables[5])
+    own, pad = (tables[1], tables[2], tables[3], tables[5]), len(mass)
     constrained_node, direction, weight, constrained_by = constrained
     speed, at_rest, weightless = np.zeros(len(constrained_node)), np.zeros(len(constrained_node)), np.zeros_like(force[0])
     now, still = (constrained_node, direction, speed, constrained_by), (constrained_node, direction, at_rest, constrained_by)
-    pad = len(mass)
     right, before, old_lengths = np.zeros_like(x), np.zeros_like(x), np.zeros_like(lengths)
+    data = ((blocks, tables, mass, v, work, inner, now), (x, y, lengths, before, right, right[:0], step))
     begin_with(inner, now)
     for n in range(len(velocity)):
         before[:] = v
@@ -317,23 +318,23 @@ def _driven_steps(  # type: ignore[no-untyped-def]  # pragma: no cover
         add_momenta(mass, v, 1.0, right)
         for h in range(len(constrained_node)):
             speed[h] = weight[h] * (direction[h] * velocity[n, constrained_by[h]]).sum()
-        _, lost, _ = new_velocity(blocks, tables, x, v, y, mass, right, work, inner, now, step, (solver[0], solver[2]))
+        _, lost, _ = new_velocity(data, (solver[0], solver[2]))
         add_reactions(now, r, pad, step, reaction[n])
         _answer(loads, force[n], v, before, mass, step, reaction[n])
         for p in range(len(xd)):
             right[:] = 0
             add_momenta(mass, vd[p], 1.0, right)
             _changed_impulse(first, second, rows, own, changed, changes[p], axes, x, v, y, xd[p], yd[p], right, step)
-            constrain(still, vd[p], pad)
+            constrain_part(still, vd[p], pad, 0, len(constrained_node))
             old = vd[p].copy()
-            multiply(first, second, rows, tables[5], axes, mass, vd[p], q)
+            multiply(blocks, tables[5], axes, mass, vd[p], q)
             r[:] = right - q
             goal = max(solver[1] ** 2 * residual_norm(r, inner[3], still), 1e-300)
-            solve(first, second, rows, tables[5], axes, mass, vd[p], r, aside, q, inner, still, goal, solver[2])
+            solve((blocks, tables, mass, vd[p], work, inner, still), goal, solver[2])
             add_reactions(still, r, pad, step, reaction_change[p, n])
             _answer(loads, weightless, vd[p], old, mass, step, reaction_change[p, n])
             xd[p] += step * vd[p]
         old_lengths[:] = lengths
-        advance(blocks, tables, x, v, before, y, lengths, mass, axes, step, lost)
+        advance(data, lost)
         for p in range(len(xd)):
             _changed_extension(first, second, rows, tables[3], changed, changes[p, 3], old_lengths, x, xd[p], yd[p])

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from naibu.core.arrays import FloatArray
-from naibu.viewer.chapter import Chapter, Figure, Section
-from naibu.viewer.chapter_page import chapter_html
+from naibu.viewer.chapters.chapter import Chapter, Figure, Section
+from naibu.viewer.chapters.chapter_page import chapter_html
 from naibu.viewer.tables import Cell, Table
 
 if TYPE_CHECKING:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from naibu.viewer.cards import Card
+from naibu.viewer.chapters.comparisons import Comparison
 from naibu.viewer.marker_view import MarkerView
 from naibu.viewer.tables import Cell, Table
 
@@ -64,6 +65,8 @@ class Chapter:
         What to know first.
     view : MarkerView, optional
         Shown in 3-D above the sections.
+    comparisons : tuple of Comparison
+        Statements of the source beside ours, with which the page opens.
     """
 
     name: str
@@ -72,3 +75,4 @@ class Chapter:
     settings: dict[str, Cell] = field(default_factory=dict)
     cards: tuple[Card, ...] = ()
     view: MarkerView | None = None
+    comparisons: tuple[Comparison, ...] = ()

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from matplotlib.figure import Figure as Canvas
 
-from naibu.viewer.chapter import Chapter, Figure, Section
-from naibu.viewer.chapter_page import write_chapter
+from naibu.viewer.chapters.chapter import Chapter, Figure, Section
+from naibu.viewer.chapters.chapter_page import write_chapter
 from naibu.viewer.tables import Table
 
 

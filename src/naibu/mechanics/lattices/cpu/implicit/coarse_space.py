@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from naibu._numba.packed_tuples import packed
 from naibu._numba.simd import WIDTH, aligned
 from naibu.core.arrays import AnyFloatArray, FloatArray, IntArray
-from naibu.mechanics.lattices.cpu._coarse_kernels import NODES, PRICE, assemble, build
+from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import NODES, PRICE, assemble, build
 from naibu.mechanics.lattices.cpu.scratch import KernelTuple
 from naibu.mechanics.lattices.model.lattice import Lattice
 
@@ -88,7 +89,8 @@ def coarse_space(lattice: Lattice, stiff: FloatArray, diagonal: FloatArray, smoo
     state[NODES], state[PRICE] = -1, _PRICE * wide**3 // lattice.n_elements
     memory = (np.zeros(3 * lattice.n_nodes, np.int64), np.zeros((3 * lattice.n_nodes, 3)), state)
     coarse = (*_steps(place, between * cells, fine[2], pad, parts), further, small, (corner, weight, *fine[:2]), memory)
-    build(coarse, smoother, (np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64)), 0)
+    free = packed(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
+    build(packed(*coarse), smoother, free, 0)
     return coarse
 
 

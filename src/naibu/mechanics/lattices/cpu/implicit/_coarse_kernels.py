@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from naibu._numba.compilation import njit
+from naibu._numba.compilation import COUNTED, njit
 from naibu._numba.simd import WIDTH, load, splat, store, total
 
 _FAST = {"contract", "nsz"}
@@ -226,7 +226,7 @@ def _invert(a):  # type: ignore[no-untyped-def]  # pragma: no cover
                     store(other, j, load(other, j) - factor * load(own, j))
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNTED)
 def build(coarse, smoother, constrained, slot):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Invert the coarse matrix while components are constrained, into a slot."""
     _, _, _, (base, scale, diagonal, inverse), (corner, weight, fine_corner, fine_weight), _ = coarse
@@ -267,7 +267,7 @@ def _knows(memory, constrained):  # type: ignore[no-untyped-def]  # pragma: no c
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNTED)
 def follow(coarse, smoother, constrained, at_once):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Make the inverse that of the constrained components, at once or when enough work was done that a new one costs little in comparison.
 
@@ -294,7 +294,7 @@ def follow(coarse, smoother, constrained, at_once):  # type: ignore[no-untyped-d
     state[SLOT], state[CREDIT] = 1, 0
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNTED)
 def begin_with(inner, constrained):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Prepare the solver, whose arrays are `inner`, for a run in which these components are constrained."""
     begin(inner[8])

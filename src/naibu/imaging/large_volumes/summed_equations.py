@@ -1,0 +1,338 @@
+"""Normal equations of a volume correlation summed over blocks, and what is solved with them: displacement, weights, covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage
+
+from naibu.core.arrays import AnyFloatArray, Float32Array, FloatArray, IntArray
+from naibu.core.chunked_volume import ChunkedVolume
+from naibu.core.errors import InputError
+from naibu.core.volume import Volume
+from naibu.imaging.large_volumes.block_frame import BlockFrame
+from naibu.imaging.large_volumes.block_sums import CLASSES, ComparedBlock, FieldState, Stage
+from naibu.imaging.large_volumes.fine_outline import BAND
+from naibu.imaging.large_volumes.noise_tiles import NoiseTiles
+from naibu.imaging.preprocessing.field_of_view import Box
+from naibu.imaging.preprocessing.object_mask import object_threshold
+from naibu.imaging.volume_correlation._spline_kernels import product
+from naibu.imaging.volume_correlation.block_displacements import BlockSums, block_edge, displacement_of_blocks
+from naibu.imaging.volume_correlation.common_content import content_of
+from naibu.imaging.volume_correlation.correlate import (
+    ADAPTATION_SAMPLES,
+    ADAPTATIONS,
+    LEVELS,
+    UNSETTLED,
+    Correlation,
+    require_convergence,
+    require_overlap,
+)
+from naibu.imaging.volume_correlation.gauss_newton import SAMPLE_TOLERANCE, SAMPLES_AT_ONCE, STEP_TOLERANCE, STILL
+from naibu.imaging.volume_correlation.image_level import GAIN_RANGE, GainMap, most_probable_gain
+from naibu.imaging.volume_correlation.intensity_comparison import MAD, ROUNDING
+from naibu.imaging.volume_correlation.residual_noise import ResidualNoise, lost_to_robustness
+from naibu.imaging.volume_correlation.result import CorrelationResult, collected
+
+# Gauss-Newton steps: the first of them with voxels of an edge in between, where there are such, and the one in which weights are adapted
+ROUGH_PASSES, ADAPTED_PASS, LEAST_PASSES, PASSES = 3, 5, 6, 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Model:
+    """What passes through the volumes change: displacement, weights of penalties, intensity model.
+
+    Attributes
+    ----------
+    coefficients : ndarray, shape (NZ, NY, NX, 3)
+        Of the displacement, mm.
+    bending, dilatation : ndarray, shape (m, 3), and float
+        Weights of the penalties.
+    gain, residual_sd, reliability
+        See `FieldState`; the reliability is that of the m cells.
+    products, pairs : ndarray, optional
+        Sums of products of residuals, and their numbers, by distance.
+    passes : int
+        How many there were.
+    settled : bool
+        Whether the last step was short.
+    """
+
+    coefficients: FloatArray
+    bending: FloatArray
+    dilatation: float
+    gain: FloatArray
+    residual_sd: float
+    reliability: Float32Array
+    products: AnyFloatArray | None = None
+    pairs: AnyFloatArray | None = None
+    passes: int = 0
+    settled: bool = False
+
+
+class SummedEquations:
+    """The correlation of the coarse volume, whose normal equations are replaced by those of all voxels.
+
+    Parameters
+    ----------
+    coarse : Correlation
+        After `follow_inclusions`.
+    volume : ChunkedVolume
+        Reference.
+    factor : int
+        Voxels along the edge of a coarse voxel.
+    """
+
+    def __init__(self, coarse: Correlation, volume: ChunkedVolume, factor: int) -> None:
+        fit = coarse.fit
+        self.coarse, self.fit, self.system, self.volume = coarse, fit, fit.system, volume
+        self.lattice = GainMap(fit.level, fit.settings.gain_cell_mm or float(fit.level.spacing.max()) * max(fit.level.mask.shape))
+        self.frame = self._frame(factor)
+        everywhere = self.lattice.everywhere(fit.value, fit.robust_weight)
+        matrix, load = self.lattice.normal_equations(fit.value, fit.robust_weight)
+        reliability = fit.reliability_of(fit.cell_agreement())
+        self.model = Model(
+            coarse.c, coarse.bending, coarse.dilatation, self._gain(matrix, load, fit.residual_sd, everywhere), fit.residual_sd, reliability
+        )
+
+    def _frame(self, factor: int) -> BlockFrame:
+        coarse, level, s = self.coarse, self.fit.level, self.coarse.settings
+        cells = np.zeros(tuple(int(n) for n in self.system.grid.cells[::-1]), dtype=bool)
+        cells[tuple(self.system.cells[:, 2:].T)] = True
+        rigid, depth = np.zeros(coarse.mask.shape, dtype=bool), np.zeros(coarse.mask.shape, np.float32)
+        z, y, x = level.index.astype(int).T[::-1]
+        depth[z, y, x] = coarse.depth_mm(level)
+        for inclusion in coarse.inclusions:
+            rigid[z[inclusion.voxels], y[inclusion.voxels], x[inclusion.voxels]] = True
+        views = tuple(_fine(v, factor, coarse.mask.shape, self.volume.shape) for v in coarse.views)
+        inside = coarse.views[0]
+        shift = float(np.mean(np.asarray(coarse.volume.values)[inside], dtype=float) - np.mean(coarse.reference[inside], dtype=float))
+        # one that was found has a margin of a coarse voxel, of which one voxel is kept
+        object_ = coarse.mask if coarse.mask_given or factor == 1 else ndimage.binary_erosion(coarse.mask, border_value=1)
+        zone = np.ones(object_.shape, np.int8)
+        zone[ndimage.binary_erosion(object_, iterations=BAND, border_value=1)] = 2
+        zone[~ndimage.binary_dilation(object_, iterations=BAND)] = 0
+        shown = Volume.from_array(np.asarray(coarse.volume.values)[inside], spacing_mm=coarse.spacing)
+        threshold = None if coarse.mask_given else object_threshold(shown)
+        edge = block_edge(int(coarse.mask.sum()) * factor**3)
+        lattice = self.lattice.low, self.lattice.step, self.lattice.n
+        return BlockFrame(
+            self.volume.shape, self.volume.spacing_mm, factor, self.system.grid, cells, object_, rigid, zone, threshold, depth,
+            (views[0], views[1]), shift, *lattice, coarse.comparison(len(LEVELS) - 1), s.smoothing_voxels, edge,
+        )  # fmt: skip
+
+    @property
+    def frames(self) -> list[BlockFrame]:
+        """The frames of the passes."""
+        factor = self.frame.factor
+        rough = self.frame.thinned(2) if factor > 2 and factor % 2 == 0 else self.frame
+        return [rough] * ROUGH_PASSES + [self.frame] * (PASSES - ROUGH_PASSES)
+
+    def state(self, stage: Stage, edges: tuple[int, ...]) -> FieldState:
+        """Return at what blocks with these edges are compared."""
+        model, seed = self.model, self.coarse.settings.seed
+        adapted = self.adapting and model.passes + 1 == ADAPTED_PASS
+        dense = np.zeros((*self.frame.cells.shape, 3, 3), np.float32)
+        dense[tuple(self.system.cells[:, 2:].T)] = model.reliability
+        draws = {"noise": 0, "step": ADAPTATION_SAMPLES if adapted else 0, "covariance": self.coarse.settings.samples}[stage]
+        tiles = None
+        if stage == "covariance" and model.products is not None and model.pairs is not None:
+            tiles = NoiseTiles.for_blocks(edges, seed, model.products, model.pairs)
+        lagged = stage == "step" and model.passes + 1 >= LEAST_PASSES
+        return FieldState(stage, model.coefficients, model.gain, model.residual_sd, dense, draws, lagged, tiles, seed + model.passes)
+
+    @property
+    def adapting(self) -> bool:
+        """Whether the weights of the penalties follow from the data."""
+        return self.coarse.settings.adaptive_weight
+
+    def with_noise_of(self, blocks: Iterable[ComparedBlock | None]) -> Model:
+        """Return the model with the residual SD of blocks."""
+        classes = np.zeros(len(CLASSES) + 1, np.int64)
+        for block in blocks:
+            classes += 0 if block is None else block.classes
+        return replace(self.model, residual_sd=self._residual_sd(classes))
+
+    def stepped(self, blocks: Iterable[ComparedBlock | None]) -> Model:
+        """Return the model after a Gauss-Newton step with the sums of all blocks, and weights adapted to them."""
+        sums, coarse = self._added(blocks), self.coarse
+        before, passes = self.model.coefficients, self.model.passes + 1
+        coarse.c, coarse.bending, coarse.dilatation = before.copy(), self.model.bending, self.model.dilatation
+        self._settle(sums, before)
+        if self.adapting and passes == ADAPTED_PASS:
+            self._adapt(sums, before)
+        self._settle(sums, before)
+        self._take_step(before)
+        return replace(
+            self._with_intensities(sums), coefficients=coarse.c, bending=coarse.bending, dilatation=coarse.dilatation, passes=passes,
+            settled=passes >= LEAST_PASSES and self.fit.moving_fraction <= UNSETTLED, products=sums.products, pairs=sums.pairs,
+        )  # fmt: skip
+
+    def result(self, blocks: Iterable[ComparedBlock | None]) -> CorrelationResult:
+        """Return the result at the voxels of the coarse volume, after the last step, from sums of the stage of the covariance.
+
+        Raises
+        ------
+        InputError
+            Volumes that do not show the same object.
+        """
+        sums, coarse, fit = self._added(blocks), self.coarse, self.fit
+        before = self.model.coefficients
+        coarse.c, coarse.bending, coarse.dilatation = before.copy(), self.model.bending, self.model.dilatation
+        require_overlap(sums.seen / max(sums.voxels, 1))
+        content = content_of(fit, sums.content)
+        content.refuse_chance(self.system.inner)
+        self._settle(sums, before, 2)
+        self._take_step(before)
+        require_convergence(fit.moving_fraction)
+        scale = lost_to_robustness(*sums.robust)
+        samples = self._samples(np.float32(scale) * sums.draws, seed=coarse.settings.seed + 1)
+        self.system.warped(coarse.c, fit.value, fit.reference_gradient, fit.gradient, fit.displacement)
+        model = self._with_intensities(sums)
+        fit.gain, fit.offset = self.lattice.values(model.gain)
+        fit.residual_sd = model.residual_sd
+        found = collected(coarse.volume, fit, coarse.c, samples, coarse.bending, coarse.dilatation, content.matched)
+        small = displacement_of_blocks(self.volume.grid, BlockSums.joined(sums.small), self.frame.spacing, scale) if sums.small else None
+        return replace(found, blocks=small)
+
+    def _adapt(self, sums: _Sums, before: FloatArray) -> None:
+        """Choose the weights of the penalties as in memory."""
+        coarse = self.coarse
+        for _ in range(ADAPTATIONS):
+            # the energies of the field, to which those of the samples are compared
+            self._assembled(sums, before)
+            settled = coarse.reweigh(self._samples(sums.draws))
+            self._settle(sums, before, 2)
+            if settled:
+                break
+
+    def _take_step(self, before: FloatArray) -> None:
+        """Let the fit judge which cells still move: a tenth of a voxel of the volume, not of the coarse one."""
+        self.fit.last_step = (self.coarse.c - before)[self.system.active].astype(np.float32)
+        self.fit.still_mm = STILL * float(np.prod(self.frame.spacing) ** (1.0 / 3.0))
+
+    def _with_intensities(self, sums: _Sums) -> Model:
+        w, f, g, ff, gg = sums.moments
+        mean_f, mean_g = f / max(w, 1e-30), g / max(w, 1e-30)
+        spread, wanted = gg - w * mean_g**2, ff - w * mean_f**2
+        gain = float(np.clip(np.sqrt(max(wanted, 0.0) / max(spread, 1e-30)), *GAIN_RANGE))
+        everywhere = gain, mean_f - gain * mean_g, float(np.sqrt(max(spread, 0.0) / max(w, 1e-30)))
+        sd = self._residual_sd(sums.classes)
+        reliability = self.fit.reliability_of(sums.agreement)
+        found = self._gain(sums.gain_matrix, sums.gain_load, self.model.residual_sd, everywhere)
+        return replace(self.model, gain=found, residual_sd=sd, reliability=reliability)
+
+    def _gain(self, matrix: FloatArray, load: FloatArray, sd: float, everywhere: tuple[float, float, float]) -> FloatArray:
+        if not self.fit.settings.gain_cell_mm:
+            return np.tile(everywhere[:2], len(load) // 2)
+        return most_probable_gain(matrix / sd**2, load / sd**2, everywhere)
+
+    def _residual_sd(self, classes: IntArray) -> float:
+        """Return the residual SD from the median of the absolute residuals, which are counted in residual SD of the model."""
+        total = np.cumsum(classes)
+        if not total[-1]:
+            raise InputError("the deformed volume does not show the object: no voxel of it was found there after its motion")
+        median = np.interp(0.5 * total[-1], total, np.r_[CLASSES[0], CLASSES])
+        return max(MAD * float(median) * self.model.residual_sd, ROUNDING * float(np.ptp(self.fit.level.intensity)))
+
+    def _assembled(self, sums: _Sums, about: FloatArray) -> Float32Array:
+        """Assemble the matrix at the present coefficients; return the right side, that of the intensities being linear about others."""
+        coarse, fit, system = self.coarse, self.fit, self.system
+        fit.products[:], fit.force[:] = 0, 0
+        if coarse.inclusions:
+            system.warped(coarse.c, fit.value, fit.reference_gradient, fit.gradient, fit.displacement)
+        for inclusion in coarse.inclusions:
+            inclusion.hold(fit)
+        dilatation = coarse.dilatation * system.gauss_volume
+        right = system.assembled(coarse.c, fit.products, fit.force, coarse.bending, dilatation, sums.matrix)
+        gone = np.zeros((system.n + 1, 3), np.float32)
+        gone[:-1] = (coarse.c - about)[system.active]
+        back = np.empty((system.n, 3), np.float32)
+        product(sums.matrix, system.neighbours, gone, back)
+        return np.asarray(right + sums.load - back)
+
+    def _settle(self, sums: _Sums, about: FloatArray, steps: int = 1) -> None:
+        """Solve for the coefficients with the present weights; each step leaves a tenth of what the one before left."""
+        for _ in range(steps):
+            step, _ = self.system.solved(self._assembled(sums, about), STEP_TOLERANCE)
+            self.coarse.c = self.coarse.c.copy()
+            self.coarse.c[self.system.active] += step
+
+    def _samples(self, draws: Float32Array, seed: int | None = None) -> Float32Array:
+        """Return random coefficients (n, 3, s) from the random loads of all blocks; with a seed inclusions have random motions, too."""
+        coarse, system = self.coarse, self.system
+        out, dilatation = np.empty_like(draws), coarse.dilatation * system.gauss_volume
+        rng = np.random.default_rng((coarse.settings.seed if seed is None else seed, self.model.passes))
+        noise = self._inclusion_noise() if coarse.inclusions else None
+        for first in range(0, draws.shape[2], SAMPLES_AT_ONCE):
+            some = slice(first, first + SAMPLES_AT_ONCE)
+            loads = draws[:, :, some].copy()
+            for k in range(loads.shape[2] if noise is not None else 0):
+                force, random = np.zeros_like(self.fit.force), noise.draw(rng) if noise is not None else self.fit.residual
+                for inclusion in coarse.inclusions:
+                    inclusion.perturb(force, random, rng)
+                loads[:, :, k] += system.force_loads(force[:, :, None])[:, :, 0]
+            system.add_penalty_noise(loads, coarse.c, coarse.bending, dilatation, rng)
+            out[:, :, some] = system.solved_many(loads, SAMPLE_TOLERANCE)[0]
+        return out
+
+    def _inclusion_noise(self) -> ResidualNoise:
+        fit = self.fit
+        for inclusion in self.coarse.inclusions:
+            inclusion.draws.clear()
+        return ResidualNoise(fit.level.mask, fit.residual * np.sqrt(fit.weight), lost_to_robustness(*fit.robust_sums))
+
+    def _added(self, blocks: Iterable[ComparedBlock | None]) -> _Sums:
+        """Return the sums of all blocks, in their order."""
+        sums, m = _Sums(self.system.n, len(self.system.cells)), self.system.cells
+        number = np.full(self.frame.cells.shape, -1, np.int64)
+        number[tuple(m[:, 2:].T)] = np.arange(len(m))
+        for block in blocks:
+            if block is not None:
+                sums.add(block, self.system.slot[tuple(block.nodes.T)], number[tuple(block.cells.T)])
+        if not sums.seen:
+            raise InputError("the deformed volume does not show the object: no voxel of it was found there after its motion")
+        return sums
+
+
+class _Sums:
+    """Sums over blocks: see `ComparedBlock`."""
+
+    def __init__(self, nodes: int, cells: int) -> None:
+        self.seen, self.voxels, self.robust = 0, 0, np.zeros(2)
+        self.matrix, self.load = np.zeros((nodes, 3, 1029), np.float32), np.zeros((nodes, 3), np.float32)
+        self.classes, self.moments = np.zeros(len(CLASSES) + 1, np.int64), np.zeros(5)
+        self.agreement, self.cells = np.zeros((cells, 12)), cells
+        self.draws, self.content = np.zeros((nodes, 3, 0), np.float32), np.zeros((cells, 0))
+        self.gain_matrix, self.gain_load, self.products, self.pairs = (np.zeros(()) for _ in range(4))
+        self.small: list[BlockSums] = []
+
+    def add(self, block: ComparedBlock, nodes: IntArray, cells: IntArray) -> None:
+        """Add a block whose nodes and cells have these numbers."""
+        if self.draws.shape[2] != block.draws.shape[2]:
+            self.draws = np.zeros((*self.draws.shape[:2], block.draws.shape[2]), np.float32)
+        if self.content.shape[1] != block.content.shape[1]:
+            self.content = np.zeros((self.cells, block.content.shape[1]))
+        self.seen, self.voxels = self.seen + block.seen, self.voxels + block.voxels
+        self.robust, self.moments = self.robust + block.robust, self.moments + block.moments
+        self.classes += block.classes
+        self.gain_matrix, self.gain_load = self.gain_matrix + block.gain_matrix, self.gain_load + block.gain_load
+        self.products, self.pairs = self.products + block.products, self.pairs + block.pairs
+        # nodes and cells of one block differ
+        self.matrix[nodes] += block.matrix
+        self.load[nodes] += block.load
+        self.draws[nodes] += block.draws
+        self.agreement[cells] += block.agreement
+        self.content[cells] += block.content
+        self.small += [] if block.small is None else [block.small]
+
+
+def _fine(view: Box, factor: int, coarse: tuple[int, ...], fine: tuple[int, ...]) -> Box:
+    """Return the box of voxels of a field of view of coarse ones; an end that is not padded is that of the volume."""
+    out = []
+    for s, n, whole in zip(view, coarse, fine, strict=True):
+        low, high, _ = s.indices(n)
+        out.append(slice(low * factor, whole if high == n else high * factor))
+    return out[0], out[1], out[2]

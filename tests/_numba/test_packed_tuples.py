@@ -1,0 +1,71 @@
+"""A kernel takes a packed tuple apart as it does the tuple itself, and changes the same arrays."""
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+
+from naibu._numba import packed_tuples
+from naibu._numba.compilation import njit
+from naibu._numba.packed_tuples import packed
+
+
+@njit
+def _scaled(pair: Any, factor: Any) -> Any:
+    matrix, vector = pair
+    total = 0.0
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            vector[i] += factor * matrix[i, j]
+            total += matrix[i, j]
+    return total + matrix.size + vector.itemsize
+
+
+@njit
+def kernel(data: Any) -> Any:
+    (first, second), (step, count, known), cube, empty = data
+    turned, part = cube[:, ::-1, 1], data[0][:1]
+    found = _scaled(first, step) + _scaled(second, 2.0 * step) + _scaled(part[0], 1.0)
+    return found, len(data), len(empty), count + cube.ndim, known, turned.sum(), data[-2].strides[0], data[2][1:].shape[0]
+
+
+def arguments() -> Any:
+    rng = np.random.default_rng(3)
+    first = rng.standard_normal((3, 4)), np.zeros(3)
+    second = rng.standard_normal((5, 2)).astype(np.float32), np.ones(5, np.float32)
+    return (first, second), (0.25, 7, True), rng.integers(0, 9, (2, 3, 4)), np.zeros((0, 3), np.int64)
+
+
+def test_packed_tuples_are_what_tuples_are() -> None:
+    assert packed_tuples.PACKED
+    plain, given = arguments(), arguments()
+    wanted, found = kernel(plain), kernel(packed(*given))
+    assert found == wanted
+    for a, b in zip((*plain[0][0], *plain[0][1]), (*given[0][0], *given[0][1]), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(given[0][0][1], arguments()[0][0][1])
+
+
+def test_arrays_stay_alive_and_may_change_between_calls() -> None:
+    given = packed(*arguments())
+    values = given.kept[2]
+    before = kernel(given)
+    values += 1
+    assert kernel(given)[5] == before[5] + values[:, :, 1].size
+
+
+def test_one_type_for_all_tuples_of_the_same_kinds() -> None:
+    one, other = packed(*arguments()), packed(*arguments())
+    assert one.kind == other.kind and one.kind.name == other.kind.name
+    again = pickle.loads(pickle.dumps(one.kind))
+    assert again == one.kind and again.name == one.kind.name
+    single = packed(np.zeros(3, np.float32))
+    assert single.kind != packed(np.zeros(3)).kind and single.kind.name != packed(np.zeros(3)).kind.name
+
+
+def test_arrays_with_gaps_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"contiguous; one has the shape \(3,\)"):
+        packed((np.arange(6.0)[::2],))

@@ -1,0 +1,62 @@
+"""Fields that cannot tell moduli are refused in words that say what is wrong with them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from naibu.core.arrays import FloatArray
+from naibu.core.displacement_field import DisplacementField
+from naibu.core.errors import InputError
+from naibu.core.volume import Volume
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
+from naibu.workflows.fields.block_mesh import block_mesh
+from naibu.workflows.fields.measured_load_case import measured_load_case
+
+SIDE_MM = 40.0
+INSIDE = Volume.from_array(np.ones((20, 20, 20), np.uint8), spacing_mm=(2.0,) * 3, origin_mm=(1.0,) * 3)
+POINTS = np.random.default_rng(0).uniform(1.0, SIDE_MM - 1.0, (300, 3))
+
+
+def case(points: FloatArray, vectors: FloatArray | None = None) -> FieldLoadCase:
+    """Return the load case of points that are sheared, if nothing else is given, in a cube of 5 x 5 x 5 cells."""
+    moved = 0.05 * points[:, [2, 0, 1]] if vectors is None else vectors
+    mesh, cells = block_mesh(INSIDE, np.ones(INSIDE.shape, np.int64), {1: "gel"}, 8.0)
+    return measured_load_case(mesh, cells, INSIDE, DisplacementField.from_arrays(points, moved), "push")
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("thickness", [0.0, 0.01])
+def test_points_in_a_plane_are_refused(turned: bool, thickness: float) -> None:
+    u, v = POINTS[:, 0] - 20.0, POINTS[:, 1] - 20.0
+    across = np.array([0.0, 0.6, 0.8]) if turned else np.array([0.0, 0.0, 1.0])
+    other = np.cross(across, [1.0, 0.0, 0.0])
+    flat = 20.0 + 0.6 * (u[:, None] * [1.0, 0.0, 0.0] + v[:, None] * other) + thickness * POINTS[:, 2:] * across
+    with pytest.raises(InputError, match=r"span only .* three dimensions"):
+        case(flat)
+
+
+@pytest.mark.parametrize("points", [np.full((300, 3), 7.0), 20.0 + (POINTS - 20.0) * [1.0, 0.0, 0.0], 0.001 * POINTS + 1.0])
+def test_points_at_a_place_and_lengths_in_metres_are_refused(points: FloatArray) -> None:
+    with pytest.raises(InputError, match=r"are they in mm\?"):
+        case(points)
+
+
+def test_where_field_and_object_are_is_told() -> None:
+    with pytest.raises(InputError, match=r"0 measurements.*20 are needed.*x 1007 to 3.881e\+04.*x 0 to 40.*one reference scan"):
+        case(1000.0 * POINTS)
+
+
+def test_a_field_without_displacements_is_refused_as_such() -> None:
+    field = DisplacementField.from_arrays(POINTS, np.full_like(POINTS, np.nan))
+    mesh, cells = block_mesh(INSIDE, np.ones(INSIDE.shape, np.int64), {1: "gel"}, 8.0)
+    with pytest.raises(InputError, match="none of its 300 points has a displacement"):
+        measured_load_case(mesh, cells, INSIDE, field, "push")
+
+
+def test_copies_of_a_measurement_count_once() -> None:
+    once = case(POINTS).field
+    twice = case(np.concatenate([POINTS, POINTS[:100]])).field
+    contradicting = case(np.concatenate([POINTS, POINTS[:100]]), np.concatenate([0.05 * POINTS, 0.06 * POINTS[:100]])).field
+    assert len(once.points) == len(twice.points) == 300
+    assert len(contradicting.points) == 400
