@@ -16,9 +16,10 @@ from pathlib import Path
 import pytest
 from virtual_press import Press
 
+import naibu as package
 from naibu import cli, datasets
 from naibu.cli.shell.run_record import RunRecord
-from naibu.cli.shell.version import checked_out_commit
+from naibu.cli.shell.version import checked_out_commit, version_text
 from naibu.io.experiment_folder.reader import read_experiment
 from naibu.io.experiment_folder.schema import Meta
 
@@ -149,7 +150,7 @@ def test_preview_writes_nothing_and_centimetres_are_not_taken_for_millimetres(na
     assert read_experiment(Path("naibu-experiment")).initial.points[0] == pytest.approx([26.97, 64.67, 12.0], abs=1e-3)
 
 
-def test_the_commit_is_that_of_git(tmp_path: Path) -> None:
+def test_the_commit_is_that_of_git(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def git(*arguments: str) -> str:
         options = ("-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false")
         return subprocess.run(["git", *options, *arguments], cwd=tmp_path, check=True, capture_output=True, text=True).stdout.strip()
@@ -159,6 +160,9 @@ def test_the_commit_is_that_of_git(tmp_path: Path) -> None:
     git("commit", "-q", "--allow-empty", "-m", "first")
     commit = git("rev-parse", "HEAD")
     assert checked_out_commit(tmp_path) == commit[:7]
+    monkeypatch.setattr(package, "__file__", str(tmp_path / "src" / "naibu" / "__init__.py"))
+    monkeypatch.setattr("naibu.cli.shell.version.files", lambda name: tmp_path / name)  # no wheel, which records its commit
+    assert version_text() == f"{package.__version__} (commit {commit[:7]})"
     git("pack-refs", "--all")
     assert checked_out_commit(tmp_path) == commit[:7]
     git("worktree", "add", "-q", "other")

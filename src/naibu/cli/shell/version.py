@@ -5,6 +5,7 @@ from __future__ import annotations
 from importlib.resources import files
 from pathlib import Path
 
+import naibu
 from naibu._version import __version__
 
 
@@ -19,7 +20,12 @@ def _commit() -> str:
     recorded = files("naibu") / "_commit.txt"
     if recorded.is_file():
         return recorded.read_text(encoding="utf-8").strip()
-    return checked_out_commit(Path(__file__).resolve().parents[3])
+    return checked_out_commit(source_root())
+
+
+def source_root() -> Path:
+    """Return the folder that holds ``src/naibu``, where the package runs from its sources."""
+    return Path(naibu.__file__).resolve().parents[2]
 
 
 def checked_out_commit(root: Path) -> str:
