@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from naibu.core import optional_packages
+from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError, MissingDependencyError
-from naibu.identification.lattice_calibration.evaluation import evaluated
+from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint, evaluated
 from naibu.identification.lattice_calibration.evolutionary import cost_of, evaluator, search_cma_es, search_genetic
 from naibu.identification.lattice_calibration.forward_model import (
     SAMPLE_S,
@@ -25,6 +26,7 @@ from naibu.identification.lattice_calibration.forward_model import (
     tributary_fractions,
 )
 from naibu.identification.lattice_calibration.gauss_newton import CalibrationProblem, Index, calibrate_lattice
+from naibu.identification.lattice_calibration.least_squares import step_within
 from naibu.identification.lattice_calibration.report_indices import indices
 from naibu.identification.lattice_calibration.unknowns import FRACTION_NOTE, LatticeUnknowns, identifiability
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
@@ -88,6 +90,42 @@ def test_the_truth_lies_within_the_intervals(lattice: Lattice, capture: Capture,
     assert found.runs < 100
     if index != "shape":
         assert np.sqrt(np.diag(found.covariance)).max() < 0.05
+
+
+def test_a_search_from_values_near_by_ends_where_the_long_one_does(lattice: Lattice, capture: Capture, unknowns: LatticeUnknowns) -> None:
+    problem = CalibrationProblem.of(lattice, [capture], unknowns)
+    far = calibrate_lattice(problem, START)
+    near = calibrate_lattice(problem, START, warm_start=1.05 * far.values, widen=False)
+    deviation = np.sqrt(np.diag(far.covariance))
+    assert (np.abs(np.log(near.values / far.values)) < 0.1 * deviation).all()
+    assert near.runs < 0.5 * far.runs
+    assert (np.sqrt(np.diag(near.covariance)) < 1.01 * deviation).all()  # not widened
+    with pytest.raises(InputError, match="K must be positive"):
+        calibrate_lattice(problem, START, warm_start=[-1.0, 1.0, 1.0])
+
+
+@pytest.mark.parametrize("reach", [100.0, 1.0, 0.01])
+def test_steps_within_a_reach_are_minima_of_the_linearised_cost(reach: float) -> None:
+    """Where the step is held back, what is left of the gradient points along it: the condition of Karush, Kuhn and Tucker."""
+    rng = np.random.default_rng(3)
+    slopes = rng.standard_normal((30, 4)) * [30.0, 5.0, 1.0, 1e-3]
+    point = EvaluatedPoint(
+        np.array([1.0, 2.0, 3.0, 9.0]), (30.0 * rng.standard_normal(20), rng.standard_normal(10)), (slopes[:20], slopes[20:])
+    )
+    centre = np.zeros(4)
+    step, decrease = step_within(point, centre, 1.2, reach)
+
+    def cost(change: FloatArray) -> float:
+        residual = np.concatenate(point.residual) + slopes @ change
+        return float(residual @ residual + (((point.theta + change - centre) / 1.2) ** 2).sum())
+
+    assert decrease == pytest.approx(cost(np.zeros(4)) - cost(step), rel=1e-9)
+    left = np.array([cost(step - h) - cost(step + h) for h in 1e-4 * np.eye(4)]) / 4e-4  # minus half the gradient
+    if reach == 100.0:
+        assert np.abs(left).max() < 1e-5
+    else:
+        assert np.abs(step).max() == pytest.approx(reach, rel=1e-2)
+        assert left @ step == pytest.approx(np.linalg.norm(left) * np.linalg.norm(step), rel=1e-5)
 
 
 def test_forces_add_what_shapes_alone_do_not_tell(lattice: Lattice, capture: Capture, unknowns: LatticeUnknowns) -> None:

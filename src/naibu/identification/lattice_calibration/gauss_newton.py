@@ -19,16 +19,17 @@ from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.progress import Progress
 from naibu.identification.lattice_calibration.estimate import LatticeEstimate
-from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint, evaluated
+from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint, Residual, evaluated
 from naibu.identification.lattice_calibration.forward_model import SAMPLE_S, Capture, PushedLattice, PushMode, Reproduced, averaged
 from naibu.identification.lattice_calibration.inverse_problem import InverseProblem
 from naibu.identification.lattice_calibration.least_squares import (
+    LONGEST,
     SETTLED,
     Evaluations,
     cost_of,
     covariance_at,
-    next_step,
     noise_factors,
+    step_within,
 )
 from naibu.identification.lattice_calibration.mapped_search import MappedSearch
 from naibu.identification.lattice_calibration.shape_distance import closest_points
@@ -40,9 +41,12 @@ Index = Literal["shape", "force", "joint"]
 Window = Literal["keep", "contact"]
 
 PRIOR_SD = 1.2  # of the logarithm of every parameter around its start: as wide as the report's ranges, a factor of 60 in all
-POLISHING = 9  # fine runs, at most
-FINE_ITERATIONS = 8  # with derivatives of fine steps, at most; they start next to the minimum, and take what is left of it
-RENEWED = 0.05  # change of a logarithm from which on coarse derivatives are computed anew beside fine residuals
+CORRECTIONS = 6  # by fine steps, at most
+RENEWED = 0.05  # change of a logarithm from which on derivatives are taken anew
+ENOUGH = 2e-3  # of the cost, while the noise is still taken as stated
+FARTHEST = 3.0  # change of a logarithm in one iteration, after steps that did what they promised
+POOR, WELL = 0.3, 0.75  # of the promised decrease, from which on steps become shorter, or may become longer
+IDLE = 2  # steps one after the other that change next to nothing, before the search ends
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,14 +182,16 @@ def calibrate_lattice(
     prior_sd: float = PRIOR_SD,
     max_iterations: int = 40,
     reweigh: bool = True,
+    warm_start: ArrayLike | Mapping[str, float] | None = None,
+    widen: bool = True,
     threads: int = 2,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> LatticeEstimate:
     """Identify lattice parameters from captures by least squares, with their covariance.
 
-    Iterations take steps that are long but after changes of motion; then residuals of fine steps throughout are brought to their minimum,
-    by the same derivatives, or by those of fine steps where that fails. Where the law does not reproduce points or forces to within their
+    Iterations take steps of time that are long but after changes of motion; then what residuals of fine steps throughout differ by is added
+    to theirs, and the search goes on. Where the law does not reproduce points or forces to within their
     noise, the noise is taken as that much larger, each for itself, and the search goes on: neither then outweighs the other by being
     measured more precisely than the model can tell. Where derivatives are differences of simulations, as in contact, Broyden's updates
     spare most of them (`MappedSearch`).
@@ -202,6 +208,10 @@ def calibrate_lattice(
         Of the coarse iterations with one size of the noise.
     reweigh : bool
         Whether the noise is enlarged to the misfit.
+    warm_start : array_like or mapping, optional
+        Values from which the search begins, as the estimate of a similar problem; weak priors stay around `start`. By default `start`.
+    widen : bool
+        Whether the covariance is widened to where chi-squared itself rises, which takes some thirty simulations of each load case.
     threads : int
         Into how many parts the derivatives of every capture are shared; by default as many threads compute them.
     executor : concurrent.futures.Executor
@@ -220,9 +230,12 @@ def calibrate_lattice(
         An interruption before the first evaluation has ended.
     """
     centre = np.log(problem.unknowns.vector(start))
+    first = centre.copy() if warm_start is None else np.log(problem.unknowns.vector(warm_start))
     at = Evaluations(threads, executor, progress)
     try:
-        return _searched(problem, centre, prior_sd, max_iterations, reweigh, at)
+        if problem.shifts(np.exp(centre)) is not None:
+            return _searched_by_mapping(problem, centre, first, prior_sd, max_iterations, reweigh, widen, at)
+        return _searched(problem, centre, first, prior_sd, max_iterations, reweigh, widen, at)
     except KeyboardInterrupt:
         if at.best is None or at.problem is None:
             raise
@@ -230,44 +243,49 @@ def calibrate_lattice(
 
 
 def _searched(
-    problem: InverseProblem, centre: FloatArray, prior_sd: float, max_iterations: int, reweigh: bool, at: Evaluations
+    problem: InverseProblem, centre: FloatArray, first: FloatArray, prior_sd: float, most: int, reweigh: bool, widen: bool, at: Evaluations
 ) -> LatticeEstimate:
-    if problem.shifts(np.exp(centre)) is not None:
-        return _searched_by_mapping(problem, centre, prior_sd, max_iterations, reweigh, at)
-    theta, runs, count = centre.copy(), 0, 0
-    here, used = problem, 0
-    for _ in range(3 if reweigh else 1):
-        point, used = _descend(here, theta, centre, prior_sd, max_iterations, at)
-        count, theta = count + used, point.theta
+    prior, here, count = (centre, prior_sd), problem, 0
+    point = at(here, first)
+    for k in range(4 if reweigh else 1):
+        # sizes of the noise that are about to change do not need the minimum
+        point, used = _descend(here, point, prior, most, at, enough=ENOUGH if reweigh and k == 0 else 0.0)
+        count += used
         factors = noise_factors(here, point.residual)
-        if not reweigh or max(abs(np.log(max(f, 1.0) / e)) for f, e in zip(factors, here.excess, strict=True)) < 0.05:
+        unchanged = max(abs(np.log(max(f, 1.0) / e)) for f, e in zip(factors, here.excess, strict=True)) < 0.05
+        if not reweigh or (k and unchanged):
             break
-        here = here.enlarged((max(factors[0], 1.0), max(factors[1], 1.0)))
-    runs, each = count * (1 + len(theta)), 1 + len(theta)
-    point, polished, settled = _polished(here, point, centre, prior_sd, at)
-    runs += polished + (polished - 1) * each
-    if not settled:  # coarse derivatives do not lead there
-        point, used = _descend(here, point.theta, centre, prior_sd, FINE_ITERATIONS, at, fine=True)
-        count, runs = count + used, runs + used * each
-    point = replace(point, slopes=at(here, point.theta).slopes)
-    runs += each
-    covariance, extra = widened_covariance(here, point, centre, prior_sd, at)
-    return _estimate(here, point, covariance, count, runs + extra)
+        point = _in_other_units(point, here.excess, excess := (max(factors[0], 1.0), max(factors[1], 1.0)))
+        here = here.enlarged(excess)
+        at.keep(here, point)
+    point, used = _corrected(here, point, prior, most, at)
+    count += used
+    covariance = widened_covariance(here, point, centre, prior_sd, at)[0] if widen else covariance_at(point, prior_sd)
+    return _estimate(here, point, covariance, count, at.runs)
+
+
+def _in_other_units(point: EvaluatedPoint, old: tuple[float, float], new: tuple[float, float]) -> EvaluatedPoint:
+    """Return a point whose residuals are in units of another noise."""
+    points, forces = old[0] / new[0], old[1] / new[1]
+    (shape, force), (shape_slopes, force_slopes) = point.residual, point.slopes
+    return EvaluatedPoint(point.theta, (shape * points, force * forces), (shape_slopes * points, force_slopes * forces))
 
 
 def _searched_by_mapping(
-    problem: InverseProblem, centre: FloatArray, prior_sd: float, max_iterations: int, reweigh: bool, at: Evaluations
+    problem: InverseProblem, centre: FloatArray, first: FloatArray, prior_sd: float, most: int, reweigh: bool, widen: bool, at: Evaluations
 ) -> LatticeEstimate:
-    search = MappedSearch(problem, centre, prior_sd, at)
-    search.run(max_iterations, reweigh=reweigh)
+    search = MappedSearch(problem, centre, prior_sd, at, first)
+    search.run(most, reweigh=reweigh)
     shifts = problem.shifts(np.exp(search.theta))
     assert shifts is not None
     if not search.settled:  # derivatives there say nothing of where the least misfit is
         unknown = prior_sd**2 * np.eye(len(centre))
         return replace(_estimate(search.problem, search.point, unknown, search.iterations, search.runs), settled=False)
-    information, smoothing = smoothed_information(search.problem, search.point, float(np.abs(shifts).max()), prior_sd, at)
-    covariance, extra = widened_covariance(search.problem, search.point, centre, prior_sd, at, information)
-    return _estimate(search.problem, search.point, covariance, search.iterations, search.runs + smoothing + extra)
+    information, _ = smoothed_information(search.problem, search.point, float(np.abs(shifts).max()), prior_sd, at)
+    covariance = np.asarray(np.linalg.inv(information + np.eye(len(centre)) / prior_sd**2))
+    if widen:
+        covariance = widened_covariance(search.problem, search.point, centre, prior_sd, at, information)[0]
+    return _estimate(search.problem, search.point, covariance, search.iterations, at.runs)
 
 
 def _estimate(
@@ -308,60 +326,67 @@ def estimate_at(problem: InverseProblem, values: ArrayLike, *, prior_sd: float =
     return _estimate(here, point, covariance_at(point, prior_sd), 0, 3 + len(theta), finished=finished)
 
 
-def _descend(
-    problem: InverseProblem, theta: FloatArray, centre: FloatArray, prior_sd: float, most: int, at: Evaluations, *, fine: bool = False
+def _corrected(
+    problem: InverseProblem, point: EvaluatedPoint, prior: tuple[FloatArray, float], most: int, at: Evaluations
 ) -> tuple[EvaluatedPoint, int]:
-    """Iterate by Gauss and Newton; a step that does not help is shortened. Returns the last point and the iterations."""
-    point, damping = at(problem, theta, fine=fine), 0.0
-    cost, used = cost_of(point, centre, prior_sd), 1
-    while used < most:
-        step, promised = next_step(point, centre, prior_sd, damping)
-        if promised < SETTLED:
+    """Move on to the minimum of residuals of fine steps, and return it with the iterations.
+
+    What they differ by from residuals of long steps is added to these, and the search goes on with them (output space mapping;
+    :cite:t:`bandler2004`), until residuals of fine steps become no better.
+    """
+    coarse, best, count = point.residual, np.inf, 0
+    for _ in range(CORRECTIONS):
+        fine = at(problem, point.theta, derivatives=False, fine=True)
+        cost = cost_of(fine, *prior)
+        if cost > best:
+            break
+        ended = best - cost < SETTLED + 1e-5 * cost
+        best, found = cost, replace(fine, slopes=point.slopes)
+        if ended:
+            break
+        offset = (fine.residual[0] - coarse[0], fine.residual[1] - coarse[1])
+        point, used = _descend(problem, found, prior, most, at, offset=offset)
+        count += used
+        coarse = (point.residual[0] - offset[0], point.residual[1] - offset[1])
+    return found, count
+
+
+def _descend(
+    problem: InverseProblem,
+    point: EvaluatedPoint,
+    prior: tuple[FloatArray, float],
+    most: int,
+    at: Evaluations,
+    *,
+    offset: Residual | None = None,
+    enough: float = 0.0,
+) -> tuple[EvaluatedPoint, int]:
+    """Iterate by Gauss and Newton within a trust region (:cite:t:`nocedal2006`, chapters 4 and 10).
+
+    An `offset` is added to all residuals. Derivatives are taken anew after `RENEWED`, and where old ones fail; `enough` is a decrease, as
+    a fraction of the cost, that is not worth a step. Returns the last point and the iterations.
+    """
+    cost, reach, taken_at, idle = cost_of(point, *prior), LONGEST, point.theta, 0
+    for used in range(1, most):
+        step, promised = step_within(point, *prior, reach)
+        if promised < max(SETTLED, enough * cost) or idle >= IDLE:
             return point, used
-        trial = at(problem, point.theta + step, derivatives=False, fine=fine)
-        used += 1
-        if (new := cost_of(trial, centre, prior_sd)) < cost:
-            settled = cost - new < SETTLED + max(1e-6 if fine else 1e-5, problem.roughness) * cost
-            if settled and np.abs(step).max() < RENEWED:
-                return replace(trial, slopes=point.slopes), used
-            if settled:
-                return at(problem, trial.theta, fine=fine), used
-            point, cost, damping = at(problem, trial.theta, fine=fine), new, 0.3 * damping if damping > 1e-4 else 0.0
-        else:
-            damping = max(10.0 * damping, 1e-3)
-            if damping > 1e6 or promised < problem.roughness * cost:
-                return point, used
-    if fine:
-        return point, used
+        trial = at(problem, point.theta + step, derivatives=False)
+        if offset is not None:
+            trial = replace(trial, residual=(trial.residual[0] + offset[0], trial.residual[1] + offset[1]))
+        decrease, size = cost - cost_of(trial, *prior), float(np.abs(step).max())
+        idle = idle + 1 if abs(decrease) < SETTLED + max(1e-5, problem.roughness, enough) * cost else 0
+        if decrease < POOR * promised:
+            reach = 0.3 * size
+        elif decrease > WELL * promised and size > 0.9 * reach:
+            reach = min(2.0 * reach, FARTHEST)
+        if decrease > 0.0:
+            point, cost = replace(trial, slopes=point.slopes), cost - decrease
+        moved = float(np.abs(point.theta - taken_at).max())
+        if moved > RENEWED or (moved > 0.0 and decrease <= 0.0):
+            point, taken_at = replace(point, slopes=at(problem, point.theta).slopes), point.theta
     raise ConvergenceError(
-        f"the calibration did not settle within {used} iterations (chi-squared {cost:.6g}); allow more (max_iterations), or start "
+        f"the calibration did not settle within {most} iterations (chi-squared {cost:.6g}); allow more (max_iterations), or start "
         "nearer: it is at "
         + ", ".join(f"{name} {value:.3g}" for name, value in zip(problem.unknowns.names, np.exp(point.theta), strict=True))
     )
-
-
-def _polished(
-    problem: InverseProblem, point: EvaluatedPoint, centre: FloatArray, prior_sd: float, at: Evaluations
-) -> tuple[EvaluatedPoint, int, bool]:
-    """Move on to the minimum of residuals of fine steps by derivatives of coarse ones; return it, the runs, and whether it settled."""
-
-    def fine(theta: FloatArray) -> EvaluatedPoint:
-        return at(problem, theta, derivatives=False, fine=True)
-
-    best, damping, coarse = replace(fine(point.theta), slopes=point.slopes), 0.0, point.theta
-    cost = cost_of(best, centre, prior_sd)
-    for count in range(1, POLISHING):
-        step, promised = next_step(best, centre, prior_sd, damping)
-        if promised < SETTLED:
-            return best, count, True
-        trial = fine(best.theta + step)
-        if (new := cost_of(trial, centre, prior_sd)) < cost:
-            slopes = best.slopes
-            if np.abs(trial.theta - coarse).max() > RENEWED:
-                slopes, coarse = at(problem, trial.theta).slopes, trial.theta
-            best, cost, damping = replace(trial, slopes=slopes), new, 0.3 * damping
-        else:
-            if promised < problem.roughness * cost:
-                return best, count, True
-            damping = max(10.0 * damping, 1e-3)
-    return best, POLISHING, False

@@ -7,6 +7,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.optimize
 
 from naibu.core.arrays import FloatArray
 from naibu.core.progress import Progress, report_progress
@@ -25,12 +26,14 @@ class Evaluations:
     executor: Executor | None
     progress: Progress | None
     count: int = 0
+    runs: int = 0  # simulations; derivatives count as one for each parameter
     best: EvaluatedPoint | None = None
     problem: InverseProblem | None = None
 
     def __call__(self, problem: InverseProblem, theta: FloatArray, *, derivatives: bool = True, fine: bool = False) -> EvaluatedPoint:
         """Return residuals, and their derivatives, at theta (p,)."""
         point = evaluated(problem, theta, derivatives=derivatives, fine=fine, threads=self.threads, executor=self.executor)
+        self.runs += 1 + (len(theta) if derivatives else 0)
         if derivatives:
             self.keep(problem, point)
         self._report(point.residual)
@@ -41,6 +44,7 @@ class Evaluations:
         found = []
         for residual in residuals_at(problem, trials, threads=self.threads, executor=self.executor):
             found.append(residual)
+            self.runs += 1
             self._report(residual)
         return found
 
@@ -76,6 +80,30 @@ def next_step(point: EvaluatedPoint, centre: FloatArray, prior_sd: float, dampin
     step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), slope)
     limited = step * min(1.0, LONGEST / max(float(np.abs(step).max()), 1e-300))
     return np.asarray(limited, dtype=np.float64), float(-slope @ step)
+
+
+def step_within(point: EvaluatedPoint, centre: FloatArray, prior_sd: float, reach: float) -> tuple[FloatArray, float]:
+    """Return the change of theta that lowers the linearised cost most, none of its components longer than `reach`; and the decrease.
+
+    Damping is the same for all logarithms: what the data determine well is not held back by what they do not.
+    """
+    hessian = point.information + np.eye(len(point.theta)) / prior_sd**2
+    slope = point.gradient() + (point.theta - centre) / prior_sd**2
+    values, vectors = np.linalg.eigh(hessian)
+    part = vectors.T @ slope
+
+    def step(damping: float) -> FloatArray:
+        return np.asarray(-vectors @ (part / (values + damping)), dtype=np.float64)
+
+    def excess(logarithm: float) -> float:
+        return float(np.abs(step(np.exp(logarithm))).max()) - reach
+
+    chosen = step(0.0)
+    if float(np.abs(chosen).max()) > reach:
+        most = np.log(float(np.linalg.norm(part)) / reach)  # no component is longer than the whole
+        least = np.log(values[0]) - 30.0
+        chosen = step(float(np.exp(scipy.optimize.brentq(excess, min(least, most - 1.0), most + 1e-9, xtol=1e-3))))
+    return chosen, float(-2.0 * slope @ chosen - chosen @ hessian @ chosen)
 
 
 def covariance_at(point: EvaluatedPoint, prior_sd: float) -> FloatArray:

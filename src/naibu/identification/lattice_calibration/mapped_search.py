@@ -33,7 +33,7 @@ LEAST_DAMPING = 1e-4
 
 @dataclass(slots=True)
 class MappedSearch:
-    """A search from the start of the weak prior on.
+    """A search for the least chi-squared.
 
     Attributes
     ----------
@@ -43,6 +43,8 @@ class MappedSearch:
         Of the weak prior.
     at : Evaluations
         Of residuals.
+    first : ndarray, shape (p,)
+        Where it begins.
     theta, residual : ndarray, tuple of ndarray
         Where it is, and residuals there: of long steps, corrected.
     offset : tuple of ndarray
@@ -61,6 +63,7 @@ class MappedSearch:
     centre: FloatArray
     prior_sd: float
     at: Evaluations
+    first: FloatArray
     theta: FloatArray = field(init=False)
     residual: Residual = field(init=False)
     offset: Residual = field(init=False)
@@ -71,7 +74,7 @@ class MappedSearch:
     settled: bool = False
 
     def __post_init__(self) -> None:
-        self.theta = self.centre.copy()
+        self.theta = self.first.copy()
         self.residual = self._simulated([(self.theta, False)])[0]
         self.offset = (np.zeros_like(self.residual[0]), np.zeros_like(self.residual[1]))
         self._differences()

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray
 from naibu.identification.lattice_calibration.estimate import LatticeEstimate
 from naibu.identification.lattice_calibration.forward_model import Capture, PushedLattice
 from naibu.identification.lattice_calibration.gauss_newton import CalibrationProblem, calibrate_lattice
@@ -46,26 +51,64 @@ def chapter4_cube(seed: int = 0, *, points: int = POINTS, sizes: tuple[int, ...]
         Voxels per edge, among 8 and 16.
     """
     settings: dict[str, Cell] = {"seed": seed, "points": points, "point_sd_mm": POINT_SD_MM, "force_sd_mn": FORCE_SD_MN}
-    sections = tuple(cube_section(n, seed, points) for n in sizes)
+    cubes: list[CalibratedCube] = []
+    for n in sorted(sizes):
+        cubes.append(calibrated_cube(n, seed, points, coarser=cubes[-1] if cubes else None))
+    sections = tuple(cube_section(cube) for cube in cubes)
     return Chapter("ch4-cube", "Chapter 4.3: a cube of dough as classic and octree lattices", sections, settings)
 
 
-def cube_section(n: int, seed: int, points: int) -> Section:
-    """Return the tables of the cube of n voxels per edge, calibrated on a twin with half the node spacing."""
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibratedCube:
+    """A twin of the cube of n voxels per edge, and the lattices of all models calibrated on it."""
+
+    n: int
+    capture: Capture
+    lattices: tuple[Lattice, ...]
+    fits: tuple[LatticeEstimate, ...]
+
+
+def calibrated_cube(n: int, seed: int, points: int, *, coarser: CalibratedCube | None = None) -> CalibratedCube:
+    """Return the cube of n voxels per edge, calibrated on a twin with half the node spacing.
+
+    The searches begin from the same models of a `coarser` cube, if there is one; weak priors stay around the initial guess.
+    """
     spacing = EDGE_MM / n
     truth = dough_lattice(spacing / 2.0, size_cm=CUBE_CM, mass_g=CUBE_G)
     capture = virtual_capture(truth, dough_parameters(truth, zones=True), CUBE_PUSHING, seed=seed, points=points)
     mask, mass = box_mask((n, n, n)), 1e-3 * CUBE_G
     lattices = [classic_lattice(mask, spacing, total_mass_kg=mass)]
     lattices += [octree_lattice(mask, spacing, kind, total_mass_kg=mass, scaling="edge") for kind in range(3)]
-    fits = [_fitted(lattice, capture) for lattice in lattices]
+    fits: list[LatticeEstimate] = []
+    for k, lattice in enumerate(lattices):
+        unknowns = LatticeUnknowns.of(lattice, classes=False, levels=True)
+        start = {name: value * spacing / 10.0 for name, value in START.items()}
+        near = None if coarser is None else _scaled(coarser.fits[k], unknowns, coarser.n / n)
+        problem = CalibrationProblem.of(lattice, [capture], unknowns)
+        fits.append(calibrate_lattice(problem, start, max_iterations=80, warm_start=near))
+    return CalibratedCube(n, capture, tuple(lattices), tuple(fits))
+
+
+def _scaled(fit: LatticeEstimate, unknowns: LatticeUnknowns, factor: float) -> FloatArray:
+    """Return the values of another estimate times a factor; of levels that it does not have, those of its highest one."""
+    known = dict(zip(fit.unknowns.names, fit.values, strict=True))
+    found = []
+    for name in unknowns.names:
+        kind, _, level = name.split()
+        found.append(next(known[f"{kind} level {k}"] for k in range(int(level), -1, -1) if f"{kind} level {k}" in known))
+    return factor * np.array(found)
+
+
+def cube_section(cube: CalibratedCube) -> Section:
+    """Return the tables of a calibrated cube."""
+    n, capture, fits = cube.n, cube.capture, list(cube.fits)
     text = (
         "A cube of 8 cm and 630 g, compressed at two opposite sides by indenters 2 cm wide. One set of K, C1 and C2 for every level of the "
-        f"octree, as in the report, calibrated on shape and force of one twin, with a node spacing of {spacing / 2.0:g} mm and a different "
-        "surface. The units printed with the parameters cannot be those of a spring (gf/cm^3): they are shown as printed.",
+        f"octree, as in the report, calibrated on shape and force of one twin, with a node spacing of {EDGE_MM / n / 2.0:g} mm and a "
+        "different surface. The units printed with the parameters cannot be those of a spring (gf/cm^3): they are shown as printed.",
     )
     title = f"{n + 1} x {n + 1} x {n + 1} nodes"
-    pushed = [PushedLattice.of(lattice, capture.pushing) for lattice in lattices]
+    pushed = [PushedLattice.of(lattice, capture.pushing) for lattice in cube.lattices]
     motions = [p.run(fit.parameters()) for p, fit in zip(pushed, fits, strict=True)]
     shapes = [FinalShape.of(model, capture, p, m) for model, p, m in zip(MODELS, pushed, motions, strict=True)]
     figure = Figure(
@@ -73,12 +116,6 @@ def cube_section(n: int, seed: int, points: int) -> Section:
     )
     found = [indices_of(capture, p, m) for p, m in zip(pushed, motions, strict=True)]
     return Section(title, text, (_parameters(n, fits), _differences(n, found)), (figure,))
-
-
-def _fitted(lattice: Lattice, capture: Capture) -> LatticeEstimate:
-    unknowns = LatticeUnknowns.of(lattice, classes=False, levels=True)
-    start = {name: value * lattice.spacing_mm / 10.0 for name, value in START.items()}
-    return calibrate_lattice(CalibrationProblem.of(lattice, [capture], unknowns), start, max_iterations=80)
 
 
 def _parameters(n: int, fits: list[LatticeEstimate]) -> Table:

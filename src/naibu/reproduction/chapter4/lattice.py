@@ -42,7 +42,7 @@ def chapter4_lattice(seed: int = 0, *, points: int = POINTS, draws: int = DRAWS)
         Twins, with noise and points of their own, for which one joint set is compared with two.
     """
     study = pattern_study(seed, points=points)
-    others = [pattern_study(seed + k, points=points, patterns=ONE_SET) for k in range(1, draws)]
+    others = [pattern_study(seed + k, points=points, patterns=ONE_SET, near=study.estimates) for k in range(1, draws)]
     sections = (exact_section(seed, points), *pattern_sections(study, others))
     settings: dict[str, Cell] = {"seed": seed, "points": points, "draws": draws, "point_sd_mm": POINT_SD_MM, "force_sd_mn": FORCE_SD_MN}
     return Chapter("ch4-lattice", "Chapter 4.3: lattices of dough, calibrated on shape and force", sections, settings)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -86,7 +86,8 @@ def pattern_study(
     law: Law = "finer",
     spacing_mm: float = 10.0,
     points: int = 2800,
-    patterns: Sequence[Pattern] = (*PATTERNS, *JOINT, *SEPARATE),
+    patterns: Sequence[Pattern] = EVERY,
+    near: Mapping[Key, LatticeEstimate] | None = None,
 ) -> PatternStudy:
     """Calibrate on either load case under displacement and force control, on shape, force and both, and evaluate all patterns.
 
@@ -102,6 +103,8 @@ def pattern_study(
         Number of captured points.
     patterns : sequence of Pattern
         Which ones.
+    near : mapping, optional
+        Estimates of another draw, from which the searches begin; intervals are then those of the derivatives alone.
     """
     twin = dough_twin((FIRST, SECOND), law=law, spacing_mm=spacing_mm, seed=seed, points=points)
     lattice = dough_lattice(spacing_mm)
@@ -109,7 +112,9 @@ def pattern_study(
     estimates = study.estimates
     for pattern in patterns:
         if pattern.calibration not in estimates:
-            estimates[pattern.calibration] = calibrated(lattice, twin.captures, pattern.calibration)
+            estimates[pattern.calibration] = calibrated(
+                lattice, twin.captures, pattern.calibration, near=near and near[pattern.calibration]
+            )
         capture = twin.captures[pattern.pushing]
         pushed = PushedLattice.of(lattice, capture.pushing, pattern.mode, force=capture.force)
         motion = pushed.run(estimates[pattern.calibration].parameters())
@@ -120,12 +125,16 @@ def pattern_study(
     return study
 
 
-def calibrated(lattice: Lattice, captures: tuple[Capture, ...], key: Key) -> LatticeEstimate:
-    """Return one calibration; forces are fitted while the indenters are at rest, as in the report."""
+def calibrated(lattice: Lattice, captures: tuple[Capture, ...], key: Key, *, near: LatticeEstimate | None = None) -> LatticeEstimate:
+    """Return one calibration; forces are fitted while the indenters are at rest, as in the report.
+
+    The search begins from an estimate that is `near`, if there is one; intervals are then not widened.
+    """
     number, mode, index = key
     problem = CalibrationProblem.of(lattice, [captures[number]], index=index, mode=mode, window="keep")
     scale = lattice.spacing_mm / 10.0
-    return calibrate_lattice(problem, {name: value * scale for name, value in START.items()}, max_iterations=80)
+    start = {name: value * scale for name, value in START.items()}
+    return calibrate_lattice(problem, start, max_iterations=80, warm_start=None if near is None else near.values, widen=near is None)
 
 
 def with_interval_factor(estimate: LatticeEstimate, k: int) -> str:
