@@ -42,7 +42,7 @@ Window = Literal["keep", "contact"]
 
 PRIOR_SD = 1.2  # of the logarithm of every parameter around its start: as wide as the report's ranges, a factor of 60 in all
 CORRECTIONS = 6  # by fine steps, at most
-RENEWED = 0.05  # change of a logarithm from which on derivatives are taken anew
+TELLING = 0.05  # change of a logarithm from which on a step tells of derivatives
 ENOUGH = 2e-3  # of the cost, while the noise is still taken as stated
 FARTHEST = 3.0  # change of a logarithm in one iteration, after steps that did what they promised
 POOR, WELL = 0.3, 0.75  # of the promised decrease, from which on steps become shorter, or may become longer
@@ -249,7 +249,7 @@ def _searched(
     point = at(here, first)
     for k in range(4 if reweigh else 1):
         # sizes of the noise that are about to change do not need the minimum
-        point, used = _descend(here, point, prior, most, at, enough=ENOUGH if reweigh and k == 0 else 0.0)
+        point, used = _descend(here, point, prior, most, at, fresh=k != 1, enough=ENOUGH if reweigh and k == 0 else 0.0)
         count += used
         factors = noise_factors(here, point.residual)
         unchanged = max(abs(np.log(max(f, 1.0) / e)) for f, e in zip(factors, here.excess, strict=True)) < 0.05
@@ -347,8 +347,19 @@ def _corrected(
         offset = (fine.residual[0] - coarse[0], fine.residual[1] - coarse[1])
         point, used = _descend(problem, found, prior, most, at, offset=offset)
         count += used
+        if np.array_equal(point.theta, found.theta):
+            break
         coarse = (point.residual[0] - offset[0], point.residual[1] - offset[1])
     return found, count
+
+
+def _told(point: EvaluatedPoint, found: Residual, step: FloatArray) -> EvaluatedPoint:
+    """Return a point whose derivatives tell what a step from there did (a rank-one update; :cite:p:`broyden1965`)."""
+    slopes = [
+        own + np.outer(new - old - own @ step, step) / float(step @ step)
+        for own, new, old in zip(point.slopes, found, point.residual, strict=True)
+    ]
+    return replace(point, slopes=(slopes[0], slopes[1]))
 
 
 def _descend(
@@ -359,32 +370,40 @@ def _descend(
     at: Evaluations,
     *,
     offset: Residual | None = None,
+    fresh: bool = True,
     enough: float = 0.0,
 ) -> tuple[EvaluatedPoint, int]:
     """Iterate by Gauss and Newton within a trust region (:cite:t:`nocedal2006`, chapters 4 and 10).
 
-    An `offset` is added to all residuals. Derivatives are taken anew after `RENEWED`, and where old ones fail; `enough` is a decrease, as
-    a fraction of the cost, that is not worth a step. Returns the last point and the iterations.
+    An `offset` is added to all residuals. Derivatives are improved by every step, and taken anew where a step does much less than it
+    promised, and before the search ends unless they are `fresh`. `enough` is a decrease, as a fraction of the cost, that is not worth a
+    step. Returns the last point and the iterations.
     """
-    cost, reach, taken_at, idle = cost_of(point, *prior), LONGEST, point.theta, 0
+    cost, reach, idle, renewed = cost_of(point, *prior), LONGEST, 0, False
     for used in range(1, most):
         step, promised = step_within(point, *prior, reach)
         if promised < max(SETTLED, enough * cost) or idle >= IDLE:
-            return point, used
+            if fresh or enough or renewed:
+                return point, used
+            point, fresh, renewed, idle = replace(point, slopes=at(problem, point.theta).slopes), True, True, 0
+            continue
         trial = at(problem, point.theta + step, derivatives=False)
         if offset is not None:
             trial = replace(trial, residual=(trial.residual[0] + offset[0], trial.residual[1] + offset[1]))
         decrease, size = cost - cost_of(trial, *prior), float(np.abs(step).max())
         idle = idle + 1 if abs(decrease) < SETTLED + max(1e-5, problem.roughness, enough) * cost else 0
-        if decrease < POOR * promised:
+        poor = decrease < POOR * promised
+        if poor:
             reach = 0.3 * size
         elif decrease > WELL * promised and size > 0.9 * reach:
             reach = min(2.0 * reach, FARTHEST)
+        if size > TELLING:
+            point = _told(point, trial.residual, step)
         if decrease > 0.0:
             point, cost = replace(trial, slopes=point.slopes), cost - decrease
-        moved = float(np.abs(point.theta - taken_at).max())
-        if moved > RENEWED or (moved > 0.0 and decrease <= 0.0):
-            point, taken_at = replace(point, slopes=at(problem, point.theta).slopes), point.theta
+        if poor and not fresh:
+            point = replace(point, slopes=at(problem, point.theta).slopes)
+        fresh = poor and not fresh
     raise ConvergenceError(
         f"the calibration did not settle within {most} iterations (chi-squared {cost:.6g}); allow more (max_iterations), or start "
         "nearer: it is at "
