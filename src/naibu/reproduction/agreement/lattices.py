@@ -5,7 +5,7 @@ from __future__ import annotations
 from naibu.reproduction.agreement.read_tables import Tables, alike, compared, verdict
 from naibu.viewer.chapters.comparisons import Comparison
 
-_COSTS = "Ours handles nodes and elements together, in padded blocks of eight, on a processor of today: octrees save little there."
+_COSTS = "Ours handles nodes and elements together, in padded blocks of eight, on a processor of today: octrees save less there."
 _TWIN = "The report's dough, cameras and force sensors are not at hand: ours are of a virtual twin, without errors of registration."
 
 
@@ -134,7 +134,7 @@ def of_octree(tables: Tables) -> tuple[Comparison, ...]:
                 misprints if apart else "",
             )
         )
-    for title in _cost_titles(tables):
+    for title, caption in _costs(tables):
         rows = [
             row for row in tables.rows(title, "lattice", "paper saves, %", "ours saves, %") if row[1] is not None and row[2] is not None
         ]
@@ -143,7 +143,7 @@ def of_octree(tables: Tables) -> tuple[Comparison, ...]:
             same = all(alike(a, b, within=0.35) or abs(a - b) < 10.0 for a, b in zip(paper, ours, strict=True))
             found.append(
                 Comparison(
-                    f"What octrees save ({title})",
+                    f"What octrees save ({title}: {caption})",
                     f"{min(paper):.0f} to {max(paper):.0f} %",
                     f"{min(ours):.0f} to {max(ours):.0f} %",
                     verdict(same),
@@ -153,5 +153,6 @@ def of_octree(tables: Tables) -> tuple[Comparison, ...]:
     return tuple(found)
 
 
-def _cost_titles(tables: Tables) -> list[str]:
-    return [t.title for s in tables.sections for t in s.tables if "paper saves, %" in t.columns and ":" not in t.title]
+def _costs(tables: Tables) -> list[tuple[str, str]]:
+    every = [t for s in tables.sections for t in s.tables]
+    return [(t.title, t.caption.rstrip(".")) for t in every if "paper saves, %" in t.columns and ":" not in t.title]

@@ -92,7 +92,7 @@ def energies(groups: Mapping[str, Sequence[Matched]]) -> Draw:
                 marker = "o" if len(number) < 10 else ""
                 upper.plot(number, way.matches.energies, line, lw=1.4, marker=marker, ms=3, label=way.name)
                 lower.plot(number, way.matches.counts, line, lw=1.4, marker=marker, ms=3)
-            upper.set(title=title, yscale="log", ylabel="energy: mean strength of match")
+            upper.set(title=title, yscale="log", ylabel="energy (1.5)")
             lower.set(xlabel="iteration", ylabel="matches")
             lower.yaxis.get_major_locator().set_params(integer=True)
         axes[0, 0].legend(frameon=False)

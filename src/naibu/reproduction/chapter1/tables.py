@@ -180,7 +180,7 @@ def _plane_section(calf: Calf, draws: int, seed: int) -> Section:
     )
     figures = (
         Figure("Matches", "From reference points to their matches, on the deformed slice.",
-               drawn.match_panels(calf.image, chosen), (9.0, 4.0)),
+               drawn.match_panels(calf.image, chosen), (9.0, 4.5)),
         Figure("Energy", "Energy (1.5), and number of matches, in every iteration.",
                drawn.energies({"image": calf.plane[1:], "volumes": calf.space[1:]}), (9.0, 4.6)),
         Figure("Fig. 1.4", "Delaunay net, dense field inside it, and its error.", drawn.net_panels(calf.image, chosen), (10.5, 6.6)),

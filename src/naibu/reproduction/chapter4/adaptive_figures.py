@@ -68,14 +68,16 @@ def shapes(found: Mapping[str, Motion]) -> Draw:
     """Return what draws the meshes at the ends of the parts of the motions, one row a part."""
 
     def draw(canvas: Canvas) -> None:
-        from matplotlib import colormaps
+        from matplotlib.cm import ScalarMappable
+        from matplotlib.colors import Normalize
         from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
 
+        scale = ScalarMappable(Normalize(1.0, LARGEST), "viridis")
         columns, rows = len(found), len(next(iter(found.values())).snapshots)
         for c, (name, motion) in enumerate(found.items()):
             for r, shape in enumerate(motion.snapshots):
                 axes = canvas.add_subplot(rows, columns, r * columns + c + 1, projection="3d")
-                colours = colormaps["viridis"]((np.clip(shape.stretch, 1.0, LARGEST) - 1.0) / (LARGEST - 1.0))
+                colours = scale.to_rgba(shape.stretch)
                 axes.add_collection3d(Poly3DCollection(shape.position[shape.faces], facecolors=colours, edgecolors="k", linewidths=0.2))
                 low, high = shape.position.min(axis=0), shape.position.max(axis=0)
                 middle, half = 0.5 * (low + high), 0.5 * float((high - low).max())
@@ -83,6 +85,7 @@ def shapes(found: Mapping[str, Motion]) -> Draw:
                 axes.set_axis_off()
                 axes.view_init(elev=18.0, azim=-65.0)
                 axes.set_title(f"{name}, {('released', 'returned')[r]}", fontsize=9)
+        canvas.colorbar(scale, ax=canvas.axes, label="edge stretch", shrink=0.6, extend="max")
 
     return draw
 
@@ -113,6 +116,7 @@ def costs(found: Mapping[str, Motion]) -> Draw:
         left.set(xlabel="time, s", ylabel="processor time of an iteration, ms", ylim=(0.0, None))
         right.set(xlabel="time, s", ylabel="nodes", ylim=(0.0, None))
         left.legend(fontsize=8)
+        right.legend(fontsize=8)
 
     return draw
 

@@ -80,7 +80,9 @@ def _shaded(axes, points: FloatArray, triangles: IntArray, colours: FloatArray, 
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     bright = 0.55 + 0.45 * np.clip(normal @ (LIGHT / np.linalg.norm(LIGHT)), 0.0, 1.0)
-    axes.add_collection3d(Poly3DCollection(corners, facecolors=bright[:, None] * colours, edgecolors=(0, 0, 0, 0.5), linewidths=width))
+    axes.add_collection3d(
+        Poly3DCollection(corners, facecolors=bright[:, None] * colours, edgecolors=(0, 0, 0, 0.5), linewidths=width, clip_on=False)
+    )
 
 
 def _framed(axes, points: FloatArray) -> None:  # type: ignore[no-untyped-def]

@@ -113,7 +113,7 @@ def pattern_study(
     for pattern in patterns:
         if pattern.calibration not in estimates:
             estimates[pattern.calibration] = calibrated(
-                lattice, twin.captures, pattern.calibration, near=near and near[pattern.calibration]
+                lattice, twin.captures, pattern.calibration, near=None if near is None else near[pattern.calibration]
             )
         capture = twin.captures[pattern.pushing]
         pushed = PushedLattice.of(lattice, capture.pushing, pattern.mode, force=capture.force)
