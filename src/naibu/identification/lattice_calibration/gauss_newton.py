@@ -401,6 +401,7 @@ def _descend(
             point = _told(point, trial.residual, step)
         if decrease > 0.0:
             point, cost = replace(trial, slopes=point.slopes), cost - decrease
+            at.keep(problem, point)
         if poor and not fresh:
             point = replace(point, slopes=at(problem, point.theta).slopes)
         fresh = poor and not fresh
