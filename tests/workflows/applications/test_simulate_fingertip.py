@@ -15,6 +15,7 @@ from vtkmodules.vtkIOHDF import vtkHDFReader
 
 from naibu.core.errors import InputError
 from naibu.core.progress import ProgressReport
+from naibu.io.tables.number_table import read_numbers
 from naibu.workflows.applications.decode_forces import decode_forces
 from naibu.workflows.applications.fingertip_study import describes_fingertip, prepared_fingertip
 from naibu.workflows.studies.simulate import example_text, named_studies, simulate
@@ -184,6 +185,19 @@ def test_bad_decoders_and_readings_are_refused(folder: Path, tmp_path: Path, nam
     with pytest.raises(InputError, match=what):
         decode_forces(paths["decoder"], paths["readings"], out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_readings_in_millivolts_are_told_by_the_training_of_the_decoder(folder: Path, tmp_path: Path) -> None:
+    """Readings of less than 0.1 V stay below 100 in mV, a thousand times what the chip gives under these forces."""
+    out = folder / "out"
+    names = ("time, s", "F_z, V", "M_x, V", "M_y, V")
+    times, *volts = read_numbers(out / "my_finger-readings.csv", names, units=("s", "V", "V", "V")).T
+    for factor in (1.0, 1000.0):
+        scaled = factor * 0.05 * np.column_stack(volts) / np.abs(volts).max()
+        np.savetxt(tmp_path / f"{factor:g}.csv", np.column_stack([times, scaled]), delimiter=",")
+    decode_forces(out / "my_finger-decoder.json", tmp_path / "1.csv", out=tmp_path / "forces")
+    with pytest.raises(InputError, match=r"row \d+: F_z of .* times the largest reading .* are the readings in V"):
+        decode_forces(out / "my_finger-decoder.json", tmp_path / "1000.csv", out=tmp_path / "more")
 
 
 def test_a_checkpoint_of_another_study_is_refused(folder: Path, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from naibu.core.volume import Volume
 from naibu.io.displacement_fields import write_field
 from naibu.io.images import read_volume, write_volume
 from naibu.validation.specimens.quadratic_body import QuadraticBody, Solved
-from naibu.workflows.fields.block_mesh import block_mesh, blurred, misplaced
+from naibu.workflows.fields.block_mesh import block_mesh, blurred, misplaced, sizes_of_voxels
 from naibu.workflows.fields.identify_fields import identify_fields, table_of_assumptions
 from naibu.workflows.fields.known_zones import parse_known_zones
 
@@ -155,6 +155,18 @@ def test_blocks_fill_the_object_along_its_own_axes() -> None:
         assert box.min(axis=0) == pytest.approx([3.5, 2.5, 1.5]) and box.max(axis=0) == pytest.approx([11.5, 10.5, 9.5])
 
 
+def test_elements_smaller_than_voxels_are_refused_and_slices_thicker_than_elements_told(folder: Path) -> None:
+    """Cells are made of whole voxels: a size below them was taken for theirs without a word."""
+    with pytest.raises(InputError, match=r"element_size_mm is 1.5 mm, less than the voxels .*\(2 x 2 x 2 mm\).*at least 2 mm"):
+        identify_fields(folder / "field.h5", zones=folder / "labels.mha", known=["label 2=10 kPa"], element_size_mm=1.5)
+    thick = Volume.from_array(np.ones((4, 10, 10), np.uint8), spacing_mm=(2.0, 2.0, 5.0))
+    assert sizes_of_voxels(thick, 5.0) == ()
+    (told,) = sizes_of_voxels(thick, 3.0)
+    assert told.startswith("Along z") and "5 mm long" in told and "not 3 mm" in told
+    with pytest.raises(InputError, match="element_size_mm"):
+        sizes_of_voxels(thick, -3.0)
+
+
 def test_known_values_and_what_is_wrong_with_them() -> None:
     names = ["gel", "bone", "pad"]
     read = parse_known_zones(["gel=12 kPa", "bone=rigid"], names)
@@ -166,6 +178,8 @@ def test_known_values_and_what_is_wrong_with_them() -> None:
         ([], "nothing sets the scale"),
         (["gel=soft"], "write 'gel=12 kPa'"),
         (["gel=12 kPa", "pad"], "state all, or name one"),
+        (["gel=12 kPa", "gel=10 kPa"], "zone 'gel' is stated twice"),
+        (["gel=12 kPa", "gel=rigid"], "zone 'gel' is stated twice"),
     ):
         with pytest.raises(InputError, match=message):
             parse_known_zones(known, names)

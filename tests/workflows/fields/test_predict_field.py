@@ -218,6 +218,7 @@ FAULTS = [
     (put("parts", 0, 2, 0.3), "must sum to 1"),
     (put("parts", 0, 2, -1.0), "must not be negative"),
     (put("parts", 0, 1, 7), "must be rows of cell, zone and part"),
+    (put("eighths", [[0, 0, 1.0]]), "eighths = 'cell 1': must sum to 1"),
     (put("format", "naibu field model 0"), "naibu field model 0"),
 ]
 

@@ -31,6 +31,7 @@ from naibu.identification.from_fields.forward.sensitivities import (
     Linearised,
     Point,
     logarithms,
+    moduli_of,
     young_and_poisson,
 )
 from naibu.identification.from_fields.forward.zones_within_cells import RegionAt, moduli_within_cells
@@ -44,7 +45,7 @@ from naibu.identification.from_fields.gauss_newton import (
     first_point,
     search,
 )
-from naibu.identification.from_fields.mesh_error import COARSE, EXTRAPOLATED, ModuliOn, changes_on_finer_mesh, doubt_of, refitted
+from naibu.identification.from_fields.mesh_error import COARSE, EXTRAPOLATED, changes_on_finer_mesh, doubt_of, refitted
 from naibu.identification.from_fields.regions.border_refinement import (
     MOST_REGIONS,
     CorrectedRegions,
@@ -374,11 +375,12 @@ class _Recipe:
 
     def _extrapolated(self, at: Linearised, quadratic: Concentrated) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray | None]:
         """Return theta and whitened residuals at vanishing element size, and the change of theta; None where it was not estimated."""
-        fitted, model = at.point.theta, at.model
-        within: ModuliOn | None = None
-        if (where := self.region_at) is not None:
-            within = lambda mesh, _: moduli_within_cells(mesh, model.zones, fitted, where)  # noqa: E731
-        changes = changes_on_finer_mesh(at, self.law, within) if self.elements == "accurate" else None
+        fitted, model, where = at.point.theta, at.model, self.region_at
+
+        def moduli_on(mesh: Mesh, zones: Zones) -> tuple[FloatArray, FloatArray]:
+            return moduli_of(zones, fitted) if where is None else moduli_within_cells(mesh, model.zones, fitted, where)
+
+        changes = changes_on_finer_mesh(at, self.law, moduli_on) if self.elements == "accurate" else None
         if changes is None:
             return fitted, tuple(o.residual(u) for o, u in zip(model.observed, at.point.states, strict=True)), None
         finer = refitted(at, quadratic, changes)

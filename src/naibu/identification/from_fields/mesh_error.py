@@ -92,10 +92,10 @@ def refitted(
     return Refit(step, left, tuple(u.reshape(state.shape) for u, state in zip(moved, at.point.states, strict=True)))
 
 
-def changes_on_finer_mesh(at: Linearised, law: LawName, moduli_on: ModuliOn | None = None) -> list[FloatArray] | None:
+def changes_on_finer_mesh(at: Linearised, law: LawName, moduli_on: ModuliOn) -> list[FloatArray] | None:
     """Return by how much the whitened residuals (q,) of every load case change on a mesh of half the element size.
 
-    `moduli_on` gives the moduli of its cells, where borders run through the coarse ones; by default they are those of the latter.
+    `moduli_on` gives the moduli of its cells, which are not those of the coarse ones where borders run through these.
     Where no equilibrium at finite strain is found on it, because the displacement of the loaded nodes is too rough for small cells, the
     change is that of small strain. None where the elements are used as given, or the finer mesh is too large.
     """
@@ -120,12 +120,12 @@ def _small_strain(at: Linearised) -> tuple[FloatArray, ...]:
     return tuple(equilibrium(law, solvers, lame, shear, o.load_case, u, b"")[0] for o, u in pairs)
 
 
-def _changes(at: Linearised, law: LawName, states: tuple[FloatArray, ...], moduli_on: ModuliOn | None) -> list[FloatArray]:
+def _changes(at: Linearised, law: LawName, states: tuple[FloatArray, ...], moduli_on: ModuliOn) -> list[FloatArray]:
     model, finer = at.model, Refinement.of(at.model.mesh)
     computed, averaged = computed_mesh(finer.mesh, "accurate")
     body = field_law(computed, law, averaged=averaged)
     zones = finer.zones(model.zones)
-    lame, shear = moduli_of(zones, at.point.theta) if moduli_on is None else moduli_on(finer.mesh, zones)
+    lame, shear = moduli_on(finer.mesh, zones)
     solvers, between = Solvers(body, computed.points, iterative=True), interpolation_operator(model.computed, computed.points)
     out = []
     for o, u in zip(model.observed, states, strict=True):

@@ -27,7 +27,8 @@ from naibu.workflows.applications.slip_report import drawn_rows, slip_card, slip
 from naibu.workflows.applications.stored_decoder import stored_detector
 from naibu.workflows.results.output_folder import output_folder
 
-MOST_VOLTS = 100.0  # several times what amplifiers give: readings in mV are told
+MOST_VOLTS = 100.0  # several times what amplifiers give
+FAR_BEYOND = 10.0  # times the largest reading of the training, from which a table is in another unit, or another fingertip's
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -94,7 +95,8 @@ def decode_forces(
     Raises
     ------
     InputError
-        Files that cannot be used, times that do not grow, fewer rows than `free_rows`, or a folder that cannot be written to.
+        Files that cannot be used, times that do not grow, readings ten times beyond those of the decoder's training, fewer rows than
+        `free_rows`, or a folder that cannot be written to.
     """
     if not 1e-3 <= noise_share <= 100.0:
         raise InputError(f"noise_share is {noise_share:g}; give a number from 0.001 to 100, 1 for unfiltered readings")
@@ -118,8 +120,9 @@ def decode_forces(
         raise InputError(
             f"free_rows is {free_rows}, and {table} has {len(rows)} rows; give at most so many, or 0 for readings without offset"
         )
-    folder = output_folder(out, ("forces.html", "forces.json", "forces.csv"), overwrite=overwrite)
     volts, offsets = _without_offset(chosen, rows[:, 1:], free_rows, noise_share)
+    _require_near_training(table, chosen, volts)
+    folder = output_folder(out, ("forces.html", "forces.json", "forces.csv"), overwrite=overwrite)
     found = chosen.decode(volts, noise_share=noise_share)
     sideways = detector.followed(rows[:, 0], volts / chosen.volts_per_load, noise_share=noise_share, touch_s=touch_s)
     csv = write_atomically(folder / "forces.csv", _csv(rows[:, 0], found, sideways, friction))
@@ -128,6 +131,19 @@ def decode_forces(
     cards = _cards(found) if friction is None else (*_cards(found), slip_card(rows[:, 0], sideways, friction))
     page, numbers = write_chapter(Chapter("forces", "Forces decoded from readings", sections, settings, cards), folder)
     return DecodedRecord((page, numbers, csv), (*_summary(found), *slip_summary(rows[:, 0], sideways, friction)))
+
+
+def _require_near_training(table: Path, decoder: ForceDecoder, volts: FloatArray) -> None:
+    """Refuse readings (n, 3), V, less their offset, that no load near those of the training gives."""
+    moment = decoder.limits[2] * decoder.unit[1]  # largest over F_z, mm
+    most = np.abs(decoder.volts_per_load) * decoder.limits[1] * [1.0, moment, moment]
+    row, channel = np.unravel_index(int(np.argmax(np.abs(volts) / most)), volts.shape)
+    value, largest = float(volts[row, channel]), float(most[channel])
+    if abs(value) >= FAR_BEYOND * largest:
+        raise InputError(
+            f"{table}: row {row + 2}: {('F_z', 'M_x', 'M_y')[channel]} of {value:.3g} V less its offset is {abs(value) / largest:.3g} "
+            f"times the largest reading that the decoder was trained on, {largest:.3g} V; are the readings in V, and of this fingertip?"
+        )
 
 
 def _without_offset(decoder: ForceDecoder, volts: FloatArray, free_rows: int, noise_share: float) -> tuple[FloatArray, FloatArray]:

@@ -25,6 +25,7 @@ PLANE = 0.5  # part of a section of the object that changes its zone there: cell
 LOST = 0.25
 SMALLER, MOST_BY_DEFAULT = 0.85, 5000  # steps of the size of cells, and how many of them are made unasked
 NARROWEST = 0.3  # of a cell, in edge lengths, between such planes
+WHOLE_VOXELS = 1.000001  # of a stated edge length: lengths of voxels are rounded in headers
 HALF_FILLED = 0.5  # part of a cell that must lie in the object
 
 
@@ -69,6 +70,28 @@ def names_of_labels(labels: IntArray, inside: Volume, given: Mapping[int, str]) 
     return {label: given.get(label, f"label {label}" if len(there) > 1 else "body") for label in there}
 
 
+def sizes_of_voxels(inside: Volume, element_size_mm: float) -> tuple[str, ...]:
+    """Say along which axes cells of a stated size, mm, are as long as voxels, because these are longer.
+
+    Raises
+    ------
+    InputError
+        A size that is no length, or below that of voxels along every axis.
+    """
+    require_lengths(element_size_mm=element_size_mm)
+    spacing = np.asarray(inside.spacing_mm)
+    if (spacing > WHOLE_VOXELS * element_size_mm).all():
+        raise InputError(
+            f"element_size_mm is {element_size_mm:g} mm, less than the voxels of mask and zones ({' x '.join(f'{s:.3g}' for s in spacing)} "
+            f"mm), of which cells are made; choose at least {spacing.min():.3g} mm"
+        )
+    return tuple(
+        f"Along {axis} of the grid elements are {length:.3g} mm long, as voxels are, and not {element_size_mm:g} mm."
+        for axis, length in zip("xyz", spacing, strict=True)
+        if length > WHOLE_VOXELS * element_size_mm
+    )
+
+
 def block_mesh(inside: Volume, labels: IntArray, names: Mapping[int, str], element_size_mm: float) -> tuple[Mesh, IntArray]:
     """Return hexahedra that fill the object, and the cell of every voxel (nz, ny, nx), -1 outside.
 
@@ -83,15 +106,13 @@ def block_mesh(inside: Volume, labels: IntArray, names: Mapping[int, str], eleme
     names : mapping
         Names of the labels.
     element_size_mm : float
-        Edge length, at least that of a voxel; 0 for about 1200 cells.
+        Edge length; along an axis on which voxels are longer, theirs; 0 for about 1200 cells.
 
     Raises
     ------
     InputError
-        A size that is no length, or so small or large that there are too many cells or too few.
+        A size so small or large that there are too many cells or too few.
     """
-    if element_size_mm:
-        require_lengths(element_size_mm=element_size_mm)
     voxels = np.argwhere(inside.values != 0)[:, ::-1]
     volume = len(voxels) * float(np.prod(inside.spacing_mm))
     size = element_size_mm or (volume / CELLS) ** (1.0 / 3.0)

@@ -29,7 +29,7 @@ from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
 from naibu.viewer.page_frame import page_html
 from naibu.viewer.tables import Cell, Table, table_html
-from naibu.workflows.fields.block_mesh import CELLS, block_mesh, labelled_object, names_of_labels
+from naibu.workflows.fields.block_mesh import CELLS, block_mesh, labelled_object, names_of_labels, sizes_of_voxels
 from naibu.workflows.fields.known_zones import parse_known_zones, stated_moduli
 from naibu.workflows.fields.predict_field import parsed_sides
 from naibu.workflows.results.output_folder import output_folder
@@ -192,6 +192,7 @@ def design(
         names = names_of_labels(labels, inside, zone_names or {})
     stated = parse_known_zones(known, list(names.values()))
     sought = _expected(expected, [name for name in names.values() if name not in stated.values])
+    longer = sizes_of_voxels(inside, element_size_mm) if element_size_mm else ()
     volume = float(inside.values.sum() * np.prod(inside.spacing_mm))
     mesh, _ = block_mesh(inside, labels, names, element_size_mm or (volume / CELLS) ** (1.0 / 3.0))
     model = Zones.of(mesh, known=stated.values, known_sd=stated.doubts)
@@ -203,7 +204,7 @@ def design(
         found = planned_identification(truth, model, cases, points=count, noise_mm=noise, plates_only=plates_only)
         rows += _rows(found, truth, push, count, noise)
         report_progress(progress, f"{push}, {count} points, {noise:g} mm", done=done, total=len(plans))
-    result = Design(tuple(rows), _notes(rows, plates_only))
+    result = Design(tuple(rows), (*_notes(rows, plates_only), *longer))
     if folder is None:
         return result
     inputs = dict(input_record({"zones": zones}))

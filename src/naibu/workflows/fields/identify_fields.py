@@ -42,6 +42,7 @@ from naibu.workflows.fields.block_mesh import (
     misplaced,
     names_of_labels,
     region_in,
+    sizes_of_voxels,
 )
 from naibu.workflows.fields.known_zones import parse_known_zones
 from naibu.workflows.fields.measured_load_case import measured_load_case, relative_deformation
@@ -184,6 +185,7 @@ def identify_fields(
     inside, labels = labelled_object(mask, zones)
     names = names_of_labels(labels, inside, zone_names or {})
     stated = parse_known_zones(known, list(names.values()))
+    longer = sizes_of_voxels(inside, element_size_mm) if element_size_mm else ()
     volume = float(inside.values.sum() * np.prod(inside.spacing_mm))
     most = CELLS_OF_MAP if each_cell else min(CELLS, max(int(field.valid.sum()) for field in read) // POINTS_OF_CELL)
     size = element_size_mm or (volume / max(most, LEAST_CELLS)) ** (1.0 / 3.0)
@@ -200,9 +202,10 @@ def identify_fields(
     body = IdentifiedBody.of(
         found, axes=inside.direction, law=law, relative=stated.relative, strain=max(relative_deformation(c.field) for c in cases),
         load_cases=cases, provenance={"naibu": __version__, "known": list(known), "loaded": list(loaded), "inputs": dict(inputs)},
+        region_at=within,
     )  # fmt: skip
     coarse = blurred(left_out, wrong, corrected=within is not None and found.mesh_shift is not None)
-    result = FieldIdentification(found, body, stated.relative, (*found.identifiability, *coarse), coarse, inside, cell_of_voxel)
+    result = FieldIdentification(found, body, stated.relative, (*found.identifiability, *coarse, *longer), coarse, inside, cell_of_voxel)
     return result if folder is None else replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))
 
 

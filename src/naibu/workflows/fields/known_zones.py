@@ -28,7 +28,7 @@ def parse_known_zones(known: Sequence[str], names: Sequence[str]) -> KnownZones:
     Raises
     ------
     InputError
-        A text that is none of these, a zone that does not exist, or nothing that sets the scale.
+        A text that is none of these, a zone that does not exist or is stated twice, or nothing that sets the scale.
     """
     values: dict[str, tuple[float, float]] = {}
     doubts: dict[str, tuple[float, float]] = {}
@@ -38,6 +38,8 @@ def parse_known_zones(known: Sequence[str], names: Sequence[str]) -> KnownZones:
         name, equals, value = (part.strip() for part in text.partition("="))
         if name not in names:
             raise InputError(f"known={text!r}: there is no zone {name!r}; the zones are {', '.join(map(repr, names))}")
+        if name in values or name in rigid:
+            raise InputError(f"known={text!r}: zone {name!r} is stated twice; state it once")
         if equals and value == "rigid":
             rigid.append(name)
         elif equals:

@@ -239,14 +239,12 @@ def _solved(body: IdentifiedBody, fixed: BoolArray, values: FloatArray) -> tuple
 def _change_on_finer_mesh(body: IdentifiedBody, fixed: BoolArray, values: FloatArray) -> FloatArray:
     """Return by how much half the element size changes the displacement of the nodes (n, 3), mm, at small strain."""
     fine = Refinement.of(body.mesh)
-    lame, shear = body.lame_of_cells()
     case = FieldLoadCase("prediction", _NOWHERE, fixed, np.zeros_like(values))
     out = []
-    for mesh, one, moved, copies in ((body.mesh, case, values, 1), (fine.mesh, fine.load_case(case), fine.displacement(values), 8)):
-        law = field_law(mesh, "linear", averaged=True)
-        stiff = np.repeat(lame, copies), np.repeat(shear, copies)
+    for on, one, moved in ((body, case, values), (body.refined(), fine.load_case(case), fine.displacement(values))):
+        law = field_law(on.mesh, "linear", averaged=True)
         start = np.where(one.loaded, moved, 0.0)
-        out.append(equilibrium(law, Solvers(law, mesh.points, iterative=True), *stiff, one, start, b"")[0])
+        out.append(equilibrium(law, Solvers(law, on.mesh.points, iterative=True), *on.lame_of_cells(), one, start, b"")[0])
     return np.asarray(out[1][: body.mesh.n_points] - out[0])
 
 

@@ -18,6 +18,7 @@ from naibu.identification.from_fields.forward.forward_model import whitening
 from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, KnownRegion, Zones
 from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.identification.from_fields.forward.sensitivities import logarithms, young_and_poisson
+from naibu.identification.from_fields.forward.zones_within_cells import RegionAt, logarithms_of_regions, parts_within_cells
 from naibu.identification.from_fields.identified.stored_body import check_stored_body
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
@@ -36,8 +37,9 @@ class IdentifiedBody:
         Axes of the grid of cells in the frame of the scan, in columns.
     zones : tuple of str
         Names of the zones that were identified.
-    parts : csr_matrix, shape (m, k)
-        Part of every cell in each of these zones, by which logarithms of moduli are mixed; an empty row where moduli are known.
+    parts : csr_matrix, shape (m, k + known regions)
+        Part of every cell in each of these zones and of the known regions, by which logarithms of moduli are mixed; an empty row where
+        moduli are known.
     theta : ndarray, shape (2 k,)
         ln mu, then ln(kappa / mu), of the zones; kPa.
     covariance : ndarray, shape (2 k, 2 k), or None
@@ -60,6 +62,9 @@ class IdentifiedBody:
         What speaks against using the model; empty where nothing does.
     provenance : mapping
         Version, settings, hashes of the inputs.
+    eighths : csr_matrix, shape (8 m, k + known regions), or None
+        `parts` of the cells of half the size, where zones end inside of cells and moduli were corrected for that; None where all eighths
+        of a cell are alike.
     """
 
     mesh: Mesh
@@ -78,6 +83,7 @@ class IdentifiedBody:
     load_cases: tuple[str, ...]
     reservation: str = ""
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    eighths: sp.csr_matrix | None = None
 
     @classmethod
     def of(
@@ -90,18 +96,26 @@ class IdentifiedBody:
         strain: float,
         load_cases: Sequence[FieldLoadCase],
         provenance: Mapping[str, Any],
+        region_at: RegionAt | None = None,
     ) -> IdentifiedBody:
-        """Take the body from an estimate on a mesh in three dimensions."""
+        """Take the body from an estimate on a mesh in three dimensions.
+
+        Where zones end inside of cells and moduli were corrected for that, with `region_at` (see
+        `naibu.identification.from_fields.estimate.identify_field`), cells get the moduli of what lies in them.
+        """
         zones, covariance = found.zones, None if found.uncertainty is None else found.uncertainty.covariance
-        parts = zones_of_cells(zones) if found.parts is None else sp.csr_matrix(found.parts)
+        parts = zones_of_cells(zones) if found.parts is None else _padded(found.parts, len(zones.known))
         known_of_cell = np.full(found.mesh.n_cells, KNOWN, dtype=np.int64) if zones.region_of_cell is None else zones.region_of_cell
+        eighths: sp.csr_matrix | None = None
+        if region_at is not None and found.mesh_shift is not None:
+            parts, known_of_cell, eighths = _parts_within(found.mesh, zones, region_at)
         doubtful = found.verdict is not None and not found.verdict.ok
         noise = float(np.sqrt(np.mean([whitening(case.field, case.name)[1] ** 2 for case in load_cases])))
         return cls(
             found.mesh, axes, zones.names, parts, found.theta,
             covariance if covariance is not None and np.isfinite(covariance).all() else None, zones.known, known_of_cell, law, relative,
             noise, found.noise_factor, strain, tuple(case.name for case in load_cases),
-            found.verdict.sentence if found.verdict is not None and doubtful else "", provenance,
+            found.verdict.sentence if found.verdict is not None and doubtful else "", provenance, eighths,
         )  # fmt: skip
 
     @classmethod
@@ -119,9 +133,8 @@ class IdentifiedBody:
     def refined(self) -> IdentifiedBody:
         """Return the body on a mesh of half the element size."""
         every = np.repeat(np.arange(self.mesh.n_cells), 8)
-        return replace(
-            self, mesh=Refinement.of(self.mesh).mesh, parts=sp.csr_matrix(self.parts[every]), known_of_cell=self.known_of_cell[every]
-        )
+        parts = sp.csr_matrix(self.parts[every]) if self.eighths is None else self.eighths
+        return replace(self, mesh=Refinement.of(self.mesh).mesh, parts=parts, known_of_cell=self.known_of_cell[every], eighths=None)
 
     @property
     def cell_zones(self) -> Zones:
@@ -139,12 +152,13 @@ class IdentifiedBody:
     @property
     def mixing(self) -> sp.csr_matrix:
         """Matrix (2 cells, 2 k) from theta of the zones to that of the cells that are not known, as `cell_zones` numbers them."""
-        return sp.csr_matrix(sp.kron(sp.identity(2), self.parts[self.known_of_cell == KNOWN]))
+        return sp.csr_matrix(sp.kron(sp.identity(2), self.parts[self.known_of_cell == KNOWN][:, : len(self.zones)]))
 
     @property
     def theta_of_cells(self) -> FloatArray:
         """Ln mu, then ln(kappa / mu), of the cells that are not known; kPa."""
-        return np.asarray(self.mixing @ self.theta)
+        mixed = self.parts[self.known_of_cell == KNOWN] @ logarithms_of_regions(self.theta, self.known)
+        return np.asarray(mixed).T.ravel()
 
     @property
     def spread(self) -> FloatArray:
@@ -172,7 +186,6 @@ class IdentifiedBody:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the body as plain numbers and strings, for JSON."""
-        parts = self.parts.tocoo()
         return {
             "format": FORMAT,
             "units": "mm, kg, s, mN, kPa",
@@ -199,7 +212,8 @@ class IdentifiedBody:
             "points": self.mesh.points.tolist(),
             "cells": self.mesh.cells.tolist(),
             "known_of_cell": self.known_of_cell.tolist(),
-            "parts": [[int(c), int(z), float(v)] for c, z, v in zip(parts.row, parts.col, parts.data, strict=True)],
+            "parts": _triples(self.parts),
+            "eighths": None if self.eighths is None else _triples(self.eighths),
         }  # fmt: skip
 
     @classmethod
@@ -216,9 +230,9 @@ class IdentifiedBody:
         check_stored_body(data)
         names = tuple(row["name"] for row in data["zones"])
         regions, known_of_cell = tuple(KnownRegion(**row) for row in data["known"]), np.array(data["known_of_cell"], dtype=np.int64)
-        rows, columns, values = np.array(data["parts"], dtype=float).reshape(-1, 3).T
-        shape = len(data["cells"]), len(names)
-        parts = sp.csr_matrix((values, (rows.astype(np.int64), columns.astype(np.int64))), shape=shape)
+        shape = len(data["cells"]), len(names) + len(regions)
+        parts = _of_triples(data["parts"], shape)
+        eighths = None if data.get("eighths") is None else _of_triples(data["eighths"], (8 * shape[0], shape[1]))
         place = np.where(known_of_cell == KNOWN, np.asarray(parts.argmax(axis=1)).ravel(), len(names) + known_of_cell)
         mesh = Mesh.from_arrays(
             data["points"], data["cells"], data["cell_type"], regions=place, region_names=(*names, *(r.name for r in regions))
@@ -227,11 +241,42 @@ class IdentifiedBody:
         return cls(
             mesh, np.array(data["axes"], dtype=float), names, parts, np.array(data["theta"], dtype=float), covariance, regions,
             known_of_cell, data["law"], data["relative"], float(data["noise_mm"]), float(data["noise_factor"]), float(data["strain"]),
-            tuple(data["load_cases"]), data["reservation"], data["provenance"],
+            tuple(data["load_cases"]), data["reservation"], data["provenance"], eighths,
         )  # fmt: skip
 
 
 def zones_of_cells(zones: Zones) -> sp.csr_matrix:
-    """Return the part of every cell in each zone (m, k): one zone a cell, none where moduli are known."""
+    """Return the part of every cell in each zone (m, k + known regions): one zone a cell, none where moduli are known."""
     cells = np.flatnonzero(zones.of_cell != KNOWN)
-    return sp.csr_matrix((np.ones(len(cells)), (cells, zones.of_cell[cells])), shape=(len(zones.of_cell), zones.count))
+    shape = len(zones.of_cell), zones.count + len(zones.known)
+    return sp.csr_matrix((np.ones(len(cells)), (cells, zones.of_cell[cells])), shape=shape)
+
+
+def _parts_within(mesh: Mesh, zones: Zones, region_at: RegionAt) -> tuple[sp.csr_matrix, IntArray, sp.csr_matrix]:
+    """Return parts, known regions of cells, and parts of their eighths, of zones that end inside of cells."""
+    eighths = parts_within_cells(Refinement.of(mesh).mesh, zones, region_at)
+    mean = sp.csr_matrix(sp.kron(sp.identity(mesh.n_cells), np.full((1, 8), 0.125)))
+    parts = sp.csr_matrix(mean @ eighths)
+    in_one = np.diff(parts.indptr) == 1
+    region = np.asarray(parts.argmax(axis=1)).ravel() - zones.count
+    known_of_cell = np.where(in_one & (region >= 0), region, KNOWN)
+    unknown = (known_of_cell == KNOWN).astype(float)
+    kept = [sp.csr_matrix(sp.diags(np.repeat(unknown, n)) @ p) for n, p in ((1, parts), (8, eighths))]
+    for matrix in kept:
+        matrix.eliminate_zeros()
+    return kept[0], known_of_cell, kept[1]
+
+
+def _padded(parts: FloatArray, known: int) -> sp.csr_matrix:
+    """Return parts in zones (m, k) with a column of zeros for each known region."""
+    return sp.csr_matrix(np.pad(parts, ((0, 0), (0, known))))
+
+
+def _triples(parts: sp.csr_matrix) -> list[list[float]]:
+    at = parts.tocoo()
+    return [[int(c), int(z), float(v)] for c, z, v in zip(at.row, at.col, at.data, strict=True)]
+
+
+def _of_triples(triples: Sequence[Sequence[float]], shape: tuple[int, int]) -> sp.csr_matrix:
+    rows, columns, values = np.array(triples, dtype=float).reshape(-1, 3).T
+    return sp.csr_matrix((values, (rows.astype(np.int64), columns.astype(np.int64))), shape=shape)

@@ -7,7 +7,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from naibu.core.arrays import LENGTHS_MM
+from naibu.core.arrays import LENGTHS_MM, FloatArray
 from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.stored_values import UNITS, array_of, check_covariance, require, require_number, rows_of
 
@@ -78,20 +78,23 @@ def _check_mesh(data: Mapping[str, Any]) -> None:
 
 
 def _check_parts(data: Mapping[str, Any]) -> None:
-    m, k = len(data["cells"]), len(data["zones"])
+    m = len(data["cells"])
     known = array_of(data, "known_of_cell", (m,))
     good = (known == np.round(known)).all() and known.min() >= -1 and known.max() < len(data["known"])
     require(bool(good), "known_of_cell", "other numbers", "must be -1 or the number of a known region, for every cell")
-    rows, columns, values = array_of(data, "parts", (None, 3)).T
+    _check_triples(data, "parts", known)
+    if data.get("eighths") is not None:
+        _check_triples(data, "eighths", np.repeat(known, 8))
+
+
+def _check_triples(data: Mapping[str, Any], name: str, known: FloatArray) -> None:
+    m, k = len(known), len(data["zones"]) + len(data["known"])
+    rows, columns, values = array_of(data, name, (None, 3)).T
     whole = (rows == np.round(rows)).all() and (columns == np.round(columns)).all()
     good = whole and bool(((rows >= 0) & (rows < m) & (columns >= 0) & (columns < k)).all())
-    require(bool(good), "parts", "other numbers", "must be rows of cell, zone and part")
-    require(bool((values >= 0.0).all()), "parts", float(values.min(initial=0.0)), "must not be negative")
+    require(bool(good), name, "other numbers", "must be rows of cell, zone and part")
+    require(bool((values >= 0.0).all()), name, float(values.min(initial=0.0)), "must not be negative")
     total = np.bincount(rows.astype(np.int64), values, minlength=m)
     wrong = np.flatnonzero(np.abs(total - (known < 0)) > WHOLE)
-    require(
-        not len(wrong),
-        "parts",
-        f"cell {int(wrong[0]) if len(wrong) else 0}",
-        "must sum to 1 in every cell that is not known, and be 0 there",
-    )
+    said = f"cell {int(wrong[0]) if len(wrong) else 0}"
+    require(not len(wrong), name, said, "must sum to 1 in every cell that is not known, and be 0 there")
