@@ -160,6 +160,31 @@ def test_a_step_that_fails_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> Non
     np.testing.assert_array_equal(frame.positions, good.positions)
 
 
+def test_frames_that_leave_their_step_to_the_next_come_to_the_same_states() -> None:
+    ends = []
+    for budget in (np.inf, 0.0):
+        touched = InteractiveSimulation(lattice_or_gel("gel"), {"sphere": spherical_indenter((20.0, 20.0, 60.0), 8.0)}, budget_s=budget)
+        touched.take("sphere")
+        frames = []
+        for height in np.linspace(52.0, TOP + 5.0, 8):
+            touched.move((20.0, 20.0, height))
+            frames.append(touched.advance())
+            while frames[-1].under_way:
+                before = frames[-1]
+                touched.move((20.0, 20.0, height + 1.0))  # not followed before the step has ended
+                frames.append(touched.advance())
+                if frames[-1].under_way:
+                    assert frames[-1].number > before.number
+                    assert frames[-1].time_s == before.time_s
+                    assert frames[-1].positions is before.positions
+                touched.move((20.0, 20.0, height))
+        assert any(frame.under_way for frame in frames) == (budget == 0.0)
+        ends.append([np.vstack([f.positions, f.force, f.tool_centre]) for f in frames if not f.under_way])
+        touched.close()
+    np.testing.assert_allclose(ends[1], ends[0], rtol=1e-12, atol=1e-12)
+    assert ends[0][-1][-2, 2] < 0.0
+
+
 def test_the_same_commands_give_the_same_frames() -> None:
     def run() -> np.ndarray:
         touched = simulation()

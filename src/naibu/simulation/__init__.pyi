@@ -11,8 +11,8 @@ from .adaptive.statics import AdaptiveSolution, StaticResult, hyperelastic_stati
 from .force_limits import ForceLimits
 from .haptic_loop import DeviceChannel, DeviceForce, DevicePose, HapticHand
 from .haptic_thread import HapticThread
-from .interactive_bodies import FiniteElementBody, InteractiveBody, LatticeBody
-from .interactive_simulation import Frame, InteractiveSimulation
+from .interactive_bodies import FiniteElementBody, Frame, InteractiveBody, LatticeBody
+from .interactive_simulation import InteractiveSimulation
 from .lattice_cut import LatticeCut, cut_engine, cut_lattice, cut_session
 from .local_contact import LocalContact
 from .real_time_loop import RealTimeLoop

@@ -1,4 +1,4 @@
-"""Bodies that a person pushes and pulls: lattices and finite elements behind one interface, with their supports and surface."""
+"""Bodies that a person pushes and pulls: lattices and finite elements behind one interface, and frames that show them."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import FloatArray, IntArray, as_vector, require_positive
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
+from naibu.mechanics.contact.indenter_motion import IndenterMotion
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
-from naibu.mechanics.contact.session_protocol import Session
+from naibu.mechanics.contact.session_protocol import Session, StepForces
 from naibu.mechanics.finite_elements.assembly import Assembler, body_force
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import material
@@ -74,6 +75,11 @@ class InteractiveBody(Protocol):
     def cut(self, state: Any, blade: SweptBlade, distance_mm: float | None = None) -> tuple[InteractiveBody, Any, VolumeCut | LatticeCut]:
         """Return the body and its state behind a cut; by default as near to the blade as the body's cells suggest."""
 
+    def step(
+        self, session: AnySession, velocity: FloatArray, motions: Sequence[IndenterMotion], steps: int, budget_s: float
+    ) -> StepForces | None:
+        """Take steps; None where one takes longer than a time of the processor: call again, with the same motions, to go on with it."""
+
     def unbalanced(self, session: AnySession) -> float:
         """Return the out-of-balance force that the last step left to the next ones, as a fraction of all forces."""
 
@@ -132,6 +138,12 @@ class LatticeBody:
     def grip_velocity(self, velocity: FloatArray) -> FloatArray:
         """Return the velocities of the support and of the gripped nodes (2, 3), mm/s."""
         return np.stack([np.zeros(3), velocity])
+
+    def step(
+        self, session: AnySession, velocity: FloatArray, motions: Sequence[IndenterMotion], steps: int, budget_s: float
+    ) -> StepForces | None:
+        """Take steps, whose time hardly varies, whole."""
+        return session.step(velocity, motions, steps=steps)
 
     def without_contact(self, state: LatticeState) -> LatticeState:
         """Return a copy of a state that no indenter touches."""
@@ -297,6 +309,14 @@ class FiniteElementBody:
         """Return the velocities of the support and of the gripped nodes (2, 3), mm/s."""
         return np.stack([np.zeros(3), velocity])
 
+    def step(
+        self, session: AnySession, velocity: FloatArray, motions: Sequence[IndenterMotion], steps: int, budget_s: float
+    ) -> StepForces | None:
+        """Take steps; a single one is left to the next call after about a time of the processor, and then None is returned."""
+        if steps == 1 and np.isfinite(budget_s) and isinstance(session, RealTimeSession):
+            return session.step_within(budget_s, velocity, motions)
+        return session.step(velocity, motions, steps=steps)
+
     def without_contact(self, state: DynamicState) -> DynamicState:
         """Return a copy of a state that no indenter touches."""
         return DynamicState(state.displacement, state.velocity)
@@ -371,3 +391,58 @@ def nodes_touching(points: FloatArray, indenters: Sequence[RigidIndenter], toler
     for indenter in indenters:
         near |= indenter.gap(points) < tolerance_mm
     return np.flatnonzero(near).astype(np.int64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """What a frame shows.
+
+    Attributes
+    ----------
+    body : InteractiveBody
+        The body, whose nodes the positions are those of.
+    number : int
+        Frames since the beginning.
+    time_s : float
+        Simulated time, s.
+    positions : ndarray, shape (n, 3)
+        Nodes, mm.
+    tool : str
+        Name of the tool in play, or an empty string.
+    tool_centre : ndarray, shape (3,)
+        Its position, mm.
+    tool_rotation : ndarray, shape (3, 3)
+        Its rotation since it was made.
+    force : ndarray, shape (3,)
+        Mean force of the tool on the body during the frame, mN.
+    pull : ndarray, shape (3,)
+        Mean force of the grip on the body, mN.
+    penetration_mm : float
+        How deep the surface nodes lie in the tool at most.
+    gripped : int
+        Node that is gripped, or -1.
+    failed : str
+        Why the last step was taken back; empty where none was.
+    topology : int
+        Counts the cuts, undone ones included.
+    unbalanced : float
+        Out-of-balance forces that the next frames take up, as a fraction of all forces, or of those of contact where that is more.
+    under_way : bool
+        Whether a step takes longer than a frame: all is as before it but the number, and `unbalanced`, which is how far it has come.
+    """
+
+    body: InteractiveBody
+    number: int
+    time_s: float
+    positions: FloatArray
+    tool: str
+    tool_centre: FloatArray
+    tool_rotation: FloatArray
+    force: FloatArray
+    pull: FloatArray
+    penetration_mm: float
+    gripped: int = -1
+    failed: str = ""
+    topology: int = 0
+    unbalanced: float = 0.0
+    under_way: bool = False

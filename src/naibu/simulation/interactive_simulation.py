@@ -23,7 +23,7 @@ from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.meshing.cutting.volume import VolumeCut
 from naibu.simulation.background_cut import BackgroundCut
-from naibu.simulation.interactive_bodies import NO_NODES, AnySession, FiniteElementBody, InteractiveBody
+from naibu.simulation.interactive_bodies import NO_NODES, AnySession, FiniteElementBody, Frame, InteractiveBody
 from naibu.simulation.lattice_cut import LatticeCut
 
 FRAME_S = 1.0 / 60.0
@@ -33,58 +33,6 @@ TURNING = 3.0  # rad/s that the tool turns at most
 LEAST_TURN = 1e-6  # rad
 UNDO = 20  # states kept
 THROUGH = 0.5  # of the thinnest half extent of a tool: how far it moves in a step at most, so that nothing passes through its middle
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Frame:
-    """What a frame shows.
-
-    Attributes
-    ----------
-    body : InteractiveBody
-        The body, whose nodes the positions are those of.
-    number : int
-        Frames since the beginning.
-    time_s : float
-        Simulated time, s.
-    positions : ndarray, shape (n, 3)
-        Nodes, mm.
-    tool : str
-        Name of the tool in play, or an empty string.
-    tool_centre : ndarray, shape (3,)
-        Its position, mm.
-    tool_rotation : ndarray, shape (3, 3)
-        Its rotation since it was made.
-    force : ndarray, shape (3,)
-        Mean force of the tool on the body during the frame, mN.
-    pull : ndarray, shape (3,)
-        Mean force of the grip on the body, mN.
-    penetration_mm : float
-        How deep the surface nodes lie in the tool at most.
-    gripped : int
-        Node that is gripped, or -1.
-    failed : str
-        Why the last step was taken back; empty where none was.
-    topology : int
-        Counts the cuts, undone ones included.
-    unbalanced : float
-        Out-of-balance forces that the next frames take up, as a fraction of all forces, or of those of contact where that is more.
-    """
-
-    body: InteractiveBody
-    number: int
-    time_s: float
-    positions: FloatArray
-    tool: str
-    tool_centre: FloatArray
-    tool_rotation: FloatArray
-    force: FloatArray
-    pull: FloatArray
-    penetration_mm: float
-    gripped: int = -1
-    failed: str = ""
-    topology: int = 0
-    unbalanced: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,11 +56,14 @@ class InteractiveSimulation:
         Tools by name, each made outside of the body: where it was made is where it waits.
     frame_s : float
         Simulated time of a frame, s.
+    budget_s : float
+        Time of the processor after which a frame leaves the step of a body of finite elements to the next one, s.
     """
 
     body: InteractiveBody
     tools: Mapping[str, RigidIndenter]
     frame_s: float = FRAME_S
+    budget_s: float = np.inf
     _session: AnySession = field(init=False)
     _tool: str = field(init=False, default="")
     _centre: FloatArray = field(init=False)
@@ -127,6 +78,7 @@ class InteractiveSimulation:
     _topology: int = field(init=False, default=0)
     _surface: IntArray = field(init=False)
     _cutting: BackgroundCut | None = field(init=False, default=None)
+    _under_way: tuple[FloatArray, FloatArray, FloatArray] | None = field(init=False, default=None)  # motion of a step begun
 
     def __post_init__(self) -> None:
         require_positive("frame_s", self.frame_s, "s")
@@ -221,7 +173,7 @@ class InteractiveSimulation:
         near = np.linalg.norm(self.body.points - self.body.points[node], axis=1) <= max(radius_mm, 0.0)
         near[node] = True
         self._nodes, self._gripped = np.flatnonzero(near & self._on_surface()).astype(np.int64), node
-        self._pull_target = self._session.positions([node])[0]
+        self._pull_target, self._under_way = self._session.positions([node])[0], None
         self.body.grip(self._session, self._nodes)
 
     def pull(self, position: ArrayLike) -> None:
@@ -237,7 +189,7 @@ class InteractiveSimulation:
     def release(self) -> None:
         """Let go of gripped nodes."""
         if self._gripped >= 0:
-            self._nodes, self._gripped = NO_NODES, -1
+            self._nodes, self._gripped, self._under_way = NO_NODES, -1, None
             self.body.grip(self._session, NO_NODES)
 
     def reset(self) -> None:
@@ -331,27 +283,38 @@ class InteractiveSimulation:
         return True
 
     def advance(self) -> Frame:
-        """Take the steps of one frame, and return it; a step that fails is taken back, and the frame says why."""
+        """Take the steps of one frame, and return it; a step that fails is taken back, and the frame says why.
+
+        A step that takes longer than the frame may goes on in the next one, with the tool's motion as it was when the step began.
+        """
         before = self._session.state()
         duration = self.steps * self.body.step_s
-        reach = self.fastest_mm_s * duration
-        centre = _towards(self._centre, self._target, min(reach, self._thin() * self.steps))
-        spin = self._spin(duration)
+        centre, spin, gripped = self._under_way or self._next_motion(duration)
         motions = self._motions((centre - self._centre) / duration, spin)
-        gripped = _towards(self._grip_position(), self._pull_target, reach) - self._grip_position()
+        self._under_way = None
         try:
-            forces = self._session.step(self.body.grip_velocity(gripped / duration), motions, steps=self.steps)
+            forces = self.body.step(self._session, self.body.grip_velocity(gripped / duration), motions, self.steps, self.budget_s)
         except ConvergenceError as error:
             self._session.restore(before)
             self._target, self._rotation_target = self._centre, self._rotation
             self._pull_target = self._grip_position()
             self._last = self._frame(self._last.number + 1, self._last.time_s, self._last.force, self._last.pull, str(error))
             return self._last
+        if forces is None:
+            self._under_way, left = (centre, spin, gripped), self.body.unbalanced(self._session)
+            self._last = replace(self._last, number=self._last.number + 1, failed="", unbalanced=left, under_way=True)
+            return self._last
         self._centre, self._rotation = centre, rotation_matrix(duration * spin) @ self._rotation
         force = forces.indenters[:, -1].mean(axis=0) if self._tool else np.zeros(3)
         pull = forces.bodies[:, 1].mean(axis=0) if self._gripped >= 0 else np.zeros(3)
         self._last = self._frame(self._last.number + 1, self._last.time_s + duration, force, pull, "")
         return self._last
+
+    def _next_motion(self, duration: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return where the tool goes in a frame, mm, how fast it turns, rad/s, and how far gripped nodes go, mm."""
+        reach, held = self.fastest_mm_s * duration, self._grip_position()
+        centre = _towards(self._centre, self._target, min(reach, self._thin() * self.steps))
+        return centre, self._spin(duration), _towards(held, self._pull_target, reach) - held
 
     def close(self) -> None:
         """Release what the session holds, and wait for a cut under way."""
@@ -385,7 +348,7 @@ class InteractiveSimulation:
         state = self._session.state()
         self._session.press(())
         self._session.restore(self.body.without_contact(state))
-        self._tool = tool
+        self._tool, self._under_way = tool, None
         self._rotation = self._rotation_target = np.eye(3)
         if tool:
             self._centre = self._target = self._outside(self.tools[tool])

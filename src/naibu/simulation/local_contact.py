@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike
 
 from naibu.core.arrays import FloatArray, require_positive
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
-from naibu.simulation.interactive_simulation import FRAME_S, Frame, InteractiveSimulation, placed
+from naibu.simulation.interactive_bodies import Frame
+from naibu.simulation.interactive_simulation import FRAME_S, InteractiveSimulation, placed
 
 STIFFEST = 2e4  # mN/mm, of the continuation
 MEMORY_S = 0.25  # in which a stiffness that a step showed is forgotten: too much makes the tool slow, too little makes it bounce
@@ -136,7 +137,7 @@ class LocalContact:
 
         Where no device leads the tool, it is where the frame has it.
         """
-        if frame is not self._seen:
+        if frame is not self._seen and not frame.under_way:
             tool = self.last.tool
             far = float(np.linalg.norm(frame.tool_centre - self.last.tool_centre)) > ELSEWHERE_S * self.fastest_mm_s
             if frame.tool != tool or far or not led:

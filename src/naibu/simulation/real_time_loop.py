@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 
 from naibu.core.errors import NaibuError
 from naibu.simulation.haptic_loop import HapticHand, require_haptic_steps
-from naibu.simulation.interactive_simulation import FRAME_S, Frame, InteractiveSimulation
+from naibu.simulation.interactive_bodies import Frame
+from naibu.simulation.interactive_simulation import FRAME_S, InteractiveSimulation
 
 MEMORY_S = 1.0  # over which rates are averaged
 BEHIND_S = 0.1  # a delay that is not caught up with
@@ -79,6 +80,7 @@ class RealTimeLoop:
     _trouble: str = field(init=False, default="")
     _failure: BaseException | None = field(init=False, default=None)
     _shown: float = field(init=False, default=float("-inf"))
+    _under_way: bool = field(init=False, default=False)  # whether the last frame left its step to the next one, which is due at once
 
     def __post_init__(self) -> None:
         if self.hand is not None:
@@ -165,7 +167,7 @@ class RealTimeLoop:
             self.hand.idle(pause)
         if self.hand is None or waits or self._shown == due:
             self._pace = self._measured()
-        return due + pause
+        return due if not waits and self._under_way else due + pause
 
     def _advance(self, due: float) -> None:
         """Make a frame, and show it unless a device steps faster than frames are shown."""
@@ -173,9 +175,10 @@ class RealTimeLoop:
         if hand is not None:
             hand.before(simulation)
         frame = simulation.advance()
+        self._under_way = frame.under_way
         if hand is not None:
             hand.after(frame, simulation.frame_s)
-        self._finished.append((self.clock(), 0.0 if frame.failed else simulation.frame_s))
+        self._finished.append((self.clock(), 0.0 if frame.failed or frame.under_way else simulation.frame_s))
         if hand is None or frame.failed or due >= self._shown + FRAME_S:
             self._latest, self._shown = frame, due
             self._keep(frame)

@@ -174,6 +174,13 @@ def test_what_cannot_be_touched_is_refused(tmp_path: Path) -> None:
         touchable(tmp_path / "model.json")
 
 
+def test_a_file_that_is_not_there_is_told_before_anything_is_prepared(tmp_path: Path) -> None:
+    prepared: list[bool] = []
+    with pytest.raises(InputError, match=r"nothere\.vtu"):
+        live(tmp_path / "nothere.vtu", preparing=lambda: prepared.append(True), ready=lambda _: None)
+    assert not prepared
+
+
 def test_a_taken_port_is_named() -> None:
     with served() as (address, _):
         port = int(address.split(":")[2].split("/")[0])

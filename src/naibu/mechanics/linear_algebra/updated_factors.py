@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,6 +14,7 @@ from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.mechanics.linear_algebra.protocols import Factorization
 
 COLUMNS = 96  # of the inverse that are computed at once
+FEW = 8  # nodes that are prepared at once where one waits for them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,6 +88,12 @@ class UpdatedFactors:
         self._columns.append(columns)
         at = _rows(self._nodes)
         self._inverse = np.concatenate([part.T.take(at, axis=1) for part in self._columns]).T
+
+    def prepared(self, nodes: IntArray) -> Iterator[None]:
+        """Prepare a few nodes of (k,) at a time, and yield between them, until all are known: one may go on later."""
+        while len(left := nodes[~self.covered(nodes)]):
+            yield
+            self.prepare(left[:FEW])
 
     def solve(self, b: FloatArray) -> FloatArray:
         """Return x of ``A x = b`` for b of shape (3 n,)."""

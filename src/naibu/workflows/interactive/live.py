@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,8 +18,8 @@ from naibu.core.errors import InputError
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.simulation.haptic_loop import LONGEST_STEP_S, HapticHand
 from naibu.simulation.haptic_thread import HapticThread
-from naibu.simulation.interactive_bodies import InteractiveBody
-from naibu.simulation.interactive_simulation import FRAME_S, Frame, InteractiveSimulation, placed
+from naibu.simulation.interactive_bodies import Frame, InteractiveBody
+from naibu.simulation.interactive_simulation import FRAME_S, InteractiveSimulation, placed
 from naibu.simulation.local_contact import LocalContact
 from naibu.simulation.real_time_loop import RealTimeLoop
 from naibu.viewer.live.commands import LiveCommand
@@ -34,6 +35,7 @@ from naibu.workflows.markers.experiments import Source
 
 GRIP_RADIUS = 0.08  # of the extent of the body
 PAGE_BYTES = 5_000_000
+BUDGET_S = 0.018  # of the processor for a frame: a step that takes longer goes on in the next one
 SWITCH_S = 2e-4  # in which the page leaves the interpreter to the physics of a haptic device
 
 
@@ -170,6 +172,8 @@ def live(
         raise InputError(f"port must lie between 0 and 65535, not {port}")
     if haptics_port is not None and not 1 <= haptics_port <= 65535:
         raise InputError(f"haptics_port must lie between 1 and 65535, not {haptics_port}")
+    if Path(source).suffix and not Path(source).exists():
+        _touchable(source, experiment, material, decoder)  # says so, before anything is prepared
     with bound_port(port) as bound, _haptic_hand(haptics_port) as hand:
         with waiting_device(hand):
             if preparing is not None:
@@ -236,6 +240,7 @@ def _prepared(model: TouchableModel, hand: HapticHand | None) -> InteractiveSimu
 def _stepped(simulation: InteractiveSimulation, hand: HapticHand | None) -> Iterator[RealTimeLoop]:
     """Step a simulation in a thread of its own, and serve a device, until the context ends."""
     single = _single(simulation.body, hand)
+    simulation.budget_s = BUDGET_S
     with ExitStack() as stack:
         stack.enter_context(threadpool_limits(1, user_api="blas"))  # threads of small matrices wait for one another where cores are busy
         if hand is not None:

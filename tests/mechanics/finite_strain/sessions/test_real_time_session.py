@@ -192,6 +192,42 @@ def test_a_step_says_how_far_its_force_is_from_balance(friction: float) -> None:
     assert max(apart) > 1e-6  # they are not the same method
 
 
+def test_a_step_that_is_taken_in_many_calls_is_the_same_step() -> None:
+    made, paths = engine("tetra", background=False), []
+    for budget in (np.inf, 0.0):
+        sphere = spherical_indenter((1.0, 2.0, SIZE + 8.2), 8.0, static_friction=0.3, kinetic_friction=0.3)
+        with made.session(constrained=[lowest(made.points)], indenters=[sphere]) as session:
+            assert isinstance(session, RealTimeSession)
+            path, waited = [], 0
+            for speed in [-30.0] * 6 + [60.0] * 3:
+                before = session.positions()
+                while (forces := session.step_within(budget, motions=[IndenterVelocity((0.0, 0.0, speed))])) is None:
+                    waited += 1
+                    assert session.under_way
+                    np.testing.assert_array_equal(session.positions(), before)
+                assert not session.under_way
+                path.append(np.vstack([session.positions(), forces.indenters[-1]]))
+            paths.append(np.array(path))
+            assert (waited > 9) == (budget == 0.0)
+    np.testing.assert_allclose(paths[1], paths[0], rtol=1e-12, atol=1e-12)
+
+
+def test_a_step_under_way_is_given_up_where_supports_tools_or_the_state_change() -> None:
+    made = engine(background=False)
+    sphere = spherical_indenter((1.0, 2.0, SIZE + 7.0), 8.0)
+    with made.session(constrained=[lowest(made.points)], indenters=[sphere]) as session:
+        assert isinstance(session, RealTimeSession)
+        begun = session.state()
+        for change in (
+            lambda: session.constrain([lowest(made.points)]),
+            lambda: session.press([sphere]),
+            lambda: session.restore(begun),
+        ):
+            assert session.step_within(0.0) is None
+            change()
+            assert not session.under_way
+
+
 def test_gripped_nodes_follow_and_let_go() -> None:
     made = engine(background=False)
     top = np.flatnonzero((made.points[:, 2] > SIZE - 1e-9) & (np.abs(made.points[:, :2]).max(axis=1) < 0.3 * SIZE))

@@ -8,7 +8,7 @@ size of the body. Contacts that open, close, stick or slip cost no iteration of 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -27,6 +27,7 @@ PATIENCE = 3  # steps that hardly help before they are searched: where a point c
 CHANGES = 12  # derivatives at most
 SEARCHES = 5  # motions tried along a step
 USUAL = 6  # evaluations after which ten times the tolerance is enough
+ENOUGH = 0.005  # of the forces: how much those of the motion that they lead to may differ where no further derivative is worth while
 FAST = 0.2  # of what was left: progress with which an earlier derivative of the contact goes on being used
 
 
@@ -67,8 +68,12 @@ class CondensedContact:
         """Whether these nodes (l,) are among those of the same body."""
         return tangent is self.tangent and bool(np.isin(nodes, self.nodes, assume_unique=True).all())
 
-    def forces(self, free: FloatArray, law: ContactLaw, begin: FloatArray, tolerance_mm: float, longest_mm: float) -> FloatArray:
+    def forces(
+        self, free: FloatArray, law: ContactLaw, begin: FloatArray, tolerance_mm: float, longest_mm: float
+    ) -> Generator[None, None, FloatArray]:
         """Return the forces g (k, 3), mN, under which ``y = free + W g(y)``; the best that is found in a few iterations.
+
+        It yields before it factorizes, which takes longest: one may go on later.
 
         A step of Newton's method that hardly helps is searched for where the forces that are out of balance do no more work on it, as in
         `naibu.mechanics.finite_strain.sessions.implicit_step`: with contact, and friction of known limit, a convex energy is least there,
@@ -92,8 +97,9 @@ class CondensedContact:
         best, evaluations, changes, unhelpful, fast, symmetric = at, 1, 0, 0, True, False
         while at.size > tolerance_mm * (1.0 if evaluations < USUAL else 10.0) and evaluations < EVALUATIONS:
             if self._changed is None or not fast:
-                if changes == CHANGES:
+                if changes == CHANGES or self._consistent(at, law):
                     break
+                yield
                 self._changed, changes = ChangedInverse.of(self._inverse, law.change(symmetric)), changes + 1
             step, before = self._changed.solve(at.left), at.size
             target = at.force + self._changed.change.times(step)  # which exerted on the body leads to the end of the step
@@ -117,6 +123,12 @@ class CondensedContact:
         force = law(motion)
         left = motion - free - (self._inverse @ force.ravel().astype(np.float32)).reshape(-1, 3)
         return _Motion(motion, exerted, force, left, float(np.abs(left).max(initial=0.0)))
+
+    def _consistent(self, at: _Motion, law: ContactLaw) -> bool:
+        """Whether the forces of a motion are, but for little, those of the motion that they lead to; the law is left where it was."""
+        apart = float(np.abs(law(at.motion - at.left) - at.force).sum())
+        law(at.motion)
+        return apart <= ENOUGH * float(np.abs(at.force).sum())
 
     def _searched(
         self, at: _Motion, step: FloatArray, target: FloatArray, share: float, free: FloatArray, law: ContactLaw

@@ -10,35 +10,33 @@ of Woodbury. Anderson's acceleration does the rest. A step that these iterations
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from naibu.core.arrays import FloatArray, Int32Array, IntArray
-from naibu.mechanics.contact.indenter_motion import parts_of_approach, slow_enough
+from naibu.core.arrays import FloatArray
+from naibu.mechanics.contact.indenter_motion import IndenterMotion, parts_of_approach, slow_enough
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
+from naibu.mechanics.contact.session_protocol import StepForces
 from naibu.mechanics.finite_elements.pressure_elements import PressureElements
 from naibu.mechanics.finite_strain.lip_assembly import lips_of
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact, local_positions
 from naibu.mechanics.finite_strain.sessions.condensed_contact import CondensedContact, ContactBesideTangent
-from naibu.mechanics.finite_strain.sessions.dynamic_session import PENETRATION, DynamicEngine, DynamicSession, DynamicState
-from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent, SolverPool, TangentThread
+from naibu.mechanics.finite_strain.sessions.dynamic_session import PENETRATION, DynamicSession, DynamicState
+from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
 from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import changing_lips
-from naibu.mechanics.finite_strain.sessions.nodes_ahead import nodes_ahead
+from naibu.mechanics.finite_strain.sessions.real_time_model import RealTimeModel
 from naibu.mechanics.finite_strain.sessions.session_checks import dead_load
+from naibu.mechanics.finite_strain.sessions.tangent_session import TangentSession
 from naibu.mechanics.finite_strain.sessions.trial_displacement import FELT, PASSABLE, Trial
 from naibu.mechanics.linear_algebra.anderson import AndersonMixing
-from naibu.mechanics.linear_algebra.block_matrix import BlockPattern, block_pattern, with_dirichlet_rows
-from naibu.mechanics.linear_algebra.updated_factors import UpdatedFactors
 
 ITERATIONS = 5  # of a step at most
 USUAL = 2  # of a step whose balance is then passable
 DEPTH = 4  # earlier iterations that are mixed
-FAINT = 1e-5  # strain of the body under contact forces too small to be told from none
 ACCEPTED = 0.06  # of a step that has used up its iterations; where it was 0.2, some later steps found no balance and took seconds
 BUDGET_S = 0.01  # of a processor for a step, after which a passable balance is taken; one that is worse goes on, and real time is lost
 DIVERGED = 1e6  # out-of-balance force from which a step is tried from another beginning
@@ -49,11 +47,10 @@ SPARE = 8  # nodes for which a step that took no iteration prepares the inverse,
 JUMP = 10.0  # its growth from which earlier iterations are forgotten, as where contacts close
 STIFFEST = 16.0  # times the first penalty, to which penalties rise: stiffer ones need more iterations
 RAISE = 1.3  # of a penalty in a step; where it leaps, pressure and limit of friction do, and the surface slips to another equilibrium
-PERIOD = 10  # steps after which a tangent is renewed without a thread
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RealTimeEngine(DynamicEngine):
+class RealTimeEngine(RealTimeModel):
     """A finite element model prepared for implicit dynamic steps in real time; see `DynamicEngine` for the other attributes.
 
     Attributes
@@ -62,21 +59,6 @@ class RealTimeEngine(DynamicEngine):
         Whether a thread renews the factors, and iterations end when the time of a step is over; otherwise factors are renewed before every
         tenth step, and runs are repeatable.
     """
-
-    background: bool = True
-    _elements: PressureElements = field(init=False)
-    _surface: BlockPattern = field(init=False)
-    _pairs: Int32Array = field(init=False)  # of the sides of cuts, in this pattern
-    _solvers: SolverPool = field(init=False)
-    _rest: list[EarlierTangent] = field(init=False, default_factory=list)
-
-    def __post_init__(self) -> None:
-        DynamicEngine.__post_init__(self)
-        object.__setattr__(self, "_elements", PressureElements.of(self.assembler))
-        pairs = np.concatenate([np.zeros((0, 2), np.int64), *(lips.pairs for lips in lips_of(self.assembler))])
-        object.__setattr__(self, "_surface", block_pattern(len(self.points), self.faces, pairs))
-        object.__setattr__(self, "_pairs", self._surface.positions(pairs))
-        object.__setattr__(self, "_solvers", SolverPool(self.assembler.pattern))
 
     def session(
         self,
@@ -89,8 +71,12 @@ class RealTimeEngine(DynamicEngine):
         return RealTimeSession(self, dead_load(external_force, self.points), self.rest()).begun(state, constrained, indenters)
 
 
+class _UnderWay(Exception):
+    """A step takes longer than it may, and goes on in the next call."""
+
+
 @dataclass(slots=True, eq=False)
-class RealTimeSession(DynamicSession):
+class RealTimeSession(TangentSession):
     """A body in motion that a loop steps in real time; made by `RealTimeEngine.session`. See `DynamicSession` for the other attributes.
 
     Attributes
@@ -101,55 +87,56 @@ class RealTimeSession(DynamicSession):
         Steps so far that had to wait for a tangent of their own.
     iterations : int
         Quasi-Newton iterations so far.
+    under_way : bool
+        Whether `step_within` has begun a step whose balance is not yet found.
     unbalanced : float
         Sum of the nodes' out-of-balance forces at the end of the last step, which the next steps take up, as a fraction of the sum of all
-        forces or of those of contact, whichever is more.
+        forces or of those of contact, whichever is more; of a step that is under way, at the best state found so far.
     """
 
     newton_steps: int = field(init=False, default=0)
     waits: int = field(init=False, default=0)
     iterations: int = field(init=False, default=0)
-    unbalanced: float = field(init=False, default=0.0)
-    _earlier: EarlierTangent | None = field(init=False, default=None)
-    _thread: TangentThread = field(init=False, default_factory=TangentThread)
-    _near: tuple[NearbyContact, ...] = field(init=False, default=())
     _gaps: tuple[FloatArray, ...] = field(init=False, default=())
-    _places: tuple[Int32Array, ...] = field(init=False, default=())
     _pressure: FloatArray | None = field(init=False, default=None)
-    _condensed: CondensedContact | None = field(init=False, default=None)
     _trial: Trial | None = field(init=False, default=None)
     _elements: PressureElements = field(init=False, repr=False)  # with the normals of the sides of cuts when the step begins
-    _seen: FloatArray | None = field(init=False, default=None)
-    _age: int = field(init=False, default=0)
     _spare: bool = field(init=False, default=False)  # whether the last step took no iteration
+    _search: Generator[None, None, Trial | None] | None = field(init=False, default=None)  # of the step under way
 
     def press(self, indenters: Sequence[RigidIndenter]) -> None:
         """Bring these indenters, and no others, into play; see `DynamicSession.press`."""
         DynamicSession.press(self, indenters)
         self._places = tuple(self._engine._surface.positions(c.nodes) for c in self._templates)
-        self._near, self._gaps, self._trial = (), (), None
+        self._near, self._gaps, self._trial, self._search = (), (), None, None
+
+    def constrain(self, constrained: Sequence[ArrayLike], bodies: int = 0) -> None:
+        """Constrain these nodes, and no others, from the next step on; see `DynamicSession.constrain`."""
+        DynamicSession.constrain(self, constrained, bodies)
+        self._search = None
 
     def restore(self, state: DynamicState) -> None:
         """Go on from a state; see `DynamicSession.restore`."""
         DynamicSession.restore(self, state)
-        self._pressure, self._near, self._gaps, self._trial = None, (), (), None
-
-    def keep_tangent(self) -> None:
-        """Have the tangent of the state reached at hand for the next sessions of the engine, in place of that of the body at rest."""
-        self._engine._rest[:] = [self._untouched(self.reached.displacement)]
-
-    def close(self) -> None:
-        """End the thread and release the factors."""
-        self._thread.close()
-        for tangent in (self._thread.take(), self._earlier):
-            self._release(tangent)
-        self._earlier = None
-        DynamicSession.close(self)
+        self._pressure, self._near, self._gaps, self._trial, self._search = None, (), (), None, None
 
     @property
-    def _engine(self) -> RealTimeEngine:
-        assert isinstance(self.engine, RealTimeEngine)
-        return self.engine
+    def under_way(self) -> bool:
+        """Whether `step_within` has begun a step whose balance is not yet found."""
+        return self._search is not None
+
+    def step_within(self, budget_s: float, velocity: ArrayLike = 0.0, motions: Sequence[IndenterMotion] = ()) -> StepForces | None:
+        """Take a step, or work on it for about a time of the processor; None: call again, with the same motions, to go on with it.
+
+        The state is that before the step until its balance is found. Newton's method, where it is needed, is not divided.
+        """
+        self._until = time.thread_time() + budget_s
+        try:
+            return self.step(velocity, motions)
+        except _UnderWay:
+            return None
+        finally:
+            self._until = np.inf
 
     def _parts(self, moving: FloatArray, along: FloatArray, spin: FloatArray) -> int:
         """Parts of a step in each of which no indenter goes through the body; the loop has no time to divide steps as the body swings."""
@@ -173,13 +160,26 @@ class RealTimeSession(DynamicSession):
     def _balanced(self, h: float, moving: FloatArray, contacts: tuple[Contact, ...]) -> FloatArray | None:
         """Return the displacement that balances momentum after a time `h`; by Newton's method where it is not found in real time."""
         if h == self.engine.step:
-            self._trial = self._quasi_newton(moving, contacts)
+            self._trial = self._gone_on(self._search or self._quasi_newton(moving, contacts))
             if self._trial is not None:
                 return self._trial.displacement
             self.newton_steps += 1
             self.unbalanced = 0.0
         self._pressure, self._trial, self._near, self._gaps = None, None, (), ()
         return DynamicSession._balanced(self, h, moving, contacts)
+
+    def _gone_on(self, search: Generator[None, None, Trial | None]) -> Trial | None:
+        """Return what a search finds; where it takes longer than it may, it is kept for the next call."""
+        self._search = None
+        while True:
+            try:
+                next(search)
+            except StopIteration as end:
+                found: Trial | None = end.value
+                return found
+            if time.thread_time() > self._until:
+                self._search = search
+                raise _UnderWay
 
     def _depths(self, contacts: tuple[Contact, ...], u: FloatArray) -> list[FloatArray]:
         """Return how deep indenters go into the faces; see `DynamicSession`. Of quasi-Newton steps only points near them are looked at."""
@@ -190,8 +190,8 @@ class RealTimeSession(DynamicSession):
             depth[near.points] = -near.gap / near.contact.element_size
         return depths
 
-    def _quasi_newton(self, moving: FloatArray, contacts: tuple[Contact, ...]) -> Trial | None:
-        """Return the balance at the end of a step, or None."""
+    def _quasi_newton(self, moving: FloatArray, contacts: tuple[Contact, ...]) -> Generator[None, None, Trial | None]:
+        """Return the balance at the end of a step, or None; yields where one may go on later."""
         tangent, start, h = self._current_tangent(), self.reached, self.engine.step
         self._elements = replace(self._engine._elements, assembler=self.engine.assembler.in_step(start.displacement))
         inertial = start.displacement + h * start.velocity
@@ -207,10 +207,10 @@ class RealTimeSession(DynamicSession):
         if pressure is None:
             pressure = self._engine._elements.bulk * self._engine._elements.dilatation(start.displacement)[0]
         before, deadline = self.iterations, (time.thread_time() + BUDGET_S if self._engine.background else np.inf)
-        best = self._from_guesses(tangent, moving, inertial, pressure, deadline)
+        best = yield from self._from_guesses(tangent, moving, inertial, pressure, deadline)
         if best is None or best.error > ACCEPTED:
             self.waits += 1
-            best = self._from_guesses(self._renewed(), moving, inertial, pressure, np.inf)
+            best = yield from self._from_guesses((yield from self._renewed()), moving, inertial, pressure, np.inf)
         if best is None or best.error > ACCEPTED:
             return None
         for near in self._near:  # gaps and responses are those of the last trial
@@ -220,11 +220,11 @@ class RealTimeSession(DynamicSession):
 
     def _from_guesses(
         self, tangent: EarlierTangent, moving: FloatArray, inertial: FloatArray, pressure: FloatArray, deadline: float
-    ) -> Trial | None:
+    ) -> Generator[None, None, Trial | None]:
         """Return the best that is found from the guesses, one after the other until a balance is accepted."""
         best = None
         for first, near, most in self._guesses(tangent, moving, inertial, pressure):
-            best = self._iterated(near, first, inertial, deadline, most).better(best)
+            best = (yield from self._iterated(near, first, inertial, deadline, most)).better(best)
             if best.error <= ACCEPTED:
                 break
         return best
@@ -253,7 +253,9 @@ class RealTimeSession(DynamicSession):
             target[nodes] = start[nodes] + self.engine.step * speed
         return self._tried(target, inertial, pressure)
 
-    def _iterated(self, tangent: EarlierTangent, trial: Trial, inertial: FloatArray, deadline: float, most: int) -> Trial:
+    def _iterated(
+        self, tangent: EarlierTangent, trial: Trial, inertial: FloatArray, deadline: float, most: int
+    ) -> Generator[None, None, Trial]:
         """Return the best that at most so many iterations find from a beginning, in the time of a processor that there is."""
         mixing, best, begun, bulk = AndersonMixing(DEPTH), trial, trial.error, self._engine._elements.bulk
         for k in range(most):
@@ -264,7 +266,9 @@ class RealTimeSession(DynamicSession):
                 return trial
             if k and trial.passable(bulk) and ((k >= USUAL and trial.felt <= FELT) or time.thread_time() > deadline):
                 return trial
-            after = self._improved(tangent, trial, inertial, mixing)
+            self.unbalanced = max(best.error, best.felt)
+            yield
+            after = yield from self._improved(tangent, trial, inertial, mixing)
             if after is None or after.error > DIVERGED:
                 break
             if after.error > JUMP * trial.error:
@@ -273,13 +277,15 @@ class RealTimeSession(DynamicSession):
             best = trial.better(best if k else None)
         return best
 
-    def _improved(self, tangent: EarlierTangent, trial: Trial, inertial: FloatArray, mixing: AndersonMixing) -> Trial | None:
+    def _improved(
+        self, tangent: EarlierTangent, trial: Trial, inertial: FloatArray, mixing: AndersonMixing
+    ) -> Generator[None, None, Trial | None]:
         """Return the end of one quasi-Newton iteration; None where it inverts an element."""
         elements = self._engine._elements
         self.iterations += 1
         force = trial.balance.copy()
         elements.add_pressures(tangent.dilatation, trial.mismatch, force)
-        step = self._with_contact(tangent, trial, force, not mixing.steps)
+        step = yield from self._with_contact(tangent, trial, force, not mixing.steps)
         if not np.isfinite(step).all():  # a tangent that has no factors in single precision
             if tangent is self._earlier:
                 self._release(tangent)
@@ -309,10 +315,10 @@ class RealTimeSession(DynamicSession):
         wrong, touching = float(np.abs(residual).sum()), float(np.abs(contact).sum())
         balance += (engine.mass / engine.step**2)[:, None] * (u - inertial) - self.external_force
         error = wrong / (float(allowed) / engine.tolerance + touching)
-        felt = wrong / (touching + FAINT * engine._modulus * engine._extent**2) if touching else 0.0
+        felt = wrong / (touching + engine.faint_mn) if touching else 0.0
         return Trial(u, pressure, balance, contact, mismatch, error, felt)
 
-    def _with_contact(self, tangent: EarlierTangent, trial: Trial, balance: FloatArray, first: bool) -> FloatArray:
+    def _with_contact(self, tangent: EarlierTangent, trial: Trial, balance: FloatArray, first: bool) -> Generator[None, None, FloatArray]:
         """Return the step (n, 3), mm, that brings a balance (n, 3), mN, without contact to zero, with contacts as they then are."""
         balance[self._constrained] = 0.0
         x = -tangent.factors.solve(balance.ravel())
@@ -335,6 +341,7 @@ class RealTimeSession(DynamicSession):
         if len(nodes):
             condensed = self._condensed
             if condensed is None or not condensed.serves(tangent, nodes):
+                yield from tangent.factors.prepared(nodes)
                 condensed = self._condensed = CondensedContact(tangent, nodes)
             nodes = condensed.nodes
             hold = 1e3 * float(self._engine._elements.bulk.max()) * self.engine._extent
@@ -345,7 +352,7 @@ class RealTimeSession(DynamicSession):
                 carried = near.contact.nodes[gaps[near.points] < 0.0]
                 way = near.contact.stop - near.contact.start
                 begin[carried] = self.reached.displacement[carried] + way - trial.displacement[carried]
-            force = condensed.forces(free[nodes], law, begin[nodes], 1e-5 * self.engine._extent, 0.05 * self.engine._extent)
+            force = yield from condensed.forces(free[nodes], law, begin[nodes], 1e-5 * self.engine._extent, 0.05 * self.engine._extent)
             tangent.factors.add_columns(nodes, force, x)
         free[self._constrained] = 0.0
         return free
@@ -369,82 +376,3 @@ class RealTimeSession(DynamicSession):
         if self._spare and self._earlier is not None:
             self._earlier.factors.prepare(ahead[~self._earlier.factors.covered(ahead)][:SPARE])
         return np.array([(trial.balance - trial.contact)[nodes].sum(axis=0) for nodes in self.bodies]).reshape(-1, 3), of_indenters
-
-    def _soon_touched(self, contacts: Sequence[Contact], gaps: Sequence[FloatArray]) -> IntArray:
-        engine = self._engine
-        return nodes_ahead(contacts, gaps, engine.faces.shape[1], engine._extent, engine.assembler, self.reached.displacement)
-
-    def _current_tangent(self) -> EarlierTangent:
-        """Return the newest tangent; where there is none for these supports, it is made now."""
-        if (done := self._thread.take()) is not None:
-            self._take(done)
-        for known in (self._earlier, *self._engine._rest):
-            if known is not None and np.array_equal(known.held, self._held()):
-                self._earlier = known
-                return known
-        self._engine._rest[:] = [self._untouched(np.zeros_like(self.engine.points))]
-        self._earlier, self._seen = self._engine._rest[0], np.zeros_like(self.engine.points)
-        return self._earlier
-
-    def _untouched(self, u: FloatArray) -> EarlierTangent:
-        """Return the tangent at a displacement without contacts of indenters."""
-        gaps = [local_positions(c, self.reached.displacement, 0.0)[1] for c in self._templates]
-        return self._made(u, (), (), self._held(), self._soon_touched(self._templates, gaps))
-
-    def _renew(self, ahead: IntArray) -> None:
-        """Have a tangent made of the state reached, if anything has changed since the last one."""
-        u = self.reached.displacement
-        still = self._seen is not None and float(np.abs(u - self._seen).max()) < 1e-4 * self.engine._extent
-        still &= self._earlier is not None and self.unbalanced <= PASSABLE and bool(self._earlier.factors.covered(ahead).all())
-        self._age += 1
-        if still or not self._thread.idle or (not self._engine.background and self._age < PERIOD):
-            return
-        self._seen = u
-        if self._engine.background:
-            self._thread.submit(partial(self._made, u, self._near, self._places, self._held(), ahead))
-        else:
-            self._take(self._made(u, self._near, self._places, self._held(), ahead))
-
-    def _renewed(self) -> EarlierTangent:
-        """Return the tangent of the state reached, which the step waits for."""
-        u = self.reached.displacement
-        gaps = []
-        for near, contact in zip(self._near, self._templates, strict=True):
-            near.add_force(u, np.zeros_like(u))
-            gaps.append(np.full(len(contact.nodes), np.inf))
-            gaps[-1][near.points] = near.gap
-        return self._take(self._made(u, self._near, self._places, self._held(), self._soon_touched(self._templates, gaps)))
-
-    def _take(self, tangent: EarlierTangent) -> EarlierTangent:
-        """Use a tangent from now on."""
-        self._release(self._earlier)
-        self._earlier, self._age, self._condensed = tangent, 0, None
-        return tangent
-
-    def _held(self) -> IntArray:
-        return self.bodies[0] if self.bodies else np.zeros(0, np.int64)
-
-    def _made(
-        self, u: FloatArray, near: tuple[NearbyContact, ...], places: tuple[Int32Array, ...], held: IntArray, ahead: IntArray
-    ) -> EarlierTangent:
-        """Return the tangent at a displacement with contacts, and columns of its inverse for nodes `ahead`."""
-        engine, pattern = self._engine, self._engine.assembler.pattern
-        blocks = engine.assembler.evaluate(u)[2]
-        contact = np.zeros((engine._surface.n_blocks, 3, 3))
-        for some, place, all_places in zip(near, places, self._positions, strict=False):
-            some.add_symmetric_stiffness(pattern, all_places, blocks)
-            some.add_symmetric_stiffness(engine._surface, place, contact)
-        blocks[pattern.diagonal()] += (engine.mass / engine.step**2)[:, None, None] * np.eye(3)
-        fixed = np.zeros(engine.points.shape, dtype=bool)
-        fixed[held] = True
-        solver = engine._solvers.get()
-        factors = UpdatedFactors(solver.factorize(with_dirichlet_rows(pattern.matrix(blocks), fixed)), len(u))
-        factors.prepare(ahead)
-        touched = np.unique(engine._surface.indices[(contact != 0.0).any(axis=(1, 2))]).astype(np.int64)
-        lips = np.concatenate([np.zeros((0, 3, 3)), *(some.add(u, np.zeros_like(u))[1] for some in lips_of(engine.assembler))])
-        return EarlierTangent(factors, engine._elements.dilatation(u)[1], contact, held, touched, lips, solver)
-
-    def _release(self, tangent: EarlierTangent | None) -> None:
-        """Let the solver of a tangent factorize again, unless the tangent is kept for the next session."""
-        if tangent is not None and not any(tangent is kept for kept in self._engine._rest):
-            self._engine._solvers.put(tangent.solver)

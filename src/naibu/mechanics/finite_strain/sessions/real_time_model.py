@@ -1,0 +1,85 @@
+"""A finite element model whose steps use the tangents of earlier ones, and such a tangent: with contacts, factorized."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray, Int32Array, IntArray
+from naibu.mechanics.finite_elements.pressure_elements import PressureElements
+from naibu.mechanics.finite_strain.lip_assembly import lips_of
+from naibu.mechanics.finite_strain.nearby_contact import NearbyContact
+from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicEngine
+from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent, SolverPool
+from naibu.mechanics.linear_algebra.block_matrix import BlockPattern, block_pattern, with_dirichlet_rows
+from naibu.mechanics.linear_algebra.updated_factors import UpdatedFactors
+
+FAINT = 1e-5  # strain of the body under contact forces too small to be told from none
+
+Contacts = tuple[Sequence[NearbyContact], Sequence[Int32Array], Sequence[Int32Array]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RealTimeModel(DynamicEngine):
+    """A finite element model prepared for tangents that outlive their step; see `DynamicEngine` for the other attributes.
+
+    Attributes
+    ----------
+    background : bool
+        Whether a thread renews the factors, and iterations end when the time of a step is over; otherwise factors are renewed before every
+        tenth step, and runs are repeatable.
+    """
+
+    background: bool = True
+    _elements: PressureElements = field(init=False)
+    _surface: BlockPattern = field(init=False)
+    _pairs: Int32Array = field(init=False)  # of the sides of cuts, in this pattern
+    _solvers: SolverPool = field(init=False)
+    _rest: list[EarlierTangent] = field(init=False, default_factory=list)
+
+    def __post_init__(self) -> None:
+        DynamicEngine.__post_init__(self)
+        object.__setattr__(self, "_elements", PressureElements.of(self.assembler))
+        pairs = np.concatenate([np.zeros((0, 2), np.int64), *(lips.pairs for lips in lips_of(self.assembler))])
+        object.__setattr__(self, "_surface", block_pattern(len(self.points), self.faces, pairs))
+        object.__setattr__(self, "_pairs", self._surface.positions(pairs))
+        object.__setattr__(self, "_solvers", SolverPool(self.assembler.pattern))
+
+    @property
+    def faint_mn(self) -> float:
+        """Force of contact too small to be told from none, mN."""
+        return FAINT * self._modulus * self._extent**2
+
+
+def tangent_at(engine: RealTimeModel, u: FloatArray, contacts: Contacts, held: IntArray, ahead: IntArray) -> EarlierTangent:
+    """Return the tangent at a displacement, and columns of its inverse for the nodes that come into contact.
+
+    Parameters
+    ----------
+    engine : RealTimeModel
+        The body, and solvers for its matrices.
+    u : ndarray, shape (n, 3)
+        Of the nodes, mm.
+    contacts : tuple
+        Contacts at this displacement, and the places of all their points in the pattern of the surface and in that of the body.
+    held : ndarray, shape (h,), int64
+        Nodes that do not move.
+    ahead : ndarray, shape (a,), int64
+        Nodes in contact or about to be.
+    """
+    pattern, blocks = engine.assembler.pattern, engine.assembler.evaluate(u)[2]
+    contact = np.zeros((engine._surface.n_blocks, 3, 3))
+    for some, place, all_places in zip(*contacts, strict=False):
+        some.add_symmetric_stiffness(pattern, all_places, blocks)
+        some.add_symmetric_stiffness(engine._surface, place, contact)
+    blocks[pattern.diagonal()] += (engine.mass / engine.step**2)[:, None, None] * np.eye(3)
+    fixed = np.zeros(engine.points.shape, dtype=bool)
+    fixed[held] = True
+    solver = engine._solvers.get()
+    factors = UpdatedFactors(solver.factorize(with_dirichlet_rows(pattern.matrix(blocks), fixed)), len(u))
+    factors.prepare(ahead)
+    touched = np.unique(engine._surface.indices[(contact != 0.0).any(axis=(1, 2))]).astype(np.int64)
+    lips = np.concatenate([np.zeros((0, 3, 3)), *(some.add(u, np.zeros_like(u))[1] for some in lips_of(engine.assembler))])
+    return EarlierTangent(factors, engine._elements.dilatation(u)[1], contact, held, touched, lips, solver)

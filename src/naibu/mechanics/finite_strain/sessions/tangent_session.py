@@ -1,0 +1,140 @@
+"""Sessions that keep the tangent of an earlier state, and have it renewed as the body moves."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray, Int32Array, IntArray
+from naibu.mechanics.contact.penalty_contact import Contact
+from naibu.mechanics.finite_strain.nearby_contact import NearbyContact, local_positions
+from naibu.mechanics.finite_strain.sessions.condensed_contact import CondensedContact
+from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicSession
+from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent, TangentThread
+from naibu.mechanics.finite_strain.sessions.nodes_ahead import nodes_ahead
+from naibu.mechanics.finite_strain.sessions.real_time_model import RealTimeModel, tangent_at
+from naibu.mechanics.finite_strain.sessions.trial_displacement import PASSABLE
+
+PERIOD = 10  # steps after which a tangent is renewed without a thread
+
+
+@dataclass(slots=True, eq=False)
+class TangentSession(DynamicSession):
+    """A body in motion with the tangent of an earlier state; see `DynamicSession` for the other attributes.
+
+    Attributes
+    ----------
+    unbalanced : float
+        See `naibu.mechanics.finite_strain.sessions.real_time_session.RealTimeSession`.
+    """
+
+    unbalanced: float = field(init=False, default=0.0)
+    _earlier: EarlierTangent | None = field(init=False, default=None)
+    _thread: TangentThread = field(init=False, default_factory=TangentThread)
+    _near: tuple[NearbyContact, ...] = field(init=False, default=())
+    _places: tuple[Int32Array, ...] = field(init=False, default=())
+    _condensed: CondensedContact | None = field(init=False, default=None)
+    _seen: FloatArray | None = field(init=False, default=None)
+    _age: int = field(init=False, default=0)
+    _until: float = field(init=False, default=np.inf)  # processor time at which a step is left to the next call
+
+    def keep_tangent(self) -> None:
+        """Have the tangent of the state reached at hand for the next sessions of the engine, in place of that of the body at rest."""
+        self._engine._rest[:] = [self._untouched(self.reached.displacement)]
+
+    def close(self) -> None:
+        """End the thread and release the factors."""
+        self._thread.close()
+        for tangent in (self._thread.take(), self._earlier):
+            self._release(tangent)
+        self._earlier = None
+        DynamicSession.close(self)
+
+    @property
+    def _engine(self) -> RealTimeModel:
+        assert isinstance(self.engine, RealTimeModel)
+        return self.engine
+
+    def _soon_touched(self, contacts: Sequence[Contact], gaps: Sequence[FloatArray]) -> IntArray:
+        engine = self._engine
+        return nodes_ahead(contacts, gaps, engine.faces.shape[1], engine._extent, engine.assembler, self.reached.displacement)
+
+    def _current_tangent(self) -> EarlierTangent:
+        """Return the newest tangent; where there is none for these supports, it is made now."""
+        if (done := self._thread.take()) is not None:
+            self._take(done)
+        for known in (self._earlier, *self._engine._rest):
+            if known is not None and np.array_equal(known.held, self._held()):
+                self._earlier = known
+                return known
+        self._engine._rest[:] = [self._untouched(np.zeros_like(self.engine.points))]
+        self._earlier, self._seen = self._engine._rest[0], np.zeros_like(self.engine.points)
+        return self._earlier
+
+    def _untouched(self, u: FloatArray) -> EarlierTangent:
+        """Return the tangent at a displacement without contacts of indenters."""
+        gaps = [local_positions(c, self.reached.displacement, 0.0)[1] for c in self._templates]
+        return self._made(u, (), (), self._held(), self._soon_touched(self._templates, gaps))
+
+    def _renew(self, ahead: IntArray) -> None:
+        """Have a tangent made of the state reached, if anything has changed since the last one."""
+        u = self.reached.displacement
+        still = self._seen is not None and float(np.abs(u - self._seen).max()) < 1e-4 * self.engine._extent
+        still &= self._earlier is not None and self.unbalanced <= PASSABLE and bool(self._earlier.factors.covered(ahead).all())
+        self._age += 1
+        if still or not self._thread.idle or (not self._engine.background and self._age < PERIOD):
+            return
+        self._seen = u
+        if self._engine.background:
+            self._thread.submit(partial(self._made, u, self._near, self._places, self._held(), ahead))
+        else:
+            self._take(self._made(u, self._near, self._places, self._held(), ahead))
+
+    def _renewed(self) -> Generator[None, None, EarlierTangent]:
+        """Return the tangent of the state reached, which the step waits for; the thread makes it where there is no time."""
+        u = self.reached.displacement
+        gaps = []
+        for near, contact in zip(self._near, self._templates, strict=True):
+            near.add_force(u, np.zeros_like(u))
+            gaps.append(np.full(len(contact.nodes), np.inf))
+            gaps[-1][near.points] = near.gap
+        make = partial(self._made, u, self._near, self._places, self._held(), self._soon_touched(self._templates, gaps))
+        if not self._engine.background or self._until == np.inf:
+            return self._take(make())
+        while not self._thread.idle:
+            self._release(self._thread.take())
+            yield from self._pause()
+        self._thread.submit(make)
+        while (done := self._thread.take()) is None:
+            yield from self._pause()
+        return self._take(done)
+
+    def _pause(self) -> Iterator[None]:
+        """Wait a moment, and end the frame if it has an end."""
+        time.sleep(1e-3)
+        self._until = -np.inf if self._until < np.inf else np.inf
+        yield
+
+    def _take(self, tangent: EarlierTangent) -> EarlierTangent:
+        """Use a tangent from now on."""
+        self._release(self._earlier)
+        self._earlier, self._age, self._condensed = tangent, 0, None
+        return tangent
+
+    def _held(self) -> IntArray:
+        return self.bodies[0] if self.bodies else np.zeros(0, np.int64)
+
+    def _made(
+        self, u: FloatArray, near: tuple[NearbyContact, ...], places: tuple[Int32Array, ...], held: IntArray, ahead: IntArray
+    ) -> EarlierTangent:
+        """Return the tangent at a displacement with contacts, and columns of its inverse for nodes `ahead`."""
+        return tangent_at(self._engine, u, (near, places, self._positions), held, ahead)
+
+    def _release(self, tangent: EarlierTangent | None) -> None:
+        """Let the solver of a tangent factorize again, unless the tangent is kept for the next session."""
+        if tangent is not None and not any(tangent is kept for kept in self._engine._rest):
+            self._engine._solvers.put(tangent.solver)
