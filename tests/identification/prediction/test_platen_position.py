@@ -10,11 +10,13 @@ from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, Loading
 from naibu.core.markers import Markers
 from naibu.core.parameters import ParameterSet
+from naibu.identification.from_markers import gauss_newton
 from naibu.identification.from_markers.calibration import initial_parameters
 from naibu.identification.from_markers.known_materials import KnownMaterials
-from naibu.identification.from_markers.observations import NoiseModel, SamePath
+from naibu.identification.from_markers.observations import NoiseModel, SamePath, SolvedLoadCase
 from naibu.identification.from_markers.specimen.parameter_names import friction, poisson_ratio, young_modulus
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings, specimen
+from naibu.identification.prediction import prediction
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.platen_position import Gauge, outermost_markers
 from naibu.identification.prediction.prediction import predict_state
@@ -61,6 +63,22 @@ def test_a_path_to_another_end_is_that_of_a_solution_from_rest(squeezed: Experim
     found = predict_state(model, squeezed, "pressed", heights_from_markers=True)  # from the path to the stated distance
     given = predict_state(model, squeezed, "pressed", platen_position_mm=found.platen_position_mm)
     np.testing.assert_allclose(found.points, given.points, atol=0.01)
+
+
+def test_a_solution_nearby_tells_how_the_distance_changes_and_where_the_plates_stand(
+    squeezed: Experiment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solved, differentiated = [], []
+    solve_state, sensitivities = prediction.solve_state, gauss_newton.sensitivities
+    monkeypatch.setattr(prediction, "solve_state", lambda *a, **k: solved.append(solve_state(*a, **k)) or solved[-1])
+    monkeypatch.setattr(gauss_newton, "sensitivities", lambda *a, **k: differentiated.append(a) or sensitivities(*a, **k))
+    found = predict_state(model_of(squeezed), squeezed, "pressed", heights_from_markers=True)
+    alone = len(differentiated)
+    near = SolvedLoadCase(solved[0].fit, solved[0].parameters)
+    again = predict_state(model_of(squeezed), squeezed, "pressed", heights_from_markers=True, warm_start=near)
+    assert len(differentiated) - alone == alone - 1 == 1
+    assert again.platen_position_mm == pytest.approx(found.platen_position_mm, abs=0.01)
+    np.testing.assert_allclose(again.points, found.points, atol=0.01)
 
 
 def test_states_of_a_path_are_met_where_the_body_was_in_them() -> None:

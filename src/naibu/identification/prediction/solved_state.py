@@ -114,5 +114,15 @@ def _solved(
     if markers is None:
         return parameters, fit, None, None
     gauge = outermost_markers(load_case.specimen, markers, fit.sd)
+    if rate is None and start is not None:
+        rate = _known_rate(start, platen, gauge)
     found, fit, rate = fitted_platen_position(matcher, fit, platen, gauge, rate)
     return found, fit, gauge, rate
+
+
+def _known_rate(start: SolvedLoadCase, platen: str, gauge: Gauge) -> float | None:
+    """Return how the distance of the outermost markers changes with the platen position nearby; None where that is not known."""
+    names = [p.name for p in start.parameters.free]
+    if platen not in names or not start.fit.path:
+        return None
+    return float(gauge.derivatives(start.fit.predicted, start.fit.jacobian)[names.index(platen)])
