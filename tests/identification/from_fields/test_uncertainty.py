@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from naibu.identification.from_fields.forward.load_cases import Zones
+from naibu.core.displacement_field import DisplacementField
+from naibu.identification.from_fields.estimate import identify_field
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, logarithms, young_and_poisson
-from naibu.identification.from_fields.gauss_newton import Objective, first_point
+from naibu.identification.from_fields.gauss_newton import Bounds, Objective, first_point
 from naibu.identification.from_fields.regularization import Laplacian, ZoneGraph
 from naibu.identification.from_fields.uncertainty import (
     Uncertainty,
@@ -19,6 +21,7 @@ from naibu.identification.from_fields.uncertainty import (
     young_and_poisson_slopes,
 )
 from naibu.reproduction.chapter3.bodies import LAYERS, PushedBody, cube
+from naibu.validation.specimens.quadratic_body import QuadraticBody
 
 PRESS, SHEAR = (0.0, 0.0, -10.0), (7.0, 0.0, -7.0)
 
@@ -95,6 +98,26 @@ def test_words_follow_the_numbers() -> None:
     assert "muscle" in words[0] and "is well determined" in words[0] and "95 % interval" in words[0]
     assert "fat" in words[1] and "roughly" in words[1] and "take it from elsewhere" in words[1]
     assert "kappa / mu of fat" in words[2] and "muscle" not in words[2]
+
+
+@pytest.mark.parametrize(
+    "bounds", [Bounds(poisson_ratio=(-0.9, 0.44)), Bounds(shear_modulus=(0.1, 1.6)), Bounds(shear_modulus=(1.9, 40.0))]
+)
+def test_at_a_bound_the_interval_is_open(bounds: Bounds) -> None:
+    """A bound that the truth, 5 kPa (1.72 kPa in shear) and 0.45, exceeds: derivatives there would give an interval of a few per cent."""
+    body = QuadraticBody("cube")
+    mesh, loaded = body.model(4, "hexahedron")
+    rng = np.random.default_rng(0)
+    points, u = body.solved((1.5, 0.0, -2.0), divisions=4).at(rng.uniform(0.02, 0.98, (400, 3)))
+    measured = DisplacementField.from_arrays(points, u + 0.04 * rng.standard_normal(u.shape), sd_mm=0.04)
+    case = FieldLoadCase.of("push", measured, mesh, loaded=loaded)
+    found = identify_field(mesh, [case], Zones.of(mesh, known={"known": (10.0, 0.4)}), bounds=bounds)
+    (young, poisson), nu = found.intervals(), bounds.poisson_ratio[1]
+    if nu == 0.44:
+        assert found.poisson_ratio[0] == pytest.approx(nu, abs=1e-6) and poisson[0][0] < 0.0 and 0.45 < poisson[0][1] <= 0.5
+    else:
+        low, high = (2.0 * (1.0 + found.poisson_ratio[0]) * mu for mu in bounds.shear_modulus)
+        assert young[0][0] < min(5.0, low) and young[0][1] > max(5.0, high)
 
 
 def test_noise_factor_scales_the_covariance() -> None:

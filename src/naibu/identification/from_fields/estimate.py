@@ -355,8 +355,7 @@ class _Recipe:
             of_mesh, covariance = doubt_of(shift, mixed=self.region_at is not None) if corrected is None else corrected.doubt
             total = total.with_added(covariance)
             coarse = float(np.abs(shift).max()) > COARSE if corrected is None else not corrected.converged
-        at_bound = theta >= self.bounds.box(model.zones.count)[1] - 1e-9  # where derivatives say nothing of how much less it may be
-        total = total.with_added(np.diag(np.where(at_bound, AT_BOUND**2, 0.0)))
+        total = total.with_added(np.diag(self._doubt_at_bounds(theta) ** 2))
         judged = verdict(model.observed, residuals, freedom)
         if self.region_at is not None and shift is not None:
             judged = _judged_within(judged, shift)
@@ -372,6 +371,14 @@ class _Recipe:
             judged, budget, shift, others, None if refined is None else refined.borders,
             None if refined is None else refined.parts,
         )  # fmt: skip
+
+    def _doubt_at_bounds(self, theta: FloatArray) -> FloatArray:
+        """Return standard deviations for logarithms at a bound, where derivatives say nothing of how far from it they may be."""
+        k, (low, high) = len(theta) // 2, self.bounds.box(len(theta) // 2)
+        doubt = np.where(theta >= high - 1e-9, AT_BOUND, 0.0)
+        of_shear = np.flatnonzero((theta[:k] <= low[:k] + 1e-9) | (theta[:k] >= high[:k] - 1e-9))
+        doubt[of_shear] = high[of_shear] - low[of_shear]
+        return doubt
 
     def _extrapolated(self, at: Linearised, quadratic: Concentrated) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray | None]:
         """Return theta and whitened residuals at vanishing element size, and the change of theta; None where it was not estimated."""

@@ -23,6 +23,7 @@ from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
+from naibu.identification.from_fields.gauss_newton import Bounds
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.io.displacement_fields import read_field
 from naibu.io.files.atomic import write_atomically
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
 
 FILES = ("model.json", "report.html", "zones.mha", "young_modulus.mha", "young_modulus_sd.mha", "poisson_ratio.mha", "identification.json")
 MOST_CARDS = 4
+BEYOND_KNOWN = 1e4  # times the stiffest, or part of the softest, known Young's modulus
 CELLS_OF_MAP = 2500  # of the model by default
 POINTS_OF_CELL, LEAST_CELLS = 2, 64  # cells with fewer points leave to the motion of the surface what zones of uniform moduli would tell
 
@@ -196,7 +198,7 @@ def identify_fields(
     within = None if each_cell or wrong < BLURRED else region_in(inside, labels, names)
     found = identify_field(
         mesh, cases, Zones.of(mesh, known=stated.values, known_sd=stated.doubts, each_cell=each_cell), law=law,
-        region_at=within, progress=progress,
+        bounds=_bounds([young for young, _ in stated.values.values()]), region_at=within, progress=progress,
     )  # fmt: skip
     inputs = input_record({"mask": mask, "zones": zones} | {f"field {k + 1}": p for k, p in enumerate(paths)})
     body = IdentifiedBody.of(
@@ -207,6 +209,11 @@ def identify_fields(
     coarse = blurred(left_out, wrong, corrected=within is not None and found.mesh_shift is not None)
     result = FieldIdentification(found, body, stated.relative, (*found.identifiability, *coarse, *longer), coarse, inside, cell_of_voxel)
     return result if folder is None else replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))
+
+
+def _bounds(known_kpa: Sequence[float]) -> Bounds:
+    """Return bounds of shear moduli, beyond which a zone cannot be told from one that is rigid, or empty."""
+    return Bounds(shear_modulus=(min(known_kpa) / BEYOND_KNOWN, max(known_kpa) * BEYOND_KNOWN))
 
 
 def _require_different(paths: Sequence[str | os.PathLike[str]], fields: Sequence[DisplacementField]) -> None:
