@@ -35,7 +35,7 @@ from naibu.workflows.markers.experiments import Source
 
 GRIP_RADIUS = 0.08  # of the extent of the body
 PAGE_BYTES = 5_000_000
-BUDGET_S = 0.018  # of the processor for a frame: a step that takes longer goes on in the next one
+BUDGET_S = 0.014  # of the processor for a frame: a step that takes longer goes on in the next one
 SWITCH_S = 2e-4  # in which the page leaves the interpreter to the physics of a haptic device
 
 
