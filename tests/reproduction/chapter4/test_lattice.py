@@ -11,12 +11,15 @@ from matplotlib.figure import Figure as Canvas
 from naibu import datasets
 from naibu.identification.lattice_calibration.forward_model import Capture, PushedFace, PushedLattice
 from naibu.identification.lattice_calibration.report_indices import ReportIndices
+from naibu.reproduction.agreement.lattices import of_lattice
+from naibu.reproduction.agreement.read_tables import Tables
 from naibu.reproduction.chapter4.cube import TABLES, calibrated_cube, cube_section
 from naibu.reproduction.chapter4.lattice import _drawn_sets, _one_set, _pattern_table, exact_section
 from naibu.reproduction.chapter4.lattice_figures import FinalShape, ForceWave, final_shapes, force_waves
 from naibu.reproduction.chapter4.octree import chapter4_octree, cost_section
 from naibu.reproduction.chapter4.patterns import JOINT, PATTERNS, SEPARATE, PatternStudy, pattern_study
 from naibu.validation.specimens.lattice_twin import CUBE_PUSHING, dough_lattice, dough_parameters
+from naibu.viewer.chapters.chapter import Section
 from naibu.viewer.tables import Table
 
 PAPER = {t["id"]: t["rows"] for t in datasets.paper_tables()["tables"]}
@@ -78,6 +81,16 @@ def test_ratios_of_the_joint_set(made_up_study: PatternStudy) -> None:
     row = _one_set(made_up_study).rows[0]
     assert row[4] == pytest.approx(sum(made_up_study.found["joint 1"].shape_mm) / sum(made_up_study.found["a"].shape_mm))
     assert row[8] == pytest.approx(made_up_study.found["joint 1"].force_mn / made_up_study.found["force 1"].force_mn)
+
+
+def test_whether_two_sets_are_needed_follows_the_ratios(made_up_study: PatternStudy) -> None:
+    tables = [_pattern_table(n, "first", k, ("joint 1",), made_up_study) for n, k in (("4-force-1", "abcd"), ("4-force-2", "efgh"))]
+    one_set = _one_set(made_up_study)
+    for factor, said in ((1.0, "differs"), (1.2, "agrees")):
+        ratio = one_set.columns.index("joint / set for force")
+        rows = tuple((*r[:4], factor, *r[5:ratio], factor) for r in one_set.rows)
+        found = of_lattice(Tables((Section("s", (), (*tables, replace(one_set, rows=rows))),)))
+        assert [c.verdict for c in found if c.what.startswith("Two sets")] == [said]
 
 
 def column(table: Table, name: str) -> list[object]:

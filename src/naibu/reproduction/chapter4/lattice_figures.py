@@ -105,9 +105,9 @@ def force_waves(waves: Sequence[ForceWave]) -> Draw:
             axes.plot(wave.times, wave.measured, color="0.6", linewidth=0.6, label="measured")
             axes.plot(wave.times, wave.computed, color="#1f5fa8", linewidth=1.2, label="computed")
             axes.set_title(wave.title, fontsize=9)
-            axes.set(xlabel="time, s", ylabel="force, N")
-            axes.label_outer()
+            axes.set(ylabel="force, N")
             axes.legend(fontsize=8)
-        canvas.tight_layout()
+        for axes in panels[-2:]:
+            axes.set_xlabel("time, s")
 
     return draw
