@@ -105,6 +105,9 @@ def test_what_does_not_fit_is_refused() -> None:
         _ = DisplacementField.from_arrays(np.eye(3), np.eye(3)).grid
     with pytest.raises(InputError, match="step must be"):
         DisplacementField.on_grid(grid, unknown).at_points(step=0)
+    unknown_sd = np.where(np.arange(3)[:, None, None] == 1, np.nan, np.eye(3))
+    with pytest.raises(InputError, match="not finite at 1 of 3 points, first at index 1; give it"):
+        DisplacementField.from_arrays(np.eye(3), np.eye(3), covariance=unknown_sd)
     with pytest.raises(InputError, match="not positive semidefinite"):
         DisplacementField.from_arrays(np.eye(3), np.eye(3), covariance=np.tile(np.diag([1.0, -1.0, 1.0]), (3, 1, 1)))
 

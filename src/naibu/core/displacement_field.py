@@ -222,7 +222,11 @@ def _covariance(sd_mm: ArrayLike | None, covariance: ArrayLike | None, shape: tu
     c = np.array(covariance, dtype=float)
     if c.shape != (n, d, d):
         raise InputError(f"covariance of a field must have shape {(n, d, d)}, mm^2, not {c.shape}")
-    if valid.any() and not (np.isfinite(c[valid]).all() and np.linalg.eigvalsh(c[valid]).min() >= -1e-12 * np.abs(c[valid]).max()):
+    if len(odd := np.flatnonzero(valid & ~np.isfinite(c).all(axis=(1, 2)))):
+        raise InputError(
+            f"covariance of a field is not finite at {len(odd)} of {n} points, first at index {odd[0]}; give it, or mark them as not valid"
+        )
+    if valid.any() and np.linalg.eigvalsh(c[valid]).min() < -1e-12 * np.abs(c[valid]).max():
         raise InputError("covariance of a field has a block that is not positive semidefinite")
     return c
 
