@@ -31,10 +31,11 @@ from naibu.identification.lattice_calibration.least_squares import (
     noise_factors,
     step_within,
 )
+from naibu.identification.lattice_calibration.local_regression import LocalRegression
 from naibu.identification.lattice_calibration.mapped_search import MappedSearch
 from naibu.identification.lattice_calibration.shape_distance import closest_points
 from naibu.identification.lattice_calibration.unknowns import LatticeUnknowns, identifiability
-from naibu.identification.lattice_calibration.widened_covariance import smoothed_information, widened_covariance
+from naibu.identification.lattice_calibration.widened_covariance import widened_covariance
 from naibu.mechanics.lattices.model.lattice import Lattice
 
 Index = Literal["shape", "force", "joint"]
@@ -194,7 +195,7 @@ def calibrate_lattice(
     to theirs, and the search goes on. Where the law does not reproduce points or forces to within their
     noise, the noise is taken as that much larger, each for itself, and the search goes on: neither then outweighs the other by being
     measured more precisely than the model can tell. Where derivatives are differences of simulations, as in contact, Broyden's updates
-    spare most of them (`MappedSearch`).
+    spare most of them (`MappedSearch`), and regressions around the end give the estimate and its covariance (`LocalRegression`).
 
     Parameters
     ----------
@@ -211,7 +212,8 @@ def calibrate_lattice(
     warm_start : array_like or mapping, optional
         Values from which the search begins, as the estimate of a similar problem; weak priors stay around `start`. By default `start`.
     widen : bool
-        Whether the covariance is widened to where chi-squared itself rises, which takes some thirty simulations of each load case.
+        Whether the covariance is widened to where chi-squared itself rises, which takes some thirty simulations of each load case;
+        not of differences of simulations, as in contact.
     threads : int
         Into how many parts the derivatives of every capture are shared; by default as many threads compute them.
     executor : concurrent.futures.Executor
@@ -234,7 +236,7 @@ def calibrate_lattice(
     at = Evaluations(threads, executor, progress)
     try:
         if problem.shifts(np.exp(centre)) is not None:
-            return _searched_by_mapping(problem, centre, first, prior_sd, max_iterations, reweigh, widen, at)
+            return _searched_by_mapping(problem, centre, first, prior_sd, max_iterations, reweigh, at)
         return _searched(problem, centre, first, prior_sd, max_iterations, reweigh, widen, at)
     except KeyboardInterrupt:
         if at.best is None or at.problem is None:
@@ -272,20 +274,18 @@ def _in_other_units(point: EvaluatedPoint, old: tuple[float, float], new: tuple[
 
 
 def _searched_by_mapping(
-    problem: InverseProblem, centre: FloatArray, first: FloatArray, prior_sd: float, most: int, reweigh: bool, widen: bool, at: Evaluations
+    problem: InverseProblem, centre: FloatArray, first: FloatArray, prior_sd: float, most: int, reweigh: bool, at: Evaluations
 ) -> LatticeEstimate:
     search = MappedSearch(problem, centre, prior_sd, at, first)
     search.run(most, reweigh=reweigh)
-    shifts = problem.shifts(np.exp(search.theta))
-    assert shifts is not None
-    if not search.settled:  # derivatives there say nothing of where the least misfit is
-        unknown = prior_sd**2 * np.eye(len(centre))
-        return replace(_estimate(search.problem, search.point, unknown, search.iterations, search.runs), settled=False)
-    information, _ = smoothed_information(search.problem, search.point, float(np.abs(shifts).max()), prior_sd, at)
-    covariance = np.asarray(np.linalg.inv(information + np.eye(len(centre)) / prior_sd**2))
-    if widen:
-        covariance = widened_covariance(search.problem, search.point, centre, prior_sd, at, information)[0]
-    return _estimate(search.problem, search.point, covariance, search.iterations, at.runs)
+    local = LocalRegression(problem, search.theta, centre, prior_sd, at)
+    point, covariance = local.run()
+    if not local.settled:  # derivatives there say nothing of where the least misfit is
+        covariance = prior_sd**2 * np.eye(len(centre))
+    found = _estimate(problem, point, covariance, search.iterations + local.rounds, at.runs)
+    information = np.linalg.inv(covariance) - np.eye(len(centre)) / prior_sd**2
+    open_combinations = identifiability(problem.unknowns.names, information)
+    return replace(found, information=information, undetermined=open_combinations, settled=local.settled)
 
 
 def _estimate(
