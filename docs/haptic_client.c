@@ -1,5 +1,5 @@
 /* A haptic device for naibu live --haptics-port 8766. Build: cc -O2 haptic_client.c -o haptic_client -lm (POSIX, little-endian).
-   read_device and set_force stand for the device's own library. */
+   read_device and set_force stand for the device's own library. The tool turns as the quaternion does, which is constant here. */
 #include <arpa/inet.h>
 #include <errno.h>
 #include <math.h>

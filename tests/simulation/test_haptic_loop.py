@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from lossy_channel import LossyChannel, felt
+from scipy.spatial.transform import Rotation
 from touched_lattice import TOP, touched_lattice
 
 from naibu.core.arrays import FloatArray
@@ -15,6 +16,7 @@ from naibu.mechanics import Assembler, elements, material, spherical_indenter
 from naibu.meshing import box
 from naibu.simulation import FiniteElementBody, ForceLimits, HapticHand, InteractiveSimulation, RealTimeLoop, SimulatedDevice
 from naibu.simulation.haptic_loop import CONTACT, HOLDS, LEAVES_S, STALE
+from naibu.simulation.interactive_simulation import LEAST_TURN
 from naibu.workflows.interactive.haptics.packets import pose_bytes, read_force
 
 START = 54.0
@@ -47,6 +49,26 @@ def test_device_body_and_coupling_are_in_balance_at_rest() -> None:
     lead = (device.position - np.array([5.0, 6.0, 7.0])) - (frame.tool_centre - np.array([20.0, 20.0, START]))
     np.testing.assert_allclose(-hand.coupling.stiffness * lead, force, atol=0.02 * force[2])
     np.testing.assert_allclose(device.stiffness * (device.position - device.path(9.0)), force, atol=0.02 * force[2])
+
+
+def test_the_tool_turns_as_the_device_does_but_not_while_the_button_is_held() -> None:
+    """It leads from where it came; then half a radian about x, whatever is lost; about y with the button; then back by 0.2 about x."""
+    held = Rotation.from_rotvec([0.0, 0.7, 0.0])
+
+    def orientation(t: float) -> FloatArray:
+        about_x = Rotation.from_rotvec([0.5 * min(max(t - 0.1, 0.0) / 0.3, 1.0), 0.0, 0.0])
+        back = Rotation.from_rotvec([-0.2 * min(max(t - 1.0, 0.0) / 0.2, 1.0), 0.0, 0.0])
+        return np.asarray(np.roll((back * (held if t > 0.8 else Rotation.identity()) * about_x).as_quat(), 1))
+
+    touched, channel = simulation(), LossyChannel(3, loss=0.05, late=0.05)
+    device, hand = SimulatedDevice(lambda _: np.zeros(3), orientation=orientation), HapticHand(channel)
+    felt(touched, hand, device, channel, 0.7)
+    np.testing.assert_allclose(Rotation.from_matrix(touched.last.tool_rotation).as_rotvec(), [0.5, 0.0, 0.0], atol=1.1 * LEAST_TURN)
+    device.buttons = HOLDS
+    felt(touched, hand, device, channel, 0.25)
+    device.buttons = 0
+    felt(touched, hand, device, channel, 0.6)
+    np.testing.assert_allclose(Rotation.from_matrix(touched.last.tool_rotation).as_rotvec(), [0.3, 0.0, 0.0], atol=1.1 * LEAST_TURN)
 
 
 @pytest.mark.parametrize("seed", [1, 2])

@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from lossy_channel import LossyChannel, felt
+from scipy.spatial.transform import Rotation
 
 from naibu.core.arrays import FloatArray
 from naibu.mechanics import Assembler, elements, material, spherical_indenter
 from naibu.meshing import box
 from naibu.simulation import FiniteElementBody, ForceLimits, Frame, HapticHand, InteractiveSimulation, LocalContact, SimulatedDevice
-from naibu.simulation.interactive_simulation import FRAME_S
+from naibu.simulation.interactive_simulation import FRAME_S, LEAST_TURN
 from naibu.simulation.local_contact import LocalFrame, LocalReaction
 
 STEP_S = 1e-3
@@ -136,3 +137,14 @@ def test_a_tool_that_the_page_moves_is_taken_where_it_is() -> None:
         led.body.advance()
     led.contact.observe(led.body.last, led=False)
     np.testing.assert_array_equal(led.contact.last.tool_centre, led.body.last.tool_centre)
+
+
+def test_the_tool_turns_with_the_steps_of_the_body() -> None:
+    channel = LossyChannel()
+    both, hand = beside(channel)
+
+    def orientation(t: float) -> FloatArray:
+        return np.asarray(np.roll(Rotation.from_rotvec([0.0, 0.4 * min(max(t - 0.1, 0.0) / 0.3, 1.0), 0.0]).as_quat(), 1))
+
+    felt(both, hand, SimulatedDevice(lambda _: np.zeros(3), orientation=orientation), channel, 0.6)
+    np.testing.assert_allclose(Rotation.from_matrix(both.body.last.tool_rotation).as_rotvec(), [0.0, 0.4, 0.0], atol=1.1 * LEAST_TURN)

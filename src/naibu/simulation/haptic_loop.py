@@ -11,6 +11,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
@@ -40,7 +41,7 @@ class DevicePose:
     position : ndarray, shape (3,)
         mm.
     quaternion : ndarray, shape (4,)
-        Orientation, scalar first.
+        Orientation, scalar first; its changes turn the tool.
     buttons : int
         Bits; the lowest one lets the device move without its tool.
     applied : int
@@ -137,13 +138,17 @@ class LedSimulation(Protocol):
     def move(self, centre: ArrayLike) -> None:
         """Lead it to a position (3,), mm."""
 
+    def turn(self, rotation: ArrayLike) -> None:
+        """Turn it further by a rotation vector (3,), rad."""
+
 
 @dataclass(slots=True, eq=False)
 class HapticHand:
     """A device that leads the tool through a virtual coupling.
 
-    When a device comes, comes back after a silence, or lets go of its button, its pose then is taken for the place of the tool: no force
-    acts at first, whatever the device's frame. It leads the tool that is in play, or the first one.
+    When a device comes, comes back after a silence, or lets go of its button, its pose then is taken for the pose of the tool: no force
+    acts at first, whatever the device's frame. It leads the tool that is in play, or the first one, which turns as the device does, at the
+    speed that the simulation permits; no torque is handed back.
 
     Attributes
     ----------
@@ -167,6 +172,7 @@ class HapticHand:
     _pose: DevicePose | None = field(init=False, default=None)
     _velocity: FloatArray = field(init=False, default_factory=lambda: np.zeros(3))
     _offset: FloatArray = field(init=False, default_factory=lambda: np.zeros(3))
+    _orientation: FloatArray = field(init=False, default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))  # to which the tool was turned
     _silence: float = field(init=False, default=0.0)
     _energy: float = field(init=False, default=0.0)  # on the account of the device when it came
 
@@ -190,6 +196,9 @@ class HapticHand:
             self._anchor(simulation)
         if self._tool is not None and self._silence <= self.limits.silence_s and not self._pose.buttons & HOLDS:
             simulation.move(self._tool.next_position(self._place(), self._velocity, simulation.frame_s))
+            if not np.array_equal(self._pose.quaternion, self._orientation):
+                simulation.turn(_rotation_between(self._orientation, self._pose.quaternion))
+        self._orientation = self._pose.quaternion
 
     def after(self, frame: LedFrame, step_s: float) -> None:
         """Answer with the force on the device, after a step."""
@@ -257,6 +266,7 @@ class HapticHand:
         if frame.tool and self._pose is not None:
             self._tool = CoupledTool(self.coupling, frame.tool_centre)
             self._offset = frame.tool_centre - self._pose.position
+            self._orientation = self._pose.quaternion
 
     def _place(self) -> FloatArray:
         """Position of the device in the frame of the body (3,), mm."""
@@ -268,6 +278,12 @@ class HapticHand:
         self.passivity = PassivityController(self.limits, self.coupling.stiffness)
         self._limiter.forget()
         self.channel.leave()
+
+
+def _rotation_between(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Return the rotation vector (3,), rad, in the frame of the body, that leads from one unit quaternion, scalar first, to another."""
+    first, second = (Rotation.from_quat(np.roll(quaternion, -1)) for quaternion in (before, after))
+    return np.asarray((second * first.inv()).as_rotvec())
 
 
 def require_haptic_steps(simulation: InteractiveSimulation) -> None:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from naibu.core.arrays import FloatArray, require_positive
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
@@ -116,6 +117,7 @@ class LocalContact:
     _since: float = field(init=False, default=0.0)
     _orders: list[Order] = field(init=False, default_factory=list)
     _asked: str = field(init=False, default="")
+    _turned: Rotation = field(init=False, default_factory=Rotation.identity)  # since the last step of the body
 
     def __post_init__(self) -> None:
         require_positive("fastest_mm_s", self.fastest_mm_s, "mm/s")
@@ -132,6 +134,10 @@ class LocalContact:
         """Lead the tool to a position (3,), mm."""
         self._target = np.asarray(centre, dtype=float)
 
+    def turn(self, rotation: ArrayLike) -> None:
+        """Turn the tool further by a rotation vector (3,), rad, in the next step of the body."""
+        self._turned = Rotation.from_rotvec(rotation) * self._turned
+
     def observe(self, frame: Frame, *, led: bool) -> list[Order]:
         """Take in the last frame of the body; return what the body's simulation is to do before its next one.
 
@@ -144,10 +150,14 @@ class LocalContact:
                 self._target, self._asked = frame.tool_centre, frame.tool
                 self.last = LocalFrame(frame.tool, frame.tool_centre, np.zeros(3))
                 self._old = self._new = LocalReaction(frame.tool_centre)
+                self._turned = Rotation.identity()
             if frame.tool:
                 self._continue(frame)
-                target = self.last.tool_centre
+                target, turned = self.last.tool_centre, self._turned.as_rotvec()
                 self._orders.append(lambda simulation: simulation.move(target))
+                if turned.any():
+                    self._orders.append(lambda simulation: simulation.turn(turned))
+                    self._turned = Rotation.identity()
             self._seen = frame
         orders, self._orders = self._orders, []
         return orders

@@ -29,6 +29,8 @@ class SimulatedDevice:
         Of the handle, kg, and of the hand, mN/mm and mN s/mm.
     position, velocity : ndarray, shape (3,)
         Of the handle, mm and mm/s.
+    orientation : callable
+        Returns how the hand holds the handle, a unit quaternion (4,), scalar first, at a time, s.
     buttons : int
         That are held; see `DevicePose`.
     applied : DeviceForce, optional
@@ -43,6 +45,7 @@ class SimulatedDevice:
     mass_kg: float = 0.2
     stiffness: float = 300.0
     damping: float = 5.0
+    orientation: Callable[[float], FloatArray] = lambda _: np.array([1.0, 0.0, 0.0, 0.0])
     position: FloatArray = field(init=False)
     velocity: FloatArray = field(init=False, default_factory=lambda: np.zeros(3))
     buttons: int = 0
@@ -83,7 +86,7 @@ class SimulatedDevice:
         self.position = self.position + moved
         self._sequence += 1
         number = 0 if self.applied is None else self.applied.number
-        return DevicePose(self._sequence, self.time_s, self.position, buttons=self.buttons, applied=number, energy_mn_mm=self.work)
+        return DevicePose(self._sequence, self.time_s, self.position, self.orientation(self.time_s), self.buttons, number, self.work)
 
     def _permitted(self, moved: FloatArray, compliance: float) -> FloatArray:
         """Return as much of the force (3,), mN, as hands out no more than the answer allows.
