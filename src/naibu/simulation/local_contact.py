@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from naibu.core.arrays import FloatArray, require_positive
+from naibu.core.arrays import FloatArray, as_vector, require_positive
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.simulation.interactive_bodies import Frame
 from naibu.simulation.interactive_simulation import FRAME_S, InteractiveSimulation, placed
@@ -136,7 +136,7 @@ class LocalContact:
 
     def turn(self, rotation: ArrayLike) -> None:
         """Turn the tool further by a rotation vector (3,), rad, in the next step of the body."""
-        self._turned = Rotation.from_rotvec(rotation) * self._turned
+        self._turned = Rotation.from_rotvec(as_vector("rotation", rotation)) * self._turned
 
     def observe(self, frame: Frame, *, led: bool) -> list[Order]:
         """Take in the last frame of the body; return what the body's simulation is to do before its next one.
