@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +17,9 @@ from naibu.cli import main
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
+from naibu.identification.from_fields.estimate import identify_field
+from naibu.identification.from_fields.field_estimate import FieldEstimate
+from naibu.identification.from_fields.uncertainty import Uncertainty
 from naibu.io.displacement_fields import write_field
 from naibu.io.images import read_volume, write_volume
 from naibu.validation.specimens.quadratic_body import QuadraticBody, Solved
@@ -65,6 +70,20 @@ def test_a_zone_is_identified_on_the_grid_of_the_scan(folder: Path) -> None:
     page = (folder / "out" / "report.html").read_text()
     assert "Young&#x27;s modulus" in page and "Moduli under other assumptions" in page
     assert check_shown(run, folder / "out" / "report.html") == numbers["zones"]
+
+
+def test_what_nothing_determines_is_null_in_the_file_of_numbers(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The interval of a modulus on which there is no information ends at infinity, which JSON does not have and which was written."""
+
+    def without_information(*of: Any, **options: Any) -> FieldEstimate:
+        return replace(identify_field(*of, **options), uncertainty=Uncertainty.of(np.zeros((2, 2))))
+
+    monkeypatch.setattr(f"{identify_fields.__module__}.identify_field", without_information)
+    options = {"zones": folder / "labels.mha", "known": ["label 2=10 kPa, 0.4"], "element_size_mm": 10.0, "law": "linear"}
+    identify_fields(folder / "field.h5", out=folder / "out", **options)  # type: ignore[arg-type]
+    text = (folder / "out" / "identification.json").read_text()
+    (zone,) = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))["zones"]
+    assert zone["95 % from"] == 0.0 and zone["to"] is None and (zone["of which 95 % from"], zone["up to"]) == (-1.0, 0.5)
 
 
 def test_what_the_other_law_would_give_stands_next_to_the_moduli(folder: Path) -> None:

@@ -30,6 +30,7 @@ from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
 from naibu.io.images import write_volume
 from naibu.viewer.cards import Card
+from naibu.viewer.json_values import jsonable
 from naibu.viewer.notebook import ShownInNotebook, empty_figure
 from naibu.viewer.result_figures import draw_slices
 from naibu.viewer.slices import Overlay, SliceView, slices_html
@@ -351,5 +352,6 @@ def _written(folder: Path, result: FieldIdentification) -> list[Path]:
         "cells": found.mesh.n_cells,
         "inputs": body.provenance["inputs"],
     }
-    files.append(write_atomically(folder / "identification.json", json.dumps(numbers, indent=1, ensure_ascii=False) + "\n"))
+    text = json.dumps(jsonable(numbers, 17), indent=1, ensure_ascii=False, allow_nan=False)
+    files.append(write_atomically(folder / "identification.json", text + "\n"))
     return [write_atomically(folder / "report.html", result.page_html()), *files]
