@@ -3,7 +3,7 @@
 A server shows a sphere that breathes 60 times a second, as a simulation would; the page draws it. Printed are frames drawn a
 second, and the time from a command of the page (the tool is moved) to the picture that shows its effect.
 
-Run: ``PYTHONPATH=. python benchmarks/live_page.py [--vertices 5000 50000] [--seconds 5]``
+Run: ``PYTHONPATH=. python benchmarks/live_page.py [--vertices 5000 50000] [--seconds 5] [--record]``
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import uvicorn
+from records import ResultTable, write_record
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.viewer.live.commands import LiveCommand
@@ -24,6 +25,7 @@ from naibu.viewer.motion_page import RigidShape
 from tests.helpers.browser import opened_browser
 
 RADIUS = 40.0
+COLUMNS = ("vertices", "frames drawn a second", "delay, median, ms", "delay, 95 %, ms")
 COUNTED = """(async () => {
   const frames = () => naibuLive.view.renderer.info.render.frame;
   const [began, first] = [performance.now(), frames()];
@@ -90,7 +92,7 @@ class Breathing:
         return ""
 
 
-def measured(vertices: int, seconds: float, moves: int) -> str:
+def measured(vertices: int, seconds: float, moves: int) -> tuple[int, float, int, int]:
     """A row of the table."""
     points, faces = sphere(vertices)
     ball = RigidShape("sphere", "sphere", np.array([8.0, 0.0, 0.0]), np.eye(3))
@@ -112,7 +114,7 @@ def measured(vertices: int, seconds: float, moves: int) -> str:
     finally:
         server.should_exit = True
         thread.join(timeout=10)
-    return f"{len(points):>9} {rate:>14.1f} {np.median(delays):>16.0f} {np.quantile(delays, 0.95):>12.0f}"
+    return len(points), round(rate, 1), round(float(np.median(delays))), round(float(np.quantile(delays, 0.95)))
 
 
 def main() -> None:
@@ -120,10 +122,14 @@ def main() -> None:
     parser.add_argument("--vertices", type=int, nargs="+", default=[5_000, 50_000])
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--moves", type=int, default=60)
+    parser.add_argument("--record", action="store_true")
     given = parser.parse_args()
-    print(" vertices  frames drawn/s  delay median, ms  95 %, ms")
+    rows = []
     for vertices in given.vertices:
-        print(measured(vertices, given.seconds, given.moves))
+        rows.append(measured(vertices, given.seconds, given.moves))
+        print("  ".join(f"{name} {value}" for name, value in zip(COLUMNS, rows[-1], strict=True)), flush=True)
+    if given.record:
+        write_record("live_page", [ResultTable("live_page", COLUMNS, tuple(rows))])
 
 
 if __name__ == "__main__":

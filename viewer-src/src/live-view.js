@@ -12,7 +12,21 @@ import { readTheme, View } from "./view.js";
 
 const MARKER_FRACTION = 0.012; // radius of a marker, in radii of the object
 
+/** Whether WebGL is drawn by the processor, as where there is no graphics card. */
+function drawnBySoftware() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  const info = gl?.getExtension("WEBGL_debug_renderer_info");
+  const name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
+  gl?.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
+}
+
 export class LiveView extends View {
+  /** Smooth edges take a processor three times as long; a screenshot is drawn anew, so that no frame has to be kept. */
+  constructor(host) {
+    super(host, { antialias: !drawnBySoftware(), preserveDrawingBuffer: false });
+  }
+
   /** Show a decoded scene at rest; one that replaces another, as after a cut, is seen as the other was. */
   show(scene) {
     const [first, clip, marked, mesh] = [!this.scene, this.clip, this.markers?.visible, this.skin?.material.wireframe];

@@ -41,10 +41,13 @@ export function readTheme(element) {
 
 /** Subclasses set `world` (Scene), `extent` (Sphere), `frameful` (lists of points that must be visible) and `sun` (a light), then call look(). */
 export class View {
-  /** @param {HTMLElement} host empty, positioned element */
-  constructor(host) {
+  /**
+   * @param {HTMLElement} host empty, positioned element
+   * @param {{antialias?: boolean, preserveDrawingBuffer?: boolean}} drawing how the canvas is drawn; by default smooth, and kept for copies
+   */
+  constructor(host, { antialias = true, preserveDrawingBuffer = true } = {}) {
     this.host = host;
-    this.renderer = new WebGLRenderer({ antialias: true, preserveDrawingBuffer: true });
+    this.renderer = new WebGLRenderer({ antialias, preserveDrawingBuffer });
     this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
     this.canvas = this.renderer.domElement;
     host.append(this.canvas);
