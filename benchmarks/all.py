@@ -28,7 +28,7 @@ COMMANDS: dict[str, tuple[str | None, str]] = {
     "interval_coverage": (None, "interval_coverage.py 16 --record"),
     "prediction_coverage": (None, "interval_coverage.py 3 --predict --record"),
     "field_identification": (None, "field_identification.py coverage --repetitions 30 --record"),
-    "lattice_calibration": (None, "lattice_calibration.py 24 --cells 3 --unknown all --workers 2 --record"),
+    "lattice_calibration": (None, "lattice_calibration.py 5 --cells 3 --threads 1 --record"),
     "fingertip": (None, "fingertip.py --record"),
     "mammography": (None, "mammography.py --record"),
     "mammography_population": (None, "mammography_population.py --out naibu-breasts-results --first 120 --breasts 50 --record"),

@@ -238,8 +238,8 @@ def _warnings(problem: StudyProblem, estimate: LatticeEstimate, before: Compared
     found = [] if estimate.finished else ["The search was interrupted: these are the best values so far, not the end of the search."]
     if not problem.unknowns.study.tied:
         found.append(
-            "In contact the intervals are not confirmed: jumps, as points begin to slip, count in them as errors of the model, but in a "
-            "trial with known truth one of eleven was still too narrow (benchmarks/lattice_calibration.py). Take them as the least "
+            "In contact the intervals are not confirmed: jumps, as points begin to slip, count in them as errors of the model, but in "
+            "trials with known truth three of 55 were still too narrow (benchmarks/lattice_calibration.py). Take them as the least "
             "uncertainty."
         )
     if not estimate.settled:
