@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -10,18 +12,20 @@ from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, logarithms, young_and_poisson
 from naibu.identification.from_fields.gauss_newton import Bounds, Objective, first_point
+from naibu.identification.from_fields.mesh_error import extrapolated, relative_change, stretch_of
 from naibu.identification.from_fields.regularization import Laplacian, ZoneGraph
 from naibu.identification.from_fields.uncertainty import (
     Uncertainty,
     cramer_rao_bound,
     information_at,
+    intervals,
     report,
     resolution,
     resolution_report,
     young_and_poisson_slopes,
 )
 from naibu.reproduction.chapter3.bodies import LAYERS, PushedBody, cube
-from naibu.validation.specimens.quadratic_body import QuadraticBody
+from naibu.validation.specimens.quadratic_body import QuadraticBody, Solved
 
 PRESS, SHEAR = (0.0, 0.0, -10.0), (7.0, 0.0, -7.0)
 
@@ -118,6 +122,38 @@ def test_at_a_bound_the_interval_is_open(bounds: Bounds) -> None:
     else:
         low, high = (2.0 * (1.0 + found.poisson_ratio[0]) * mu for mu in bounds.shear_modulus)
         assert young[0][0] < min(5.0, low) and young[0][1] > max(5.0, high)
+
+
+@pytest.mark.parametrize(("poisson_ratio", "cells", "seed"), [(n, c, s) for n in (0.49, 0.499) for c in (4, 6, 9) for s in (0, 1)])
+def test_intervals_hold_poisson_ratios_near_one_half(poisson_ratio: float, cells: int, seed: int) -> None:
+    """Elements add .045 to mu / kappa on four cells a side, whose truth is .020 and .002: what is left after extrapolation is in doubt."""
+    points, u = nearly_incompressible(poisson_ratio).at(np.random.default_rng(seed).uniform(0.02, 0.98, (400, 3)))
+    u = u + 0.04 * np.random.default_rng(100 + seed).standard_normal(u.shape)
+    body = QuadraticBody("cube", unknown=(5.0, poisson_ratio))
+    mesh, loaded = body.model(cells, "hexahedron")
+    case = FieldLoadCase.of("push", DisplacementField.from_arrays(points, u, sd_mm=0.04), mesh, loaded=loaded)
+    (young,), (poisson,) = identify_field(mesh, [case], Zones.of(mesh, known={"known": body.known})).intervals()
+    assert young[0] < 5.0 < young[1] and poisson[0] < poisson_ratio < poisson[1] <= 0.5 and poisson[0] > 0.46
+
+
+@cache
+def nearly_incompressible(poisson_ratio: float) -> Solved:
+    return QuadraticBody("cube", unknown=(5.0, poisson_ratio)).solved((0.0, 0.0, -4.0), divisions=6)
+
+
+def test_the_amount_of_compressibility_is_extrapolated() -> None:
+    """mu / kappa of 1 / 20 that falls by a half on half the size: seven tenths go, and equal errors weigh 1 / 0.3 times as much."""
+    theta = extrapolated(np.log([2.0, 20.0]), np.array([0.1, 0.5]))
+    np.testing.assert_allclose(np.exp(-theta[1]), 0.05 * 0.3)
+    assert theta[0] == pytest.approx(np.log(2.0) + 0.14) and extrapolated(theta, np.array([0.0, 0.8]))[1] == np.inf
+    shift = theta - np.log([2.0, 20.0])
+    np.testing.assert_allclose(relative_change(shift), [0.14, 0.7])
+    np.testing.assert_allclose(stretch_of(shift), [1.0, 1.0 / 0.3])
+    for sd, upper in ((0.02, 0.5 - 1.5 * 0.015 * (1.0 - 1.96 * 0.02 / 0.3) / 3.013), (0.2, 0.5)):
+        found = Uncertainty(np.eye(2), np.diag([0.01, sd]) ** 2).stretched(stretch_of(shift))
+        low, high = intervals(theta, found)[1][0]
+        most = 0.015 + 0.05 * np.expm1(1.96 * sd)
+        assert low == pytest.approx(0.5 - 1.5 * most / (3.0 + most), abs=1e-4) and high == pytest.approx(upper, abs=1e-4)
 
 
 def test_noise_factor_scales_the_covariance() -> None:

@@ -45,7 +45,15 @@ from naibu.identification.from_fields.gauss_newton import (
     first_point,
     search,
 )
-from naibu.identification.from_fields.mesh_error import COARSE, EXTRAPOLATED, changes_on_finer_mesh, doubt_of, refitted
+from naibu.identification.from_fields.mesh_error import (
+    COARSE,
+    changes_on_finer_mesh,
+    doubt_of,
+    extrapolated,
+    refitted,
+    relative_change,
+    stretch_of,
+)
 from naibu.identification.from_fields.regions.border_refinement import (
     MOST_REGIONS,
     CorrectedRegions,
@@ -337,8 +345,10 @@ class _Recipe:
         shift: FloatArray | None
         if corrected is not None:
             theta, residuals, shift = corrected.refined.theta, corrected.residuals, corrected.shift
+            stretch = np.ones_like(theta)
         else:
             theta, residuals, shift = self._extrapolated(at, quadratic)
+            stretch = stretch_of(np.zeros_like(theta) if shift is None else shift)
             if refined is not None:
                 theta = Objective(bounds=self.bounds).clipped(theta + refined.theta - point.theta)
         misfit, freedom = sum(float(r @ r) for r in residuals), model.n_free - 2.0 * model.zones.count
@@ -348,13 +358,15 @@ class _Recipe:
         of_noise = Uncertainty(of_noise.information / shared, of_noise.covariance * shared)
         if refined is not None:
             of_noise = of_noise.with_added(factor**2 * shared * (refined.covariance - refined.at_these_borders))
+        of_noise = of_noise.stretched(stretch)
         others = assumptions(at, quadratic, self.law)
-        of_known = covariance_of(others, len(theta))
+        of_known = covariance_of(others, len(theta)) * np.outer(stretch, stretch)
         of_mesh, total, coarse = np.full(len(theta), np.nan), of_noise.with_added(of_known), False
         if shift is not None:
-            of_mesh, covariance = doubt_of(shift, mixed=self.region_at is not None) if corrected is None else corrected.doubt
-            total = total.with_added(covariance)
-            coarse = float(np.abs(shift).max()) > COARSE if corrected is None else not corrected.converged
+            relative = shift if corrected is not None else relative_change(shift)
+            of_mesh, covariance = doubt_of(relative, mixed=self.region_at is not None) if corrected is None else corrected.doubt
+            of_mesh, total = of_mesh * stretch, total.with_added(covariance * np.outer(stretch, stretch))
+            coarse = float(np.abs(relative).max()) > COARSE if corrected is None else not corrected.converged
         total = total.with_added(np.diag(self._doubt_at_bounds(theta) ** 2))
         judged = verdict(model.observed, residuals, freedom)
         if self.region_at is not None and shift is not None:
@@ -391,7 +403,7 @@ class _Recipe:
         if changes is None:
             return fitted, tuple(o.residual(u) for o, u in zip(model.observed, at.point.states, strict=True)), None
         finer = refitted(at, quadratic, changes)
-        theta = Objective(bounds=self.bounds).clipped(fitted + EXTRAPOLATED * finer.theta)
+        theta = Objective(bounds=self.bounds).clipped(extrapolated(fitted, finer.theta))
         young, before = young_and_poisson(theta)[0], young_and_poisson(fitted)[0]
         most = 100.0 * float(np.abs(young / before - 1.0).max())
         self.record(f"half the element size: Young's modulus changes by up to {most:.2g} % when extrapolated to vanishing size")
@@ -400,8 +412,8 @@ class _Recipe:
 
 def _judged_within(judged: Verdict, shift: FloatArray) -> Verdict:
     """Return the verdict on zones that end inside of cells, where half the size of these changed moduli by `shift`."""
-    worst = float(np.abs(shift).max())
-    if worst <= WITHIN:
+    if float(np.abs(relative_change(shift)).max()) <= WITHIN:
         return judged
-    reason = f"zones end inside of elements, and with half their size moduli would change {np.exp(worst):.2g} times: use smaller ones"
+    times = np.exp(float(np.abs(shift).max()))
+    reason = f"zones end inside of elements, and with half their size moduli would change {times:.2g} times: use smaller ones"
     return replace(judged, explanation=Explanation.NOT_EXPLAINED, reasons=(reason, *judged.reasons))

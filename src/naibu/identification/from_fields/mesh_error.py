@@ -1,9 +1,10 @@
 """Discretisation error of identified moduli: the same load cases on a mesh of half the element size, and extrapolation from the two.
 
 The state on the finer mesh, under the same moduli and the same displacement of the loaded nodes, changes the residuals; the moduli that fit
-best then change by a Gauss-Newton step. Corners, edges and interfaces make solutions singular, so that the order of convergence lies
-between 1 and 2 whatever the elements; on bodies like those of the benchmark it is about 1.8. What
-extrapolation adds is doubted accordingly.
+best then change by a Gauss-Newton step. Elements near incompressibility are too compressible by an amount of mu / kappa that hardly depends
+on its value; so it is mu / kappa that is extrapolated, not its logarithm, which would never reach 0. Corners, edges and interfaces make
+solutions singular, so that the order of convergence lies between 1 and 2 whatever the elements; on bodies like those of the benchmark it is
+about 1.8. What extrapolation adds is doubted accordingly.
 """
 
 from __future__ import annotations
@@ -56,9 +57,33 @@ class Refit:
         return sum(float(r @ r) for r in self.residuals)
 
 
+def extrapolated(fitted: FloatArray, change: FloatArray) -> FloatArray:
+    """Return logarithms (2 count,) at vanishing element size, from those on a mesh and their change by a Gauss-Newton step on a finer one.
+
+    ln mu is extrapolated as it is, and mu / kappa instead of its logarithm; where that is negative, ln(kappa / mu) is infinite.
+    """
+    k, out = len(fitted) // 2, fitted + EXTRAPOLATED * change
+    with np.errstate(divide="ignore"):
+        out[k:] = fitted[k:] - np.log(np.maximum(1.0 - EXTRAPOLATED * change[k:], 0.0))
+    return out
+
+
+def stretch_of(shift: FloatArray) -> FloatArray:
+    """Return by how much equal errors of mu / kappa weigh more in its logarithm after that changed by `shift` (2 count,), 1 for ln mu."""
+    k = len(shift) // 2
+    return np.concatenate([np.ones(k), np.exp(shift[k:])])
+
+
+def relative_change(shift: FloatArray) -> FloatArray:
+    """Return the change of ln mu, then how much of mu / kappa went, of logarithms (2 count,) that changed by `shift`."""
+    k = len(shift) // 2
+    return np.concatenate([shift[:k], -np.expm1(-shift[k:])])
+
+
 def doubt_of(shift: FloatArray, *, mixed: bool = False) -> tuple[FloatArray, FloatArray]:
     """Return standard deviations (2 count,) and covariance (2 count, 2 count) of extrapolated logarithms that changed by `shift`.
 
+    Those of ln(kappa / mu) are relative to mu / kappa on the mesh (see `relative_change` and `stretch_of`).
     The error of all moduli has one cause and one sign, unless elements are so coarse that changes say little of what is left. Where zones
     end inside of cells (`mixed`), it has no order of convergence: what is left may be as large as the change to half the size.
     """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg as sl
@@ -34,10 +34,14 @@ class Uncertainty:
         Fisher information of ln mu, then ln(kappa / mu), the displacement of loaded nodes estimated as well.
     covariance : ndarray, shape (2 k, 2 k)
         Its inverse; infinite on the diagonal where a modulus is not determined.
+    stretch : ndarray, shape (2 k,), or None
+        Factors by which standard deviations of logarithms are larger than where the data were fitted, because errors of mu / kappa stayed
+        while the size of elements was taken off it; None where nothing was.
     """
 
     information: FloatArray
     covariance: FloatArray
+    stretch: FloatArray | None = None
 
     @classmethod
     def of(cls, information: FloatArray, noise_factor: float = 1.0) -> Uncertainty:
@@ -54,7 +58,11 @@ class Uncertainty:
 
     def with_added(self, covariance: FloatArray) -> Uncertainty:
         """Return the uncertainty with independent errors of another covariance (2 k, 2 k) added; the information stays that of the data."""
-        return Uncertainty(self.information, self.covariance + covariance)
+        return replace(self, covariance=self.covariance + covariance)
+
+    def stretched(self, stretch: FloatArray) -> Uncertainty:
+        """Return the uncertainty of logarithms whose errors are larger by factors (2 k,); the information stays that of the data."""
+        return Uncertainty(self.information, self.covariance * np.outer(stretch, stretch), stretch)
 
     def standard_deviations(self) -> FloatArray:
         """Return those of ln mu, then ln(kappa / mu) (2 k,)."""
@@ -153,14 +161,17 @@ class ErrorBudget:
 def intervals(theta: FloatArray, found: Uncertainty, level: float = 0.95) -> tuple[FloatArray, FloatArray]:
     """Return the bounds of Young's modulus (k, 2), kPa, and of Poisson's ratio (k, 2) that hold the truth with a probability `level`.
 
-    Both are normal in a logarithm: of E, and of kappa / mu, so that no bound of Poisson's ratio exceeds 0.5.
+    Errors are normal in a logarithm: of E, and of mu / kappa before what the size of elements added to it was taken off. Towards
+    incompressibility they are normal in mu / kappa itself: where its lower bound is below 0, Poisson's ratio may be 0.5.
     """
     k, quantile = len(theta) // 2, float(ndtri(0.5 + 0.5 * level))
     of_young, _ = found.of_young_and_poisson(theta)
     young = young_and_poisson(theta)[0][:, None] * np.exp(quantile * of_young[:, None] * np.array([-1.0, 1.0]))
-    sd = found.standard_deviations()[k:, None]
-    with np.errstate(over="ignore"):
-        ratio = np.exp(theta[k:, None] + quantile * np.where(np.isfinite(sd), sd, 1e3) * np.array([-1.0, 1.0]))
+    sd = quantile * found.standard_deviations()[k:]
+    stretch = np.ones(k) if found.stretch is None else found.stretch[k:]
+    with np.errstate(over="ignore", divide="ignore"):
+        most = 1.0 + stretch * np.expm1(np.where(np.isfinite(sd), sd, 1e3 * stretch) / stretch)
+        ratio = np.exp(theta[k:])[:, None] / np.stack([most, np.maximum(1.0 - sd, 0.0)], axis=1)
     return young, 0.5 - 1.5 / (3.0 * ratio + 1.0)
 
 
