@@ -3,15 +3,17 @@
 A server shows a sphere that breathes 60 times a second, as a simulation would; the page draws it. Printed are frames drawn a
 second, and the time from a command of the page (the tool is moved) to the picture that shows its effect.
 
-Run: ``PYTHONPATH=. python benchmarks/live_page.py [--vertices 5000 50000] [--seconds 5] [--record]``
+Run: ``python benchmarks/live_page.py [--vertices 5000 50000] [--seconds 5] [--record]``
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 import threading
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import uvicorn
@@ -22,7 +24,9 @@ from naibu.viewer.live.commands import LiveCommand
 from naibu.viewer.live.scene import LiveFrame, LiveScene
 from naibu.viewer.live.server import LONGEST_MESSAGE, LiveServer
 from naibu.viewer.motion_page import RigidShape
-from tests.helpers.browser import opened_browser
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "helpers"))
+from browser import opened_browser
 
 RADIUS = 40.0
 COLUMNS = ("vertices", "frames drawn a second", "delay, median, ms", "delay, 95 %, ms")
