@@ -304,3 +304,11 @@ def test_spline_tables_hold_derivatives() -> None:
         for order in (0, 1):
             numeric = (grid.matrix(axis, at + STEP, order) - grid.matrix(axis, at - STEP, order)) / (2 * STEP)
             np.testing.assert_allclose(grid.matrix(axis, at, order + 1), numeric, atol=1e-4)
+
+
+def test_forces_on_no_voxel_load_nothing() -> None:
+    images = level()
+    system = SplineSystem(images, SplineGrid.around(np.zeros(3), np.array(SHAPE[::-1]) * SPACING, np.full(3, 8.0)))
+    # a block at the rim of an object can hold so few voxels that none of them is drawn
+    number = np.full(images.mask.shape, -1, np.int32)
+    assert not system.force_loads(np.zeros((0, 3, 4), np.float32), number).any()

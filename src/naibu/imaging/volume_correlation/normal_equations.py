@@ -211,7 +211,7 @@ class SplineSystem:
         """Return loads (n, 3, s) of forces (voxels, 3, s) on the voxels, or on those that are numbered in their box, others being -1."""
         loads = np.zeros((self.n, 3, forces.shape[2]), np.float32)
         which = self.level.number if number is None else number
-        flat = forces.reshape(len(forces), -1)
+        flat = forces.reshape(len(forces), 3 * forces.shape[2])  # also of no voxel
         add_forces(loads.reshape(self.n, -1), self.tasks, self.cells, self.slot, flat, which, self.starts, self.weights)
         return loads
 
