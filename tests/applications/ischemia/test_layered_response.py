@@ -153,7 +153,9 @@ def test_the_edge_of_a_pale_area_moves_evenly() -> None:
     radius = np.linspace(0.0, 1.5, 16)
     cone = 8.0 * (1.0 - 0.5 * (radius[1:] + radius[:-1]))[None]
     change = np.full_like(cone, -8.0 * (radius[1] - radius[0]))
-    motion = SkinMotion(np.zeros(1), np.zeros(1), np.zeros(1, dtype=np.int64), np.zeros((1, 1, 2)), cone, change, np.pi * np.diff(radius**2))
+    motion = SkinMotion(
+        np.zeros(1), np.zeros(1), np.zeros(1, dtype=np.int64), np.zeros((1, 1, 2)), cone, change, np.pi * np.diff(radius**2)
+    )
     levels = np.linspace(0.5, 7.0, 40)
     areas = np.array([motion.pale_area(p)[0] for p in levels])
     assert_allclose(areas, np.pi * (1.0 - levels / 8.0) ** 2, atol=0.01)

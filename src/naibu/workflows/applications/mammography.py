@@ -35,7 +35,14 @@ from naibu.viewer.chapters.chapter import Chapter, Figure, Section
 from naibu.viewer.chapters.chapter_page import chapter_html
 from naibu.viewer.notebook import WrittenResult
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.applications.mammogram_inputs import place_in, plate_distances, positioner_angle, read_projections, read_scan, read_views
+from naibu.workflows.applications.mammogram_inputs import (
+    place_in,
+    plate_distances,
+    positioner_angle,
+    read_projections,
+    read_scan,
+    read_views,
+)
 from naibu.workflows.applications.mammography_figures import draw_breast, draw_views
 from naibu.workflows.applications.mammography_motion import breast_page
 from naibu.workflows.results.output_folder import output_folder
@@ -148,7 +155,7 @@ def relate_views(
     plates, angle = plate_distances(views, thickness_mm), positioner_angle(views, angle_deg)
     uncertainty = ModelUncertainty(unresolved_mm=unresolved_mm)
     outlines = None if views is None else (views[0].outline, views[1].outline)
-    scan = read_scan(mr, side, views) if mr is not None else None
+    scan: ScannedBreast | ProjectedBreast | None = None if mr is None else read_scan(mr, side, views)
     if mr_axial is not None and mr_sagittal is not None:
         scan = read_projections(mr_axial, mr_sagittal, pixel_mm)
     common: dict[str, Any] = {"model": model, "uncertainty": uncertainty, "draws": draws, "seed": seed}
