@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -50,6 +51,12 @@ def test_page_and_numbers_from_tables_and_from_masks(tmp_path: Path) -> None:
     masks = relate_views(tmp_path / "cc.tif", tmp_path / "mlo.tif", point_cc=(50.0, 110.0), pixel_mm=0.5, out=tmp_path / "m", **common)  # type: ignore[arg-type]
     again = json.loads(masks.files[1].read_text(encoding="utf-8"))
     np.testing.assert_allclose(again["curve_in_mlo_mm"], numbers["curve_in_mlo_mm"], atol=1.5)
+    curve, band = (np.array(again[name]) for name in ("curve_in_mlo_mm", "band_in_mlo_mm"))
+    page = masks.files[0].read_text(encoding="utf-8")
+    assert f"{curve[:, 0].min():.0f} to {curve[:, 0].max():.0f} mm" in page
+    told = float(re.search(r"band reaches (\d+) mm to either side", page)[1])  # type: ignore[index]
+    across = np.ptp(band[np.abs(band[:, 1] - np.median(curve[:, 1])) < 5.0][:, 0])  # the curve runs along the chest wall
+    assert told == pytest.approx(0.5 * across, abs=2.0)
 
 
 def test_outlines_under_neutral_names_that_may_be_swapped_are_told(tmp_path: Path) -> None:

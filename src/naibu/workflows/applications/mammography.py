@@ -268,6 +268,18 @@ def _rows(found: _Found) -> list[tuple[str, str]]:
 
 def _cards(found: _Found) -> tuple[Card, ...]:
     cards = []
+    for k, other in enumerate(("MLO", "CC")):
+        curve = found.curves[k]
+        if curve is not None and found.lesion is None:
+            depths = curve.curve[:, 0]
+            half = 0.5 * float(np.median(np.hypot(*(curve.band[: len(curve.curve)] - curve.band[::-1][: len(curve.curve)]).T)))
+            cards.append(
+                Card(
+                    f"Epipolar curve in {other}",
+                    f"{depths.min():.0f} to {depths.max():.0f} mm",
+                    f"from the chest wall; the 95 % band reaches {half:.0f} mm to either side",
+                )
+            )
     if found.lesion is not None:
         for axis, value, low, high in zip(_AXES, found.lesion.position, found.lesion.low, found.lesion.high, strict=True):
             cards.append(Card(f"Lesion, {axis}", f"{value:.0f} mm".replace("-", "−"), f"95 % interval {low:.0f} to {high:.0f} mm"))
@@ -285,7 +297,7 @@ def _warnings(found: _Found) -> list[str]:
     if found.lesion is not None and not found.lesion.agrees:
         told.append("The MLO point lies outside of the band of the CC point: the points may not show one lesion; do not use the position.")
     if found.pair.refused:
-        told.append(f"{found.pair.refused} of the models drawn gave no breast with these outlines and were left out.")
+        told.append(f"Models drawn that gave no breast with these outlines, and were left out: {found.pair.refused}.")
     return told
 
 
