@@ -11,6 +11,7 @@ from .ischemia.layered_response import LayeredModes, SkinMotion, frequency_respo
 from .ischemia.response_times import ResponseTimes, response_times
 from .ischemia.skin import MeshedPatch, SkinLayer, SkinPatch, SurfaceLoad, meshed
 from .mammography.breast_from_mr import ScannedBreast, breast_in_scan
+from .mammography.breast_from_projections import ProjectedBreast, breast_in_projections
 from .mammography.breast_outline import BreastOutline, breast_outline, mask_outline
 from .mammography.breast_segmentation import breast_mask
 from .mammography.breast_shape import BreastShape, half_ellipsoid_shape, shape_from_widths
@@ -66,6 +67,7 @@ __all__ = [
     "Press",
     "PressedView",
     "Pressing",
+    "ProjectedBreast",
     "Projection",
     "RampKalman",
     "ReadingChain",
@@ -82,6 +84,7 @@ __all__ = [
     "TwoViews",
     "WholeFingertip",
     "assumed_chip",
+    "breast_in_projections",
     "breast_in_scan",
     "breast_mask",
     "breast_outline",

@@ -25,7 +25,10 @@ def mammography(
     point_mlo: Annotated[str, Parameter(allow_leading_hyphen=True)] = "",
     mr: Path | None = None,
     side: Literal["left", "right"] | None = None,
+    mr_axial: Path | None = None,
+    mr_sagittal: Path | None = None,
     point_mr: Annotated[str, Parameter(allow_leading_hyphen=True)] = "",
+    constrain_outlines: bool = False,
     pixel_mm: float | None = None,
     model: Literal["geometric", "mechanical"] = "geometric",
     unresolved_mm: float = 6.0,
@@ -58,8 +61,16 @@ def mammography(
         Mask of the breast in an MR volume (NIfTI, MetaImage, NRRD): its shape is used instead of the one that the outlines imply.
     side
         Which breast the MR mask holds.
+    mr_axial
+        Instead of a mask of the volume: the unloaded breast in an axial maximum intensity projection of it, an outline or a mask as
+        of CC.
+    mr_sagittal
+        The same in a sagittal projection, upper side up as in MLO.
     point_mr
-        Point X,Y,Z in the MR volume, mm (LPS), to be shown in CC and MLO.
+        Point X,Y,Z in the MR volume, mm (LPS), to be shown in CC and MLO; with projections X,Y in the axial outline, and Z upwards in the
+        sagittal one.
+    constrain_outlines
+        Scale the equilibria of an MR shape onto the widths of the outlines in CC and MLO (mechanical model).
     pixel_mm
         Size of a pixel of the masks, mm, where the files do not state it.
     model
@@ -86,7 +97,10 @@ def mammography(
         point_mlo=_numbers("point_mlo", point_mlo) if point_mlo else None,
         mr=mr,
         side=side,
+        mr_axial=mr_axial,
+        mr_sagittal=mr_sagittal,
         point_mr=_numbers("point_mr", point_mr) if point_mr else None,
+        constrain_outlines=constrain_outlines,
         pixel_mm=pixel_mm,
         model=model,
         unresolved_mm=unresolved_mm,

@@ -158,7 +158,7 @@ def reproduce_all(
             write_atomically(folder / f"{left[index]}.html", page)
             write_atomically(folder / f"{left[index]}.json", numbers)
 
-    tasks = [Task(f"chapter {name}", _computed, {"name": name, "seed": seed}) for name in left]
+    tasks = [Task(f"chapter {name}", _computed, {"name": name, "seed": seed}, length=PROCESSOR_S[name]) for name in left]
     outcomes = run_tasks(tasks, workers=where, memory_mb=MEMORY_MB, stage="chapters", finished=write, progress=progress)
     for outcome in outcomes:
         outcome.value()

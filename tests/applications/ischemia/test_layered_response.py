@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from naibu.applications.ischemia.layered_response import LayeredModes, frequency_response, laplace_modulus, simulate_skin
-from naibu.applications.ischemia.skin import SkinLayer, SkinPatch, SurfaceLoad, from_planes, meshed
+from naibu.applications.ischemia.layered_response import LayeredModes, SkinMotion, frequency_response, laplace_modulus, simulate_skin
+from naibu.applications.ischemia.skin import SkinLayer, SkinPatch, SurfaceLoad, from_planes, graded, meshed
 from naibu.core.errors import InputError
 from naibu.mechanics.small_strain.dynamics import simulate_motion
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
@@ -40,6 +40,44 @@ def test_a_uniform_column_creeps_as_the_closed_form_says() -> None:
         return np.where(t > 0.0, 1.0 - np.exp(-np.maximum(t, 0.0) * 2.0 / 0.5) + 2.0 * t / 40.0, 0.0)
 
     assert_allclose(creeping, elastic * (creep(TIMES) - creep(TIMES - 0.5)), rtol=1e-9)
+
+
+def test_two_layers_in_a_column_creep_in_series() -> None:
+    # without lateral strain (a Poisson ratio of 0, a load on the whole surface) layers are three elements one above the other
+    lower, upper = three_element(0.5, 1.0, 30.0, 0.0), three_element(3.8, 0.03, 20.0, 0.0)
+    heights, width, force, end = (0.4, 0.6), 1.0, 2.0, 0.47
+    patch = SkinPatch((SkinLayer(heights[0], lower), SkinLayer(heights[1], upper)), width)
+    mesh = meshed(patch, 0.4999, across=6, upwards=6)
+    found = simulate_skin(LayeredModes.of(mesh), (lower, upper), SurfaceLoad(force, end, 0.4999), TIMES)
+
+    def crept(t: np.ndarray) -> np.ndarray:
+        after = np.maximum(t, 0.0)
+        layers = zip(heights, ((0.5, 1.0, 30.0), (3.8, 0.03, 20.0)), strict=True)
+        return np.asarray(force / width * sum(h * ((1.0 - np.exp(-after * e / c1)) / e + after / c2) for h, (e, c1, c2) in layers))
+
+    assert_allclose(found.indentation, crept(TIMES) - crept(TIMES - end), rtol=2e-3)
+    s = 2j * np.pi * np.array([0.1, 1.0, 10.0, 100.0])
+    compliance = 0.4 * (1.0 / (0.5 + 1.0 * s) + 1.0 / (30.0 * s)) + 0.6 * (1.0 / (3.8 + 0.03 * s) + 1.0 / (20.0 * s))
+    assert_allclose(frequency_response(mesh, (lower, upper), s.imag / (2.0 * np.pi), inertia=False), compliance / width, rtol=2e-3)
+
+
+def test_a_round_pressure_on_a_deep_layer_is_that_of_boussinesq() -> None:
+    # a half space under an even pressure p on a circle of radius a sinks by 2 p a (1 - nu^2) / E in the middle, below which the
+    # pressure is p 2 (1 + nu) / 3 (1 - z / sqrt(a^2 + z^2)) at the depth z
+    young, poisson, radius, force = 3.8, 0.45, 0.5, 2.0
+    material = voigt(young, 0.0, poisson)
+    mesh = meshed(SkinPatch((SkinLayer(12.0, material),), 24.0, kinematics="axisymmetric"), radius, across=24, upwards=48)
+    planes = mesh.grid.planes[0], 12.0 - graded(12.0, radius, 24)[::-1]
+    mesh = from_planes(mesh.patch, planes, radius)
+    motion = simulate_skin(LayeredModes.of(mesh), (material,), SurfaceLoad(force, 1.0, radius), [0.9])
+    pressure = force / (np.pi * radius**2)
+    sunk = 2.0 * pressure * radius * (1.0 - poisson**2) / young
+    assert motion.indentation[0] == pytest.approx(sunk * (1.0 - 0.5 * radius / 12.0), rel=0.03)  # the base is not infinitely deep
+    z = 0.5 * (planes[1][-1] - planes[1][-2])  # the pressure is that of the uppermost cells
+    below = pressure * 2.0 * (1.0 + poisson) / 3.0 * (1.0 - z / np.hypot(radius, z))
+    assert motion.pressure[0, 0] == pytest.approx(below, rel=0.02)
+    cell = radius / 12.0
+    assert abs(np.sqrt(motion.pale_area(0.3 * pressure)[0] / np.pi) - radius) < cell  # it jumps there
 
 
 def test_two_layers_move_as_the_time_integration_of_triangles_says() -> None:
@@ -108,6 +146,20 @@ def test_pressure_below_the_load_carries_it(kinematics: str) -> None:
     area = motion.pale_area(0.3 * 10.0 / loaded)[0]
     assert 0.6 * loaded < area < 1.9 * loaded
     assert motion.pale_area(100.0)[0] == 0.0
+
+
+def test_the_edge_of_a_pale_area_moves_evenly() -> None:
+    # a pressure that falls in proportion to the radius, as a cone, is above p in a circle of area pi (1 - p / 8)^2
+    radius = np.linspace(0.0, 1.5, 16)
+    cone = 8.0 * (1.0 - 0.5 * (radius[1:] + radius[:-1]))[None]
+    change = np.full_like(cone, -8.0 * (radius[1] - radius[0]))
+    motion = SkinMotion(
+        np.zeros(1), np.zeros(1), np.zeros(1, dtype=np.int64), np.zeros((1, 1, 2)), cone, change, np.pi * np.diff(radius**2)
+    )
+    levels = np.linspace(0.5, 7.0, 40)
+    areas = np.array([motion.pale_area(p)[0] for p in levels])
+    assert_allclose(areas, np.pi * (1.0 - levels / 8.0) ** 2, atol=0.01)
+    assert np.all(np.diff(areas) < 0.0)
 
 
 def test_a_pressure_that_jumps_is_that_under_the_load_when_the_load_is_removed(modes: LayeredModes) -> None:

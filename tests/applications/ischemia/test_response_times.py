@@ -36,6 +36,12 @@ def test_what_does_not_move_has_no_times() -> None:
     assert np.isnan([found.rise_s, found.fall_s, found.rise_constant_s, found.fall_constant_s]).all() and found.peak == 0.0
 
 
+def test_what_changes_between_two_instants_changes_at_once_whatever_their_distance() -> None:
+    for times in (np.linspace(0.0, 3.0, 61), np.linspace(0.0, 3.0, 601)):  # a pressure follows its load without delay
+        found = response_times(times, np.where((times > 0.0) & (times <= 0.5), 2.0, 0.0), 0.5)
+        assert (found.rise_s, found.rise_constant_s, found.fall_s, found.fall_constant_s) == (0.0, 0.0, 0.0, 0.0)
+
+
 def test_a_response_slower_than_the_record_has_no_time_constant() -> None:
     assert np.isnan(response_times(TIMES, loaded(0.02, 50.0), 0.5).fall_constant_s)
 

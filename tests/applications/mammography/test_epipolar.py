@@ -9,7 +9,7 @@ from naibu.applications.mammography.breast_outline import BreastOutline, breast_
 from naibu.applications.mammography.breast_shape import half_ellipsoid_shape
 from naibu.applications.mammography.epipolar import MammographicPair, ModelUncertainty
 from naibu.applications.mammography.geometric_model import DEFAULT_PARAMETERS, Compression, CompressionParameters, compressed
-from naibu.applications.mammography.pair_construction import mammographic_pair
+from naibu.applications.mammography.pair_construction import mammographic_pair, pair_of_shape
 from naibu.applications.mammography.two_views import two_views
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
@@ -58,6 +58,27 @@ def test_the_unloaded_shape_is_found_from_the_outlines() -> None:
     assert found.shape.depth_mm == pytest.approx(90.0, rel=0.03)  # the deeper of both views is taken to reach the chest wall
     for state in (found.cc, found.mlo):
         assert state.volume_mm3() == pytest.approx(found.shape.volume_mm3, rel=0.05)
+
+
+@pytest.mark.parametrize("angle", [30.0, 45.0, 90.0])
+def test_of_a_breast_that_is_hardly_pressed_the_curve_is_the_line_of_two_parallel_projections(angle: float) -> None:
+    # a rigid body in two parallel projections about the axis away from the chest wall: the depth is the same in both, a point at a of
+    # the first and y of the height lies at a cos(t) + y sin(t) of the second, and the half ellipsoid ends where its equation says
+    rx, ry, depth_mm = 65.0, 70.0, 90.0
+    t = np.deg2rad(angle)
+    shape = half_ellipsoid_shape((2.0 * rx, 2.0 * ry, depth_mm), sections=2000)
+    plates = (1.0 - 1e-5) * 2.0 * ry, (1.0 - 1e-5) * 2.0 * float(np.hypot(rx * np.sin(t), ry * np.cos(t)))
+    known = ModelUncertainty(thickness_mm=0.0, angle_deg=0.0)  # plates that are a little farther apart would not press
+    pair = pair_of_shape(shape, plates, angle, uncertainty=known, draws=20)
+    for depth, along in ((40.0, 20.0), (10.0, -45.0), (60.0, 0.0)):
+        curve = pair.epipolar_curve([depth, along]).curve
+        np.testing.assert_allclose(curve[:, 0], depth, atol=0.02)
+        reach = ry * np.sqrt(1.0 - (along / rx) ** 2 - (depth / depth_mm) ** 2)
+        ends = along * np.cos(t) + np.array([-reach, reach]) * np.sin(t)
+        np.testing.assert_allclose(curve[[0, -1], 1], ends, atol=0.02 * reach)  # rays are sampled
+        height = 0.4 * reach
+        found = pair.lesion([depth, along], [depth, along * np.cos(t) + height * np.sin(t)])
+        np.testing.assert_allclose(found.position, [along, height, depth], atol=0.05)
 
 
 def test_tissue_that_an_image_does_not_reach_is_told_from_the_other_view() -> None:

@@ -5,14 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from naibu.applications.mammography.breast_from_projections import breast_in_projections
 from naibu.applications.mammography.breast_outline import BreastOutline, breast_outline
 from naibu.applications.mammography.breast_shape import half_ellipsoid_shape
 from naibu.applications.mammography.mechanical_model import MechanicalParameters, mechanically_compressed
-from naibu.applications.mammography.pair_construction import mammographic_pair
+from naibu.applications.mammography.pair_construction import mammographic_pair, pair_of_shape
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.meshing.quality import signed_volumes
-from naibu.validation.specimens.virtual_breasts import PressedBreast, VirtualBreast, press_breast, random_breast
+from naibu.meshing.surface import boundary_faces, level_extents
+from naibu.validation.specimens.half_ball_mesh import unstructured_half_ball
+from naibu.validation.specimens.virtual_breasts import PressedBreast, VirtualBreast, breast_points, press_breast, random_breast
 
 SHAPE = half_ellipsoid_shape((120.0, 120.0, 80.0))
 POINTS = np.array([[20.0, 10.0, 30.0], [-15.0, 25.0, 20.0], [5.0, -20.0, 50.0]])
@@ -62,6 +65,31 @@ def test_points_of_a_virtual_breast_lie_near_their_curves(virtual: tuple[Virtual
     assert len(distances) > 9
     assert np.mean(distances) < 2.2
     assert np.linalg.norm(errors, axis=1).mean() < 8.0
+
+
+def test_points_of_a_scan_lie_near_their_true_places_with_and_without_the_outlines(virtual: tuple[VirtualBreast, PressedBreast]) -> None:
+    # the shape is that of two projections of the unloaded breast, which sags away from its own nipple when it is pressed
+    breast, pressed = virtual
+    unit = unstructured_half_ball(0.15)
+    points, faces = breast_points(breast, unit.points), boundary_faces(unit).faces
+    edges = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    depths = breast.depth_mm * np.sin(0.5 * np.pi * np.linspace(0.0, 1.0, 60))
+    projections = []
+    for axis in (0, 1):
+        low, high = level_extents(points[edges[:, 0]][:, [2, axis]], points[edges[:, 1]][:, [2, axis]], depths)
+        projections.append(breast_outline(np.vstack([np.column_stack([depths, low]), np.column_stack([depths, high])[::-1]])))
+    shape, both = breast_in_projections(projections[0], projections[1]).shape, outlines(pressed)
+    seen = np.all(pressed.places[:, :, 0] > 0.0, axis=0)
+    errors = []
+    for constrained in (False, True):
+        pair = pair_of_shape(
+            shape, breast.stated_thickness_mm, breast.stated_angle_deg, outlines=both, constrain_outlines=constrained, model="mechanical",
+            draws=20,
+        )  # fmt: skip
+        found = np.array([pair.project(point).places for point in pressed.points[seen]])
+        truth = np.stack([both[k].from_image(pressed.places[k, seen]) for k in (0, 1)], axis=1)
+        errors.append(np.linalg.norm(found - truth, axis=2).mean(axis=0))
+    assert np.all(np.array(errors) < 3.5)
 
 
 @pytest.mark.parametrize(

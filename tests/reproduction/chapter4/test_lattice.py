@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -137,8 +138,10 @@ def test_figures_show_the_last_shape_and_the_points_far_from_it() -> None:
     np.testing.assert_allclose(wave.measured, wave.computed)
     assert wave.times[[0, -1]] == pytest.approx([0.001, 0.199])
     for draw in (final_shapes([shape] * 3), force_waves([wave] * 4)):
-        canvas = Canvas()
-        draw(canvas)
+        canvas = Canvas(layout="constrained")  # as pages have it
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # it would be shown to the user
+            draw(canvas)
         assert len(canvas.axes) in (3, 4)
 
 

@@ -79,7 +79,7 @@ def test_the_gain_leaves_a_two_hundredth_of_the_range(chapter: Chapter) -> None:
 
 def test_every_figure_is_drawn(chapter: Chapter) -> None:
     page = chapter_html(chapter)
-    assert page.count("data:image/svg+xml") == sum(len(section.figures) for section in chapter.sections) == 12
+    assert page.count("data:image/svg+xml") == sum(len(section.figures) for section in chapter.sections) == 13
     assert all(np.isfinite(v) for row in table(chapter, "Designs").rows for v in row[1:])
 
 

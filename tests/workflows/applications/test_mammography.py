@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -50,6 +51,12 @@ def test_page_and_numbers_from_tables_and_from_masks(tmp_path: Path) -> None:
     masks = relate_views(tmp_path / "cc.tif", tmp_path / "mlo.tif", point_cc=(50.0, 110.0), pixel_mm=0.5, out=tmp_path / "m", **common)  # type: ignore[arg-type]
     again = json.loads(masks.files[1].read_text(encoding="utf-8"))
     np.testing.assert_allclose(again["curve_in_mlo_mm"], numbers["curve_in_mlo_mm"], atol=1.5)
+    curve, band = (np.array(again[name]) for name in ("curve_in_mlo_mm", "band_in_mlo_mm"))
+    page = masks.files[0].read_text(encoding="utf-8")
+    assert f"{curve[:, 0].min():.0f} to {curve[:, 0].max():.0f} mm" in page
+    told = float(re.search(r"band reaches (\d+) mm to either side", page)[1])  # type: ignore[index]
+    across = np.ptp(band[np.abs(band[:, 1] - np.median(curve[:, 1])) < 5.0][:, 0])  # the curve runs along the chest wall
+    assert told == pytest.approx(0.5 * across, abs=2.0)
 
 
 def test_outlines_under_neutral_names_that_may_be_swapped_are_told(tmp_path: Path) -> None:
@@ -219,6 +226,30 @@ def test_a_point_of_a_scan_is_shown_in_both_views(tmp_path: Path) -> None:
         relate_views(side="right", out=tmp_path / "other", **{**common, "point_mr": (-12.0, -40.0, 20.0)})  # type: ignore[arg-type]
     with pytest.raises(InputError, match="point_mr is given without `mr`"):
         relate_views(*written(tmp_path), point_mr=(0.0, 0.0, 0.0), out=tmp_path / "other")
+
+
+def test_a_point_of_projections_is_shown_in_both_views(tmp_path: Path) -> None:
+    """A half ellipsoid, 120 x 130 x 80 mm, from above and from the side; the chest wall at x = 5."""
+    for name, half, middle in (("axial", 60.0, 30.0), ("sagittal", 65.0, -20.0)):
+        curve = np.column_stack([5.0 + 80.0 * np.cos(TURN), middle + half * np.sin(TURN)])
+        np.savetxt(tmp_path / f"{name}.csv", curve, delimiter=",")
+    paths = {"mr_axial": tmp_path / "axial.csv", "mr_sagittal": tmp_path / "sagittal.csv"}
+    common = {**paths, "thickness_mm": (65.0,), "angle_deg": 45.0, "draws": 20, "point_mr": (45.0, 42.0, 0.0)}
+    run = relate_views(out=tmp_path / "out", **common)  # type: ignore[arg-type]
+    numbers = json.loads(run.files[1].read_text(encoding="utf-8"))
+    known = compressed(half_ellipsoid_shape((120.0, 130.0, 80.0)), 0.0, 65.0)
+    np.testing.assert_allclose(numbers["point_of_scan_in_cc_mm"], known.project([12.0, 20.0, 40.0]), atol=0.5)
+    np.savetxt(tmp_path / "shallow.csv", 0.8 * np.loadtxt(tmp_path / "axial.csv", delimiter=","), delimiter=",")
+    for changes, told in (
+        ({"mr_axial": None}, "mr_axial is missing"),
+        ({"mr": tmp_path / "mask.nii"}, "give the mask or the projections"),
+        ({"side": "left"}, "side is 'left', but there is no scan"),
+        ({"mr_axial": tmp_path / "shallow.csv"}, "64 mm deep in the axial projection and 80 mm in the sagittal one"),
+        ({"constrain_outlines": True}, "constrain_outlines needs"),
+    ):
+        with pytest.raises(InputError, match=told):
+            relate_views(out=tmp_path / "other", **{**common, **changes})  # type: ignore[arg-type]
+        assert not (tmp_path / "other" / "mammography.html").exists()
 
 
 def test_the_verb_with_the_mechanical_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

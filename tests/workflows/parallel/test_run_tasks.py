@@ -52,6 +52,15 @@ def test_results_come_in_order_whatever_the_number_of_workers() -> None:
         assert any(r.done % 1 == 0.5 for r in reports if r.done is not None) or workers is TWO  # workers leave out what comes too often
 
 
+def test_long_tasks_count_more_in_the_share_that_is_done() -> None:
+    tasks = [Task(f"{k}", worker_tasks.square, {"number": float(k)}, length=length) for k, length in enumerate((10.0, 10.0, 380.0))]
+    reports: list[ProgressReport] = []
+    run_tasks(tasks, workers=Workers(1), progress=reports.append, stage="chapters")
+    told = {report.done: report.fraction for report in reports}
+    assert told == pytest.approx({0.0: 0.0, 1.0: 0.025, 2.0: 0.05, 3.0: 1.0})
+    assert {report.total for report in reports} == {3}
+
+
 def test_a_killed_worker_costs_its_task_only_which_is_begun_again(tmp_path: Path) -> None:
     once = Task("once", worker_tasks.dying, {"times": 1, "counter": str(tmp_path / "once")})
     always = Task("always", worker_tasks.dying, {"times": 99, "counter": str(tmp_path / "always")})

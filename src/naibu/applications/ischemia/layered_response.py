@@ -152,6 +152,8 @@ class SkinMotion:
     pressure : ndarray, shape (t, j)
         Pressure (minus a third of the trace of the stress) below parts of the surface, kPa: in the uppermost cells, and linear between
         their centres (except in three dimensions).
+    change : ndarray, shape (t, j)
+        By how much the pressure changes across each of these parts, kPa; zero in three dimensions.
     areas : ndarray, shape (j,)
         Areas of these parts, from the middle or from one side to the other, mm^2.
     """
@@ -161,13 +163,16 @@ class SkinMotion:
     surface_nodes: IntArray
     surface: FloatArray
     pressure: FloatArray
+    change: FloatArray
     areas: FloatArray
 
     def pale_area(self, threshold_kpa: float) -> FloatArray:
         """Return the area (t,), mm^2, where the pressure in the tissue exceeds that of the capillaries, which are then empty."""
         if not (np.isfinite(threshold_kpa) and threshold_kpa > 0.0):
             raise InputError(f"threshold_kpa must be positive, not {threshold_kpa:g} kPa")
-        return (self.pressure > threshold_kpa) @ self.areas
+        # the part of each part that lies above: a pressure that is linear there crosses the threshold at most once
+        beyond = (self.pressure - threshold_kpa) / np.maximum(np.abs(self.change), 1e-12 * threshold_kpa)
+        return np.clip(0.5 + beyond, 0.0, 1.0) @ self.areas
 
 
 def simulate_skin(modes: LayeredModes, materials: tuple[Rheology, ...], load: SurfaceLoad, times: ArrayLike) -> SkinMotion:
@@ -219,9 +224,9 @@ def simulate_skin(modes: LayeredModes, materials: tuple[Rheology, ...], load: Su
     last = len(layers) - 1
     lame, shear = meshed.unit_stiffness(last)
     bulk = (lame + 2.0 / 3.0 * shear)[cells]
-    pressure, areas = _subdivided(meshed, -(bulk[:, None] * (strain @ of_load(last))).T)
+    parts = _subdivided(meshed, -(bulk[:, None] * (strain @ of_load(last))).T)
     middle = int(np.flatnonzero(top == meshed.middle)[0])
-    return SkinMotion(instants, -surface[:, middle, -1], top.astype(np.int64), surface, pressure, areas)
+    return SkinMotion(instants, -surface[:, middle, -1], top.astype(np.int64), surface, *parts)
 
 
 def skin_displacements(modes: LayeredModes, materials: tuple[Rheology, ...], load: SurfaceLoad, times: ArrayLike) -> FloatArray:
@@ -232,15 +237,16 @@ def skin_displacements(modes: LayeredModes, materials: tuple[Rheology, ...], loa
     return np.asarray(moved.T.reshape(len(instants), *modes.meshed.constrained.shape))
 
 
-def _subdivided(meshed: MeshedPatch, pressure: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return pressure (t, j) and areas (j,) of parts of cells, linear between their centres: the edge of an area moves evenly."""
+def _subdivided(meshed: MeshedPatch, pressure: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return pressure and its change (t, j) in parts of cells, linear between the cells' centres, and the areas (j,) of the parts."""
     planes, kinematics = meshed.grid.planes[0], meshed.grid.kinematics
     if kinematics == "three_dimensional":
-        return pressure, meshed.surface_areas
+        return pressure, np.zeros_like(pressure), meshed.surface_areas
     parts = np.concatenate([*(np.linspace(a, b, PARTS, endpoint=False) for a, b in itertools.pairwise(planes)), planes[-1:]])
-    at, centres = 0.5 * (parts[1:] + parts[:-1]), 0.5 * (planes[1:] + planes[:-1])
+    centres = 0.5 * (planes[1:] + planes[:-1])
+    ends = np.stack([np.interp(parts, centres, row) for row in pressure])
     areas = np.pi * np.diff(parts**2) if kinematics == "axisymmetric" else np.diff(parts) * meshed.patch.depth_mm
-    return np.stack([np.interp(at, centres, row) for row in pressure]), areas
+    return 0.5 * (ends[:, 1:] + ends[:, :-1]), np.diff(ends, axis=1), areas
 
 
 def frequency_response(

@@ -19,9 +19,11 @@ class ResponseTimes:
     Attributes
     ----------
     rise_s, fall_s : float
-        Time from 10 % to 90 % of the change under the load, and after it, s; NaN where nothing changes.
+        Time from 10 % to 90 % of the change under the load, and after it, s; NaN where nothing changes, 0 where it changes at once: between
+        two instants.
     rise_constant_s, fall_constant_s : float
-        Time constant of the exponential with an offset that fits best (and, under the load, with a linear flow), s; NaN where none fits.
+        Time constant of the exponential with an offset that fits best (and, under the load, with a linear flow), s; NaN where none fits,
+        0 where the change is at once.
     peak : float
         Value when the load is removed.
     residual : float
@@ -81,6 +83,8 @@ def _tenth_to_nine_tenths(t: FloatArray, v: FloatArray) -> float:
         return float("nan")
     share = (v - v[0]) / change
     low, high = (int(np.argmax(share >= level)) for level in (0.1, 0.9))
+    if low == high:  # between two instants: how fast, they do not tell
+        return 0.0
     return _crossing(t, share, high, 0.9) - _crossing(t, share, low, 0.1)
 
 
@@ -96,6 +100,9 @@ def _time_constant(t: FloatArray, v: FloatArray, *, flow: bool) -> float:
     if change == 0.0:
         return float("nan")
     x, y = (t - t[0]) / span, (v - v[0]) / change
+    rise = _tenth_to_nine_tenths(x, y)
+    if rise == 0.0:
+        return 0.0
     root = np.sqrt(np.gradient(x))  # instants may be denser where more happens
 
     def residuals(p: FloatArray) -> FloatArray:
@@ -103,7 +110,7 @@ def _time_constant(t: FloatArray, v: FloatArray, *, flow: bool) -> float:
         flowing = p[2] * x if flow else 0.0
         return np.asarray(root * (size * -np.expm1(-x * np.exp(log_rate)) + flowing - y))
 
-    start = [1.0, np.log(1.0 / max(_tenth_to_nine_tenths(x, y) / 2.2, 1e-6)), *([0.0] if flow else [])]
+    start = [1.0, np.log(1.0 / max(rise / 2.2, 1e-6)), *([0.0] if flow else [])]
     found = least_squares(residuals, start, xtol=1e-12, ftol=1e-12, gtol=1e-12, max_nfev=500)
     constant = float(span * np.exp(-found.x[1]))
     # slower than the record: the exponential and the flow are not told apart

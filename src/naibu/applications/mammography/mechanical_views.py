@@ -111,6 +111,16 @@ def _seen(outline: BreastOutline, depth_mm: float, levels: FloatArray) -> tuple[
     return np.interp(at, outline.depths, outline.low), np.interp(at, outline.depths, outline.high)
 
 
+def onto_widths(state: MechanicalCompression, outline: BreastOutline) -> MechanicalCompression:
+    """Return an equilibrium that is scaled and shifted along the chest wall onto the widths of an outline.
+
+    The depth stays: what the image does not reach at the chest wall is the difference of the depths.
+    """
+    depth = state.extents()[2]
+    low, high = _seen(outline, depth, compressed_levels())
+    return replace(state.with_outline(depth, low, high), hidden_mm=depth - outline.depth_mm)
+
+
 def _onto(state: MechanicalCompression, outline: BreastOutline, whole: float) -> MechanicalCompression:
     depth = whole * state.extents()[2]
     low, high = _seen(outline, depth, compressed_levels())

@@ -13,7 +13,7 @@ from naibu.applications.mammography.breast_shape import BreastShape
 from naibu.applications.mammography.epipolar import DEFAULT_UNCERTAINTY, MammographicPair, Model, ModelUncertainty
 from naibu.applications.mammography.geometric_model import DEFAULT_PARAMETERS, Compression, CompressionParameters, compressed
 from naibu.applications.mammography.mechanical_model import MechanicalCompression, mechanically_compressed
-from naibu.applications.mammography.mechanical_views import mechanical_views
+from naibu.applications.mammography.mechanical_views import mechanical_views, onto_widths
 from naibu.applications.mammography.two_views import LEAST_ANGLE, MOST_ANGLE, TwoViews, two_views
 from naibu.core.arrays import require_count, require_within
 from naibu.core.errors import InputError
@@ -79,6 +79,7 @@ def pair_of_shape(
     angle_deg: float,
     *,
     outlines: tuple[BreastOutline, BreastOutline] | None = None,
+    constrain_outlines: bool = False,
     model: Model = "geometric",
     parameters: CompressionParameters = DEFAULT_PARAMETERS,
     uncertainty: ModelUncertainty = DEFAULT_UNCERTAINTY,
@@ -95,15 +96,19 @@ def pair_of_shape(
         As of `mammographic_pair`.
     outlines : (BreastOutline, BreastOutline), optional
         Of CC and MLO: the nipple of the model is put onto theirs. By default the outlines are those of the model.
+    constrain_outlines : bool
+        Whether the equilibria of the mechanical model are scaled and shifted along the chest wall onto the widths of the outlines.
 
     Raises
     ------
     InputError
-        Plates that do not press the breast, or what `mammographic_pair` refuses.
+        Plates that do not press the breast, a constraint without outlines or by the geometric model, or what `mammographic_pair` refuses.
     ConvergenceError
         No equilibrium was found.
     """
     _require(model, draws, seed)
+    if constrain_outlines and (outlines is None or model != "mechanical"):
+        raise InputError("constrain_outlines needs the outlines of both views, and model 'mechanical'")
     if not LEAST_ANGLE <= angle_deg <= MOST_ANGLE:
         raise InputError(
             f"angle_deg is {angle_deg:g}: must be between {LEAST_ANGLE:g} and {MOST_ANGLE:g}, the positioner angle of MLO against CC"
@@ -117,7 +122,10 @@ def pair_of_shape(
     nominal = centre
     if model == "mechanical":
         states = [mechanically_compressed(shape, a, t) for a, t in zip((0.0, angle_deg), thickness_mm, strict=True)]
-        nominal = TwoViews(shape, *(_at_nipple(state, k, outlines) for k, state in enumerate(states)))
+        if outlines is not None and constrain_outlines:
+            nominal = TwoViews(shape, *(onto_widths(state, outline) for state, outline in zip(states, outlines, strict=True)))
+        else:
+            nominal = TwoViews(shape, *(_at_nipple(_from_own_nipple(state), k, outlines) for k, state in enumerate(states)))
     shown = outlines or (
         breast_outline(nominal.cc.outline(), what="outline of CC by the model"),
         breast_outline(nominal.mlo.outline(), what="outline of MLO by the model"),
@@ -128,6 +136,11 @@ def pair_of_shape(
 _Parameters = tuple[CompressionParameters, CompressionParameters]
 _Settings = tuple[tuple[float, float], float, CompressionParameters, ModelUncertainty, int, int]
 _Pressed = TypeVar("_Pressed", Compression, MechanicalCompression)
+
+
+def _from_own_nipple(state: MechanicalCompression) -> MechanicalCompression:
+    """Return an equilibrium whose positions along the chest wall count from where its nipple appears, as those of outlines do."""
+    return replace(state, shift=state.shift - breast_outline(state.outline(), what="outline by the model").nipple_mm)
 
 
 def _at_nipple(view: _Pressed, index: int, outlines: tuple[BreastOutline, BreastOutline] | None) -> _Pressed:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from naibu.reproduction.agreement.read_tables import Tables, compared, verdict
+from naibu.reproduction.chapter5.mammography import CURVE, OBSERVED, SCANNED
+from naibu.reproduction.chapter5.scanned_breasts import CONSTRAINED, EQUILIBRIUM, IN_SCAN
 from naibu.viewer.chapters.comparisons import Comparison
 
 
@@ -16,8 +18,6 @@ def of_chapter5(tables: Tables) -> tuple[Comparison, ...]:
     alone = tables.number(same, ("C1 = 30 Pa s", "converged"), "rise 10-90 %, s")
     quick, slow = (tables.number(layers, (name, "converged"), "rise 10-90 %, s") for name in _LAYERS)
     grid, converged = (tables.number(same, ("C1 = 30 Pa s", mesh), "at release, mm") for mesh in ("printed", "converged"))
-    bend = str(tables.cell("Observations of section IV", (_BEND,), "measured here"))
-    markers = "Interior markers at 100 mm"
     return (
         Comparison(
             "Rise and fall are faster with C1 = 30 than with 80 Pa s (Fig. 5.8)",
@@ -52,20 +52,79 @@ def of_chapter5(tables: Tables) -> tuple[Comparison, ...]:
             "With the printed force, modulus and height the strains are not small, which the linear model supposes; and the printed "
             "triangles lock at a Poisson ratio of 0.49.",
         ),
-        Comparison("Cross-sections of the phantom bend outward (mammography, section IV)", "seen", bend, verdict("outward by" in bend)),
+        *_mammography(tables),
+    )
+
+
+def _mammography(tables: Tables) -> tuple[Comparison, ...]:
+    def seen(quantity: str) -> tuple[float, float]:
+        first, second = (tables.number(OBSERVED, (quantity, where), "measured") for where in _WHERE[quantity])
+        return first, second
+
+    outward, rise, area, volume = (seen(quantity) for quantity in _WHERE)
+    names = (IN_SCAN, EQUILIBRIUM, CONSTRAINED)
+    places = [[tables.number(SCANNED, (name,), view) for view in ("CC, mm", "MLO, mm")] for name in names]
+    scan, free, onto = (sum(both) / 2.0 for both in places)
+    wide = [tables.number(SCANNED, (name,), "CC wider by, %") for name in ("true", EQUILIBRIUM)]
+    curve = tables.number(CURVE, ("outlines, distances and angle",), "mean, mm")
+    return (
+        Comparison(
+            "Cross-sections of the phantom bend outward, most half-way between the plates (section IV)",
+            "seen",
+            f"outward by {outward[0]:.2f} mm there, {outward[1]:.2f} mm near the plates",
+            verdict(outward[0] > 1.2 * max(outward[1], 0.0)),
+        ),
+        Comparison(
+            "Displacements in the mid-plane should be considered (section IV)",
+            "seen",
+            f"it rises by {rise[0]:.2f} mm",
+            verdict(rise[0] > 1.0),
+        ),
+        Comparison(
+            "Markers of a layer get denser where the plates press than beside them (Fig. 8b)",
+            "seen",
+            f"area less by {100.0 * (1.0 - area[0]):.1f} %, beside them {100.0 * (1.0 - area[1]):.1f} %",
+            verdict(area[0] < area[1] < 1.0),
+        ),
+        Comparison(
+            "Conservation of volume that is too strong removes from reality (section IV)",
+            "concluded",
+            f"volume {100.0 * volume[0]:.1f} and {100.0 * volume[1]:.1f} % of that at rest",
+            verdict(min(volume) < 0.98),
+            "The layer rises and arches: its markers come closer, and the volume between them stays.",
+        ),
+        Comparison(
+            "A lesion of the scan appears nearest to its place by the equilibrium on the outlines, then by the equilibrium (Fig. 7)",
+            "seen in one lesion",
+            f"{onto:.1f} mm and {free:.1f} mm from there, {scan:.1f} mm where it is in the scan",
+            verdict(onto < free < scan),
+            "On virtual breasts, in both views; the paper has one lesion of one patient.",
+        ),
+        Comparison(
+            "A simulated compression does not grow along the chest wall as the mammogram does (Fig. 5)",
+            "seen in one patient",
+            f"in CC by {wide[1]:.0f} %, virtual breasts by {wide[0]:.0f} %",
+            "cannot be compared",
+            "Both let the tissue slide along the chest wall; what that of a patient does, the paper does not measure.",
+        ),
         Comparison(
             "Distance of a lesion to the curve in the other view",
             "7 mm on 50 patients; 2.2 mm with the patient's MR",
-            f"no patients here; interior markers of the phantom {tables.number(markers, (_FULL,), 'ours, on the table, mm'):.2g} mm",
+            f"no patients here; {curve:.2g} mm on virtual breasts, from outlines alone",
             "cannot be compared",
-            "On virtual breasts: benchmarks/mammography_population.py.",
+            "They are positioned better than patients.",
         ),
     )
 
 
 _LAYERS = ("model 1, lower C1 = 500 Pa s", "model 3, lower C1 = 2000 Pa s")
-_BEND = "cross-sections bend outward, most at the mid-plane"
-_FULL = "equilibrium at finite strain, modulus by hardness 0"
+_SHEETS, _PLATES = ("half-way between the plates", "near the plates"), ("between the plates", "beside them")
+_WHERE = {
+    "moves outward, mm": _SHEETS,
+    "rises, mm": _SHEETS,
+    "area of the lowest layer, over that at rest": _PLATES,
+    "volume, over that at rest": _PLATES,
+}
 
 
 def of_chapter6(tables: Tables) -> tuple[Comparison, ...]:

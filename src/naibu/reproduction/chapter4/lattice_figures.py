@@ -91,6 +91,7 @@ def final_shapes(shapes: Sequence[FinalShape]) -> Draw:
             axes.set_axis_off()
             axes.view_init(elev=22.0, azim=-58.0)
             axes.set_title(f"{shape.title}: {len(shape.far)} of {shape.captured} points", fontsize=9)
+        canvas.set_layout_engine(None)  # axes that are not shown leave no room for themselves
         canvas.subplots_adjust(left=0.0, right=1.0, bottom=0.0, top=0.95, wspace=0.0, hspace=0.1)
 
     return draw

@@ -64,7 +64,7 @@ def pale_areas(found: Sequence[Response]) -> Draw:
             motion = response.motion
             if motion is None:
                 continue
-            left.plot(1e3 * motion.times, motion.pale_area(THRESHOLD_KPA), line, label=response.name, lw=1.3, drawstyle="steps-post")
+            left.plot(1e3 * motion.times, motion.pale_area(THRESHOLD_KPA), line, label=response.name, lw=1.3)
             radius = np.sqrt(np.cumsum(motion.areas) / np.pi)
             for time, shade in ((0.002, 0.4), (0.46, 1.0)):
                 row = motion.pressure[int(np.argmin(np.abs(motion.times - time)))]

@@ -10,7 +10,7 @@ from naibu.applications.ischemia.layer_identification import LayerEstimate
 from naibu.mechanics.small_strain.rheology import Rheology
 from naibu.reproduction.chapter5 import figures, ischemia
 from naibu.reproduction.chapter5.ischemia import DURATION_S, JET_RADIUS_MM, LOWER, SAME, THRESHOLD_KPA, UPPER, Response
-from naibu.reproduction.chapter5.mammography import mammography_section
+from naibu.reproduction.chapter5.mammography import phantom_section, scans_section
 from naibu.viewer.chapters.chapter import Chapter, Figure, Section
 from naibu.viewer.tables import Cell, Table
 
@@ -48,7 +48,8 @@ def chapter5(seed: int = 0) -> Chapter:
         _pale_area(),
         _frequencies(),
         _identification(seed),
-        mammography_section(),
+        phantom_section(),
+        scans_section(),
     )
     settings: dict[str, Cell] = {"seed": seed, **ischemia.ASSUMED}
     return Chapter("ch5", "Chapter 5: active ischemia of skin, and mammography", sections, settings)

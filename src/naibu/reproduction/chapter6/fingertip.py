@@ -14,6 +14,7 @@ from naibu.applications.fingertip.readings import ReadingChain
 from naibu.applications.sensing_chip.filters import first_order_filter
 from naibu.core.arrays import FloatArray
 from naibu.reproduction.chapter6 import fingertip_figures
+from naibu.reproduction.chapter6.contact_comparison import theories_section
 from naibu.viewer.chapters.chapter import Figure, Section
 from naibu.viewer.tables import Cell, Table
 
@@ -47,7 +48,8 @@ def fingertip_sections(chain: ReadingChain, seed: int, resolution: FingertipReso
     strong = [large.pressed(Press(tilt, LARGE_MN)) for tilt in (0.0, 20.0)]
     coarse = resolution or FingertipResolution(3, 2, 10)
     switched = switched_presses(Fingertip(), Press(20.0, FULL_MN), coarse)
-    return (_basic(small, pressings, chain, seed), _moments(pressings, chain, switched), _to_60_newtons(strong, chain))
+    theories = theories_section(small.fingertip, [f"{tilt:g} degrees" for tilt in TILTS], pressings)
+    return (_basic(small, pressings, chain, seed), _moments(pressings, chain, switched), _to_60_newtons(strong, chain), theories)
 
 
 def _volts(pressing: Pressing, chain: ReadingChain, azimuth: float, forces: FloatArray) -> FloatArray:

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from naibu.applications.fingertip.contact_theories import hertz_force, parallel_springs_force, power_law
 from naibu.applications.fingertip.decoder import DecodedForces, ForceDecoder, directions, true_contact
 from naibu.applications.fingertip.pressing import FingertipModel, Pressing, rotated_loads
 from naibu.applications.fingertip.readings import ReadingChain
@@ -15,6 +14,7 @@ from naibu.applications.fingertip.slip import SlipDetector
 from naibu.applications.sensing_chip.filters import noise_gain
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.reproduction.chapter6 import fingertip_figures
+from naibu.reproduction.chapter6.contact_comparison import theories_section
 from naibu.viewer.cards import Card
 from naibu.viewer.chapters.chapter import Figure, Section
 from naibu.viewer.tables import Cell, Table
@@ -64,7 +64,7 @@ class FingertipResults:
 
 def fingertip_sections(study: PreparedFingertip, results: FingertipResults) -> tuple[Section, ...]:
     """Return the sections of the page."""
-    sections = [_presses(study, results), _theories(results)]
+    sections = [_presses(study, results), theories_section(results.model.fingertip, results.names, results.pressings)]
     if results.decoder is not None:
         sections.insert(1, _decoding(results, results.decoder))
     curves = tuple(_curve(results, k) for k in range(len(results.names)))
@@ -183,26 +183,3 @@ def _angle(answer: DecodedForces, truth: FloatArray) -> FloatArray:
 
 def _most(values: FloatArray, chosen: BoolArray) -> float | None:
     return float(values[chosen].max()) if chosen.any() else None
-
-
-def _theories(results: FingertipResults) -> Section:
-    tip = results.model.fingertip
-    rows: list[tuple[Cell, ...]] = []
-    for k, p in enumerate(results.pressings):
-        pressed = (p.slide_mm == 0.0) & (p.along_rod_mn > 0.02 * p.along_rod_mn.max())
-        if pressed.sum() < 3:
-            continue
-        depth, force = p.depth_mm[pressed], p.along_rod_mn[pressed]
-        c, gamma = power_law(force, p.contact_radius_mm[pressed])
-        exponent = float(np.polyfit(np.log(depth), np.log(force), 1)[0])
-        theory = (1e-3 * float(f(tip, depth[-1:])[0]) for f in (hertz_force, parallel_springs_force))
-        rows.append((results.names[k], 1e-3 * float(force[-1]), *theory, exponent, gamma, c * 1e3**gamma))
-    table = Table(
-        "Theories of soft contact",
-        ("press", "force, N", "Hertz at the same depth, N", "parallel springs, N", "exponent of the force over depth",
-         "exponent of the contact radius over force", "contact radius at 1 N, mm"),
-        tuple(rows),
-        note="Hertz: exponents 1.5 and 1/3, of a half space at small strain. Parallel springs (Inoue, Hirai): exponent 2. Soft fingers of "
-        "power-law materials: a = c F^gamma with gamma up to 1/3 (Xydas and Kao).",
-    )  # fmt: skip
-    return Section("Against theories of soft contact", (), (table,))

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from naibu.applications.mammography.breast_from_mr import ScannedBreast, breast_in_scan
+from naibu.applications.mammography.breast_from_projections import ProjectedBreast, breast_in_projections
 from naibu.applications.mammography.breast_outline import BreastOutline, breast_outline, mask_outline
 from naibu.applications.mammography.breast_segmentation import breast_mask
 from naibu.core.arrays import FloatArray
@@ -122,6 +123,17 @@ def read_scan(mask: PathLike, side: str | None, views: tuple[View, View] | None)
     if told is not None and wanted != {"L": "left", "R": "right"}[told]:
         raise InputError(f"side is {side!r}, and the mammograms show the other breast by their ImageLaterality")
     return breast_in_scan(read_volume(mask), left=wanted == "left", what=str(mask))
+
+
+def read_projections(axial: PathLike, sagittal: PathLike, pixel_mm: float | None) -> ProjectedBreast:
+    """Read the outlines of a breast in the axial and the sagittal projection of a magnetic resonance volume.
+
+    Raises
+    ------
+    InputError
+        Files that are no outlines, or outlines that do not fit together.
+    """
+    return breast_in_projections(_outline(Path(axial), pixel_mm), _outline(Path(sagittal), pixel_mm))
 
 
 def place_in(outline: BreastOutline, name: str, point: Sequence[float] | None) -> FloatArray | None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from naibu._version import __version__
 from naibu.applications.mammography.breast_from_mr import ScannedBreast
+from naibu.applications.mammography.breast_from_projections import ProjectedBreast
 from naibu.applications.mammography.epipolar import (
     DEFAULT_UNCERTAINTY,
     EpipolarCurve,
@@ -34,7 +35,14 @@ from naibu.viewer.chapters.chapter import Chapter, Figure, Section
 from naibu.viewer.chapters.chapter_page import chapter_html
 from naibu.viewer.notebook import WrittenResult
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.applications.mammogram_inputs import place_in, plate_distances, positioner_angle, read_scan, read_views
+from naibu.workflows.applications.mammogram_inputs import (
+    place_in,
+    plate_distances,
+    positioner_angle,
+    read_projections,
+    read_scan,
+    read_views,
+)
 from naibu.workflows.applications.mammography_figures import draw_breast, draw_views
 from naibu.workflows.applications.mammography_motion import breast_page
 from naibu.workflows.results.output_folder import output_folder
@@ -83,7 +91,10 @@ def relate_views(
     point_mlo: Sequence[float] | None = None,
     mr: str | os.PathLike[str] | None = None,
     side: str | None = None,
+    mr_axial: str | os.PathLike[str] | None = None,
+    mr_sagittal: str | os.PathLike[str] | None = None,
     point_mr: Sequence[float] | None = None,
+    constrain_outlines: bool = False,
     pixel_mm: float | None = None,
     model: Model = "geometric",
     unresolved_mm: float = DEFAULT_UNCERTAINTY.unresolved_mm,
@@ -110,8 +121,14 @@ def relate_views(
         Mask of the breast in a magnetic resonance volume: the unloaded shape, instead of that which the outlines imply.
     side : {"left", "right"}, optional
         Which breast the mask holds.
+    mr_axial, mr_sagittal : path-like, optional
+        Outlines, or masks, of the unloaded breast in maximum intensity projections of a scan, instead of `mr`: from above (perpendicular to
+        the chest wall, then laterally) and from the side (then upwards).
     point_mr : sequence of float, optional
-        A point in the scan, LPS, mm, to be shown in both views.
+        A point to be shown in both views, mm: in the scan, LPS; or, of projections, in the coordinates of the axial outline and with the
+        second one of the sagittal outline.
+    constrain_outlines : bool
+        Whether the mechanical model of a scan is brought onto the outlines of `cc` and `mlo`; see `naibu.applications.pair_of_shape`.
     pixel_mm : float, optional
         Size of a pixel of masks.
     model : {"geometric", "mechanical"}
@@ -131,28 +148,31 @@ def relate_views(
     ConvergenceError
         The mechanical model found no equilibrium.
     """
-    _require_points(cc, mlo, mr, (point_cc, point_mlo, point_mr))
-    if side is not None and mr is None:
-        raise InputError(f"side is {side!r}, but there is no scan: give its mask as `mr`, or leave `side` out")
+    _require_scan(mr, side, mr_axial, mr_sagittal)
+    _require_points(cc, mlo, mr or mr_axial, (point_cc, point_mlo, point_mr))
     folder = output_folder(out, [f"{_NAME}.html", f"{_NAME}.json", _BREAST], overwrite=overwrite)
     views = None if cc is None or mlo is None else read_views(cc, mlo, pixel_mm)
     plates, angle = plate_distances(views, thickness_mm), positioner_angle(views, angle_deg)
     uncertainty = ModelUncertainty(unresolved_mm=unresolved_mm)
     outlines = None if views is None else (views[0].outline, views[1].outline)
-    scan = None if mr is None else read_scan(mr, side, views)
+    scan: ScannedBreast | ProjectedBreast | None = None if mr is None else read_scan(mr, side, views)
+    if mr_axial is not None and mr_sagittal is not None:
+        scan = read_projections(mr_axial, mr_sagittal, pixel_mm)
+    common: dict[str, Any] = {"model": model, "uncertainty": uncertainty, "draws": draws, "seed": seed}
+    if constrain_outlines and (scan is None or outlines is None):
+        raise InputError("constrain_outlines needs the shape of the breast in a scan, and cc and mlo")
     if scan is not None:
-        pair = pair_of_shape(scan.shape, plates, angle, outlines=outlines, model=model, uncertainty=uncertainty, draws=draws, seed=seed)
+        pair = pair_of_shape(scan.shape, plates, angle, outlines=outlines, constrain_outlines=constrain_outlines, **common)
     else:
         if views is None:  # refused above
             raise InputError("cc and mlo are missing: give both views, or the mask of a scan")
-        pair = mammographic_pair(
-            views[0].outline, views[1].outline, plates, angle, model=model, uncertainty=uncertainty, draws=draws, seed=seed
-        )
+        pair = mammographic_pair(views[0].outline, views[1].outline, plates, angle, **common)
     found = _found(pair, (point_cc, point_mlo), None if scan is None else _scanned_point(scan, point_mr))
     untold = views is not None and any(view.mammogram is None for view in views)  # no tag says which view a file shows
     warnings = _warnings(found) + ([_SWAPPED] if untold and may_be_swapped(*pair.outlines) else [])
     settings: dict[str, Cell] = {
-        "CC": str(cc), "MLO": str(mlo), "MR": str(mr), "model": model, "thickness_mm": ", ".join(f"{t:g}" for t in plates),
+        "CC": str(cc), "MLO": str(mlo), "MR": str(mr) if mr_axial is None else f"{mr_axial}, {mr_sagittal}", "model": model,
+        "constrained to the outlines": "yes" if constrain_outlines else "no", "thickness_mm": ", ".join(f"{t:g}" for t in plates),
         "angle_deg": angle, "unresolved_mm": unresolved_mm, "draws": draws, "draws without a breast": pair.refused, "seed": seed,
     }  # fmt: skip
     chapter = Chapter(_NAME, "One point in two mammographic views", _sections(found, warnings, model, uncertainty), settings, _cards(found))
@@ -183,6 +203,15 @@ class _Found:
         return np.zeros((0, 3)) if curve is None else curve.points[:: max(1, len(curve.points) // _SHOWN)]
 
 
+def _require_scan(mr: object, side: str | None, axial: object, sagittal: object) -> None:
+    if (axial is None) != (sagittal is None):
+        raise InputError(f"{'mr_axial' if axial is None else 'mr_sagittal'} is missing: give both projections")
+    if mr is not None and axial is not None:
+        raise InputError("mr is given beside mr_axial and mr_sagittal: give the mask or the projections")
+    if side is not None and mr is None:
+        raise InputError(f"side is {side!r}, but there is no scan: give its mask as `mr`, or leave `side` out")
+
+
 def _require_points(cc: object, mlo: object, mr: object, points: tuple[object, object, object]) -> None:
     if (cc is None) != (mlo is None):
         raise InputError(f"{'cc' if cc is None else 'mlo'} is missing: give both views")
@@ -191,12 +220,12 @@ def _require_points(cc: object, mlo: object, mr: object, points: tuple[object, o
     if all(point is None for point in points):
         raise InputError("point_cc is missing: give a point in CC, in MLO, in both, or in a scan")
     if points[2] is not None and mr is None:
-        raise InputError("point_mr is given without `mr`: give the mask of the breast in the scan")
+        raise InputError("point_mr is given without `mr`: give the mask of the breast in the scan, or mr_axial and mr_sagittal")
     if cc is None and (points[0] is not None or points[1] is not None):
         raise InputError("point_cc or point_mlo is given without cc and mlo: give both views")
 
 
-def _scanned_point(scan: ScannedBreast, point: Sequence[float] | None) -> FloatArray | None:
+def _scanned_point(scan: ScannedBreast | ProjectedBreast, point: Sequence[float] | None) -> FloatArray | None:
     if point is None:
         return None
     if len(point) != 3 or not np.isfinite(point).all():
@@ -239,6 +268,18 @@ def _rows(found: _Found) -> list[tuple[str, str]]:
 
 def _cards(found: _Found) -> tuple[Card, ...]:
     cards = []
+    for k, other in enumerate(("MLO", "CC")):
+        curve = found.curves[k]
+        if curve is not None and found.lesion is None:
+            depths = curve.curve[:, 0]
+            half = 0.5 * float(np.median(np.hypot(*(curve.band[: len(curve.curve)] - curve.band[::-1][: len(curve.curve)]).T)))
+            cards.append(
+                Card(
+                    f"Epipolar curve in {other}",
+                    f"{depths.min():.0f} to {depths.max():.0f} mm",
+                    f"from the chest wall; the 95 % band reaches {half:.0f} mm to either side",
+                )
+            )
     if found.lesion is not None:
         for axis, value, low, high in zip(_AXES, found.lesion.position, found.lesion.low, found.lesion.high, strict=True):
             cards.append(Card(f"Lesion, {axis}", f"{value:.0f} mm".replace("-", "−"), f"95 % interval {low:.0f} to {high:.0f} mm"))
@@ -256,7 +297,7 @@ def _warnings(found: _Found) -> list[str]:
     if found.lesion is not None and not found.lesion.agrees:
         told.append("The MLO point lies outside of the band of the CC point: the points may not show one lesion; do not use the position.")
     if found.pair.refused:
-        told.append(f"{found.pair.refused} of the models drawn gave no breast with these outlines and were left out.")
+        told.append(f"Models drawn that gave no breast with these outlines, and were left out: {found.pair.refused}.")
     return told
 
 

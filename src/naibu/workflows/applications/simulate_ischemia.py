@@ -284,8 +284,7 @@ def _motion_section(study: PreparedIschemia, motion: SkinMotion) -> Section:
     table = Table(
         "Response", columns, rows, caption=f"{study.load.force_mn:g} mN for {study.load.duration_s:g} s.",
         note=f"The area is pale where the pressure in the tissue exceeds {threshold:g} kPa; the blood that returns is not "
-        f"modelled. A dash: the "
-        "quantity does not change, or more slowly than the record is long.",
+        f"modelled. A dash: the quantity does not change, or more slowly than the record is long; 0: at once, between two instants.",
     )  # fmt: skip
     text: tuple[str, ...] = ()
     if motion.indentation.max() > _MOST_INDENTATION * study.patch.height_mm:

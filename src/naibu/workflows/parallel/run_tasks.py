@@ -98,7 +98,10 @@ class _Overall:
     def report(self) -> None:
         """Report how many tasks are done, with the shares of those that are computed."""
         done = round(len(self.outcomes) + sum(self._shares.values()), 2)
-        report_progress(self._progress, self._stage, done=done, total=len(self._tasks))
+        lengths = [task.length for task in self._tasks]
+        gone = sum(lengths[i] for i in self.outcomes) + sum(lengths[i] * share for i, share in self._shares.items())
+        share = gone / sum(lengths) if len(set(lengths)) > 1 else None
+        report_progress(self._progress, self._stage, done=done, total=len(self._tasks), share=share)
 
     def follow(self, messages: SimpleQueue[Message]) -> None:
         """Take messages until all tasks are finished."""

@@ -21,12 +21,15 @@ class Task:
         By name; everything in it can be pickled.
     measured : bool
         Whether its reports tell the share that it has done, so that the progress over all tasks can count it.
+    length : float
+        About how long it takes, in any unit that all tasks have in common: the time left is told from that.
     """
 
     name: str
     function: Callable[..., Any]
     arguments: Mapping[str, Any] = field(default_factory=dict)
     measured: bool = False
+    length: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
