@@ -12,6 +12,7 @@ from naibu.mechanics.contact.penalty_contact import Contact, ContactResponse
 from naibu.mechanics.finite_strain._nearby_kernels import add_forces, local
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ContactTangent:
     """Where the stiffness of a contact is added.

@@ -12,7 +12,7 @@ from naibu.core.arrays import FloatArray
 from naibu.mechanics.finite_strain.sessions.condensed_contact import CondensedContact
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
 from naibu.mechanics.linear_algebra.direct import SuperLUSolver
-from naibu.mechanics.linear_algebra.updated_factors import BlockChange, UpdatedFactors
+from naibu.mechanics.linear_algebra.updated_factors import BlockChange, ChangedInverse, UpdatedFactors
 
 BODY, WALL, GAP = 10.0, 1e4, 0.5  # mN/mm, mN/mm, mm
 
@@ -137,3 +137,16 @@ def test_springs_stop_at_a_wall_or_do_not_reach_it(begin: float) -> None:
     np.testing.assert_allclose(force[:, :2], 0.0, atol=1e-6)
     assert condensed.serves(tangent, np.array([2, 3]))
     assert not condensed.serves(tangent, np.array([1, 2]))
+
+
+def test_springs_beside_a_change_hold_the_nodes_back() -> None:
+    """Solutions with a change and springs are those of the dense matrix; one node has both, one a spring alone, one neither."""
+    body, k = BODY * np.eye(9) + np.ones((9, 9)), np.array([2.0, 5.0, 0.0])
+    place = np.array([0])
+    change = BlockChange(place, place, place, np.array([[[4.0, 1.0, 0.0], [0.0, 3.0, 0.0], [0.0, 0.0, 7.0]]]))
+    inverse = np.asfortranarray(np.linalg.inv(body), dtype=np.float32)
+    right = np.random.default_rng(1).normal(size=(3, 3))
+    dense = np.diag(np.repeat(k, 3))
+    dense[:3, :3] += change.blocks[0]
+    expected = np.linalg.solve(body + dense, body @ right.ravel()).reshape(-1, 3)
+    np.testing.assert_allclose(ChangedInverse.of(inverse, change.with_springs(k)).solve(right), expected, rtol=1e-4, atol=1e-5)

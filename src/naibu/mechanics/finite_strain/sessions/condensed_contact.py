@@ -5,14 +5,14 @@ forces of contacts beside those that A contains, at the motion y = E^T dx of the
 ``W = E^T A^-1 E`` of the inverse alone (:cite:t:`courtecuisse2010` condense contacts in this way), at a cost that does not depend on the
 size of the body. Contacts that open, close, stick or slip cost no iteration of the whole body then.
 
-The derivative of Coulomb friction vanishes along the direction of slip. Steps of Newton's method are far too long where points begin or cease
-to slip, and points stick and slip by turns. With the secant of the friction instead, the force over the elastic slip, every step reduces the
-energy of friction of a known limit (Kačanov's method :cite:p:`han1997`). One such matrix serves for many steps, which Anderson's acceleration
-mixes :cite:p:`walker2011`.
+The derivative of Coulomb friction vanishes along the direction of slip. Steps of Newton's method are far too long where points begin or
+cease to slip, and points stick and slip by turns. With the secant of the friction instead, the force over the elastic slip, every step
+reduces the energy of friction of a known limit (Kacanov's method :cite:p:`han1997`). One such matrix serves for many steps, which
+Anderson's acceleration mixes :cite:p:`walker2011`.
 
-The tangent of a compressed body may be indefinite without the contact that held its surface. Where that contact slips or opens, and the body
-has moved on, such a tangent has no equilibrium nearby, and forces grow without bound. Springs as stiff as the elements then hold the nodes
-back, as in the method of Levenberg and Marquardt :cite:p:`nocedal2006`: the iterations of the whole body take up what they leave.
+The tangent of a compressed body may be indefinite without the contact that held its surface. Where that contact slips or opens, and the
+body has moved on, such a tangent has no equilibrium nearby, and forces grow without bound. Springs as stiff as the elements then hold the
+nodes back, as in the method of Levenberg and Marquardt :cite:p:`nocedal2006`: the iterations of the whole body take up what they leave.
 """
 
 from __future__ import annotations
