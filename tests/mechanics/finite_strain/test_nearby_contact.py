@@ -9,6 +9,7 @@ from naibu.core.arrays import FloatArray
 from naibu.mechanics import RigidIndenter, box_indenter, cylindrical_indenter, plane_indenter, spherical_indenter
 from naibu.mechanics.contact.indenter_contacts import indenter_contacts
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact, local_positions
+from naibu.mechanics.linear_algebra.block_matrix import block_pattern
 from naibu.meshing import boundary_faces, box
 
 SIZE = 30.0
@@ -38,3 +39,25 @@ def test_forces_and_gaps_are_those_of_all_points(indenter: RigidIndenter) -> Non
     np.testing.assert_allclose(force, whole.scattered(expected.force, len(u), expected.orientation), atol=1e-9)
     np.testing.assert_allclose(near.gap, expected.gap[near.points], atol=1e-12)
     np.testing.assert_allclose(near.touching().response.stiffness, expected.stiffness[expected.gap < 0.0], atol=1e-9)
+
+
+def test_the_secant_of_friction_times_the_elastic_slip_is_the_friction() -> None:
+    """On a plane, where points slip; where they stick, the secant is the derivative."""
+    mesh = box((SIZE, SIZE, SIZE), (4, 4, 4))
+    plane = plane_indenter((0.0, 0.0, SIZE - 0.1), (0.0, 0.0, -1.0), static_friction=0.3, kinetic_friction=0.3)
+    faces = boundary_faces(mesh).faces
+    whole = indenter_contacts([plane], mesh.points, faces, normal_stiffness=500.0, tangential_stiffness=90.0)[0]
+    rest = np.zeros_like(mesh.points)
+    pattern = block_pattern(mesh.n_points, faces, np.zeros((0, 2), np.int64))
+    for slip, slips in ((1e-3, False), (2.0, True)):
+        along = np.array([0.6 * slip, 0.8 * slip, 0.0])
+        near = NearbyContact.of(whole, whole.local(rest, 1.0) - along @ whole.orientation(1.0), local_positions(whole, rest, 1.0)[1], 0.05)
+        force = np.zeros_like(rest)
+        near.add_force(rest, force)
+        touching = near.touching()
+        assert touching.response.slip_direction.any(axis=1).all() == slips
+        blocks = np.zeros((pattern.n_blocks, 3, 3))
+        touching.add_secant_stiffness(pattern, pattern.positions(whole.nodes), blocks)
+        friction = (pattern.matrix(blocks) @ np.tile(along, len(rest))).reshape(-1, 3)
+        assert np.abs(force[:, :2]).max() > 0.0
+        np.testing.assert_allclose(friction[:, :2], -force[:, :2], atol=1e-9 * np.abs(force).max())

@@ -95,6 +95,18 @@ class NearbyContact:
         if len(self.points):
             self.contact.add_stiffness(self.response, pattern, positions[self.points], blocks)
 
+    def add_secant_stiffness(self, pattern: BlockPattern, positions: Int32Array, blocks: FloatArray) -> None:
+        """Add what `add_stiffness` adds and, where points slip, the friction over the elastic slip, along the slip."""
+        if len(self.points):
+            r = self.response
+            size = np.linalg.norm(r.tangential, axis=1)
+            along = r.tangential / np.where(size == 0.0, 1.0, size)[:, None]
+            slips = r.slip_direction.any(axis=1)
+            # across the slip the stiffness is the secant: the trace of the derivative, as far as the surface is flat
+            secant = np.where(slips, np.maximum(np.trace(r.tangential_stiffness, axis1=1, axis2=2), 0.0), 0.0)
+            more = (self.contact.area * secant)[:, None, None] * along[:, :, None] * along[:, None, :]
+            self.contact.add_stiffness(replace(r, stiffness=r.stiffness + more), pattern, positions[self.points], blocks)
+
     def add_symmetric_stiffness(self, pattern: BlockPattern, positions: Int32Array, blocks: FloatArray) -> None:
         """Add what `add_stiffness` adds but the growth of friction with pressure, without which the stiffness is symmetric."""
         if len(self.points):

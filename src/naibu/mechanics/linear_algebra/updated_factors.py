@@ -36,11 +36,15 @@ class BlockChange:
     columns: IntArray
     blocks: FloatArray
 
-    def times(self, motion: FloatArray) -> FloatArray:
-        """Return the product (m, 3) with a vector (m, 3) of all m nodes, of which `nodes` are places."""
-        out = np.zeros_like(motion)
-        np.add.at(out, self.nodes[self.rows], np.einsum("bij,bj->bi", self.blocks, motion[self.nodes[self.columns]]))
-        return out
+    def with_springs(self, stiffness: FloatArray) -> BlockChange:
+        """Return the change with springs (m,) beside it, which hold each of all m nodes where it is."""
+        held = np.flatnonzero(stiffness)
+        if len(held) == 0:
+            return self
+        nodes = np.union1d(self.nodes, held)
+        place, own = nodes.searchsorted(self.nodes), nodes.searchsorted(held)
+        blocks = np.concatenate([self.blocks, stiffness[held][:, None, None] * np.eye(3)])
+        return BlockChange(nodes, np.concatenate([place[self.rows], own]), np.concatenate([place[self.columns], own]), blocks)
 
 
 @dataclass(slots=True, eq=False)

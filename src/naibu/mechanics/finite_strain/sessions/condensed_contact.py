@@ -4,6 +4,15 @@ In an iteration with the tangent A of an earlier state, a body moves by ``dx = f
 forces of contacts beside those that A contains, at the motion y = E^T dx of the nodes concerned. Newton's method finds y with the part
 ``W = E^T A^-1 E`` of the inverse alone (:cite:t:`courtecuisse2010` condense contacts in this way), at a cost that does not depend on the
 size of the body. Contacts that open, close, stick or slip cost no iteration of the whole body then.
+
+The derivative of Coulomb friction vanishes along the direction of slip. Steps of Newton's method are far too long where points begin or
+cease to slip, and points stick and slip by turns. With the secant of the friction instead, the force over the elastic slip, every step
+reduces the energy of friction of a known limit (Kacanov's method :cite:p:`han1997`). One such matrix serves for many steps, which
+Anderson's acceleration mixes :cite:p:`walker2011`.
+
+The tangent of a compressed body may be indefinite without the contact that held its surface. Where that contact slips or opens, and the
+body has moved on, such a tangent has no equilibrium nearby, and forces grow without bound. Springs as stiff as the elements then hold the
+nodes back, as in the method of Levenberg and Marquardt :cite:p:`nocedal2006`: the iterations of the whole body take up what they leave.
 """
 
 from __future__ import annotations
@@ -19,16 +28,19 @@ from naibu.core.arrays import FloatArray, Int32Array, IntArray
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent, add_earlier_forces, contact_change
 from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import LipsBesideTangent
+from naibu.mechanics.linear_algebra.anderson import AndersonMixing
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 from naibu.mechanics.linear_algebra.updated_factors import BlockChange, ChangedInverse
 
-EVALUATIONS = 40  # of the contact at most
-PATIENCE = 3  # steps that hardly help before they are searched: where a point closes, what is left grows before it vanishes
-CHANGES = 12  # derivatives at most
-SEARCHES = 5  # motions tried along a step
+EVALUATIONS = 60  # of the contact at most
+CHANGES = 12  # matrices at most
+UNAIDED = 2  # of them before nodes are held back
+DEPTH = 6  # earlier steps with a matrix that are mixed
+TRIAL = 3  # steps with a matrix before it is judged: where a point closes, what is left grows before it vanishes
+SLOW = 0.7  # of what was left: mean progress of a step from which another matrix is worth while
+JUMP = 3.0  # growth of what is left from which it is at once
 USUAL = 6  # evaluations after which ten times the tolerance is enough
-ENOUGH = 0.005  # of the forces: how much those of the motion that they lead to may differ where no further derivative is worth while
-FAST = 0.2  # of what was left: progress with which an earlier derivative of the contact goes on being used
+ENOUGH = 0.005  # of the forces: how much those of the motion that they lead to may differ where no further matrix is worth while
 
 
 class ContactLaw(Protocol):
@@ -37,11 +49,14 @@ class ContactLaw(Protocol):
     def __call__(self, motion: FloatArray) -> FloatArray:
         """Return the forces (k, 3), mN, at a motion (k, 3), mm."""
 
-    def change(self, symmetric: bool = False) -> BlockChange:
-        """Return minus the derivative of the forces at the last motion; its nodes are places among the k.
+    def change(self) -> BlockChange:
+        """Return minus the derivative of the forces at the last motion, with the secant of friction along the slip.
 
-        Symmetric, it lacks the growth of friction with pressure.
+        Its nodes are places among the k.
         """
+
+    def opened(self) -> BlockChange:
+        """Return what `change` would be if no contact touched."""
 
 
 @dataclass(slots=True, eq=False)
@@ -54,15 +69,20 @@ class CondensedContact:
         The body.
     nodes : ndarray, shape (k,), int64
         Their numbers in the body.
+    stiffness : ndarray, shape (k,)
+        Of the elements at the nodes, mN/mm.
     """
 
     tangent: EarlierTangent
     nodes: IntArray
+    stiffness: FloatArray
     _inverse: NDArray[np.float32] = field(init=False)
     _changed: ChangedInverse | None = field(init=False, default=None)
+    _springs: FloatArray = field(init=False)  # that hold the nodes back (k,), mN/mm
 
     def __post_init__(self) -> None:
         self._inverse = self.tangent.factors.between(self.nodes)
+        self._springs = np.zeros(len(self.nodes))
 
     def serves(self, tangent: EarlierTangent, nodes: IntArray) -> bool:
         """Whether these nodes (l,) are among those of the same body."""
@@ -74,11 +94,6 @@ class CondensedContact:
         """Return the forces g (k, 3), mN, under which ``y = free + W g(y)``; the best that is found in a few iterations.
 
         It yields before it factorizes, which takes longest: one may go on later.
-
-        A step of Newton's method that hardly helps is searched for where the forces that are out of balance do no more work on it, as in
-        `naibu.mechanics.finite_strain.sessions.implicit_step`: with contact, and friction of known limit, a convex energy is least there,
-        and points that stick and slip by turns end the search. The growth of friction with pressure may lead a step uphill; the next one
-        goes without it.
 
         Parameters
         ----------
@@ -93,61 +108,44 @@ class CondensedContact:
         longest_mm : float
             Motion in one iteration at most, mm: no node may pass through an indenter.
         """
-        at = self._tried(begin, None, free, law)
-        best, evaluations, changes, unhelpful, fast, symmetric = at, 1, 0, 0, True, False
+        at = best = begun = self._tried(begin, begin, free, law)
+        evaluations, changes, steps, mixing = 1, 0, 0, AndersonMixing(DEPTH)
+        useless = self._changed is None
         while at.size > tolerance_mm * (1.0 if evaluations < USUAL else 10.0) and evaluations < EVALUATIONS:
-            if self._changed is None or not fast:
-                if changes == CHANGES or self._consistent(at, law):
+            if self._changed is None or useless:
+                if changes == CHANGES or self._consistent(at, begin, law):
                     break
                 yield
-                self._changed, changes = ChangedInverse.of(self._inverse, law.change(symmetric)), changes + 1
-            step, before = self._changed.solve(at.left), at.size
-            target = at.force + self._changed.change.times(step)  # which exerted on the body leads to the end of the step
+                if changes == UNAIDED and not self._springs.any() and len(held := law.opened().nodes):
+                    self._springs[held] = self.stiffness[held]
+                    at = best = self._tried(begin, begin, free, law)
+                change = law.change().with_springs(self._springs)
+                self._changed, changes = ChangedInverse.of(self._inverse, change), changes + 1
+                begun, steps, mixing = at, 0, AndersonMixing(DEPTH)
+            step = mixing.step(at.motion.ravel(), -self._changed.solve(at.left).ravel()).reshape(-1, 3)
             share = min(1.0, longest_mm / float(np.abs(step).max()))
-            if at.exerted is None or unhelpful < PATIENCE:
-                at = self._tried(at.motion - share * step, target if share == 1.0 else None, free, law)
-                evaluations += 1
-            elif at.work(step) <= 0.0 and not symmetric:
-                symmetric, fast = True, False
-                continue
-            else:
-                at, tried = self._searched(at, step, target, share, free, law)
-                evaluations += tried
-                symmetric = symmetric and at.size > 0.5 * before
-            fast, unhelpful = at.size <= FAST * before, unhelpful + (at.size > 0.5 * before)
+            at = self._tried(at.motion + share * step, begin, free, law)
+            evaluations, steps = evaluations + 1, steps + 1
+            slow = steps >= TRIAL and at.size > SLOW**steps * begun.size
+            useless = slow or share < 1.0 or at.size > JUMP * begun.size
             if at.size < best.size:
                 best = at
         return best.force
 
-    def _tried(self, motion: FloatArray, exerted: FloatArray | None, free: FloatArray, law: ContactLaw) -> _Motion:
-        force = law(motion)
+    def _tried(self, motion: FloatArray, begin: FloatArray, free: FloatArray, law: ContactLaw) -> _Motion:
+        force = self._forces(motion, begin, law)
         left = motion - free - (self._inverse @ force.ravel().astype(np.float32)).reshape(-1, 3)
-        return _Motion(motion, exerted, force, left, float(np.abs(left).max(initial=0.0)))
+        return _Motion(motion, force, left, float(np.abs(left).max(initial=0.0)))
 
-    def _consistent(self, at: _Motion, law: ContactLaw) -> bool:
+    def _forces(self, motion: FloatArray, begin: FloatArray, law: ContactLaw) -> FloatArray:
+        """Return the forces (k, 3) of contacts, and of the springs that hold the nodes back, mN."""
+        return np.asarray(law(motion) - self._springs[:, None] * (motion - begin))
+
+    def _consistent(self, at: _Motion, begin: FloatArray, law: ContactLaw) -> bool:
         """Whether the forces of a motion are, but for little, those of the motion that they lead to; the law is left where it was."""
-        apart = float(np.abs(law(at.motion - at.left) - at.force).sum())
+        apart = float(np.abs(self._forces(at.motion - at.left, begin, law) - at.force).sum())
         law(at.motion)
         return apart <= ENOUGH * float(np.abs(at.force).sum())
-
-    def _searched(
-        self, at: _Motion, step: FloatArray, target: FloatArray, share: float, free: FloatArray, law: ContactLaw
-    ) -> tuple[_Motion, int]:
-        """Return where the forces out of balance do little work on a step, and how many motions were tried."""
-        assert at.exerted is not None
-        before = low_work = at.work(step)
-        low, high, high_work = 0.0, 0.0, 0.0
-        for k in range(SEARCHES):
-            found = self._tried(at.motion - share * step, at.exerted + share * (target - at.exerted), free, law)
-            work = found.work(step)
-            if abs(work) <= 0.5 * abs(before) or found.size < 0.5 * at.size or (work > 0.0 and high == 0.0) or k == SEARCHES - 1:
-                break
-            if work > 0.0:
-                low, low_work = share, work
-            else:
-                high, high_work = share, work
-            share = low + (high - low) * min(max(low_work / (low_work - high_work), 0.1), 0.9)
-        return found, k + 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,8 +156,6 @@ class _Motion:
     ----------
     motion : ndarray, shape (k, 3)
         y, mm.
-    exerted : ndarray, shape (k, 3), optional
-        Forces under which the body moves so, mN, where they are known.
     force : ndarray, shape (k, 3)
         g(y), mN.
     left : ndarray, shape (k, 3)
@@ -169,15 +165,9 @@ class _Motion:
     """
 
     motion: FloatArray
-    exerted: FloatArray | None
     force: FloatArray
     left: FloatArray
     size: float
-
-    def work(self, step: FloatArray) -> float:
-        """Return the work of the forces out of balance on a step (k, 3), mm, that is subtracted; mN mm."""
-        assert self.exerted is not None
-        return float((step * (self.exerted - self.force)).sum())
 
 
 @dataclass(slots=True, eq=False)
@@ -229,10 +219,16 @@ class ContactBesideTangent:
             contact.add_force(moved, force)
         return np.asarray(force[self.nodes])
 
-    def change(self, symmetric: bool = False) -> BlockChange:
-        """Return minus the derivative of the forces at the last motion; see `ContactLaw`."""
+    def change(self) -> BlockChange:
+        """Return the stiffness at the last motion; see `ContactLaw`."""
         blocks = np.zeros((self.pattern.n_blocks, 3, 3))
         for contact, places in zip(self.contacts, self.places, strict=True):
-            touching = contact.touching()
-            (touching.add_symmetric_stiffness if symmetric else touching.add_stiffness)(self.pattern, places, blocks)
+            contact.touching().add_secant_stiffness(self.pattern, places, blocks)
+        return self._beside(blocks)
+
+    def opened(self) -> BlockChange:
+        """Return minus the stiffness of the contacts that the tangent contains; see `ContactLaw`."""
+        return self._beside(np.zeros((self.pattern.n_blocks, 3, 3)))
+
+    def _beside(self, blocks: FloatArray) -> BlockChange:
         return contact_change(self.pattern, blocks, self.tangent, self.nodes, self._place, self.gripped, self.hold)

@@ -69,8 +69,8 @@ class LipsBesideTangent:
             for b in range(2):
                 np.add.at(blocks, places[:, a, b], (1.0 if a == b else -1.0) * (self._now - self.earlier))
 
-    def add_symmetric_stiffness(self, pattern: BlockPattern, positions: Int32Array, blocks: FloatArray) -> None:
-        """Add what `add_stiffness` adds, which is symmetric: there is no friction."""
+    def add_secant_stiffness(self, pattern: BlockPattern, positions: Int32Array, blocks: FloatArray) -> None:
+        """Add what `add_stiffness` adds: there is no friction."""
         self.add_stiffness(pattern, positions, blocks)
 
 

@@ -36,6 +36,7 @@ class RealTimeModel(DynamicEngine):
     _elements: PressureElements = field(init=False)
     _surface: BlockPattern = field(init=False)
     _pairs: Int32Array = field(init=False)  # of the sides of cuts, in this pattern
+    _local_stiffness: FloatArray = field(init=False)  # of the elements at the nodes of the surface, mN/mm; 0 elsewhere
     _solvers: SolverPool = field(init=False)
     _rest: list[EarlierTangent] = field(init=False, default_factory=list)
 
@@ -46,11 +47,21 @@ class RealTimeModel(DynamicEngine):
         object.__setattr__(self, "_surface", block_pattern(len(self.points), self.faces, pairs))
         object.__setattr__(self, "_pairs", self._surface.positions(pairs))
         object.__setattr__(self, "_solvers", SolverPool(self.assembler.pattern))
+        object.__setattr__(self, "_local_stiffness", 3.0 * self._shear * _mean_edges(self.points, self.faces))
 
     @property
     def faint_mn(self) -> float:
         """Force of contact too small to be told from none, mN."""
         return FAINT * self._modulus * self._extent**2
+
+
+def _mean_edges(points: FloatArray, faces: IntArray) -> FloatArray:
+    """Return the mean length (n,), mm, of the edges of the faces at every node; 0 where there is none."""
+    a, b = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    length = np.linalg.norm(points[a] - points[b], axis=1)
+    ends, both = np.concatenate([a, b]), np.concatenate([length, length])
+    count = np.bincount(ends, minlength=len(points))
+    return np.asarray(np.bincount(ends, both, minlength=len(points)) / np.maximum(count, 1))
 
 
 def tangent_at(engine: RealTimeModel, u: FloatArray, contacts: Contacts, held: IntArray, ahead: IntArray) -> EarlierTangent:

@@ -342,7 +342,7 @@ class RealTimeSession(TangentSession):
             condensed = self._condensed
             if condensed is None or not condensed.serves(tangent, nodes):
                 yield from tangent.factors.prepared(nodes)
-                condensed = self._condensed = CondensedContact(tangent, nodes)
+                condensed = self._condensed = CondensedContact(tangent, nodes, self._engine._local_stiffness[nodes])
             nodes = condensed.nodes
             hold = 1e3 * float(self._engine._elements.bulk.max()) * self.engine._extent
             places = [*self._places, *([self._engine._pairs] if lips else [])]
