@@ -117,15 +117,15 @@ def doubts_of_scale(name: str, field: DisplacementField) -> tuple[str, ...]:
     if share < TINY_DEFORMATION:
         told.append(
             f"{name}: the object, {extent:.3g} mm large, deforms by {deformed:.2g} mm RMS, {share:.1g} of its size. Scans and particles seldom "
-            "show so little: are its displacements in metres? Moduli at finite strain, and forces, would be others; give the columns their unit, "
-            "such as 'ux [m]'."
+            "show so little: are its displacements in metres? Moduli at finite strain, and forces, would be others; give the "
+            "columns their unit, such as 'ux [m]'."
         )
     if field.covariance is not None:
         sd = float(np.sqrt(np.trace(field.covariance[field.valid], axis1=1, axis2=2).mean()))
         if deformed < sd:
             told.append(
-                f"{name}: the object deforms by {deformed:.2g} mm RMS, less than the stated standard deviation of its vectors, {sd:.2g} mm: "
-                "only what many of them share tells its moduli. Are displacements and standard deviations in one unit?"
+                f"{name}: the object deforms by {deformed:.2g} mm RMS, less than the stated standard deviation of its vectors, {sd:.2g} "
+                "mm: only what many of them share tells its moduli. Are displacements and standard deviations in one unit?"
             )
     return tuple(told)
 
