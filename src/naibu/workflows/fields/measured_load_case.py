@@ -116,8 +116,8 @@ def doubts_of_scale(name: str, field: DisplacementField) -> tuple[str, ...]:
     deformed, told = share * extent, []
     if share < TINY_DEFORMATION:
         told.append(
-            f"{name}: the object, {extent:.3g} mm large, deforms by {deformed:.2g} mm RMS, {share:.1g} of its size. Scans and particles seldom "
-            "show so little: are its displacements in metres? Moduli at finite strain, and forces, would be others; give the "
+            f"{name}: the object, {extent:.3g} mm large, deforms by {deformed:.2g} mm RMS, {share:.1g} of its size. Scans and particles "
+            "seldom show so little: are its displacements in metres? Moduli at finite strain, and forces, would be others; give the "
             "columns their unit, such as 'ux [m]'."
         )
     if field.covariance is not None:
