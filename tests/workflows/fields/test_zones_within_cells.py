@@ -80,7 +80,7 @@ def test_intervals_hold_the_moduli_of_a_skin_thinner_than_cubes(tmp_path: Path, 
     for (low, high), name in zip(run.estimate.intervals()[0], ("core", "skin"), strict=True):
         assert low < TRUTH[name][0] < high
     assert run.estimate.young_modulus[1] < 4.0
-    assert "as much is part of their standard deviations" in " ".join(run.blurred)
+    assert "as much is part of their standard deviations" in " ".join(run.cautions)
 
 
 def test_a_prediction_mixes_what_lies_in_cubes_as_the_identification_does(tmp_path: Path) -> None:

@@ -24,6 +24,9 @@ REMAINING = 5.0  # empirical: last steps that a cell which has not converged may
 # empirical: standard deviation along every axis of the bias by the bending penalty, in lengths of the change that smoothing the field once
 # more makes. Errors of legs and chests exceed what the samples say by 4 to 5 such lengths in three axes, and along the change only in part
 BIAS, BIAS_TOLERANCE = 1.9, 0.03
+# empirical: mean square of the residuals of a cell, in variances of the noise, beyond which structures lie at the wrong place there. Edges
+# in legs reach 8 in one cell of a hundred; lungs that slide by 5 to 17 mm along the chest wall 8 to 100 in one cell of twenty
+MISPLACED = 8.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -231,7 +234,8 @@ def collected(
     -----
     The samples hold the error of fields as rough as the penalty assumes. That of others is a bias, whose size is estimated by smoothing
     the field once more, as in Tukey's twicing :cite:p:`tukey1977`. Its direction is not: what the penalty took from the true field was not
-    parallel to what it takes from its estimate. It is therefore added as a variance along every axis.
+    parallel to what it takes from its estimate. It is therefore added as a variance along every axis. So is what large residuals tell of
+    structures that no smooth field brings together, such as those on either side of organs that slide on each other.
     """
     system, level = fit.system, fit.level
     box = tuple(slice(int(a), int(b)) for a, b in zip(level.low, level.high, strict=True))
@@ -259,10 +263,11 @@ def collected(
         full[~valid] = np.nan
     smoothed = fit.system.solved(fit.system.bending_load(c, bending), BIAS_TOLERANCE)[0]
     remaining = np.where(fit.moving, (REMAINING * fit.last_steps_mm) ** 2, 0.0)
-    variance = _bias_variance(fit, smoothed) + remaining
+    misplaced = _misplacement_variance(fit)
+    variance = _bias_variance(fit, smoothed) + remaining + misplaced
     spread = sampled_covariance(fit, samples) + variance[:, None, None] * np.eye(3)
     covariance = _per_cell(system.grid, fit, spread)
-    strain_sd = np.sqrt(_strain_variance(fit, c, samples, smoothed) + remaining / float(system.grid.step_mm.min()) ** 2)
+    strain_sd = np.sqrt(_strain_variance(fit, c, samples, smoothed) + (remaining + misplaced) / float(system.grid.step_mm.min()) ** 2)
     converged = np.ones(tuple(int(n) for n in system.grid.cells[::-1]), dtype=bool)
     converged[tuple(system.cells[:, 2:].T)] = ~fit.moving | ~system.inner
     return CorrelationResult(
@@ -306,6 +311,18 @@ def _bias_variance(fit: CorrelationFit, smoothed: Float32Array) -> FloatArray:
     """
     length = np.linalg.norm(fit.system.at_middles(smoothed, every=True), axis=1)
     return BIAS**2 * _averaged(fit, length**2)
+
+
+def _misplacement_variance(fit: CorrelationFit) -> FloatArray:
+    """Return the variance (m,), mm^2 along every axis, of displacements that would leave the residuals beyond `MISPLACED` in a cell.
+
+    A displacement by e leaves residuals g.e in a gradient g. Cells next to such a cell share its splines, and their errors.
+    """
+    m, noise = len(fit.system.cells), MISPLACED * fit.residual_sd**2
+    excess = np.bincount(fit.cell_of_voxel, fit.residual.astype(float) ** 2 - noise, minlength=m)
+    gradients = np.bincount(fit.cell_of_voxel, (fit.gradient**2).sum(axis=1), minlength=m)
+    of_cell = _per_cell(fit.system.grid, fit, np.maximum(excess, 0.0) / np.maximum(gradients, 1e-30))
+    return np.asarray(ndimage.maximum_filter(np.nan_to_num(of_cell), 3)[tuple(fit.system.cells[:, 2:].T)])
 
 
 def _strain_variance(fit: CorrelationFit, c: FloatArray, samples: Float32Array, smoothed: Float32Array) -> FloatArray:

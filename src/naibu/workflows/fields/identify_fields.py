@@ -47,7 +47,7 @@ from naibu.workflows.fields.block_mesh import (
     sizes_of_voxels,
 )
 from naibu.workflows.fields.known_zones import parse_known_zones
-from naibu.workflows.fields.measured_load_case import measured_load_case, relative_deformation
+from naibu.workflows.fields.measured_load_case import doubts_of_scale, measured_load_case, relative_deformation
 from naibu.workflows.results.files_together import written_together
 from naibu.workflows.results.output_folder import output_folder
 
@@ -75,8 +75,8 @@ class FieldIdentification(ShownInNotebook):
         Whether moduli are multiples of that of a zone whose modulus was not stated.
     notes : tuple of str
         Verdict, intervals and what limits them, in words.
-    blurred : tuple of str
-        Those of them that tell what cubes leave out of the object.
+    cautions : tuple of str
+        Those of them that doubt units of the fields, or tell what cubes leave out of the object.
     scan : Volume
         Not zero in the object.
     cell_of_voxel : ndarray, shape (nz, ny, nx), int
@@ -89,7 +89,7 @@ class FieldIdentification(ShownInNotebook):
     body: IdentifiedBody
     relative: bool
     notes: tuple[str, ...]
-    blurred: tuple[str, ...]
+    cautions: tuple[str, ...]
     scan: Volume
     cell_of_voxel: IntArray
     files: tuple[Path, ...] = ()
@@ -208,7 +208,9 @@ def identify_fields(
         region_at=within,
     )  # fmt: skip
     coarse = blurred(left_out, wrong, corrected=within is not None and found.mesh_shift is not None)
-    result = FieldIdentification(found, body, stated.relative, (*found.identifiability, *coarse, *longer), coarse, inside, cell_of_voxel)
+    scales = tuple(told for case in cases for told in doubts_of_scale(case.name, case.field))
+    notes = (*found.identifiability[:1], *scales, *found.identifiability[1:], *coarse, *longer)
+    result = FieldIdentification(found, body, stated.relative, notes, (*scales, *coarse), inside, cell_of_voxel)
     return result if folder is None else replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))
 
 
@@ -313,7 +315,7 @@ def _maps(result: FieldIdentification) -> list[tuple[str, FloatArray]]:
 
 
 def _page(result: FieldIdentification) -> SliceView:
-    scan, first = result.scan, [line for line in (*result.notes[:1], TOO_COARSE, *result.blurred) if line in result.notes]
+    scan, first = result.scan, [line for line in (*result.notes[:1], TOO_COARSE, *result.cautions) if line in result.notes]
     return SliceView(
         title="Moduli from displacement fields",
         sentences=first,

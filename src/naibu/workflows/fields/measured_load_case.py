@@ -20,6 +20,7 @@ FEWEST_POINTS = 20
 THINNEST = 0.1  # of a cell: points that span less along a direction do not tell how displacements change along it
 MOST_POINTS = 10_000  # measurements of a load case: neighbours in a field say the same
 LEAST_DEFORMATION, LARGEST_DEFORMATION = 1e-6, 0.5  # RMS of what a rigid motion leaves, part of the extent of the object
+TINY_DEFORMATION = 1e-4  # so little is usual for waves and interferometry, and for scans and particles is a sign of another unit
 
 
 def measured_load_case(
@@ -98,6 +99,35 @@ def relative_deformation(field: DisplacementField) -> float:
     points, vectors = field.points[field.valid], field.vectors[field.valid]
     left = vectors - registration(points, points + vectors).displacement(points)
     return float(np.sqrt((left**2).sum(axis=1).mean()) / np.linalg.norm(np.ptp(points, axis=0)))
+
+
+def doubts_of_scale(name: str, field: DisplacementField) -> tuple[str, ...]:
+    """Say what speaks for displacements in another unit than mm; nothing is refused, since small strains may well be measured.
+
+    Parameters
+    ----------
+    name : str
+        For messages.
+    field : DisplacementField
+        At points that were measured, mm.
+    """
+    extent = float(np.linalg.norm(np.ptp(field.points[field.valid], axis=0)))
+    share = relative_deformation(field)
+    deformed, told = share * extent, []
+    if share < TINY_DEFORMATION:
+        told.append(
+            f"{name}: the object, {extent:.3g} mm large, deforms by {deformed:.2g} mm RMS, {share:.1g} of its size. Scans and particles "
+            "seldom show so little: are its displacements in metres? Moduli at finite strain, and forces, would be others; give the "
+            "columns their unit, such as 'ux [m]'."
+        )
+    if field.covariance is not None:
+        sd = float(np.sqrt(np.trace(field.covariance[field.valid], axis1=1, axis2=2).mean()))
+        if deformed < sd:
+            told.append(
+                f"{name}: the object deforms by {deformed:.2g} mm RMS, less than the stated standard deviation of its vectors, {sd:.2g} "
+                "mm: only what many of them share tells its moduli. Are displacements and standard deviations in one unit?"
+            )
+    return tuple(told)
 
 
 def _require_deformation(name: str, field: DisplacementField) -> None:
