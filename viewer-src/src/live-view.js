@@ -237,6 +237,8 @@ export class LiveView extends View {
     }
     const index = coarse ? this.coarse.get(nodes) : this.whole;
     if (this.skin.geometry.index !== index) this.skin.geometry.setIndex(index);
+    // what is behind cannot be seen, and takes time; single triangles of a coarse surface may face the other way
+    this.skin.material.side = this.scene.closed && !this.clip && !coarse ? FrontSide : DoubleSide;
   }
 
   /** Value of the colours at a node: mm of displacement, or what the frame carries. */
@@ -274,7 +276,6 @@ export class LiveView extends View {
     this.clip = plane;
     this.renderer.localClippingEnabled = Boolean(this.clip);
     for (const { material } of [this.skin, this.outline]) material.clippingPlanes = this.clip ? [this.clip] : [];
-    this.skin.material.side = this.scene.closed && !this.clip ? FrontSide : DoubleSide; // what is behind cannot be seen, and takes time
     this.cap.visible = Boolean(this.clip);
     this.#cut();
     this.#placeMarkers();
