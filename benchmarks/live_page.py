@@ -1,9 +1,10 @@
 """Frames a second and delay of the live page in headless Chromium with software rendering, for surfaces of several sizes.
 
-A server shows a sphere that breathes 60 times a second, as a simulation would; the page draws it, with the finest picture that there is
-time for. Printed are vertices and pixels (a side, for one of the screen) that are drawn in motion, frames drawn a second, and the time from a
-command of the page (the tool is moved) to the animation frame after the one that drew its effect: the browser has composed the picture then.
-Chromium is started as on a computer without a graphics card, where it draws WebGL with SwiftShader and composes the page itself.
+A server shows a sphere that breathes 60 times a second, as a simulation would; the page draws it, with the finest picture that
+there is time for. Printed are vertices and pixels (a side, for one of the screen) that are drawn in motion, frames drawn a second,
+and the time from a command of the page (the tool is moved) to the animation frame after the one that drew its effect: the browser
+has composed the picture then. Chromium is started as on a computer without a graphics card, where it draws WebGL with SwiftShader
+and composes the page itself.
 
 Run: ``python benchmarks/live_page.py [--vertices 5000 50000] [--seconds 5] [--record]``
 """
@@ -70,7 +71,10 @@ def sphere(vertices: int) -> tuple[FloatArray, IntArray]:
     a, b = round_ * i + j, round_ * i + (j + 1) % round_
     north, south = len(points), len(points) + 1
     first, last = np.arange(round_), (rings - 1) * round_ + np.arange(round_)
-    caps = [np.stack([np.full(round_, north), first, np.roll(first, -1)], axis=1), np.stack([np.full(round_, south), np.roll(last, -1), last], axis=1)]
+    caps = [
+        np.stack([np.full(round_, north), first, np.roll(first, -1)], axis=1),
+        np.stack([np.full(round_, south), np.roll(last, -1), last], axis=1),
+    ]
     sides = [np.stack([a, a + round_, b], axis=1), np.stack([b, a + round_, b + round_], axis=1)]
     return np.vstack([points, [[0.0, 0.0, RADIUS], [0.0, 0.0, -RADIUS]]]), np.concatenate([*sides, *caps])
 

@@ -9,8 +9,8 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from naibu.core.arrays import AnyArray, Float32Array, FloatArray, IntArray
-from naibu.viewer.live.cut_outline import cut_outline
 from naibu.viewer.live.closed_surface import is_closed
+from naibu.viewer.live.cut_outline import cut_outline
 from naibu.viewer.motion_page import RigidShape
 
 MAGIC = b"NLV3"
