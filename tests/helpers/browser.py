@@ -18,8 +18,9 @@ from typing import Any
 from websockets.sync.client import ClientConnection, connect
 
 CHROMIUM = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
-_OPTIONS = (
-    "--headless=new", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--hide-scrollbars",
+# As on a computer without a graphics card: WebGL is drawn by SwiftShader, and the page is composed by the processor.
+OPTIONS = (
+    "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--hide-scrollbars",
     "--remote-debugging-port=0", "--remote-allow-origins=*", "--no-first-run", "--disable-background-networking",
 )  # fmt: skip
 
@@ -101,8 +102,8 @@ class Page:
 def opened_browser(width: int = 1200, height: int = 860) -> Iterator[Page]:
     """Start Chromium, and yield a page of it."""
     assert CHROMIUM is not None
-    with tempfile.TemporaryDirectory() as folder:
-        options = [*_OPTIONS, f"--user-data-dir={folder}", f"--window-size={width},{height}", "about:blank"]
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:  # its processes may still write
+        options = [*OPTIONS, f"--user-data-dir={folder}", f"--window-size={width},{height}", "about:blank"]
         process = subprocess.Popen([CHROMIUM, *options], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
             with connect(_address_of_page(Path(folder)), max_size=None) as link:

@@ -10,7 +10,7 @@ import uvicorn
 from touched_lattice import touched_lattice
 
 from naibu.simulation import InteractiveSimulation, RealTimeLoop
-from naibu.viewer.live.server import LiveServer
+from naibu.viewer.live.server import LiveServer, web_server
 from naibu.workflows import TouchableModel, tools_for
 from naibu.workflows.interactive.live import LiveSimulation
 
@@ -24,7 +24,7 @@ def served(model: TouchableModel | None = None, port: int = 0) -> Iterator[tuple
         pages = LiveServer(simulation, "secret")
         bound = uvicorn.Config(pages.app(0), host="127.0.0.1", port=port, log_level="critical").bind_socket()
         chosen = bound.getsockname()[1]
-        server = uvicorn.Server(uvicorn.Config(pages.app(chosen), log_level="critical", lifespan="off", ws="websockets-sansio"))
+        server = web_server(pages.app(chosen), "critical")
         thread = threading.Thread(target=server.run, kwargs={"sockets": [bound]}, daemon=True)
         thread.start()
         yield f"http://127.0.0.1:{chosen}/?token=secret", simulation

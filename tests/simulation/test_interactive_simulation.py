@@ -408,3 +408,48 @@ def test_a_sphere_dragged_across_a_cut_and_back_finds_a_balance_in_every_frame(f
     lips = body.engine.assembler.lips  # type: ignore[attr-defined]
     gaps = lips.gaps(session.state().displacement)
     assert gaps[np.isfinite(gaps)].min() > -0.02 * lips.edge.min()
+
+
+def pressed_gel() -> tuple[InteractiveSimulation, float]:
+    """A block of finite elements that a sphere presses by a quarter of its height, at rest; and that height, mm."""
+    size = 20.0
+    mesh = box((size,) * 3, (5,) * 3, cell_type="tetra", centred=False)
+    law = material(young_modulus=10.0, poisson_ratio=0.45)
+    assembler = Assembler.from_materials(elements(mesh, "mean_dilatation"), mesh.regions, [law])
+    body = FiniteElementBody.of(mesh, assembler, supported=np.flatnonzero(mesh.points[:, 2] < 1e-9), background=False)
+    above = size + 5.0
+    tools = {name: spherical_indenter((0.5 * size, 0.5 * size, above), 4.0) for name in ("sphere", "other")}
+    touched = InteractiveSimulation(body, tools)
+    touched.take("sphere")
+    touched.move((0.5 * size, 0.5 * size, above - 0.3 * size))
+    for _ in range(60):
+        touched.advance()
+    assert touched.last.force[2] < -50.0 and not touched.last.failed
+    return touched, size
+
+
+@pytest.mark.parametrize("tool", ["", "other"])
+def test_a_tool_that_presses_is_lifted_before_another_one_is_taken(tool: str) -> None:
+    touched, size = pressed_gel()
+    touched.take(tool)
+    for _ in range(60):
+        frame = touched.advance()
+        assert not frame.failed
+    assert frame.tool == tool
+    assert not frame.force.any()
+    assert abs(float(frame.positions[:, 2].max()) - size) < 0.01 * size  # it has sprung back
+
+
+def test_undo_of_a_reset_brings_back_the_body_with_the_tool_that_presses_it() -> None:
+    touched, _ = pressed_gel()
+    before = touched.last
+    touched.reset()
+    touched.advance()
+    assert touched.undo()
+    assert touched.last.tool == "sphere"
+    np.testing.assert_allclose(touched.last.tool_centre, before.tool_centre, atol=1e-12)
+    for _ in range(5):
+        frame = touched.advance()
+        assert not frame.failed
+    np.testing.assert_allclose(frame.force[2], before.force[2], rtol=0.02)
+    assert np.abs(frame.positions - before.positions).max() < 0.02

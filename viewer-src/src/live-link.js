@@ -14,6 +14,8 @@ export class LiveLink {
     this.listener = listener;
     this.delay = 500;
     this.arrivals = [];
+    this.newest = null; // frame that waits to be drawn
+    this.owed = false; // whether the next frame is asked for only when that is drawn
     this.connect();
   }
 
@@ -23,6 +25,7 @@ export class LiveLink {
     this.socket.onopen = () => {
       this.delay = 500;
       this.listener.onState("connected");
+      this.owed = false;
       this.send({ type: "next" });
     };
     this.socket.onmessage = ({ data }) => {
@@ -39,10 +42,25 @@ export class LiveLink {
     };
   }
 
+  /** Keep the newest frame for the next picture; while it waits to be drawn, one more is on its way, and no further one is asked for. */
   #received(frame) {
     const now = performance.now();
     this.arrivals = [...this.arrivals.filter((t) => now - t < 1000), now];
-    requestAnimationFrame(() => this.send({ type: "next" })); // before what draws this frame is called: the next one travels meanwhile
+    const waits = this.newest !== null;
+    this.newest = frame;
+    if (waits) {
+      this.owed = true;
+      return;
+    }
+    this.send({ type: "next" });
+    requestAnimationFrame(() => this.#draw());
+  }
+
+  #draw() {
+    const frame = this.newest;
+    this.newest = null;
+    if (this.owed) this.send({ type: "next" });
+    this.owed = false;
     this.listener.onFrame(frame);
   }
 

@@ -23,6 +23,8 @@ const DEAD_ZONE = 0.15;
 const TURN = 0.1; // rad, of a key
 const PAD_TURN = 0.03; // rad, of a frame in which the stick is held
 const WHEEL_TURN = 0.001; // rad, of a pixel
+const WRITE_MS = 100; // from one reading of the numbers to the next
+const CURVE_MS = 50; // from one drawing of the curves to the next
 const UNBALANCED = 0.05; // of all forces, above which the badge says so
 const digits = (value) => String(Number(value.toPrecision(3))).replace("-", "−");
 const newtons = (force) => Math.hypot(...force) / 1000;
@@ -32,6 +34,7 @@ class LivePage {
     this.scene = scene;
     this.mode = "push";
     this.probed = -1;
+    this.written = this.curved = -Infinity; // times at which numbers were written and curves drawn, ms
     this.tool = scene.tools.length ? scene.tools[0].name : "";
     this.#build(root);
     this.view = new LiveView(this.stage);
@@ -166,6 +169,7 @@ class LivePage {
     if (this.mode === "probe") {
       this.probed = hit.node;
       this.#probe();
+      this.#markProbed();
       return;
     }
     this.command("grip", { node: hit.node });
@@ -238,30 +242,49 @@ class LivePage {
     this.view.setFrame(frame);
     this.#gamepad();
     this.curve.add(frame.time, [[newtons(frame.gripped >= 0 ? frame.pull : frame.force), NaN, NaN]]);
-    this.curve.draw();
-    this.plots.show(frame.time, frame.readings);
-    this.ticks.replaceChildren(...[0, 1, 2, 3, 4].map((k) => h("span", {}, digits((k / 4) * this.view.top))));
+    this.plots.add(frame.time, frame.readings);
+    this.#markProbed();
+    this.#badge(frame);
+    this.#write(frame, performance.now());
+    this.stage.setAttribute("data-ready", "1");
+  }
+
+  /** Write numbers and draw curves, no more often than they can be read: laying out text takes longer than drawing the body. */
+  #write(frame, now) {
+    if (now - this.curved >= CURVE_MS) {
+      this.curved = now;
+      this.curve.draw();
+      this.plots.draw();
+    }
+    if (now - this.written < WRITE_MS) return;
+    this.written = now;
+    if (this.scaled !== this.view.top) this.ticks.replaceChildren(...[0, 1, 2, 3, 4].map((k) => h("span", {}, digits((k / 4) * this.view.top))));
+    this.scaled = this.view.top;
     const { numbers } = this;
     numbers.force.textContent = frame.tool < 0 ? "–" : `${newtons(frame.force).toFixed(2)} N`;
     numbers.pull.textContent = frame.gripped < 0 ? "–" : `${newtons(frame.pull).toFixed(2)} N`;
     numbers.penetration.textContent = `${frame.penetration.toFixed(2)} mm`;
     numbers.time.textContent = `${frame.time.toFixed(2)} s`;
     numbers.rate.textContent = `${Math.round(frame.stepsPerSecond)} steps/s, ${this.link.framesPerSecond} frames/s`;
+    this.plots.write();
     this.#probe();
-    this.#badge(frame);
-    this.stage.setAttribute("data-ready", "1");
   }
 
   /** Fetch the scene of a body that was cut, or whose cut was undone. */
   async #renew() {
     if (this.renewing) return;
     this.renewing = true;
-    const answer = await fetch(`/scene${window.location.search}`);
-    this.scene = decodeScene(await answer.json());
-    this.view.show(this.scene);
-    this.probed = -1;
-    this.view.overlay.mark(null);
-    this.renewing = false;
+    try {
+      const answer = await fetch(`/scene${window.location.search}`);
+      this.scene = decodeScene(await answer.json());
+      this.view.show(this.scene);
+      this.probed = -1;
+      this.view.overlay.mark(null);
+    } catch {
+      this.#say("the simulation does not answer; trying again"); // with the next frame
+    } finally {
+      this.renewing = false;
+    }
   }
 
   #badge(frame) {
@@ -272,10 +295,11 @@ class LivePage {
     if (frame.replaying) text = "replay";
     if (frame.failed) text = "the last step failed and was taken back";
     if (!frame.driving) text += " (watching)";
-    this.badge.textContent = text;
+    const write = (element, said) => { if (element.textContent !== said) element.textContent = said; };
+    write(this.badge, text);
     this.badge.dataset.held = String(real >= 97 || frame.paused || frame.replaying);
-    this.pause.textContent = frame.paused ? "▶ Go on" : "❚❚ Pause";
-    this.record.textContent = frame.recording ? "■ Stop" : "● Record";
+    write(this.pause, frame.paused ? "▶ Go on" : "❚❚ Pause");
+    write(this.record, frame.recording ? "■ Stop" : "● Record");
   }
 
   #probe() {
@@ -284,6 +308,11 @@ class LivePage {
     const d = [0, 1, 2].map((a) => moved[3 * this.probed + a] - points[3 * this.probed + a]);
     const signed = d.map((v) => v.toFixed(2).replace("-", "−"));
     this.numbers.probe.textContent = `moved (${signed.join(", ")}) mm, ${Math.hypot(...d).toFixed(2)} mm in all`;
+  }
+
+  #markProbed() {
+    if (this.probed < 0 || !this.frame) return;
+    const { positions: moved } = this.frame;
     const at = new Vector3().fromArray(moved, 3 * this.probed).project(this.view.camera);
     const { clientWidth: w, clientHeight: t } = this.stage;
     this.view.overlay.mark({ x: ((at.x + 1) / 2) * w, y: ((1 - at.y) / 2) * t });
@@ -300,7 +329,7 @@ class LivePage {
   }
 
   #screenshot() {
-    this.view.render();
+    this.view.renderFinest();
     this.view.canvas.toBlob((blob) => {
       const link = h("a", { href: URL.createObjectURL(blob), download: "naibu-live.png" });
       link.click();

@@ -1,16 +1,20 @@
 // The 3-D view of a running simulation: coloured surface, section, markers, tool, fixtures, and picking.
 import {
-  BufferAttribute, BufferGeometry, DataTexture, DirectionalLight, DoubleSide, DynamicDrawUsage, HemisphereLight, InstancedMesh,
+  BufferAttribute, BufferGeometry, DataTexture, DirectionalLight, DoubleSide, DynamicDrawUsage, FrontSide, HemisphereLight, InstancedMesh,
   LineBasicMaterial, LineSegments, LinearFilter, Matrix4, Mesh, MeshBasicMaterial, Plane, Raycaster, Scene, ShaderMaterial, Sphere, SphereGeometry,
   Vector2, Vector3,
 } from "three";
 import { gridLines } from "./body.js";
+import { coarserSurface } from "./coarser-surface.js";
 import { colourTable, niceCeiling } from "./colormap.js";
+import { Detail, STILL_MS, STILL_RATIO } from "./detail.js";
 import { FRAGMENT, rigidBody, VERTEX } from "./motion.js";
 import { section } from "./section.js";
 import { readTheme, View } from "./view.js";
 
 const MARKER_FRACTION = 0.012; // radius of a marker, in radii of the object
+const SEEN_PX = 0.05; // motion below this is not drawn
+const SEEN_COLOUR = 1 / 512; // nor is a change of a value, of the scale
 
 /** Whether WebGL is drawn by the processor, as where there is no graphics card. */
 function drawnBySoftware() {
@@ -22,9 +26,14 @@ function drawnBySoftware() {
 }
 
 export class LiveView extends View {
-  /** Smooth edges take a processor three times as long; a screenshot is drawn anew, so that no frame has to be kept. */
+  /**
+   * Where a processor draws, pictures in motion are drawn without smooth edges, which take three times as long, and as finely as there is time
+   * for; a picture at rest is drawn once more. A screenshot is drawn anew, so that no frame has to be kept.
+   */
   constructor(host) {
-    super(host, { antialias: !drawnBySoftware(), preserveDrawingBuffer: false });
+    const slow = drawnBySoftware();
+    super(host, { antialias: !slow, preserveDrawingBuffer: false });
+    this.slow = slow;
   }
 
   /** Show a decoded scene at rest; one that replaces another, as after a cut, is seen as the other was. */
@@ -38,11 +47,16 @@ export class LiveView extends View {
     this.level = new BufferAttribute(new Float32Array(scene.points.length / 3), 1).setUsage(DynamicDrawUsage);
     this.top ??= 1;
     this.skin = this.#coloured(this.position, this.level);
-    this.skin.geometry.setIndex(new BufferAttribute(scene.faces, 1));
+    this.whole = new BufferAttribute(scene.faces, 1);
+    this.skin.geometry.setIndex(this.whole);
+    this.coarse = new Map();
+    this.picked = this.#pickable();
+    this.drawn = null;
     this.outline = this.#outline(this.position, scene.outline);
     this.cap = this.#coloured(new BufferAttribute(new Float32Array(0), 3), new BufferAttribute(new Float32Array(0), 1));
     this.cap.visible = false;
     this.#measure();
+    this.detail = this.slow ? new Detail(scene.points.length / 3, this.host.clientWidth * this.host.clientHeight) : null;
     this.markers = this.#spheres();
     this.grid = gridLines(scene.points, niceCeiling(this.extent.radius / 6.5));
     this.fixtures = scene.fixtures.filter((f) => f.kind !== "plane").map((f) => this.#fixture(f));
@@ -88,6 +102,14 @@ export class LiveView extends View {
     return mesh;
   }
 
+  /** The whole surface, for picking: what is drawn may be coarser. */
+  #pickable() {
+    const geometry = new BufferGeometry();
+    geometry.setAttribute("position", this.position);
+    geometry.setIndex(this.whole);
+    return new Mesh(geometry, new MeshBasicMaterial({ side: DoubleSide }));
+  }
+
   /** Where cuts meet the surface, also while they are closed: lines drawn a little in front of it. */
   #outline(position, edges) {
     const geometry = new BufferGeometry();
@@ -123,18 +145,44 @@ export class LiveView extends View {
     for (const mesh of [this.skin, this.cap]) mesh.material.uniforms.colours.value = texture;
   }
 
-  /** Show a frame; the surface is coloured by displacement, or by the values of the frame if it has some. */
+  /** Show a frame, at once; the surface is coloured by displacement, or by the values of the frame if it has some. */
   setFrame(frame) {
     this.frame = frame;
-    const { points } = this.scene;
-    const moved = frame.positions;
-    this.position.array = moved; // that of the message, not a copy
+    if (!this.#changed(frame)) return;
+    this.drawn = frame;
+    this.position.array = frame.positions; // that of the message, not a copy
     this.position.needsUpdate = true;
+    this.#setLevels(frame);
+    this.tools.forEach((tool, k) => {
+      tool.visible = k === frame.tool;
+      if (!tool.visible) return;
+      tool.position.set(...frame.centre);
+      tool.quaternion.set(...frame.rotation).multiply(this.made[k]);
+    });
+    this.#placeMarkers();
+    this.#cut();
+    this.render();
+  }
+
+  /** Whether a frame looks different from what is drawn. */
+  #changed(frame) {
+    const { drawn } = this;
+    if (!drawn || drawn.tool !== frame.tool || (drawn.values === null) !== (frame.values === null)) return true;
+    const least = SEEN_PX * this.mmPerPx;
+    if (frame.centre.some((v, a) => Math.abs(v - drawn.centre[a]) > least)) return true;
+    if (frame.rotation.some((v, a) => Math.abs(v - drawn.rotation[a]) > 1e-3)) return true;
+    const [is, was] = [frame.positions, drawn.positions];
+    for (let i = 0; i < is.length; i += 1) if (Math.abs(is[i] - was[i]) > least) return true;
+    return frame.values !== null && frame.values.some((v, i) => Math.abs(v - drawn.values[i]) > SEEN_COLOUR * this.top);
+  }
+
+  #setLevels({ positions: moved, values }) {
+    const { points } = this.scene;
     const out = this.level.array;
     let largest = 0;
     for (let i = 0; i < out.length; i += 1) {
       let value;
-      if (frame.values) value = frame.values[i];
+      if (values) value = values[i];
       else {
         const x = moved[3 * i] - points[3 * i];
         const y = moved[3 * i + 1] - points[3 * i + 1];
@@ -148,15 +196,49 @@ export class LiveView extends View {
     if (largest > this.top || largest < this.top / 3) this.top = niceCeiling(Math.max(1.1 * largest, 0.01));
     for (let i = 0; i < out.length; i += 1) out[i] /= this.top;
     this.level.needsUpdate = true;
-    this.tools.forEach((tool, k) => {
-      tool.visible = k === frame.tool;
-      if (!tool.visible) return;
-      tool.position.set(...frame.centre);
-      tool.quaternion.set(...frame.rotation).multiply(this.made[k]);
-    });
-    this.#placeMarkers();
-    this.#cut();
-    this.requestRender();
+  }
+
+  /** Draw: where a processor draws, as finely as there is time for, and again when nothing has changed for a while. */
+  render() {
+    if (!this.detail) {
+      super.render();
+      return;
+    }
+    const { ratio, nodes } = this.detail.level;
+    this.#drawAt(ratio, nodes);
+    if (this.detail.due) {
+      const began = performance.now();
+      super.render();
+      this.#waitUntilDrawn();
+      this.detail.took(performance.now() - began);
+    } else super.render();
+    clearTimeout(this.rest);
+    this.rest = setTimeout(() => this.renderFinest(), STILL_MS);
+  }
+
+  /** Draw the picture of a view at rest. */
+  renderFinest() {
+    if (this.detail) this.#drawAt(STILL_RATIO, Infinity);
+    super.render();
+  }
+
+  #waitUntilDrawn() {
+    const gl = this.renderer.getContext();
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+  }
+
+  /** Set pixels of the canvas for one of the screen, and how many nodes of the surface are drawn. */
+  #drawAt(ratio, nodes) {
+    if (this.renderer.getPixelRatio() !== ratio) this.renderer.setPixelRatio(ratio);
+    // a section, the lines of the mesh and those of cuts belong to the whole surface
+    const coarse = nodes < this.position.count && !this.clip && !this.skin.material.wireframe && !this.outline.visible;
+    if (coarse && !this.coarse.has(nodes)) {
+      this.coarse.set(nodes, new BufferAttribute(coarserSurface(this.scene.points, this.scene.faces, nodes), 1));
+    }
+    const index = coarse ? this.coarse.get(nodes) : this.whole;
+    if (this.skin.geometry.index !== index) this.skin.geometry.setIndex(index);
+    // what is behind cannot be seen, and takes time; single triangles of a coarse surface may face the other way
+    this.skin.material.side = this.scene.closed && !this.clip && !coarse ? FrontSide : DoubleSide;
   }
 
   /** Value of the colours at a node: mm of displacement, or what the frame carries. */
@@ -229,8 +311,8 @@ export class LiveView extends View {
 
   /** Node of the surface under the pointer, and the point that was hit; null beside the object. */
   pick(x, y) {
-    this.skin.geometry.computeBoundingSphere();
-    const hits = this.#ray(x, y).intersectObject(this.skin);
+    this.picked.geometry.computeBoundingSphere();
+    const hits = this.#ray(x, y).intersectObject(this.picked);
     const hit = hits.find(({ point }) => !this.clip || this.clip.distanceToPoint(point) >= 0);
     if (!hit) return null;
     const corners = [hit.face.a, hit.face.b, hit.face.c];

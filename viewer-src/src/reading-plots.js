@@ -30,11 +30,20 @@ export class ReadingPlots {
     return { members, curve, element: h("div", {}, ...lines, canvas) };
   }
 
-  /** Show the readings of a frame: three numbers each. */
-  show(time, values) {
-    const of = (i) => [...values.subarray(3 * i, 3 * i + 3)];
+  /** Take the readings of a frame: three numbers each. */
+  add(time, values) {
+    this.values = values;
+    this.plots.forEach(({ curve, members }) => curve.add(time, members.map((i) => this.#of(i))));
+  }
+
+  #of(i) {
+    return [...this.values.subarray(3 * i, 3 * i + 3)];
+  }
+
+  /** Write the last readings. */
+  write() {
     this.texts.forEach((text, i) => {
-      const [value, low, high] = of(i);
+      const [value, low, high] = this.#of(i);
       const interval = Number.isFinite(low) ? ` (${digits(low)} to ${digits(high)})` : "";
       if (this.states[i].length) {
         text.textContent = Number.isFinite(value) ? this.states[i][value > 0 ? 1 : 0] : "–";
@@ -43,9 +52,10 @@ export class ReadingPlots {
       }
       text.textContent = Number.isFinite(value) ? `${digits(value)}${this.units[i]}${interval}` : "–";
     });
-    this.plots.forEach(({ curve, members }) => {
-      curve.add(time, members.map(of));
-      curve.draw();
-    });
+  }
+
+  /** Draw the curves. */
+  draw() {
+    this.plots.forEach(({ curve }) => curve.draw());
   }
 }

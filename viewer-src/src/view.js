@@ -166,12 +166,20 @@ export class View {
     this.requestRender();
   }
 
-  requestRender() {
-    if (this.pending || !this.world) return;
-    this.pending = requestAnimationFrame(() => { this.pending = 0; this.render(); });
+  /** Length that a pixel of the screen shows, mm. */
+  get mmPerPx() {
+    return (this.camera.top - this.camera.bottom) / (this.camera.zoom * this.host.clientHeight);
   }
 
+  requestRender() {
+    if (this.pending || !this.world) return;
+    this.pending = requestAnimationFrame(() => this.render());
+  }
+
+  /** Draw at once; a picture that was asked for before is this one. */
   render() {
+    cancelAnimationFrame(this.pending);
+    this.pending = 0;
     this.sun.position.copy(this.camera.position).sub(this.controls.target).applyAxisAngle(this.camera.up, 0.5);
     this.renderer.render(this.world, this.camera);
     this.overlay.update(this.camera, this.host.clientWidth, this.host.clientHeight);

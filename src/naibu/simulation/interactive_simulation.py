@@ -42,6 +42,9 @@ class _Kept:
     body: InteractiveBody
     state: Any
     time_s: float
+    tool: str
+    centre: FloatArray
+    rotation: FloatArray
 
 
 @dataclass(slots=True, eq=False)
@@ -78,6 +81,7 @@ class InteractiveSimulation:
     _topology: int = field(init=False, default=0)
     _surface: IntArray = field(init=False)
     _cutting: BackgroundCut | None = field(init=False, default=None)
+    _next: str | None = field(init=False, default=None)  # tool that is taken when the one in play has left the body
     _under_way: tuple[FloatArray, FloatArray, FloatArray] | None = field(init=False, default=None)  # motion of a step begun
 
     def __post_init__(self) -> None:
@@ -115,6 +119,8 @@ class InteractiveSimulation:
     def take(self, tool: str) -> None:
         """Bring a tool into play, where it waits; an empty name puts the one in play away.
 
+        One that presses finite elements is lifted first, in the next frames: no step finds the balance of a dent that is let go at once.
+
         Raises
         ------
         InputError
@@ -123,7 +129,10 @@ class InteractiveSimulation:
         if tool and tool not in self.tools:
             raise InputError(f"there is no tool {tool!r}; choose one of {', '.join(self.tools)}")
         self._keep()
-        self._press(tool)
+        if self._presses():
+            self._next = tool
+        else:
+            self._press(tool)
 
     def move(self, centre: ArrayLike) -> None:
         """Lead the tool to a position (3,), mm, which is kept within two extents of the body.
@@ -235,6 +244,8 @@ class InteractiveSimulation:
         cutting = BackgroundCut(self.body)
         cutting.begin(self.body.without_contact(self._session.state()), swept_blade(edges), distance_mm)
         self._cutting = cutting
+        if self._presses() and self._next is None:
+            self._next = self._tool
 
     def finish_cut(self, *, wait: bool = False) -> bool:
         """Go on with the body behind the cut that was begun; False where none is ready.
@@ -242,7 +253,7 @@ class InteractiveSimulation:
         Parameters
         ----------
         wait : bool
-            Whether to wait for it.
+            Whether to wait for it; frames are taken until a tool that presses the body has left it.
 
         Raises
         ------
@@ -254,7 +265,9 @@ class InteractiveSimulation:
             return False
         if wait:
             cutting.wait()
-        if not cutting.finished:
+            while self._next is not None and not self.advance().failed:
+                pass
+        if not cutting.finished or self._next is not None:
             return False
         self._cutting = None
         if cutting.body is not self.body:
@@ -277,8 +290,12 @@ class InteractiveSimulation:
             return False
         kept = self._kept.pop()
         self._topology += kept.body is not self.body
-        self._begin(kept.body, kept.state)
-        self._press(self._tool)
+        self._begin(kept.body, kept.body.without_contact(kept.state))
+        self._press(kept.tool)
+        if kept.tool:
+            self._session.restore(kept.state)
+            self._centre = self._target = kept.centre
+            self._rotation = self._rotation_target = kept.rotation
         self._last = self._frame(self._last.number + 1, kept.time_s, np.zeros(3), np.zeros(3), "")
         return True
 
@@ -287,6 +304,7 @@ class InteractiveSimulation:
 
         A step that takes longer than the frame may goes on in the next one, with the tool's motion as it was when the step began.
         """
+        self._leave()
         before = self._session.state()
         duration = self.steps * self.body.step_s
         centre, spin, gripped = self._under_way or self._next_motion(duration)
@@ -309,6 +327,24 @@ class InteractiveSimulation:
         pull = forces.bodies[:, 1].mean(axis=0) if self._gripped >= 0 else np.zeros(3)
         self._last = self._frame(self._last.number + 1, self._last.time_s + duration, force, pull, "")
         return self._last
+
+    def _presses(self) -> bool:
+        """Whether the tool in play touches finite elements."""
+        if not self._tool or not isinstance(self.body, FiniteElementBody):
+            return False
+        gap = placed(self.tools[self._tool], self._centre, self._rotation).gap(self._session.positions(self._surface))
+        return bool(self._last.force.any() or gap.min() < 0.0)
+
+    def _leave(self) -> None:
+        """Lead a tool that is to be put away against the force that it exerts, and take the next one when it has left the body."""
+        if self._next is None or self._under_way is not None:
+            return
+        if not self._presses():
+            self._press(self._next)
+            return
+        force = float(np.linalg.norm(self._last.force))
+        away = -self._last.force / force if force else np.array([0.0, 0.0, 1.0])
+        self._target = self._within(self._centre + self.extent_mm * away)
 
     def _next_motion(self, duration: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return where the tool goes in a frame, mm, how fast it turns, rad/s, and how far gripped nodes go, mm."""
@@ -348,7 +384,7 @@ class InteractiveSimulation:
         state = self._session.state()
         self._session.press(())
         self._session.restore(self.body.without_contact(state))
-        self._tool, self._under_way = tool, None
+        self._tool, self._under_way, self._next = tool, None, None
         self._rotation = self._rotation_target = np.eye(3)
         if tool:
             self._centre = self._target = self._outside(self.tools[tool])
@@ -384,7 +420,7 @@ class InteractiveSimulation:
         return np.asarray(np.clip(position, middle - reach, middle + reach))
 
     def _keep(self) -> None:
-        self._kept.append(_Kept(self.body, self.body.without_contact(self._session.state()), self._last.time_s))
+        self._kept.append(_Kept(self.body, self._session.state(), self._last.time_s, self._tool, self._centre, self._rotation))
 
     def _frame(self, number: int, time_s: float, force: FloatArray, pull: FloatArray, failed: str) -> Frame:
         positions = self._session.positions()

@@ -20,7 +20,7 @@ from websockets.sync.client import ClientConnection, connect
 from naibu.core.errors import InputError
 from naibu.viewer.live.commands import LiveCommand
 from naibu.viewer.live.scene import DRIVING, HEADER, LiveFrame, LiveReading, LiveScene, frame_bytes
-from naibu.viewer.live.server import COMMANDS_PER_S, LONGEST_MESSAGE, LiveServer
+from naibu.viewer.live.server import COMMANDS_PER_S, LONGEST_MESSAGE, STILL_S, LiveServer, web_server
 from naibu.viewer.motion_page import RigidShape
 
 POINTS = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10]])
@@ -31,7 +31,8 @@ class Source:
 
     def __init__(self) -> None:
         self.told: list[LiveCommand] = []
-        self.number = 0
+        self.shown = 0
+        self.still = False
         self.said = ""
         tool = RigidShape("sphere", "sphere", np.array([3.0, 0.0, 0.0]), np.eye(3))
         faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
@@ -39,10 +40,14 @@ class Source:
             "A <b>tetrahedron</b>", ["one cell"], POINTS, faces, np.array([[0, 1, 2, 3]]), [tool], [], np.zeros((0, 3)), "strain, %", 1 / 60
         )
 
+    @property
+    def number(self) -> int:
+        return self.shown if self.still else self.shown + 1
+
     def frame(self) -> LiveFrame:
-        self.number += 1
+        self.shown = self.number
         centre, force = np.arange(3.0), np.array([0, 0, -5.0])
-        return LiveFrame(self.number, 0.5, POINTS + 1.0, 0, -1, centre, force, np.zeros(3), 0.25, 60.0, 1.0, 0, lambda: np.arange(4.0))
+        return LiveFrame(self.shown, 0.5, POINTS + 1.0, 0, -1, centre, force, np.zeros(3), 0.25, 60.0, 1.0, 0, lambda: np.arange(4.0))
 
     def command(self, command: LiveCommand) -> None:
         self.told.append(command)
@@ -63,10 +68,7 @@ class Running:
         self.live = LiveServer(self.source, "secret")
         bound = uvicorn.Config(self.live.app(0), host="127.0.0.1", port=0, log_level="critical").bind_socket()
         self.port = bound.getsockname()[1]
-        config = uvicorn.Config(
-            self.live.app(self.port), log_level="critical", lifespan="off", ws="websockets-sansio", ws_max_size=LONGEST_MESSAGE
-        )
-        self.server = uvicorn.Server(config)
+        self.server = web_server(self.live.app(self.port), "critical")
         self.thread = threading.Thread(target=self.server.run, kwargs={"sockets": [bound]}, daemon=True)
         self.thread.start()
         while not self.server.started:
@@ -160,6 +162,26 @@ def test_the_first_page_drives_the_others_watch_until_it_leaves(running: Running
                 break
             time.sleep(0.02)
         assert flags(second) & DRIVING
+
+
+def test_a_page_that_waits_for_a_frame_is_obeyed_meanwhile(running: Running) -> None:
+    with running.session() as link:
+        link.send('{"type": "next"}')
+        link.recv(timeout=20)
+        running.source.still = True  # as while the simulation takes long for a step: the next answer comes after STILL_S
+        began = time.monotonic()
+        link.send('{"type": "next"}')
+        link.send('{"type": "move", "at": [1, 2, 3]}')
+        while not running.source.told:
+            time.sleep(0.001)
+        with pytest.raises(TimeoutError):
+            link.recv(timeout=max(0.0, began + 0.5 * STILL_S - time.monotonic()))
+        assert link.recv(timeout=20)
+
+
+def test_frames_are_sent_as_they_are(running: Running) -> None:
+    with running.session() as link:  # the client offers compression
+        assert link.protocol.extensions == []
 
 
 @pytest.mark.parametrize("message", ["no json", '{"type": "move", "at": [1]}', b"\x00\x01", "x" * (LONGEST_MESSAGE + 1)])

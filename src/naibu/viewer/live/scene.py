@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from naibu.core.arrays import AnyArray, Float32Array, FloatArray, IntArray
+from naibu.viewer.live.closed_surface import is_closed
 from naibu.viewer.live.cut_outline import cut_outline
 from naibu.viewer.motion_page import RigidShape
 
@@ -123,6 +124,7 @@ class LiveScene:
             "points": _base64(self.points, "<f4"),
             "faces": _base64(self.faces, "<u4"),
             "cells": _base64(self.cells, "<u4"),
+            "closed": is_closed(np.asarray(self.points, dtype=float), self.faces),
             "outline": _base64(cut_outline(np.asarray(self.points, dtype=float), self.faces), "<u4"),
             "tools": [_shape(s) for s in self.tools],
             "fixtures": [_shape(s) | {"centre": c.tolist()} for s, c in zip(self.fixtures, self.fixture_centres, strict=True)],

@@ -20,7 +20,7 @@ from starlette.applications import Starlette
 from starlette.requests import HTTPConnection, Request
 from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from naibu.core.errors import InputError, NaibuError
 from naibu.viewer.live.commands import LiveCommand, read_command
@@ -42,6 +42,10 @@ class LiveSource(Protocol):
     def scene(self) -> LiveScene:
         """What does not change."""
 
+    @property
+    def number(self) -> int:
+        """Number of the last frame."""
+
     def frame(self) -> LiveFrame:
         """Return the last frame."""
 
@@ -61,6 +65,7 @@ class _Page:
 
     coloured_by_strain: bool = False
     sent: int = -1
+    wants: asyncio.Event = field(default_factory=asyncio.Event)  # another frame
     allowance: float = COMMANDS_PER_S
     _spoke: float = field(default_factory=monotonic)
 
@@ -143,45 +148,57 @@ class LiveServer:
         await socket.accept()
         page = _Page()
         self.pages.append(page)
+        both = [asyncio.ensure_future(self._hear(socket, page)), asyncio.ensure_future(self._show(socket, page))]
         try:
-            while True:
-                text = await socket.receive_text()
-                if not page.may_speak():
-                    await socket.close(TOO_MUCH, "too many commands a second")
-                    return
-                try:
-                    command = read_command(text)
-                except InputError as error:
-                    await socket.close(MALFORMED, str(error)[:120])
-                    return
-                await self._answer(socket, page, command)
-        except (WebSocketDisconnect, KeyError):  # a binary message has no text
-            return
+            await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
         finally:
             self.pages.remove(page)
+            for task in both:
+                task.cancel()
+        ended = await asyncio.gather(*both, return_exceptions=True)
+        for error in ended:
+            # a page that left, or a binary message, which has no text; what was cancelled ended with the other one
+            if isinstance(error, BaseException) and not isinstance(error, WebSocketDisconnect | KeyError | asyncio.CancelledError):
+                raise error
 
-    async def _answer(self, socket: WebSocket, page: _Page, command: LiveCommand) -> None:
-        driving = self.pages[0] is page
-        if command.kind == "next":
-            await self._send_frame(socket, page, driving)
-        elif command.kind == "colour":
-            page.coloured_by_strain = command.name == "strain"
-            page.sent = -1
-        elif driving:
-            self.source.command(command)
+    async def _hear(self, socket: WebSocket, page: _Page) -> None:
+        """Carry out what a page says, at once: also while it waits for a frame."""
+        while True:
+            text = await socket.receive_text()
+            if not page.may_speak():
+                await socket.close(TOO_MUCH, "too many commands a second")
+                return
+            try:
+                command = read_command(text)
+            except InputError as error:
+                await socket.close(MALFORMED, str(error)[:120])
+                return
+            if command.kind == "next":
+                page.wants.set()
+            elif command.kind == "colour":
+                page.coloured_by_strain = command.name == "strain"
+                page.sent = -1
+            elif self.pages[0] is page:
+                self.source.command(command)
 
-    async def _send_frame(self, socket: WebSocket, page: _Page, driving: bool) -> None:
-        """Wait for a frame that the page has not seen, and send it."""
-        began = monotonic()
-        frame = self.source.frame()
-        while frame.number == page.sent and monotonic() - began < STILL_S:
-            await asyncio.sleep(POLL_S)
+    async def _show(self, socket: WebSocket, page: _Page) -> None:
+        """Send a frame that the page has not seen whenever it wants one."""
+        while True:
+            await page.wants.wait()
+            page.wants.clear()
+            began = monotonic()
+            while self.source.number == page.sent and monotonic() - began < STILL_S:
+                await asyncio.sleep(POLL_S)
             frame = self.source.frame()
-        page.sent = frame.number
-        values = frame.strain() if page.coloured_by_strain else None
-        if driving and (trouble := self.source.trouble()):
-            await socket.send_json({"trouble": trouble})
-        await socket.send_bytes(frame_bytes(frame, driving, values))
+            page.sent = frame.number
+            values = frame.strain() if page.coloured_by_strain else None
+            driving = self.pages[0] is page
+            trouble = self.source.trouble() if driving else ""
+            if socket.application_state is not WebSocketState.CONNECTED:
+                return  # closed for what the page said
+            if trouble:
+                await socket.send_json({"trouble": trouble})
+            await socket.send_bytes(frame_bytes(frame, driving, values))
 
 
 @contextmanager
@@ -221,12 +238,18 @@ def serve(server: LiveServer, bound: Socket, ready: Callable[[str], None]) -> No
     except OSError as error:  # two may bind a port that nobody listens at yet
         raise InputError(f"port {bound.getsockname()[1]} is taken; choose another, or 0 for a free one") from error
     chosen = bound.getsockname()[1]
-    config = uvicorn.Config(
-        server.app(chosen), log_level="warning", lifespan="off", ws="websockets-sansio", ws_max_size=LONGEST_MESSAGE,
-        timeout_graceful_shutdown=1, server_header=False, date_header=False,
-    )  # fmt: skip
     ready(f"http://127.0.0.1:{chosen}/?token={server.token}")
-    uvicorn.Server(config).run(sockets=[bound])
+    web_server(server.app(chosen)).run(sockets=[bound])
+
+
+def web_server(app: Starlette, log_level: str = "warning") -> uvicorn.Server:
+    """Return the server of an application; it sends frames as they are: on one machine, compressing them takes longer than sending them."""
+    return uvicorn.Server(
+        uvicorn.Config(
+            app, log_level=log_level, lifespan="off", ws="websockets-sansio", ws_max_size=LONGEST_MESSAGE, ws_per_message_deflate=False,
+            timeout_graceful_shutdown=1, server_header=False, date_header=False,
+        )
+    )  # fmt: skip
 
 
 async def _nothing(*_: object) -> None:

@@ -68,6 +68,11 @@ class LiveSimulation:
             readings=() if self.model.sensor is None else self.model.sensor.readings,
         )  # fmt: skip
 
+    @property
+    def number(self) -> int:
+        """Number of the last frame."""
+        return self.loop.latest()[0].number
+
     def frame(self) -> LiveFrame:
         """Return the last frame."""
         frame, pace = self.loop.latest()
