@@ -20,6 +20,9 @@ from numba.core.compiler_lock import global_compiler_lock
 Compiler = Callable[[Any, Any], Any]
 
 
+WRAPPER = "wrapper"  # name of the modules of wrappers for Python
+
+
 class _NoPlaces:
     """What sets the environments of kernels in machine code, where there is none."""
 
@@ -31,6 +34,11 @@ class CalledLibrary(JITCodeLibrary):
     """Code of a called kernel: optimised and ready to be linked, never made into machine code."""
 
     codegen = _NoPlaces()  # type: ignore[assignment]
+
+    def add_ir_module(self, ir_module: Any) -> None:
+        """Take in code, but for a wrapper for Python, which Numba makes of the body of each parallel loop."""
+        if ir_module.name != WRAPPER:
+            super().add_ir_module(ir_module)
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()
@@ -56,6 +64,16 @@ class CalledLibrary(JITCodeLibrary):
         return library
 
 
+class _LibrariesOf:
+    """Libraries of one kernel for Python and of all that is compiled for it: only that of the kernel itself gets machine code."""
+
+    def __init__(self, kernel: Any) -> None:
+        self._name = kernel.py_func.__qualname__
+
+    def __call__(self, codegen: Any, name: str) -> JITCodeLibrary:
+        return (JITCodeLibrary if name == self._name else CalledLibrary)(codegen, name)
+
+
 class _Nesting:
     """How many compilations are going on inside one another; changed under Numba's lock of the compiler."""
 
@@ -73,10 +91,10 @@ def is_called_only(result: Any) -> bool:
 
 
 @contextlib.contextmanager
-def made_for(called: bool) -> Iterator[None]:
-    """Make or load kernels for callers among kernels, or with machine code, within this context."""
+def libraries(kind: Any) -> Iterator[None]:
+    """Within this context, Numba makes or loads libraries of this class."""
     before = JITCPUCodegen._library_class
-    JITCPUCodegen._library_class = CalledLibrary if called else JITCodeLibrary
+    JITCPUCodegen._library_class = kind
     try:
         yield
     finally:
@@ -101,7 +119,7 @@ def compiled_for(called: bool, kernel: Any, compile: Compiler, args: Any, return
     compiler._customize_flags = _without_wrappers if called else _without_wrapper_for_c
     _Nesting.depth += 1
     try:
-        with made_for(called):
+        with libraries(CalledLibrary if called else _LibrariesOf(kernel)):
             result = compile(args, return_type)
     finally:
         _Nesting.depth -= 1

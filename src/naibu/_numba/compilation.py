@@ -108,7 +108,7 @@ class CachedCompiler:
 
     def _loaded(self, file: Any, called: bool) -> Any:
         target = self._kernel.targetctx
-        with called_kernels.made_for(called) if called_apart() else contextlib.nullcontext():
+        with called_kernels.libraries(called_kernels.CalledLibrary) if called else contextlib.nullcontext():
             found = file.load(target)
         if found is not None and not found.objectmode:
             target.insert_user_function(found.entry_point, found.fndesc, [found.library])
