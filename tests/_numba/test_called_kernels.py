@@ -99,7 +99,7 @@ def test_python_can_call_what_only_kernels_called_before(package: Path) -> None:
     assert compiled_by(package, CALL_IT) == []
 
 
-@pytest.mark.skipif(not called_apart() or sys.platform != "linux", reason="looks for machine code as Linux has it, where some kernels have none")
+@pytest.mark.skipif(not called_apart() or sys.platform != "linux", reason="tells machine code as Linux has it")
 def test_a_called_kernel_is_kept_without_machine_code(package: Path) -> None:
     compiled_by(package)
     whole = {path.name.split("-")[0]: ELF in path.read_bytes() for path in package.rglob("*.nbc")}
