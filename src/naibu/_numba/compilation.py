@@ -8,6 +8,7 @@ one compiles it and the others wait.
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
 from collections.abc import Callable
 from functools import cache as cached
@@ -24,6 +25,10 @@ try:
     from naibu._numba.kernel_files import KernelFile
 except Exception:  # whatever a changed interface raises
     KernelFile = None  # type: ignore[assignment,misc]
+try:
+    from naibu._numba import called_kernels
+except Exception:  # whatever a changed interface raises
+    called_kernels = None  # type: ignore[assignment]
 
 # Options of kernels that neither make nor return arrays: references are not counted. Numba counts those of every array in a tuple, each
 # time that a kernel takes the tuple apart, which takes longer than many a step of a small lattice.
@@ -51,6 +56,8 @@ def njit(function: Callable[..., Any] | None = None, *, cache: bool = False, **o
         compiler = getattr(compiled, "_compiler", None)  # None where NUMBA_DISABLE_JIT is set, or on an untested Numba
         if cache and compiler is not None and hasattr(compiler, "compile"):
             compiler.compile = CachedCompiler(compiled, compiler.compile)
+            if called_apart():
+                called_kernels.keep_from_python(compiled)
         return compiled
 
     return decorated if function is None else decorated(function)
@@ -76,40 +83,50 @@ class CachedCompiler:
 
     def __call__(self, args: Any, return_type: Any) -> Any:
         """Return the compile result, from its file where there is one."""
-        file = self._file(args, return_type)
+        called = called_apart() and called_kernels.being_called() and not self._kernel.targetoptions.get("parallel")
+        file = self._file(args, return_type, called)
         if file is None:
-            return self._reported(args, return_type)
-        found = self._loaded(file)
+            return self._reported(args, return_type, called)
+        found = self._loaded(file, called)
         if found is None:
             with file.lock():
-                found = self._loaded(file)  # another process may have compiled it meanwhile
+                found = self._loaded(file, called)  # another process may have compiled it meanwhile
                 if found is None:
-                    found = self._reported(args, return_type)
+                    found = self._reported(args, return_type, called)
                     file.save(found)
         return found
 
-    def _file(self, args: Any, return_type: Any) -> Any:
+    def _file(self, args: Any, return_type: Any, called: bool) -> Any:
         if not cache_works():
             return None
         try:
             self._digest = self._digest or kernel_digest(self._kernel)
         except OSError:  # no sources, as in a frozen application
             return None
-        return KernelFile.of(self._label, self._digest, (tuple(args), return_type), self._kernel.targetctx)
+        kind = ("called",) if called else ()
+        return KernelFile.of(self._label, self._digest, (tuple(args), return_type, *kind), self._kernel.targetctx)
 
-    def _loaded(self, file: Any) -> Any:
+    def _loaded(self, file: Any, called: bool) -> Any:
         target = self._kernel.targetctx
-        found = file.load(target)
+        with called_kernels.libraries(called_kernels.CalledLibrary) if called else contextlib.nullcontext():
+            found = file.load(target)
         if found is not None and not found.objectmode:
             target.insert_user_function(found.entry_point, found.fndesc, [found.library])
         return found
 
-    def _reported(self, args: Any, return_type: Any) -> Any:
+    def _reported(self, args: Any, return_type: Any, called: bool) -> Any:
         report(self._label, False)
         try:
+            if called_apart():
+                return called_kernels.compiled_for(called, self._kernel, self._compile, args, return_type)
             return self._compile(args, return_type)
         finally:
             report(self._label, True)
+
+
+def called_apart() -> bool:
+    """Tell whether kernels that only kernels call are compiled without machine code: on tested versions of Numba."""
+    return called_kernels is not None and tested()
 
 
 @cached
