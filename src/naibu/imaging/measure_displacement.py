@@ -6,6 +6,7 @@ flow, and rigid registration.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
@@ -32,6 +33,7 @@ from naibu.imaging.preprocessing.object_mask import mask_in_view, mask_jumps
 from naibu.imaging.preprocessing.resampling import require_mask, resampled_to_grid
 from naibu.imaging.preprocessing.rigid_registration import rigid_from_points, total_displacement
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
+from naibu.imaging.volume_correlation.part_by_part import APART, correlated_parts
 from naibu.imaging.volume_correlation.result import CorrelationResult
 
 Method = Literal["default", "features", "sad-blocks", "ssd-blocks", "ncc-blocks", "horn-schunck", "lucas-kanade", "hybrid", "rigid"]
@@ -56,6 +58,7 @@ FACTS = {
     "convergence": "convergence",
     "unconverged_cells": "cells of the spline grid that have not converged",
     "unconverged_fraction": "the same, fraction of the cells in the object",
+    "parts": "parts that were measured by themselves, since they slide on each other",
     "coarse_factor": "block by block: voxels along an edge of the coarse voxels of this page",
     "blocks": "block by block: number of blocks",
     "passes": "block by block: passes through the volumes",
@@ -279,7 +282,38 @@ def _correlated(
     progress: Progress | None,
 ) -> MeasuredDisplacement:
     found = correlate_volumes(reference, deformed, mask=masks[0], deformed_mask=masks[1], progress=progress)
-    return measured_by(found, reference, inside)
+    parts = correlated_parts(reference, deformed, inside, found, progress=progress)
+    if not parts:
+        return measured_by(found, reference, inside)
+    rest = inside & ~np.logical_or.reduce([part for part, _ in parts])
+    # parts that leave less apart first: facts are those of the first one
+    results = sorted(((own, part) for part, own in parts), key=lambda each: each[0].misplaced_fraction)
+    return _joined([measured_by(own, reference, part) for own, part in [*results, (found, rest)]], inside)
+
+
+def _joined(measured: Sequence[MeasuredDisplacement], inside: BoolArray) -> MeasuredDisplacement:
+    """Return the displacement of parts of an object that were measured by themselves, the last of which is the rest."""
+    first, *others = measured
+    vectors, gradient = first.displacement.vectors.copy(), first.gradient.copy()
+    covariance, strain_sd = first.displacement.covariance, first.strain_sd
+    for other in others:
+        here = other.mask
+        vectors[here], gradient[here] = other.displacement.vectors[here], other.gradient[here]
+        if covariance is not None and other.displacement.covariance is not None:
+            covariance[here] = other.displacement.covariance[here]
+        if strain_sd is not None and other.strain_sd is not None:
+            strain_sd[here] = other.strain_sd[here]
+    valid = np.logical_or.reduce([one.displacement.valid for one in measured])
+    blocks = [one.blocks for one in measured if one.blocks is not None]
+    each = [np.concatenate([getattr(b, name) for b in blocks]) for name in ("points", "vectors", "covariance")]
+    parts = sum(bool(one.mask.any()) for one in measured)
+    return replace(
+        first,
+        displacement=DisplacementField.on_grid(first.displacement.grid, vectors, covariance=covariance, valid=valid),
+        mask=inside, gradient=gradient, strain_sd=strain_sd, facts=first.facts | {"parts": parts},
+        warnings=tuple(dict.fromkeys(told for one in measured for told in one.warnings)),
+        blocks=DisplacementField.from_arrays(each[0], each[1], covariance=each[2]),
+    )  # fmt: skip
 
 
 def measured_by(found: CorrelationResult, reference: Volume, inside: BoolArray) -> MeasuredDisplacement:
@@ -313,18 +347,20 @@ def measured_by(found: CorrelationResult, reference: Volume, inside: BoolArray) 
         y, x = np.nonzero(valid[z])
         covariance[z, y, x] = found.covariance_at(found.volume.to_physical(np.stack([x, y, np.full(len(x), z)], axis=1)))
     field = DisplacementField.on_grid(reference, vectors, covariance=covariance, valid=valid)
-    blocks = None if found.blocks is None else _in_object(found.blocks, found.volume, valid)
-    doubts = _convergence_doubts(unconverged, cells)
+    blocks = None if found.blocks is None else _in_object(found, found.blocks, valid)
+    doubts = (*_convergence_doubts(unconverged, cells), *_misplacement_doubts(found.misplaced_fraction))
     strain_sd = np.where(valid, found.strain_sd(), np.float32(np.nan))
     return MeasuredDisplacement("default", field, inside, gradient, facts=facts, warnings=doubts, blocks=blocks, strain_sd=strain_sd)
 
 
-def _in_object(blocks: DisplacementField, grid: Volume, valid: BoolArray) -> DisplacementField:
-    """Return the blocks whose middle lies in a valid voxel."""
-    z, y, x = np.clip(np.rint(grid.to_index(blocks.points)).astype(int)[:, ::-1], 0, np.array(grid.shape) - 1).T
+def _in_object(found: CorrelationResult, blocks: DisplacementField, valid: BoolArray) -> DisplacementField:
+    """Return the blocks whose middle lies in a valid voxel, less certain where structures stay apart."""
+    z, y, x = np.clip(np.rint(found.volume.to_index(blocks.points)).astype(int)[:, ::-1], 0, np.array(valid.shape) - 1).T
     kept = valid[z, y, x]
-    covariance = None if blocks.covariance is None else blocks.covariance[kept]
-    return DisplacementField.from_arrays(blocks.points[kept], blocks.vectors[kept], covariance=covariance)
+    points, covariance = blocks.points[kept], blocks.covariance
+    if covariance is not None:
+        covariance = covariance[kept] + np.nan_to_num(found.misplacement_at(points))[:, None, None] * np.eye(3)
+    return DisplacementField.from_arrays(points, blocks.vectors[kept], covariance=covariance)
 
 
 def _convergence_doubts(unconverged: int, cells: int) -> tuple[str, ...]:
@@ -333,4 +369,13 @@ def _convergence_doubts(unconverged: int, cells: int) -> tuple[str, ...]:
     return (
         f"{unconverged} of {cells} cells of the grid ({unconverged / cells:.1%}) have not converged: their displacement is less certain, "
         "which its standard deviation includes.",
+    )
+
+
+def _misplacement_doubts(fraction: float) -> tuple[str, ...]:
+    if fraction < APART:
+        return ()
+    return (
+        f"In {fraction:.0%} of the object structures stay more than a voxel apart after registration, as where parts slide on each other "
+        "or tear: the displacement near them is less certain, which its standard deviation includes. A `mask` of one part measures it.",
     )

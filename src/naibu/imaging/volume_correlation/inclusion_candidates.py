@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 from naibu.core.volume import Volume
+from naibu.imaging.preprocessing.morphology import closed, opened
 
 # rims are thin and broken: candidates are found at each of these thresholds, between the intensity of air (0) and of the object (1), and
 # closing radii, in units of the size; what enough of the nine find is kept. Empirical, as are all lengths here, in units of the size.
@@ -70,25 +71,15 @@ def _in_thinned(smooth: Float32Array, mask: BoolArray, spacing: FloatArray, size
     for level in DARK:
         dark = (smooth < air + level * (tissue - air)) & deep
         for radius in CLOSING:
-            votes += _filled(_closed(dark, spacing, radius * size_mm) if radius else dark, spacing, LARGEST_AREA * size_mm**2)
+            votes += _filled(closed(dark, spacing, radius * size_mm) if radius else dark, spacing, LARGEST_AREA * size_mm**2)
     filled = votes >= VOTES
-    inclusions = _opened(filled, spacing, OPENING * size_mm) & filled
+    inclusions = opened(filled, spacing, OPENING * size_mm) & filled
     labels, n = ndimage.label(inclusions)
     big = np.bincount(labels.ravel(), minlength=n + 1) * np.prod(spacing) > LEAST_VOLUME * size_mm**3
     big[0] = False
     number = np.cumsum(big) * big
     out[box] = number[labels]
     return out
-
-
-def _closed(found: BoolArray, spacing: FloatArray, radius: float) -> BoolArray:
-    pad = [int(radius // s) + 1 for s in spacing]
-    wide = np.pad(found, [(p, p) for p in pad], mode="edge")
-    if not wide.any():
-        return found
-    grown = ndimage.distance_transform_edt(~wide, sampling=spacing) <= radius
-    shrunk = ndimage.distance_transform_edt(grown, sampling=spacing) > radius
-    return np.asarray(shrunk[tuple(slice(p, -p) for p in pad)])
 
 
 def _filled(found: BoolArray, spacing: FloatArray, largest: float) -> BoolArray:
@@ -107,13 +98,3 @@ def _filled(found: BoolArray, spacing: FloatArray, largest: float) -> BoolArray:
             if enclosed.any():
                 page |= enclosed[open_parts]
     return out
-
-
-def _opened(found: BoolArray, spacing: FloatArray, radius: float) -> BoolArray:
-    pad = [int(radius // s) + 1 for s in spacing]
-    wide = np.pad(found, [(p, p) for p in pad], mode="edge")
-    core = ndimage.distance_transform_edt(wide, sampling=spacing) > radius
-    if not core.any():
-        return np.zeros_like(found)
-    grown = ndimage.distance_transform_edt(~core, sampling=spacing) <= radius
-    return np.asarray(grown[tuple(slice(p, -p) for p in pad)])

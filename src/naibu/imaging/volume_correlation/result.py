@@ -47,6 +47,9 @@ class CorrelationResult:
     cell_strain_sd : ndarray, shape (CZ, CY, CX)
         Standard deviation of a component of the Green-Lagrange strain in the middle of every cell, root mean square over the components;
         NaN where there is no object.
+    cell_misplacement : ndarray, shape (CZ, CY, CX)
+        Variance along every axis, mm^2, of displacements that would explain residuals far above the noise, a part of the covariance: 0
+        where structures lie on one another after registration, NaN where there is no object.
     bending, dilatation : ndarray, shape (CZ, CY, CX, 3), and float
         Weights of the penalties: of squared second derivatives, for each component along the axes of the volume, 1/mm, and of the squared
         dilatation, 1/mm^3; NaN where there is no object.
@@ -71,6 +74,7 @@ class CorrelationResult:
     coefficients: FloatArray
     cell_covariance: FloatArray
     cell_strain_sd: FloatArray
+    cell_misplacement: FloatArray
     bending: FloatArray
     dilatation: float
     residual_sd: float
@@ -135,6 +139,16 @@ class CorrelationResult:
         out = np.full((*self.volume.shape, 3, 3), np.nan, np.float32)
         out[self.valid] = self._covariance(np.argwhere(self.valid)[:, ::-1] * self.volume.spacing_mm)
         return out
+
+    @property
+    def misplaced_fraction(self) -> float:
+        """Fraction of the cells in the object where structures stay more than a voxel apart after registration."""
+        known = self.cell_misplacement[np.isfinite(self.cell_misplacement)]
+        return float((known > float(np.prod(self.volume.spacing_mm)) ** (2.0 / 3.0)).mean())
+
+    def misplacement_at(self, points_mm: ArrayLike) -> FloatArray:
+        """Return `cell_misplacement` (n,), mm^2, at positions (n, 3), mm; NaN away from the object."""
+        return self._between_cells(self.cell_misplacement, self._local(points_mm))
 
     def strain_sd(self) -> Float32Array:
         """Return the standard deviation of a component of strain (nz, ny, nx) at the voxels; NaN where it is not valid, 0 in inclusions."""
@@ -272,8 +286,8 @@ def collected(
     converged[tuple(system.cells[:, 2:].T)] = ~fit.moving | ~system.inner
     return CorrelationResult(
         DisplacementField.on_grid(volume, vectors, valid=valid), system.grid, c, volume.direction @ covariance @ volume.direction.T,
-        _per_cell(system.grid, fit, strain_sd), _per_cell(system.grid, fit, bending), dilatation, fit.residual_sd, maps[0], maps[1],
-        converged, inclusions, motions, _status(system.grid, volume, converged),
+        _per_cell(system.grid, fit, strain_sd), _per_cell(system.grid, fit, misplaced), _per_cell(system.grid, fit, bending), dilatation,
+        fit.residual_sd, maps[0], maps[1], converged, inclusions, motions, _status(system.grid, volume, converged),
     )  # fmt: skip
 
 
