@@ -17,13 +17,15 @@ from naibu.mechanics.lattices.cpu.implicit._implicit_kernels import (
     add_momenta,
     add_reactions,
     advance,
-    extrapolated_velocity,
-    improved_velocity,
+    extrapolated_residual,
+    settle,
 )
+from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import residual_norm, solve
 from naibu.mechanics.lattices.cpu.implicit._solver_parts import OPERATOR
 
 AGREED = 1e-4  # error of the pressures, as a fraction of their sum, at which a step is settled
 AGREED_FRICTION = 2e-3  # likewise of the friction, of the sum of its limits
+ROUGHLY, ROUGH_PASSES = 0.1, 3  # reduction of the residual of a pass whose contacts may be far from those of the solution, and how many
 
 
 @njit(cache=True)
@@ -41,7 +43,7 @@ def _settle(engine, contact, base, right, ahead, smoother, most):  # type: ignor
     x, step = data[1][0], data[1][6]
     count, indenters, motion, surface, history, lists, slid, points, slot, diagonal = contact
     operator = inner[OPERATOR]
-    iterations, lost, goal, share = 0, 0.0, 0.0, 0.0
+    iterations, lost, goal, share, ended = 0, 0.0, 0.0, 0.0, False
     for attempt in range(-1, most):  # before the first solution, points are linearized about the velocity as it is
         if attempt >= 0:
             if attempt:  # the residual of the same solution with other contacts
@@ -55,13 +57,16 @@ def _settle(engine, contact, base, right, ahead, smoother, most):  # type: ignor
                 for i in range(len(r)):
                     r[i] += right[i]
                 add_contact(operator[0], operator[1], operator[5][FACES], -1.0, v, r)
-                done, lost = improved_velocity(data, goal, solver[1])
             else:
-                done, lost, goal, share = extrapolated_velocity(data, ahead, solver)
-            iterations += done
+                goal, share = extrapolated_residual(data, ahead, solver[0])
+            now = max(goal, ROUGHLY**2 * residual_norm(r, smoother, data[0][6])) if attempt < ROUGH_PASSES else goal
+            iterations += solve(data[0], now, solver[1])
+            ended = now <= goal
+            if ended:
+                lost = settle(data)
         begins = attempt < 0
         wrong, wrong_friction, total, limits = look(count, x, v, step, indenters, motion, surface, history, lists, slid, points, begins)
-        if not begins and wrong <= AGREED * total and wrong_friction <= AGREED_FRICTION * limits + 1e-300:
+        if not begins and ended and wrong <= AGREED * total and wrong_friction <= AGREED_FRICTION * limits + 1e-300:
             return iterations, attempt + 1, lost, True, share
     return iterations, most, lost, False, share
 

@@ -146,11 +146,12 @@ def new_velocity(data, limits):  # type: ignore[no-untyped-def]  # pragma: no co
 
 
 @njit(cache=True, fastmath=_FAST, **UNCOUNTED)
-def extrapolated_velocity(data, ahead, limits):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Do what `new_velocity` does for a v to which a share of a change (3 pad,) was added; `ahead` are the two.
+def extrapolated_residual(data, ahead, tolerance):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Constrain v, to which a share of a change (3 pad,) was added, and set r to its residual; `ahead` are the two.
 
-    The residual goes down to the same size as from the v without it, for which extrapolated motion is often nearly enough
-    :cite:p:`fischer1998`. The share becomes that which leaves the least energy norm of the error; it is returned last.
+    Extrapolated motion is often nearly enough :cite:p:`fischer1998`. The share becomes that which leaves the least energy norm of the
+    error. Returns the square of the residual's norm at which the solver is to end, that of the v without any change reduced by the
+    tolerance, and the share.
     """
     blocks, tables, mass, v, (axes, r, p, q), inner, constrained = data[0]
     touched, (change, taken) = inner[OPERATOR], ahead
@@ -162,12 +163,12 @@ def extrapolated_velocity(data, ahead, limits):  # type: ignore[no-untyped-def] 
     curvature += add_contact(touched[0], touched[1], touched[5][FACES], 1.0, p, q)
     for i in range(len(r)):
         r[i] += taken * q[i]
-    goal = max(limits[0] ** 2 * residual_norm(r, inner[3], constrained), floor)
+    goal = max(tolerance**2 * residual_norm(r, inner[3], constrained), floor)
     portion = dot(p, r) / curvature if curvature > 0.0 else 0.0
     for i in range(len(r)):
         v[i] += (portion - taken) * p[i]
         r[i] -= portion * q[i]
-    return *improved_velocity(data, goal, limits[1]), goal, portion
+    return goal, portion
 
 
 @njit(cache=True, **UNCOUNTED)
