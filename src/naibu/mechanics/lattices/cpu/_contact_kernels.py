@@ -15,6 +15,7 @@ from naibu.mechanics.lattices.cpu._contact_points import SLIDE, assemble, look, 
 from naibu.mechanics.lattices.cpu._contact_solver import (
     change_contacts,
     extrapolate,
+    forget_impulses,
     plain_residual,
     settle_in_contact,
     solve_exactly,
@@ -38,14 +39,14 @@ def _settle(engine, contact, vectors, ahead, smoother, most):  # type: ignore[no
     the solver, from the velocity of the step before.
 
     `engine` are the data of the step and the limits of the solver; `contact` what `look` takes behind the step, and what is scratch;
-    `vectors` the right side without contact and room for three more (3 pad,); `ahead` what the velocity changed by in the step before
+    `vectors` room for impulses of contact, zero, and two more (3 pad,); `ahead` what the velocity changed by in the step before
     (3 pad,), and the share of it that was added to v. Returns last the share that was right.
     """
     data, (tolerance, limit) = engine
     v, (_, r, _, _), inner = data[0][3], data[0][4], data[0][5]
     x, step = data[1][0], data[1][6]
     count, indenters, motion, surface, history, lists, slid, points, slot, diagonal, room = contact
-    base, given, plain, origin = vectors
+    given, plain, origin = vectors
     operator = inner[OPERATOR]
     iterations, lost, goal, share, ended = 0, 0.0, 0.0, 0.0, False
     for attempt in range(-1, most):  # before the first solution, points are linearized about the velocity as it is
@@ -53,9 +54,9 @@ def _settle(engine, contact, vectors, ahead, smoother, most):  # type: ignore[no
             floor = 0.0
             if attempt:  # the residual of the same solution with other contacts
                 change_contacts(data, given, -1.0)
-            else:
-                floor = plain_residual(data, base, plain, origin)
-            given[:] = 0.0
+            forget_impulses(operator, given)
+            if not attempt:
+                floor = plain_residual(data, plain, origin)
             assemble(count, step, surface, lists, points[0], given, operator)
             close_operator(operator, smoother, slot, diagonal)
             change_contacts(data, given, 1.0)
@@ -120,18 +121,18 @@ def contact_steps(data, contact, weight, motion, solver, reactions, most):  # ty
     (q, 5) and weights (p,) at the points, and where points (k + 1,) and shape functions (k + 1,) of each indenter begin; the arrays of
     `ContactState`; what `near_faces` lists, linearizations and what they exert, which points slide, slots of the nodes, their diagonal
     blocks, four numbers a node (4, k, n), the mean acceleration in the step before (3, n) and how much of it lasted (1,), which are
-    changed; and room for five vectors (3 pad,). Constrained components of `data` move by their weights times the velocities of their bodies;
+    changed; and room for four vectors (3 pad,). Constrained components of `data` move by their weights times the velocities of their bodies;
     `motion` are these (steps, bodies, 3), and velocities and angular velocities of the indenters (steps, k, 3); `solver` the limits of the
     solver; `reactions` those of the bodies and of the indenters; `most` the most passes. Returns iterations, passes and the steps whose
     contacts did not settle.
     """
-    (_, _, mass, v, work, inner, now), (x, _, _, before, _, external, step) = data
-    indenters, surface, history, scratch, (base, change, given, plain, origin) = contact
+    (_, _, mass, v, work, inner, now), (x, _, _, before, base, external, step) = data
+    indenters, surface, history, scratch, (change, given, plain, origin) = contact
     (_, axes), centres, _, _, _ = indenters
     held_velocity, velocity, spin = motion
     lists, points, slid, slot, diagonal, nodal, trend, trust = scratch
     operator, first = inner[OPERATOR], surface[5]
-    change[:] = 0.0
+    change[:], given[:] = 0.0, 0.0
     pad = len(mass)
     iterations, passes, unsettled = 0, 0, 0
     room = new_room()
@@ -157,7 +158,7 @@ def contact_steps(data, contact, weight, motion, solver, reactions, most):  # ty
             for i in range(trend.shape[1]):
                 change[a * pad + i] = step * trend[a, i]
                 v[a * pad + i] += trust[0] * change[a * pad + i]
-        done, tries, lost, agreed, share = _settle((data, solver), found, (base, given, plain, origin), (change, trust[0]), inner[3], most)
+        done, tries, lost, agreed, share = _settle((data, solver), found, (given, plain, origin), (change, trust[0]), inner[3], most)
         trust[0] = min(max(share, 0.0), 1.0)
         for a in range(3):
             for i in range(trend.shape[1]):

@@ -12,27 +12,24 @@ from naibu._numba.compilation import UNCOUNTED, njit
 from naibu.mechanics.lattices.cpu._contact_operator import FACES, NODES, add_contact
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import CREDIT
 from naibu.mechanics.lattices.cpu.implicit._implicit_kernels import first_residual, settle
-from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import conjugate_gradients, dot, multiply, project, residual_norm
+from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import conjugate_gradients, multiply, project, residual_norm
 from naibu.mechanics.lattices.cpu.implicit._solver_parts import ALIGN, MULTIPLY, NORM, OPERATOR, POOL, share
 
-_FAST = {"contract", "nsz"}
+_FAST, _SUMS = {"contract", "nsz"}, {"contract", "nsz", "reassoc"}
 _ROUNDS = 8  # of conjugate gradients, at most, between which the residual is computed in double precision
 
 
 @njit(cache=True, fastmath=_FAST, **UNCOUNTED)
-def plain_residual(data, base, plain, origin):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Constrain v; keep it in `origin` and its residual without contact, for the right side `base`, in `plain`, all (3 pad,).
+def plain_residual(data, plain, origin):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Constrain v; keep it in `origin`, and its residual without contact in `plain`, both (3 pad,).
 
     Returns the square of the norm below which rounding rules.
     """
-    v, r, right = data[0][3], data[0][4][1], data[1][4]
-    counts = data[0][5][OPERATOR][5]
+    v, r, counts = data[0][3], data[0][4][1], data[0][5][OPERATOR][5]
     counts[FACES], counts[NODES] = 0, 0
-    for i in range(len(v)):
-        right[i] = base[i]
     floor = first_residual(data)
     for i in range(len(v)):
-        plain[i], origin[i], right[i] = r[i], v[i], 0.0
+        plain[i], origin[i] = r[i], v[i]
     return floor
 
 
@@ -40,12 +37,24 @@ def plain_residual(data, base, plain, origin):  # type: ignore[no-untyped-def]  
 def change_contacts(data, given, sign):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add what the contacts exert at the velocity v to its residual, with a sign; `given` are their impulses at no velocity (3 pad,)."""
     v, r, operator = data[0][3], data[0][4][1], data[0][5][OPERATOR]
-    for i in range(len(r)):
-        r[i] += sign * given[i]
+    pad = len(r) // 3
+    for c in range(operator[5][NODES]):
+        i = operator[3][c]
+        for a in range(3):
+            r[a * pad + i] += sign * given[a * pad + i]
     add_contact(operator[0], operator[1], operator[5][FACES], -sign, v, r)
 
 
-@njit(cache=True, fastmath=_FAST, **UNCOUNTED)
+@njit(cache=True, **UNCOUNTED)
+def forget_impulses(operator, given):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Clear the impulses (3 pad,) at the nodes of an operator."""
+    pad = len(given) // 3
+    for c in range(operator[5][NODES]):
+        for a in range(3):
+            given[a * pad + operator[3][c]] = 0.0
+
+
+@njit(cache=True, fastmath=_SUMS, **UNCOUNTED)
 def extrapolate(data, ahead, tolerance, floor):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Correct the share of a change (3 pad,) that was added to v, whose residual is r; `ahead` are the two.
 
@@ -53,20 +62,26 @@ def extrapolate(data, ahead, tolerance, floor):  # type: ignore[no-untyped-def] 
     error. Returns the square of the residual's norm at which the solver is to end, that of the v without any change reduced by the
     tolerance, but `floor` at least, and the share.
     """
-    _, _, mass, v, (_, r, p, q), inner, constrained = data[0]
+    _, _, mass, v, (_, r, _, _), inner, constrained = data[0]
     change, taken = ahead
-    for i in range(len(p)):
-        p[i] = change[i]
-    project(constrained, p, len(mass))
-    curvature = _product(data[0], p, q)
+    along, q, smoother, pad = inner[6], inner[POOL][3][0], inner[3], len(mass)
     for i in range(len(r)):
-        r[i] += taken * q[i]
-    goal = max(tolerance**2 * residual_norm(r, inner[3], constrained), floor)
-    portion = dot(p, r) / curvature if curvature > 0.0 else 0.0
-    for i in range(len(r)):
-        v[i] += (portion - taken) * p[i]
-        r[i] -= portion * q[i]
-    return goal, portion
+        along[i] = change[i]
+    project(constrained, along, pad)
+    curvature = _product(data[0])
+    project(constrained, q, pad)
+    both, square = 0.0, 0.0  # r . q and q . q in the inverse of the diagonal
+    work = 0.0
+    for a in range(3):
+        for i in range(pad):
+            at = a * pad + i
+            both += smoother[i] * r[at] * q[at]
+            square += smoother[i] * q[at] * q[at]
+            work += along[at] * r[at]
+    norm = residual_norm(r, smoother, constrained) + taken * (2.0 * both + taken * square)
+    portion = taken + work / curvature if curvature > 0.0 else 0.0
+    _move_along(v, r, along, q, portion - taken)
+    return max(tolerance**2 * norm, floor), portion
 
 
 @njit(cache=True, fastmath=_FAST, **UNCOUNTED)
@@ -113,29 +128,33 @@ def solve_exactly(data, goal, limit, given, plain, origin):  # type: ignore[no-u
 def settle_in_contact(data):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Do what `settle` does; single precision is enough for the small part of v that changes."""
     solver = data[0]
-    v, (_, r, p, q), operator = solver[3], solver[4], solver[5][OPERATOR]
+    v, (_, r, p, _), operator = solver[3], solver[4], solver[5][OPERATOR]
     if operator[5][FACES] == 0:
         return settle(data)
     lost = share(solver, ALIGN, 0.0)
     if lost >= 0.0:
         return lost
-    curvature = _product(solver, p, q)
+    along = solver[5][6]
+    for i in range(len(p)):
+        along[i] = p[i]
+    curvature = _product(solver)
     fraction = lost / curvature if curvature > 0.0 else 0.0
-    for i in range(len(v)):
-        v[i] += fraction * p[i]
-        r[i] -= fraction * q[i]
+    _move_along(v, r, along, solver[5][POOL][3][0], fraction)
     return 0.0
 
 
-@njit(cache=True, fastmath=_FAST, **UNCOUNTED)
-def _product(solver, p, q):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Set q to A p, in single precision, contacts included, and return p . q."""
+@njit(cache=True, **UNCOUNTED)
+def _product(solver):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Multiply p, in single precision, by the matrix, contacts included, and return p times that."""
     inner = solver[5]
     touched, along, product = inner[OPERATOR], inner[6], inner[POOL][3][0]
-    for i in range(len(p)):
-        along[i] = p[i]
     curvature = share(solver, MULTIPLY, 0.0)
-    curvature += add_contact(touched[0], touched[2], touched[5][FACES], 1.0, along, product)
-    for i in range(len(q)):
-        q[i] = product[i]
-    return curvature
+    return curvature + add_contact(touched[0], touched[2], touched[5][FACES], 1.0, along, product)
+
+
+@njit(cache=True, fastmath=_FAST, **UNCOUNTED)
+def _move_along(v, r, p, q, fraction):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Move v by a fraction of p, and its residual r likewise, by that of q."""
+    for i in range(len(v)):
+        v[i] += fraction * p[i]
+        r[i] -= fraction * q[i]

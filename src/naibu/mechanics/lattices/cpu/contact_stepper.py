@@ -169,7 +169,7 @@ class ContactStepper:
             history = (contact.mode, contact.touched, contact.compression, contact.extension, contact.friction, contact.multiplier)
             corners, spread, *rest = self.points
             surface = (corners, spread, self.surface.foundation(base.step), *rest)
-            vectors = tuple(np.zeros_like(base.position) for _ in range(5))
+            vectors = tuple(np.zeros_like(base.position) for _ in range(4))
             scratch = (*own, contact.acceleration, contact.lasting)
             known = base.constrained, data, packed(self._shapes(), surface, history, scratch, vectors)
             self._arguments[parts] = known
