@@ -28,7 +28,7 @@ from naibu.mechanics.lattices.cpu.implicit._solver_parts import OPERATOR
 
 AGREED = 1e-4  # error of the pressures, as a fraction of their sum, at which a step is settled
 AGREED_FRICTION = 2e-3  # likewise of the friction, of the sum of its limits
-ROUGHLY, ROUGH_PASSES = 0.1, 3  # reduction of the residual of a pass whose contacts may be far from those of the solution, and how many
+ROUGHLY, ROUGH_PASSES = 0.3, 2  # reduction of the residual of a pass whose contacts may be far from those of the solution, and how many
 
 
 @njit(cache=True)
