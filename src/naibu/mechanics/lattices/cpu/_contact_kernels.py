@@ -1,7 +1,8 @@
 """Implicit steps of a lattice in unilateral contact with Coulomb friction: a semismooth Newton iteration settles every step.
 
 The contact conditions hold at the quadrature points of the faces (`_contact_points`) for the solution at the end of the step. A pass solves
-a step with the contact linearized about the solution of the pass before, until what the points exert agrees with what they ought to.
+a step with the contact linearized about the solution of the pass before, until what the points exert agrees with what they ought to. The
+first passes are solved roughly, as inexact Newton methods do :cite:p:`eisenstat1996`; the last one is solved to the tolerance.
 """
 
 from __future__ import annotations
@@ -121,10 +122,10 @@ def contact_steps(data, contact, weight, motion, solver, reactions, most):  # ty
     (q, 5) and weights (p,) at the points, and where points (k + 1,) and shape functions (k + 1,) of each indenter begin; the arrays of
     `ContactState`; what `near_faces` lists, linearizations and what they exert, which points slide, slots of the nodes, their diagonal
     blocks, four numbers a node (4, k, n), the mean acceleration in the step before (3, n) and how much of it lasted (1,), which are
-    changed; and room for four vectors (3 pad,). Constrained components of `data` move by their weights times the velocities of their bodies;
-    `motion` are these (steps, bodies, 3), and velocities and angular velocities of the indenters (steps, k, 3); `solver` the limits of the
-    solver; `reactions` those of the bodies and of the indenters; `most` the most passes. Returns iterations, passes and the steps whose
-    contacts did not settle.
+    changed; and room for four vectors (3 pad,). Constrained components of `data` move by their weights times the velocities of their
+    bodies; `motion` are these (steps, bodies, 3), and velocities and angular velocities of the indenters (steps, k, 3); `solver` the
+    limits of the solver; `reactions` those of the bodies and of the indenters; `most` the most passes. Returns iterations, passes and the
+    steps whose contacts did not settle.
     """
     (_, _, mass, v, work, inner, now), (x, _, _, before, base, external, step) = data
     indenters, surface, history, scratch, (change, given, plain, origin) = contact

@@ -22,7 +22,7 @@ from naibu.mechanics.lattices.cpu.stepper import MOST_ITERATIONS, ImplicitSteppe
 from naibu.mechanics.lattices.model.contact_state import ContactState
 from naibu.mechanics.lattices.model.contact_surface import ContactSurface
 
-PASSES = 20  # solutions in a step, at most
+PASSES = 60  # solutions in a step, at most: in an impact in which points alternate between stick and slip, they approach slowly
 SECANT_STEPS = 12  # of the speed of an indenter that a force drives
 DEEP, ROUND = (
     0.5,
