@@ -159,6 +159,21 @@ def test_a_fast_thin_plate_does_not_pass_through(driven: bool) -> None:
         np.testing.assert_allclose(coarse.forces().indenters[0], mean, rtol=0.01, atol=0.01 * np.abs(mean).max())
 
 
+def test_passes_that_end_early_leave_forces_as_exact_as_the_tolerance_asks() -> None:
+    """Pressed and dragged to and fro: points begin to slip and stick again at each turn. A tolerance of 1e-8 allows no early end."""
+    found = []
+    for tolerance in (1e-8, 1e-2, 1e-4):
+        made = LatticeEngine.of(LATTICE, lattice_parameters(LATTICE, 40.0, 2.0, 100.0), tolerance=tolerance)
+        session = made.session(constrained=BOTTOM, indenters=[BALL])
+        session.step(motions=[IndenterVelocity((0.0, 0.0, -30.0))], steps=100)
+        paths = [IndenterVelocity((side * 60.0, 0.0, 0.0)) for side in (1.0, -1.0, 1.0) for _ in range(60)]
+        found.append(np.array([session.step(motions=[path]).indenters[0, 0] for path in paths]))
+        assert session.unsettled == 0
+        np.testing.assert_allclose(found[-1], found[0], rtol=0.0, atol=0.5 * tolerance * np.abs(found[0]).max())
+    drag, weight = found[0][:, 0], found[0][:, 2]
+    assert drag.max() > 0.2 * -weight.min() > 0.0 > -0.2 * -weight.min() > drag.min()  # it slid both ways
+
+
 def test_a_mesh_of_a_box_presses_as_the_box_does() -> None:
     corners = np.array([[x, y, z] for z in (-5, 5) for y in (-9, 9) for x in (-9, 9)], dtype=float)
     sides = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from naibu._numba.compilation import njit
+from naibu._numba.compilation import UNCOUNTED, njit
 from naibu.mechanics.contact._geometry_kernels import mesh_of
 from naibu.mechanics.lattices.cpu._contact_points import ALONG, FORCE, FREE, HARD, OWN, SLIDE, STICK, TANGENT, TOUCHING, gap_of
 
@@ -56,12 +56,12 @@ def pull_off(count, x, v, step, mass, indenters, motion, surface, history, lists
                         base[a * pad + corners[f, c]] -= step * force * n[a] * shape[c]
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def keep(count, indenters, surface, history, lists, slid, found, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add up the forces of the indenters, mN, and leave the history of the contact as it is at the end of the step."""
     _, _, friction, pull, form = indenters
     corners, _, foundation, shapes, weights, first, rule = surface
-    _, touched, compression, extension, _, multiplier = history
+    mode, touched, compression, extension, _, multiplier = history
     for entry in range(count):
         k, f = lists[0][entry], lists[1][entry]
         each, left = rule[k + 1] - rule[k], False
@@ -69,6 +69,9 @@ def keep(count, indenters, surface, history, lists, slid, found, reaction):  # t
         for g in range(each):
             p, shape = first[k] + f * each + g, shapes[rule[k] + g]
             before = compression[p]
+            if found[p, TOUCHING] == 0.0 and before == 0.0 and extension[p] == 0.0 and mode[p] == FREE:
+                left |= touched[p] and pull[k, 2] > 0.0
+                continue
             compression[p] -= spring / stiff * extension[p]
             if found[p, TOUCHING] > 0.0:
                 carried = 0.0
@@ -87,7 +90,7 @@ def keep(count, indenters, surface, history, lists, slid, found, reaction):  # t
         lists[4][k, f] = left
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def update_multipliers(count, surface, multiplier, lists, found, nodal):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Give the nodes what the foundation carries besides their multipliers (k, n), as far as the area around them is covered.
 
@@ -136,7 +139,7 @@ def update_multipliers(count, surface, multiplier, lists, found, nodal):  # type
                 largest[k, i] = -1.0
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _keep_friction(p, k, result, weight, friction, slid, history, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Keep friction and mode of a point, and add what it exerts to the reaction of its indenter k."""
     mode, touched, _, _, traction, _ = history

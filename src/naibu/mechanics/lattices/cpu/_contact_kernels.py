@@ -1,7 +1,8 @@
 """Implicit steps of a lattice in unilateral contact with Coulomb friction: a semismooth Newton iteration settles every step.
 
 The contact conditions hold at the quadrature points of the faces (`_contact_points`) for the solution at the end of the step. A pass solves
-a step with the contact linearized about the solution of the pass before, until what the points exert agrees with what they ought to.
+a step with the contact linearized about the solution of the pass before, until what the points exert agrees with what they ought to. The
+first passes are solved roughly, as inexact Newton methods do :cite:p:`eisenstat1996`; the last one is solved to the tolerance.
 """
 
 from __future__ import annotations
@@ -10,58 +11,70 @@ import numpy as np
 
 from naibu._numba.compilation import njit
 from naibu.mechanics.lattices.cpu._contact_history import keep, pull_off, update_multipliers
-from naibu.mechanics.lattices.cpu._contact_operator import FACES, NODES, add_contact, close_operator
-from naibu.mechanics.lattices.cpu._contact_points import SLIDE, assemble, look, near_faces
-from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import begin_with
-from naibu.mechanics.lattices.cpu.implicit._implicit_kernels import (
-    add_momenta,
-    add_reactions,
-    advance,
-    extrapolated_velocity,
-    improved_velocity,
+from naibu.mechanics.lattices.cpu._contact_operator import FACES, NODES, close_operator
+from naibu.mechanics.lattices.cpu._contact_points import SLIDE, assemble, look, near_faces, new_room
+from naibu.mechanics.lattices.cpu._contact_solver import (
+    change_contacts,
+    extrapolate,
+    forget_impulses,
+    plain_residual,
+    settle_in_contact,
+    solve_exactly,
+    solve_roughly,
 )
+from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import begin_with
+from naibu.mechanics.lattices.cpu.implicit._implicit_kernels import add_momenta, add_reactions, advance
+from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import residual_norm
 from naibu.mechanics.lattices.cpu.implicit._solver_parts import OPERATOR
 
 AGREED = 1e-4  # error of the pressures, as a fraction of their sum, at which a step is settled
 AGREED_FRICTION = 2e-3  # likewise of the friction, of the sum of its limits
+ROUGHLY, ROUGH_PASSES = 0.3, 2  # reduction of the residual of a pass whose contacts may be far from those of the solution, and how many
 
 
 @njit(cache=True)
-def _settle(engine, contact, base, right, ahead, smoother, most):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _settle(engine, contact, vectors, ahead, smoother, most):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Solve a step until its contacts agree with the solution; return iterations, passes, what the solver lost, and whether they agree.
 
-    The first pass reduces the residual by the tolerance; those that follow, whose contacts differ little, reduce theirs to the same size.
+    A pass whose contacts may be far from those of the solution reduces the residual by `ROUGHLY` only; the last one by the tolerance of
+    the solver, from the velocity of the step before.
 
-    `engine` are the data of the step, with `right` among them, and the limits of the solver; `contact` what `look` takes behind the step,
-    and what is scratch; `base` the right side without contact (3 pad,); `ahead` what the velocity changed by in the step before (3 pad,),
-    and the share of it that was added to v. Returns last the share that was right.
+    `engine` are the data of the step and the limits of the solver; `contact` what `look` takes behind the step, and what is scratch;
+    `vectors` room for impulses of contact, zero, and two more (3 pad,); `ahead` what the velocity changed by in the step before
+    (3 pad,), and the share of it that was added to v. Returns last the share that was right.
     """
-    data, solver = engine
+    data, (tolerance, limit) = engine
     v, (_, r, _, _), inner = data[0][3], data[0][4], data[0][5]
     x, step = data[1][0], data[1][6]
-    count, indenters, motion, surface, history, lists, slid, points, slot, diagonal = contact
+    count, indenters, motion, surface, history, lists, slid, points, slot, diagonal, room = contact
+    given, plain, origin = vectors
     operator = inner[OPERATOR]
-    iterations, lost, goal, share = 0, 0.0, 0.0, 0.0
+    iterations, lost, goal, share, ended = 0, 0.0, 0.0, 0.0, False
     for attempt in range(-1, most):  # before the first solution, points are linearized about the velocity as it is
         if attempt >= 0:
+            floor = 0.0
             if attempt:  # the residual of the same solution with other contacts
-                add_contact(operator[0], operator[1], operator[5][FACES], 1.0, v, r)
-                for i in range(len(r)):
-                    r[i] -= right[i]
-            right[:] = base
-            assemble(count, step, surface, lists, points[0], right, operator)
+                change_contacts(data, given, -1.0)
+            forget_impulses(operator, given)
+            if not attempt:
+                floor = plain_residual(data, plain, origin)
+            assemble(count, step, surface, lists, points[0], given, operator)
             close_operator(operator, smoother, slot, diagonal)
-            if attempt:
-                for i in range(len(r)):
-                    r[i] += right[i]
-                add_contact(operator[0], operator[1], operator[5][FACES], -1.0, v, r)
-                done, lost = improved_velocity(data, goal, solver[1])
+            change_contacts(data, given, 1.0)
+            if not attempt:
+                goal, share = extrapolate(data, ahead, tolerance, floor)
+            rough = ROUGHLY**2 * residual_norm(r, smoother, data[0][6])
+            ended = rough <= goal or attempt >= min(ROUGH_PASSES, most - 1)
+            if ended:
+                iterations += solve_exactly(data, goal, limit, given, plain, origin)
+                lost = settle_in_contact(data)
             else:
-                done, lost, goal, share = extrapolated_velocity(data, ahead, solver)
-            iterations += done
+                iterations += solve_roughly(data[0], rough, limit)
         begins = attempt < 0
-        wrong, wrong_friction, total, limits = look(count, x, v, step, indenters, motion, surface, history, lists, slid, points, begins)
-        if not begins and wrong <= AGREED * total and wrong_friction <= AGREED_FRICTION * limits + 1e-300:
+        wrong, wrong_friction, total, limits = look(
+            count, x, v, step, indenters, motion, surface, history, lists, slid, points, begins, room
+        )
+        if ended and wrong <= AGREED * total and wrong_friction <= AGREED_FRICTION * limits + 1e-300:
             return iterations, attempt + 1, lost, True, share
     return iterations, most, lost, False, share
 
@@ -109,20 +122,21 @@ def contact_steps(data, contact, weight, motion, solver, reactions, most):  # ty
     (q, 5) and weights (p,) at the points, and where points (k + 1,) and shape functions (k + 1,) of each indenter begin; the arrays of
     `ContactState`; what `near_faces` lists, linearizations and what they exert, which points slide, slots of the nodes, their diagonal
     blocks, four numbers a node (4, k, n), the mean acceleration in the step before (3, n) and how much of it lasted (1,), which are
-    changed; and room for two vectors (3 pad,). Constrained components of `data` move by their weights times the velocities of their bodies;
-    `motion` are these (steps, bodies, 3), and velocities and angular velocities of the indenters (steps, k, 3); `solver` the limits of the
-    solver; `reactions` those of the bodies and of the indenters; `most` the most passes. Returns iterations, passes and the steps whose
-    contacts did not settle.
+    changed; and room for four vectors (3 pad,). Constrained components of `data` move by their weights times the velocities of their
+    bodies; `motion` are these (steps, bodies, 3), and velocities and angular velocities of the indenters (steps, k, 3); `solver` the
+    limits of the solver; `reactions` those of the bodies and of the indenters; `most` the most passes. Returns iterations, passes and the
+    steps whose contacts did not settle.
     """
-    (_, _, mass, v, work, inner, now), (x, _, _, before, right, external, step) = data
-    indenters, surface, history, scratch, (base, change) = contact
+    (_, _, mass, v, work, inner, now), (x, _, _, before, base, external, step) = data
+    indenters, surface, history, scratch, (change, given, plain, origin) = contact
     (_, axes), centres, _, _, _ = indenters
     held_velocity, velocity, spin = motion
     lists, points, slid, slot, diagonal, nodal, trend, trust = scratch
     operator, first = inner[OPERATOR], surface[5]
-    change[:] = 0.0
+    change[:], given[:] = 0.0, 0.0
     pad = len(mass)
     iterations, passes, unsettled = 0, 0, 0
+    room = new_room()
     begin_with(inner, now)
     for n in range(len(velocity)):
         before[:] = v
@@ -140,12 +154,12 @@ def contact_steps(data, contact, weight, motion, solver, reactions, most):  # ty
             k, each = lists[0][entry], surface[6][lists[0][entry] + 1] - surface[6][lists[0][entry]]
             for p in range(first[k] + lists[1][entry] * each, first[k] + (lists[1][entry] + 1) * each):
                 slid[p] = history[0][p] == SLIDE
-        found = (count, indenters, moving, surface, history, lists, slid, points, slot, diagonal)
+        found = (count, indenters, moving, surface, history, lists, slid, points, slot, diagonal, room)
         for a in range(3):
             for i in range(trend.shape[1]):
                 change[a * pad + i] = step * trend[a, i]
                 v[a * pad + i] += trust[0] * change[a * pad + i]
-        done, tries, lost, agreed, share = _settle((data, solver), found, base, right, (change, trust[0]), inner[3], most)
+        done, tries, lost, agreed, share = _settle((data, solver), found, (given, plain, origin), (change, trust[0]), inner[3], most)
         trust[0] = min(max(share, 0.0), 1.0)
         for a in range(3):
             for i in range(trend.shape[1]):

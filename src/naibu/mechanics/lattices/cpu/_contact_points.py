@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from naibu._numba.compilation import njit
+from naibu._numba.compilation import UNCOUNTED, njit
 from naibu.mechanics.contact._geometry_kernels import MESH, SPHERE, distance_from_primitive, mesh_of, signed_distance
 from naibu.mechanics.lattices.cpu._contact_operator import FACES
 
@@ -132,7 +132,14 @@ def _combine(shape, values, out):  # type: ignore[no-untyped-def]  # pragma: no 
 
 
 @njit(cache=True)
-def look(count, x, v, step, indenters, motion, surface, history, lists, slid, points, begins):  # type: ignore[no-untyped-def]  # pragma: no cover
+def new_room():  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return small arrays for `look`."""
+    nodes, vectors = np.empty((2, 4, 3)), np.empty((6, 3))
+    return (nodes[0], nodes[1]), np.empty(4), (vectors[0], vectors[1], vectors[2], vectors[3], vectors[4], vectors[5]), np.empty((0, 0))
+
+
+@njit(cache=True, **UNCOUNTED)
+def look(count, x, v, step, indenters, motion, surface, history, lists, slid, points, begins, room):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Linearize all points of the listed faces about the velocity v, having found what the linearization before gave at it.
 
     `slid` (p,) says which points slide; `points` are the linearizations (p, COLUMNS) and what they exert (p, RESULTS). Returns how much
@@ -143,9 +150,7 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
     corners, _, foundation, shapes, weights, first, rule = surface
     _, _, compression, extension, traction, multiplier = history
     linear, found = points
-    across = np.empty(3)
-    at, speed, share = np.empty((4, 3)), np.empty((4, 3)), np.empty(4)
-    slip, d, q, m, n, none = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty((0, 0))
+    (at, speed), share, (across, slip, d, q, m, n), none = room
     wrong, wrong_friction, total, limits = 0.0, 0.0, 0.0, 0.0
     for entry in range(count):
         k, f = lists[0][entry], lists[1][entry]

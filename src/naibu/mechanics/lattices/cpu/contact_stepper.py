@@ -22,7 +22,7 @@ from naibu.mechanics.lattices.cpu.stepper import MOST_ITERATIONS, ImplicitSteppe
 from naibu.mechanics.lattices.model.contact_state import ContactState
 from naibu.mechanics.lattices.model.contact_surface import ContactSurface
 
-PASSES = 20  # solutions in a step, at most
+PASSES = 60  # solutions in a step, at most: in an impact in which points alternate between stick and slip, they approach slowly
 SECANT_STEPS = 12  # of the speed of an indenter that a force drives
 DEEP, ROUND = (
     0.5,
@@ -169,7 +169,7 @@ class ContactStepper:
             history = (contact.mode, contact.touched, contact.compression, contact.extension, contact.friction, contact.multiplier)
             corners, spread, *rest = self.points
             surface = (corners, spread, self.surface.foundation(base.step), *rest)
-            vectors = tuple(np.zeros_like(base.position) for _ in range(2))
+            vectors = tuple(np.zeros_like(base.position) for _ in range(4))
             scratch = (*own, contact.acceleration, contact.lasting)
             known = base.constrained, data, packed(self._shapes(), surface, history, scratch, vectors)
             self._arguments[parts] = known

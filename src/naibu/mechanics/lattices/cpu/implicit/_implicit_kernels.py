@@ -22,7 +22,7 @@ from naibu._numba.simd import WIDTH, load, splat, store
 from naibu._numba.thread_pool import begin_step, end_step
 from naibu.mechanics.lattices.cpu._contact_operator import FACES, add_contact
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import begin_with, follow
-from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import dot, multiply, project, residual_norm, solve
+from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import dot, solve
 from naibu.mechanics.lattices.cpu.implicit._solver_parts import ALIGN, CHANGE, FURTHER, MULTIPLY_FULL, NORM, OPERATOR, POOL, share, summed
 from naibu.mechanics.lattices.cpu.implicit._step_parts import CONSTRAIN, EXTEND, LIMIT, MOVE, PREPARE, START, share_step
 
@@ -115,7 +115,7 @@ def add_momenta(mass, v, sign, right):  # type: ignore[no-untyped-def]  # pragma
 
 
 @njit(cache=True, **UNCOUNTED)
-def _first_residual(data):  # type: ignore[no-untyped-def]  # pragma: no cover
+def first_residual(data):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Constrain v and set r to its residual; return the square of the norm below which rounding rules."""
     solver = data[0]
     v, r, inner, constrained = solver[3], solver[4][1], solver[5], solver[6]
@@ -140,34 +140,9 @@ def new_velocity(data, limits):  # type: ignore[no-untyped-def]  # pragma: no co
     Leaves in r minus the impulses that hold the nodes; returns the number of iterations, the energy that the early end of the solver
     dissipates, mN mm, and the square of the residual's norm at which it ended, for `improved_velocity`.
     """
-    floor = _first_residual(data)
+    floor = first_residual(data)
     goal = max(limits[0] ** 2 * share(data[0], NORM, 0.0), floor)
     return *improved_velocity(data, goal, limits[1]), goal
-
-
-@njit(cache=True, fastmath=_FAST, **UNCOUNTED)
-def extrapolated_velocity(data, ahead, limits):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Do what `new_velocity` does for a v to which a share of a change (3 pad,) was added; `ahead` are the two.
-
-    The residual goes down to the same size as from the v without it, for which extrapolated motion is often nearly enough
-    :cite:p:`fischer1998`. The share becomes that which leaves the least energy norm of the error; it is returned last.
-    """
-    blocks, tables, mass, v, (axes, r, p, q), inner, constrained = data[0]
-    touched, (change, taken) = inner[OPERATOR], ahead
-    floor = _first_residual(data)
-    for i in range(len(p)):
-        p[i] = change[i]
-    project(constrained, p, len(mass))
-    curvature = multiply(blocks, tables[5], axes, mass, p, q)
-    curvature += add_contact(touched[0], touched[1], touched[5][FACES], 1.0, p, q)
-    for i in range(len(r)):
-        r[i] += taken * q[i]
-    goal = max(limits[0] ** 2 * residual_norm(r, inner[3], constrained), floor)
-    portion = dot(p, r) / curvature if curvature > 0.0 else 0.0
-    for i in range(len(r)):
-        v[i] += (portion - taken) * p[i]
-        r[i] -= portion * q[i]
-    return *improved_velocity(data, goal, limits[1]), goal, portion
 
 
 @njit(cache=True, **UNCOUNTED)

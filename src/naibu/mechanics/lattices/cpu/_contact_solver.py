@@ -1,0 +1,160 @@
+"""Velocities of a step in contact whose contacts change from pass to pass, by one thread.
+
+A pass that may not be the last one ends early, with the residual that conjugate gradients in single precision carry along. The lattice
+is multiplied in double precision once, at the end: by what all passes changed.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from naibu._numba.compilation import UNCOUNTED, njit
+from naibu.mechanics.lattices.cpu._contact_operator import FACES, NODES, add_contact
+from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import CREDIT
+from naibu.mechanics.lattices.cpu.implicit._implicit_kernels import first_residual, settle
+from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import conjugate_gradients, multiply, project, residual_norm
+from naibu.mechanics.lattices.cpu.implicit._solver_parts import ALIGN, MULTIPLY, NORM, OPERATOR, POOL, share
+
+_FAST, _SUMS = {"contract", "nsz"}, {"contract", "nsz", "reassoc"}
+_ROUNDS = 8  # of conjugate gradients, at most, between which the residual is computed in double precision
+
+
+@njit(cache=True, fastmath=_FAST, **UNCOUNTED)
+def plain_residual(data, plain, origin):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Constrain v; keep it in `origin`, and its residual without contact in `plain`, both (3 pad,).
+
+    Returns the square of the norm below which rounding rules.
+    """
+    v, r, counts = data[0][3], data[0][4][1], data[0][5][OPERATOR][5]
+    counts[FACES], counts[NODES] = 0, 0
+    floor = first_residual(data)
+    for i in range(len(v)):
+        plain[i], origin[i] = r[i], v[i]
+    return floor
+
+
+@njit(cache=True, fastmath=_FAST, **UNCOUNTED)
+def change_contacts(data, given, sign):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add what the contacts exert at the velocity v to its residual, with a sign; `given` are their impulses at no velocity (3 pad,)."""
+    v, r, operator = data[0][3], data[0][4][1], data[0][5][OPERATOR]
+    pad = len(r) // 3
+    for c in range(operator[5][NODES]):
+        i = operator[3][c]
+        for a in range(3):
+            r[a * pad + i] += sign * given[a * pad + i]
+    add_contact(operator[0], operator[1], operator[5][FACES], -sign, v, r)
+
+
+@njit(cache=True, **UNCOUNTED)
+def forget_impulses(operator, given):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Clear the impulses (3 pad,) at the nodes of an operator."""
+    pad = len(given) // 3
+    for c in range(operator[5][NODES]):
+        for a in range(3):
+            given[a * pad + operator[3][c]] = 0.0
+
+
+@njit(cache=True, fastmath=_SUMS, **UNCOUNTED)
+def extrapolate(data, ahead, tolerance, floor):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Correct the share of a change (3 pad,) that was added to v, whose residual is r; `ahead` are the two.
+
+    Extrapolated motion is often nearly enough :cite:p:`fischer1998`. The share becomes that which leaves the least energy norm of the
+    error. Returns the square of the residual's norm at which the solver is to end, that of the v without any change reduced by the
+    tolerance, but `floor` at least, and the share.
+    """
+    _, _, mass, v, (_, r, _, _), inner, constrained = data[0]
+    change, taken = ahead
+    along, q, smoother, pad = inner[6], inner[POOL][3][0], inner[3], len(mass)
+    for i in range(len(r)):
+        along[i] = change[i]
+    project(constrained, along, pad)
+    curvature = _product(data[0])
+    project(constrained, q, pad)
+    both, square = 0.0, 0.0  # r . q and q . q in the inverse of the diagonal
+    work = 0.0
+    for a in range(3):
+        for i in range(pad):
+            at = a * pad + i
+            both += smoother[i] * r[at] * q[at]
+            square += smoother[i] * q[at] * q[at]
+            work += along[at] * r[at]
+    norm = residual_norm(r, smoother, constrained) + taken * (2.0 * both + taken * square)
+    portion = taken + work / curvature if curvature > 0.0 else 0.0
+    _move_along(v, r, along, q, portion - taken)
+    return max(tolerance**2 * norm, floor), portion
+
+
+@njit(cache=True, fastmath=_FAST, **UNCOUNTED)
+def solve_roughly(solver, goal, limit):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Improve v, whose residual is r, until the square of the residual's norm is below `goal`, in single precision.
+
+    Leaves in r the free part of the residual, as conjugate gradients carry it along. Returns the number of iterations.
+    """
+    v, r, inner = solver[3], solver[4][1], solver[5]
+    w, rough, memory = inner[4], inner[5], inner[8][5][2]
+    norm = share(solver, NORM, 0.0)
+    if not norm > goal:
+        return 0
+    unit = np.sqrt(norm)
+    count, _ = conjugate_gradients(solver, unit, max(0.9 * goal / norm, 1e-10), limit, len(memory) > 0)
+    for i in range(len(v)):
+        v[i] += unit * w[i]
+        r[i] = unit * rough[i]
+    if len(memory):
+        memory[CREDIT] += count
+    return count
+
+
+@njit(cache=True, fastmath=_FAST, **UNCOUNTED)
+def solve_exactly(data, goal, limit, given, plain, origin):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Improve v until the square of the norm of its residual, in double precision, is below `goal`; returns the number of iterations."""
+    solver = data[0]
+    blocks, tables, mass, v, (axes, r, p, q), _, _ = solver
+    count = 0
+    for _ in range(_ROUNDS):
+        count += solve_roughly(solver, goal, limit - count)
+        for i in range(len(v)):
+            p[i] = v[i] - origin[i]
+        multiply(blocks, tables[5], axes, mass, p, q)
+        for i in range(len(r)):
+            r[i] = plain[i] - q[i]
+        change_contacts(data, given, 1.0)
+        if count >= limit or not share(solver, NORM, 0.0) > goal:
+            break
+    return count
+
+
+@njit(cache=True, fastmath=_FAST, **UNCOUNTED)
+def settle_in_contact(data):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Do what `settle` does; single precision is enough for the small part of v that changes."""
+    solver = data[0]
+    v, (_, r, p, _), operator = solver[3], solver[4], solver[5][OPERATOR]
+    if operator[5][FACES] == 0:
+        return settle(data)
+    lost = share(solver, ALIGN, 0.0)
+    if lost >= 0.0:
+        return lost
+    along = solver[5][6]
+    for i in range(len(p)):
+        along[i] = p[i]
+    curvature = _product(solver)
+    fraction = lost / curvature if curvature > 0.0 else 0.0
+    _move_along(v, r, along, solver[5][POOL][3][0], fraction)
+    return 0.0
+
+
+@njit(cache=True, **UNCOUNTED)
+def _product(solver):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Multiply p, in single precision, by the matrix, contacts included, and return p times that."""
+    inner = solver[5]
+    touched, along, product = inner[OPERATOR], inner[6], inner[POOL][3][0]
+    curvature = share(solver, MULTIPLY, 0.0)
+    return curvature + add_contact(touched[0], touched[2], touched[5][FACES], 1.0, along, product)
+
+
+@njit(cache=True, fastmath=_FAST, **UNCOUNTED)
+def _move_along(v, r, p, q, fraction):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Move v by a fraction of p, and its residual r likewise, by that of q."""
+    for i in range(len(v)):
+        v[i] += fraction * p[i]
+        r[i] -= fraction * q[i]
