@@ -1,15 +1,16 @@
 """Implicit steps of a lattice in unilateral contact with Coulomb friction: a semismooth Newton iteration settles every step.
 
 The contact conditions hold at the quadrature points of the faces (`_contact_points`) for the solution at the end of the step. A pass solves
-a step with the contact linearized about the solution of the pass before, until what the points exert agrees with what they ought to. The
-first passes are solved roughly, as inexact Newton methods do :cite:p:`eisenstat1996`; the last one is solved to the tolerance.
+a step with the contact linearized about the solution of the pass before, until what the points exert agrees with what they ought to.
+Where the tolerance is loose, the first passes are solved roughly, as inexact Newton methods do :cite:p:`eisenstat1996`; the last one is
+solved to the tolerance.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from naibu._numba.compilation import njit
+from naibu._numba.compilation import UNCOUNTED, njit
 from naibu.mechanics.lattices.cpu._contact_history import keep, pull_off, update_multipliers
 from naibu.mechanics.lattices.cpu._contact_operator import FACES, NODES, close_operator
 from naibu.mechanics.lattices.cpu._contact_points import SLIDE, assemble, look, near_faces, new_room
@@ -29,15 +30,27 @@ from naibu.mechanics.lattices.cpu.implicit._solver_parts import OPERATOR
 
 AGREED = 1e-4  # error of the pressures, as a fraction of their sum, at which a step is settled
 AGREED_FRICTION = 2e-3  # likewise of the friction, of the sum of its limits
+LOOSE = 5e-3  # tolerance from which on passes may be rough; with a tighter one, no early end is to decide which points slip
 ROUGHLY, ROUGH_PASSES = 0.3, 2  # reduction of the residual of a pass whose contacts may be far from those of the solution, and how many
+
+
+@njit(cache=True, **UNCOUNTED)
+def _slid_before(count, surface, history, lists, slid):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set which points of the listed faces slid at the end of the step before."""
+    first, rule = surface[5], surface[6]
+    for entry in range(count):
+        k = lists[0][entry]
+        each = rule[k + 1] - rule[k]
+        for p in range(first[k] + lists[1][entry] * each, first[k] + (lists[1][entry] + 1) * each):
+            slid[p] = history[0][p] == SLIDE
 
 
 @njit(cache=True)
 def _settle(engine, contact, vectors, ahead, smoother, most):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Solve a step until its contacts agree with the solution; return iterations, passes, what the solver lost, and whether they agree.
 
-    A pass whose contacts may be far from those of the solution reduces the residual by `ROUGHLY` only; the last one by the tolerance of
-    the solver, from the velocity of the step before.
+    A pass whose contacts may be far from those of the solution reduces the residual by `ROUGHLY` only, with a tolerance from `LOOSE` on;
+    the last one by the tolerance of the solver, from the velocity of the step before.
 
     `engine` are the data of the step and the limits of the solver; `contact` what `look` takes behind the step, and what is scratch;
     `vectors` room for impulses of contact, zero, and two more (3 pad,); `ahead` what the velocity changed by in the step before
@@ -49,7 +62,7 @@ def _settle(engine, contact, vectors, ahead, smoother, most):  # type: ignore[no
     count, indenters, motion, surface, history, lists, slid, points, slot, diagonal, room = contact
     given, plain, origin = vectors
     operator = inner[OPERATOR]
-    iterations, lost, goal, share, ended = 0, 0.0, 0.0, 0.0, False
+    iterations, lost, goal, share, ended, ended_before = 0, 0.0, 0.0, 0.0, False, False
     for attempt in range(-1, most):  # before the first solution, points are linearized about the velocity as it is
         if attempt >= 0:
             floor = 0.0
@@ -64,13 +77,15 @@ def _settle(engine, contact, vectors, ahead, smoother, most):  # type: ignore[no
             if not attempt:
                 goal, share = extrapolate(data, ahead, tolerance, floor)
             rough = ROUGHLY**2 * residual_norm(r, smoother, data[0][6])
-            ended = rough <= goal or attempt >= min(ROUGH_PASSES, most - 1)
+            ended = tolerance < LOOSE or rough <= goal or attempt >= min(ROUGH_PASSES, most - 1)
             if ended:
                 iterations += solve_exactly(data, goal, limit, given, plain, origin)
                 lost = settle_in_contact(data)
             else:
                 iterations += solve_roughly(data[0], rough, limit)
-        begins = attempt < 0
+        if attempt > 0 and not ended_before:  # what begins to slip is not decided by a rough solution
+            _slid_before(count, surface, history, lists, slid)
+        begins, ended_before = attempt < 0, ended
         wrong, wrong_friction, total, limits = look(
             count, x, v, step, indenters, motion, surface, history, lists, slid, points, begins, room
         )
@@ -150,10 +165,7 @@ def contact_steps(data, contact, weight, motion, solver, reactions, most):  # ty
         count = near_faces(x, v, step, indenters, moving, surface, lists)
         pull_off(count, x, v, step, mass, indenters, moving, surface, history, lists, base, reactions[1][n])
         add_momenta(mass, v, 1.0, base)
-        for entry in range(count):
-            k, each = lists[0][entry], surface[6][lists[0][entry] + 1] - surface[6][lists[0][entry]]
-            for p in range(first[k] + lists[1][entry] * each, first[k] + (lists[1][entry] + 1) * each):
-                slid[p] = history[0][p] == SLIDE
+        _slid_before(count, surface, history, lists, slid)
         found = (count, indenters, moving, surface, history, lists, slid, points, slot, diagonal, room)
         for a in range(3):
             for i in range(trend.shape[1]):
