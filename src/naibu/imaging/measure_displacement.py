@@ -307,11 +307,12 @@ def _joined(measured: Sequence[MeasuredDisplacement], inside: BoolArray) -> Meas
     blocks = [one.blocks for one in measured if one.blocks is not None]
     each = [np.concatenate([getattr(b, name) for b in blocks]) for name in ("points", "vectors", "covariance")]
     parts = sum(bool(one.mask.any()) for one in measured)
+    told = f"{parts - 1} part(s) of the object, of another intensity than the rest, have a field of their own: they slide on it."
     return replace(
         first,
         displacement=DisplacementField.on_grid(first.displacement.grid, vectors, covariance=covariance, valid=valid),
         mask=inside, gradient=gradient, strain_sd=strain_sd, facts=first.facts | {"parts": parts},
-        warnings=tuple(dict.fromkeys(told for one in measured for told in one.warnings)),
+        warnings=tuple(dict.fromkeys([told, *(doubt for one in measured for doubt in one.warnings)])),
         blocks=DisplacementField.from_arrays(each[0], each[1], covariance=each[2]),
     )  # fmt: skip
 
