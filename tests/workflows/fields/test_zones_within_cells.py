@@ -59,13 +59,13 @@ def labels() -> Volume:
     return Volume.from_array(numbers, spacing_mm=(2.0,) * 3, origin_mm=(1.0,) * 3)
 
 
-def identified(folder: Path, seed: int) -> FieldIdentification:
+def identified(folder: Path, seed: int, sd_mm: float = SD_MM) -> FieldIdentification:
     """Identify the limb in cubes of 8 mm, wider than its skin, from the field under the plate."""
     mesh, u = limb()
     rng = np.random.default_rng(seed)
     points = rng.uniform(0.5, SIDE_MM - 0.5, (2500, 3))
-    moved = interpolation_operator(mesh, points) @ u + SD_MM * rng.standard_normal(points.shape)
-    write_field(folder / "field.h5", DisplacementField.from_arrays(points, moved, sd_mm=SD_MM))
+    moved = interpolation_operator(mesh, points) @ u + sd_mm * rng.standard_normal(points.shape)
+    write_field(folder / "field.h5", DisplacementField.from_arrays(points, moved, sd_mm=sd_mm))
     write_volume(folder / "labels.mha", labels())
     return identify_fields(
         folder / "field.h5", zones=folder / "labels.mha", zone_names=NAMES, known=["pad=10 kPa, 0.45"], element_size_mm=8.0
@@ -81,6 +81,14 @@ def test_intervals_hold_the_moduli_of_a_skin_thinner_than_cubes(tmp_path: Path, 
         assert low < TRUTH[name][0] < high
     assert run.estimate.young_modulus[1] < 4.0
     assert "as much is part of their standard deviations" in " ".join(run.cautions)
+
+
+def test_a_determined_modulus_that_half_the_size_of_cubes_moves_is_no_result(tmp_path: Path) -> None:
+    """Noise of 0.2 mm leaves the shear modulus of the skin to a third; half the size of cubes halves it."""
+    found = identified(tmp_path, 6, sd_mm=0.2).estimate
+    assert found.mesh_shift is not None and found.mesh_shift[1] < -0.5 and found.budget is not None and found.budget.noise[1] < 0.5
+    assert found.verdict is not None and not found.verdict.ok
+    assert "use smaller ones" in found.identifiability[0]
 
 
 def test_a_prediction_mixes_what_lies_in_cubes_as_the_identification_does(tmp_path: Path) -> None:

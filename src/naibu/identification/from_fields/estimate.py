@@ -67,8 +67,9 @@ from naibu.identification.from_fields.regularization_weight import WeightChoice,
 from naibu.identification.from_fields.truncated_newton import truncated_step
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, report, resolution, resolution_report
 from naibu.identification.from_fields.verdict import inflation, verdict
+from naibu.identification.from_fields.verdict_within_cells import HalfSize, judged_within_cells
 from naibu.identification.load_case import require_load_cases
-from naibu.identification.verdict import Explanation, Verdict
+from naibu.identification.verdict import Explanation
 
 FEW = 12  # zones up to which no penalty is needed by default
 START_POISSON_RATIO = 0.4
@@ -76,7 +77,6 @@ TOO_COARSE = "The elements are too coarse for extrapolation to be trusted, and i
 MOST_UNKNOWNS = 120_000  # nodal displacements of the quadratic elements with which regions of a map are refitted
 SEARCH_AT_WEIGHT = SearchSettings(max_iterations=15, tolerance=1e-3)
 AT_BOUND = 3.7  # standard deviation of ln(kappa / mu) where it is at its bound: half of the way down to that of a Poisson's ratio of 0
-WITHIN = 0.5  # change of a logarithm where zones end inside of cells, from which a linear correction is worth nothing
 UNEXPLAINED = 3.0  # standard deviations of chi squared by which regions may fit worse than the regularised field
 
 
@@ -358,7 +358,7 @@ class _Recipe:
         of_noise = Uncertainty(of_noise.information / shared, of_noise.covariance * shared)
         if refined is not None:
             of_noise = of_noise.with_added(factor**2 * shared * (refined.covariance - refined.at_these_borders))
-        of_noise = of_noise.stretched(stretch)
+        on_mesh, of_noise = of_noise, of_noise.stretched(stretch)
         others = assumptions(at, quadratic, self.law)
         of_known = covariance_of(others, len(theta)) * np.outer(stretch, stretch)
         of_mesh, total, coarse = np.full(len(theta), np.nan), of_noise.with_added(of_known), False
@@ -370,11 +370,12 @@ class _Recipe:
         total = total.with_added(np.diag(self._doubt_at_bounds(theta) ** 2))
         judged = verdict(model.observed, residuals, freedom)
         if self.region_at is not None and shift is not None:
-            judged = _judged_within(judged, shift)
+            half = HalfSize(point.theta, theta, on_mesh, beyond_noise=(point.misfit - freedom, misfit - freedom))
+            judged = judged_within_cells(judged, model.zones.names, half)
         budget = ErrorBudget(of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), shared)
         sure = judged.explanation is Explanation.EXPLAINED and not coarse
         how_well = report(model.zones, theta, total, budget=budget, usable=judged.ok, sure=sure)
-        words = (judged.sentence, *how_well, *effects(others, model.zones, theta, intervals(theta, total)[0]))
+        words = (judged.sentence, *judged.notes, *how_well, *effects(others, model.zones, theta, intervals(theta, total)[0]))
         if coarse:
             words = (words[0], TOO_COARSE, *words[1:])
         states = tuple(u[: model.mesh.n_points] for u in point.states)
@@ -408,12 +409,3 @@ class _Recipe:
         most = 100.0 * float(np.abs(young / before - 1.0).max())
         self.record(f"half the element size: Young's modulus changes by up to {most:.2g} % when extrapolated to vanishing size")
         return theta, finer.residuals, theta - fitted
-
-
-def _judged_within(judged: Verdict, shift: FloatArray) -> Verdict:
-    """Return the verdict on zones that end inside of cells, where half the size of these changed moduli by `shift`."""
-    if float(np.abs(relative_change(shift)).max()) <= WITHIN:
-        return judged
-    times = np.exp(float(np.abs(shift).max()))
-    reason = f"zones end inside of elements, and with half their size moduli would change {times:.2g} times: use smaller ones"
-    return replace(judged, explanation=Explanation.NOT_EXPLAINED, reasons=(reason, *judged.reasons))

@@ -1,0 +1,101 @@
+"""Verdict on zones that end inside of cells: whether moduli that the data determine stay when the cells are halved.
+
+Where elements of half the size change a modulus by much, its correction to vanishing size, which is linear, is worth nothing, and the model
+on these elements is not one of the object. That holds for a modulus that the data determine. One that they leave open, such as the ratio of
+bulk to shear modulus of a thin skin, moves at no cost to the fit and changes little else: it is told as not determined instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray, IntArray
+from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
+from naibu.identification.from_fields.mesh_error import relative_change
+from naibu.identification.from_fields.uncertainty import Uncertainty
+from naibu.identification.from_fields.verdict import SHARED
+from naibu.identification.verdict import Explanation, Verdict
+
+WITHIN = 0.5  # change of a logarithm from which a linear correction is worth nothing
+DETERMINED = 0.5  # standard deviation of a logarithm from measurement alone: 95 % intervals up to 7 times as high as low are determined
+NUMBERS = ("Young's modulus", "the shear modulus", "kappa / mu, hence Poisson's ratio,")
+FALLS = 0.75  # part of the misfit beyond noise that may be left on elements of half the size for these to be what explains it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HalfSize:
+    """What elements of half the size change.
+
+    Attributes
+    ----------
+    fitted, theta : ndarray, shape (2 count,)
+        ln mu, then ln(kappa / mu) of the zones: those that fit best on the mesh, and at vanishing element size.
+    of_noise : Uncertainty
+        Of `fitted`, from the measurement alone.
+    beyond_noise : tuple of float
+        Misfit less what noise leaves on average, on the mesh and on elements of half the size.
+    """
+
+    fitted: FloatArray
+    theta: FloatArray
+    of_noise: Uncertainty
+    beyond_noise: tuple[float, float]
+
+    @property
+    def changes(self) -> FloatArray:
+        """Change of ln E, of ln mu, and how much of mu / kappa went (3, count)."""
+        young, before = young_and_poisson(self.theta)[0], young_and_poisson(self.fitted)[0]
+        return np.stack([np.log(young / before), *relative_change(self.theta - self.fitted).reshape(2, -1)])
+
+    @property
+    def standard_deviations(self) -> FloatArray:
+        """Those of the same numbers (3, count)."""
+        return np.stack([self.of_noise.of_young_and_poisson(self.fitted)[0], *self.of_noise.standard_deviations().reshape(2, -1)])
+
+    @property
+    def times(self) -> FloatArray:
+        """Factor, 1 or more, by which E, mu and kappa / mu change (3, count)."""
+        shift = (self.theta - self.fitted).reshape(2, -1)
+        times: FloatArray = np.exp(np.abs(np.stack([self.changes[0], *shift])))
+        return times
+
+    @property
+    def falls(self) -> bool:
+        """Whether elements of half the size explain some of what the mesh does not."""
+        before, after = self.beyond_noise
+        return after < FALLS * before
+
+
+def judged_within_cells(judged: Verdict, names: Sequence[str], half: HalfSize) -> Verdict:
+    """Return the verdict on zones with these names, which end inside of cells.
+
+    Moduli that the data determine and that move are no result; nor is anything where they determine no Young's modulus. Others that move
+    are told in the notes as not determined. Where neighbours share residuals that elements of half the size leave, these come first.
+    """
+    moves = np.abs(half.changes) > WITHIN
+    sure = half.standard_deviations < DETERMINED
+    refused = moves & (sure | ~sure[0].any())
+    left_open = moves & ~refused
+    notes = tuple(_told_open(name, np.flatnonzero(left_open[:, i]), half, i) for i, name in enumerate(names) if left_open[:, i].any())
+    judged = replace(judged, notes=(*judged.notes, *notes))
+    if not refused.any():
+        return judged
+    reason = f"zones end inside of elements, and with half their size moduli would change {half.times[refused].max():.2g} times"
+    advised = f"{reason}: use smaller ones"
+    reasons = (advised, *judged.reasons)
+    if judged.explanation is not Explanation.EXPLAINED and judged.shared > SHARED and not half.falls:
+        reasons = (*judged.reasons, f"elements of half the size leave such residuals as well; but {reason}")
+    return replace(judged, explanation=Explanation.NOT_EXPLAINED, reasons=reasons)
+
+
+def _told_open(name: str, which: IntArray, half: HalfSize, zone: int) -> str:
+    """Say of a zone that numbers `which` (rows of `HalfSize.changes`) are not determined and depend on the size of elements."""
+    several = " and ".join(NUMBERS[i] for i in which)
+    sd, times = half.standard_deviations[which, zone].min(), half.times[which, zone].max()
+    return (
+        f"{name}: the measurement does not determine {several} (standard deviation of the logarithm {sd:.2g} or more); elements of half "
+        f"the size would change what was found {times:.2g} times. Take it from elsewhere."
+    )

@@ -1,0 +1,76 @@
+"""Zones that end inside of cells: determined moduli that move with the size of cells are no result, undetermined ones are told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from naibu.identification.from_fields.forward.sensitivities import logarithms
+from naibu.identification.from_fields.uncertainty import Uncertainty
+from naibu.identification.from_fields.verdict_within_cells import HalfSize, judged_within_cells
+from naibu.identification.verdict import Explanation, Verdict
+from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
+
+EXPLAINED = Verdict(Explanation.EXPLAINED, (), "residuals are those of noise", 1.0, 0.01, 0.0)
+SHARED = "residuals are 1.4 times the stated noise, and neighbouring points share it: question law, zones and known values"
+IN_PART = Verdict(Explanation.IN_PART, (SHARED,), "", 1.4, 0.2, 0.4)
+NAMES = ("muscle", "skin")
+OPEN = (0.02, 0.15, 0.05, 1.5)  # standard deviations from the measurement: of these numbers only kappa / mu of the skin is not determined
+
+
+def half(
+    young: tuple[float, float], poisson: tuple[float, float], sd: tuple[float, ...] = OPEN, beyond_noise: tuple[float, float] = (0.0, 0.0)
+) -> HalfSize:
+    """Return what elements of half the size make of a muscle of 11 kPa and a skin of 24 kPa with a ratio of 0.4."""
+    fitted, theta = (
+        logarithms(*(np.array(v) for v in zip(*(lame_parameters(e, nu) for e, nu in zip(es, nus, strict=True)), strict=True)))
+        for es, nus in (((11.0, 24.0), (0.45, 0.40)), (young, poisson))
+    )
+    return HalfSize(fitted, theta, Uncertainty(np.diag(np.array(sd) ** -2.0), np.diag(np.array(sd) ** 2)), beyond_noise)
+
+
+def test_a_ratio_that_is_not_determined_is_told_and_does_not_turn_the_verdict() -> None:
+    judged = judged_within_cells(EXPLAINED, NAMES, half((10.0, 26.0), (0.45, 0.485)))
+    assert judged.explanation is Explanation.EXPLAINED and judged.reasons == ()
+    (note,) = judged.notes
+    assert note.startswith("skin: the measurement does not determine kappa / mu, hence Poisson's ratio,") and "logarithm 1.5" in note
+    kappa_over_mu = [2.0 * (1.0 + nu) / (3.0 * (1.0 - 2.0 * nu)) for nu in (0.485, 0.40)]
+    assert f"{kappa_over_mu[0] / kappa_over_mu[1]:.2g} times" in note
+
+
+@pytest.mark.parametrize(
+    ("young", "poisson", "sd"),
+    [
+        ((10.0, 45.0), (0.45, 0.40), OPEN),  # Young's modulus of the skin
+        ((6.0, 26.0), (0.45, 0.485), OPEN),  # of the muscle, whatever the ratio of the skin does
+        ((10.0, 26.0), (0.45, 0.485), (0.02, 0.15, 0.05, 0.3)),  # a ratio that is determined
+        ((10.0, 26.0), (0.45, 0.485), (0.8, 0.9, 0.8, 1.5)),  # no Young's modulus is determined
+    ],
+)
+def test_a_determined_modulus_that_moves_never_passes(
+    young: tuple[float, float], poisson: tuple[float, float], sd: tuple[float, ...]
+) -> None:
+    judged = judged_within_cells(EXPLAINED, NAMES, half(young, poisson, sd))
+    assert not judged.ok
+    assert "use smaller ones" in judged.sentence
+
+
+def test_moduli_that_stay_leave_the_verdict_as_it_is() -> None:
+    assert judged_within_cells(IN_PART, NAMES, half((10.0, 26.0), (0.46, 0.41))) == IN_PART
+
+
+def test_the_factor_told_is_that_of_the_moduli_that_are_judged() -> None:
+    """The ratio of the skin moves 7 times, which is not determined; Young's modulus of the muscle halves."""
+    told = judged_within_cells(EXPLAINED, NAMES, half((5.5, 26.0), (0.45, 0.485))).sentence
+    assert "moduli would change 2 times" in told
+
+
+def test_shared_residuals_that_smaller_elements_leave_come_first() -> None:
+    moved = half((5.5, 26.0), (0.45, 0.40), beyond_noise=(4000.0, 3900.0))
+    stay = judged_within_cells(IN_PART, NAMES, moved)
+    assert not stay.ok and stay.reasons[0] == SHARED
+    assert "elements of half the size leave such residuals as well" in stay.reasons[1] and "use smaller ones" not in stay.sentence
+    fall = judged_within_cells(IN_PART, NAMES, replace(moved, beyond_noise=(4000.0, 500.0)))
+    assert not fall.ok and "use smaller ones" in fall.reasons[0] and fall.reasons[1] == SHARED
