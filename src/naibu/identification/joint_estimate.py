@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
@@ -107,7 +107,7 @@ def joint_estimate(estimates: Sequence[NormalEstimate]) -> JointEstimate:
     left = [values[at] - e.values for at, e in zip(chosen, kept, strict=True)]
     chi_squared = sum(float(r @ w @ r) for r, w in zip(left, weights, strict=True))
     freedom = sum(len(e.names) for e in kept) - len(names)
-    widened = float(np.sqrt(chi_squared / freedom)) if chi2.sf(chi_squared, freedom) < CONTRADICTED else 1.0
+    widened = float(np.sqrt(chi_squared / freedom)) if chdtrc(freedom, chi_squared) < CONTRADICTED else 1.0
     return JointEstimate(
         NormalEstimate(names, values, np.asarray(covariance * widened**2, dtype=np.float64)), shared, chi_squared, freedom, widened
     )

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
-from scipy.stats import chi2, norm
-from scipy.stats import t as student
+from scipy.special import gammaincinv, ndtr, stdtrit
 
 from naibu.applications.ischemia.layered_response import LayeredModes
 from naibu.applications.ischemia.skin import SurfaceLoad, refined
@@ -126,7 +125,7 @@ def identify_layers(
     names = [(i, n) for i, m in enumerate(first) for n in PARAMETERS if (i, n) not in set(known) and np.isfinite(getattr(m, n))]
     if len(t) <= len(names):
         raise InputError(f"indentation_mm has {len(t)} values for {len(names)} parameters; record more instants, or state `known` ones")
-    if float(((measured / noise_mm) ** 2).sum()) <= chi2.ppf(0.999, len(t)):
+    if float(((measured / noise_mm) ** 2).sum()) <= _greatest_chi_squared(len(t)):
         raise InputError(f"indentation_mm lies within its noise, noise_mm = {noise_mm:g}, about 0: nothing can be identified from it")
     fit = _Fit(_of_indentation(modes, load), load, t, measured, noise_mm, first, tuple(names))
     best = fit.search(np.zeros(len(names)))
@@ -208,7 +207,7 @@ class _Fit:
         freedom = len(self.times) - len(best)
         # residuals larger than the noise widen the interval
         factor = max(1.0, 2.0 * base.cost / freedom)
-        allowed = base.cost + 0.5 * factor * student.ppf(0.975, freedom) ** 2
+        allowed = base.cost + 0.5 * factor * float(stdtrit(freedom, 0.975)) ** 2
         ends = []
         for sign in (-1.0, 1.0):
             inside, at, step = best[i], best.copy(), 0.02
@@ -256,9 +255,14 @@ def _of_indentation(modes: LayeredModes, load: SurfaceLoad) -> LayeredModes:
     return replace(modes, share=share[kept], amplitude=total[kept])
 
 
+def _greatest_chi_squared(freedom: int) -> float:
+    """Return the sum of squares of `freedom` unit normal numbers that 0.1 % exceed."""
+    return 2.0 * float(gammaincinv(0.5 * freedom, 0.999))
+
+
 def _explained(scaled: FloatArray, parameters: int) -> bool:
     """Return whether scaled residuals are as small as unit noise, and their signs do not run together in time (Wald-Wolfowitz)."""
-    small = float((scaled**2).sum()) <= chi2.ppf(0.999, max(1, len(scaled) - parameters))
+    small = float((scaled**2).sum()) <= _greatest_chi_squared(max(1, len(scaled) - parameters))
     positive = scaled > 0.0
     n, m = int(positive.sum()), int((~positive).sum())
     if min(n, m) < 2:
@@ -266,4 +270,4 @@ def _explained(scaled: FloatArray, parameters: int) -> bool:
     runs = 1 + int((positive[1:] != positive[:-1]).sum())
     mean = 1.0 + 2.0 * n * m / (n + m)
     spread = np.sqrt((mean - 1.0) * (mean - 2.0) / (n + m - 1.0))
-    return bool(small and norm.cdf((runs - mean) / spread) > 1e-3)
+    return bool(small and ndtr((runs - mean) / spread) > 1e-3)

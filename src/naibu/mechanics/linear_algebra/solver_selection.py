@@ -41,6 +41,7 @@ DIRECT_LIMIT = 200_000  # unknowns from which a factorization costs more than mu
 SERIES_LIMIT = 20_000  # unknowns from which multigrid solves systems that change little one after the other sooner, up to the ratio below
 SINGLE_LIMIT = 4_000  # likewise a single system
 COMPRESSIBLE = 0.49  # Poisson's ratio, beyond which the iterations of multigrid become many
+ROUNDING = 1e-9  # of a ratio that is computed from Lame's constants
 SINGLE_TOLERANCE = 1e-10  # relative, of a single system: digits cost little
 RECYCLING_FROM = 4_000  # unknowns from which a factorization is worth recycling
 UNSYMMETRIC_FROM = 1_000  # likewise for unsymmetric systems, of which LU factors cost twice as much
@@ -113,7 +114,7 @@ def _automatic(unknowns: int, symmetric: bool, poisson_ratio: float | None, sing
     if not symmetric:
         return "recycled_lu" if with_mkl and unknowns > UNSYMMETRIC_FROM else direct
     limit = DIRECT_LIMIT if with_mkl else DIRECT_LIMIT // 10
-    if poisson_ratio is not None and poisson_ratio <= COMPRESSIBLE:
+    if poisson_ratio is not None and poisson_ratio <= COMPRESSIBLE + ROUNDING:
         limit = min(limit, SINGLE_LIMIT if single else SERIES_LIMIT)
     if unknowns > limit:
         return "multigrid"
