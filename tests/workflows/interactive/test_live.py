@@ -13,12 +13,13 @@ from scipy.ndimage import binary_dilation
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from served_models import served
+from touched_lattice import touched_lattice
 
 from naibu.core.errors import InputError
 from naibu.io.vtk_files import write_vtu
 from naibu.meshing import box
-from naibu.simulation import InteractiveSimulation
-from naibu.workflows import MeshMaterial, live, tools_for, touchable
+from naibu.simulation import InteractiveSimulation, RealTimeLoop
+from naibu.workflows import MeshMaterial, TouchableModel, live, tools_for, touchable
 from naibu.workflows.interactive.live import LiveSimulation
 
 
@@ -175,6 +176,19 @@ def test_a_person_cuts_a_body_and_takes_it_back(tmp_path: Path, kind: str) -> No
         page.value("naibuLive.command('undo')")
         page.wait("naibuLive.frame.topology === naibuLive.scene.topology && naibuLive.scene.points.length === 375", 60)
         assert page.console == []
+
+
+def test_markers_come_back_when_a_cut_is_undone() -> None:
+    body = touched_lattice()
+    model = TouchableModel("Cube", (), body, "mean elongation, %", np.array([[0, 1]]), np.array([[0.5, 0.5]]))
+    loop = RealTimeLoop(InteractiveSimulation(body, {}))
+    live_one, found = LiveSimulation(model, loop), []
+    blade = [[[-50.0, y, 21.0], [50.0, y, 21.0]] for y in (-50.0, 50.0)]
+    for command in (lambda s: None, lambda s: s.cut(blade), lambda s: s.undo()):
+        loop.submit(command)
+        loop._obey()
+        found.append((live_one.scene.topology, len(live_one.scene.marker_nodes)))
+    assert found == [(0, 1), (1, 0), (2, 1)]
 
 
 def test_a_mesh_is_held_at_its_lowest_nodes_and_pressed(tmp_path: Path) -> None:

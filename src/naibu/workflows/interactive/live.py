@@ -58,7 +58,7 @@ class LiveSimulation:
 
     def _made_scene(self, body: InteractiveBody, topology: int) -> LiveScene:
         tools = self.loop.simulation.tools
-        whole = topology == 0  # the numbers of nodes that markers refer to
+        whole = body is self.model.body  # also behind Undo: the numbers of nodes that markers refer to
         return LiveScene(
             self.model.title, self.model.sentences, body.points, body.faces, body.cells,
             [_shape(name, tool) for name, tool in tools.items()],
