@@ -453,3 +453,51 @@ def test_undo_of_a_reset_brings_back_the_body_with_the_tool_that_presses_it() ->
         assert not frame.failed
     np.testing.assert_allclose(frame.force[2], before.force[2], rtol=0.02)
     assert np.abs(frame.positions - before.positions).max() < 0.02
+
+
+def clamped_sphere() -> InteractiveSimulation:
+    """A block with a cavity that holds a sphere: its roof is gripped and pulled down until the sphere is held fast from both sides."""
+    size = 20.0
+    mesh = box((size,) * 3, (5,) * 3, cell_type="tetra", centred=False)
+    hollow = np.abs(mesh.points[mesh.cells].mean(axis=1) - 0.5 * size).max(axis=1) < 6.0
+    used, cells = np.unique(mesh.cells[~hollow], return_inverse=True)
+    mesh = replace(mesh, points=mesh.points[used], cells=cells.reshape(-1, 4), regions=mesh.regions[~hollow])
+    law = material(young_modulus=10.0, poisson_ratio=0.45)
+    assembler = Assembler.from_materials(elements(mesh, "mean_dilatation"), mesh.regions, [law])
+    body = FiniteElementBody.of(mesh, assembler, supported=np.flatnonzero(mesh.points[:, 2] < 1e-9), background=False)
+    tools = {"sphere": spherical_indenter((0.5 * size,) * 3, 6.0), "other": spherical_indenter((0.5 * size, 0.5 * size, 40.0), 4.0)}
+    touched = InteractiveSimulation(body, tools)
+    touched.take("sphere")
+    roof = int(np.argmin(np.linalg.norm(mesh.points - [0.4 * size, 0.4 * size, size], axis=1)))
+    touched.grip(roof, 30.0)
+    touched.pull(mesh.points[roof] - [0.0, 0.0, 3.5])
+    for _ in range(60):
+        assert not touched.advance().failed
+    assert touched.last.penetration_mm > 0.0
+    return touched
+
+
+def test_a_tool_that_the_body_holds_fast_keeps_neither_frames_nor_cuts_waiting() -> None:
+    touched = clamped_sphere()
+    touched.take("other")
+    frames = 0
+    with pytest.raises(InputError, match="sphere did not leave the body within 3 s, and it stays in play"):
+        while not touched.finish_cut():
+            assert not touched.advance().failed
+            frames += 1
+            assert frames < 400
+    assert frames * touched.frame_s == pytest.approx(3.0, abs=0.1)
+    assert touched.last.tool == "sphere"
+    assert not touched.finish_cut()  # said once
+    touched.begin_cut([[[x, 10.0, 30.0], [x, 10.0, 10.0]] for x in (-5.0, 25.0)])
+    with pytest.raises(InputError, match="the cut came to nothing: move it out"):
+        touched.finish_cut(wait=True)
+    assert touched.last.topology == 0
+    assert not touched.advance().failed
+    touched.pull(touched.last.positions[touched.last.gripped] + [0.0, 0.0, 3.5])  # the roof goes up again, and lets it go
+    for _ in range(60):
+        touched.advance()
+    touched.take("other")
+    for _ in range(60):
+        touched.advance()
+    assert touched.last.tool == "other"

@@ -77,8 +77,8 @@ class LivePage {
     const list = h("dl", { class: "numbers" }, ...Object.entries(labels).flatMap(([name, text]) => [h("dt", {}, text), this.numbers[name]]));
     root.replaceChildren(
       h("div", { class: "bar" }, h("div", { class: "modes", role: "group", "aria-label": "What dragging does" }, ...this.modes),
-        h("label", { for: "naibu-tool" }, "Tool"), this.toolChoice, this.pause, this.#button("↺ Undo", () => this.command("undo")),
-        this.#button("Reset", () => this.command("reset"))),
+        h("span", { class: "pair" }, h("label", { for: "naibu-tool" }, "Tool"), this.toolChoice), this.pause, this.#button("↺ Undo", () => this.back("undo")),
+        this.#button("Reset", () => this.back("reset"))),
       h("div", { class: "live-grid" },
         h("div", {}, this.stage, this.hint, h("div", { class: "motion-scale" }, this.gradient, this.ticks), this.#viewControls()),
         h("div", { class: "live-side" }, this.badge, this.message, list, this.canvas,
@@ -99,9 +99,10 @@ class LivePage {
       const box = h("input", { type: "checkbox", onchange: () => action(box.checked) });
       return h("label", { class: "toggle" }, box, text);
     };
-    const markers = this.scene.markers.nodes.length ? [toggle("markers", (on) => this.view.setMarkers(on))] : [];
-    return h("div", { class: "bar" }, h("label", { for: "naibu-clip" }, "Section"), axis, slider,
-      h("label", { for: "naibu-colour" }, "Colour by"), this.colour, toggle("mesh", (on) => this.view.setEdges(on)), ...markers);
+    this.markers = toggle("markers", (on) => this.view.setMarkers(on));
+    this.markers.hidden = !this.scene.markers.nodes.length;
+    return h("div", { class: "bar" }, h("span", { class: "pair" }, h("label", { for: "naibu-clip" }, "Section"), axis), slider,
+      h("span", { class: "pair" }, h("label", { for: "naibu-colour" }, "Colour by"), this.colour), toggle("mesh", (on) => this.view.setEdges(on)), this.markers);
   }
 
   #keys() {
@@ -109,7 +110,7 @@ class LivePage {
     const keys = Object.fromEntries(Object.entries(moves).map(([key, [axis, sign]]) => [key, () => this.nudge(axis, sign * 0.02)]));
     const turns = { z: ["away", -1], x: ["away", 1], c: ["right", -1], v: ["right", 1], f: ["up", -1], g: ["up", 1] };
     Object.entries(turns).forEach(([key, [axis, sign]]) => { keys[key] = () => this.turn(axis, sign * TURN); });
-    return { ...keys, " ": () => this.command("pause", { on: !this.frame?.paused }), u: () => this.command("undo") };
+    return { ...keys, " ": () => this.command("pause", { on: !this.frame?.paused }), u: () => this.back("undo") };
   }
 
   /** Send a command; those that steer are not sent by a page that only watches. */
@@ -118,11 +119,24 @@ class LivePage {
     else this.#say("Another page drives this simulation; this one watches.");
   }
 
+  /** Undo or reset: keys lead the tool from where it is then. */
+  back(type) {
+    this.lead = null;
+    this.command(type);
+  }
+
   take(name) {
     this.tool = name;
     this.lead = null;
     this.toolChoice.value = name;
     this.command("tool", { name });
+  }
+
+  /** Another tool came into play, also by Undo: it is the one that is chosen, and keys lead it from where it is. */
+  #inPlay(number) {
+    this.tool = this.scene.tools[number]?.name ?? "";
+    this.toolChoice.value = this.tool;
+    this.lead = null;
   }
 
   setMode(mode) {
@@ -237,6 +251,7 @@ class LivePage {
       return;
     }
     const first = !this.frame;
+    if (first ? frame.tool >= 0 : frame.tool !== this.frame.tool) this.#inPlay(frame.tool);
     this.frame = frame;
     if (first && frame.driving && this.tool && frame.tool < 0) this.take(this.tool);
     this.view.setFrame(frame);
@@ -258,8 +273,12 @@ class LivePage {
     }
     if (now - this.written < WRITE_MS) return;
     this.written = now;
-    if (this.scaled !== this.view.top) this.ticks.replaceChildren(...[0, 1, 2, 3, 4].map((k) => h("span", {}, digits((k / 4) * this.view.top))));
-    this.scaled = this.view.top;
+    const unit = frame.values ? this.scene.strain.split(", ").at(-1) : "mm";
+    const scaled = `${this.view.top} ${unit}`;
+    if (this.scaled !== scaled) {
+      this.ticks.replaceChildren(...[0, 1, 2, 3, 4].map((k) => h("span", {}, digits((k / 4) * this.view.top) + (k === 4 ? ` ${unit}` : ""))));
+    }
+    this.scaled = scaled;
     const { numbers } = this;
     numbers.force.textContent = frame.tool < 0 ? "–" : `${newtons(frame.force).toFixed(2)} N`;
     numbers.pull.textContent = frame.gripped < 0 ? "–" : `${newtons(frame.pull).toFixed(2)} N`;
@@ -278,6 +297,8 @@ class LivePage {
       const answer = await fetch(`/scene${window.location.search}`);
       this.scene = decodeScene(await answer.json());
       this.view.show(this.scene);
+      this.markers.hidden = !this.scene.markers.nodes.length; // a cut body has none
+      this.view.setMarkers(!this.markers.hidden && this.markers.firstChild.checked);
       this.probed = -1;
       this.view.overlay.mark(null);
     } catch {

@@ -1,10 +1,11 @@
 // The 3-D view of a running simulation: coloured surface, section, markers, tool, fixtures, and picking.
 import {
   BufferAttribute, BufferGeometry, DataTexture, DirectionalLight, DoubleSide, DynamicDrawUsage, FrontSide, HemisphereLight, InstancedMesh,
-  LineBasicMaterial, LineSegments, LinearFilter, Matrix4, Mesh, MeshBasicMaterial, Plane, Raycaster, Scene, ShaderMaterial, Sphere, SphereGeometry,
+  LinearFilter, Matrix4, Mesh, MeshBasicMaterial, Plane, Raycaster, Scene, ShaderMaterial, Sphere, SphereGeometry,
   Vector2, Vector3,
 } from "three";
 import { gridLines } from "./body.js";
+import { CutOutline } from "./cut-outline.js";
 import { coarserSurface } from "./coarser-surface.js";
 import { colourTable, niceCeiling } from "./colormap.js";
 import { Detail, STILL_MS, STILL_RATIO } from "./detail.js";
@@ -52,7 +53,7 @@ export class LiveView extends View {
     this.coarse = new Map();
     this.picked = this.#pickable();
     this.drawn = null;
-    this.outline = this.#outline(this.position, scene.outline);
+    this.outline = new CutOutline(this.position, scene.outline);
     this.cap = this.#coloured(new BufferAttribute(new Float32Array(0), 3), new BufferAttribute(new Float32Array(0), 1));
     this.cap.visible = false;
     this.#measure();
@@ -63,7 +64,7 @@ export class LiveView extends View {
     this.tools = scene.tools.map((t) => rigidBody(t));
     this.tools.forEach((t) => { t.visible = false; });
     this.made = this.tools.map((t) => t.quaternion.clone());
-    this.world.add(this.grid, this.skin, this.outline, this.cap, this.markers, ...this.fixtures, ...this.tools, new HemisphereLight(0xffffff, 0x8a8a8a, 2.0), this.sun);
+    this.world.add(this.grid, this.skin, ...this.outline.lines, this.cap, this.markers, ...this.fixtures, ...this.tools, new HemisphereLight(0xffffff, 0x8a8a8a, 2.0), this.sun);
     this.applyTheme();
     this.#colours();
     this.#clipBy(clip ?? null);
@@ -110,17 +111,6 @@ export class LiveView extends View {
     return new Mesh(geometry, new MeshBasicMaterial({ side: DoubleSide }));
   }
 
-  /** Where cuts meet the surface, also while they are closed: lines drawn a little in front of it. */
-  #outline(position, edges) {
-    const geometry = new BufferGeometry();
-    geometry.setAttribute("position", position);
-    geometry.setIndex(new BufferAttribute(edges, 1));
-    const lines = new LineSegments(geometry, new LineBasicMaterial());
-    lines.frustumCulled = false;
-    lines.visible = edges.length > 0;
-    return lines;
-  }
-
   #spheres() {
     const { nodes, each } = this.scene.markers;
     const count = nodes.length / each;
@@ -152,6 +142,7 @@ export class LiveView extends View {
     this.drawn = frame;
     this.position.array = frame.positions; // that of the message, not a copy
     this.position.needsUpdate = true;
+    this.outline.follow();
     this.#setLevels(frame);
     this.tools.forEach((tool, k) => {
       tool.visible = k === frame.tool;
@@ -275,7 +266,7 @@ export class LiveView extends View {
   #clipBy(plane) {
     this.clip = plane;
     this.renderer.localClippingEnabled = Boolean(this.clip);
-    for (const { material } of [this.skin, this.outline]) material.clippingPlanes = this.clip ? [this.clip] : [];
+    for (const { material } of [this.skin, ...this.outline.lines]) material.clippingPlanes = this.clip ? [this.clip] : [];
     this.cap.visible = Boolean(this.clip);
     this.#cut();
     this.#placeMarkers();
@@ -352,7 +343,7 @@ export class LiveView extends View {
     this.world.background = null;
     this.renderer.setClearColor(colours.background);
     this.grid.material.color.set(colours.grid);
-    for (const drawn of [this.markers, this.outline]) drawn.material.color.set(colours.predicted);
+    this.markers.material.color.set(colours.predicted);
     for (const group of [...this.tools, ...this.fixtures]) group.children.forEach((part) => part.material.color.set(colours.box));
     this.requestRender();
   }

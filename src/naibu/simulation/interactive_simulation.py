@@ -25,6 +25,7 @@ from naibu.meshing.cutting.volume import VolumeCut
 from naibu.simulation.background_cut import BackgroundCut
 from naibu.simulation.interactive_bodies import NO_NODES, AnySession, FiniteElementBody, Frame, InteractiveBody
 from naibu.simulation.lattice_cut import LatticeCut
+from naibu.simulation.tool_places import placed, towards
 
 FRAME_S = 1.0 / 60.0
 REACH = 2.0  # extents of the body around its centre in which the tool stays
@@ -32,6 +33,7 @@ SPEED = 3.0  # extents of the body a second that tool and grip move at most
 TURNING = 3.0  # rad/s that the tool turns at most
 LEAST_TURN = 1e-6  # rad
 UNDO = 20  # states kept
+LEAVING_S = 3.0  # simulated time in which a tool that is put away leaves the body at the latest
 THROUGH = 0.5  # of the thinnest half extent of a tool: how far it moves in a step at most, so that nothing passes through its middle
 
 
@@ -82,6 +84,8 @@ class InteractiveSimulation:
     _surface: IntArray = field(init=False)
     _cutting: BackgroundCut | None = field(init=False, default=None)
     _next: str | None = field(init=False, default=None)  # tool that is taken when the one in play has left the body
+    _leaving: int = field(init=False, default=0)  # frames in which it was led away
+    _trapped: str = field(init=False, default="")  # what is to be said of a tool that did not leave the body
     _under_way: tuple[FloatArray, FloatArray, FloatArray] | None = field(init=False, default=None)  # motion of a step begun
 
     def __post_init__(self) -> None:
@@ -120,6 +124,7 @@ class InteractiveSimulation:
         """Bring a tool into play, where it waits; an empty name puts the one in play away.
 
         One that presses finite elements is lifted first, in the next frames: no step finds the balance of a dent that is let go at once.
+        One that has not left the body within `LEAVING_S` stays in play, and `finish_cut` says so.
 
         Raises
         ------
@@ -248,25 +253,29 @@ class InteractiveSimulation:
             self._next = self._tool
 
     def finish_cut(self, *, wait: bool = False) -> bool:
-        """Go on with the body behind the cut that was begun; False where none is ready.
+        """Go on with the body behind the cut that was begun; False where none is ready, as while a tool that presses the body leaves it.
 
         Parameters
         ----------
         wait : bool
-            Whether to wait for it; frames are taken until a tool that presses the body has left it.
+            Whether to wait for it; frames are taken until a tool that presses the body has left it, or cannot.
 
         Raises
         ------
         InputError
-            What `cut` refuses, or another body than the one that was cut; the body is then as it was.
+            What `cut` refuses, another body than the one that was cut, or a tool that did not leave the body, for a cut or for another
+            tool; the body is then as it was.
         """
         cutting = self._cutting
+        if cutting is not None and wait:
+            cutting.wait()
+            while self._next is not None:
+                self.advance()
+        if self._trapped and (cutting is None or cutting.finished):
+            said, self._trapped, self._cutting = self._trapped, "", None
+            raise InputError(said)
         if cutting is None:
             return False
-        if wait:
-            cutting.wait()
-            while self._next is not None and not self.advance().failed:
-                pass
         if not cutting.finished or self._next is not None:
             return False
         self._cutting = None
@@ -342,6 +351,12 @@ class InteractiveSimulation:
         if not self._presses():
             self._press(self._next)
             return
+        self._leaving += 1
+        if self._leaving * self.frame_s > LEAVING_S:
+            undone = "the cut came to nothing" if self._cutting is not None else "it stays in play"
+            self._trapped = f"{self._tool} did not leave the body within {LEAVING_S:g} s, and {undone}: move it out and try again"
+            self._next, self._leaving, self._target = None, 0, self._centre
+            return
         force = float(np.linalg.norm(self._last.force))
         away = -self._last.force / force if force else np.array([0.0, 0.0, 1.0])
         self._target = self._within(self._centre + self.extent_mm * away)
@@ -349,8 +364,8 @@ class InteractiveSimulation:
     def _next_motion(self, duration: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return where the tool goes in a frame, mm, how fast it turns, rad/s, and how far gripped nodes go, mm."""
         reach, held = self.fastest_mm_s * duration, self._grip_position()
-        centre = _towards(self._centre, self._target, min(reach, self._thin() * self.steps))
-        return centre, self._spin(duration), _towards(held, self._pull_target, reach) - held
+        centre = towards(self._centre, self._target, min(reach, self._thin() * self.steps))
+        return centre, self._spin(duration), towards(held, self._pull_target, reach) - held
 
     def close(self) -> None:
         """Release what the session holds, and wait for a cut under way."""
@@ -384,7 +399,7 @@ class InteractiveSimulation:
         state = self._session.state()
         self._session.press(())
         self._session.restore(self.body.without_contact(state))
-        self._tool, self._under_way, self._next = tool, None, None
+        self._tool, self._under_way, self._next, self._leaving, self._trapped = tool, None, None, 0, ""
         self._rotation = self._rotation_target = np.eye(3)
         if tool:
             self._centre = self._target = self._outside(self.tools[tool])
@@ -431,16 +446,3 @@ class InteractiveSimulation:
             self.body, number, time_s, positions, self._tool, self._centre, self._rotation, force, pull, depth, self._gripped, failed,
             self._topology, self.body.unbalanced(self._session),
         )  # fmt: skip
-
-
-def placed(tool: RigidIndenter, centre: FloatArray, rotation: FloatArray | None = None) -> RigidIndenter:
-    """Return a tool at another place (3,), mm, rotated (3, 3) since it was made."""
-    turned = tool.geometry if rotation is None else replace(tool.geometry, axes=tool.geometry.axes @ rotation.T)
-    return replace(tool, geometry=turned, centre=centre)
-
-
-def _towards(start: FloatArray, target: FloatArray, reach: float) -> FloatArray:
-    """Return the point on the way to a target that is at most `reach` away from the start."""
-    way = target - start
-    length = float(np.linalg.norm(way))
-    return np.asarray(target if length <= reach else start + way * (reach / length), dtype=float)

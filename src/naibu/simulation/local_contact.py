@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 from naibu.core.arrays import FloatArray, as_vector, require_positive
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.simulation.interactive_bodies import Frame
-from naibu.simulation.interactive_simulation import FRAME_S, InteractiveSimulation, placed
+from naibu.simulation.interactive_simulation import FRAME_S, InteractiveSimulation
+from naibu.simulation.tool_places import placed
 
 STIFFEST = 2e4  # mN/mm, of the continuation
 MEMORY_S = 0.25  # in which a stiffness that a step showed is forgotten: too much makes the tool slow, too little makes it bounce

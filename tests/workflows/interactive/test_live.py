@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from browser import CHROMIUM, Page, opened_browser
 from matplotlib.image import imread
+from scipy.ndimage import binary_dilation
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from served_models import served
+from touched_lattice import touched_lattice
 
 from naibu.core.errors import InputError
 from naibu.io.vtk_files import write_vtu
 from naibu.meshing import box
-from naibu.simulation import InteractiveSimulation
-from naibu.workflows import MeshMaterial, live, tools_for, touchable
+from naibu.simulation import InteractiveSimulation, RealTimeLoop
+from naibu.workflows import MeshMaterial, TouchableModel, live, tools_for, touchable
 from naibu.workflows.interactive.live import LiveSimulation
 
 
@@ -34,6 +37,9 @@ def test_a_person_pushes_pulls_looks_inside_and_saves(tmp_path: Path) -> None:
         assert page.value("naibuLive.view.cap.geometry.attributes.position.count") > 50
         page.value("naibuLive.command('colour', {name: 'strain'}, true)")
         page.wait(f"{frame}.values !== null", 30)
+        page.wait("naibuLive.ticks.textContent.endsWith(' %')", 30)
+        page.value("naibuLive.command('colour', {name: 'displacement'}, true)")
+        page.wait("naibuLive.ticks.textContent.endsWith(' mm')", 30)
         page.value("naibuLive.view.setClip(null)")
 
         page.value("naibuLive.take(''); naibuLive.setMode('pull')")
@@ -57,6 +63,28 @@ def test_a_person_pushes_pulls_looks_inside_and_saves(tmp_path: Path) -> None:
         assert page.console == []
         assert len(page.picture(tmp_path / "live.png").read_bytes()) > 10_000
         assert "Recorded from the live page." in simulation.recording_html()
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
+def test_the_tool_that_is_chosen_is_the_one_in_play_also_behind_undo_and_on_another_page() -> None:
+    chosen, ready = "naibuLive.toolChoice.value", "document.querySelector('.stage[data-ready]') !== null"
+    with served() as (address, _), opened_browser() as page:
+        page.open(address)
+        page.wait(f"{ready} && naibuLive.frame.tool === 0", 60)
+        first, second = page.value("naibuLive.scene.tools.slice(0, 2).map((tool) => tool.name)")
+        page.value(f"naibuLive.take('{second}')")
+        page.wait("naibuLive.frame.tool === 1", 30)
+        page.value("naibuLive.nudge('up', 1)")
+        page.value("naibuLive.back('undo')")
+        page.wait("naibuLive.frame.tool === 0", 30)
+        assert page.value(f"[{chosen}, naibuLive.tool, naibuLive.lead]") == [first, first, None]
+        page.value(f"naibuLive.take('{second}')")
+        page.wait("naibuLive.frame.tool === 1", 30)
+        page.call("Page.reload")
+        page.wait("window.naibuLive === undefined || !naibuLive.frame || naibuLive.frame.tool === 1", 30)
+        page.wait(f"{ready} && naibuLive.frame.tool === 1", 60)
+        assert page.value(chosen) == second
+        assert page.console == []
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
@@ -98,12 +126,12 @@ def pieces(simulation: LiveSimulation) -> int:
     return int(connected_components(graph, directed=False)[0])
 
 
-def orange(page: Page, picture: Path) -> int:
-    """Number of pixels of the 3-D view that are more orange than any colour of the map; beside it the badge may be."""
+def outlined(page: Page, picture: Path) -> int:
+    """Number of black pixels of the 3-D view that are a few pixels from white ones: those of the line of a cut, on any colour."""
     box = page.value("(() => { const b = naibuLive.view.canvas.getBoundingClientRect(); return [b.left, b.top, b.right, b.bottom]; })()")
     left, top, right, bottom = (round(edge) for edge in box)
-    red, green, blue = imread(page.picture(picture))[top:bottom, left:right, :3].transpose(2, 0, 1)
-    return int(((red > 0.6) & (green < 0.6 * red) & (blue < 0.3)).sum())
+    shown = imread(page.picture(picture))[top:bottom, left:right, :3]
+    return int(((shown < 0.02).all(axis=2) & binary_dilation((shown > 0.99).all(axis=2), iterations=3)).sum())
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
@@ -115,7 +143,7 @@ def test_a_person_cuts_a_body_and_takes_it_back(tmp_path: Path, kind: str) -> No
         page.open(address)
         page.wait("document.querySelector('.stage[data-ready]') !== null && naibuLive.frame.tool === 0", 60)
         page.value("naibuLive.take(''); naibuLive.setMode('cut')")
-        assert page.value("naibuLive.scene.outline.length") == 0 and orange(page, tmp_path / "whole.png") == 0
+        assert page.value("naibuLive.scene.outline.length") == 0 and outlined(page, tmp_path / "whole.png") == 0
         left, top, width, height = page.value(
             "(() => { const b = naibuLive.view.canvas.getBoundingClientRect(); return [b.left, b.top, b.width, b.height]; })()"
         )
@@ -129,7 +157,10 @@ def test_a_person_cuts_a_body_and_takes_it_back(tmp_path: Path, kind: str) -> No
         assert simulation.scene.topology == 1
         assert page.value("naibuLive.scene.outline.length") > 0  # the cut is closed: its outline shows where it is
         page.wait("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))")
-        assert orange(page, tmp_path / f"{kind}.png") > 100
+        for dark in (False, True):
+            page.dark(dark)
+            time.sleep(0.5)
+            assert outlined(page, tmp_path / f"{kind}.png") > 100
         if kind == "mesh":  # a closed line, but for a gap of some pixels, cuts a second piece out
             radius, before = 0.13 * height, pieces(simulation)
             ring = [(left + 0.5 * width + radius * np.cos(t), top + 0.62 * height + radius * np.sin(t)) for t in np.linspace(0.0, 6.2, 24)]
@@ -145,6 +176,19 @@ def test_a_person_cuts_a_body_and_takes_it_back(tmp_path: Path, kind: str) -> No
         page.value("naibuLive.command('undo')")
         page.wait("naibuLive.frame.topology === naibuLive.scene.topology && naibuLive.scene.points.length === 375", 60)
         assert page.console == []
+
+
+def test_markers_come_back_when_a_cut_is_undone() -> None:
+    body = touched_lattice()
+    model = TouchableModel("Cube", (), body, "mean elongation, %", np.array([[0, 1]]), np.array([[0.5, 0.5]]))
+    loop = RealTimeLoop(InteractiveSimulation(body, {}))
+    live_one, found = LiveSimulation(model, loop), []
+    blade = [[[-50.0, y, 21.0], [50.0, y, 21.0]] for y in (-50.0, 50.0)]
+    for command in (lambda s: None, lambda s: s.cut(blade), lambda s: s.undo()):
+        loop.submit(command)
+        loop._obey()
+        found.append((live_one.scene.topology, len(live_one.scene.marker_nodes)))
+    assert found == [(0, 1), (1, 0), (2, 1)]
 
 
 def test_a_mesh_is_held_at_its_lowest_nodes_and_pressed(tmp_path: Path) -> None:

@@ -19,9 +19,10 @@ from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.simulation.haptic_loop import LONGEST_STEP_S, HapticHand
 from naibu.simulation.haptic_thread import HapticThread
 from naibu.simulation.interactive_bodies import Frame, InteractiveBody
-from naibu.simulation.interactive_simulation import FRAME_S, InteractiveSimulation, placed
+from naibu.simulation.interactive_simulation import FRAME_S, InteractiveSimulation
 from naibu.simulation.local_contact import LocalContact
 from naibu.simulation.real_time_loop import RealTimeLoop
+from naibu.simulation.tool_places import placed
 from naibu.viewer.live.commands import LiveCommand
 from naibu.viewer.live.scene import FAILED, PAUSED, RECORDING, REPLAYING, LiveFrame, LiveScene
 from naibu.viewer.live.server import LiveServer, bound_port, serve
@@ -57,7 +58,7 @@ class LiveSimulation:
 
     def _made_scene(self, body: InteractiveBody, topology: int) -> LiveScene:
         tools = self.loop.simulation.tools
-        whole = topology == 0  # the numbers of nodes that markers refer to
+        whole = body is self.model.body  # also behind Undo: the numbers of nodes that markers refer to
         return LiveScene(
             self.model.title, self.model.sentences, body.points, body.faces, body.cells,
             [_shape(name, tool) for name, tool in tools.items()],
