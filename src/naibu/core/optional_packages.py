@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
+import numpy as np
+
 from naibu.core.errors import MissingDependencyError
 
 
@@ -34,3 +36,7 @@ def optional_package(name: str, purpose: str, install: str | None = None) -> Any
         return importlib.import_module(name)
     except ImportError as error:
         raise MissingDependencyError(f'{purpose} needs {name} ({error}); run: pip install "{install or name}"') from error
+    except (OSError, ValueError, AttributeError, RuntimeError) as error:  # compiled for another NumPy, or its libraries are not there
+        raise MissingDependencyError(
+            f"{purpose} needs {name}, which is installed but cannot be loaded ({error}); install a build of it for NumPy {np.__version__}"
+        ) from error
