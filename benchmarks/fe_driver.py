@@ -61,12 +61,12 @@ def measure(peer: Peer, cells: int, out: Path) -> None:
     """Run one peer once in this process and write what came out."""
     peer.run(make_case(cells if peer.warm_up is None else peer.warm_up))
     case = make_case(cells)
-    start = time.perf_counter()
+    start, busy = time.perf_counter(), time.process_time()
     result = peer.run(case)
-    seconds = time.perf_counter() - start
+    seconds, busy = time.perf_counter() - start, time.process_time() - busy
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform != "darwin" else 1024**2)
     seconds, memory = result.measured or (seconds, memory)
-    np.savez(out, u=result.displacement, force=result.force, numbers=[seconds, memory, result.iterations])
+    np.savez(out, u=result.displacement, force=result.force, numbers=[seconds, memory, result.iterations, busy])
 
 
 def measured(script: str, peers: dict[str, Peer], cells: int, repeats: int) -> tuple[dict[str, list[Any]], dict[str, str]]:

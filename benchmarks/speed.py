@@ -2,8 +2,9 @@
 
 Run: ``python benchmarks/speed.py [--quick] [--only NAME ...] [--repeats 2] [--json FILE] [--record]``
 
-Parts are ``linear`` (a linear-elastic cube with a stiff ball by every solver), ``lattice`` (explicit steps beside NumPy and a plain Numba
-loop) and ``sensing`` (a textured ball with known displacement, by every dense method). Every time is the least of the repeats, of the
+Parts are ``linear`` (a linear-elastic cube with a stiff ball by every solver), ``hyperelastic`` (the same of neo-Hookean material, squeezed by
+a quarter, and the gradient of an identification with an unknown in every element; up to three million tetrahedra), ``lattice`` (explicit steps
+beside NumPy and a plain Numba loop) and ``sensing`` (a textured ball with known displacement, by every dense method). Every time is the least of the repeats, of the
 processor (all threads), so that other work on the machine counts little; each computation runs once before, on a small case, to compile.
 """
 
@@ -15,9 +16,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import fe_compression
+import fe_gradient
 import numpy as np
 from ball_case import ball_case
 from fe_case import make_case, prescribed
+from fe_driver import measured
 from fe_linear_peers import LOWERED
 from lattice_steps import GENTLE, MASS_KG, SIDE_MM, STEP_S, numpy_steps, plain_loop, pushed
 from records import Cell, ResultTable, write_record
@@ -34,12 +38,22 @@ from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 
 Rows = list[tuple[Cell, ...]]
 CELLS, MORE_CELLS = (6, 10, 14, 20, 30), (40,)
+HYPERELASTIC, MORE_HYPERELASTIC = (14, 20, 28), (40, 56, 80)
+GRADIENT_MOST = 56  # cells an edge
 SUPERLU_MOST = 14  # cells an edge; beyond, it takes minutes
 VOXELS, MORE_VOXELS = (8, 16), (32,)  # an edge of the lattice
 WARM_UP, SCANS, MORE_SCANS = 32, (64, 88), (120,)  # voxels an edge
 METHODS: tuple[Method, ...] = ("default", "ssd-blocks", "ncc-blocks", "horn-schunck", "lucas-kanade", "rigid")
 COLUMNS = {
     "linear": ("solver", "unknowns", "processor time, s", "ratio to SciPy's SuperLU"),
+    "hyperelastic": (
+        "computation",
+        "tetrahedra",
+        "processor time, s",
+        "time, s",
+        "peak memory, MB",
+        "exponent of growth from the size before",
+    ),
     "lattice": ("program", "elements", "processor time of a step, ms", "ratio to the plain loop"),
     "sensing": ("method", "voxels", "processor time, s", "mean error, voxel"),
 }
@@ -73,6 +87,24 @@ def linear(quick: bool, repeats: int) -> Rows:
         if cells > 4:  # the smallest compiles
             unknowns = case.mesh.points.size
             rows += [(s, unknowns, t, t / times["superlu"] if "superlu" in times else "") for s, t in times.items()]
+    return rows
+
+
+def hyperelastic(quick: bool, repeats: int) -> Rows:
+    """Each size in a process of its own, so that its peak of memory is its own."""
+    rows: Rows = []
+    for label, script, cells_most in (("compression by 25 %", fe_compression, 80), ("gradient", fe_gradient, GRADIENT_MOST)):
+        before = None
+        for cells in (*HYPERELASTIC, *(() if quick else MORE_HYPERELASTIC)):
+            if cells > cells_most:
+                continue
+            found, absent = measured(script.__file__, {"naibu": script.PEERS["naibu"]}, cells, repeats)
+            if absent:
+                raise RuntimeError(f"{label}, {cells} cells an edge: {absent['naibu']}")
+            seconds, memory, _, busy = np.min([run["numbers"] for run in found["naibu"]], axis=0)
+            growth = "" if before is None else float(np.log(busy / before[1]) / np.log((cells / before[0]) ** 3))
+            rows.append((label, 6 * cells**3, busy, seconds, memory, growth))
+            before = cells, busy
     return rows
 
 
@@ -126,7 +158,7 @@ def sensing(quick: bool, repeats: int) -> Rows:
     return rows
 
 
-PARTS: dict[str, Callable[[bool, int], Rows]] = {"linear": linear, "lattice": lattice, "sensing": sensing}
+PARTS: dict[str, Callable[[bool, int], Rows]] = {"linear": linear, "hyperelastic": hyperelastic, "lattice": lattice, "sensing": sensing}
 
 
 def main() -> None:
