@@ -2,10 +2,11 @@
 
 Run: ``python benchmarks/speed.py [--quick] [--only NAME ...] [--repeats 2] [--json FILE] [--record]``
 
-Parts are ``linear`` (a linear-elastic cube with a stiff ball by every solver), ``hyperelastic`` (the same of neo-Hookean material, squeezed by
-a quarter, and the gradient of an identification with an unknown in every element; up to three million tetrahedra), ``lattice`` (explicit steps
-beside NumPy and a plain Numba loop) and ``sensing`` (a textured ball with known displacement, by every dense method). Every time is the least of the repeats, of the
-processor (all threads), so that other work on the machine counts little; each computation runs once before, on a small case, to compile.
+Parts are ``linear`` (a linear-elastic cube with a stiff ball by every solver), ``hyperelastic`` (the same of neo-Hookean material, squeezed
+by a quarter, and the gradient of an identification with an unknown in every element; up to three million tetrahedra), ``lattice``
+(explicit steps beside NumPy and a plain Numba loop) and ``sensing`` (a textured ball with known displacement, by every dense method). Every
+time is the least of the repeats, of the processor (all threads), so that other work on the machine counts little; each computation runs
+once before, on a small case, to compile.
 """
 
 from __future__ import annotations
