@@ -11,7 +11,6 @@ import argparse
 import importlib.util
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -23,6 +22,7 @@ from typing import Any
 
 import numpy as np
 from fe_case import Case, Result, make_case
+from peak_memory import peak_memory_mb
 
 JAX_FEM = ("jax", "jax_fem", "petsc4py", "basix", "gmsh", "meshio", "pyfiglet")  # the wheel of jax-fem names no requirements
 HEADINGS = {
@@ -64,8 +64,7 @@ def measure(peer: Peer, cells: int, out: Path) -> None:
     start, busy = time.perf_counter(), time.process_time()
     result = peer.run(case)
     seconds, busy = time.perf_counter() - start, time.process_time() - busy
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform != "darwin" else 1024**2)
-    seconds, memory = result.measured or (seconds, memory)
+    seconds, memory = result.measured or (seconds, peak_memory_mb())
     np.savez(out, u=result.displacement, force=result.force, numbers=[seconds, memory, result.iterations, busy])
 
 
