@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -49,3 +51,15 @@ def test_derivatives_that_are_not_given_are_central_differences() -> None:
 def test_bad_motions_are_named(times: list[float], displacements: list[list[float]], message: str) -> None:
     with pytest.raises(InputError, match=message):
         PrescribedMotion.through(times, displacements)
+
+
+def test_a_path_goes_to_other_processes() -> None:
+    path = PrescribedMotion.through([0.0, 0.1, 0.3], [[0.0, 0.0], [1.0, -2.0], [1.0, 0.0]])
+    sent = pickle.loads(pickle.dumps(path))
+    for time in (-0.1, 0.0, 0.05, 0.1, 0.2, 0.3, 0.4):
+        np.testing.assert_array_equal(sent.displacement(time), path.displacement(time))
+        for side in (-1, 1):
+            np.testing.assert_array_equal(sent.velocity(time, side), path.velocity(time, side))
+    np.testing.assert_allclose(sent.velocity(0.1, -1), [10.0, -20.0])
+    np.testing.assert_allclose(sent.velocity(0.1, 1), [0.0, 10.0])
+    np.testing.assert_array_equal(sent.velocity(0.3, 1), [0.0, 0.0])

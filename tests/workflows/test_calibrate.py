@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,15 @@ import pytest
 from lattice_studies import study_file
 from notebooks import check_shown
 
-from naibu.core.errors import InputError
+from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.progress import ProgressReport
+from naibu.identification.lattice_calibration.estimate import LatticeEstimate
 from naibu.identification.lattice_calibration.study_model import StudyModel
+from naibu.identification.lattice_calibration.study_problem import RecordedForces, StudyProblem
 from naibu.identification.lattice_calibration.study_unknowns import StudyUnknowns
 from naibu.workflows.studies.calibrate import calibrate_study
 from naibu.workflows.studies.calibration_example import write_calibration_example
+from naibu.workflows.studies.calibration_starts import StartedSearch, best_of
 from naibu.workflows.studies.lattice_study import prepared_study
 
 STUDY = """
@@ -129,3 +133,62 @@ def test_the_example_is_complete(tmp_path: Path) -> None:
     assert prepared_study(study).settings.parameters.K == 50.0
     assert shapes.read_text(encoding="utf-8").count("\n") == 1 + 5 * 2800
     assert forces.read_text(encoding="utf-8").count("\n") == 1 + 2 * 2000
+
+
+def test_several_starts_agree_whoever_computes_them(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    study, cloud, sensor = inputs
+    one = calibrate_study(study, shapes=[cloud], forces=[sensor], out=tmp_path / "one", groups="all", point_sd_mm=0.05)
+    runs = [
+        calibrate_study(
+            study, shapes=[cloud], forces=[sensor], out=tmp_path / str(n), groups="all", point_sd_mm=0.05, starts=3, workers=n, seed=1
+        )
+        for n in (1, 2)
+    ]
+    np.testing.assert_allclose(runs[0].estimate.values, runs[1].estimate.values, rtol=1e-12)
+    np.testing.assert_allclose(runs[0].estimate.values, one.estimate.values, rtol=0.01)  # one minimum: all starts lead there
+    told = json.loads(runs[1].files[1].read_text(encoding="utf-8"))["starts"]
+    assert len(told) == 3 and not any(row["fits_as_well_elsewhere"] or row["error"] for row in told)
+    assert max(row["start"]["K"] for row in told) > 2.0 * min(row["start"]["K"] for row in told)
+    assert "Where the searches ended" in runs[1].files[0].read_text(encoding="utf-8")
+
+
+def test_values_that_fit_as_well_widen_the_intervals(inputs: tuple[Path, Path, Path]) -> None:
+    """A search that ends elsewhere with the same misfit is not told apart; one that fits worse is passed over."""
+    study = prepared_study(inputs[0]).study
+    unknowns = StudyUnknowns.of(study, groups="all")
+    recorded = RecordedForces.of(study, [(1, 1e-3 * np.arange(1.0, 100.0, 2.0), np.ones((50, 3)))], sd_mn=1.0)
+    problem = StudyProblem.of(unknowns, (), recorded, point_sd_mm=0.1)
+    estimate = LatticeEstimate(unknowns, np.array([45.0, 5.0]), 1e-4 * np.eye(2), 1e4 * np.eye(2), (np.nan, 1.0), 1, 1, ())
+    elsewhere, worse = replace(estimate, values=np.array([45.0, 10.0])), replace(estimate, values=np.array([90.0, 5.0]))
+    ended = [(estimate, 100.0), (elsewhere, 102.0), (worse, 160.0)]
+    searches = (*(StartedSearch(e.values, e, chi) for e, chi in ended), StartedSearch(np.ones(2), None, np.inf, "diverged"))
+    found = best_of(problem, searches, complete=True)
+    assert found.rivals == (1,)
+    low, high = found.estimate.intervals().T
+    assert low[1] < 5.0 < 10.0 < high[1]
+    assert high[0] < 50.0
+    with pytest.raises(ConvergenceError, match="diverged"):
+        best_of(problem, searches[3:], complete=True)
+
+
+def test_workers_without_several_starts_are_refused(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    study, _, sensor = inputs
+    with pytest.raises(InputError, match="`starts` is 1"):
+        calibrate_study(study, forces=[sensor], out=tmp_path / "out", groups="all", workers=2)
+    with pytest.raises(InputError, match="starts is 0"):
+        calibrate_study(study, forces=[sensor], out=tmp_path / "out", groups="all", starts=0)
+
+
+def test_an_interruption_keeps_the_searches_that_ended(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    study, cloud, sensor = inputs
+
+    def stop(report: ProgressReport) -> None:
+        if report.stage == "calibrate" and report.total == 3 and report.done and report.done >= 1:
+            raise KeyboardInterrupt
+
+    run = calibrate_study(
+        study, shapes=[cloud], forces=[sensor], out=tmp_path / "out", groups="all", point_sd_mm=0.05, starts=3, progress=stop
+    )
+    assert not run.estimate.finished
+    assert len(json.loads(run.files[1].read_text(encoding="utf-8"))["starts"]) == 1
+    assert run.estimate.values == pytest.approx(list(TRUTH.values()), rel=0.1)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from naibu.cli.shell.console import INTERRUPTED, WARNING, errors, print_table, progress_display, say
-from naibu.cli.shell.described import Flag, Out, Overwrite, Whole
+from naibu.cli.shell.described import Flag, Out, Overwrite, Whole, WorkerOptions
 from naibu.cli.shell.run_record import wrote
 from naibu.cli.shell.verbs import SIMULATE, verb
 from naibu.cli.studies import stopped_gently
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     SIMULATE,
     "calibrate --example dough   # writes inputs to try it with",
     "calibrate dough/dough.toml --shapes dough/shapes.csv --forces dough/forces.csv --open",
+    "calibrate dough/dough.toml --forces dough/forces.csv --starts 4 --workers 2   # do other values fit as well?",
     "calibrate my_study.toml --shapes 0=rest.ply --shapes 0.5=pressed.ply --forces stamp=sensor.csv --friction common",
 )
 def calibrate(
@@ -41,6 +42,8 @@ def calibrate(
     max_runs: Whole = 2000,
     seed: Whole = 0,
     threads: Whole = 2,
+    starts: Whole = 1,
+    where: WorkerOptions | None = None,
     example: Path | None = None,
     out: Out = Path("naibu-calibration"),
     overwrite: Overwrite = False,
@@ -79,6 +82,9 @@ def calibrate(
         Seed of the random numbers, of such a search or of the example.
     threads
         Number of threads that compute derivatives.
+    starts
+        Number of independent searches: from the values of the study, and from a Latin hypercube within a factor of 10 around them. The best
+        is taken, and intervals reach to other values that fit as well.
     example
         Write inputs to try the verb with into this folder, and do nothing else.
     out
@@ -103,8 +109,8 @@ def calibrate(
 
         run = calibrate_study(
             study, shapes=shapes or (), forces=forces or (), out=out, groups=groups, friction=friction, pull_off=pull_off, method=method,
-            point_sd_mm=point_sd_mm, force_sd_mn=force_sd_mn, max_runs=max_runs, seed=seed, threads=threads, overwrite=overwrite,
-            progress=progress,
+            point_sd_mm=point_sd_mm, force_sd_mn=force_sd_mn, max_runs=max_runs, seed=seed, threads=threads, starts=starts,
+            overwrite=overwrite, progress=progress, **(where or WorkerOptions()).arguments,
         )  # fmt: skip
     _show(run)
     say(f"{time.perf_counter() - began:.0f} s. Page: {run.files[0]}   numbers: {run.files[1]}   study: {run.files[2]}")

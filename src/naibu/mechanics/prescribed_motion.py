@@ -15,6 +15,26 @@ _FINE, _COARSE = 1e-5, 1e-3  # steps, s, of the differences that stand in for de
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Polyline:
+    """Displacements g (k, d) at times t (k,), linear in between; its methods can be sent to other processes."""
+
+    t: FloatArray
+    g: FloatArray
+
+    def displacement(self, time: float) -> FloatArray:
+        return np.array([np.interp(time, self.t, column) for column in self.g.T])
+
+    def velocity(self, time: float, side: int) -> FloatArray:
+        k = int(np.searchsorted(self.t, time, side="right" if side > 0 else "left"))
+        if not 0 < k < len(self.t):
+            return np.zeros(self.g.shape[1])
+        return np.asarray((self.g[k] - self.g[k - 1]) / (self.t[k] - self.t[k - 1]))
+
+    def acceleration(self, time: float) -> FloatArray:
+        return np.zeros(self.g.shape[1])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PrescribedMotion:
     """Displacement as a function of time; made by `through` (piecewise linear) or `of` (smooth functions).
 
@@ -58,15 +78,8 @@ class PrescribedMotion:
             )
         if not (np.isfinite(t).all() and np.isfinite(g).all() and (np.diff(t) > 0.0).all()):
             raise InputError("times_s must increase, and times_s and displacements_mm must be finite numbers")
-        velocities = np.vstack([np.zeros(g.shape[1]), np.diff(g, axis=0) / np.diff(t)[:, None], np.zeros(g.shape[1])])
-
-        def displacement(time: float) -> FloatArray:
-            return np.array([np.interp(time, t, column) for column in g.T])
-
-        def velocity(time: float, side: int) -> FloatArray:
-            return np.asarray(velocities[np.searchsorted(t, time, side="right" if side > 0 else "left")])
-
-        return cls(displacement, velocity, lambda _: np.zeros(g.shape[1]), tuple(t.tolist()))
+        line = _Polyline(t, g)
+        return cls(line.displacement, line.velocity, line.acceleration, tuple(t.tolist()))
 
     @classmethod
     def of(

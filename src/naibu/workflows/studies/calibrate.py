@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 
@@ -18,8 +18,6 @@ from naibu.core.arrays import require_within
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress
 from naibu.identification.lattice_calibration.estimate import LatticeEstimate
-from naibu.identification.lattice_calibration.evolutionary import search_cma_es, search_genetic
-from naibu.identification.lattice_calibration.gauss_newton import calibrate_lattice, estimate_at
 from naibu.identification.lattice_calibration.study_problem import RecordedForces, StudyProblem
 from naibu.identification.lattice_calibration.study_unknowns import PULL_OFF, Friction, Groups, StudyUnknowns
 from naibu.io.files.atomic import write_atomically
@@ -30,11 +28,12 @@ from naibu.io.tables.captured_shapes import CapturedSurface, read_captured_shape
 from naibu.io.tables.force_records import ForceRecord, read_force_records
 from naibu.viewer.chapters.chapter_page import chapter_html
 from naibu.viewer.notebook import WrittenResult
+from naibu.workflows.parallel.worker_count import Workers
 from naibu.workflows.results.output_folder import output_folder
-from naibu.workflows.studies.calibration_page import Compared, calibration_chapter, held_intervals, misfit_numbers
+from naibu.workflows.studies.calibration_page import Compared, calibration_chapter, held_intervals, misfit_numbers, start_numbers
+from naibu.workflows.studies.calibration_starts import CalibratedFromStarts, Method, calibrate_from_starts, searched
 from naibu.workflows.studies.lattice_study import PreparedStudy, prepared_study
 
-Method = Literal["gauss-newton", "cma-es", "genetic"]
 POINT_SD_MM = 0.5  # of the report's stereo cameras :cite:p:`hirai2008`
 
 
@@ -82,12 +81,15 @@ def calibrate_study(
     max_runs: int = 2000,
     seed: int = 0,
     threads: int = 2,
+    starts: int = 1,
+    workers: int = 1,
+    cluster: str | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> LatticeCalibration:
     """Identify the parameters of a lattice from what cameras and force sensors recorded of it.
 
-    Ctrl-C (KeyboardInterrupt, also from `progress`) keeps the best values so far.
+    Ctrl-C (KeyboardInterrupt, also from `progress`) keeps the best values so far; of several starts on workers, of the searches that ended.
 
     Parameters
     ----------
@@ -113,6 +115,11 @@ def calibrate_study(
         Of the random numbers of such a search.
     threads : int
         Computing derivatives.
+    starts : int
+        Number of independent searches: from the values of the study, and from a Latin hypercube within a factor of 10 around them. The
+        best is taken; intervals reach to other values that fit as well.
+    workers, cluster
+        Where these searches run, as for `naibu.workflows.Workers`.
     overwrite : bool
         Whether results that the folder holds are replaced.
     progress : callable, optional
@@ -126,7 +133,8 @@ def calibrate_study(
     ConvergenceError
         The iterations did not settle.
     """
-    _check_arguments(shapes, forces, method, point_sd_mm, force_sd_mn, max_runs, threads, seed)
+    _check_arguments(shapes, forces, method, point_sd_mm, force_sd_mn, max_runs, threads, seed, starts)
+    where = _checked_workers(workers, cluster, starts)
     prepared = prepared_study(study)
     if prepared.settings.material is not None and groups != "given":
         raise InputError(
@@ -140,20 +148,23 @@ def calibrate_study(
     folder = output_folder(out, ("calibration.html", "calibration.json", name), overwrite=overwrite)
     before = Compared.of(problem, unknowns.start)
     _check_directions(prepared, before)
-    estimate = _searched(problem, method, seed, max_runs, threads, progress)
+    estimate, several = _searched(problem, starts, where, progress, method=method, seed=seed, max_runs=max_runs, threads=threads)
     after = Compared.of(problem, estimate.values)
     settings = calibrated_settings(prepared.settings, estimate)
     inputs = {**prepared.inputs, **_hashes((*shapes, *forces))}
     options: dict[str, str | float | int | None] = {
         "study": prepared.source, "method": method, "groups": groups, "friction": friction, "point_sd_mm": point_sd_mm, "seed": seed,
+        "starts": starts,
         **{f"SHA-256 of {file}": digest for file, digest in inputs.items()},
     }  # fmt: skip
-    warnings = _warnings(problem, estimate, before)
-    chapter = calibration_chapter(prepared.title, problem, estimate, before, after, records, warnings, options)
+    warnings = (*_warnings_of_starts(several), *_warnings(problem, estimate, before))
+    chapter = calibration_chapter(prepared.title, problem, estimate, before, after, records, warnings, options, several)
     comment = f"{prepared.title}, calibrated by naibu {__version__} from {', '.join(map(_file_name, (*shapes, *forces)))}"
     target = write_atomically(folder / name, study_document(_with_volumes(prepared, settings, folder), comment))
     page = write_atomically(folder / "calibration.html", chapter_html(chapter))
     numbers = {**_numbers(estimate), "misfit": misfit_numbers(problem, before, after), "warnings": list(warnings), "settings": options}
+    if several:
+        numbers["starts"] = start_numbers(several)
     written = write_atomically(folder / "calibration.json", json.dumps(numbers, indent=1, ensure_ascii=False) + "\n")
     return LatticeCalibration((page, written, target), estimate, warnings)
 
@@ -167,13 +178,14 @@ def _check_arguments(
     max_runs: int,
     threads: int,
     seed: int,
+    starts: int,
 ) -> None:
     if method not in get_args(Method):
         raise InputError(f"method is {method!r}; choose one of {', '.join(get_args(Method))}")
     require_within("point_sd_mm", point_sd_mm, 1e-6, 1e3, "mm")
     if force_sd_mn is not None:
         require_within("force_sd_mn", force_sd_mn, 1e-6, 1e6, "mN")
-    for name, count in (("max_runs", max_runs), ("threads", threads)):
+    for name, count in (("max_runs", max_runs), ("threads", threads), ("starts", starts)):
         if count < 1:
             raise InputError(f"{name} is {count}: must be at least 1")
     if seed < 0:
@@ -225,13 +237,34 @@ def _check_directions(prepared: PreparedStudy, before: Compared) -> None:
             )
 
 
-def _searched(problem: StudyProblem, method: Method, seed: int, max_runs: int, threads: int, progress: Progress | None) -> LatticeEstimate:
-    start = problem.unknowns.start
-    if method == "gauss-newton":
-        return calibrate_lattice(problem, start, threads=threads, progress=progress)
-    search = search_cma_es if method == "cma-es" else search_genetic
-    found = search(problem, start, seed=seed, measure="chi-squared", max_runs=max_runs, progress=progress)
-    return estimate_at(problem, found.values, finished=found.finished)
+def _checked_workers(workers: int, cluster: str | None, starts: int) -> Workers:
+    where = Workers(workers, cluster)
+    if starts == 1 and where.elsewhere:
+        raise InputError("`workers` and `cluster` share out the searches of several starts, and `starts` is 1; raise it, or leave them out")
+    return where
+
+
+def _searched(
+    problem: StudyProblem, starts: int, where: Workers, progress: Progress | None, **options: Any
+) -> tuple[LatticeEstimate, CalibratedFromStarts | None]:
+    if starts == 1:
+        return searched(problem, problem.unknowns.start, progress=progress, **options), None
+    several = calibrate_from_starts(problem, starts, workers=where, progress=progress, **options)
+    return several.estimate, several
+
+
+def _warnings_of_starts(several: CalibratedFromStarts | None) -> tuple[str, ...]:
+    if several is None:
+        return ()
+    found = []
+    if several.rivals:
+        found.append(
+            f"{len(several.rivals)} of the other searches ended at values that fit as well: the data do not tell them apart. "
+            "Intervals reach to all of them; read the table of starts."
+        )
+    if failed := [s for s in several.searches if s.estimate is None]:
+        found.append(f"{len(failed)} of {len(several.searches)} searches came to no end, the first of them: {failed[0].error}.")
+    return tuple(found)
 
 
 def _warnings(problem: StudyProblem, estimate: LatticeEstimate, before: Compared) -> tuple[str, ...]:

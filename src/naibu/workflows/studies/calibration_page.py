@@ -15,6 +15,7 @@ from naibu.identification.lattice_calibration.study_problem import StudyProblem
 from naibu.io.tables.force_records import ForceRecord
 from naibu.viewer.chapters.chapter import Chapter, Figure, Section
 from naibu.viewer.tables import Cell, Table
+from naibu.workflows.studies.calibration_starts import CalibratedFromStarts
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -103,8 +104,9 @@ def calibration_chapter(
     records: Sequence[ForceRecord],
     warnings: Sequence[str],
     settings: Mapping[str, Cell],
+    several: CalibratedFromStarts | None = None,
 ) -> Chapter:
-    """Return the page of a calibration."""
+    """Return the page of a calibration; with `several`, of that from several starts."""
     sections = [_estimates(problem, estimate, warnings)]
     numbers = misfit_numbers(problem, before, after)
     if after.times:
@@ -115,6 +117,8 @@ def calibration_chapter(
         sections.append(Section("Shapes", (text,), (Table("Distance of the captured points", columns, rows),), (figure,)))
     if numbers["forces"]:
         sections.append(_forces(problem, before, after, records, numbers))
+    if several:
+        sections.append(_starts(several))
     return Chapter("calibration", f"Calibration: {title}", tuple(sections), dict(settings))
 
 
@@ -139,6 +143,39 @@ def _estimates(problem: StudyProblem, estimate: LatticeEstimate, warnings: Seque
     table = Table("Parameters", ("parameter", "unit", "estimate", "95 % from", "to", "start"), rows)
     left = Table("What the data do not determine", ("combination",), tuple((sentence,) for sentence in estimate.undetermined))
     return Section("Parameters", text, (table, left))
+
+
+def start_numbers(several: CalibratedFromStarts) -> list[dict[str, Any]]:
+    """Return where every search began and ended, and how well it fits."""
+    names = several.estimate.unknowns.names
+    return [
+        {
+            "start": dict(zip(names, search.start.tolist(), strict=True)),
+            "values": dict(zip(names, search.estimate.values.tolist(), strict=True)) if search.estimate else None,
+            "chi_squared": search.misfit if search.estimate else None,
+            "settled": bool(search.estimate and search.estimate.settled),
+            "fits_as_well_elsewhere": k in several.rivals,
+            "error": search.error,
+        }
+        for k, search in enumerate(several.searches)
+    ]
+
+
+def _starts(several: CalibratedFromStarts) -> Section:
+    rows: list[tuple[Cell, ...]] = []
+    for k, search in enumerate(several.searches):
+        found = search.estimate
+        remark = search.error
+        if found is not None:
+            remark = "fits as well" if k in several.rivals else "" if found.settled else "did not come to rest"
+        ended = [None] * len(search.start) if found is None else [float(value) for value in found.values]
+        rows.append((k + 1, None if found is None else search.misfit, *ended, remark))
+    text = (
+        "Independent searches, from the values of the study and from a Latin hypercube around them; chi-squared of fine steps in units of "
+        "the stated noise, with the weak prior. The least one is taken."
+    )
+    columns = ("search", "chi-squared", *several.estimate.unknowns.names, "remark")
+    return Section("Starts", (text,), (Table("Where the searches ended", columns, tuple(rows)),))
 
 
 def _forces(
