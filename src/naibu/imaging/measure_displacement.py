@@ -286,9 +286,7 @@ def _correlated(
     if not parts:
         return measured_by(found, reference, inside)
     rest = inside & ~np.logical_or.reduce([part for part, _ in parts])
-    # parts that leave less apart first: facts are those of the first one
-    results = sorted(((own, part) for part, own in parts), key=lambda each: each[0].misplaced_fraction)
-    return _joined([measured_by(own, reference, part) for own, part in [*results, (found, rest)]], inside)
+    return _joined([measured_by(own, reference, part) for part, own in [*parts, (rest, found)]], inside)
 
 
 def _joined(measured: Sequence[MeasuredDisplacement], inside: BoolArray) -> MeasuredDisplacement:
@@ -311,10 +309,23 @@ def _joined(measured: Sequence[MeasuredDisplacement], inside: BoolArray) -> Meas
     return replace(
         first,
         displacement=DisplacementField.on_grid(first.displacement.grid, vectors, covariance=covariance, valid=valid),
-        mask=inside, gradient=gradient, strain_sd=strain_sd, facts=first.facts | {"parts": parts},
+        mask=inside, gradient=gradient, strain_sd=strain_sd,
+        facts=_worst_of([one.facts for one in measured]) | {"parts": parts},
         warnings=tuple(dict.fromkeys([told, *(doubt for one in measured for doubt in one.warnings)])),
         blocks=DisplacementField.from_arrays(each[0], each[1], covariance=each[2]),
     )  # fmt: skip
+
+
+def _worst_of(facts: Sequence[dict[str, float | int | str]]) -> dict[str, float | int | str]:
+    """Return diagnostics of measurements together: sums of numbers, the largest of sizes and fractions, and every kind of convergence."""
+    joined: dict[str, float | int | str] = {}
+    for name in facts[0]:
+        each = [one[name] for one in facts]
+        if name == "convergence":
+            joined[name] = ", ".join(dict.fromkeys(map(str, each)))
+        else:
+            joined[name] = (sum if isinstance(each[0], int) else max)(each)  # type: ignore[arg-type]
+    return joined
 
 
 def measured_by(found: CorrelationResult, reference: Volume, inside: BoolArray) -> MeasuredDisplacement:

@@ -65,6 +65,8 @@ def test_parts_that_differ_in_intensity_are_measured_by_themselves() -> None:
     one = correlate_volumes(before, after, mask=ball)
     found = measure_displacement(before, after, mask=ball)
     assert found.facts["parts"] == 2
+    assert found.facts["residual_sd"] >= one.residual_sd  # diagnostics are those of the worst part
+    assert found.facts["unconverged_cells"] >= (~one.converged).sum()
     near = ball & (np.abs(positions(before)[..., 2] - MIDDLE_MM[2]) < 3.0)
 
     def missed(vectors: FloatArray) -> float:
