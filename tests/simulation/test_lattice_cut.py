@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.mechanics import (
     ConstrainedNodes,
@@ -24,7 +24,7 @@ from naibu.mechanics import (
     spherical_indenter,
 )
 from naibu.mechanics.contact.indenter_motion import IndenterVelocity
-from naibu.mechanics.lattices.model.surface import surface_of
+from naibu.mechanics.lattices.model.surface import surface_of, surface_triangles
 from naibu.meshing import SweptBlade, swept_blade
 from naibu.simulation import LatticeCut, cut_lattice, cut_session
 
@@ -89,6 +89,52 @@ def test_a_plane_leaves_two_pieces_and_everything_that_there_was(kind: str, seed
     of_node[cut.lattice.cells] = cut.piece[:, None]
     np.testing.assert_array_equal(of_node[cut.lattice.cells], np.repeat(cut.piece[:, None], 8, axis=1))  # pieces share no node
     np.testing.assert_array_equal(*of_node[cut.lattice.elements].T)
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_blade_that_goes_on_in_small_steps_cuts_as_in_one_go(kind: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    edge, way, _ = np.linalg.qr(rng.normal(size=(3, 3)))[0].T
+    centre, places = rng.uniform(5.0, SIZE - 5.0, 3), np.linspace(-20.0, 20.0, 80)  # a quarter of a cube a step
+    poses = centre + places[:, None, None] * way + np.array([-40.0, 40.0])[:, None] * edge
+    lattice, parameters = before = made(kind)
+    area = 0.0
+    for k in range(len(poses) - 1):
+        cut = cut_lattice(lattice, parameters, swept_blade(poses[k : k + 2]))
+        lattice, parameters, area = cut.lattice, cut.parameters, area + _area(lattice, cut)
+    whole = cut_lattice(*before, swept_blade(poses[[0, -1]]))
+    np.testing.assert_array_equal(np.bincount(cut.piece), np.bincount(whole.piece))
+    assert cut.n_pieces >= 2 and lattice.n_nodes == whole.lattice.n_nodes
+    assert area == pytest.approx(_area(before[0], whole), rel=1e-12)
+    assert lattice.total_mass == pytest.approx(before[0].total_mass, rel=1e-12)
+
+
+def _area(before: Lattice, cut: LatticeCut) -> float:
+    """Area of the new surface; it is what was added to the surface."""
+    added, old, new = (_areas(at.points, t) for at, t in ((cut.lattice, cut.faces), *((x, surface_triangles(x)) for x in (before, cut.lattice))))
+    assert new - old == pytest.approx(added, abs=1e-9)
+    return added
+
+
+def _areas(points: FloatArray, triangles: IntArray) -> float:
+    a, b, c = points[triangles].transpose(1, 0, 2)
+    return 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+
+
+def test_a_blade_that_parts_two_cubes_inside_opens_nothing_until_it_goes_on() -> None:
+    lattice, parameters = made()
+    small = swept_blade([[[8.0, 6.4, z], [8.0, 7.6, z]] for z in (6.4, 7.6)])  # through one face, whose nodes other cubes hold together
+    cut = cut_lattice(lattice, parameters, small)
+    assert not len(cut.faces) and cut.lattice.n_nodes == lattice.n_nodes
+    np.testing.assert_array_equal(surface_triangles(cut.lattice), surface_triangles(lattice))
+    behind = cut_lattice(cut.lattice, cut.parameters, swept_blade([[[8.0, y, z] for y in (7.6, 60.0)] for z in (-40.0, 60.0)]))
+    ahead = cut_lattice(behind.lattice, behind.parameters, swept_blade([[[8.0, y, z] for y in (-40.0, 6.4)] for z in (-40.0, 60.0)]))
+    slit = [swept_blade([[[8.0, 6.4, z], [8.0, 7.6, z]] for z in ends]) for ends in ((-40.0, 6.4), (7.6, 60.0))]
+    for blade in slit:
+        ahead = cut_lattice(ahead.lattice, ahead.parameters, blade)
+    assert ahead.n_pieces == 2
+    assert _areas(ahead.lattice.points, surface_triangles(ahead.lattice)) == pytest.approx(8 * SIZE**2, rel=1e-12)
 
 
 @settings(max_examples=8, deadline=None)

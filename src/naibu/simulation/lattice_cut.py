@@ -206,7 +206,7 @@ def cut_lattice(lattice: Lattice, parameters: LatticeParameters, blade: SweptBla
     cut = _crossed(where[cells].mean(axis=1), known, blade, volumes)
     parted = replace(known, joined=known.joined & ~cut)
     new_cells, source = _separated(cells, known, parted, cut, lattice.n_nodes)
-    faces = known.triangles(new_cells, known.sides(cut))
+    faces = known.triangles(new_cells, known.sides(parted.opened(new_cells) & ~known.opened(cells)))
     of_copies = np.bincount(new_cells.ravel(), np.repeat(volumes, 8), minlength=len(source)).astype(np.float64)
     share = of_copies / np.bincount(cells.ravel(), np.repeat(volumes, 8), minlength=lattice.n_nodes)[source]
     surface = lattice.surface_node[source]
@@ -216,6 +216,7 @@ def cut_lattice(lattice: Lattice, parameters: LatticeParameters, blade: SweptBla
         lattice, points=lattice.points[source], elements=elements, node_mass=lattice.node_mass[source] * share, surface_node=surface,
         element_class=lattice.element_class[element_source], element_zone=lattice.element_zone[element_source],
         element_level=lattice.element_level[element_source], scale=lattice.scale[element_source] * part, cells=new_cells,
+        parted=np.unique(known.unit[~parted.joined]),
     )  # fmt: skip
     gap = np.zeros(len(nodes := np.unique(faces)))
     distances(np.ascontiguousarray(where[source[nodes]]), *blade.arrays, gap)

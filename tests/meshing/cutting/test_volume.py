@@ -16,6 +16,7 @@ from naibu.core.mesh import Mesh
 from naibu.core.rigid_transform import RigidTransform, rotation_matrix
 from naibu.meshing import SweptBlade, VolumeCut, blade_poses, box, cut_volume, signed_volumes, swept_blade
 from naibu.meshing.quality import smallest_dihedral_angle
+from naibu.meshing.surface import boundary_faces
 
 SIZE = 20.0
 
@@ -52,6 +53,12 @@ def check(before: Mesh, cut: VolumeCut, distance: float) -> None:
     np.testing.assert_array_equal(before.regions[cut.parents], cut.mesh.regions)
     first, second = np.split(cut.faces, 2)
     np.testing.assert_allclose(cut.mesh.points[first].mean(axis=1), cut.mesh.points[second].mean(axis=1), atol=1e-12)
+    added = _area(cut.mesh.points, cut.faces)  # what the cut says is new is what the surface of the mesh grew by
+    assert _area(cut.mesh.points, boundary_faces(cut.mesh).faces) - _area(before.points, boundary_faces(before).faces) == pytest.approx(added, abs=1e-8)
+
+
+def _area(points: FloatArray, faces: np.ndarray) -> float:
+    return 0.5 * float(np.linalg.norm(_area_vectors(points, faces), axis=1).sum())
 
 
 @pytest.mark.parametrize("distance", [8.0, 2.0])

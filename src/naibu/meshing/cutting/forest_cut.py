@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from naibu.core.arrays import AnyArray, BoolArray, FloatArray, IntArray, require_positive, require_shape
 from naibu.core.errors import InputError
@@ -43,7 +44,8 @@ class ForestCut:
     copies : ndarray, shape (k, 2), int64
         Vertices that were doubled, and their copies.
     faces : ndarray, shape (f, 4), int64
-        New surface: cell above the blade, place in it of the vertex opposite to the face, and the same of the cell below.
+        New surface: cell above the blade, place in it of the vertex opposite to the face, and the same of the cell below. Faces at the
+        front all of whose vertices are still one on both sides are no part of it, but of that of the cut that separates them.
     deviation_mm : float
         Largest distance of a vertex of the new surface from the blade.
     smallest_angle_deg : float
@@ -141,8 +143,12 @@ def _cut(
         raise _too_fine(distance_mm)
     angle = _quality(forest, changes, distance_mm, least_angle_deg)
     faces = _opened(forest, faces, centres, whole, 0.5 * distance_mm)
-    _, deviation = kernels.too_coarse(forest.arrays[0], faces, where, surface, np.inf, gap, np.empty(0, dtype=np.int64))
-    return ForestCut(tuple(changes), _separated(forest, faces), faces, float(deviation), angle)
+    copies, apart, earlier = _separated(forest, faces)
+    where = _extended(where, forest.node_rows, copies)
+    gap = _extended(gap, forest.node_rows, copies)
+    _, deviation = kernels.too_coarse(forest.arrays[0], faces[apart], where, surface, np.inf, gap, np.empty(0, dtype=np.int64))
+    late = _above_first(forest, earlier, where, whole)
+    return ForestCut(tuple(changes), copies, np.concatenate([faces[apart], late]), float(deviation), angle)
 
 
 def _extended(values: AnyArray, rows: int, copies: IntArray) -> AnyArray:
@@ -233,16 +239,58 @@ def face_vertices(forest: BisectionForest, cells: IntArray, places: IntArray) ->
     return corners
 
 
-def _separated(forest: BisectionForest, faces: IntArray) -> IntArray:
-    """Double the vertices of open faces, and return them with their copies (k, 2)."""
+def _separated(forest: BisectionForest, faces: IntArray) -> tuple[IntArray, BoolArray, IntArray]:
+    """Double the vertices of open faces.
+
+    Returns
+    -------
+    tuple of ndarray
+        Vertices and their copies (k, 2); which of the faces (f,) have different vertices on both sides now; and such faces (e, 4) that cuts
+        before had opened at their fronts.
+    """
     touched, slot = np.zeros(forest.node_rows, dtype=np.int8), np.full(forest.cell_rows, -1, dtype=np.int64)
     around, group, count = kernels.corner_groups(forest.arrays[0], forest.arrays[4], forest.n_cells, faces, touched, slot)
     first, source = forest.node_rows, np.empty(int(count), dtype=np.int64)
+    pairs = _coincident(forest, around)
     forest.reserve(int(count))
     cells, points, nodes, _, _, counters = forest.arrays
     counters[[NODES, COUNT]] += int(count)
     kernels.double_vertices(cells, points, nodes, around, group, touched, first, source)
-    return np.stack([source, first + np.arange(len(source))], axis=1)
+    known = {(t, s) for row in faces.tolist() for t, s in (row[:2], row[2:])}
+    before = np.array([row for row in pairs.tolist() if (row[0], row[1]) not in known], dtype=np.int64).reshape(-1, 4)
+    return np.stack([source, first + np.arange(len(source))], axis=1), _apart(forest, faces), before[_apart(forest, before)]
+
+
+def _coincident(forest: BisectionForest, cells: IntArray) -> IntArray:
+    """Pairs (p, 4) of open faces of cells that have the same vertices."""
+    t, s = np.nonzero(forest.neighbours[cells] < 0)
+    corners = _corners(forest, cells[t], s)
+    order = np.lexsort(corners.T)
+    same = (np.diff(corners[order], axis=0) == 0).all(axis=1)
+    one, two = order[:-1][same], order[1:][same]
+    return np.stack([cells[t[one]], s[one], cells[t[two]], s[two]], axis=1)
+
+
+def _apart(forest: BisectionForest, faces: IntArray) -> BoolArray:
+    """Whether faces (f, 4) have other vertices on one side than on the other."""
+    one, two = (_corners(forest, faces[:, k], faces[:, k + 1]) for k in (0, 2))
+    return np.asarray((one != two).any(axis=1))
+
+
+def _corners(forest: BisectionForest, cells: IntArray, places: IntArray) -> IntArray:
+    """Sorted vertices (f, 3) of faces."""
+    return np.sort(forest.simplices[cells].astype(np.int64)[np.arange(len(cells))[:, None], _FACES[places]], axis=1)
+
+
+def _above_first(forest: BisectionForest, faces: IntArray, where: FloatArray, blade: SweptBlade) -> IntArray:
+    """Faces (f, 4) with the cell first that lies above the part of the blade that is nearest to the face."""
+    if not len(faces):
+        return faces
+    a, b, c = blade.points[blade.triangles].transpose(1, 0, 2)
+    upper, lower = (where[forest.simplices[faces[:, k]]].mean(axis=1) for k in (0, 2))
+    nearest = cKDTree((a + b + c) / 3.0).query(0.5 * (upper + lower))[1]
+    below = ((upper - lower) * np.cross(b - a, c - a)[nearest]).sum(axis=1) < 0.0
+    return np.where(below[:, None], faces[:, [2, 3, 0, 1]], faces)
 
 
 def _quality(forest: BisectionForest, changes: list[MeshChange], distance_mm: float, least_angle_deg: float | None) -> float:

@@ -31,7 +31,7 @@ class CubeFaces:
     unit : ndarray, shape (p,), int64
         The face of the larger cube, ``6 cube + face``: what is joined there, or separated, as a whole.
     joined : ndarray, shape (p,), bool
-        Whether nodes that stand at the same place are the same, all around the unit.
+        Whether no cut has gone through the unit.
     edge : ndarray, shape (c,), int64
         Edges of the cubes, in spacings.
     """
@@ -53,9 +53,16 @@ class CubeFaces:
         small = 6 * self.pairs[chosen, 0] + self.face[chosen]
         return np.unique(np.concatenate([small, self.unit[chosen]]))
 
-    def outer(self) -> IntArray:
-        """Return the faces, ``6 cube + face``, that nothing is joined to."""
-        return np.union1d(np.flatnonzero(self.beyond.ravel() < 0), self.sides(~self.joined))
+    def opened(self, cells: IntArray) -> BoolArray:
+        """Return which pairs (p,) a cut has opened: at its front, all nodes of two cubes may still be the same."""
+        small, large = self.pairs.T
+        here = cells[small[:, None], FACES[self.face]]
+        there = cells[large[:, None], FACES[self.unit % 6]]
+        return np.asarray(~self.joined & ((self.edge[small] != self.edge[large]) | (here != there).any(axis=1)))
+
+    def outer(self, cells: IntArray) -> IntArray:
+        """Return the faces, ``6 cube + face``, that lie on the surface, also on that of cuts."""
+        return np.union1d(np.flatnonzero(self.beyond.ravel() < 0), self.sides(self.opened(cells)))
 
 
 def cube_faces(lattice: Lattice) -> CubeFaces:
@@ -75,7 +82,8 @@ def cube_faces(lattice: Lattice) -> CubeFaces:
     kept = (edge[cube] < edge[other]) | ((edge[cube] == edge[other]) & (cube < other))
     pairs, face = np.stack([cube[kept], other[kept]], axis=1), face[kept]
     unit = 6 * pairs[:, 1] + (face ^ 1)
-    return CubeFaces(beyond, pairs, face, unit, _joined(lattice, grid, pairs, unit), edge)
+    joined = np.ones(len(unit), dtype=bool) if lattice.parted is None else ~np.isin(unit, lattice.parted)
+    return CubeFaces(beyond, pairs, face, unit, joined, edge)
 
 
 def require_cubes(lattice: Lattice) -> IntArray:
@@ -102,20 +110,6 @@ def _beyond(at: IntArray, edge: IntArray) -> IntArray:
     middle, size = edge[:, None, None] // 2, edge[:, None, None]
     place = at[:, None, :] + np.where(_WAYS > 0, size, np.where(_WAYS < 0, -1, middle)) + 1
     return np.asarray(owner[tuple(np.moveaxis(place, 2, 0))], dtype=np.int64)
-
-
-def _joined(lattice: Lattice, grid: IntArray, pairs: IntArray, unit: IntArray) -> BoolArray:
-    """Whether the nodes at one place are the same for both cubes of every pair (p,), and of all pairs of its unit."""
-    cells = require_cubes(lattice)
-    stride = int(grid.max()) + 1
-    key = grid[:, 0] + stride * (grid[:, 1] + stride * grid[:, 2])
-    _, first, count = np.unique(key, return_inverse=True, return_counts=True)
-    doubled = (count > 1)[first]
-    open_pair = np.zeros(len(pairs), dtype=bool)
-    chosen = np.flatnonzero(doubled[cells[pairs[:, 0]]].any(axis=1))
-    one, two = cells[pairs[chosen, 0]][:, :, None], cells[pairs[chosen, 1]][:, None, :]
-    open_pair[chosen] = ((key[one] == key[two]) & (one != two)).any(axis=(1, 2))
-    return ~np.isin(unit, unit[open_pair])
 
 
 def corner_volumes(lattice: Lattice) -> FloatArray:

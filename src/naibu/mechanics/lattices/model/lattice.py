@@ -55,6 +55,8 @@ class Lattice:
         are none.
     frame : RigidTransform
         From `points` to the frame of the scanner, in which results are written; the identity where there was no scan.
+    parted : ndarray, shape (k,), int64, optional
+        Faces ``6 cube + face`` that cuts have gone through, of the larger cube where two sizes meet; None of lattices that were never cut.
     """
 
     points: FloatArray
@@ -69,6 +71,7 @@ class Lattice:
     cells: IntArray | None = None
     frame: RigidTransform = field(default_factory=RigidTransform.identity)
     faces: IntArray | None = None
+    parted: IntArray | None = None
 
     @property
     def n_nodes(self) -> int:

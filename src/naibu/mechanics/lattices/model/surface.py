@@ -30,7 +30,7 @@ def surface_triangles(lattice: Lattice) -> IntArray:
         A lattice without cubes.
     """
     cells, faces = require_cubes(lattice), cube_faces(lattice)
-    return faces.triangles(cells, faces.outer())
+    return faces.triangles(cells, faces.outer(cells))
 
 
 def surface_faces(lattice: Lattice) -> IntArray:
