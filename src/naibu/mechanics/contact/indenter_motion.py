@@ -118,7 +118,7 @@ def step_parts(
     """
     if slow_enough(indenters, travel, turn, approach):
         return 1
-    allowed, ways = _allowed(indenters), np.maximum(np.linalg.norm(travel, axis=1), approach)
+    allowed, ways = harmless_ways(indenters), np.maximum(np.linalg.norm(travel, axis=1), approach)
     if turn.any():
         arms = np.array([np.linalg.norm(points - centre, axis=1).max() for centre in centres])
         ways = ways + np.linalg.norm(turn, axis=1) * arms
@@ -167,10 +167,10 @@ def slow_enough(indenters: Sequence[RigidIndenter], travel: FloatArray, turn: Fl
 
     Each may move by `SHARE` of the radius of the largest sphere in the indenter: together they stay below that radius.
     """
-    return not turn.any() and bool((np.maximum(np.linalg.norm(travel, axis=1), approach) <= _allowed(indenters)).all())
+    return not turn.any() and bool((np.maximum(np.linalg.norm(travel, axis=1), approach) <= harmless_ways(indenters)).all())
 
 
-def _allowed(indenters: Sequence[RigidIndenter]) -> FloatArray:
+def harmless_ways(indenters: Sequence[RigidIndenter]) -> FloatArray:
     """Return how far (k,), mm, indenters may move at once where they touch."""
     return np.array([SHARE * i.geometry.inradius for i in indenters])
 

@@ -75,6 +75,11 @@ class UpdatedFactors:
         """For which of these nodes (any shape) the part of the inverse is known."""
         return np.asarray(self._slot[nodes] >= 0)
 
+    @property
+    def column_bytes(self) -> int:
+        """Memory of the columns of the inverse."""
+        return sum(columns.nbytes for columns in self._columns)
+
     def prepare(self, nodes: IntArray) -> None:
         """Compute the part of the inverse that belongs to nodes (k,) and those of earlier calls."""
         new = np.unique(nodes[self._slot[nodes] < 0])

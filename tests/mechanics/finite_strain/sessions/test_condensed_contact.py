@@ -85,7 +85,7 @@ def factorized(matrix: FloatArray) -> EarlierTangent:
     solver = SuperLUSolver()
     factors = UpdatedFactors(solver.factorize(sp.bsr_matrix(matrix, blocksize=(3, 3))), len(matrix) // 3)
     none = np.zeros(0, np.int64)
-    return EarlierTangent(factors, np.zeros((0, 0, 3)), np.zeros((0, 3, 3)), none, none, np.zeros((0, 3, 3)), solver)
+    return EarlierTangent(factors, np.zeros((0, 0, 3)), np.zeros((0, 3, 3)), none, none, np.zeros((0, 3, 3)), solver, np.zeros((len(matrix) // 3, 3)))
 
 
 @pytest.mark.parametrize("friction", [0.3, 1.0, 2.0])
@@ -96,7 +96,7 @@ def test_a_chain_of_points_that_stick_and_slip_is_solved_with_few_derivatives(fr
     tangent, nodes = factorized(np.kron(springs, np.eye(3))), np.arange(count)
     free = np.column_stack([np.linspace(0.0, 4.0, count), 0.5 * np.cos(np.arange(count)), 0.5 + 0.4 * np.sin(2.0 * np.arange(count))])
     law = RoughWall(friction, 1e4)
-    force = found_by(CondensedContact(tangent, nodes, np.full(count, BODY)).forces(free, law, np.zeros_like(free), 1e-6, 10.0))
+    force = found_by(CondensedContact(tangent, nodes, np.full(count, BODY)).forces(free, law, np.zeros_like(free), 1e-6, 10.0, 1e-3))
     assert law.changes <= 8
     reached = free + np.linalg.solve(np.kron(springs, np.eye(3)), force.ravel()).reshape(-1, 3)
     sideways, limit = np.linalg.norm(force[:, :2], axis=1), -friction * force[:, 2]
@@ -119,7 +119,7 @@ def test_points_of_stiff_and_soft_bodies_that_stick_and_slip_by_turns_find_their
         body = axes @ np.diag(10.0 ** chance.uniform(0.0, 3.0, 36)) @ axes.T
         free = np.column_stack([chance.normal(0.0, 2.0, (12, 2)), chance.normal(0.5, 1.0, 12)])
         condensed = CondensedContact(factorized(body), np.arange(12), np.full(12, 100.0))
-        force = found_by(condensed.forces(free, RoughWall(0.3, 1e4), np.zeros_like(free), 1e-5, 10.0))
+        force = found_by(condensed.forces(free, RoughWall(0.3, 1e4), np.zeros_like(free), 1e-5, 10.0, 1e-3))
         reached = free + np.linalg.solve(body, force.ravel()).reshape(-1, 3)
         solved += bool(np.abs(force - RoughWall(0.3, 1e4)(reached)).max() < 0.05 * np.abs(force).max())
     assert solved >= 34
@@ -130,7 +130,7 @@ def test_springs_stop_at_a_wall_or_do_not_reach_it(begin: float) -> None:
     tangent = factorized(BODY * np.eye(12))
     free = np.array([[0.0, 0.0, 2.0], [0.0, 0.3, 0.4], [0.1, 0.0, -4.0]])
     condensed = CondensedContact(tangent, np.array([0, 2, 3]), np.full(3, BODY))
-    force = found_by(condensed.forces(free, Wall(), np.full((3, 3), begin), 1e-5, 1.0))
+    force = found_by(condensed.forces(free, Wall(), np.full((3, 3), begin), 1e-5, 1.0, 1e-3))
     # in equilibrium: BODY (free - y) = WALL (y - GAP)
     stopped = (BODY * 2.0 + WALL * GAP) / (BODY + WALL)
     np.testing.assert_allclose(force[:, 2], [-BODY * (2.0 - stopped), 0.0, 0.0], atol=0.2)
@@ -150,3 +150,32 @@ def test_springs_beside_a_change_hold_the_nodes_back() -> None:
     dense[:3, :3] += change.blocks[0]
     expected = np.linalg.solve(body + dense, body @ right.ravel()).reshape(-1, 3)
     np.testing.assert_allclose(ChangedInverse.of(inverse, change.with_springs(k)).solve(right), expected, rtol=1e-4, atol=1e-5)
+
+
+class SoftWall(Wall):
+    """A wall at a gap above all nodes whose pressure rises with the square of the penetration at first."""
+
+    RAMP = 0.01  # mm
+
+    def __call__(self, motion: FloatArray) -> FloatArray:
+        self.deep = np.maximum(motion[:, 2] - GAP, 0.0)
+        ramp = np.where(self.deep < self.RAMP, 0.5 * self.deep**2 / self.RAMP, self.deep - 0.5 * self.RAMP)
+        return np.column_stack([np.zeros((len(motion), 2)), -WALL * ramp])
+
+    def change(self) -> BlockChange:
+        nodes = np.flatnonzero(self.deep > 0.0)
+        slope = WALL * np.minimum(self.deep[nodes] / self.RAMP, 1.0)
+        places = np.arange(len(nodes))
+        return BlockChange(nodes, places, places, slope[:, None, None] * np.diag([0.0, 0.0, 1.0]))
+
+
+@pytest.mark.parametrize("pressed", [1e-3, 1e-2, 1.0, 100.0])
+def test_light_contact_is_balanced_as_well_as_heavy_contact(pressed: float) -> None:
+    """A motion of 1e-3 mm is 10 mN at the wall: far more than a body weighs that lies on it lightly."""
+    tangent = factorized(BODY * np.eye(9))
+    free = np.array([[0.0, 0.0, GAP + pressed / BODY], [0.0, 0.0, GAP + 2.0 * pressed / BODY], [0.0, 0.0, 0.0]])
+    condensed = CondensedContact(tangent, np.arange(3), np.full(3, BODY))
+    force = found_by(condensed.forces(free, SoftWall(), np.zeros((3, 3)), 1e-3, 10.0, 1e-6))
+    reached = free + force / BODY
+    np.testing.assert_allclose(force, SoftWall()(reached), atol=0.02 * np.abs(force).sum())
+    assert force[0, 2] < 0.0

@@ -116,6 +116,20 @@ def test_a_tool_that_leaves_a_compressed_body_waits_for_no_tangent() -> None:
         assert np.abs(session.positions() - made.points).max() < 1e-3 * SIZE
 
 
+@pytest.mark.parametrize("thickness", [2.0, 20.0])
+def test_a_body_does_not_spring_through_a_thin_tool_that_stops(thickness: float) -> None:
+    """At rest it would be in balance too, with the tool within."""
+    made = engine("tetra", background=False)
+    middle = SIZE + 0.1 + 0.5 * thickness
+    plate = box_indenter((0.0, 0.0, middle), (80.0, 80.0, thickness), static_friction=0.3, kinetic_friction=0.3)
+    with made.session(constrained=[lowest(made.points)], indenters=[plate]) as session:
+        for speed in [-60.0] * 12 + [0.0] * 6:
+            forces = session.step(motions=[IndenterVelocity((0.0, 0.0, speed))])
+            if speed == 0.0:
+                assert forces.indenters[-1, 0, 2] < -1e4
+        assert session.positions()[:, 2].max() < SIZE - 11.0
+
+
 def test_while_nothing_touches_the_inverse_is_prepared_for_what_will() -> None:
     made = engine(background=False)
     with made.session(constrained=[lowest(made.points)]) as session:

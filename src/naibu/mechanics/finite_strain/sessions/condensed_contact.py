@@ -40,7 +40,8 @@ TRIAL = 3  # steps with a matrix before it is judged: where a point closes, what
 SLOW = 0.7  # of what was left: mean progress of a step from which another matrix is worth while
 JUMP = 3.0  # growth of what is left from which it is at once
 USUAL = 6  # evaluations after which ten times the tolerance is enough
-ENOUGH = 0.005  # of the forces: how much those of the motion that they lead to may differ where no further matrix is worth while
+BALANCED = 0.01  # of the forces: how much those of the motion that they lead to may differ, where hardly any motion is left
+ENOUGH = 0.005  # likewise, where no further matrix is worth while
 
 
 class ContactLaw(Protocol):
@@ -89,7 +90,7 @@ class CondensedContact:
         return tangent is self.tangent and bool(np.isin(nodes, self.nodes, assume_unique=True).all())
 
     def forces(
-        self, free: FloatArray, law: ContactLaw, begin: FloatArray, tolerance_mm: float, longest_mm: float
+        self, free: FloatArray, law: ContactLaw, begin: FloatArray, tolerance_mm: float, longest_mm: float, faint_mn: float
     ) -> Generator[None, None, FloatArray]:
         """Return the forces g (k, 3), mN, under which ``y = free + W g(y)``; the best that is found in a few iterations.
 
@@ -104,16 +105,20 @@ class CondensedContact:
         begin : ndarray, shape (k, 3)
             First guess of y, mm.
         tolerance_mm : float
-            What is left of the equation at its end, mm.
+            What is left of the equation at its end, mm. Where contact is so light that this motion matters to its forces, it is less.
         longest_mm : float
             Motion in one iteration at most, mm: no node may pass through an indenter.
+        faint_mn : float
+            Forces so small, mN, that it does not matter by how much they are wrong.
         """
         at = best = begun = self._tried(begin, begin, free, law)
         evaluations, changes, steps, mixing = 1, 0, 0, AndersonMixing(DEPTH)
         useless = self._changed is None
-        while at.size > tolerance_mm * (1.0 if evaluations < USUAL else 10.0) and evaluations < EVALUATIONS:
+        while evaluations < EVALUATIONS:
+            if at.size <= tolerance_mm * (1.0 if evaluations < USUAL else 10.0) and self._consistent(at, begin, law, BALANCED, faint_mn):
+                break
             if self._changed is None or useless:
-                if changes == CHANGES or self._consistent(at, begin, law):
+                if changes == CHANGES or self._consistent(at, begin, law, ENOUGH, faint_mn):
                     break
                 yield
                 if changes == UNAIDED and not self._springs.any() and len(held := law.opened().nodes):
@@ -124,8 +129,11 @@ class CondensedContact:
                 begun, steps, mixing = at, 0, AndersonMixing(DEPTH)
             step = mixing.step(at.motion.ravel(), -self._changed.solve(at.left).ravel()).reshape(-1, 3)
             share = min(1.0, longest_mm / float(np.abs(step).max()))
-            at = self._tried(at.motion + share * step, begin, free, law)
+            before, at = at, self._tried(at.motion + share * step, begin, free, law)
             evaluations, steps = evaluations + 1, steps + 1
+            if mixing.steps > 1 and at.size > JUMP * before.size:
+                at, mixing = before, AndersonMixing(DEPTH)
+                law(at.motion)
             slow = steps >= TRIAL and at.size > SLOW**steps * begun.size
             useless = slow or share < 1.0 or at.size > JUMP * begun.size
             if at.size < best.size:
@@ -141,11 +149,11 @@ class CondensedContact:
         """Return the forces (k, 3) of contacts, and of the springs that hold the nodes back, mN."""
         return np.asarray(law(motion) - self._springs[:, None] * (motion - begin))
 
-    def _consistent(self, at: _Motion, begin: FloatArray, law: ContactLaw) -> bool:
+    def _consistent(self, at: _Motion, begin: FloatArray, law: ContactLaw, fraction: float, faint_mn: float) -> bool:
         """Whether the forces of a motion are, but for little, those of the motion that they lead to; the law is left where it was."""
         apart = float(np.abs(self._forces(at.motion - at.left, begin, law) - at.force).sum())
         law(at.motion)
-        return apart <= ENOUGH * float(np.abs(at.force).sum())
+        return apart <= fraction * (float(np.abs(at.force).sum()) + faint_mn)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -40,6 +40,8 @@ class EarlierTangent:
         Stiffness of the contact of the sides of cuts of then, mN/mm, which is none of `contact`.
     solver : LinearSolver
         What the factors belong to; they end when it factorizes another matrix.
+    displacement : ndarray, shape (n, 3)
+        Of the nodes in that state, mm.
     """
 
     factors: UpdatedFactors
@@ -49,6 +51,7 @@ class EarlierTangent:
     touched: IntArray
     lips: FloatArray
     solver: LinearSolver
+    displacement: FloatArray
 
 
 @dataclass(slots=True, eq=False)

@@ -93,4 +93,4 @@ def tangent_at(engine: RealTimeModel, u: FloatArray, contacts: Contacts, held: I
     factors.prepare(ahead)
     touched = np.unique(engine._surface.indices[(contact != 0.0).any(axis=(1, 2))]).astype(np.int64)
     lips = np.concatenate([np.zeros((0, 3, 3)), *(some.add(u, np.zeros_like(u))[1] for some in lips_of(engine.assembler))])
-    return EarlierTangent(factors, engine._elements.dilatation(u)[1], contact, held, touched, lips, solver)
+    return EarlierTangent(factors, engine._elements.dilatation(u)[1], contact, held, touched, lips, solver, u)

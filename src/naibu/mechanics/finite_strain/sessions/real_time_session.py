@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from naibu.core.arrays import FloatArray
-from naibu.mechanics.contact.indenter_motion import IndenterMotion, parts_of_approach, slow_enough
+from naibu.mechanics.contact.indenter_motion import IndenterMotion, harmless_ways, parts_of_approach, slow_enough
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.contact.session_protocol import StepForces
@@ -232,18 +232,37 @@ class RealTimeSession(TangentSession):
     def _guesses(
         self, tangent: EarlierTangent, moving: FloatArray, inertial: FloatArray, pressure: FloatArray
     ) -> Iterator[tuple[Trial, EarlierTangent, int]]:
-        """Yield where the motion leads and where the body is, with the tangent; before them its rest, if nearer: tools leave it fast."""
+        """Yield where the motion leads and where the body is, with the tangent; before them its rest, if nearer: tools leave it fast.
+
+        Where both are in balance, the body stays where it is: it would creep on, and frictional points would be carried along.
+        """
         first = self._guessed(inertial, moving, inertial, pressure)
         if first is None or first.error > UNLIKELY:
             for kept in self._engine._rest:
-                rest = self._guessed(np.zeros_like(inertial), moving, inertial, np.zeros_like(pressure))
-                if rest is not None and np.array_equal(kept.held, tangent.held) and (first is None or rest.error < first.error):
+                rest = self._at_rest(kept, moving, inertial) if np.array_equal(kept.held, tangent.held) else None
+                if rest is not None and (first is None or rest.error < first.error):
                     yield rest, kept, USUAL
+        still, bulk = None, self._engine._elements.bulk
+        if first is not None and first.finished(bulk, begun=False):
+            still = self._guessed(self.reached.displacement, moving, inertial, pressure)
+            first = still if still is not None and still.finished(bulk, begun=False) else first
         if first is not None:
             yield first, tangent, ITERATIONS + FURTHER
-        still = self._guessed(self.reached.displacement, moving, inertial, pressure)
+        still = still or self._guessed(self.reached.displacement, moving, inertial, pressure)
         if still is not None:
             yield still, tangent, ITERATIONS + FURTHER
+
+    def _at_rest(self, kept: EarlierTangent, moving: FloatArray, inertial: FloatArray) -> Trial | None:
+        """Return what is out of balance where a tangent was made that is kept; None where the body would pass through an indenter."""
+        indenters, points, _, _ = self._places_of(self.reached)
+        if indenters:
+            moves = self._templates[0].positions(kept.displacement) - points
+            centres = np.array([near.contact.stop for near in self._near])
+            axes = np.array([i.geometry.axes @ near.contact.orientation(1.0).T for i, near in zip(indenters, self._near, strict=True)])
+            if parts_of_approach(indenters, points, moves, centres, axes, np.zeros_like(centres), np.zeros_like(centres)) > 1:
+                return None
+        elements = self._engine._elements
+        return self._guessed(kept.displacement, moving, inertial, elements.bulk * elements.dilatation(kept.displacement)[0])
 
     def _guessed(self, guess: FloatArray, moving: FloatArray, inertial: FloatArray, pressure: FloatArray) -> Trial | None:
         """Return what is out of balance at a guess of the displacement (n, 3), mm, with bodies where they are led."""
@@ -258,6 +277,8 @@ class RealTimeSession(TangentSession):
     ) -> Generator[None, None, Trial]:
         """Return the best that at most so many iterations find from a beginning, in the time of a processor that there is."""
         mixing, best, begun, bulk = AndersonMixing(DEPTH), trial, trial.error, self._engine._elements.bulk
+        for near in self._near:  # gaps are those of this guess, which need not be the last one that was looked at
+            near.add_force(trial.displacement, np.zeros_like(trial.contact))
         for k in range(most):
             many = self._condensed is not None and len(self._condensed.nodes) > FEW
             if k == ITERATIONS and (best.error <= ACCEPTED or best.error > NEARER * begun or many):
@@ -288,8 +309,8 @@ class RealTimeSession(TangentSession):
         step = yield from self._with_contact(tangent, trial, force, not mixing.steps)
         if not np.isfinite(step).all():  # a tangent that has no factors in single precision
             if tangent is self._earlier:
+                self._kept.drop(tangent)
                 self._release(tangent)
-                self._earlier, self._condensed = None, None
             return None
         rise = elements.pressure_change(tangent.dilatation, step, trial.mismatch)
         scale = 1e-2 * self.engine._extent / self.engine._modulus  # mm/kPa
@@ -327,9 +348,8 @@ class RealTimeSession(TangentSession):
         marked[tangent.touched] = True
         active = []
         for near in self._near:
-            after = local_positions(near.contact, trial.displacement + free, 1.0)[1]
             known = tangent.factors.covered(near.contact.nodes).all(axis=1)
-            touches = (near.gap < 0.0) | ((after < 0.0) & known) | marked[near.contact.nodes].any(axis=1)
+            touches = (near.gap < 0.0) | (near.reached(trial.displacement, free) & known) | marked[near.contact.nodes].any(axis=1)
             active.append(near.only(touches))
         lips = [changing_lips(some, tangent, trial.displacement, free) for some in lips_of(self._elements.assembler)]
         for concerned in (*(c.contact.nodes for c in active), *(c.lips.pairs for c in lips)):
@@ -352,7 +372,9 @@ class RealTimeSession(TangentSession):
                 carried = near.contact.nodes[gaps[near.points] < 0.0]
                 way = near.contact.stop - near.contact.start
                 begin[carried] = self.reached.displacement[carried] + way - trial.displacement[carried]
-            force = yield from condensed.forces(free[nodes], law, begin[nodes], 1e-5 * self.engine._extent, 0.05 * self.engine._extent)
+            extent, faint = self.engine._extent, self._engine.faint_mn
+            longest = min(0.05 * extent, float(harmless_ways(self.indenters).min(initial=np.inf)))
+            force = yield from condensed.forces(free[nodes], law, begin[nodes], 1e-5 * extent, longest, faint)
             tangent.factors.add_columns(nodes, force, x)
         free[self._constrained] = 0.0
         return free

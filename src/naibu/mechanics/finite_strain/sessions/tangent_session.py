@@ -15,6 +15,7 @@ from naibu.mechanics.finite_strain.nearby_contact import NearbyContact, local_po
 from naibu.mechanics.finite_strain.sessions.condensed_contact import CondensedContact
 from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicSession
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent, TangentThread
+from naibu.mechanics.finite_strain.sessions.kept_tangents import KeptTangents
 from naibu.mechanics.finite_strain.sessions.nodes_ahead import nodes_ahead
 from naibu.mechanics.finite_strain.sessions.real_time_model import RealTimeModel, tangent_at
 from naibu.mechanics.finite_strain.sessions.trial_displacement import PASSABLE
@@ -34,6 +35,7 @@ class TangentSession(DynamicSession):
 
     unbalanced: float = field(init=False, default=0.0)
     _earlier: EarlierTangent | None = field(init=False, default=None)
+    _kept: KeptTangents = field(init=False, default_factory=KeptTangents)
     _thread: TangentThread = field(init=False, default_factory=TangentThread)
     _near: tuple[NearbyContact, ...] = field(init=False, default=())
     _places: tuple[Int32Array, ...] = field(init=False, default=())
@@ -49,7 +51,7 @@ class TangentSession(DynamicSession):
     def close(self) -> None:
         """End the thread and release the factors."""
         self._thread.close()
-        for tangent in (self._thread.take(), self._earlier):
+        for tangent in (self._thread.take(), *self._kept.drained()):
             self._release(tangent)
         self._earlier = None
         DynamicSession.close(self)
@@ -64,21 +66,22 @@ class TangentSession(DynamicSession):
         return nodes_ahead(contacts, gaps, engine.faces.shape[1], engine._extent, engine.assembler, self.reached.displacement)
 
     def _current_tangent(self) -> EarlierTangent:
-        """Return the newest tangent; where there is none for these supports, it is made now."""
+        """Return the tangent of the state nearest to where the body goes; where there is none for these supports, it is made now."""
         if (done := self._thread.take()) is not None:
-            self._take(done)
-        for known in (self._earlier, *self._engine._rest):
-            if known is not None and np.array_equal(known.held, self._held()):
-                self._earlier = known
-                return known
-        self._engine._rest[:] = [self._untouched(np.zeros_like(self.engine.points))]
-        self._earlier, self._seen = self._engine._rest[0], np.zeros_like(self.engine.points)
-        return self._earlier
+            self._keep(done)
+        at = self.reached
+        known = self._kept.nearest(at.displacement + self.engine.step * at.velocity, self._held(), self._earlier, self._engine._rest)
+        if known is None:
+            self._engine._rest[:] = [self._untouched(np.zeros_like(self.engine.points))]
+            known, self._seen = self._engine._rest[0], np.zeros_like(self.engine.points)
+        return self._used(known)
 
     def _untouched(self, u: FloatArray) -> EarlierTangent:
         """Return the tangent at a displacement without contacts of indenters."""
-        gaps = [local_positions(c, self.reached.displacement, 0.0)[1] for c in self._templates]
-        return self._made(u, (), (), self._held(), self._soon_touched(self._templates, gaps))
+        still = np.zeros((len(self._templates), 3))
+        contacts = self._contacts(0.0, still, still)  # where indenters are now
+        gaps = [local_positions(c, self.reached.displacement, 0.0)[1] for c in contacts]
+        return self._made(u, (), (), self._held(), self._soon_touched(contacts, gaps))
 
     def _renew(self, ahead: IntArray) -> None:
         """Have a tangent made of the state reached, if anything has changed since the last one."""
@@ -92,7 +95,7 @@ class TangentSession(DynamicSession):
         if self._engine.background:
             self._thread.submit(partial(self._made, u, self._near, self._places, self._held(), ahead))
         else:
-            self._take(self._made(u, self._near, self._places, self._held(), ahead))
+            self._keep(self._made(u, self._near, self._places, self._held(), ahead))
 
     def _renewed(self) -> Generator[None, None, EarlierTangent]:
         """Return the tangent of the state reached, which the step waits for; the thread makes it where there is no time."""
@@ -104,14 +107,15 @@ class TangentSession(DynamicSession):
             gaps[-1][near.points] = near.gap
         make = partial(self._made, u, self._near, self._places, self._held(), self._soon_touched(self._templates, gaps))
         if not self._engine.background or self._until == np.inf:
-            return self._take(make())
+            return self._used(self._keep(make()))
         while not self._thread.idle:
-            self._release(self._thread.take())
+            if (done := self._thread.take()) is not None:
+                self._keep(done)
             yield from self._pause()
         self._thread.submit(make)
         while (done := self._thread.take()) is None:
             yield from self._pause()
-        return self._take(done)
+        return self._used(self._keep(done))
 
     def _pause(self) -> Iterator[None]:
         """Wait a moment, and end the frame if it has an end."""
@@ -119,10 +123,17 @@ class TangentSession(DynamicSession):
         self._until = -np.inf if self._until < np.inf else np.inf
         yield
 
-    def _take(self, tangent: EarlierTangent) -> EarlierTangent:
+    def _keep(self, tangent: EarlierTangent) -> EarlierTangent:
+        """Have a new tangent at hand."""
+        self._age = 0
+        for given_up in self._kept.keep(tangent):
+            self._release(given_up)
+        return tangent
+
+    def _used(self, tangent: EarlierTangent) -> EarlierTangent:
         """Use a tangent from now on."""
-        self._release(self._earlier)
-        self._earlier, self._age, self._condensed = tangent, 0, None
+        if tangent is not self._earlier:
+            self._earlier, self._condensed = tangent, None
         return tangent
 
     def _held(self) -> IntArray:
@@ -136,5 +147,7 @@ class TangentSession(DynamicSession):
 
     def _release(self, tangent: EarlierTangent | None) -> None:
         """Let the solver of a tangent factorize again, unless the tangent is kept for the next session."""
+        if tangent is self._earlier:
+            self._earlier, self._condensed = None, None
         if tangent is not None and not any(tangent is kept for kept in self._engine._rest):
             self._engine._solvers.put(tangent.solver)

@@ -9,7 +9,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 
 FINISHED = 1e-2  # out-of-balance force, as a fraction of all forces, at which a step ends
-SETTLED = 1e-3  # below which no iteration is worth while
+SETTLED = 1e-4  # below which no iteration is worth while, also as a fraction of the contact forces, if ten times as much
 FELT = 0.02  # fraction of the contact forces that it must also be below: beside forces in a nearly incompressible body those are small
 PASSABLE = 5e-2  # at which a step may end that is late
 VOLUME_ERROR = 3e-4  # difference of the volume strain and that of its pressure
@@ -51,8 +51,8 @@ class Trial:
 
     def finished(self, bulk: FloatArray, *, begun: bool) -> bool:
         """Whether the step may end here, at the beginning of the iterations or where they have `begun`; for bulk moduli (m,), kPa."""
-        within = FINISHED if begun else SETTLED
-        return self.felt <= FELT and self.error <= within and self._volume_error(bulk) <= VOLUME_ERROR
+        error, felt = (FINISHED, FELT) if begun else (SETTLED, 10.0 * SETTLED)
+        return self.felt <= felt and self.error <= error and self._volume_error(bulk) <= VOLUME_ERROR
 
     def passable(self, bulk: FloatArray) -> bool:
         """Whether a step that is late may end here."""
