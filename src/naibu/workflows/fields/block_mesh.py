@@ -207,11 +207,16 @@ def mesh_that_shows(
         size *= SMALLER
 
 
-def region_in(inside: Volume, labels: IntArray, names: Mapping[int, str]) -> Callable[[FloatArray], IntArray]:
-    """Return what gives the number of the region of a mesh from `block_mesh` at points (k, 3), mm; -1 outside of the object."""
+def regions_of(labels: IntArray, names: Mapping[int, str]) -> IntArray:
+    """Return the number of the region of a mesh from `block_mesh` of every voxel (nz, ny, nx), -1 for labels without a name."""
     of_label = np.full(labels.max() + 1, -1, dtype=np.int64)
     of_label[sorted(names)] = np.arange(len(names))
-    numbers = np.where(inside.values != 0, of_label[np.maximum(labels, 0)], -1)
+    return np.asarray(of_label[np.maximum(labels, 0)])
+
+
+def region_in(inside: Volume, labels: IntArray, names: Mapping[int, str]) -> Callable[[FloatArray], IntArray]:
+    """Return what gives the number of the region of a mesh from `block_mesh` at points (k, 3), mm; -1 outside of the object."""
+    numbers = np.where(inside.values != 0, regions_of(labels, names), -1)
 
     def at(points: FloatArray) -> IntArray:
         index = np.round(inside.to_index(points)).astype(np.int64)[:, ::-1]

@@ -35,6 +35,7 @@ from naibu.viewer.notebook import ShownInNotebook, empty_figure
 from naibu.viewer.result_figures import draw_slices
 from naibu.viewer.slices import Overlay, SliceView, slices_html
 from naibu.viewer.tables import Cell, Table
+from naibu.workflows.fields.border_fitting import fitted_to_borders
 from naibu.workflows.fields.block_mesh import (
     BLURRED,
     CELLS,
@@ -44,6 +45,7 @@ from naibu.workflows.fields.block_mesh import (
     misplaced,
     names_of_labels,
     region_in,
+    regions_of,
     sizes_of_voxels,
 )
 from naibu.workflows.fields.known_zones import parse_known_zones
@@ -194,8 +196,11 @@ def identify_fields(
     size = element_size_mm or (volume / max(most, LEAST_CELLS)) ** (1.0 / 3.0)
     sought = () if each_cell else set(names.values()) - set(stated.values)
     mesh, cell_of_voxel = mesh_that_shows(inside, labels, names, sought, size, exactly=element_size_mm > 0.0)
-    cases = [measured_load_case(mesh, cell_of_voxel, inside, field, Path(p).stem, loaded) for p, field in zip(paths, read, strict=True)]
     left_out, wrong = misplaced(mesh, cell_of_voxel, inside, labels, names)
+    if not each_cell and wrong >= BLURRED:
+        mesh, cell_of_voxel = fitted_to_borders(mesh, cell_of_voxel, inside, regions_of(labels, names))
+        left_out, wrong = misplaced(mesh, cell_of_voxel, inside, labels, names)
+    cases = [measured_load_case(mesh, cell_of_voxel, inside, field, Path(p).stem, loaded) for p, field in zip(paths, read, strict=True)]
     within = None if each_cell or wrong < BLURRED else region_in(inside, labels, names)
     found = identify_field(
         mesh, cases, Zones.of(mesh, known=stated.values, known_sd=stated.doubts, each_cell=each_cell), law=law,
