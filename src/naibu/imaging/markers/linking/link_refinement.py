@@ -14,23 +14,22 @@ from scipy.special import gammaln
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.imaging.markers.linking._point_matching_kernels import settle
+from naibu.imaging.markers.linking.kriged_links import LEAST, fraction_around, kriged_links, linked_neighbours
+from naibu.imaging.markers.linking.local_kriging import MEDIAN
 from naibu.imaging.markers.linking.point_clouds import NEIGHBOURS, Cloud, State, grid_of, local_spacing, proposed
 from naibu.imaging.markers.settings import LinkSettings
 
 # Empirical values, judged by tests/imaging/markers/test_point_matching.py and benchmarks/particle_gels.py.
-REFINEMENTS = 4  # rounds in each metric, at most
+REFINEMENTS = 3  # rounds in each metric, at most
 SETTLED = 0.005  # fraction of the points whose links change, from which on a round is the last
 METRICS = 2  # times that the metric is estimated, beside the first rounds without one
 MOST_ANISOTROPIC = 8.0  # ratio of standard deviations along two axes
 ENOUGH = {2: 60, 3: 100}  # links from which on a metric is estimated
 LOCAL = (0.5, 8.0)  # bounds of the local noise, as multiples of that of all
 ALIKE = 1.2  # ratio of standard deviations up to which axes are alike
-LEAST = 0.01  # least noise, in spacings
 CORE = 3.0  # medians within which residuals tell the metric
-AROUND, PRIOR = 24, 6.0  # deformed points around that tell how many are unlinked there, and weight of those everywhere, in points
 CAUTION = 6.0  # how much more often chance is assumed to link than the densities say
 WITNESSES, CREDIBLE = 16, 0.9  # links around, and their mean probability below which a link is less likely for it
-MEDIAN = {2: 1.1774, 3: 1.5382}  # of the length of a vector of standard normal components
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,9 +78,13 @@ def refined(cloud: Cloud, state: State, how: LinkSettings) -> RefinedLinks:
         state.gradients = np.ascontiguousarray(np.einsum("ab,nbc->nac", step, state.gradients))
         here = _in_metric(cloud, metric)
         predicted = _settled(here, state, how)
+    if state.count < ENOUGH[d]:
+        length = np.linalg.norm(_residuals(here, state, predicted), axis=1)
+        sd = np.maximum(_local_median(linked_neighbours(here, state), length) / MEDIAN[d], LEAST * here.growth * here.reference_scale)
+    else:
+        predicted, sd = kriged_links(here, state, how)
+        length = np.linalg.norm(_residuals(here, state, predicted), axis=1)
     vectors = _residuals(here, state, predicted)
-    length = np.linalg.norm(vectors, axis=1)
-    sd = np.maximum(_local_median(_linked_neighbours(here, state), length) / MEDIAN[d], LEAST * here.growth * here.reference_scale)
     return RefinedLinks(state.link, vectors @ np.linalg.inv(metric).T, length / sd, sd**d)
 
 
@@ -91,7 +94,7 @@ def _settled(cloud: Cloud, state: State, how: LinkSettings) -> FloatArray:
     least, limit = (bound * cloud.growth * cloud.reference_scale for bound in how.residual_bounds)
     most, predicted = limit, np.full_like(cloud.reference, np.nan)
     for _ in range(REFINEMENTS):
-        near = replace(cloud, neighbours=_linked_neighbours(cloud, state))
+        near = replace(cloud, neighbours=linked_neighbours(cloud, state))
         predicted, proposal, distance, fitted = proposed(near, state, everyone, limit, robust=True)
         residual = np.linalg.norm(_residuals(cloud, state, predicted), axis=1)
         limit = np.clip(how.residual_factor * _local_median(near.neighbours, residual), least, most)
@@ -111,18 +114,6 @@ def _residuals(cloud: Cloud, state: State, predicted: FloatArray) -> FloatArray:
     out = cloud.deformed[np.maximum(state.link, 0)] - predicted
     out[state.link < 0] = np.nan
     return out
-
-
-def _linked_neighbours(cloud: Cloud, state: State) -> IntArray:
-    """Return the nearest linked points (n, k) of every reference point, itself left out."""
-    linked = np.flatnonzero(state.link >= 0)
-    k = min(NEIGHBOURS[cloud.dimensions], len(linked) - 1)
-    if k < 1:
-        return cloud.neighbours
-    near = linked[np.asarray(cKDTree(cloud.reference[linked]).query(cloud.reference, k=k + 1, workers=-1)[1])]
-    left_out = near == np.arange(len(near))[:, None]
-    left_out[~left_out.any(axis=1), -1] = True
-    return np.ascontiguousarray(near[~left_out].reshape(len(near), k))
 
 
 def _local_median(neighbours: IntArray, residual: FloatArray) -> FloatArray:
@@ -173,10 +164,10 @@ def probability(found: RefinedLinks, reference: FloatArray, deformed: FloatArray
     at = found.link[linked]
     lost, free = found.link < 0, np.ones(len(deformed), dtype=bool)
     free[at] = False
-    missing = _fraction_around(reference, lost, reference[linked])
+    missing = fraction_around(reference, lost, reference[linked])
     # a point has a volume of about (spacing / 0.63)^d
     density = (0.63 / local_spacing(deformed)[at]) ** d
-    by_chance = _fraction_around(deformed, free, deformed[at]) * density * np.maximum(missing / (1.0 - missing), 1.0)
+    by_chance = fraction_around(deformed, free, deformed[at]) * density * np.maximum(missing / (1.0 - missing), 1.0)
     freedom = found.tails
     t = np.exp(gammaln(0.5 * (freedom + d)) - gammaln(0.5 * freedom)) / (np.pi * freedom) ** (0.5 * d)
     right = t * (1.0 + found.ratio[linked] ** 2 / freedom) ** (-0.5 * (freedom + d)) / np.maximum(found.volume[linked], 1e-300)
@@ -189,10 +180,3 @@ def probability(found: RefinedLinks, reference: FloatArray, deformed: FloatArray
     return out
 
 
-def _fraction_around(points: FloatArray, which: BoolArray, at: FloatArray) -> FloatArray:
-    """Return the fraction (k,) of the points (n, d) around `at` (k, d) that `which` (n,) holds for, not below that of all, nor 0 or 1."""
-    n = len(points)
-    everywhere = (which.sum() + 1.0) / (n + 2.0)
-    near = np.asarray(cKDTree(points).query(at, k=min(AROUND, n), workers=-1)[1]).reshape(len(at), -1)
-    here = (which[near].sum(axis=1) + PRIOR * everywhere) / (near.shape[1] + PRIOR)
-    return np.asarray(np.maximum(here, everywhere))

@@ -12,7 +12,7 @@ from naibu.core.arrays import BoolArray, FloatArray, IntArray, require_shape
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.imaging.displacement.strain import green_lagrange_strain_of
-from naibu.imaging.markers.linking.link_refinement import MEDIAN
+from naibu.imaging.markers.linking.local_kriging import MEDIAN
 from naibu.imaging.markers.linking.point_clouds import NEIGHBOURS
 from naibu.imaging.markers.linking.point_matching import Links, link_markers
 from naibu.imaging.markers.settings import LinkSettings, require_between
