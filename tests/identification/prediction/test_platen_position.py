@@ -65,7 +65,7 @@ def test_a_path_to_another_end_is_that_of_a_solution_from_rest(squeezed: Experim
     np.testing.assert_allclose(found.points, given.points, atol=0.01)
 
 
-def test_a_solution_nearby_tells_how_the_distance_changes_and_where_the_plates_stand(
+def test_the_path_tells_how_the_distance_changes_and_a_solution_nearby_where_the_plates_stand(
     squeezed: Experiment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     solved, differentiated = [], []
@@ -76,7 +76,7 @@ def test_a_solution_nearby_tells_how_the_distance_changes_and_where_the_plates_s
     alone = len(differentiated)
     near = SolvedLoadCase(solved[0].fit, solved[0].parameters)
     again = predict_state(model_of(squeezed), squeezed, "pressed", heights_from_markers=True, warm_start=near)
-    assert len(differentiated) - alone == alone - 1 == 1
+    assert len(differentiated) - alone == alone == 1  # for the uncertainty alone
     assert again.platen_position_mm == pytest.approx(found.platen_position_mm, abs=0.01)
     np.testing.assert_allclose(again.points, found.points, atol=0.01)
 

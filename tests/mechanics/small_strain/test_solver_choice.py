@@ -11,7 +11,7 @@ from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
-from naibu.mechanics.linear_algebra import direct, solver_selection
+from naibu.mechanics.linear_algebra import direct, recycled_factors, solver_selection
 from naibu.mechanics.linear_algebra.direct import pardiso_library
 from naibu.mechanics.linear_algebra.solver_selection import SolverName
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
@@ -21,7 +21,7 @@ from naibu.meshing.primitives import box
 SIDE, YOUNG, POISSON, STRETCH = 30.0, 20.0, 0.45, 0.02
 MKL = [pytest.param(True, marks=pytest.mark.skipif(pardiso_library() is None, reason="oneMKL is not installed")), False]
 HERE = [name for name in get_args(SolverName) if name != "petsc"]  # that starts MPI: tests/mechanics/linear_algebra/test_petsc.py
-NEEDS_MKL = ("pardiso", "recycled_cholesky", "recycled_lu")
+NEEDS_MKL = ("pardiso", "recycled_cholesky")
 
 
 def bar(cells: int) -> tuple[Mesh, PrescribedDisplacement, np.ndarray]:
@@ -37,7 +37,7 @@ def bar(cells: int) -> tuple[Mesh, PrescribedDisplacement, np.ndarray]:
 
 
 def without_mkl(monkeypatch: pytest.MonkeyPatch) -> None:
-    for place in (direct, solver_selection):
+    for place in (direct, recycled_factors, solver_selection):
         monkeypatch.setattr(place, "pardiso_library", lambda: None)
 
 

@@ -98,17 +98,11 @@ def mesh_error(
     return MeshError(max(sizes), abs(factor) * float(np.sqrt(squares.mean())), factor * step)
 
 
-def marker_error(
-    load_case: MarkerLoadCase, fit: LoadCaseFit, values: Mapping[str, float], near: SolvedLoadCase | None = None
-) -> FloatArray:
-    """Return how far vanishing elements would move the markers (k, 3) of a solved load case, mm, by a coarser mesh; 0 where it has none.
-
-    A solution on the coarser mesh `near` these parameters saves time.
-    """
+def marker_error(load_case: MarkerLoadCase, fit: LoadCaseFit, values: Mapping[str, float]) -> FloatArray:
+    """Return how far vanishing elements would move the markers (k, 3) of a solved load case, mm, by a coarser mesh; 0 where it has none."""
     size = element_size(load_case.specimen.experiment, load_case.specimen.settings.element_size_mm)
-    known = None if near is None else near.warm_start(values)
     try:
-        return np.asarray(-change_on_mesh(load_case, fit, values, size * RATIO, known) / (RATIO**ORDER - 1.0))
+        return np.asarray(-change_on_mesh(load_case, fit, values, size * RATIO) / (RATIO**ORDER - 1.0))
     except (ConvergenceError, InputError):
         return np.zeros_like(fit.predicted)
 

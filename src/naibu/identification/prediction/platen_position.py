@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,8 @@ from naibu.identification.prediction.calibrated_model import CalibratedModel
 LAYER_GAP = 0.4  # a new marker layer starts where the height jumps by this fraction of the markers' spacing
 ENOUGH = 3  # known markers that an outermost layer or column needs; else the next one inwards is taken
 LEAST_RATE = 0.1  # change of the distance of the outermost markers for a change of the platen position of 1 mm
-ACCURATE_MM = 1e-3  # of a platen position that markers tell
+ACCURATE = 0.05  # of what noise leaves open of a platen position that markers tell
+BACK = 0.03  # of the load, over which at least a path tells how the distance of the outermost markers changes with its end
 SD_MM = {"given": 0.5, "same experiment": 1.0, "stated": 1.5, "unknown": 5.0}
 
 
@@ -156,32 +158,28 @@ def outermost_markers(body: Specimen, state: State, sd_mm: FloatArray) -> Gauge:
     return Gauge(low, high, None if sides else axis, distance, float(np.sqrt(variance)))
 
 
-def fitted_platen_position(
-    matcher: Matcher, fit: LoadCaseFit, name: str, gauge: Gauge, rate: float | None = None
-) -> tuple[ParameterSet, LoadCaseFit, float]:
+def fitted_platen_position(matcher: Matcher, fit: LoadCaseFit, name: str, gauge: Gauge) -> tuple[ParameterSet, LoadCaseFit]:
     """Choose the platen position `name` with which the two groups of markers of a gauge are as far apart as measured.
 
-    The body moves along one path, whose states are kept: only its end changes. The positions follow from the secant method.
+    The body moves along one path, whose states are kept: only its end changes, and its last states tell how the distance changes with
+    it. Later positions follow from the secant method, until noise leaves far more open.
 
     Parameters
     ----------
     matcher : Matcher
-        Of the state; the platen position is among its free parameters.
+        Of the state.
     fit : LoadCaseFit
         The solution at the parameters of the matcher.
     name : str
         Of the platen position.
     gauge : Gauge
         The groups.
-    rate : float, optional
-        Change of their distance for a change of the platen position of 1 mm; by default that of `fit`, which is differentiated for it.
 
     Returns
     -------
     parameters : ParameterSet
     fit : LoadCaseFit
         Without derivatives.
-    rate : float
 
     Raises
     ------
@@ -190,25 +188,34 @@ def fitted_platen_position(
     ConvergenceError
         The state cannot be solved.
     """
-    parameters, start = matcher.parameters, matcher.load_cases[0].specimen.experiment.full_platen_position_mm
-    if rate is None:
-        differentiated = matcher.differentiated([fit], parameters.values())[0]
-        k = [p.name for p in parameters.free].index(name)
-        rate = float(gauge.derivatives(fit.predicted, differentiated.jacobian)[k])
+    parameters, body = matcher.parameters, matcher.load_cases[0].specimen
+    start = body.experiment.full_platen_position_mm
+    rate = _rate_along_path(body, fit, parameters.values(), name, gauge)
     for _ in range(8):
         if rate < LEAST_RATE:
             raise InputError("the distance of the outermost markers does not tell the platen position; give platen_position_mm")
         position, distance = parameters.values()[name], gauge.distance(fit.predicted)
+        accuracy = ACCURATE * gauge.sd_mm / rate
         change = float(np.clip((gauge.measured_mm - distance) / rate, -5.0, 5.0))
-        if abs(change) < ACCURATE_MM:
+        if abs(change) < accuracy:
             break
         reached = (position - start) / (position + change - start) if position + change < start else 0.0
         near = SamePath(fit, parameters, reached=reached) if reached > 0.0 else None
         parameters = parameters.with_values({name: position + change})
         fit = matcher.evaluate(parameters.values(), [near], [fit.pose], derivatives=False)[0]
-        if abs(change) > 10.0 * ACCURATE_MM:
+        if abs(change) > accuracy:
             rate = (gauge.distance(fit.predicted) - distance) / change
-    return parameters, fit, rate
+    return parameters, fit
+
+
+def _rate_along_path(body: Specimen, fit: LoadCaseFit, values: Mapping[str, float], name: str, gauge: Gauge) -> float:
+    """Return how the distance of the groups of markers changes with the platen position, by the last states of the path to it."""
+    states, shaped = fit.solution.states, body.reshaped(values)
+    before = next(s for s in reversed(states) if s.load <= 1.0 - BACK)
+    way = (values[name] - body.experiment.full_platen_position_mm) * (1.0 - before.load)
+    moved = shaped.marker_points + shaped.at_markers(fit.since_scan(before.displacement))
+    then = gauge.distance(fit.pose.applied(moved) / body.enlargement(values))
+    return (gauge.distance(fit.predicted) - then) / way if way else np.inf
 
 
 def source_of_platen_position(gauge: Gauge, position_mm: float) -> str:

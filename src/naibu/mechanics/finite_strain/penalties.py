@@ -16,6 +16,7 @@ from naibu.core.arrays import FloatArray
 from naibu.mechanics.contact.penalty_contact import STICK, Contact
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.hyperelasticity import small_strain_shear_moduli
+from naibu.mechanics.finite_strain.nearby_contact import local_positions
 from naibu.mechanics.finite_strain.problem import Problem
 
 FACTOR = 4.0
@@ -84,7 +85,7 @@ def _power(factor: FloatArray, *, up: bool = False) -> FloatArray:
 
 def relative_penetrations(contacts: Sequence[Contact], displacement: FloatArray, load: float) -> list[FloatArray]:
     """Return how deeply bodies penetrate at every point (p,) of every contact, as a fraction of the edge of the element there."""
-    return [-c.gap(displacement, load) / c.element_size for c in contacts]
+    return [-local_positions(c, displacement, load)[1] / c.element_size for c in contacts]
 
 
 def stiffened(problem: Problem, depths: Sequence[FloatArray], allowed: float) -> Problem:

@@ -7,6 +7,8 @@ to step.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -21,6 +23,11 @@ from naibu.mechanics.finite_strain.newton import Newton
 from naibu.mechanics.finite_strain.penalties import with_normal_stiffness
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
 from naibu.mechanics.finite_strain.statics import LoadState
+from naibu.mechanics.linear_algebra.direct import usable_threads, use_one_thread
+from naibu.mechanics.linear_algebra.protocols import Factorization
+from naibu.mechanics.linear_algebra.recycled_factors import RecycledFactors
+
+MOST_AHEAD = 4  # states whose tangents are factorized at once: every one takes the memory of its factors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,9 +96,7 @@ def sensitivities(
     reshaped = {k: _Reshaped.along(problem, d.points) for k, d in enumerate(directions) if d.points is not None}
     moving = [_BodyDirections.gather(i, c, directions) for i, c in enumerate(problem.contacts)]
     d_anchors = [m.at_rest(c) for m, c in zip(moving, problem.contacts, strict=True)]
-    for before, state in pairwise(states):
-        solver.problem = with_normal_stiffness(problem, state.normal_stiffness)
-        _, _, factorization, responses = solver.linearised(state.displacement, before.anchors, state.load)
+    for state, (factorization, responses) in zip(states[1:], _linearised(solver, problem, states), strict=True):
         rhs = np.zeros((*problem.points.shape, count))
         for k, direction in enumerate(directions):
             if direction.materials is not None:
@@ -112,6 +117,31 @@ def sensitivities(
             for c, response, change in zip(problem.contacts, responses, explicit, strict=True)
         ]
     return out
+
+
+def _linearised(newton: Newton, problem: Problem, states: Sequence[LoadState]) -> Iterator[tuple[Factorization, list[ContactResponse]]]:
+    """Yield the factorized tangent, which is valid until the next is asked for, and the contact responses at all states but the first.
+
+    Where LU factors are exact and this thread may use others, those of the states ahead are computed meanwhile.
+    """
+
+    def at(solver: Newton, before: LoadState, state: LoadState) -> tuple[Factorization, list[ContactResponse]]:
+        solver.problem = with_normal_stiffness(problem, state.normal_stiffness)
+        return solver.linearised(state.displacement, before.anchors, state.load)[2:]
+
+    first, *steps = pairwise(states)
+    yield at(newton, *first)  # which chooses a linear solver
+    count = min(usable_threads(), MOST_AHEAD, len(steps))
+    if not isinstance(newton.solver, RecycledFactors) or count < 2:
+        yield from (at(newton, *step) for step in steps)
+        return
+    solvers = [Newton(problem, replace(newton.settings, linear_solver="pardiso")) for _ in range(count)]
+    with ThreadPoolExecutor(count, initializer=use_one_thread) as pool:
+        jobs = [pool.submit(at, solver, *step) for solver, step in zip(solvers, steps, strict=False)]
+        for k in range(len(steps)):
+            yield jobs[k].result()
+            if k + count < len(steps):  # the factors of state k are done with
+                jobs.append(pool.submit(at, solvers[k % count], *steps[k + count]))
 
 
 def _of_points_that_touch(

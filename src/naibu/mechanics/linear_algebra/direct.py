@@ -60,6 +60,12 @@ def use_threads(count: int) -> None:
         library.MKL_Set_Num_Threads_Local(count)
 
 
+def usable_threads() -> int:
+    """Return how many threads the direct solver may use when called from the present thread; 1 where oneMKL is not installed."""
+    library = pardiso_library()
+    return 1 if library is None else int(library.MKL_Get_Max_Threads())
+
+
 MKL_MB = 400  # of address space for the libraries, twice of what they took here
 MKL_THREAD_MB = 80  # for the stack and the heap of a thread
 SINGULAR = {np.float64: 1e14, np.float32: 1e9}  # growth of a solution, beyond which it is rounding

@@ -1,4 +1,4 @@
-"""Generalised minimal residuals (GMRES, :cite:p:`saad1986`) preconditioned by single-precision LU factors of an earlier matrix."""
+"""Generalised minimal residuals (GMRES, :cite:p:`saad1986`) preconditioned by LU factors of an earlier matrix."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ import scipy.sparse as sp
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError
-from naibu.mechanics.linear_algebra.direct import PardisoSolver
+from naibu.mechanics.linear_algebra.direct import PardisoSolver, SuperLUSolver, direct_solver, pardiso_library
 from naibu.mechanics.linear_algebra.iterative import ApproximateFactorization
-from naibu.mechanics.linear_algebra.protocols import Factorization
+from naibu.mechanics.linear_algebra.protocols import Factorization, LinearSolver
 
 FACTORIZATION = 14.0  # its cost in iterations
 MOST = 30  # iterations, after which the factors are made anew
+NEWTON_TOLERANCE = 1e-2  # relative, of steps of Newton's method in motion: the next one corrects them
 FINEST = 1e-8  # relative tolerance below which a factorization in double precision costs less
 
 
 class RecycledFactors:
     """Solver for unsymmetric systems that change little from one to the next, such as tangents with friction.
 
-    Single right-hand sides are solved to the tolerance that is asked for, with LU factors in single precision that are kept while that is
-    cheaper than new ones; several ones, and fine tolerances, with a factorization in double precision.
+    Single right-hand sides are solved to the tolerance that is asked for, with LU factors, in single precision where oneMKL is installed,
+    that are kept while that is cheaper than new ones; several ones, and fine tolerances, with a factorization in double precision.
 
     Parameters
     ----------
@@ -30,20 +31,17 @@ class RecycledFactors:
         A matrix with the pattern of those to be solved.
     relative_tolerance : float
         Relative residual of a solve, unless another is given to it.
-
-    Raises
-    ------
-    InputError
-        oneMKL is not installed.
     """
-
-    name = "GMRES + PARDISO (oneMKL) in single precision"
 
     def __init__(self, matrix: sp.bsr_matrix, *, relative_tolerance: float = 1e-11) -> None:
         self.tolerance = relative_tolerance
-        self._rough = PardisoSolver(matrix, symmetric=False, single_precision=True)
+        single = pardiso_library() is not None
+        self.name = f"GMRES + {PardisoSolver.name} in single precision" if single else f"GMRES + {SuperLUSolver.name}"
+        self._direct: LinearSolver = PardisoSolver(matrix, symmetric=False, single_precision=True) if single else SuperLUSolver()
+        self._rough: Factorization | None = None
         self._pattern = matrix
-        self._exact: PardisoSolver | None = None
+        self._direct_exact: LinearSolver | None = None
+        self._exact: Factorization | None = None
         self._factorized: sp.bsr_matrix | None = None  # the matrix of the factors in double precision
         self._spent = self._digits = 0.0
         self._stale = True
@@ -62,19 +60,22 @@ class RecycledFactors:
         """
         if b.shape[1] == 1 and tolerance > FINEST:
             for _ in range(2):
-                if not self._stale or self._renewed(matrix):
-                    x, iterations = gmres(matrix, b[:, 0], self._rough.solve, tolerance, MOST)
-                    if x is not None:
-                        self._account(iterations, max(-np.log10(tolerance), 0.1))
-                        return x[:, None]
+                if self._stale:
+                    self._renew(matrix)
+                if self._rough is None:
+                    break
+                x, iterations = gmres(matrix, b[:, 0], self._rough.solve, tolerance, MOST)
+                if x is not None:
+                    self._account(iterations, max(-np.log10(tolerance), 0.1))
+                    return x[:, None]
                 self._stale = True
-        if self._exact is None:
-            self._exact = PardisoSolver(self._pattern, symmetric=False)
-        if self._factorized is not matrix:
-            self._factorized = None
-            self._exact.factorize(matrix)
+        if self._direct_exact is None:
+            self._direct_exact = direct_solver(self._pattern, symmetric=False)
+        if self._exact is None or self._factorized is not matrix:
+            self._exact = self._factorized = None
+            self._exact = self._direct_exact.factorize(matrix)
             self._factorized = matrix
-        return self._exact.solve(b)
+        return np.asarray(self._exact.solve(b))
 
     def _account(self, iterations: int, digits: float) -> None:
         """The mean cost of a digit since the last factorization is minimal where the last digit costs as much as the mean."""
@@ -82,14 +83,14 @@ class RecycledFactors:
         self._digits += digits
         self._stale = iterations / digits > self._spent / self._digits
 
-    def _renewed(self, matrix: sp.bsr_matrix) -> bool:
-        """Factorize in single precision; False where the matrix is singular to that."""
+    def _renew(self, matrix: sp.bsr_matrix) -> None:
+        """Factorize roughly; there are no factors where the matrix is singular to that."""
+        self._rough = None
         try:
-            self._rough.factorize(matrix)
+            self._rough = self._direct.factorize(matrix)
         except ConvergenceError:
-            return False
+            return
         self._spent, self._digits, self._stale = FACTORIZATION, 0.0, False
-        return True
 
 
 def gmres(

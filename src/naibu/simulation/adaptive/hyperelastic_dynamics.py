@@ -23,7 +23,7 @@ from naibu.mechanics.finite_strain.penalties import relative_penetrations, with_
 from naibu.mechanics.finite_strain.sessions.implicit_step import ImplicitStep
 from naibu.mechanics.finite_strain.viscoelasticity import HistoryVariables, PronySeries, ViscoelasticBody
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
-from naibu.mechanics.linear_algebra.recycled_lu import RecycledLU
+from naibu.mechanics.linear_algebra.recycled_factors import NEWTON_TOLERANCE, RecycledFactors
 from naibu.mechanics.linear_algebra.solver_selection import choose_solver
 from naibu.meshing.surface import boundary_faces
 from naibu.simulation.adaptive.body import BodyState
@@ -244,7 +244,11 @@ class HyperelasticMotion:
 
     def _solved(self, symmetric: bool, matrix: sp.bsr_matrix, residual: FloatArray) -> FloatArray:
         if symmetric not in self._solvers:
-            chosen = choose_solver(matrix, self.mesh.points, self.constrained, symmetric=True) if symmetric else RecycledLU(matrix)
+            chosen = (
+                choose_solver(matrix, self.mesh.points, self.constrained, symmetric=True)
+                if symmetric
+                else RecycledFactors(matrix, relative_tolerance=NEWTON_TOLERANCE)
+            )
             self._solvers[symmetric] = chosen
         return self._solvers[symmetric].factorize(matrix).solve(residual.ravel()).reshape(-1, 3)
 

@@ -29,7 +29,7 @@ from naibu.mechanics.finite_strain.sessions.implicit_step import ImplicitStep
 from naibu.mechanics.finite_strain.sessions.indenter_session import IndenterSession
 from naibu.mechanics.finite_strain.sessions.session_checks import dead_load
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
-from naibu.mechanics.linear_algebra.recycled_lu import RecycledLU
+from naibu.mechanics.linear_algebra.recycled_factors import NEWTON_TOLERANCE, RecycledFactors
 
 SUBDIVISIONS = 5  # of a step that does not converge: halves, quarters, ...
 PENETRATION = 0.01  # of the edge of a face, to which the penalties limit how deep indenters go into it, as in statics
@@ -264,7 +264,7 @@ class DynamicSession(IndenterSession[DynamicEngine, DynamicState]):
 
     def _solved(self, matrix: sp.bsr_matrix, residual: FloatArray) -> FloatArray:
         if self._solver is None:
-            self._solver = RecycledLU(matrix)
+            self._solver = RecycledFactors(matrix, relative_tolerance=NEWTON_TOLERANCE)
         return self._solver.factorize(matrix).solve(residual.ravel()).reshape(-1, 3)
 
     def _accepted(self, h: float, u: FloatArray, contacts: tuple[Contact, ...], spin: FloatArray) -> tuple[FloatArray, FloatArray]:
