@@ -33,6 +33,15 @@ class LipAssembler(Assembler):
         """Return the assembler of a time step that begins at a displacement (n, 3), mm: lips have the normals that they have there."""
         return self if self.lips is None else replace(self, lips=self.lips.with_normals_of(displacement))
 
+    @property
+    def unsymmetric(self) -> bool:
+        """Whether friction of the sides of cuts makes the tangent unsymmetric."""
+        return self.lips is not None and self.lips.friction > 0.0
+
+    def with_anchors(self, anchors: FloatArray | None) -> LipAssembler:
+        """Return the assembler whose lips have slipped to these frictional anchors (p, 3), mm; None for those at rest."""
+        return self if self.lips is None else replace(self, lips=self.lips.with_anchors(anchors))
+
     def add_contact_of_lips(self, displacement: FloatArray, force: FloatArray) -> None:
         """Add the forces of lips in contact to internal forces (n, 3), mN."""
         if self.lips is not None:
@@ -55,7 +64,7 @@ def lips_of(assembler: Assembler) -> tuple[CutLips, ...]:
     return (assembler.lips,) if isinstance(assembler, LipAssembler) and assembler.lips is not None else ()
 
 
-def with_lips(assembler: Assembler, points: FloatArray, faces: IntArray) -> Assembler:
+def with_lips(assembler: Assembler, points: FloatArray, faces: IntArray, friction: float = 0.0) -> Assembler:
     """Return an assembler in which the two sides of cuts do not pass through each other; the same where there is no cut.
 
     Parameters
@@ -66,10 +75,18 @@ def with_lips(assembler: Assembler, points: FloatArray, faces: IntArray) -> Asse
         Its nodes in the reference configuration, mm.
     faces : ndarray, shape (f, 3), int64
         Its boundary triangles; those that lie on each other are the sides of cuts. Quadrilaterals have no such contact.
+    friction : float
+        Coulomb's coefficient between the two sides.
+
+    Raises
+    ------
+    InputError
+        A negative coefficient.
     """
     lips = cut_lips(points, faces, node_shear_moduli(assembler)) if faces.shape[1] == 3 else None
     if lips is None:
         return assembler
+    lips = lips.with_friction(friction)
     coupled = assembler.with_couplings(lips.pairs)
     known = {f.name: getattr(coupled, f.name) for f in fields(Assembler)}
     return LipAssembler(**known, lips=lips, _pairs=coupled.pattern.positions(lips.pairs))
