@@ -9,13 +9,16 @@ import pytest
 
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
-from naibu.mechanics.finite_elements.assembly import Assembler
+from naibu.mechanics.finite_elements.assembly import Assembler, body_force
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import material
-from naibu.mechanics.finite_strain.lip_assembly import LipAssembler, with_lips
+from naibu.mechanics.finite_strain.lip_assembly import LipAssembler, going_on, with_lips
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
-from naibu.mechanics.finite_strain.statics import LoadState, Solution, going_on, solve
+from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicEngine
+from naibu.mechanics.finite_strain.sessions.quasi_static_session import QuasiStaticEngine
+from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeEngine
+from naibu.mechanics.finite_strain.statics import LoadState, Solution, solve
 from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.meshing.cutting.volume import cut_volume
 from naibu.meshing.primitives import box
@@ -57,7 +60,7 @@ def force_on_top(found: Solution, mesh: Mesh) -> np.ndarray:
 
 def force_of(task: Problem, state: LoadState, high: np.ndarray) -> np.ndarray:
     """Force on the upper face in a state, which anchors without slip of their own would not change."""
-    assembler = going_on(task, state).assembler
+    assembler = going_on(task.assembler, state.lips)
     return np.asarray(assembler.forces(state.displacement)[1][high].sum(axis=0))
 
 
@@ -142,3 +145,64 @@ def test_a_solve_goes_on_from_how_the_sides_slipped() -> None:
     np.testing.assert_allclose(then.displacement, once.displacement, atol=2e-4)
     assert then.states[-1].lips is not None and once.states[-1].lips is not None
     np.testing.assert_allclose(then.states[-1].lips, once.states[-1].lips, atol=2e-4)
+
+
+def test_a_quasi_static_session_slides_rests_and_slides_back() -> None:
+    """Pressed, sheared to and fro in steps that each begin where the last one ended: friction turns round, and never exceeds its limit."""
+    mesh, friction = inclined(0.0), 0.3
+    task = problem(mesh, (0.0, 0.0, 0.0), friction)
+    low, high = (np.flatnonzero(side) for side in (mesh.points[:, 2] < 1e-9, mesh.points[:, 2] > SIZE - 1e-9))
+    engine = QuasiStaticEngine(mesh.points, task.assembler, boundary_faces(mesh).faces)
+    still, forces = [0.0, 0.0, 0.0], []
+    with engine.session(constrained=[low, high]) as session:
+        session.step([still, [0.0, 0.0, -0.2]])
+        for way in [0.1] * 6 + [0.0] * 2 + [-0.1] * 12:
+            forces.append(session.step([still, [way, 0.0, 0.0]]).bodies[0, 1])
+    found = np.array(forces)
+    ratio = found[:, 0] / -found[:, 2]
+    assert ratio[5] == pytest.approx(friction, rel=0.02) and ratio[-1] == pytest.approx(-friction, rel=0.02)
+    assert ratio[7] == pytest.approx(ratio[5], rel=1e-5)  # at rest nothing creeps
+    assert abs(ratio).max() < 1.02 * friction
+
+
+def sliding(slope: float, friction: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean position and velocity (steps, 3) of the piece above an inclined cut, under its weight; what lies below is fixed."""
+    mesh = inclined(slope)
+    made = problem(mesh, (0.0, 0.0, 0.0), friction).assembler
+    upper = np.zeros(mesh.n_points, dtype=bool)
+    centre = mesh.points[mesh.cells].mean(axis=1)
+    share = 1.0 - np.abs(centre[:, 2] - 0.5 * SIZE) / (0.5 * SIZE)
+    upper[mesh.cells[centre[:, 2] > 0.5 * SIZE + share * slope * (centre[:, 1] - 0.5 * SIZE)]] = True
+    mass = body_force(made.elements, np.full(mesh.n_cells, 1e-6), np.array([1.0, 0.0, 0.0]))[:, 0]
+    engine = DynamicEngine(mesh.points, made, mass, boundary_faces(mesh).faces, step=1e-3, tolerance=1e-5)
+    weight = mass[:, None] * np.array([0.0, 0.0, -9810.0])
+    share_of = (mass * upper / mass[upper].sum())[:, None]
+    place, speed = [], []
+    with engine.session(constrained=[np.flatnonzero(~upper)], external_force=weight) as session:
+        for _ in range(steps):
+            session.step()
+            place.append((share_of * session.state().displacement).sum(axis=0))
+            speed.append((share_of * session.state().velocity).sum(axis=0))
+    return np.array(place), np.array(speed)
+
+
+def test_a_piece_slides_down_a_cut_with_the_acceleration_of_a_block_on_a_slope() -> None:
+    slope, friction = 0.4, 0.2
+    _, speed = sliding(slope, friction, 40)
+    angle = np.arctan(slope)
+    along = -speed @ np.array([0.0, np.cos(angle), np.sin(angle)])
+    found = np.polyfit(1e-3 * np.arange(15, 40), along[15:], 1)[0]  # once the piece has settled on the slope
+    assert found == pytest.approx(9810.0 * (np.sin(angle) - friction * np.cos(angle)), rel=0.02)
+
+
+def test_a_piece_rests_on_a_cut_that_is_less_steep_than_the_angle_of_friction() -> None:
+    place, speed = sliding(0.3, 0.5, 120)
+    assert np.abs(speed[-1]).max() < 0.05  # it fell by 0.1 mm, at up to 10 mm/s
+    assert np.linalg.norm(place[-1] - place[-40]) < 2e-3
+
+
+def test_a_live_body_refuses_what_it_does_not_keep() -> None:
+    mesh = inclined(0.2)
+    made, mass = problem(mesh, (0.0, 0.0, 0.0), 0.2).assembler, np.full(mesh.n_points, 1e-6)
+    with pytest.raises(InputError, match="lips_friction must be 0 in real time"):
+        RealTimeEngine(mesh.points, made, mass, boundary_faces(mesh).faces)

@@ -140,7 +140,7 @@ class Assembler:
         """Whether the tangent is unsymmetric; that of elements is not."""
         return False
 
-    def in_step(self, displacement: FloatArray) -> Assembler:
+    def in_step(self, displacement: FloatArray, lips: FloatArray | None = None) -> Assembler:
         """Return the assembler of a time step that begins at a displacement (n, 3), mm; here the same."""
         return self
 

@@ -29,18 +29,19 @@ class LipAssembler(Assembler):
         """Return the derivative (n, 3) of the internal forces along `direction` (m, 4) in the cells' parameters; lips have none."""
         return Assembler._run(self, displacement, direction, np.empty((0, 3, 3)))[1]
 
-    def in_step(self, displacement: FloatArray) -> LipAssembler:
-        """Return the assembler of a time step that begins at a displacement (n, 3), mm: lips have the normals that they have there."""
-        return self if self.lips is None else replace(self, lips=self.lips.with_normals_of(displacement))
+    def in_step(self, displacement: FloatArray, lips: FloatArray | None = None) -> LipAssembler:
+        """Return the assembler of a time step that begins at a displacement (n, 3), mm: lips have the normals that they have there.
+
+        Those that rub on each other have slipped to the frictional anchors `lips` (p, 3), mm, by default those at rest.
+        """
+        if self.lips is None:
+            return self
+        return replace(self, lips=self.lips.with_normals_of(displacement).with_anchors(lips if self.unsymmetric else None))
 
     @property
     def unsymmetric(self) -> bool:
         """Whether friction of the sides of cuts makes the tangent unsymmetric."""
         return self.lips is not None and self.lips.friction > 0.0
-
-    def with_anchors(self, anchors: FloatArray | None) -> LipAssembler:
-        """Return the assembler whose lips have slipped to these frictional anchors (p, 3), mm; None for those at rest."""
-        return self if self.lips is None else replace(self, lips=self.lips.with_anchors(anchors))
 
     def add_contact_of_lips(self, displacement: FloatArray, force: FloatArray) -> None:
         """Add the forces of lips in contact to internal forces (n, 3), mN."""
@@ -62,6 +63,13 @@ class LipAssembler(Assembler):
 def lips_of(assembler: Assembler) -> tuple[CutLips, ...]:
     """Return the sides of the cuts of an assembler; of one that has none, nothing."""
     return (assembler.lips,) if isinstance(assembler, LipAssembler) and assembler.lips is not None else ()
+
+
+def going_on(assembler: Assembler, anchors: FloatArray | None) -> Assembler:
+    """Return the assembler whose sides of cuts, where they rub on each other, have slipped to anchors (p, 3), mm; None: those at rest."""
+    if not isinstance(assembler, LipAssembler) or assembler.lips is None or not assembler.unsymmetric:
+        return assembler
+    return replace(assembler, lips=assembler.lips.with_anchors(anchors))
 
 
 def with_lips(assembler: Assembler, points: FloatArray, faces: IntArray, friction: float = 0.0) -> Assembler:
