@@ -1,8 +1,12 @@
 """Contact of the two sides of a cut with each other: pairs of nodes that were one before the cut.
 
 Each pair resists approach along the mean normal of its two sides, as they are in the deformed body, by a penalty :cite:p:`wriggers2006`; it
-exerts nothing while it is open, and no friction. Pairs are those of the cut: sides that slide past each other further than `FURTHEST`
-edges, or that no longer face each other, do not touch.
+exerts nothing while it is open. Pairs are those of the cut: sides that slide past each other further than `FURTHEST` edges, or that no
+longer face each other, do not touch.
+
+With Coulomb friction a closed pair also resists slip: the elastic predictor ``e = k_t P (d - a)`` is returned to ``|e| <= mu N``; d is
+the position of the second node relative to the first, P the projection along the sides, N the force across them, and the anchor a is the
+history variable of the pair, as of a point of an indenter (`naibu.mechanics.contact.penalty_contact`).
 """
 
 from __future__ import annotations
@@ -13,10 +17,12 @@ import numpy as np
 
 from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.errors import InputError
 
 RAMP = 2e-4  # of the edge: penetration over which the pressure rises smoothly
 FURTHEST = 2.0  # edges between the nodes of a pair across the normal
 STIFFNESS = 40.0  # Young's moduli (of an incompressible solid) over the edge
+TANGENTIAL = 0.5  # stiffness of a pair before it slips, of that across the sides
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +47,10 @@ class CutLips:
         Penalties, kPa/mm.
     normals : ndarray, shape (p, 3), optional
         Of which the gaps are taken: those of an earlier position; zero for pairs that did not face each other there.
+    friction : float
+        Coulomb's coefficient; 0 for frictionless sides.
+    anchors : ndarray, shape (p, 3), optional
+        Positions of the second nodes relative to the first, mm, at which friction would vanish; those at rest by default.
     """
 
     points: FloatArray
@@ -51,6 +61,43 @@ class CutLips:
     edge: FloatArray
     stiffness: FloatArray
     normals: FloatArray | None = None
+    friction: float = 0.0
+    anchors: FloatArray | None = None
+
+    def with_friction(self, coefficient: float) -> CutLips:
+        """Return the same pairs with a coefficient of friction.
+
+        Raises
+        ------
+        InputError
+            A negative coefficient, or NaN.
+        """
+        if not (np.isfinite(coefficient) and coefficient >= 0.0):
+            raise InputError(f"lips_friction must be a finite number that is not negative, not {coefficient:g}; 0 is frictionless")
+        return replace(self, friction=coefficient)
+
+    def with_anchors(self, anchors: FloatArray | None) -> CutLips:
+        """Return the same pairs with other anchors (p, 3), mm; None for those at rest."""
+        return replace(self, anchors=anchors)
+
+    def anchors_behind(self, displacement: FloatArray) -> FloatArray:
+        """Return the anchors (p, 3), mm, from which the next step goes on: elastic slip is that of the friction at a displacement (n, 3).
+
+        Pairs that are open forget where they were.
+        """
+        gap, normal = self._gaps_and_normals(displacement)
+        d = self._relative(displacement)
+        traction = np.zeros_like(d)
+        blocks, force = np.zeros((len(d), 3, 3)), np.zeros_like(displacement)
+        self._rubbed(gap, normal, d, force, blocks, traction)
+        return np.asarray(d - traction / (TANGENTIAL * self.stiffness * self.area)[:, None])
+
+    def slip_forces(self, displacement: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the forces across (p,) and the friction along the sides (p, 3) that every pair exerts on its first node, mN."""
+        gap, normal = self._gaps_and_normals(displacement)
+        traction, blocks = np.zeros_like(normal), np.zeros((len(gap), 3, 3))
+        self._rubbed(gap, normal, self._relative(displacement), np.zeros_like(displacement), blocks, traction)
+        return _across(gap, self.area, self.edge, self.stiffness), traction
 
     def with_normals_of(self, displacement: FloatArray) -> CutLips:
         """Return the same pairs with the normals, and the choice of pairs that touch, of a displacement (n, 3), mm.
@@ -66,7 +113,7 @@ class CutLips:
         assert self.normals is not None
         return replace(
             self, pairs=self.pairs[which], area=self.area[which], edge=self.edge[which], stiffness=self.stiffness[which],
-            normals=self.normals[which],
+            normals=self.normals[which], anchors=None if self.anchors is None else self.anchors[which],
         )  # fmt: skip
 
     def gaps(self, displacement: FloatArray) -> FloatArray:
@@ -78,15 +125,32 @@ class CutLips:
         gap, normal = self._gaps_and_normals(displacement)
         blocks = np.zeros((len(self.pairs), 3, 3))
         energy = _pressed(gap, normal, self.pairs, self.area, self.edge, self.stiffness, force, blocks)
+        if self.friction > 0.0:
+            energy += self._rubbed(gap, normal, self._relative(displacement), force, blocks, np.zeros_like(normal))
         return float(energy), blocks
+
+    def _rubbed(
+        self, gap: FloatArray, normal: FloatArray, relative: FloatArray, force: FloatArray, blocks: FloatArray, traction: FloatArray
+    ) -> float:
+        """Add friction to internal forces and stiffnesses, put that of the pairs in place, and return what is stored in elastic slip."""
+        anchors = self._relative(np.zeros_like(self.points)) if self.anchors is None else self.anchors
+        pressing = _across(gap, self.area, self.edge, self.stiffness)
+        slope = np.where(gap > -RAMP * self.edge, -gap / (RAMP * self.edge), 1.0) * self.stiffness * self.area
+        tangential = TANGENTIAL * self.stiffness * self.area
+        shift = relative - anchors
+        return float(
+            _slipped(pressing, slope, normal, self.pairs, shift, tangential, self.friction, force, blocks, traction)
+        )  # fmt: skip
+
+    def _relative(self, displacement: FloatArray) -> FloatArray:
+        first, second = self.pairs.T
+        return np.asarray((self.points[second] - self.points[first]) + (displacement[second] - displacement[first]))
 
     def _gaps_and_normals(self, displacement: FloatArray) -> tuple[FloatArray, FloatArray]:
         if self.normals is None:
             gap, normals = _state(self.points, self.faces, self.pairs, self.corner_pair, self.edge, np.ascontiguousarray(displacement))
             return gap, normals
-        first, second = self.pairs.T
-        apart = (self.points[second] - self.points[first]) + (displacement[second] - displacement[first])
-        gap = (self.normals * apart).sum(axis=1)
+        gap = (self.normals * self._relative(displacement)).sum(axis=1)
         return np.where(self.normals.any(axis=1), gap, np.inf), self.normals
 
 
@@ -186,4 +250,43 @@ def _pressed(gap, normal, pairs, area, edge, stiffness, force, blocks):  # type:
             force[pairs[p, 1], i] -= pressing * normal[p, i]
             for j in range(3):
                 blocks[p, i, j] += slope * normal[p, i] * normal[p, j]
+    return energy
+
+
+def _across(gap: FloatArray, area: FloatArray, edge: FloatArray, stiffness: FloatArray) -> FloatArray:
+    """Return the forces across the sides (p,), mN, of pairs with these gaps: those of `_pressed`."""
+    k, ramp = stiffness * area, RAMP * edge
+    closed = np.minimum(gap, 0.0)
+    return np.where(closed > -ramp, 0.5 * k * closed * closed / ramp, -k * (closed + 0.5 * ramp))
+
+
+@njit(cache=True, nogil=True)
+def _slipped(pressing, slope, normal, pairs, shift, tangential, mu, force, blocks, traction):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add the friction of closed pairs and its derivative, which is unsymmetric where they slide; returns the energy of elastic slip."""
+    energy = 0.0
+    e = np.empty(3)
+    for p in range(len(pairs)):
+        limit = mu * pressing[p]
+        if limit <= 0.0:
+            continue
+        along = 0.0
+        for i in range(3):
+            along += normal[p, i] * shift[p, i]
+        size = 0.0
+        for i in range(3):
+            e[i] = tangential[p] * (shift[p, i] - along * normal[p, i])
+            size += e[i] * e[i]
+        size = np.sqrt(size)
+        slides = size > limit
+        ratio = limit / size if slides else 1.0
+        energy += 0.5 * (ratio * size) ** 2 / tangential[p]
+        for i in range(3):
+            traction[p, i] = ratio * e[i]
+            force[pairs[p, 0], i] -= ratio * e[i]
+            force[pairs[p, 1], i] += ratio * e[i]
+            for j in range(3):
+                held = tangential[p] * ((1.0 if i == j else 0.0) - normal[p, i] * normal[p, j])
+                if slides:
+                    held = ratio * (held - tangential[p] * e[i] * e[j] / size**2) - mu * slope[p] * e[i] * normal[p, j] / size
+                blocks[p, i, j] += held
     return energy

@@ -129,20 +129,18 @@ class Assembler:
         return self._run(displacement, self.parameters, np.empty((0, 3, 3)))
 
     def forces_of_parameter(self, displacement: FloatArray, direction: FloatArray) -> FloatArray:
-        """Return the derivative (n, 3) of the internal forces along a direction of the cells' parameters.
+        """Return the derivative (n, 3) of the internal forces at a displacement (n, 3), mm, along a direction (m, 4) of parameters, kPa.
 
         Every law is linear in its parameters, so this is the internal force of the parameters `direction`.
-
-        Parameters
-        ----------
-        displacement : ndarray, shape (n, 3)
-            Displacement of the nodes, mm.
-        direction : ndarray, shape (m, 4)
-            Change of the parameters of all cells, kPa.
         """
         return self._run(displacement, direction, np.empty((0, 3, 3)))[1]
 
-    def in_step(self, displacement: FloatArray) -> Assembler:
+    @property
+    def unsymmetric(self) -> bool:
+        """Whether the tangent is unsymmetric; that of elements is not."""
+        return False
+
+    def in_step(self, displacement: FloatArray, lips: FloatArray | None = None) -> Assembler:
         """Return the assembler of a time step that begins at a displacement (n, 3), mm; here the same."""
         return self
 

@@ -29,9 +29,19 @@ class LipAssembler(Assembler):
         """Return the derivative (n, 3) of the internal forces along `direction` (m, 4) in the cells' parameters; lips have none."""
         return Assembler._run(self, displacement, direction, np.empty((0, 3, 3)))[1]
 
-    def in_step(self, displacement: FloatArray) -> LipAssembler:
-        """Return the assembler of a time step that begins at a displacement (n, 3), mm: lips have the normals that they have there."""
-        return self if self.lips is None else replace(self, lips=self.lips.with_normals_of(displacement))
+    def in_step(self, displacement: FloatArray, lips: FloatArray | None = None) -> LipAssembler:
+        """Return the assembler of a time step that begins at a displacement (n, 3), mm: lips have the normals that they have there.
+
+        Those that rub on each other have slipped to the frictional anchors `lips` (p, 3), mm, by default those at rest.
+        """
+        if self.lips is None:
+            return self
+        return replace(self, lips=self.lips.with_normals_of(displacement).with_anchors(lips if self.unsymmetric else None))
+
+    @property
+    def unsymmetric(self) -> bool:
+        """Whether friction of the sides of cuts makes the tangent unsymmetric."""
+        return self.lips is not None and self.lips.friction > 0.0
 
     def add_contact_of_lips(self, displacement: FloatArray, force: FloatArray) -> None:
         """Add the forces of lips in contact to internal forces (n, 3), mN."""
@@ -55,7 +65,14 @@ def lips_of(assembler: Assembler) -> tuple[CutLips, ...]:
     return (assembler.lips,) if isinstance(assembler, LipAssembler) and assembler.lips is not None else ()
 
 
-def with_lips(assembler: Assembler, points: FloatArray, faces: IntArray) -> Assembler:
+def going_on(assembler: Assembler, anchors: FloatArray | None) -> Assembler:
+    """Return the assembler whose sides of cuts, where they rub on each other, have slipped to anchors (p, 3), mm; None: those at rest."""
+    if not isinstance(assembler, LipAssembler) or assembler.lips is None or not assembler.unsymmetric:
+        return assembler
+    return replace(assembler, lips=assembler.lips.with_anchors(anchors))
+
+
+def with_lips(assembler: Assembler, points: FloatArray, faces: IntArray, friction: float = 0.0) -> Assembler:
     """Return an assembler in which the two sides of cuts do not pass through each other; the same where there is no cut.
 
     Parameters
@@ -66,10 +83,18 @@ def with_lips(assembler: Assembler, points: FloatArray, faces: IntArray) -> Asse
         Its nodes in the reference configuration, mm.
     faces : ndarray, shape (f, 3), int64
         Its boundary triangles; those that lie on each other are the sides of cuts. Quadrilaterals have no such contact.
+    friction : float
+        Coulomb's coefficient between the two sides.
+
+    Raises
+    ------
+    InputError
+        A negative coefficient.
     """
     lips = cut_lips(points, faces, node_shear_moduli(assembler)) if faces.shape[1] == 3 else None
     if lips is None:
         return assembler
+    lips = lips.with_friction(friction)
     coupled = assembler.with_couplings(lips.pairs)
     known = {f.name: getattr(coupled, f.name) for f in fields(Assembler)}
     return LipAssembler(**known, lips=lips, _pairs=coupled.pattern.positions(lips.pairs))

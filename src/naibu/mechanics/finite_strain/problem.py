@@ -97,7 +97,9 @@ class Problem:
     def unsymmetric(self) -> bool:
         """Whether Coulomb friction makes the tangent unsymmetric."""
         curved = any(not c.surface.flat for c in self.contacts)  # friction turns with the normal
-        return curved or any(not c.tied and float(c.friction_coefficient.min()) < 100.0 for c in self.contacts)
+        return (
+            self.assembler.unsymmetric or curved or any(not c.tied and float(c.friction_coefficient.min()) < 100.0 for c in self.contacts)
+        )
 
     def with_changes(self, *, assembler: Assembler | None = None, contacts: tuple[Contact, ...] | None = None) -> Problem:
         """Return the problem with other parameters or bodies (same nodes)."""

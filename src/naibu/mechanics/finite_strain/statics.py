@@ -11,6 +11,7 @@ from naibu.core.arrays import FloatArray, require_finite
 from naibu.core.errors import ConvergenceError
 from naibu.core.status import Status
 from naibu.mechanics.finite_strain.failure_reasons import failure_reason
+from naibu.mechanics.finite_strain.lip_assembly import going_on, lips_of
 from naibu.mechanics.finite_strain.newton import Newton
 from naibu.mechanics.finite_strain.penalties import (
     relative_penetrations,
@@ -47,12 +48,15 @@ class LoadState:
         starts.
     normal_stiffness : tuple of ndarray, shape (p,)
         Penalties of the points of every contact with which the state was found, kPa/mm; empty where it was not solved.
+    lips : ndarray, shape (p, 3), optional
+        Frictional anchors of the pairs of the sides of cuts, mm, with which the next load step starts.
     """
 
     load: float
     displacement: FloatArray
     anchors: tuple[FloatArray, ...]
     normal_stiffness: tuple[FloatArray, ...] = ()
+    lips: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,12 +148,13 @@ def solve(
     require_finite("problem.external_force", problem.external_force)
     newton = Newton(with_suited_penalties(problem), chosen, solver)
     rest = LoadState(0.0, np.zeros_like(problem.points), tuple(c.anchors_at_rest() for c in problem.contacts))
-    first = rest if start is None else LoadState(0.0, start.displacement, start.anchors)
+    first = rest if start is None else LoadState(0.0, start.displacement, start.anchors, lips=start.lips)
+    newton.problem = _from_state(newton.problem, first)
     path = _LoadPath(newton, [first], warm_start, *((1.0, 1.0) if warm_start else (chosen.first_step, chosen.largest_step)))
     path.stiffness = stiffness or {}
     softer = path.follow(callback)
     if softer is not None:
-        newton.problem, known = softer, [(state.load, state.displacement) for state in path.states[1:]]
+        newton.problem, known = _from_state(softer, first), [(state.load, state.displacement) for state in path.states[1:]]
         path = _LoadPath(newton, [first], known, chosen.first_step, chosen.largest_step, may_soften=False)
         path.follow(callback)
     return finished(newton, path.states, path.residual, path.status, throw, path.seen)
@@ -202,6 +207,7 @@ class _LoadPath:
                 continue
             self.residual = found[1]
             states.append(advanced(self.newton.problem, found[0], last.anchors, load))
+            self.newton.problem = _from_state(self.newton.problem, states[-1])
             if ahead is not None:
                 self.step = min(1.0, 2.0 * self.step)
             else:
@@ -230,6 +236,12 @@ class _LoadPath:
                 self.smooth_from = len(self.states)
                 return found, int(USUAL_ITERATIONS)
         return found, newton.iterations - before
+
+
+def _from_state(problem: Problem, state: LoadState) -> Problem:
+    """Return the problem with which one goes on from a state: the sides of cuts that rub on each other know how they slipped."""
+    assembler = going_on(problem.assembler, state.lips)
+    return problem if assembler is problem.assembler else problem.with_changes(assembler=assembler)
 
 
 def _jumped(states: list[LoadState], u: FloatArray, load: float) -> bool:
@@ -295,7 +307,8 @@ def without_penetration(
 def advanced(problem: Problem, u: FloatArray, anchors: tuple[FloatArray, ...], load: float) -> LoadState:
     """Return the converged state with displacement `u` (n, 3), mm, and the anchors for the next load step."""
     moved = tuple(c.next_anchors(c.evaluate(u, a, load)) for c, a in zip(problem.contacts, anchors, strict=True))
-    return LoadState(load, u, moved, tuple(c.normal_stiffness for c in problem.contacts))
+    lips = next((some.anchors_behind(u) for some in lips_of(problem.assembler) if some.friction > 0.0), None)
+    return LoadState(load, u, moved, tuple(c.normal_stiffness for c in problem.contacts), lips)
 
 
 def finished(newton: Newton, states: list[LoadState], residual: float, status: Status, throw: bool, seen: str = "") -> Solution:

@@ -264,12 +264,13 @@ def hyperelastic_problem(
     contacts: tuple[Contact, ...] = (),
     density: float = 0.0,
     formulation: Formulation = "standard",
+    lips_friction: float = 0.0,
 ) -> Problem:
     """Return the boundary value problem on one mesh of tetrahedra; see `hyperelastic_static`."""
     parts = elements(mesh, formulation)
     pattern = block_pattern(mesh.n_points, parts.connectivity, *(c.nodes for c in contacts))
     assembler = Assembler.from_materials(parts, mesh.regions, list(materials), pattern)
-    assembler = with_lips(assembler, mesh.points, boundary_faces(mesh).faces)
+    assembler = with_lips(assembler, mesh.points, boundary_faces(mesh).faces, lips_friction)
     held = PrescribedDisplacement(conditions.constrained(mesh.points), np.zeros_like(mesh.points))
     return Problem(mesh.points, assembler, contacts, held, conditions.force(mesh, lumped_mass(simplices(mesh), density)))
 
@@ -283,6 +284,7 @@ def hyperelastic_static(
     settings: SolverSettings | None = None,
     formulation: Formulation = "standard",
     goal: Goal = "energy",
+    lips_friction: float = 0.0,
 ) -> StaticSolve:
     """Return what solves for equilibrium at finite strain, in contact or not, on any mesh of tetrahedra, for `solve_adaptively`.
 
@@ -303,11 +305,21 @@ def hyperelastic_static(
     goal : {"energy", "force"}
         Whether cells are marked by their part in the error in the energy norm, or in those of the forces of moving indenters along their
         travel, which `StaticResult.force_errors` then holds :cite:p:`becker2001`.
+    lips_friction : float
+        Coulomb's coefficient between the two sides of cuts. With friction, every mesh follows the load from its beginning.
+
+    Raises
+    ------
+    InputError
+        A negative coefficient.
     """
 
     def solve_on(mesh: Mesh, start: FloatArray | None) -> StaticResult:
-        problem = hyperelastic_problem(mesh, conditions, materials, contacts=contacts(mesh), density=density, formulation=formulation)
-        found = solve(problem, settings=settings, warm_start=() if start is None else [(1.0, start)])
+        problem = hyperelastic_problem(
+            mesh, conditions, materials, contacts=contacts(mesh), density=density, formulation=formulation, lips_friction=lips_friction
+        )
+        known = [] if start is None or problem.assembler.unsymmetric else [(1.0, start)]
+        found = solve(problem, settings=settings, warm_start=known)
         return static_result(mesh, found, materials, goal)
 
     return solve_on

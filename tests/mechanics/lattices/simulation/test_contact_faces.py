@@ -48,9 +48,10 @@ def pushed(engine: LatticeEngine, indenter: RigidIndenter, depth: float, steps: 
     return -np.array(forces)
 
 
-def test_a_sphere_meets_a_smooth_force_that_a_finer_mesh_confirms() -> None:
-    """5 mm deep with a radius as large as a face."""
-    curves = [pushed(dough(nodes), spherical_indenter((40.0, 40.0, SIDE_MM + 10.0), 10.0), 5.0, 250) for nodes in (9, 17)]
+@pytest.mark.parametrize("place", [(40.0, 40.0), (40.0, 45.0), (42.5, 42.5), (45.0, 45.0), (43.3, 46.1)])
+def test_a_sphere_meets_a_smooth_force_that_a_finer_mesh_confirms(place: tuple[float, float]) -> None:
+    """5 mm deep with a radius as large as a face: over a node, an edge, a quarter, the middle of a face, and elsewhere."""
+    curves = [pushed(dough(nodes), spherical_indenter((*place, SIDE_MM + 10.0), 10.0), 5.0, 250) for nodes in (9, 17)]
     for curve in curves:
         assert np.abs(np.diff(curve)).max() < 0.02 * np.ptp(curve)
     assert np.abs(curves[0] - curves[1]).max() < 0.03 * np.ptp(curves[1])

@@ -24,6 +24,7 @@ from naibu.mechanics.contact.indenter_motion import IndenterForce, IndenterMotio
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.assembly import Assembler
+from naibu.mechanics.finite_strain.lip_assembly import lips_of
 from naibu.mechanics.finite_strain.penalties import node_shear_moduli, relative_penetrations, stiff_enough, with_less_penetration
 from naibu.mechanics.finite_strain.sessions.implicit_step import ImplicitStep
 from naibu.mechanics.finite_strain.sessions.indenter_session import IndenterSession
@@ -54,6 +55,8 @@ class DynamicState:
         Frictional anchors of their contacts, mm.
     normal_stiffness : tuple of ndarray, shape (p,)
         Penalties of the contacts, kPa/mm, as stiff as they had to be so far; empty: those of the engine.
+    lips : ndarray, shape (p, 3), optional
+        Frictional anchors of the sides of cuts, mm; those at rest by default.
     """
 
     displacement: FloatArray
@@ -62,6 +65,7 @@ class DynamicState:
     rotations: FloatArray = field(default_factory=lambda: np.zeros((0, 3, 3)))
     anchors: tuple[FloatArray, ...] = ()
     normal_stiffness: tuple[FloatArray, ...] = ()
+    lips: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -259,7 +263,7 @@ class DynamicSession(IndenterSession[DynamicEngine, DynamicState]):
         floor = 1e-5 * engine._modulus * engine._extent**2
         return ImplicitStep(
             engine.assembler, engine.mass, h, start.displacement, start.velocity, self.external_force, self._constrained, contacts,
-            start.anchors, self._positions, engine.tolerance, floor, engine.iterations,
+            start.anchors, self._positions, engine.tolerance, floor, engine.iterations, lips=start.lips,
         )  # fmt: skip
 
     def _solved(self, matrix: sp.bsr_matrix, residual: FloatArray) -> FloatArray:
@@ -272,7 +276,7 @@ class DynamicSession(IndenterSession[DynamicEngine, DynamicState]):
         engine, start = self.engine, self.reached
         responses = [c.evaluate(u, a, 1.0) for c, a in zip(contacts, start.anchors, strict=True)]
         velocity = (u - start.displacement) / h
-        internal = engine.assembler.in_step(start.displacement).forces(u)[1]
+        internal = engine.assembler.in_step(start.displacement, start.lips).forces(u)[1]
         rest = internal - self.external_force + engine.mass[:, None] * (velocity - start.velocity) / h
         of_indenters = np.zeros((len(contacts), 3))
         for k, (contact, response) in enumerate(zip(contacts, responses, strict=True)):
@@ -289,7 +293,10 @@ class DynamicSession(IndenterSession[DynamicEngine, DynamicState]):
         start = self.reached
         centres = np.array([c.stop for c in contacts]).reshape(-1, 3)
         penalties = tuple(c.normal_stiffness for c in contacts)
-        return DynamicState(u, (u - start.displacement) / h, centres, turned(start.rotations, h * spin), anchors, penalties)
+        moved, turns = (u - start.displacement) / h, turned(start.rotations, h * spin)
+        assembler = self.engine.assembler.in_step(start.displacement, start.lips) if self.engine.assembler.unsymmetric else None
+        slipped = None if assembler is None else next(lips.anchors_behind(u) for lips in lips_of(assembler))
+        return DynamicState(u, moved, centres, turns, anchors, penalties, slipped)
 
     def _contacts(self, h: float, along: FloatArray, spin: FloatArray) -> tuple[Contact, ...]:
         """Contacts whose bodies move from where they are for a time `h`."""

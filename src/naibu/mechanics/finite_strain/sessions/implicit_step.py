@@ -53,6 +53,8 @@ class ImplicitStep:
         Newton iterations at most.
     retardation_s : float
         tau, s.
+    lips : ndarray, shape (p, 3), optional
+        Frictional anchors of the sides of cuts when the step begins, mm.
     """
 
     assembler: Assembler
@@ -69,11 +71,12 @@ class ImplicitStep:
     floor: float = 0.0
     iterations: int = 10
     retardation_s: float = 0.0
+    lips: FloatArray | None = None
     inertial: FloatArray = field(init=False)  # where the nodes would come to without forces, mm
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "inertial", self.displacement + self.duration * self.velocity)
-        object.__setattr__(self, "assembler", self.assembler.in_step(self.displacement))
+        object.__setattr__(self, "assembler", self.assembler.in_step(self.displacement, self.lips))
 
     def solved(self, u: FloatArray, linear: LinearSolve) -> FloatArray:
         """Return the displacement (n, 3) near `u`, whose constrained components are as prescribed, that balances momentum.

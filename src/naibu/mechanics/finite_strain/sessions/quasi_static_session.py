@@ -20,6 +20,7 @@ from naibu.mechanics.contact.indenter_motion import IndenterForce, IndenterMotio
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
+from naibu.mechanics.finite_strain.lip_assembly import going_on
 from naibu.mechanics.finite_strain.penalties import with_normal_stiffness
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
 from naibu.mechanics.finite_strain.sessions.indenter_session import IndenterSession
@@ -49,6 +50,8 @@ class EquilibriumState:
         Frictional anchors of their contacts, mm.
     normal_stiffness : tuple of ndarray, shape (p,)
         Penalties of the contacts, kPa/mm, as stiff as they had to be so far.
+    lips : ndarray, shape (p, 3), optional
+        Frictional anchors of the sides of cuts, mm; those at rest by default.
     """
 
     displacement: FloatArray
@@ -56,6 +59,7 @@ class EquilibriumState:
     rotations: FloatArray = field(default_factory=lambda: np.zeros((0, 3, 3)))
     anchors: tuple[FloatArray, ...] = ()
     normal_stiffness: tuple[FloatArray, ...] = ()
+    lips: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +96,7 @@ class QuasiStaticEngine:
 
     def energy(self, state: EquilibriumState) -> float:
         """Return the strain energy, mN mm."""
-        return float(self.assembler.forces(state.displacement)[0])
+        return float(going_on(self.assembler, state.lips).forces(state.displacement)[0])
 
     def session(
         self,
@@ -174,7 +178,7 @@ class QuasiStaticSession(IndenterSession[QuasiStaticEngine, EquilibriumState]):
         contacts = moving_contacts(self._templates, at.centres, at.rotations, ends - at.centres, turn)
         problem = Problem(self.engine.points, self.engine.assembler, contacts, prescribed, self.external_force)
         problem = with_normal_stiffness(problem, at.normal_stiffness)
-        return solve(problem, settings=self.engine.settings, start=LoadState(0.0, at.displacement, at.anchors))
+        return solve(problem, settings=self.engine.settings, start=LoadState(0.0, at.displacement, at.anchors, lips=at.lips))
 
     def _driven(self, motion: IndenterForce, index: int, velocity: FloatArray, ends: FloatArray, spin: FloatArray) -> Solution:
         """Move an indenter along its guide to where the body balances its force."""
@@ -206,7 +210,7 @@ class QuasiStaticSession(IndenterSession[QuasiStaticEngine, EquilibriumState]):
         """Forces (bodies, 3), mN, of the bodies of constrained nodes on the object."""
         last = solution.states[-1]
         before = solution.states[-2].anchors if len(solution.states) > 1 else last.anchors
-        rest = self.engine.assembler.forces(last.displacement)[1] - self.external_force
+        rest = solution.problem.assembler.forces(last.displacement)[1] - self.external_force
         for contact, anchors in zip(solution.problem.contacts, before, strict=True):
             response = contact.evaluate(last.displacement, anchors, last.load)
             rest = rest - contact.scattered(response.force, len(rest), response.orientation)
@@ -218,4 +222,4 @@ def _end_of(solution: Solution) -> EquilibriumState:
     last, contacts = solution.states[-1], solution.problem.contacts
     centres = np.array([c.stop for c in contacts]).reshape(-1, 3)
     rotations = np.array([c.orientation(1.0) for c in contacts]).reshape(-1, 3, 3)
-    return EquilibriumState(last.displacement, centres, rotations, last.anchors, last.normal_stiffness)
+    return EquilibriumState(last.displacement, centres, rotations, last.anchors, last.normal_stiffness, last.lips)

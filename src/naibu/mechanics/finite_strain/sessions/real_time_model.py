@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
+from naibu.core.errors import InputError
 from naibu.mechanics.finite_elements.pressure_elements import PressureElements
 from naibu.mechanics.finite_strain.lip_assembly import lips_of
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact
@@ -42,6 +43,10 @@ class RealTimeModel(DynamicEngine):
 
     def __post_init__(self) -> None:
         DynamicEngine.__post_init__(self)
+        if self.assembler.unsymmetric:
+            raise InputError(
+                "lips_friction must be 0 in real time; `DynamicEngine` and `QuasiStaticEngine` take friction between sides of cuts"
+            )
         object.__setattr__(self, "_elements", PressureElements.of(self.assembler))
         pairs = np.concatenate([np.zeros((0, 2), np.int64), *(lips.pairs for lips in lips_of(self.assembler))])
         object.__setattr__(self, "_surface", block_pattern(len(self.points), self.faces, pairs))

@@ -7,6 +7,7 @@ import numpy as np
 from naibu._numba.compilation import UNCOUNTED, njit
 from naibu.mechanics.contact._geometry_kernels import mesh_of
 from naibu.mechanics.lattices.cpu._contact_points import ALONG, FORCE, FREE, HARD, OWN, SLIDE, STICK, TANGENT, TOUCHING, gap_of
+from naibu.mechanics.lattices.model.contact_surface import PER_RADIUS, SHARED, THINNEST
 
 GONE = 1e-9  # compression of a foundation that counts as none, mm
 EARNEST = 0.25  # covered fraction of a face that counts
@@ -61,11 +62,12 @@ def keep(count, indenters, surface, history, lists, slid, found, reaction):  # t
     """Add up the forces of the indenters, mN, and leave the history of the contact as it is at the end of the step."""
     _, _, friction, pull, form = indenters
     corners, _, foundation, shapes, weights, first, rule = surface
-    mode, touched, compression, extension, _, multiplier = history
+    mode, touched, compression, extension, _, multiplier, thickness = history
     for entry in range(count):
         k, f = lists[0][entry], lists[1][entry]
         each, left = rule[k + 1] - rule[k], False
-        stiff, spring, decay, growth = foundation[f, 0], foundation[f, 1], foundation[f, 2], foundation[f, 3]
+        stiff, spring = foundation[f, 0] / thickness[k, f], foundation[f, 1] / thickness[k, f]
+        decay, growth = foundation[f, 2], foundation[f, 3]
         for g in range(each):
             p, shape = first[k] + f * each + g, shapes[rule[k] + g]
             before = compression[p]
@@ -78,7 +80,7 @@ def keep(count, indenters, surface, history, lists, slid, found, reaction):  # t
                 for c in range(4):
                     carried += shape[c] * multiplier[k, corners[f, c]]
                 found[p, OWN] = found[p, ALONG] - found[p, TOUCHING] * carried
-                compression[p] += found[p, OWN] / (shape[4] * stiff)
+                compression[p] += found[p, OWN] / stiff
                 over = compression[p] - form[k, 1]
                 if over > 0.0:
                     compression[p] -= over * HARD / (1.0 + HARD)
@@ -91,12 +93,14 @@ def keep(count, indenters, surface, history, lists, slid, found, reaction):  # t
 
 
 @njit(cache=True, **UNCOUNTED)
-def update_multipliers(count, surface, multiplier, lists, found, nodal):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Give the nodes what the foundation carries besides their multipliers (k, n), as far as the area around them is covered.
+def update_multipliers(count, form, surface, history, lists, found, nodal):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Give the nodes what the foundation carries besides their multipliers, as far as the area around them is covered.
 
-    `nodal` (4, k, n) is scratch.
+    Under round indenters nodes of faces carry the fraction `SHARED` of the pressure in any case, and the thickness of the foundations
+    follows from the area that is covered around them. `nodal` (4, k, n) is scratch.
     """
     corners, spread, _, shapes, weights, first, rule = surface
+    multiplier, thickness = history[5], history[6]
     gain, covering, largest, fraction = nodal[0], nodal[1], nodal[2], nodal[3]
     for entry in range(count):
         for c in range(4):
@@ -125,6 +129,11 @@ def update_multipliers(count, surface, multiplier, lists, found, nodal):  # type
         for g in range(each):
             p = first[k] + f * each + g
             touching, area = touching + weights[p] * found[p, TOUCHING], area + weights[p]
+        if form[k, 0] > 0.0 and spread[f, 1] > 0.0:
+            around = 0.0
+            for c in range(4):
+                around += covering[k, corners[f, c]] if spread[f, c] > 0.0 else 0.0
+            thickness[k, f] = np.sqrt(THINNEST**2 + PER_RADIUS**2 * around / (np.pi * area))
         earnest = min(touching / (EARNEST * area), 1.0)
         for c in range(4):
             i = corners[f, c]
@@ -134,7 +143,8 @@ def update_multipliers(count, surface, multiplier, lists, found, nodal):  # type
         for c in range(4):
             k, i = lists[0][entry], corners[lists[1][entry], c]
             if largest[k, i] >= 0.0:
-                kept = min(max((fraction[k, i] - BARELY) / (NEARLY - BARELY), 0.0), 1.0) ** 2
+                share = SHARED if form[k, 0] > 0.0 and spread[lists[1][entry], 1] > 0.0 else 0.0
+                kept = share + (1.0 - share) * min(max((fraction[k, i] - BARELY) / (NEARLY - BARELY), 0.0), 1.0) ** 2
                 multiplier[k, i] = max(kept * (multiplier[k, i] + largest[k, i] * gain[k, i]), 0.0)
                 largest[k, i] = -1.0
 
@@ -142,7 +152,7 @@ def update_multipliers(count, surface, multiplier, lists, found, nodal):  # type
 @njit(cache=True, **UNCOUNTED)
 def _keep_friction(p, k, result, weight, friction, slid, history, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Keep friction and mode of a point, and add what it exerts to the reaction of its indenter k."""
-    mode, touched, _, _, traction, _ = history
+    mode, touched, _, _, traction, _, _ = history
     size = 0.0
     for a in range(3):
         reaction[k, a] += weight * result[FORCE + a]

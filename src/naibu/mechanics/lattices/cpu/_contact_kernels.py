@@ -133,14 +133,14 @@ def contact_steps(data, contact, weight, motion, solver, reactions, most):  # ty
 
     `data` are those of an implicit step, with the operator of the contact; `contact` are indenters, surface, history, scratch and vectors:
     shapes (geometry, axes), centres (k, 3), friction (k, 2), pull-off (k, 3), curvature and depth from which the foundation is stiffer
-    (k, 2) of the indenters; nodes of the faces (f, 4), inverse areas (f, 4), foundation (f, 4), shape functions with inverse thickness
-    (q, 5) and weights (p,) at the points, and where points (k + 1,) and shape functions (k + 1,) of each indenter begin; the arrays of
-    `ContactState`; what `near_faces` lists, linearizations and what they exert, which points slide, slots of the nodes, their diagonal
-    blocks, four numbers a node (4, k, n), the mean acceleration in the step before (3, n) and how much of it lasted (1,), which are
-    changed; and room for four vectors (3 pad,). Constrained components of `data` move by their weights times the velocities of their
-    bodies; `motion` are these (steps, bodies, 3), and velocities and angular velocities of the indenters (steps, k, 3); `solver` the
-    limits of the solver; `reactions` those of the bodies and of the indenters; `most` the most passes. Returns iterations, passes and the
-    steps whose contacts did not settle.
+    (k, 2) of the indenters; nodes of the faces (f, 4), inverse areas (f, 4), foundation (f, 4), shape functions (q, 4) and weights (p,)
+    at the points, and where points (k + 1,) and shape functions (k + 1,) of each indenter begin; the arrays of `ContactState`; what
+    `near_faces` lists, linearizations and what they exert, which points slide, slots of the nodes, their diagonal blocks, four numbers a
+    node (4, k, n), the mean acceleration in the step before (3, n) and how much of it lasted (1,), which are changed; and room for four
+    vectors (3 pad,). Constrained components of `data` move by their weights times the velocities of their bodies; `motion` are these
+    (steps, bodies, 3), and velocities and angular velocities of the indenters (steps, k, 3); `solver` the limits of the solver;
+    `reactions` those of the bodies and of the indenters; `most` the most passes.
+    Returns iterations, passes and the steps whose contacts did not settle.
     """
     (_, _, mass, v, work, inner, now), (x, _, _, before, base, external, step) = data
     indenters, surface, history, scratch, (change, given, plain, origin) = contact
@@ -179,7 +179,7 @@ def contact_steps(data, contact, weight, motion, solver, reactions, most):  # ty
         iterations, passes, unsettled = iterations + done, passes + tries, unsettled + (not agreed)
         add_reactions(now, work[1], len(mass), step, reactions[0][n])
         keep(count, indenters, surface, history, lists, slid, points[1], reactions[1][n])
-        update_multipliers(count, surface, history[5], lists, points[1], nodal)
+        update_multipliers(count, indenters[4], surface, history, lists, points[1], nodal)
         advance(data, lost)
     operator[5][FACES], operator[5][NODES] = 0, 0
     return iterations, passes, unsettled

@@ -19,7 +19,7 @@ from naibu.mechanics.contact._geometry_kernels import MESH, SPHERE, distance_fro
 from naibu.mechanics.lattices.cpu._contact_operator import FACES
 
 FREE, STICK, SLIDE = range(3)
-TANGENTIAL = 8.0  # stiffness of a point before it slips, of that along the normal
+TANGENTIAL = 16.0  # stiffness of a point before it slips, of a foundation one element thick: the area in contact does not matter to it
 MARGIN = 0.25  # of the radius of a face, by which it may be off what was foreseen
 HARD = 20.0  # how many times the foundation is stiffer where an indenter is deep in it
 STEEP, FLAT = -0.7, -0.3  # cosines of the angle between the normals of an indenter and of a face, between which the latter takes over
@@ -148,7 +148,7 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
     """
     (geometry, axes), centres, friction, _, form = indenters
     corners, _, foundation, shapes, weights, first, rule = surface
-    _, _, compression, extension, traction, multiplier = history
+    _, _, compression, extension, traction, multiplier, thickness = history
     linear, found = points
     (at, speed), share, (across, slip, d, q, m, n), none = room
     wrong, wrong_friction, total, limits = 0.0, 0.0, 0.0, 0.0
@@ -160,6 +160,7 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
         for c in range(4):
             share[c] = multiplier[k, corners[f, c]]
         _face_normal(at, across)
+        stiff, spring = foundation[f, 0] / thickness[k, f], foundation[f, 1] / thickness[k, f]
         for g in range(each):
             p, shape = first[k] + f * each + g, shapes[rule[k] + g]
             weight = weights[p]
@@ -180,7 +181,6 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
             own, result = linear[p], found[p]
             _combine(shape, speed, slip)
             _exerted(own, slip, result)
-            stiff, spring = shape[4] * foundation[f, 0], shape[4] * foundation[f, 1]
             slope = _slope(n, across)
             carried = shape[0] * share[0] + shape[1] * share[1] + shape[2] * share[2] + shape[3] * share[3]
             _towards_face(n, across)
@@ -197,7 +197,7 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
             own[STIFF] = step * ((stiff + hard) * covered + growth * carried)
             own[PRESSURE] = pressure + own[STIFF] * away
             if friction[k, 0] > 0.0:
-                drag = step * TANGENTIAL * stiff
+                drag = step * TANGENTIAL * foundation[f, 0]
                 wrong_friction += weight * _return_mapping(own, traction[p], slip, drag, pressure, friction[k], slid, p, result)
                 limits += weight * friction[k, 1] * pressure
     return wrong, wrong_friction, total, limits

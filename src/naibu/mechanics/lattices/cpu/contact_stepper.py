@@ -166,7 +166,7 @@ class ContactStepper:
         if known is None or known[0] is not base.constrained:
             (node, direction, _, body), (operator, *own), contact = base.constrained, self.scratch, self.contact
             data = base.arguments(base.scratch[1][POOL], operator, (node, direction, np.zeros(len(node)), body))
-            history = (contact.mode, contact.touched, contact.compression, contact.extension, contact.friction, contact.multiplier)
+            history = contact.history()
             corners, spread, *rest = self.points
             surface = (corners, spread, self.surface.foundation(base.step), *rest)
             vectors = tuple(np.zeros_like(base.position) for _ in range(4))
@@ -201,16 +201,14 @@ class ContactStepper:
         base, contact = self.base, self.contact
         assert base.length is not None  # as of all implicit steps
         lattice = (base.position, base.velocity, base.extension, base.length)
-        history = (contact.mode, contact.touched, contact.compression, contact.extension, contact.friction, contact.multiplier)
-        return (*lattice, *history, contact.centres, contact.axes, contact.acceleration, contact.lasting)
+        return (*lattice, *contact.history(), contact.centres, contact.axes, contact.acceleration, contact.lasting)
 
 
 def _points(surface: ContactSurface, contact: ContactState) -> KernelTuple:
-    """Return nodes of faces, inverse areas, shape functions with inverse thickness, weights, and where those of each indenter begin."""
+    """Return nodes of faces, inverse areas, shape functions, weights, and where those of each indenter begin."""
     rules = [surface.quadrature(int(own)) for own in contact.order]
     rule = np.concatenate([[0], np.cumsum([len(shape) for shape, _ in rules])]).astype(np.int64)
-    shape = np.concatenate([shape for shape, _ in rules])
-    shapes = np.ascontiguousarray(np.column_stack([shape, 1.0 / surface.compliance(shape)]))
+    shapes = np.ascontiguousarray(np.concatenate([shape for shape, _ in rules]))
     weights = np.concatenate([weight.ravel() for _, weight in rules])
     return np.ascontiguousarray(surface.nodes), surface.spread, shapes, weights, contact.first, rule
 

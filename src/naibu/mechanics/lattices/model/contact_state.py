@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from naibu.core.arrays import BoolArray, FloatArray, Int8Array, IntArray
+from naibu.core.arrays import AnyArray, BoolArray, FloatArray, Int8Array, IntArray
 from naibu.core.errors import InputError
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.lattices.model.contact_surface import ContactSurface, contact_faces
@@ -38,6 +38,8 @@ class ContactState:
         Traction of friction on the lattice, kPa.
     multiplier : ndarray, shape (indenters, n)
         Pressure at the nodes, kPa, that the foundation between them need not carry.
+    thickness : ndarray, shape (indenters, f)
+        Of the foundations of the faces, in lengths of the elements behind them.
     centres : ndarray, shape (indenters, 3)
         Reference points of the indenters, mm.
     axes : ndarray, shape (indenters, 3, 3)
@@ -58,6 +60,7 @@ class ContactState:
     extension: FloatArray
     friction: FloatArray
     multiplier: FloatArray
+    thickness: FloatArray
     centres: FloatArray
     axes: FloatArray
     begun: BoolArray
@@ -68,6 +71,11 @@ class ContactState:
     def indenters(self) -> int:
         """Number of indenters."""
         return len(self.centres)
+
+    def history(self) -> tuple[AnyArray, ...]:
+        """Return what steps change at the points, nodes and faces, in the order of the attributes."""
+        points = (self.mode, self.touched, self.compression, self.extension, self.friction)
+        return (*points, self.multiplier, self.thickness)
 
     def copied(self) -> ContactState:
         """Return a copy of all arrays."""
@@ -139,7 +147,8 @@ def begin_contact(
     touched, none, at_node = gap < TOUCH_MM, np.zeros(len(gap)), np.zeros((len(indenters), lattice.n_nodes))
     centres, axes = np.array([p.centre for p in indenters], dtype=float), np.array([p.geometry.axes for p in indenters], dtype=float)
     begun, traction = np.zeros((), dtype=bool), np.zeros((len(gap), 3))
+    thickness = np.array([surface.thickness(p.geometry) for p in indenters])
     return ContactState(
-        order, first, touched.astype(np.int8), touched, none, none.copy(), traction, at_node, centres, axes, begun,
-        np.zeros((3, lattice.n_nodes)), np.zeros(1),
+        order, first, touched.astype(np.int8), touched, none, none.copy(), traction, at_node, thickness, centres, axes,
+        begun, np.zeros((3, lattice.n_nodes)), np.zeros(1),
     )  # fmt: skip

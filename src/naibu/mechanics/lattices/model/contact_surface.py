@@ -1,10 +1,14 @@
 """The surface of a lattice that indenters touch: its faces, their quadrature points, and the material behind them.
 
 Between its nodes a face of a lattice is rigid, and the solid that it stands for is not. Each quadrature point therefore stands on an
-elastic foundation :cite:p:`johnson1985` (chapter 4.3) of three-element elements like those behind its face. Its thickness, in lengths of
-these elements, is `AT_NODE` at a node and grows by `BETWEEN` times what the nodes yield less elsewhere, one minus the sum of the squares
-of the shape functions. With these two numbers a sphere, as large as a face or twice as large, on a lattice and on one twice as fine meets
-forces that differ least, wherever it stands (``benchmarks/contact_steps.py``).
+elastic foundation of three-element elements like those behind its face. A foundation yields to a small indenter as a half-space does if
+its thickness is in proportion to the radius of the area that is pressed :cite:p:`johnson1985` (chapter 4.3), and what the nodes yield
+must not be counted twice: of the pressure they carry the fraction `SHARED` past it. The thickness, in lengths of the elements, is the
+root of the sum of the squares of `THINNEST`, and of `PER_RADIUS` times the radius of the covered area around the face over its edge. With
+`SHARED` and `PER_RADIUS` a lattice yields to a given (Hertz's) pressure as one twice as fine does, wherever it acts: by itself it yields
+17 to 36 % less if the radius of the pressure is 0.6 edges of a face, 12 to 17 % at 1.2 and 1 edges, and then to 2.3 % as much, 6 % at 0.4
+edges (``benchmarks/contact_steps.py --given``; no contact was computed to find them). `THINNEST` keeps the first touch of a single point
+soft, at the expense of smaller indenters.
 """
 
 from __future__ import annotations
@@ -20,7 +24,9 @@ from naibu.mechanics.lattices.model.coefficients import explicit_coefficients, i
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
 from naibu.mechanics.lattices.model.surface import surface_faces
 
-AT_NODE, BETWEEN = 0.15, 0.6
+SHARED, PER_RADIUS, THINNEST = 0.7, 1.48, 0.35
+FLAT = 0.48  # thickness under flat indenters, whose contact comes and goes at once
+SINGLE = 0.15  # thickness where nodes touch for themselves: they stand on nothing that is coarser than themselves
 FLAT_ORDER = 2  # Gauss points per side of a face under a plane, exact for the product of two shape functions
 LEAST_ORDER, MOST_ORDER = 3, 8
 FINENESS = 1.2  # quadrature points along the volume of an indenter over its area; 3.6 along the radius of a sphere
@@ -91,10 +97,10 @@ class ContactSurface:
         shape, weight = face_quadrature(self.points, self.faces, order)
         return np.pad(shape, ((0, 0), (0, 4 - shape.shape[1]))), weight
 
-    @staticmethod
-    def compliance(shape: FloatArray) -> FloatArray:
-        """Return the thickness of the foundation (q,), in lengths of the elements, at points with shape functions (q, 4)."""
-        return np.asarray(AT_NODE + BETWEEN * (1.0 - (shape**2).sum(axis=1)))
+    def thickness(self, geometry: IndenterGeometry) -> FloatArray:
+        """Return the thickness of the foundations (f,) before an indenter presses them, in lengths of the elements."""
+        single = self.faces.shape[1] == 1
+        return np.full(len(self.faces), SINGLE if single else THINNEST if geometry.curvature > 0.0 else FLAT)
 
     def foundation(self, step: float) -> FloatArray:
         """Return the coefficients (f, 4) of steps of a length, s.
