@@ -112,7 +112,9 @@ def test_a_blade_that_goes_on_in_small_steps_cuts_as_in_one_go(kind: str, seed: 
 
 def _area(before: Lattice, cut: LatticeCut) -> float:
     """Area of the new surface; it is what was added to the surface."""
-    added, old, new = (_areas(at.points, t) for at, t in ((cut.lattice, cut.faces), *((x, surface_triangles(x)) for x in (before, cut.lattice))))
+    added, old, new = (
+        _areas(at.points, t) for at, t in ((cut.lattice, cut.faces), *((x, surface_triangles(x)) for x in (before, cut.lattice)))
+    )
     assert new - old == pytest.approx(added, abs=1e-9)
     return added
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
-from naibu.meshing import BisectionForest, box, cut_forest, forest_pieces, rectangle, signed_volumes, swept_blade
+from naibu.meshing import BisectionForest, ForestCut, box, cut_forest, forest_pieces, rectangle, signed_volumes, swept_blade
 from naibu.meshing.cutting.swept_blade import SweptBlade
 from naibu.meshing.refinement._forest_kernels import TAG
 
@@ -85,6 +85,44 @@ def test_refinement_and_coarsening_go_on_around_cuts(seed: int, x: float, until_
         found.coarsen(found.leaves())
     check(found)
     assert found.n_cells < finest
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(-6.0, 6.0), st.floats(-8.0, 8.0), st.sampled_from([3.0, 5.0]))
+def test_the_front_of_a_cut_stays_closed_until_the_cut_goes_on(seed: int, x: float, until_y: float, distance: float) -> None:
+    found, rng = forest(), np.random.default_rng(seed)
+    whole = _surface(found)
+    cut = cut_forest(found, plane(x, until_y), distance)
+    opened = _area(found, cut)
+    assert _surface(found) == pytest.approx(whole + opened, rel=1e-12)
+    changed = found.copied()
+    for _ in range(4):
+        found.refine(rng.choice(found.leaves(), 20))
+        assert _surface(found) == pytest.approx(whole + opened, rel=1e-12)  # refinement opens nothing
+        changed.refine(rng.choice(changed.leaves(), 20))
+        changed.coarsen(rng.choice(changed.leaves(), changed.n_cells // 2, replace=False))
+        assert _surface(changed) == pytest.approx(whole + opened, rel=1e-12)
+    there = swept_blade([[[x + 0.2 * y, y, -5.0], [x + 0.2 * y, y, 25.0]] for y in (until_y, 16.0)])
+    on = cut_forest(found, there, distance, earlier=plane(x, until_y))
+    assert _surface(found) == pytest.approx(whole + opened + _area(found, on), rel=1e-12)
+    check(found)
+    sizes = np.bincount(forest_pieces(found), found.volumes(np.sort(found.leaves())))
+    assert sizes[1] > 0.1 * SIZE**3  # parted; beside the two there may be splinters of cells that were bisected in between
+
+
+def _surface(found: BisectionForest) -> float:
+    faces, _ = found.boundary_faces()
+    return _areas(found, faces)
+
+
+def _area(found: BisectionForest, cut: ForestCut) -> float:
+    return _areas(found, cut.faces.reshape(-1, 2))
+
+
+def _areas(found: BisectionForest, faces: IntArray) -> float:
+    corners = [np.delete(found.simplices[t], s) for t, s in faces.tolist()]
+    a, b, c = found.points[np.array(corners).reshape(-1, 3)].transpose(1, 0, 2)
+    return 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
 
 
 def test_cells_near_a_cut_are_coarsened_again_but_for_those_that_it_runs_through() -> None:

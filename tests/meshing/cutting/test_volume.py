@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import Delaunay
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
@@ -54,7 +55,9 @@ def check(before: Mesh, cut: VolumeCut, distance: float) -> None:
     first, second = np.split(cut.faces, 2)
     np.testing.assert_allclose(cut.mesh.points[first].mean(axis=1), cut.mesh.points[second].mean(axis=1), atol=1e-12)
     added = _area(cut.mesh.points, cut.faces)  # what the cut says is new is what the surface of the mesh grew by
-    assert _area(cut.mesh.points, boundary_faces(cut.mesh).faces) - _area(before.points, boundary_faces(before).faces) == pytest.approx(added, abs=1e-8)
+    assert _area(cut.mesh.points, boundary_faces(cut.mesh).faces) - _area(before.points, boundary_faces(before).faces) == pytest.approx(
+        added, abs=1e-8
+    )
 
 
 def _area(points: FloatArray, faces: np.ndarray) -> float:
@@ -122,6 +125,31 @@ def test_a_blade_that_goes_on_step_by_step_cuts_as_in_one_go() -> None:
     np.testing.assert_allclose(sizes[0], sizes[1], rtol=0.02)
     with pytest.raises(InputError, match="give that of the cut that made the mesh"):
         cut_volume(mesh, steps[0], 2.0, forest=cut.forest)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_blade_that_goes_on_step_by_step_parts_irregular_meshes(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    corners = np.array(list(np.ndindex(2, 2, 2)), dtype=float)
+    points = SIZE * np.concatenate([corners, rng.uniform(size=(40, 3))])
+    cells = Delaunay(points).simplices.astype(np.int64)
+    turned = np.linalg.det(points[cells][:, 1:] - points[cells][:, :1]) < 0.0
+    cells[turned, 2:] = cells[turned, 3:1:-1]
+    before = mesh = Mesh.from_arrays(points, cells, "tetra")
+    edge, way, bulge = np.linalg.qr(rng.normal(size=(3, 3)))[0].T
+    s = np.linspace(-24.0, 24.0, 33)[:, None]
+    poses = (10.0 + s * way + 2.0 * np.sin(0.15 * s) * bulge)[:, None] + np.array([[-40.0], [40.0]]) * edge
+    swept = [swept_blade(poses[k : k + 2]) for k in range(32)]
+    cut = None
+    for k, blade in enumerate(swept):
+        made = cut_volume(mesh, blade, 3.0, forest=None if cut is None else cut.forest, earlier=sum(swept[1:k], swept[0]) if k else None)
+        check(mesh, made, 3.0)
+        cut, mesh = made, made.mesh
+    assert cut is not None
+    whole = cut_volume(before, swept_blade(poses), 3.0)
+    sizes = [np.bincount(c.piece, signed_volumes(c.mesh)) for c in (cut, whole)]
+    assert sizes[0][:2].sum() > 0.999 * SIZE**3  # besides the two, nothing but splinters
+    np.testing.assert_allclose(sizes[0][:2], sizes[1][:2], rtol=0.02)
 
 
 def test_a_closed_path_cuts_a_column_out() -> None:

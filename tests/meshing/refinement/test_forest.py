@@ -277,6 +277,15 @@ def test_a_refused_refinement_leaves_the_mesh_as_it_was():
     assert len(BisectionForest.of(fan(300)).refine([0]).parents) == 300
 
 
+def test_cells_that_are_numbered_the_other_way_round_are_turned():
+    start = kuhn()
+    cells = start.cells.copy()
+    cells[::3] = cells[::3][:, [1, 0, 2, 3]]
+    forest = BisectionForest.of(Mesh.from_arrays(start.points, cells, "tetra"))
+    forest.refine(np.arange(20))
+    require_sound(forest, start)
+
+
 def test_unsuitable_meshes_and_numbers_are_refused():
     with pytest.raises(InputError, match="'hexahedron'"):
         BisectionForest.of(box((1, 1, 1), (1, 1, 1)))
@@ -286,6 +295,19 @@ def test_unsuitable_meshes_and_numbers_are_refused():
     points = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 2], [0, 0, -1]]
     with pytest.raises(InputError, match="three cells share"):
         BisectionForest.of(Mesh.from_arrays(points, [[0, 1, 2, 3], [0, 1, 2, 4], [0, 1, 2, 5]], "tetra"))
+    alone = Mesh.from_arrays([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3], [1, 0, 2, 3]], "tetra")
+    with pytest.raises(InputError, match="cells 0 and 1 have the same nodes; remove duplicate cells"):
+        BisectionForest.of(alone)
+    folded = kuhn()
+    points = folded.points.copy()
+    points[np.argmin(np.abs(points - [0, 0, 0.5]).sum(axis=1)), 0] += 0.9  # through the cells beside it
+    with pytest.raises(InputError, match=r"cells \d+ and \d+ lie on the same side of the face that they share: one of them is inverted"):
+        BisectionForest.of(Mesh.from_arrays(points, folded.cells, "tetra"))
+    plane = rectangle((2, 1), (2, 2))
+    points = plane.points.copy()
+    points[4] += [1.5, 0]
+    with pytest.raises(InputError, match="same side of the face"):
+        BisectionForest.of(Mesh.from_arrays(points, plane.cells, "triangle"))
     forest = BisectionForest.of(kuhn())
     for wrong in ([-1], [48]):
         with pytest.raises(InputError, match="numbers 0 to 47"):

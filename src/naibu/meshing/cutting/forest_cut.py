@@ -45,7 +45,7 @@ class ForestCut:
         Vertices that were doubled, and their copies.
     faces : ndarray, shape (f, 4), int64
         New surface: cell above the blade, place in it of the vertex opposite to the face, and the same of the cell below. Faces at the
-        front all of whose vertices are still one on both sides are no part of it, but of that of the cut that separates them.
+        front that other cells still hold together are part of that of the cut that opens them; see `BisectionForest.cut_front`.
     deviation_mm : float
         Largest distance of a vertex of the new surface from the blade.
     smallest_angle_deg : float
@@ -98,8 +98,8 @@ def cut_forest(
         The cut is refused where it would make cells with a smaller dihedral angle; by default a tenth of the smallest one of the cells that
         are bisected.
     earlier : SweptBlade, optional
-        Of a blade that goes on step by step, what it swept in the steps before, as far back as a cell reaches. Cells that are bisected now
-        are separated along it too; without it, parts of them would hold the two sides together.
+        Of a blade that goes on step by step, what it swept in the steps before, as far back as a cell reaches. Cells that were bisected
+        since the last cut, or are now, are separated along it too; without it, parts of them would hold the two sides together.
 
     Raises
     ------
@@ -121,11 +121,11 @@ def _cut(
     forest: BisectionForest, blade: SweptBlade, whole: SweptBlade, distance_mm: float, where: FloatArray, least_angle_deg: float | None
 ) -> ForestCut:
     changes: list[MeshChange] = []
-    gap, centres, fresh = np.full(forest.node_rows, -1.0), np.empty((0, 3)), np.zeros(0, dtype=bool)
+    gap, centres = np.full(forest.node_rows, -1.0), np.empty((0, 3))
     for _ in range(ROUNDS):
         if len(centres) < forest.cell_rows:
             centres = np.empty((2 * forest.cell_rows, 3))
-            fresh = np.append(fresh, np.zeros(2 * forest.cell_rows - len(fresh), dtype=bool))
+        fresh = np.append(forest.since_cut, np.zeros(max(0, forest.cell_rows - len(forest.since_cut)), dtype=bool))
         surface = (*whole.arrays, len(blade.triangles), fresh)
         faces = _crossed(forest, surface, where, centres)
         coarse = _too_coarse(forest, faces, where, surface, centres, 0.5 * distance_mm, gap)
@@ -134,21 +134,25 @@ def _cut(
         if forest.n_cells + max(2 * len(coarse), _needed(forest, where, coarse, distance_mm)) > MOST_CELLS:
             raise _too_fine(distance_mm)
         changes.append(forest.refine(coarse))
-        fresh = np.append(fresh, np.zeros(max(0, forest.cell_rows - len(fresh)), dtype=bool))
-        fresh[changes[-1].children] = True
         where = transferred_nodes(forest, changes[-1], where)
         gap = np.concatenate([gap, np.full(forest.node_rows - len(gap), -1.0)])
         gap[changes[-1].nodes] = -1.0
     else:
         raise _too_fine(distance_mm)
     angle = _quality(forest, changes, distance_mm, least_angle_deg)
-    faces = _opened(forest, faces, centres, whole, 0.5 * distance_mm)
-    copies, apart, earlier = _separated(forest, faces)
-    where = _extended(where, forest.node_rows, copies)
-    gap = _extended(gap, forest.node_rows, copies)
-    _, deviation = kernels.too_coarse(forest.arrays[0], faces[apart], where, surface, np.inf, gap, np.empty(0, dtype=np.int64))
-    late = _above_first(forest, earlier, where, whole)
-    return ForestCut(tuple(changes), copies, np.concatenate([faces[apart], late]), float(deviation), angle)
+    late = _late(forest, faces, where, whole)
+    if len(whole.triangles) > len(blade.triangles):  # where cells are new, what the blade swept before has told already
+        late = late[~fresh[late[:, ::2]].any(axis=1)]
+    faces = _opened(forest, np.concatenate([faces, late]), centres, whole, 0.5 * distance_mm)
+    copies = _separated(forest, faces)
+    apart = _apart(forest, faces)
+    kernels.set_open(forest.arrays[0], faces[~apart], 0)
+    forest.cut_front, forest.since_cut = _corners(forest, faces[~apart, 0], faces[~apart, 1]), np.zeros(0, dtype=bool)
+    faces = faces[apart]
+    now = faces[~np.isin(faces[:, 0] * 4 + faces[:, 1], late[:, 0] * 4 + late[:, 1])]
+    where, gap = (_extended(values, forest.node_rows, copies) for values in (where, gap))
+    _, deviation = kernels.too_coarse(forest.arrays[0], now, where, surface, np.inf, gap, np.empty(0, dtype=np.int64))
+    return ForestCut(tuple(changes), copies, faces, float(deviation), angle)
 
 
 def _extended(values: AnyArray, rows: int, copies: IntArray) -> AnyArray:
@@ -219,7 +223,8 @@ def _opened(forest: BisectionForest, faces: IntArray, centres: FloatArray, blade
         beside = of_piece.any(axis=1) & ~small.all(axis=1)  # not those towards other splinters
         if not beside.any():
             continue
-        across = np.where(of_piece[:, 0], label[faces[:, 2]], label[faces[:, 0]])
+        # what lies above the piece and what lies below it are two, also where a cut that ends inside leaves one piece of both
+        across = 2 * np.where(of_piece[:, 0], label[faces[:, 2]], label[faces[:, 0]]) + of_piece[:, 0]
         area = np.bincount(across[beside], _areas(forest, faces[beside]))
         closed |= beside & (across == int(area.argmax()))
     kernels.set_open(cells, faces[closed], 0)
@@ -239,36 +244,16 @@ def face_vertices(forest: BisectionForest, cells: IntArray, places: IntArray) ->
     return corners
 
 
-def _separated(forest: BisectionForest, faces: IntArray) -> tuple[IntArray, BoolArray, IntArray]:
-    """Double the vertices of open faces.
-
-    Returns
-    -------
-    tuple of ndarray
-        Vertices and their copies (k, 2); which of the faces (f,) have different vertices on both sides now; and such faces (e, 4) that cuts
-        before had opened at their fronts.
-    """
+def _separated(forest: BisectionForest, faces: IntArray) -> IntArray:
+    """Double the vertices of open faces, and return them with their copies (k, 2)."""
     touched, slot = np.zeros(forest.node_rows, dtype=np.int8), np.full(forest.cell_rows, -1, dtype=np.int64)
     around, group, count = kernels.corner_groups(forest.arrays[0], forest.arrays[4], forest.n_cells, faces, touched, slot)
     first, source = forest.node_rows, np.empty(int(count), dtype=np.int64)
-    pairs = _coincident(forest, around)
     forest.reserve(int(count))
     cells, points, nodes, _, _, counters = forest.arrays
     counters[[NODES, COUNT]] += int(count)
     kernels.double_vertices(cells, points, nodes, around, group, touched, first, source)
-    known = {(t, s) for row in faces.tolist() for t, s in (row[:2], row[2:])}
-    before = np.array([row for row in pairs.tolist() if (row[0], row[1]) not in known], dtype=np.int64).reshape(-1, 4)
-    return np.stack([source, first + np.arange(len(source))], axis=1), _apart(forest, faces), before[_apart(forest, before)]
-
-
-def _coincident(forest: BisectionForest, cells: IntArray) -> IntArray:
-    """Pairs (p, 4) of open faces of cells that have the same vertices."""
-    t, s = np.nonzero(forest.neighbours[cells] < 0)
-    corners = _corners(forest, cells[t], s)
-    order = np.lexsort(corners.T)
-    same = (np.diff(corners[order], axis=0) == 0).all(axis=1)
-    one, two = order[:-1][same], order[1:][same]
-    return np.stack([cells[t[one]], s[one], cells[t[two]], s[two]], axis=1)
+    return np.stack([source, first + np.arange(len(source))], axis=1)
 
 
 def _apart(forest: BisectionForest, faces: IntArray) -> BoolArray:
@@ -282,15 +267,26 @@ def _corners(forest: BisectionForest, cells: IntArray, places: IntArray) -> IntA
     return np.sort(forest.simplices[cells].astype(np.int64)[np.arange(len(cells))[:, None], _FACES[places]], axis=1)
 
 
-def _above_first(forest: BisectionForest, faces: IntArray, where: FloatArray, blade: SweptBlade) -> IntArray:
-    """Faces (f, 4) with the cell first that lies above the part of the blade that is nearest to the face."""
-    if not len(faces):
-        return faces
+def _late(forest: BisectionForest, faces: IntArray, where: FloatArray, blade: SweptBlade) -> IntArray:
+    """Faces (f, 4) at the fronts of cuts before, but for those that the blade crosses now.
+
+    The cell first is the one above the part of the blade that is nearest to the face.
+    """
+    known, found = {frozenset((t, u)) for t, u in faces[:, ::2].tolist()}, []
+    for face in forest.cut_front.tolist():
+        around = forest.around_node(face[0])
+        beside = around[np.isin(forest.simplices[around], face).sum(axis=1) == 3].tolist()
+        if len(beside) == 2 and frozenset(beside) not in known:
+            t, u = beside
+            found.append((t, forest.neighbours[t].tolist().index(u), u, forest.neighbours[u].tolist().index(t)))
+    if not found:
+        return np.empty((0, 4), dtype=np.int64)
+    rows = np.array(found, dtype=np.int64)
     a, b, c = blade.points[blade.triangles].transpose(1, 0, 2)
-    upper, lower = (where[forest.simplices[faces[:, k]]].mean(axis=1) for k in (0, 2))
+    upper, lower = (where[forest.simplices[rows[:, k]]].mean(axis=1) for k in (0, 2))
     nearest = cKDTree((a + b + c) / 3.0).query(0.5 * (upper + lower))[1]
     below = ((upper - lower) * np.cross(b - a, c - a)[nearest]).sum(axis=1) < 0.0
-    return np.where(below[:, None], faces[:, [2, 3, 0, 1]], faces)
+    return np.where(below[:, None], rows[:, [2, 3, 0, 1]], rows)
 
 
 def _quality(forest: BisectionForest, changes: list[MeshChange], distance_mm: float, least_angle_deg: float | None) -> float:

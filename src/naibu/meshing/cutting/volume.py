@@ -127,7 +127,6 @@ def cut_volume(
     where = mesh.points if positions is None else positions
     require_shape("positions", where, mesh.points.shape)
     if forest is None:
-        _require_single_cells(mesh)
         forest = BisectionForest.of(mesh)
     elif (forest.n_cells, forest.n_nodes, forest.node_rows) != (mesh.n_cells, mesh.n_points, mesh.n_points):
         raise InputError(
@@ -163,13 +162,3 @@ def _parents(forest: BisectionForest, before: IntArray, leaf: LeafMesh) -> IntAr
     while (later := place[out] < 0).any():
         out[later] = parents[out[later]]
     return np.asarray(place[out])
-
-
-def _require_single_cells(mesh: Mesh) -> None:
-    """Refuse cells that are given twice; of those with neighbours, the forest finds that three cells share a face."""
-    cells = np.sort(mesh.cells, axis=1)
-    order = np.lexsort(cells.T)
-    same = (np.diff(cells[order], axis=0) == 0).all(axis=1)
-    if same.any():
-        pair = np.sort(order[:-1][same][:1].tolist() + order[1:][same][:1].tolist())
-        raise InputError(f"cells {pair[0]} and {pair[1]} have the same nodes; remove duplicate cells, which share what they fill")

@@ -14,6 +14,8 @@ from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.meshing.refinement import _forest_kernels as kernels
 from naibu.meshing.refinement._forest_kernels import CHILD, FLIPPED, LEAF, LEVEL, PARENT, REGION, TAG
+from naibu.meshing.refinement.cut_front import NO_FRONT, followed_front
+from naibu.meshing.refinement.root_cells import join_roots, require_volumes
 from naibu.meshing.refinement.tagging import tagged
 
 _Arrays = tuple[Int32Array, FloatArray, Int32Array, Int32Array, Int32Array, IntArray]
@@ -85,12 +87,19 @@ class BisectionForest:
         Names of the regions of the coarsest mesh.
     n_roots : int
         Number of cells of the coarsest mesh, which have the numbers 0 to n_roots - 1.
+    cut_front : ndarray, shape (f, 3), int64
+        Vertices of faces inside that a blade went through, but around which other cells still hold all vertices together; the cut that
+        parts these opens them (`naibu.meshing.cut_forest`).
+    since_cut : ndarray, shape (r,), bool
+        Which cells, of the numbers below r, bisections have made since the last cut.
     """
 
     dimension: int
     region_names: tuple[str, ...]
     n_roots: int
     _arrays: _Arrays
+    cut_front: IntArray = field(default_factory=lambda: NO_FRONT)
+    since_cut: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
     _ring: IntArray = field(default_factory=lambda: np.empty(kernels.MAX_RING, dtype=np.int64))
     _stack: IntArray = field(default_factory=lambda: np.empty(kernels.MAX_DEPTH, dtype=np.int64))
 
@@ -106,20 +115,16 @@ class BisectionForest:
         Raises
         ------
         InputError
-            Other cells, cells without volume, or a face that more than two cells share.
+            Other cells, cells without volume, a face that more than two cells share, or cells that overlap: inverted or duplicate ones.
 
         Notes
         -----
+        Of tetrahedra that are only numbered the other way round, `leaf_mesh` has the positive order.
+
         The quality of all descendants of a cell is bounded: there are finitely many classes of similar cells, three on Kuhn's cubes. See
         `naibu.meshing.refinement.tagging` for what is bisected first.
         """
-        if mesh.cell_type not in ("triangle", "tetra"):
-            raise InputError(f"a bisection forest has triangles or linear tetrahedra, not {mesh.cell_type!r} cells; split the cells first")
-        corners = mesh.points[mesh.cells]
-        size = np.linalg.det(corners[:, 1:] - corners[:, :1])
-        if not (size != 0.0).all():
-            bad = int(np.argmin(np.abs(size)))
-            raise InputError(f"cell {bad} of {mesh.n_cells} has no volume; remove it, or move its nodes apart")
+        require_volumes(mesh)
         k, m, n = mesh.dimension + 1, mesh.n_cells, mesh.n_points
         order, tags = tagged(mesh.points, mesh.cells)
         cells = np.zeros((2 * m + 1024, kernels.WIDTH), dtype=np.int32)
@@ -135,7 +140,7 @@ class BisectionForest:
         counters = np.array([m, -1, n, -1, m, n], dtype=np.int64)
         leaves = np.empty(len(cells), dtype=np.int32)
         leaves[:m] = np.arange(m)
-        _join(cells[:m], k)
+        join_roots(cells[:m], k, mesh)
         table = np.zeros(_table_size(len(nodes)), dtype=np.int32)
         return cls(mesh.dimension, mesh.region_names, m, (cells, points, nodes, table, leaves, counters))
 
@@ -368,15 +373,22 @@ class BisectionForest:
         """Return the change of rows (c, 3) of parents, their first children and the places of their vertices."""
         parents, first, patches = np.ascontiguousarray(rows.T)
         ends = self._arrays[2][nodes, :2].astype(np.int64)
-        return MeshChange(refined, nodes, ends, parents, patches, np.stack([first, first + 1], axis=1))
+        children = np.stack([first, first + 1], axis=1)
+        self.cut_front = followed_front(self.cut_front, refined, nodes, ends)
+        if refined:
+            if len(self.since_cut) < self.cell_rows:
+                self.since_cut = np.append(self.since_cut, np.zeros(2 * self.cell_rows - len(self.since_cut), dtype=bool))
+            self.since_cut[children] = True
+        return MeshChange(refined, nodes, ends, parents, patches, children)
 
     def copied(self) -> BisectionForest:
         """Return a copy."""
-        return BisectionForest(self.dimension, self.region_names, self.n_roots, _copied(self._arrays))
+        arrays = _copied(self._arrays)
+        return BisectionForest(self.dimension, self.region_names, self.n_roots, arrays, self.cut_front, self.since_cut.copy())
 
     def become(self, other: BisectionForest) -> None:
         """Take over the cells and vertices of a copy, which is not used any more."""
-        self._arrays = other._arrays
+        self._arrays, self.cut_front, self.since_cut = other._arrays, other.cut_front, other.since_cut
 
     @property
     def arrays(self) -> _Arrays:
@@ -412,21 +424,6 @@ def _copied(arrays: _Arrays) -> _Arrays:
 def _table_size(n_nodes: int) -> int:
     """Entries of the hash table of midpoints: a power of two, at most half of which are taken."""
     return 1 << int(2 * n_nodes - 1).bit_length()
-
-
-def _join(cells: Int32Array, k: int) -> None:
-    """Set the neighbours of the cells of a conforming mesh, which are -1 before.
-
-    Raises
-    ------
-    InputError
-        Three cells share a face.
-    """
-    others = np.array([[j for j in range(k) if j != i] for i in range(k)])
-    faces = np.sort(cells[:, others].reshape(-1, k - 1), axis=1)
-    bad = int(kernels.neighbours_by_faces(cells, np.lexsort(faces.T), faces, k))
-    if bad >= 0:
-        raise InputError(f"three cells share the face with nodes {faces[bad].tolist()}; at most two can: remove duplicate cells")
 
 
 @njit(cache=True)
