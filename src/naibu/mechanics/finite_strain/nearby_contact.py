@@ -85,14 +85,14 @@ class NearbyContact:
         self.gap = add_contact_forces(self.contact, self.anchors, displacement, 1.0, force)
 
     def reached(self, displacement: FloatArray, motion: FloatArray) -> BoolArray:
-        """Return which points (p,) come into the body, or could pass through it, where the nodes move (n, 3), mm, from the last evaluation."""
+        """Return which points (p,) come into the body, or may pass it, where nodes move (n, 3), mm, from the last evaluation."""
         after = local_positions(self.contact, displacement + motion, 1.0)[1]
         moves = np.einsum("pk,pki->pi", self.contact.shape, motion[self.contact.nodes])
         far = np.linalg.norm(moves, axis=1) > self.contact.surface.inradius
         if not far.any():
-            return after < 0.0
+            return np.asarray(after < 0.0)
         ahead = local_positions(self.contact, displacement + 1e-3 * motion, 1.0)[1]
-        return (after < 0.0) | (far & (self.gap < np.linalg.norm(moves, axis=1)) & (ahead < self.gap))
+        return np.asarray((after < 0.0) | (far & (self.gap < np.linalg.norm(moves, axis=1)) & (ahead < self.gap)))
 
     def touching(self) -> NearbyContact:
         """Return the points that touch, at the last evaluation."""

@@ -84,8 +84,8 @@ def factorized(matrix: FloatArray) -> EarlierTangent:
     """The tangent of a body without contact."""
     solver = SuperLUSolver()
     factors = UpdatedFactors(solver.factorize(sp.bsr_matrix(matrix, blocksize=(3, 3))), len(matrix) // 3)
-    none = np.zeros(0, np.int64)
-    return EarlierTangent(factors, np.zeros((0, 0, 3)), np.zeros((0, 3, 3)), none, none, np.zeros((0, 3, 3)), solver, np.zeros((len(matrix) // 3, 3)))
+    none, still = np.zeros(0, np.int64), np.zeros((len(matrix) // 3, 3))
+    return EarlierTangent(factors, np.zeros((0, 0, 3)), np.zeros((0, 3, 3)), none, none, np.zeros((0, 3, 3)), solver, still)
 
 
 @pytest.mark.parametrize("friction", [0.3, 1.0, 2.0])

@@ -59,19 +59,19 @@ def test_few_are_kept_where_their_columns_take_much_memory(monkeypatch: pytest.M
     assert kept.drained() == [last]  # the newest is never given up
 
 
-def test_the_nearest_is_used_if_it_is_much_nearer() -> None:
+def test_the_newest_of_the_nearest_is_used() -> None:
     kept, none = KeptTangents(), np.zeros(0, np.int64)
     first, second, third = at(0.0), at(4.0), at(8.0)
-    for tangent in (first, second):
+    for tangent in (second, first):
         kept.keep(tangent)
-    assert kept.nearest(pressed(1.0), none, None, ()) is first
-    assert kept.nearest(pressed(2.2), none, first, ()) is first
-    assert kept.nearest(pressed(3.0), none, first, ()) is second
-    assert kept.nearest(pressed(7.0), none, second, [third]) is third
-    assert kept.nearest(pressed(1.0), none, third, ()) is first  # that in use is no longer kept
-    assert kept.nearest(pressed(1.0), np.array([1]), first, [third]) is None
+    assert kept.nearest(pressed(1.0), none, 10.0, [third]) is first
+    assert kept.nearest(pressed(2.2), none, 10.0, [third]) is first  # about as near, and newer
+    assert kept.nearest(pressed(3.0), none, 10.0, [third]) is second
+    assert kept.nearest(pressed(7.0), none, 10.0, [third]) is third
+    assert kept.nearest(pressed(4.0), none, 1e5, [third]) is first  # of a body of 100 m these are one state
+    assert kept.nearest(pressed(1.0), np.array([1]), 10.0, [third]) is None
     kept.drop(first)
-    assert kept.nearest(pressed(1.0), none, None, ()) is second
+    assert kept.nearest(pressed(1.0), none, 10.0, ()) is second
 
 
 def test_a_body_whose_tool_leaves_finds_the_tangents_of_the_way_in() -> None:

@@ -40,7 +40,7 @@ TRIAL = 3  # steps with a matrix before it is judged: where a point closes, what
 SLOW = 0.7  # of what was left: mean progress of a step from which another matrix is worth while
 JUMP = 3.0  # growth of what is left from which it is at once
 USUAL = 6  # evaluations after which ten times the tolerance is enough
-BALANCED = 0.01  # of the forces: how much those of the motion that they lead to may differ, where hardly any motion is left
+BALANCED = 0.003  # of the forces: how much those of the motion that they lead to may differ, where hardly any motion is left
 ENOUGH = 0.005  # likewise, where no further matrix is worth while
 
 

@@ -12,7 +12,8 @@ from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangen
 
 MOST = 5  # tangents
 MOST_BYTES = 3e8  # of the columns of their inverses
-NEARER = 0.6  # of the distance of the tangent in use, at which another one takes its place: that costs a factorization of the contact
+AS_NEAR = 1.6  # times the distance of the nearest, up to which a newer one is used: it knows better what touches
+SAME = 1e-3  # of the extent: distance, root of the mean square over the nodes, up to which states are the same
 
 
 @dataclass(slots=True, eq=False)
@@ -38,21 +39,26 @@ class KeptTangents:
         kept, self._kept = self._kept, []
         return kept
 
-    def nearest(
-        self, displacement: FloatArray, held: IntArray, used: EarlierTangent | None, others: Iterable[EarlierTangent]
-    ) -> EarlierTangent | None:
-        """Return that of the state nearest to a displacement (n, 3), mm, among those kept and `others`; None where none holds these nodes.
+    def nearest(self, displacement: FloatArray, held: IntArray, extent_mm: float, older: Iterable[EarlierTangent]) -> EarlierTangent | None:
+        """Return the newest of those whose states are about as near as the nearest to a displacement.
 
-        The one in use is returned where another is not much nearer.
+        Parameters
+        ----------
+        displacement : ndarray, shape (n, 3)
+            Of the nodes of the body, mm.
+        held : ndarray, shape (h,), int64
+            Nodes that do not move; None is returned where no tangent holds just these.
+        extent_mm : float
+            Of the body.
+        older : iterable of EarlierTangent
+            Others beside those that are kept.
         """
-        usable = [t for t in (*self._kept, *others) if np.array_equal(t.held, held)]
+        usable = [t for t in (*older, *self._kept) if np.array_equal(t.held, held)]
         if not usable:
             return None
-        best = min(usable, key=lambda t: _distance(t.displacement, displacement))
-        if used is None or not any(used is t for t in usable):
-            return best
-        near = _distance(best.displacement, displacement) <= NEARER * _distance(used.displacement, displacement)
-        return best if near else used
+        far = [_distance(t.displacement, displacement) for t in usable]
+        most = max(AS_NEAR * min(far), SAME * extent_mm * np.sqrt(len(displacement)))
+        return [t for t, way in zip(usable, far, strict=True) if way <= most][-1]
 
     def _most_dispensable(self) -> int:
         """Return the number of the older one of the two that are nearest to each other; with other nodes held, that of the first."""

@@ -35,7 +35,7 @@ from naibu.mechanics.finite_strain.sessions.trial_displacement import FELT, PASS
 from naibu.mechanics.linear_algebra.anderson import AndersonMixing
 
 ITERATIONS = 5  # of a step at most
-USUAL = 2  # of a step whose balance is then passable
+USUAL = 3  # of a step whose balance is then passable
 DEPTH = 4  # earlier iterations that are mixed
 ACCEPTED = 0.06  # of a step that has used up its iterations; where it was 0.2, some later steps found no balance and took seconds
 BUDGET_S = 0.01  # of a processor for a step, after which a passable balance is taken; one that is worse goes on, and real time is lost

@@ -70,7 +70,7 @@ class TangentSession(DynamicSession):
         if (done := self._thread.take()) is not None:
             self._keep(done)
         at = self.reached
-        known = self._kept.nearest(at.displacement + self.engine.step * at.velocity, self._held(), self._earlier, self._engine._rest)
+        known = self._kept.nearest(at.displacement + self.engine.step * at.velocity, self._held(), self.engine._extent, self._engine._rest)
         if known is None:
             self._engine._rest[:] = [self._untouched(np.zeros_like(self.engine.points))]
             known, self._seen = self._engine._rest[0], np.zeros_like(self.engine.points)

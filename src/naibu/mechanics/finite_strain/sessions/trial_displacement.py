@@ -8,9 +8,9 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 
-FINISHED = 1e-2  # out-of-balance force, as a fraction of all forces, at which a step ends
+FINISHED = 2.5e-3  # out-of-balance force, as a fraction of all forces, at which a step ends
 SETTLED = 1e-4  # below which no iteration is worth while, also as a fraction of the contact forces, if ten times as much
-FELT = 0.02  # fraction of the contact forces that it must also be below: beside forces in a nearly incompressible body those are small
+FELT = 5e-3  # fraction of the contact forces that it must also be below: beside forces in a nearly incompressible body those are small
 PASSABLE = 5e-2  # at which a step may end that is late
 VOLUME_ERROR = 3e-4  # difference of the volume strain and that of its pressure
 
