@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from particle_gels import particle_gel
+from traction_gels import traction_gel
 
 from naibu.core.errors import InputError
 from naibu.imaging.markers.linking.particle_motion import particle_motion
@@ -85,3 +86,22 @@ def test_clouds_of_two_bodies_other_units_and_mirror_images_are_refused(seed: in
     for second in (other.deformed, 10.0 * cloud.deformed, cloud.deformed * (1.0, 1.0, -1.0)):
         with pytest.raises(InputError, match=r"no common structure|no soft body|mirror image"):
             particle_motion(cloud.reference, second)
+
+
+@pytest.mark.parametrize(("peak", "decay", "degrees"), [(3.0, 4.0, 0.0), (2.5, 1.5, 20.0)])
+def test_particles_around_cells_are_linked_and_deviations_hold_where_the_motion_changes_within_a_few(
+    peak: float, decay: float, degrees: float
+) -> None:
+    gel = traction_gel(8000, 11, peak=peak, decay=decay, degrees=degrees)
+    found = particle_motion(gel.cloud.reference, gel.cloud.deformed)
+    right, possible, wrong = gel.cloud.judged(found.links.pairs)
+    assert right / (right + wrong) > 0.993
+    assert right / possible > 0.98
+    assert wrong < np.sum(1.0 - found.links.confidence)
+    at, sd = found.field.points, found.field.standard_deviation
+    assert sd is not None
+    for some in (found.field.valid, found.field.valid & (gel.cloud.displacement[found.links.pairs[:, 0]] > 0.5)):
+        off = np.abs(found.field.vectors - (gel.moved(at) - at))[some]
+        assert 0.9 < np.mean(off < 1.96 * sd[some]) < 0.99
+        slope = np.abs(found.gradient - gel.gradient(at))[some]
+        assert 0.9 < np.mean(slope < 1.96 * found.gradient_sd[some]) < 0.99

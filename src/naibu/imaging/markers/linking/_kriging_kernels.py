@@ -11,6 +11,8 @@ from naibu.core.arrays import FloatArray, IntArray
 
 # variance of the affine part of a motion, in that of the noise: so large that it is as good as free
 AFFINE = 1e5
+# curvature of the covariance at zero
+SLOPE = 56.0 / 3.0
 
 
 @njit(cache=True, fastmath={"reassoc", "contract"})
@@ -24,8 +26,8 @@ def _factorized(x: FloatArray, noise: FloatArray, roughness: float, reach: float
                 square += (x[i, a] - x[j, a]) ** 2
                 product += x[i, a] * x[j, a]
             t = np.sqrt(square) / reach
-            left = max(1.0 - t, 0.0) ** 2
-            value = AFFINE * product + roughness * left * left * (4.0 * t + 1.0)
+            left = max(1.0 - t, 0.0) ** 3
+            value = AFFINE * product + roughness * left * left * (35.0 * t * t + 18.0 * t + 3.0) / 3.0
             if i == j:
                 value += noise[i]
             for k in range(j):
@@ -109,8 +111,8 @@ def krige(
             for a in range(d):
                 square += x[i, a] ** 2
             t = np.sqrt(square) / reach
-            left = max(1.0 - t, 0.0) ** 2
-            right[i] = AFFINE + roughness[p] * left * left * (4.0 * t + 1.0)
+            left = max(1.0 - t, 0.0) ** 3
+            right[i] = AFFINE + roughness[p] * left * left * (35.0 * t * t + 18.0 * t + 3.0) / 3.0
         explained = _forward(matrix, right, part)
         variance[p] = max(AFFINE + roughness[p] - explained, 0.0)
         for b in range(v):
@@ -121,10 +123,11 @@ def krige(
                     square = 0.0
                     for e in range(d):
                         square += x[i, e] ** 2
-                    left = max(1.0 - np.sqrt(square) / reach, 0.0)
-                    right[i] = x[i, a] * (AFFINE + roughness[p] * 20.0 * left**3 / reach**2)
+                    t = np.sqrt(square) / reach
+                    left = max(1.0 - t, 0.0)
+                    right[i] = x[i, a] * (AFFINE + roughness[p] * SLOPE * left**5 * (5.0 * t + 1.0) / reach**2)
                 explained = _forward(matrix, right, part)
-                gradient_variance[p, a] = max(AFFINE + 20.0 * roughness[p] / reach**2 - explained, 0.0) / scale[p] ** 2
+                gradient_variance[p, a] = max(AFFINE + SLOPE * roughness[p] / reach**2 - explained, 0.0) / scale[p] ** 2
                 for b in range(v):
                     gradient[p, b, a] = np.dot(sides[b], part) / scale[p]
 

@@ -12,11 +12,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import gammaln
 
-from naibu.core.arrays import BoolArray, FloatArray, IntArray
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.imaging.markers.linking._point_matching_kernels import settle
 from naibu.imaging.markers.linking.kriged_links import LEAST, fraction_around, kriged_links, linked_neighbours
 from naibu.imaging.markers.linking.local_kriging import MEDIAN
-from naibu.imaging.markers.linking.point_clouds import NEIGHBOURS, Cloud, State, grid_of, local_spacing, proposed
+from naibu.imaging.markers.linking.point_clouds import Cloud, State, grid_of, local_spacing, proposed
 from naibu.imaging.markers.settings import LinkSettings
 
 # Empirical values, judged by tests/imaging/markers/test_point_matching.py and benchmarks/particle_gels.py.

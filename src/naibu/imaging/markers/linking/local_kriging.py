@@ -1,7 +1,7 @@
 """Kriging of a motion: every point is predicted from those around it by a Gaussian process as rough as the motion is there.
 
 Beside a cell that pulls at a hydrogel, or under the edge of an indenter, a motion is not affine over the few particles that tell it. The
-process has a free affine part and another of Wendland's covariance, which is twice differentiable and vanishes beyond its reach
+process has a free affine part and another of Wendland's covariance, which is four times differentiable and vanishes beyond its reach
 :cite:p:`rasmussen2006`. How large that part is, relative to the noise, is chosen from place to place by how well points are predicted that
 are left out, so that where the motion is affine its prediction is that of an affine fit.
 """
@@ -91,9 +91,8 @@ class LocalKriging:
         everyone = np.arange(len(values))
         overall = float(np.median(self._level[self._best, everyone]))
         # the noise differs less from place to place than a median of so few tells
-        choose(
-            wide, neighbours, AROUND, self._cost, self._level, np.array([LOCAL[0] * overall, LOCAL[1] * overall]), self._best, self.noise_sd,
-        )  # fmt: skip
+        bounds = np.array([LOCAL[0] * overall, LOCAL[1] * overall])
+        choose(wide, neighbours, AROUND, self._cost, self._level, bounds, self._best, self.noise_sd)
         best = self._best[wide]
         self.predicted[wide], self.roughness[wide] = self._all_predicted[best, wide], np.array(ROUGHNESS)[best]
         self.sd[wide] = self.noise_sd[wide] * np.sqrt(1.0 + self._all_variance[best, wide])
@@ -118,7 +117,7 @@ def _solve(
 def kriged_gradient(
     points: FloatArray, scale: FloatArray, neighbours: IntArray, values: FloatArray, noise: FloatArray, roughness: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the derivatives (n, d, d) of the values along the axes, and their standard deviation (n, d) for values of unit deviation.
+    """Return the derivatives (n, d, d) of the values along the axes, and their variance (n, d) for values of unit variance.
 
     Parameters are those of `LocalKriging.update`; `neighbours` may include the point itself.
     """
@@ -127,4 +126,4 @@ def kriged_gradient(
     krige(
         everyone, points, scale, neighbours, values, noise, roughness, REACH, True, np.empty((n, d)), np.empty(n), gradient, variance,
     )  # fmt: skip
-    return gradient, np.sqrt(variance)
+    return gradient, variance

@@ -12,8 +12,9 @@ from naibu.core.arrays import BoolArray, FloatArray, IntArray, require_shape
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.imaging.displacement.strain import green_lagrange_strain_of
-from naibu.imaging.markers.linking.local_kriging import MEDIAN
-from naibu.imaging.markers.linking.point_clouds import NEIGHBOURS
+from naibu.imaging.markers.linking.kriged_links import SUSPECT
+from naibu.imaging.markers.linking.local_kriging import KRIGED, MEDIAN, LocalKriging, kriged_gradient
+from naibu.imaging.markers.linking.point_clouds import local_spacing
 from naibu.imaging.markers.linking.point_matching import Links, link_markers
 from naibu.imaging.markers.settings import LinkSettings, require_between
 
@@ -21,7 +22,7 @@ from naibu.imaging.markers.settings import LinkSettings, require_between
 FLAT = 0.05  # ratio of the extents of neighbours below which they lie in a plane or on a line, and tell no strain across it
 ROUNDS = 3  # of the robust fit
 CORE = 3.0  # medians within which residuals tell the noise
-AT_ONCE = 50_000  # particles fitted together, which bounds the memory
+WHITENED = 1  # times that displacements are scaled to noise that is alike along all axes
 LEAST_SD = 1e-6  # of the distance between neighbours: positions are written with as many digits
 
 
@@ -101,13 +102,14 @@ def particle_motion(
     if trusted.sum() < d + 3:
         raise InputError(f"only {int(trusted.sum())} of {len(links)} links are trusted; a displacement gradient needs {d + 3} particles")
     neighbours = _neighbours(at, trusted)
-    parts = [_fitted(at, moved, neighbours, some) for some in np.array_split(np.arange(len(at)), len(at) // AT_ONCE + 1)]
-    residual, gradient, inverse = (np.concatenate(part) for part in zip(*parts, strict=True))
+    residual, gradient, unit_variance = _kriged(at, moved, trusted, neighbours)
     covariance = _noise(residual, trusted, neighbours, at)
+    noise = np.einsum("naa->na", covariance)
     stated = _stated(x.shape, y.shape, reference_sd_mm, deformed_sd_mm)
     if stated is not None:
         covariance = _raised(stated[0][here] ** 2 + stated[1][there] ** 2, residual, trusted)
-    gradient_sd = np.sqrt(np.einsum("naa,nbb->nab", covariance, inverse))
+        noise = np.maximum(noise, np.einsum("naa->na", covariance))
+    gradient_sd = np.sqrt(noise[:, :, None] * unit_variance[:, None, :])
     field = DisplacementField.from_arrays(at, moved, covariance=covariance, valid=trusted)
     field = DisplacementField(field.support, moved, covariance, trusted, links.confidence)
     return ParticleMotion(field, links, gradient, gradient_sd)
@@ -116,52 +118,59 @@ def particle_motion(
 def _neighbours(at: FloatArray, trusted: BoolArray) -> IntArray:
     """Return the nearest trusted particles (k, c) of every one, itself left out."""
     known = np.flatnonzero(trusted)
-    count = min(NEIGHBOURS[at.shape[1]], len(known) - 1)
+    count = min(KRIGED[at.shape[1]], len(known) - 1)
     near = known[np.asarray(cKDTree(at[known]).query(at, k=count + 1, workers=-1)[1])]
     left_out = near == np.arange(len(at))[:, None]
     left_out[~left_out.any(axis=1), -1] = True
     return np.asarray(near[~left_out].reshape(len(at), count))
 
 
-def _fitted(at: FloatArray, moved: FloatArray, neighbours: IntArray, some: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Fit an affine motion to the neighbours of some particles.
+def _kriged(at: FloatArray, moved: FloatArray, trusted: BoolArray, neighbours: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Predict every displacement from those of its neighbours, and its gradient also from its own.
 
-    Returns the difference (s, d) of each displacement from the fit, scaled to the standard deviation of a displacement, the gradients
-    (s, d, d), and the covariance (s, d, d) of a gradient's row for displacements of unit variance.
+    Returns the difference (k, d) of each displacement from its prediction, scaled to the standard deviation of a displacement, the
+    gradients (k, d, d), and the variance (k, d) of their columns for displacements of unit variance.
     """
-    near, d = neighbours[some], at.shape[1]
-    offset, values = at[near] - at[some][:, None], moved[near]
-    scale = np.sqrt(np.mean(offset**2, axis=(1, 2)))[:, None, None] + 1e-300
-    rows = np.concatenate([np.ones((*near.shape, 1)), offset / scale], axis=2)
-    weight = np.ones(near.shape)
-    inverse, fit = np.zeros((len(some), d + 1, d + 1)), np.zeros((len(some), d + 1, d))
-    for _ in range(ROUNDS):
-        weighted = np.swapaxes(rows * weight[:, :, None], 1, 2)
-        inverse = np.linalg.inv(weighted @ rows + 1e-9 * np.eye(d + 1))
-        fit = inverse @ (weighted @ values)
-        off = np.linalg.norm(values - rows @ fit, axis=2)
-        weight = 1.0 / np.maximum(off / (CORE * np.median(off, axis=1, keepdims=True) + 1e-12 * scale[:, :, 0]), 1.0) ** 2
-    residual = (moved[some] - fit[:, 0]) / np.sqrt(1.0 + inverse[:, 0, 0])[:, None]
-    extents = np.linalg.svd(rows[:, :, 1:] - rows[:, :, 1:].mean(axis=1, keepdims=True), compute_uv=False)
-    gradient = np.swapaxes(fit[:, 1:], 1, 2) / scale
+    d, everyone, scale = at.shape[1], np.arange(len(at)), local_spacing(at)
+    values, white, noise = moved, np.eye(d), np.ones(len(at))
+    process, least = LocalKriging(at, scale), LEAST_SD * scale
+    for _ in range(WHITENED):
+        process.update(everyone, neighbours, values, trusted, noise)
+        off = values - process.predicted
+        noise = np.maximum(np.linalg.norm(off, axis=1) / (SUSPECT * np.sqrt(d) * np.maximum(process.sd, least)), 1.0) ** 4
+        scaled = off * (process.noise_sd / process.sd)[:, None]
+        factor = np.linalg.cholesky(np.linalg.inv(_shape(scaled[trusted], at, neighbours)))
+        values, white = values @ factor, white @ factor
+    process.update(everyone, neighbours, values, trusted, noise)
+    residual = (values - process.predicted) * (process.noise_sd / process.sd)[:, None] @ np.linalg.inv(white)
+    own = np.ascontiguousarray(np.column_stack([everyone, neighbours[:, :-1]]))
+    gradient, variance = kriged_gradient(at, scale, own, values, noise, process.roughness)
+    gradient = np.einsum("ca,ncb->nab", np.linalg.inv(white), gradient)
+    offset = at[neighbours] - at[neighbours].mean(axis=1, keepdims=True)
+    extents = np.linalg.svd(offset, compute_uv=False)
     gradient[extents[:, -1] < FLAT * extents[:, 0]] = np.nan
-    return residual, gradient, inverse[:, 1:, 1:] / scale**2
+    return residual, gradient, variance
 
 
 def _noise(residual: FloatArray, trusted: BoolArray, neighbours: IntArray, at: FloatArray) -> FloatArray:
     """Return the covariance (k, d, d) of displacements: one ellipsoid, scaled by the residuals around each."""
     d = residual.shape[1]
-    known = residual[trusted]
-    length = np.linalg.norm(known, axis=1)
+    shape = _shape(residual[trusted], at, neighbours)
+    length = np.sqrt(np.einsum("na,ab,nb->n", residual, np.linalg.inv(shape), residual))
+    ratio = np.median(length[neighbours], axis=1) / MEDIAN[d]
+    return np.asarray(np.maximum(ratio, 0.1)[:, None, None] ** 2 * shape)
+
+
+def _shape(known: FloatArray, at: FloatArray, neighbours: IntArray) -> FloatArray:
+    """Return the covariance (d, d) of the core of residuals (m, d), mm^2."""
+    d = known.shape[1]
     least = (LEAST_SD * float(np.sqrt(np.median(np.sum((at[neighbours[:, 0]] - at) ** 2, axis=1))))) ** 2
-    shape = np.eye(d) * max(float(np.median(length)) ** 2, least)
+    shape = np.eye(d) * max(float(np.median(np.linalg.norm(known, axis=1))) ** 2, least)
     for _ in range(2 * ROUNDS):
         length = np.sqrt(np.einsum("na,ab,nb->n", known, np.linalg.inv(shape), known))
         core = known[length <= CORE * np.median(length)]
         shape = core.T @ core / len(core) + least * np.eye(d)
-    length = np.sqrt(np.einsum("na,ab,nb->n", residual, np.linalg.inv(shape), residual))
-    ratio = np.median(length[neighbours], axis=1) / MEDIAN[d]
-    return np.asarray(np.maximum(ratio, 0.1)[:, None, None] ** 2 * shape)
+    return np.asarray(shape)
 
 
 def _stated(
