@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from naibu.core.arrays import BoolArray, FloatArray, require_shape
+from naibu.core.arrays import AnyFloatArray, BoolArray, FloatArray, require_shape
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.volume import Volume
+
+CHUNKS = 16  # parts of a field in which what is derived from its covariance is computed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,7 +27,7 @@ class DisplacementField:
         Positions of the vectors, mm: listed, or as the voxels of a grid or the nodes of a mesh, which store no positions of their own.
     vectors : ndarray, shape (..., d), float64
         Displacement along x, y, z, mm; NaN where there is none.
-    covariance : ndarray, shape (..., d, d), float64, or None
+    covariance : ndarray, shape (..., d, d), float64, on grids also float32, or None
         Covariance of each vector, mm^2: zero for exact data, None where it is not known.
     valid : ndarray, shape (...), bool
         Where the displacement was measured, not interpolated or filled in.
@@ -35,7 +37,7 @@ class DisplacementField:
 
     support: FloatArray | Volume | Mesh
     vectors: FloatArray
-    covariance: FloatArray | None
+    covariance: AnyFloatArray | None
     valid: BoolArray
     quality: FloatArray | None = None
 
@@ -108,7 +110,8 @@ class DisplacementField:
         """
         v = np.asarray(vectors, dtype=float)
         require_shape("vectors", v, (*grid.shape, 3))
-        c = None if covariance is None else np.asarray(covariance, dtype=float)
+        c = None if covariance is None else np.asarray(covariance)
+        c = c if c is None or c.dtype == np.float32 else np.asarray(c, dtype=float)
         if c is not None:
             require_shape("covariance", c, (*grid.shape, 3, 3))
         q = None if quality is None else np.asarray(quality, dtype=float)
@@ -163,9 +166,10 @@ class DisplacementField:
         """Standard deviation (...) along the least certain direction, mm; None where the covariance is not known."""
         if self.covariance is None:
             return None
-        known = np.isfinite(self.covariance).all(axis=(-2, -1))
-        out = np.full(known.shape, np.nan)
-        out[known] = np.sqrt(_largest_eigenvalues(self.covariance[known]))
+        out = np.full(self.covariance.shape[:-2], np.nan)
+        for some, each in zip(np.array_split(out, CHUNKS), np.array_split(self.covariance, CHUNKS), strict=True):  # which bounds the memory
+            known = np.isfinite(each).all(axis=(-2, -1))
+            some[known] = np.sqrt(_largest_eigenvalues(each[known].astype(float)))
         return out
 
     def at_points(self, *, step: int = 1) -> DisplacementField:
@@ -191,7 +195,7 @@ class DisplacementField:
         some[::step, ::step, ::step] = True
         some &= self.valid
         points = self.support.to_physical(np.argwhere(some)[:, ::-1])
-        covariance = None if self.covariance is None else self.covariance[some]
+        covariance = None if self.covariance is None else self.covariance[some].astype(float)
         quality = None if self.quality is None else self.quality[some]
         return DisplacementField(points, self.vectors[some], covariance, np.ones(len(points), dtype=bool), quality)
 

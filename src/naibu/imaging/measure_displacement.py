@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from naibu.core.arrays import BoolArray, Float32Array, FloatArray
+from naibu.core.arrays import AnyFloatArray, BoolArray, Float32Array
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress, report_progress
@@ -97,7 +97,7 @@ class MeasuredDisplacement:
     method: Method
     displacement: DisplacementField
     mask: BoolArray
-    gradient: FloatArray
+    gradient: AnyFloatArray
     rigid: RigidTransform | None = None
     matches: PotentialMatches | None = None
     facts: dict[str, float | int | str] = field(default_factory=dict)
@@ -351,17 +351,16 @@ def measured_by(found: CorrelationResult, reference: Volume, inside: BoolArray) 
     }
     valid = found.valid & inside
     outside = ~valid
-    vectors, gradient = found.displacement.vectors.copy(), found.gradient()
+    vectors, gradient = found.displacement.vectors.copy(), found.gradient(np.float32)
     for values in (vectors, gradient):
         values[outside] = np.nan
-    covariance = np.full((*valid.shape, 3, 3), np.nan)
-    for z in np.flatnonzero(valid.any(axis=(1, 2))):
-        y, x = np.nonzero(valid[z])
-        covariance[z, y, x] = found.covariance_at(found.volume.to_physical(np.stack([x, y, np.full(len(x), z)], axis=1)))
+    covariance = found.covariance()
+    covariance[outside] = np.nan
     field = DisplacementField.on_grid(reference, vectors, covariance=covariance, valid=valid)
     blocks = None if found.blocks is None else _in_object(found, found.blocks, valid)
     doubts = (*_convergence_doubts(unconverged, cells), *_misplacement_doubts(found.misplaced_fraction))
-    strain_sd = np.where(valid, found.strain_sd(), np.float32(np.nan))
+    strain_sd = found.strain_sd()
+    strain_sd[outside] = np.nan
     return MeasuredDisplacement("default", field, inside, gradient, facts=facts, warnings=doubts, blocks=blocks, strain_sd=strain_sd)
 
 

@@ -296,6 +296,18 @@ def test_the_gradient_is_that_of_the_splines() -> None:
     assert np.allclose(found.displacement_at(x), found.displacement.vectors[tuple(at.T)], atol=1e-9)
 
 
+def test_what_is_known_of_all_voxels_is_what_is_known_of_each() -> None:
+    _, _, found = waved()
+    at = positions(found.volume)[found.valid]
+    np.testing.assert_allclose(found.covariance()[found.valid], found.covariance_at(at), rtol=1e-4, atol=1e-9)
+    assert np.isnan(found.covariance()[~found.valid]).all()
+    np.testing.assert_allclose(found.gradient(np.float32)[found.valid], found.gradient()[found.valid], rtol=1e-6, atol=1e-8)
+    # a cell that is not known does not count, and where the nearest cells are not known the others do
+    cells = np.where(np.random.default_rng(3).random(found.cell_covariance.shape[:3]) < 0.4, np.nan, 1.0)
+    less = replace(found, cell_covariance=found.cell_covariance * cells[..., None, None])
+    np.testing.assert_allclose(less.covariance()[found.valid], less.covariance_at(at), rtol=2e-4, atol=1e-9)
+
+
 def test_a_field_is_what_identification_takes() -> None:
     _, _, found = waved()
     field = found.at_points()

@@ -1,19 +1,24 @@
 """Sensitivities of whole load paths, including Coulomb slip and its history, against central differences of solves."""
 
+import threading
 from dataclasses import replace
 from itertools import accumulate, pairwise
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from builders import GEL, of, problem
 from scipy.spatial.transform import Rotation
 
 from naibu.mechanics.contact.contact_surfaces import Friction, interface, rigid_contact
 from naibu.mechanics.contact.indenter_geometry import IndenterGeometry, bar_geometry, plane_geometry
 from naibu.mechanics.contact.penalty_contact import STICK, Contact
+from naibu.mechanics.finite_strain import sensitivities as sensitivities_module
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
 from naibu.mechanics.finite_strain.sensitivities import Direction, sensitivities
 from naibu.mechanics.finite_strain.statics import Solution, solve
+from naibu.mechanics.linear_algebra import solver_selection
+from naibu.mechanics.linear_algebra.direct import PardisoSolver, pardiso_library
 from naibu.meshing.interfaces import split_at_plane
 from naibu.meshing.primitives import box
 from naibu.meshing.surface import faces_among, faces_towards, node_areas
@@ -185,3 +190,26 @@ def test_scaling_all_stiffnesses_changes_nothing_but_penetration():
     table = [Direction(materials=body.assembler.parameters), Direction(materials=body.assembler.parameters * (MESH.regions == 1)[:, None])]
     overall, ratio = np.moveaxis(sensitivities(body, states, table)[-1], 2, 0)
     assert np.abs(overall).max() < 0.1 * np.abs(ratio).max()
+
+
+@pytest.mark.skipif(pardiso_library() is None, reason="oneMKL is not installed")
+@pytest.mark.parametrize("threads", [2, 3, 100])
+def test_tangents_that_are_factorized_ahead_are_those_of_their_states(monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
+    body = pressed(plane_geometry((0, 0, -1)), 0.3)
+    states = solve(body, settings=replace(PATH, tolerance=1e-9)).states
+    wanted = [d for d, _ in directions(body).values()][:6]
+    expected = sensitivities(body, states, wanted)
+    monkeypatch.setattr(solver_selection, "UNSYMMETRIC_FROM", 0)
+    monkeypatch.setattr(sensitivities_module, "usable_threads", lambda: threads)
+    factorized: list[str] = []
+    factorize = PardisoSolver.factorize
+
+    def noted(solver: PardisoSolver, matrix: sp.bsr_matrix) -> PardisoSolver:
+        factorized.append(threading.current_thread().name)
+        return factorize(solver, matrix)
+
+    monkeypatch.setattr(PardisoSolver, "factorize", noted)
+    found = sensitivities(body, states, wanted)
+    assert len({name for name in factorized if name != threading.main_thread().name}) > 0
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-8 * np.abs(expected[-1]).max())

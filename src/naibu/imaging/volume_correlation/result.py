@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from naibu.core.arrays import BoolArray, Float32Array, FloatArray, Int32Array, IntArray
+from naibu.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray, Int32Array, IntArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.resampling import positions
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
 from naibu.imaging.volume_correlation.rigid_inclusions import InclusionMotion
-from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable
+from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable, separable_slice
 
 VOXELS_PER_CELL = 6  # at which the random fields are evaluated: splines vary little within a cell
 SHARED = 0.7  # empirical, cells: SD of the window in which cells share their samples
@@ -27,6 +28,7 @@ BIAS, BIAS_TOLERANCE = 1.9, 0.03
 # empirical: mean square of the residuals of a cell, in variances of the noise, beyond which structures lie at the wrong place there. Edges
 # in legs reach 8 in one cell of a hundred; lungs that slide by 5 to 17 mm along the chest wall 8 to 100 in one cell of twenty
 MISPLACED = 8.0
+LEAST_KNOWN = 1e-4  # weight of the known cells about a voxel, from which it is interpolated among all voxels at once
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,8 +80,8 @@ class CorrelationResult:
     bending: FloatArray
     dilatation: float
     residual_sd: float
-    gain: FloatArray
-    offset: FloatArray
+    gain: Float32Array
+    offset: Float32Array
     converged: BoolArray
     inclusions: Int32Array
     motions: tuple[InclusionMotion, ...]
@@ -101,22 +103,33 @@ class CorrelationResult:
         """Centres (n, 3), mm, of the cells that have not converged."""
         return _middles_mm(self.grid, self.volume, ~self.converged)
 
-    def gradient(self) -> FloatArray:
-        """Return du_i/dx_j (nz, ny, nx, 3, 3) at the voxels, from the splines, along the axes of space; NaN where it is not valid."""
-        axes = [np.arange(n) * s for n, s in zip(self.volume.shape[::-1], self.volume.spacing_mm, strict=True)]
-        plain = [self.grid.matrix(a, axes[a]) for a in range(3)]
-        out = np.empty((*self.volume.shape, 3, 3))
-        for j in range(3):
-            matrices = list(plain)
-            matrices[j] = self.grid.matrix(j, axes[j], 1)
-            out[..., j] = separable(matrices, self.coefficients)
+    def gradient(self, dtype: type[np.floating[Any]] = np.float64) -> AnyFloatArray:
+        """Return du_i/dx_j (nz, ny, nx, 3, 3) at the voxels, from the splines, along the axes of space; NaN where it is not valid.
+
+        Parameters
+        ----------
+        dtype : type
+            ``np.float64`` or, for half the memory, ``np.float32``.
+        """
+        plain = [self.grid.matrix(a, axis) for a, axis in enumerate(self._axes)]
+        along = [self.grid.matrix(a, axis, 1) for a, axis in enumerate(self._axes)]
+        out = np.empty((*self.volume.shape, 3, 3), dtype)
         r = self.volume.direction
-        if not np.array_equal(r, np.eye(3)):
-            out = r @ out @ r.T
+        for z in range(len(out)):  # a slice at a time, which bounds the memory
+            for j in range(3):
+                x, y, deep = (along[a] if a == j else plain[a] for a in range(3))
+                out[z, ..., j] = separable_slice(x, y, deep[z], self.coefficients)
+            if not np.array_equal(r, np.eye(3)):
+                out[z] = r @ out[z] @ r.T
         for motion in self.motions:
             out[self.inclusions == motion.number] = r @ (motion.transform.rotation - np.eye(3)) @ r.T
         out[~self.valid] = np.nan
         return out
+
+    @property
+    def _axes(self) -> list[FloatArray]:
+        """Coordinates of the voxels along x, y, z, mm from the first voxel."""
+        return [np.arange(n) * s for n, s in zip(self.volume.shape[::-1], self.volume.spacing_mm, strict=True)]
 
     def displacement_at(self, points_mm: ArrayLike) -> FloatArray:
         """Return the displacement (n, 3), mm, at positions (n, 3), mm; NaN further than a cell from the object."""
@@ -136,8 +149,10 @@ class CorrelationResult:
 
     def covariance(self) -> Float32Array:
         """Return the covariance (nz, ny, nx, 3, 3), mm^2, at the voxels; NaN where it is not valid."""
-        out = np.full((*self.volume.shape, 3, 3), np.nan, np.float32)
-        out[self.valid] = self._covariance(np.argwhere(self.valid)[:, ::-1] * self.volume.spacing_mm)
+        out = self._at_voxels(self.cell_covariance)
+        for motion in self.motions:
+            here = (self.inclusions == motion.number) & self.valid
+            out[here] = self._covariance(np.argwhere(here)[:, ::-1] * self.volume.spacing_mm)
         return out
 
     @property
@@ -152,9 +167,7 @@ class CorrelationResult:
 
     def strain_sd(self) -> Float32Array:
         """Return the standard deviation of a component of strain (nz, ny, nx) at the voxels; NaN where it is not valid, 0 in inclusions."""
-        out = np.full(self.volume.shape, np.nan, np.float32)
-        local = np.argwhere(self.valid)[:, ::-1] * self.volume.spacing_mm
-        out[self.valid] = np.sqrt(self._between_cells(self.cell_strain_sd**2, local))
+        out = np.sqrt(self._at_voxels(self.cell_strain_sd**2))
         out[self.valid & (self.inclusions > 0)] = 0.0
         return out
 
@@ -209,6 +222,23 @@ class CorrelationResult:
     def _cells_at(self, local_mm: FloatArray) -> FloatArray:
         return self._between_cells(self.cell_covariance, local_mm)
 
+    def _at_voxels(self, values: FloatArray) -> Float32Array:
+        """Interpolate values (CZ, CY, CX, ...) of cells at all valid voxels, as `_between_cells` does; NaN at others."""
+        parts = values.reshape(*values.shape[:3], -1)
+        known: BoolArray = np.asarray(np.isfinite(parts).all(axis=-1))
+        filled = np.concatenate([np.where(known[..., None], parts, 0.0), known[..., None]], axis=-1)
+        x, y, z = (_linear(self.grid, a, axis) for a, axis in enumerate(self._axes))
+        out = np.full((*self.volume.shape, parts.shape[-1]), np.nan, np.float32)
+        doubtful = np.zeros(self.volume.shape, dtype=bool)
+        for k in np.flatnonzero(self.valid.any(axis=(1, 2))):
+            sums = separable_slice(x, y, z[k], filled)
+            here = self.valid[k] & (sums[..., -1] > LEAST_KNOWN)
+            out[k, here] = sums[here, :-1] / sums[here, -1:]
+            doubtful[k] = self.valid[k] & ~here
+        if doubtful.any():  # hardly a cell about them is known
+            out[doubtful] = self._between_cells(parts, np.argwhere(doubtful)[:, ::-1] * self.volume.spacing_mm)
+        return out.reshape(*self.volume.shape, *values.shape[3:])
+
     def _between_cells(self, values: FloatArray, local_mm: FloatArray) -> FloatArray:
         """Interpolate values (CZ, CY, CX, ...) of cells, among those that have one."""
         n = np.array(values.shape[2::-1])
@@ -229,6 +259,12 @@ class CorrelationResult:
         out[total > 0] /= total[total > 0].reshape(-1, *further)
         out[total == 0] = np.nan
         return out
+
+
+def _linear(grid: SplineGrid, axis: int, at_mm: FloatArray) -> FloatArray:
+    """Return the matrix (n, c) of linear interpolation between the middles of cells along an axis, at coordinates (n,), mm."""
+    t = (at_mm - grid.origin_mm[axis]) / grid.step_mm[axis] - 0.5
+    return np.asarray(np.maximum(1.0 - np.abs(t[:, None] - np.arange(grid.cells[axis])), 0.0))
 
 
 def collected(
@@ -271,7 +307,7 @@ def collected(
     if not np.array_equal(volume.direction, np.eye(3)):
         vectors = vectors @ volume.direction.T
     vectors[~valid] = np.nan
-    maps = [np.full(volume.shape, np.nan) for _ in range(2)]
+    maps = [np.full(volume.shape, np.nan, np.float32) for _ in range(2)]
     for full, listed in zip(maps, (fit.gain, fit.offset), strict=True):
         full[box][level.mask] = listed
         full[~valid] = np.nan

@@ -132,6 +132,12 @@ def separable(matrices: Sequence[AnyFloatArray], coefficients: AnyFloatArray) ->
     return np.asarray(out)
 
 
+def separable_slice(x: AnyFloatArray, y: AnyFloatArray, z: AnyFloatArray, coefficients: AnyFloatArray) -> FloatArray:
+    """Return one slice (ny, nx, ...) of what `separable` returns, of matrices along x and y and the weights (NZ,) along z."""
+    rows = np.tensordot(y, np.tensordot(z, coefficients, (0, 0)), (1, 0))
+    return np.asarray(np.moveaxis(np.tensordot(x, rows, (1, 1)), 0, 1))
+
+
 def _two_scale(cells: int) -> FloatArray:
     """Return the matrix from coefficients on cells to those on half as large ones."""
     out = np.zeros((2 * cells + 3, cells + 3))

@@ -361,7 +361,7 @@ def _vtu(path: Path, grid: Volume, measured: MeasuredDisplacement) -> Path:
         "green_lagrange_strain": green_lagrange_strain_of(measured.gradient[some].reshape(-1, 3, 3)[used]),
     }
     if (covariance := measured.displacement.covariance) is not None:
-        data["displacement_covariance_mm2"] = covariance[some].reshape(-1, 3, 3)[used]
+        data["displacement_covariance_mm2"] = covariance[some].reshape(-1, 3, 3)[used].astype(np.float64)
     if measured.strain_sd is not None:
         data["strain_standard_deviation"] = measured.strain_sd[some].ravel()[used].astype(np.float64)
     write_vtu(path, mesh, data)
