@@ -86,6 +86,7 @@ def cut(
     out: Out = Path("naibu-cut"),
     distance_mm: float | None = None,
     pull_percent: float | None = None,
+    lips_friction: float | None = None,
     experiment: str | None = None,
     young_modulus_kpa: float | None = None,
     poisson_ratio: float | None = None,
@@ -115,6 +116,8 @@ def cut(
         refined: a cut of theirs farther away is refused.
     pull_percent
         Solids: how far the ends along the axis that the cut crosses most are pulled apart, in per cent of their distance; 5 by default.
+    lips_friction
+        Finite elements: Coulomb's coefficient between the two sides of the cut; 0 by default. With friction the motion takes longer.
     experiment
         Experiment whose body an identified model is made for, if not the first one that it was identified from.
     young_modulus_kpa
@@ -138,7 +141,8 @@ def cut(
     from naibu.workflows.interactive.cut_surface import is_surface
 
     solid = {
-        "pull_percent": pull_percent, "experiment": experiment, "young_modulus_kpa": young_modulus_kpa, "poisson_ratio": poisson_ratio,
+        "pull_percent": pull_percent, "lips_friction": lips_friction, "experiment": experiment, "young_modulus_kpa": young_modulus_kpa,
+        "poisson_ratio": poisson_ratio,
     }  # fmt: skip
     sheet = {
         "tension_percent": tension_percent, "groove_depth_mm": groove_depth_mm, "reach_mm": reach_mm, "refine": refine, "unit_mm": unit_mm,
@@ -153,6 +157,7 @@ def cut(
             source, path, out=out, distance_mm=distance_mm, experiment=experiment,
             material=_material(young_modulus_kpa, poisson_ratio), overwrite=overwrite, progress=progress,
             **({} if pull_percent is None else {"pull_percent": pull_percent}),
+            **({} if lips_friction is None else {"lips_friction": lips_friction}),
         )  # fmt: skip
     wrote(*done.files)
     sizes = ", ".join(f"{volume:.4g}" for volume in done.volumes_mm3[:6])

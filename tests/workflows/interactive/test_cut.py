@@ -54,6 +54,20 @@ def test_a_whole_cut_parts_the_pieces_by_the_pull(tmp_path: Path) -> None:
     assert sum(float(str(row["volume_mm3"])) for row in check_shown(done, done.files[0])) == pytest.approx(SIZE**3)
 
 
+def test_friction_does_not_hold_what_opens_and_is_refused_where_there_is_none(tmp_path: Path) -> None:
+    body, path = mesh_file(tmp_path), path_file(tmp_path, 10.0)
+    free = cut(body, path, out=tmp_path / "free", pull_percent=10.0)
+    rubbed = cut(body, path, out=tmp_path / "rubbed", pull_percent=10.0, lips_friction=0.5)
+    assert rubbed.opening_mm == pytest.approx(free.opening_mm, rel=0.02)  # live bodies end their steps sooner than Newton's method
+    assert json.loads((tmp_path / "rubbed" / "cut.json").read_text())["lips_friction"] == 0.5
+    for wrong in (-0.1, np.nan, np.inf):
+        with pytest.raises(InputError, match="lips_friction must be a finite number"):
+            cut(body, path, out=tmp_path / "wrong", lips_friction=wrong)
+    with pytest.raises(InputError, match="the sides of the cut of a lattice do not touch"):
+        cut("dough-pressed-by-sphere", path, out=tmp_path / "wrong", lips_friction=0.3)
+    assert not list((tmp_path / "wrong").glob("*"))
+
+
 LATTICE = """
 [object]
 labels = "body.nrrd"

@@ -72,6 +72,19 @@ def going_on(assembler: Assembler, anchors: FloatArray | None) -> Assembler:
     return replace(assembler, lips=assembler.lips.with_anchors(anchors))
 
 
+def with_friction(assembler: Assembler, coefficient: float) -> Assembler:
+    """Return an assembler whose sides of cuts rub on each other; the same where there is no cut.
+
+    Raises
+    ------
+    InputError
+        A negative coefficient, or NaN.
+    """
+    if not isinstance(assembler, LipAssembler) or assembler.lips is None:
+        return assembler
+    return replace(assembler, lips=assembler.lips.with_friction(coefficient))
+
+
 def with_lips(assembler: Assembler, points: FloatArray, faces: IntArray, friction: float = 0.0) -> Assembler:
     """Return an assembler in which the two sides of cuts do not pass through each other; the same where there is no cut.
 

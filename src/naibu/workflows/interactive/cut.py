@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,8 @@ from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import sha256
 from naibu.io.tables.blade_table import read_blade_path
 from naibu.io.vtk_files import write_vtkhdf_series, write_vtu
+from naibu.mechanics.finite_strain.lip_assembly import with_friction
+from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicEngine
 from naibu.mechanics.lattices.model.hexahedra import lattice_mesh
 from naibu.mechanics.lattices.model.state import ConstrainedNodes
 from naibu.meshing.cutting.swept_blade import SweptBlade, swept_blade
@@ -76,6 +78,7 @@ def cut(
     out: str | os.PathLike[str],
     distance_mm: float | None = None,
     pull_percent: float = 5.0,
+    lips_friction: float = 0.0,
     experiment: Source | None = None,
     material: MeshMaterial | None = None,
     overwrite: bool = False,
@@ -97,6 +100,9 @@ def cut(
     pull_percent : float
         How far the two ends of the body along the axis that the cut crosses most are pulled apart, % of their distance; 0 leaves the cut
         closed.
+    lips_friction : float
+        Coulomb's coefficient between the two sides of the cut, of finite elements; steps are then taken by Newton's method, which takes
+        longer.
     experiment : path, str or Experiment, optional
         Whose body an identified model is made for.
     material : MeshMaterial, optional
@@ -115,10 +121,14 @@ def cut(
     """
     if not 0.0 <= pull_percent <= LARGEST_PULL:
         raise InputError(f"pull_percent must lie between 0 and {LARGEST_PULL:g} %, not {pull_percent:g}")
+    if not (np.isfinite(lips_friction) and lips_friction >= 0.0):
+        raise InputError(f"lips_friction must be a finite number that is not negative, not {lips_friction:g}; 0 is frictionless")
     require_lengths(distance_mm=distance_mm)
     blade = _blade(path)
     folder = output_folder(out, FILES, overwrite=overwrite)
     model = touchable(source, experiment=experiment, material=material)
+    if lips_friction > 0.0 and isinstance(model.body, LatticeBody):
+        raise InputError(f"lips_friction must be 0, not {lips_friction:g}: the sides of the cut of a lattice do not touch each other")
     before, after, found, distance = _cut(model.body, blade, distance_mm)
     if not len(found.faces):
         raise InputError(
@@ -129,7 +139,7 @@ def cut(
     areas = 0.5 * np.cross(b - a, c - a)
     axis = int(np.abs(areas).sum(axis=0).argmax())
     turn = after.engine.lattice.frame.rotation if isinstance(after, LatticeBody) else np.eye(3)
-    times, moved = _pulled(after, axis, pull_percent, progress)
+    times, moved = _pulled(_rubbing(after, lips_friction), axis, pull_percent, progress)
     moved = moved @ turn.T
     volumes = np.bincount(found.piece, signed_volumes(found.mesh)).astype(np.float64)
     opening = _opening(found, moved[-1])
@@ -138,6 +148,7 @@ def cut(
         "area_of_the_blade_path_mm2": blade.area_mm2, "largest_distance_from_the_blade_mm": found.deviation_mm,
         **({} if distance is None else {"allowed_distance_mm": 0.5 * distance}), "largest_opening_mm": opening,
         "source": str(source), "naibu": __version__, "pull_percent": pull_percent,
+        **({"lips_friction": lips_friction} if lips_friction else {}),
         **({"doubt": model.doubt} if model.doubt else {}),
         "pulled_along": "xyz"[int(np.abs(turn[:, axis]).argmax())], "inputs_sha256": {Path(path).name: sha256(path)},
     }  # fmt: skip
@@ -168,6 +179,16 @@ def _cut(
     distance = 0.5 * mean_edge_length(body.mesh) if distance_mm is None else distance_mm
     behind, _, cut_mesh = body.cut(body.engine.rest(), blade, distance)
     return body.mesh, behind, cut_mesh, distance
+
+
+def _rubbing(body: InteractiveBody, friction: float) -> InteractiveBody:
+    """Return the body whose sides of the cut rub on each other, stepped by Newton's method; the same where there is no friction."""
+    if friction == 0.0:
+        return body
+    assert isinstance(body, FiniteElementBody)
+    e = body.engine
+    made = with_friction(e.assembler, friction)
+    return replace(body, engine=DynamicEngine(e.points, made, e.mass, e.faces, e.step, e.normal_stiffness, e.tangential_stiffness))
 
 
 def _pulled(body: InteractiveBody, axis: int, pull_percent: float, progress: Progress | None) -> tuple[FloatArray, FloatArray]:
